@@ -1,0 +1,1 @@
+"""Frozen values in; figures, HTML, PDF and JSON out. Knows no database, no packets and no payload."""

@@ -1,0 +1,387 @@
+"""What a report is made of: frozen values of plain arrays, numbers and text.
+
+Conventions: times are ``utc_ns`` (int64, POSIX nanoseconds), angles are degrees, lengths metres, image
+coordinates pixels with pixel centres at integers, speeds metres per second. Vectors in R/T/N are radial,
+transverse (along-track) and normal (cross-track) of the reference orbit. NaN means "no value here". Where a
+field is ``None`` or empty its section says that it is not available, with the reason from
+``PassReport.not_available`` when one is given there.
+
+A report reads no clock: the same value gives the same octets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+ByteArray = NDArray[np.uint8]
+
+ODOMETRY_OUTCOMES = ("anchored", "multi", "single", "predicted", "missed", "rejected")
+FIX_OUTCOMES = ("fixed", "coasted", "refused", "no_image")
+RESET_TRIGGERS = ("none", "initialization", "time_gap", "manual_step", "safety_timeout")
+
+
+@dataclass(frozen=True, slots=True)
+class HeadlineFigure:
+    """One of the five numbers of the first page.
+
+    ``value`` is a number (printed with three significant digits), text (printed as it is) or None ("not
+    available"). ``evidence_rung`` overrides the report's own rung where one figure rests on other evidence.
+    """
+
+    label: str
+    value: float | int | str | None
+    unit: str = ""
+    note: str = ""
+    evidence_rung: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameAccounting:
+    """Where the frames of a pass went; None where a count is not known."""
+
+    expected: int | None = None
+    acquired: int | None = None
+    lit: int | None = None
+    processed: int | None = None
+    with_detections: int | None = None
+    navigated: int | None = None
+    bad_image: int | None = None
+    downlinked: int | None = None
+    quality: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class ApidAccounting:
+    """Packets of one application process."""
+
+    name: str
+    packets: int
+    lost: int = 0
+    duplicates: int = 0
+    conflicts: int = 0
+    crc_errors: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CompletenessSeries:
+    """Packets expected and received in each interval of the pass: edges (n+1,), counts (n,)."""
+
+    edges_utc_ns: IntArray
+    expected: IntArray
+    received: IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class PacketAccounting:
+    """What became of every octet of the downlink."""
+
+    packets: int
+    lost: int = 0
+    duplicates: int = 0
+    conflicts: int = 0
+    crc_errors: int = 0
+    octets_skipped: int = 0
+    frames: int | None = None
+    frames_bad: int = 0
+    symbols_corrected: int = 0
+    octets: int | None = None
+    by_apid: Mapping[int, ApidAccounting] = field(default_factory=dict)
+    completeness: CompletenessSeries | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TimeSpan:
+    """A half-open interval of UTC."""
+
+    start_utc_ns: int
+    stop_utc_ns: int
+    label: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackSeries:
+    """A track over the Moon: mean-Earth latitude and longitude in degrees, altitude in metres."""
+
+    utc_ns: IntArray
+    latitude_deg: FloatArray
+    longitude_deg: FloatArray
+    altitude_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class NavigationStatistics:
+    """Figures of one navigation solution over the pass; NaN where there is none."""
+
+    median_3d_m: float = float("nan")
+    p68_3d_m: float = float("nan")
+    p95_3d_m: float = float("nan")
+    p99_3d_m: float = float("nan")
+    max_3d_m: float = float("nan")
+    drift_percent: float = float("nan")
+    end_of_pass_m: float = float("nan")
+    path_length_m: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class DriftSample:
+    """Relative drift over sub-tracks of one length."""
+
+    path_length_m: float
+    median_percent: float
+    p95_percent: float
+    samples: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NavigationSeries:
+    """One estimate, or one baseline, against the reference, sampled at ``utc_ns`` (n,).
+
+    ``kind`` is "estimate" (flown on board) or "baseline" (computed on the ground for comparison).
+    ``error_rtn_m`` and ``sigma_rtn_m`` are (n, 3), estimate minus reference. ``outcome`` and
+    ``reset_trigger`` name what the matcher did at each sample (see `ODOMETRY_OUTCOMES`, `FIX_OUTCOMES`,
+    `RESET_TRIGGERS`); empty tuples where the solution has no such thing. ``error_rtn_m`` at a reset is the
+    error after it; ``reset_error_m`` (n,) holds the horizontal error at the instant before, NaN elsewhere.
+    The optional arrays (n,) are what the error may depend on; ``nees`` has three degrees of freedom, ``nis``
+    ``nis_dof``.
+    """
+
+    name: str
+    kind: str
+    utc_ns: IntArray
+    latitude_deg: FloatArray
+    longitude_deg: FloatArray
+    altitude_m: FloatArray
+    error_rtn_m: FloatArray
+    sigma_rtn_m: FloatArray | None = None
+    outcome: tuple[str, ...] = ()
+    reset_trigger: tuple[str, ...] = ()
+    anchor_reads: int = 0
+    anchor_reads_after_start: int | None = None
+    statistics: NavigationStatistics = field(default_factory=NavigationStatistics)
+    description: str = ""
+    reset_error_m: FloatArray | None = None
+    matched: IntArray | None = None
+    candidates: IntArray | None = None
+    nis: FloatArray | None = None
+    nis_dof: IntArray | None = None
+    nees: FloatArray | None = None
+    sun_elevation_deg: FloatArray | None = None
+    time_since_fix_s: FloatArray | None = None
+    terrain: tuple[str, ...] = ()
+    wrong_fixes: int | None = None
+    drift_by_length: tuple[DriftSample, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ClassScore:
+    """Detection against the catalogue for one size class (or all, size_class = -1)."""
+
+    size_class: int
+    label: str
+    expected: int
+    detected_true: int
+    false_alarms: int
+    precision: float
+    recall: float
+    localisation_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class BinScore:
+    """Precision and recall in one bin of a quantity such as altitude or Sun elevation."""
+
+    low: float
+    high: float
+    expected: int
+    precision: float
+    recall: float
+    localisation_px: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PrecisionRecallCurve:
+    """Precision and recall against the score threshold for one class (or all)."""
+
+    label: str
+    threshold: FloatArray
+    precision: FloatArray
+    recall: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationBin:
+    """Detections whose score lies in a bin: mean score and the share of them that are true."""
+
+    mean_score: float
+    fraction_true: float
+    count: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResidualSeries:
+    """Detected minus expected centre of matched craters: arrays (n,) in pixels; Sun azimuth in the image,
+    degrees clockwise from up."""
+
+    u_px: FloatArray
+    v_px: FloatArray
+    du_px: FloatArray
+    dv_px: FloatArray
+    sun_azimuth_deg: FloatArray | None = None
+    diameter_px: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorScore:
+    """The detector judged by the ground: detections against catalogue, reference orbit and camera."""
+
+    per_class: tuple[ClassScore, ...] = ()
+    micro: ClassScore | None = None
+    method: str = ""
+    by_altitude_km: tuple[BinScore, ...] = ()
+    by_sun_elevation_deg: tuple[BinScore, ...] = ()
+    curves: tuple[PrecisionRecallCurve, ...] = ()
+    calibration: tuple[CalibrationBin, ...] = ()
+    residuals: ResidualSeries | None = None
+    repeatability: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GalleryFrame:
+    """One image with what was detected and what the catalogue says should be there.
+
+    ``image`` is uint8 (H, W) or (H, W, 3). Detection arrays are (n,), catalogue arrays (m,).
+    ``detection_matched`` (n,) and ``catalogue_matched`` (m,) are True where the two agree; None where nobody
+    matched them.
+    """
+
+    frame_number: int
+    utc_ns: int | None
+    image: ByteArray
+    detection_u_px: FloatArray
+    detection_v_px: FloatArray
+    detection_diameter_px: FloatArray
+    detection_class: IntArray
+    catalogue_u_px: FloatArray
+    catalogue_v_px: FloatArray
+    catalogue_diameter_px: FloatArray
+    catalogue_class: IntArray
+    detection_matched: BoolArray | None = None
+    catalogue_matched: BoolArray | None = None
+    caption: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CraterMap:
+    """Craters around the ground track, arrays (n,): how often each should have been and was detected."""
+
+    latitude_deg: FloatArray
+    longitude_deg: FloatArray
+    diameter_m: FloatArray
+    expected: IntArray | None = None
+    detected: IntArray | None = None
+    source: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TerrainMap:
+    """A gray shaded relief (H, W) uint8, row 0 north, as the ground of the track map; bounds in degrees, east
+    longitudes."""
+
+    image: ByteArray
+    west_deg: float
+    east_deg: float
+    south_deg: float
+    north_deg: float
+    source: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HousekeepingParameter:
+    """One engineering parameter over time: ``utc_ns`` and ``values`` (n,)."""
+
+    name: str
+    unit: str
+    utc_ns: IntArray
+    values: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class PassEvent:
+    """An event report of the payload."""
+
+    utc_ns: int
+    severity: str
+    name: str
+    detail: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class AnchorRead:
+    """One use of the anchor ephemeris (truth, or what the ground uploaded as truth) by an on-board
+    estimator."""
+
+    estimator: str
+    utc_ns: int
+    trigger: str
+    frame_number: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Sensitivity:
+    """What one changed setting does to the figures."""
+
+    name: str
+    setting: str
+    median_3d_m: float
+    p95_3d_m: float
+    nees: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PassReport:
+    """Everything the report of one pass says.
+
+    ``verdict`` is one or two sentences; ``verdict_level`` is "good", "caution", "bad" or "" and colours the
+    rule beside them. ``evidence_rung`` names the rung of the evidence ladder on which the accuracy figures
+    stand. ``not_available`` gives the reason why a section is missing; its keys are names of fields of this
+    value. ``configuration`` maps a group ("camera") to its settings.
+    """
+
+    title: str
+    pass_id: str
+    verdict: str = ""
+    verdict_level: str = ""
+    generated_for: str = ""
+    created_utc: str = ""
+    evidence_rung: str = ""
+    headline: tuple[HeadlineFigure, ...] = ()
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    data_sources: tuple[str, ...] = ()
+    span: TimeSpan | None = None
+    accounting: FrameAccounting | None = None
+    packets: PacketAccounting | None = None
+    reference: TrackSeries | None = None
+    navigation: tuple[NavigationSeries, ...] = ()
+    imaging_arcs: tuple[TimeSpan, ...] = ()
+    gaps: tuple[TimeSpan, ...] = ()
+    detector: DetectorScore | None = None
+    gallery: tuple[GalleryFrame, ...] = ()
+    worst_frames: tuple[GalleryFrame, ...] = ()
+    craters: CraterMap | None = None
+    terrain: TerrainMap | None = None
+    housekeeping: tuple[HousekeepingParameter, ...] = ()
+    events: tuple[PassEvent, ...] = ()
+    truth_ledger: tuple[AnchorRead, ...] = ()
+    sensitivities: tuple[Sensitivity, ...] = ()
+    configuration: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    scenario_text: str = ""
+    remarks: tuple[str, ...] = ()
+    not_available: Mapping[str, str] = field(default_factory=dict)
