@@ -1,0 +1,117 @@
+"""The `linna` command: finds the group asked for, imports only that one, turns known errors into one line.
+
+Exit status: 0 done, 1 a gate or requirement not met, 2 bad usage or bad input, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from linna import __version__
+
+# Threads of numerical libraries that spin while they wait make two busy cores ten times slower: wait passively.
+_THREAD_POLICY = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "NUMBA_SLP_VECTORIZE": "1"}
+
+# name -> (module, one line of help); the order is that of `linna --help`.
+GROUPS: dict[str, tuple[str, str]] = {
+    "demo": ("demo", "fly one observation window, downlink it, ingest it, write the report"),
+    "emulate": ("emulate", "run the payload over a scenario and write a pass archive"),
+    "orbit": ("orbit", "propagate, compare and interpolate ephemerides"),
+    "catalogue": ("catalogue", "crater catalogues: statistics and on-board curation"),
+    "camera": ("camera", "camera studies (field of view)"),
+    "render": ("render", "render one frame of a scenario"),
+    "dataset": ("dataset", "build, check and summarise detector data sets"),
+    "detector": ("detector", "train, export, evaluate and run the crater detector"),
+    "tm": ("tm", "decode and check telemetry; the dictionary as ICD and XTCE"),
+    "ingest": ("ingest", "ingest downlink files or pass archives into the ground database"),
+    "pass": ("pass_", "list and show passes"),
+    "report": ("report", "write the report of a pass"),
+    "serve": ("serve", "run the ground service's HTTP API"),
+    "worker": ("worker", "run a job worker of the ground service"),
+    "db": ("db", "database migrations"),
+    "user": ("user", "users of the ground service"),
+}
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run one command line; the exit status comes back."""
+    for name, value in _THREAD_POLICY.items():
+        os.environ.setdefault(name, value)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_overview())
+        return 0 if arguments else 2
+    if arguments[0] == "--version":
+        print(f"linna {__version__}")
+        return 0
+    group = arguments[0]
+    if group not in GROUPS:
+        print(f"linna: error: unknown command '{group}'{_nearest(group)}; see linna --help", file=sys.stderr)
+        return 2
+    module_name, help_line = GROUPS[group]
+    module = importlib.import_module(f"linna.commands.{module_name}")
+    parser = argparse.ArgumentParser(prog=f"linna {group}", description=help_line)
+    module.configure(parser)
+    try:
+        namespace = parser.parse_args(list(arguments[1:]))
+    except SystemExit as stop:  # argparse has printed its line already
+        return int(stop.code or 0)
+    handler = getattr(namespace, "handler", None)
+    if handler is None:
+        parser.print_usage(sys.stderr)
+        return 2
+    return _guarded(handler, namespace)
+
+
+def _guarded(handler, namespace: argparse.Namespace) -> int:
+    try:
+        return int(handler(namespace) or 0)
+    except KeyboardInterrupt:
+        print("linna: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        print(f"linna: error: {_one_line(_os_message(error))}", file=sys.stderr)
+        return 2
+    except _known_errors() as error:
+        print(f"linna: error: {_one_line(str(error))}", file=sys.stderr)
+        return 2
+
+
+def _known_errors() -> tuple[type[Exception], ...]:
+    """The base errors of the packages that have been imported by now (none is imported for this)."""
+    bases = {"lunar": "LunarError", "tmtc": "TmtcError", "reports": "ReportError",
+             "payload_emulator": "PayloadError", "ground_service": "GroundError", "linna": "UsageError"}
+    loaded = (getattr(sys.modules.get(f"{package}.errors"), name, None) for package, name in bases.items())
+    return tuple(error for error in loaded if error is not None)
+
+
+def _os_message(error: OSError) -> str:
+    where = f" ({error.filename})" if error.filename else ""
+    return f"{error.strerror or error}{where}"
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _nearest(name: str) -> str:
+    import difflib
+
+    close = difflib.get_close_matches(name, GROUPS, n=1)
+    return f" (did you mean '{close[0]}'?)" if close else ""
+
+
+def _overview() -> str:
+    width = max(map(len, GROUPS))
+    lines = ["usage: linna COMMAND [options]", "",
+             "LINNA: crater-based navigation for a lunar CubeSat, payload emulator and ground segment.", "",
+             "commands:"]
+    lines += [f"  {name:<{width}}  {help_line}" for name, (_, help_line) in GROUPS.items()]
+    lines += ["", "linna COMMAND --help tells more; --version prints the version."]
+    return "\n".join(lines)

@@ -1,0 +1,69 @@
+"""What commands print: one JSON object or plain text on stdout, progress on stderr."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, TypeVar
+
+Item = TypeVar("Item")
+_PLAIN_LINE_INTERVAL_S = 5.0
+
+
+def add_json_flag(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout, everything else on stderr")
+
+
+def emit(arguments: argparse.Namespace, figures: Mapping[str, Any], text: str | None = None) -> None:
+    """Print `figures` as one JSON object if --json was given, else `text` (or the figures, a line each)."""
+    if getattr(arguments, "json", False):
+        print(json.dumps(_plain(figures), allow_nan=False))
+    elif text is not None:
+        print(text)
+    else:
+        for key, value in figures.items():
+            print(f"{key}: {value}")
+
+
+def log(message: str) -> None:
+    """One line of progress on stderr."""
+    print(message, file=sys.stderr, flush=True)
+
+
+def progress(items: Iterable[Item], total: int | None = None, label: str = "", unit: str = "") -> Iterator[Item]:
+    """Yield `items`, showing a bar with rate and time left on a terminal, plain lines otherwise."""
+    if sys.stderr.isatty():
+        from tqdm import tqdm
+
+        yield from tqdm(items, total=total, desc=label, unit=f" {unit}" if unit else "it", file=sys.stderr)
+        return
+    started = last = time.monotonic()
+    count = 0
+    for count, item in enumerate(items, start=1):
+        yield item
+        now = time.monotonic()
+        if now - last >= _PLAIN_LINE_INTERVAL_S:
+            last = now
+            rate = count / (now - started)
+            left = f", {(total - count) / rate:.0f} s left" if total else ""
+            log(f"{label}: {count}{f'/{total}' if total else ''} {unit} ({rate:.1f}/s{left})")
+    log(f"{label}: {count} {unit} in {time.monotonic() - started:.1f} s")
+
+
+def _plain(value: Any) -> Any:
+    """`value` with arrays as lists, numpy scalars as Python's, and NaN or infinity as null (JSON has neither)."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple, set)):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if value is None or isinstance(value, (str, int, float, bool)):
+        return value
+    return str(value)

@@ -1,0 +1,33 @@
+"""What can go wrong in the payload emulator.
+
+PayloadError
+├── ScenarioError      a scenario file, or what it asks for, is not usable
+├── TerrainError       a terrain source is missing, damaged or does not cover the place asked for
+├── ModelError         a detector model is not the one that flight expects
+├── TableError         an uploaded table (anchor ephemeris, catalogue, gravity) is damaged or of another kind
+└── DatasetError       a data set is missing, incomplete or of another camera
+"""
+
+
+class PayloadError(Exception):
+    """Base of every error that the payload emulator raises on purpose; the text is one line for a user."""
+
+
+class ScenarioError(PayloadError):
+    """A scenario cannot be flown: the message names the file, the key, what was expected and what was found."""
+
+
+class TerrainError(PayloadError):
+    """A terrain source is missing, damaged, or does not cover the place asked for."""
+
+
+class ModelError(PayloadError):
+    """A detector model has other inputs or outputs than flight expects, or fails its hash."""
+
+
+class TableError(PayloadError):
+    """An uploaded table is truncated, fails its checksum, or is of another kind or version."""
+
+
+class DatasetError(PayloadError):
+    """A data set is missing, incomplete, or was made for another camera."""

@@ -1,0 +1,325 @@
+"""Emulation scenarios: one TOML file, parsed into frozen values; unknown keys are refused with the nearest known one.
+
+Degrees, kilometres and seconds stand in the file and in these values' names; users of a scenario convert once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from lunar.errors import LunarError
+from lunar.timescales import parse_utc
+from payload_emulator.errors import ScenarioError
+
+SHIPPED = Path(__file__).resolve().parent.parent / "scenarios"
+
+
+@dataclass(frozen=True, slots=True)
+class OrbitSection:
+    """Where the spacecraft is at the epoch: Keplerian elements (osculating), or an OEM file that flies the truth."""
+
+    epoch: str = "2029-08-07T00:00:00Z"
+    frame: Literal["MCI", "ICRF"] = "MCI"
+    semi_major_axis_km: float = 1768.180
+    eccentricity: float = 0.006908
+    inclination_deg: float = 89.076
+    raan_deg: float = 3.164
+    argument_of_perilune_deg: float = 333.604
+    true_anomaly_deg: float = 8.882
+    oem: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class DynamicsSection:
+    """Forces on the true spacecraft. `gravity`: "auto" (best field at hand), "builtin", or a coefficient file."""
+
+    gravity: str = "auto"
+    degree: int = 100
+    orientation: Literal["auto", "iau", "de421"] = "auto"
+    earth: bool = True
+    sun: bool = True
+    integrator: Literal["dop853", "rkf78"] = "dop853"
+
+
+@dataclass(frozen=True, slots=True)
+class ManeuverSection:
+    """The paper's orbit maintenance (section V-B.1)."""
+
+    enabled: bool = True
+    periselene_altitude_km: float = 15.0
+    semi_major_axis_km: float = 1768.180
+    eccentricity: float = 0.006
+
+
+@dataclass(frozen=True, slots=True)
+class WindowSection:
+    """When the payload observes.
+
+    `search`: "terrain" takes the first window of the wanted direction whose whole track lies over the terrain at hand,
+    no earlier than `start` (the orbit's epoch when empty); "none" observes from `start` for `duration_s`.
+    Frames are taken where the sub-satellite latitude is within `latitude_limit_deg`.
+    """
+
+    search: Literal["terrain", "none"] = "terrain"
+    start: str = ""
+    duration_s: float = 0.0
+    passes: int = 1
+    direction: Literal["ascending", "descending", "any"] = "ascending"
+    latitude_limit_deg: float = 60.0
+    search_days: float = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSection:
+    """The pinhole camera (paper, section V-B.3)."""
+
+    width_px: int = 512
+    height_px: int = 512
+    fov_deg: float = 120.0
+    frame_interval_s: float = 15.0
+
+
+@dataclass(frozen=True, slots=True)
+class LightSection:
+    """`paper`: the Sun drawn anew for each frame (section V-B.4); `real`: from the ephemeris."""
+
+    mode: Literal["paper", "real"] = "paper"
+    elevation_min_deg: float = 5.0
+    elevation_max_deg: float = 15.0
+    azimuth_min_deg: float = -45.0
+    azimuth_max_deg: float = 45.0
+
+
+@dataclass(frozen=True, slots=True)
+class TerrainSection:
+    """`auto`: the real terrain where its rasters are at hand, else the procedural Moon."""
+
+    source: Literal["auto", "real", "procedural"] = "auto"
+    sub_resolution_craters: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class NavigationSection:
+    """Estimators on board, and what they are started and fed with."""
+
+    estimators: tuple[str, ...] = ("paper", "spherical")
+    initial_position_error_m: float = 0.0
+    initial_velocity_error_m_s: float = 0.0
+    filter_gravity: str = "auto"
+    filter_degree: int = 100
+    catalogue_min_diameter_km: float = 3.0
+    catalogue_max_diameter_km: float = 30.0
+    catalogue_error_fraction_of_diameter: float = 0.0
+    catalogue_height_error_m: float = 0.0
+    safety_timeout_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeSection:
+    """Pointing of the camera and what the ADCS knows of it, 1 sigma per axis."""
+
+    pointing_error_deg: float = 0.0
+    knowledge_noise_deg: float = 0.0
+    knowledge_bias_deg: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class ClockSection:
+    """The on-board clock: reading minus ideal = offset + drift x elapsed."""
+
+    offset_s: float = 0.0
+    drift_ppm: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class LinkSection:
+    """What the link does to the downlink: probabilities per transfer frame, and bit error rate."""
+
+    coding: Literal["rs", "none"] = "rs"
+    frame_loss: float = 0.0
+    bit_error_rate: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceSection:
+    """How far the ground's reference ephemeris is from the truth (constant RTN offset of that sigma)."""
+
+    position_error_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """Everything an emulation is made of; two runs of equal scenarios give equal octets."""
+
+    name: str
+    title: str = ""
+    seed: int = 1
+    orbit: OrbitSection = field(default_factory=OrbitSection)
+    dynamics: DynamicsSection = field(default_factory=DynamicsSection)
+    maneuvers: ManeuverSection = field(default_factory=ManeuverSection)
+    window: WindowSection = field(default_factory=WindowSection)
+    camera: CameraSection = field(default_factory=CameraSection)
+    light: LightSection = field(default_factory=LightSection)
+    terrain: TerrainSection = field(default_factory=TerrainSection)
+    navigation: NavigationSection = field(default_factory=NavigationSection)
+    attitude: AttitudeSection = field(default_factory=AttitudeSection)
+    clock: ClockSection = field(default_factory=ClockSection)
+    link: LinkSection = field(default_factory=LinkSection)
+    reference: ReferenceSection = field(default_factory=ReferenceSection)
+
+    @property
+    def epoch_utc_ns(self) -> int:
+        return parse_utc(self.orbit.epoch)
+
+
+def load_scenario(path: Path | str) -> Scenario:
+    """The scenario in a TOML file; a bare name means one of those shipped (`scenarios/NAME.toml`).
+
+    Raises
+    ------
+    ScenarioError
+        The file is missing, no TOML, has unknown keys, values of a wrong type or an impossible orbit.
+    """
+    where = Path(path)
+    if not where.exists() and where.suffix == "" and (SHIPPED / f"{where.name}.toml").exists():
+        where = SHIPPED / f"{where.name}.toml"
+    try:
+        text = where.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        shipped = ", ".join(sorted(file.stem for file in SHIPPED.glob("*.toml")))
+        raise ScenarioError(f"{path}: no such scenario file; shipped scenarios: {shipped}") from None
+    except UnicodeDecodeError as error:
+        raise ScenarioError(f"{where}: expected UTF-8 text, found octet {error.object[error.start]:#04x} "
+                            f"at {error.start}") from None
+    return parse_scenario(text, source=str(where))
+
+
+def parse_scenario(text: str, source: str = "scenario") -> Scenario:
+    """The scenario written in `text`; `source` names it in error messages."""
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{source}: not TOML: {error}") from None
+    if "name" not in table:
+        raise ScenarioError(f"{source}: key 'name' is missing, expected a short text")
+    scenario = _build(Scenario, table, source, "")
+    _check(scenario, source)
+    return scenario
+
+
+def format_scenario(scenario: Scenario) -> str:
+    """TOML text that parses to an equal scenario (every key written out)."""
+    lines: list[str] = []
+    sections: list[str] = []
+    for item in dataclasses.fields(scenario):
+        value = getattr(scenario, item.name)
+        if dataclasses.is_dataclass(value):
+            sections += ["", f"[{item.name}]"]
+            sections += [f"{key.name} = {_toml(getattr(value, key.name))}" for key in dataclasses.fields(value)]
+        else:
+            lines.append(f"{item.name} = {_toml(value)}")
+    return "\n".join(lines + sections) + "\n"
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n") + '"'
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_toml(item) for item in value) + "]"
+    return repr(value)
+
+
+def _build(kind: type, table: Any, source: str, path: str) -> Any:
+    if not isinstance(table, dict):
+        raise ScenarioError(f"{source}: [{path}] must be a table, found {type(table).__name__}")
+    hints = get_type_hints(kind)
+    known = [item.name for item in dataclasses.fields(kind)]
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        place = f"{path}.{key}" if path else key
+        if key not in known:
+            close = difflib.get_close_matches(key, known, n=1)
+            hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(known)}"
+            raise ScenarioError(f"{source}: unknown key '{place}'; {hint}")
+        values[key] = _convert(hints[key], value, source, place)
+    return kind(**values)
+
+
+def _convert(hint: Any, value: Any, source: str, place: str) -> Any:
+    origin = get_origin(hint)
+    if dataclasses.is_dataclass(hint):
+        return _build(hint, value, source, place)  # type: ignore[arg-type]
+    if origin is Literal:
+        if value not in get_args(hint):
+            expected = ", ".join(repr(item) for item in get_args(hint))
+            raise ScenarioError(f"{source}: {place} must be one of {expected}, found {value!r}")
+        return value
+    if origin is tuple:
+        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+            raise ScenarioError(f"{source}: {place} must be a list of texts, found {value!r}")
+        return tuple(value)
+    if origin in (Union, UnionType):
+        raise TypeError(f"scenario field {place} has a union type, which the parser does not read")
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if type(value) is not hint:
+        raise ScenarioError(f"{source}: {place} must be {_NAMES[hint]}, found {value!r}")
+    if hint is float and not math.isfinite(value):
+        raise ScenarioError(f"{source}: {place} must be finite, found {value!r}")
+    return value
+
+
+_NAMES = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
+ESTIMATORS = ("paper", "spherical", "anchored")
+
+
+def _check(scenario: Scenario, source: str) -> None:
+    """Refuse what cannot be flown; each message names the key, what is expected and what was found."""
+
+    def require(good: bool, key: str, expected: str, found: object) -> None:
+        if not good:
+            raise ScenarioError(f"{source}: {key} must be {expected}, found {found!r}")
+
+    orbit, camera, window = scenario.orbit, scenario.camera, scenario.window
+    for key, text in (("orbit.epoch", orbit.epoch), ("window.start", window.start)):
+        try:
+            if text or key == "orbit.epoch":
+                parse_utc(text)
+        except (LunarError, ValueError):
+            require(False, key, "a UTC time such as 2029-08-07T00:00:00Z", text)
+    if not orbit.oem:
+        require(0.0 <= orbit.eccentricity < 1.0, "orbit.eccentricity", "from 0 to below 1", orbit.eccentricity)
+        perilune_km = orbit.semi_major_axis_km * (1.0 - orbit.eccentricity)
+        require(perilune_km > 1737.4, "orbit.semi_major_axis_km and eccentricity",
+                "an orbit above the ground (perilune radius over 1737.4 km)", round(perilune_km, 3))
+        require(0.0 <= orbit.inclination_deg <= 180.0, "orbit.inclination_deg", "from 0 to 180", orbit.inclination_deg)
+    require(2 <= scenario.dynamics.degree <= 1200, "dynamics.degree", "from 2 to 1200", scenario.dynamics.degree)
+    require(16 <= camera.width_px <= 8192, "camera.width_px", "from 16 to 8192", camera.width_px)
+    require(16 <= camera.height_px <= 8192, "camera.height_px", "from 16 to 8192", camera.height_px)
+    require(1.0 <= camera.fov_deg <= 170.0, "camera.fov_deg", "from 1 to 170", camera.fov_deg)
+    require(camera.frame_interval_s > 0.0, "camera.frame_interval_s", "positive", camera.frame_interval_s)
+    require(0.0 < window.latitude_limit_deg <= 90.0, "window.latitude_limit_deg", "over 0 and up to 90",
+            window.latitude_limit_deg)
+    require(window.passes >= 1, "window.passes", "at least 1", window.passes)
+    require(window.search != "none" or window.duration_s > 0.0, "window.duration_s",
+            "positive when window.search is 'none'", window.duration_s)
+    light = scenario.light
+    require(light.elevation_min_deg <= light.elevation_max_deg, "light.elevation_min_deg",
+            "no more than light.elevation_max_deg", light.elevation_min_deg)
+    require(light.azimuth_min_deg <= light.azimuth_max_deg, "light.azimuth_min_deg",
+            "no more than light.azimuth_max_deg", light.azimuth_min_deg)
+    for name in scenario.navigation.estimators:
+        require(name in ESTIMATORS, "navigation.estimators", f"of {', '.join(ESTIMATORS)}", name)
+    require(len(scenario.navigation.estimators) > 0, "navigation.estimators", "at least one estimator", ())
+    require(0.0 <= scenario.link.frame_loss <= 1.0, "link.frame_loss", "from 0 to 1", scenario.link.frame_loss)
+    require(0.0 <= scenario.link.bit_error_rate <= 0.5, "link.bit_error_rate", "from 0 to 0.5",
+            scenario.link.bit_error_rate)
