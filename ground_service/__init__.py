@@ -1,0 +1,1 @@
+"""The ground service: ingest, archive, evaluation, reports, API and jobs of the LINNA payload."""

@@ -1,0 +1,1 @@
+"""Pure evaluation: arrays in, arrays and report values out. Opens nothing and reads no clock."""

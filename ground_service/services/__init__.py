@@ -1,0 +1,1 @@
+"""What the service does, one module per service: it joins store, link and processing."""

@@ -1,0 +1,210 @@
+"""Opening the database, keeping its schema current, and the transactions of one writer.
+
+SQLite is opened with a write-ahead log, so readers never wait for the writer; a write transaction takes the
+write lock at once (BEGIN IMMEDIATE), so that what it reads first is what it changes.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sqlalchemy import Connection, Engine, create_engine, event, inspect, make_url, text
+from sqlalchemy.exc import DBAPIError, SQLAlchemyError
+
+import ground_service
+from ground_service.errors import (
+    DatabaseNotMigrated,
+    DatabaseTooNew,
+    DatabaseUnavailable,
+    GroundError,
+    StorageFull,
+    StorageReadOnly,
+    storage_error,
+)
+
+if TYPE_CHECKING:
+    from alembic.config import Config
+
+BUSY_TIMEOUT_MS = 30_000
+
+
+@dataclass(frozen=True, slots=True)
+class Database:
+    """An engine and its transactions."""
+
+    engine: Engine
+
+    @property
+    def dialect(self) -> str:
+        """Name of the database in use: sqlite or postgresql."""
+        return self.engine.dialect.name
+
+    @property
+    def label(self) -> str:
+        """The URL without its password."""
+        return self.engine.url.render_as_string(hide_password=True)
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A connection to read with."""
+        with self._translated(), self.engine.connect() as connection:
+            yield connection
+
+    @contextmanager
+    def writing(self) -> Iterator[Connection]:
+        """A connection inside one write transaction, committed at the end, undone on an error."""
+        with self._translated(), self.engine.connect() as connection:
+            if self.dialect == "sqlite":
+                connection.execution_options(linna_write=True)
+            with connection.begin():
+                yield connection
+
+    @contextmanager
+    def _translated(self) -> Iterator[None]:
+        try:
+            yield
+        except DBAPIError as error:
+            raise database_error(error, self.label) from error
+
+
+def open_database(url: str) -> Database:
+    """The database at `url`; nothing is created or checked yet, except the folder of a SQLite file."""
+    try:
+        parsed = make_url(url)
+    except SQLAlchemyError:
+        raise DatabaseUnavailable(url.split("@")[-1], "expected a URL such as sqlite:///file.db") from None
+    if parsed.get_backend_name() == "sqlite":
+        if parsed.database and parsed.database != ":memory:":
+            _make_folder(Path(parsed.database))
+        engine = create_engine(parsed, connect_args={"timeout": BUSY_TIMEOUT_MS / 1000})
+        event.listen(engine, "connect", _prepare_sqlite)
+        event.listen(engine, "begin", _begin_sqlite)
+        return Database(engine)
+    try:
+        return Database(create_engine(parsed, pool_pre_ping=True, pool_size=10, max_overflow=20))
+    except (SQLAlchemyError, ImportError) as error:
+        raise DatabaseUnavailable(parsed.render_as_string(), str(error).splitlines()[0]) from None
+
+
+def prepare_database(url: str, *, upgrade: bool | None = None) -> Database:
+    """The database at `url` with the schema of this version.
+
+    A SQLite database is created and upgraded by itself; a server's schema is changed only by
+    `linna db upgrade` (`upgrade` True) so that one person decides when.
+
+    Raises
+    ------
+    DatabaseTooNew
+        If a newer version of the program wrote it.
+    DatabaseNotMigrated
+        If it is older and may not be upgraded here.
+    DatabaseUnavailable, StorageReadOnly, StorageFull
+        If it cannot be used.
+    """
+    database = open_database(url)
+    found, head, known = schema_revisions(database)
+    if found == head:
+        return database
+    if found is not None and found not in known:
+        raise DatabaseTooNew(database.label, head, found)
+    if upgrade is False or (upgrade is None and database.dialect != "sqlite"):
+        raise DatabaseNotMigrated(database.label, head, found or "none")
+    upgrade_database(database)
+    return database
+
+
+def schema_revisions(database: Database) -> tuple[str | None, str, tuple[str, ...]]:
+    """The revision of the database (None: empty), the newest one known here, and all known here."""
+    from alembic.script import ScriptDirectory
+
+    scripts = ScriptDirectory.from_config(migration_config())
+    known = tuple(script.revision for script in scripts.walk_revisions())
+    with database.reading() as connection:
+        found = None
+        if inspect(connection).has_table("alembic_version"):
+            found = connection.execute(text("SELECT version_num FROM alembic_version")).scalar()
+    return found, known[0], known
+
+
+def upgrade_database(database: Database, revision: str = "head") -> None:
+    """Bring the schema to `revision`, in one transaction; another process doing the same is waited for."""
+    _migrate(database, "upgrade", revision)
+
+
+def downgrade_database(database: Database, revision: str) -> None:
+    """Take the schema back to `revision` ("base": remove everything)."""
+    _migrate(database, "downgrade", revision)
+
+
+def migrations_folder() -> Path:
+    """Where the migration scripts lie: beside the packages of this project."""
+    return Path(ground_service.__file__).resolve().parent.parent / "db" / "migrations"
+
+
+def migration_config() -> Config:
+    """Alembic's configuration, made here so that no file and no working directory is needed."""
+    from alembic.config import Config
+
+    config = Config()
+    config.set_main_option("script_location", str(migrations_folder()).replace("%", "%%"))
+    config.set_main_option("path_separator", "os")
+    return config
+
+
+def database_error(error: DBAPIError, label: str) -> GroundError:
+    """The error of this package that says what a database error means."""
+    original: Any = error.orig
+    message = str(original).splitlines()[0] if original is not None else str(error).splitlines()[0]
+    name = getattr(original, "sqlite_errorname", "") or ""
+    if name.startswith("SQLITE_FULL") or getattr(original, "sqlstate", None) == "53100":
+        return StorageFull(label)
+    if name.startswith("SQLITE_READONLY") or getattr(original, "sqlstate", None) == "25006":
+        return StorageReadOnly(label)
+    if name.startswith("SQLITE_NOTADB") or name.startswith("SQLITE_CORRUPT"):
+        return DatabaseUnavailable(label, f"{message}; expected a SQLite database")
+    return DatabaseUnavailable(label, message)
+
+
+def _migrate(database: Database, direction: str, revision: str) -> None:
+    from alembic import command
+
+    config = migration_config()
+    with database.writing() as connection:
+        if database.dialect == "postgresql":
+            connection.execute(text("SELECT pg_advisory_xact_lock(7601)"))
+        config.attributes["connection"] = connection
+        getattr(command, direction)(config, revision)
+
+
+def _make_folder(path: Path) -> None:
+    folder = path.parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise OSError(errno.EACCES, "read-only", str(folder))
+    except OSError as error:
+        raise storage_error(error, folder) from None
+
+
+def _prepare_sqlite(connection: sqlite3.Connection, _record: object) -> None:
+    """WAL, and no transaction handling by the driver: `_begin_sqlite` says BEGIN."""
+    connection.isolation_level = None
+    cursor = connection.cursor()
+    cursor.execute("PRAGMA journal_mode=WAL")
+    cursor.execute("PRAGMA synchronous=NORMAL")
+    cursor.execute("PRAGMA foreign_keys=ON")
+    cursor.execute("PRAGMA temp_store=MEMORY")
+    cursor.execute("PRAGMA cache_size=-65536")
+    cursor.close()
+
+
+def _begin_sqlite(connection: Connection) -> None:
+    writing = connection.get_execution_options().get("linna_write", False)
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")

@@ -1,0 +1,346 @@
+"""Tables of the service.
+
+The record is `packets` (octets, once, by content) and `files`; the sample tables hold what one dictionary
+version decodes from a packet and can be made again from it. Sample tables are clustered by
+(vehicle, dictionary version, time, packet), so a time range of one vehicle is one contiguous read.
+
+Times on board are ``ticks`` (2^-16 s since 2000-01-01 TAI); times on the ground are ``utc_ns``. The UTC of a
+sample is computed from its ticks with a time correlation when it is read, so late data never need rewriting.
+A vehicle is one spacecraft in one `instance`: the flown one, or one emulated or replayed run, each a domain of
+its own for time and sequence counts.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    Double,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    SmallInteger,
+    String,
+    Text,
+    UniqueConstraint,
+)
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+NO_TICKS = -1
+"""On-board time of a packet that carries none."""
+
+BigKey = BigInteger().with_variant(Integer, "sqlite")
+Flag = SmallInteger
+
+
+class Base(DeclarativeBase):
+    """Base of all tables, with names for every constraint so that migrations can find them."""
+
+    metadata = MetaData(
+        naming_convention={
+            "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+            "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+            "fk": "fk_%(table_name)s_%(column_0_name)s_%(referred_table_name)s",
+            "pk": "pk_%(table_name)s",
+        }
+    )
+
+
+class File(Base):
+    """A file of the archive, stored once under the SHA-256 of its octets."""
+
+    __tablename__ = "files"
+    sha256: Mapped[str] = mapped_column(String(64), primary_key=True)
+    kind: Mapped[str] = mapped_column(String(32))
+    name: Mapped[str] = mapped_column(Text)
+    octets: Mapped[int] = mapped_column(BigInteger)
+    received_utc_ns: Mapped[int] = mapped_column(BigInteger)
+
+
+class Vehicle(Base):
+    """A spacecraft in one instance: a domain of time, boots and sequence counts."""
+
+    __tablename__ = "vehicles"
+    __table_args__ = (UniqueConstraint("ccsds_id", "instance"),)
+    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    ccsds_id: Mapped[int] = mapped_column(Integer)
+    instance: Mapped[str] = mapped_column(String(96))
+
+
+class Ingest(Base):
+    """One run of the ingest over one file: what was in it and what of it was new."""
+
+    __tablename__ = "ingests"
+    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
+    vehicle_id: Mapped[int | None] = mapped_column(ForeignKey("vehicles.id"), index=True)
+    file_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"), index=True)
+    state: Mapped[str] = mapped_column(String(16))
+    error: Mapped[str | None] = mapped_column(Text)
+    dictionary_version: Mapped[int] = mapped_column(Integer)
+    received_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    finished_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
+    accounting: Mapped[dict[str, Any]] = mapped_column(JSON)
+
+
+class Packet(Base):
+    """A space packet, immutable, once per vehicle by content."""
+
+    __tablename__ = "packets"
+    __table_args__ = (UniqueConstraint("vehicle_id", "apid", "ticks", "sequence_count", "digest"),)
+    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
+    vehicle_id: Mapped[int] = mapped_column(Integer)
+    apid: Mapped[int] = mapped_column(SmallInteger)
+    sequence_count: Mapped[int] = mapped_column(SmallInteger)
+    ticks: Mapped[int] = mapped_column(BigInteger)
+    digest: Mapped[bytes] = mapped_column(LargeBinary(16))
+    octets: Mapped[bytes] = mapped_column(LargeBinary)
+
+
+class Fragment(Base):
+    """Octets at the edge of an ingested file that no whole packet could be made of, kept until the rest comes."""
+
+    __tablename__ = "fragments"
+    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"), primary_key=True)
+    digest: Mapped[bytes] = mapped_column(LargeBinary(16), primary_key=True)
+    place: Mapped[str] = mapped_column(String(8))
+    octets: Mapped[bytes] = mapped_column(LargeBinary)
+
+
+class Sample:
+    """Columns that every decoded sample has.
+
+    Packets and samples carry no foreign keys: they are written in bulk, in one transaction with what they
+    point to, and a check per row would cost more than the row.
+    """
+
+    vehicle_id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False, sort_order=-1)
+    dictionary_version: Mapped[int] = mapped_column(
+        SmallInteger, primary_key=True, autoincrement=False, sort_order=-1
+    )
+    ticks: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False, sort_order=-1)
+    packet_id: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False, sort_order=-1)
+
+
+CLUSTERED = {"sqlite_with_rowid": False}
+
+
+class Housekeeping(Sample, Base):
+    """Engineering values of a housekeeping report; `ticks` is the packet's time."""
+
+    __tablename__ = "housekeeping"
+    __table_args__ = CLUSTERED
+    boot_count: Mapped[int] = mapped_column(Integer)
+    mode: Mapped[int] = mapped_column(SmallInteger)
+    frames_processed: Mapped[int] = mapped_column(BigInteger)
+    frames_bad: Mapped[int] = mapped_column(BigInteger)
+    detections_total: Mapped[int] = mapped_column(BigInteger)
+    packets_sent: Mapped[int] = mapped_column(BigInteger)
+    anchor_reads: Mapped[int] = mapped_column(BigInteger)
+    events_sent: Mapped[int] = mapped_column(BigInteger)
+    telecommands_accepted: Mapped[int] = mapped_column(Integer)
+    telecommands_rejected: Mapped[int] = mapped_column(Integer)
+    last_image_quality: Mapped[int] = mapped_column(SmallInteger)
+    temperature_c: Mapped[float] = mapped_column(Double)
+    bus_voltage_v: Mapped[float] = mapped_column(Double)
+    power_w: Mapped[float] = mapped_column(Double)
+    memory_used_kib: Mapped[int] = mapped_column(BigInteger)
+    queue_depth: Mapped[int] = mapped_column(Integer)
+    storage_used_permille: Mapped[int] = mapped_column(Integer)
+    model_hash: Mapped[int] = mapped_column(BigInteger)
+    parameters_hash: Mapped[int] = mapped_column(BigInteger)
+    catalogue_hash: Mapped[int] = mapped_column(BigInteger)
+    anchor_table_hash: Mapped[int] = mapped_column(BigInteger)
+    clock_status: Mapped[int] = mapped_column(SmallInteger)
+    watchdog_resets: Mapped[int] = mapped_column(Integer)
+
+
+class DetectionFrame(Sample, Base):
+    """Detections of one image; `ticks` is the image's time, `items` packed as `codec.DETECTION_ITEM`."""
+
+    __tablename__ = "detections"
+    __table_args__ = CLUSTERED
+    packet_ticks: Mapped[int] = mapped_column(BigInteger)
+    frame_number: Mapped[int] = mapped_column(BigInteger)
+    image_quality: Mapped[int] = mapped_column(SmallInteger)
+    count: Mapped[int] = mapped_column(SmallInteger)
+    items: Mapped[bytes] = mapped_column(LargeBinary)
+
+
+class NavigationState(Sample, Base):
+    """State of one on-board estimator; `ticks` is the image's time."""
+
+    __tablename__ = "navigation_states"
+    __table_args__ = CLUSTERED
+    packet_ticks: Mapped[int] = mapped_column(BigInteger)
+    frame_number: Mapped[int] = mapped_column(BigInteger)
+    estimator: Mapped[int] = mapped_column(SmallInteger)
+    outcome: Mapped[int] = mapped_column(SmallInteger)
+    latitude_deg: Mapped[float | None] = mapped_column(Double)
+    longitude_deg: Mapped[float | None] = mapped_column(Double)
+    altitude_m: Mapped[float | None] = mapped_column(Double)
+    velocity_x_m_s: Mapped[float | None] = mapped_column(Float)
+    velocity_y_m_s: Mapped[float | None] = mapped_column(Float)
+    velocity_z_m_s: Mapped[float | None] = mapped_column(Float)
+    sigma_r_m: Mapped[float | None] = mapped_column(Float)
+    sigma_t_m: Mapped[float | None] = mapped_column(Float)
+    sigma_n_m: Mapped[float | None] = mapped_column(Float)
+    nis: Mapped[float | None] = mapped_column(Float)
+    matched: Mapped[int] = mapped_column(SmallInteger)
+
+
+class FrameOutcome(Sample, Base):
+    """What one estimator made of one image; `ticks` is the image's time."""
+
+    __tablename__ = "frame_outcomes"
+    __table_args__ = CLUSTERED
+    packet_ticks: Mapped[int] = mapped_column(BigInteger)
+    frame_number: Mapped[int] = mapped_column(BigInteger)
+    estimator: Mapped[int] = mapped_column(SmallInteger)
+    outcome: Mapped[int] = mapped_column(SmallInteger)
+    reset_trigger: Mapped[int] = mapped_column(SmallInteger)
+    detections: Mapped[int] = mapped_column(SmallInteger)
+    candidate_pairs: Mapped[int] = mapped_column(Integer)
+    pairs: Mapped[int] = mapped_column(SmallInteger)
+    shift_east_m: Mapped[float | None] = mapped_column(Float)
+    shift_north_m: Mapped[float | None] = mapped_column(Float)
+    anchor_reads: Mapped[int] = mapped_column(BigInteger)
+
+
+class Event(Sample, Base):
+    """An event report; `ticks` is the packet's time, `severity` 1 (info) to 4 (high)."""
+
+    __tablename__ = "events"
+    __table_args__ = CLUSTERED
+    severity: Mapped[int] = mapped_column(SmallInteger)
+    event_id: Mapped[int] = mapped_column(Integer)
+    frame_number: Mapped[int] = mapped_column(BigInteger)
+    value_1: Mapped[float | None] = mapped_column(Double)
+    value_2: Mapped[float | None] = mapped_column(Double)
+
+
+class TimeReport(Sample, Base):
+    """A time report; `ticks` is the packet's time."""
+
+    __tablename__ = "time_reports"
+    __table_args__ = CLUSTERED
+    reported_ticks: Mapped[int] = mapped_column(BigInteger)
+    rate_exponent: Mapped[int] = mapped_column(SmallInteger)
+
+
+class Verification(Sample, Base):
+    """A telecommand verification report (service 1); `ticks` is the packet's time."""
+
+    __tablename__ = "verifications"
+    __table_args__ = CLUSTERED
+    subtype: Mapped[int] = mapped_column(SmallInteger)
+    request_id: Mapped[int] = mapped_column(BigInteger)
+    failure_code: Mapped[int | None] = mapped_column(Integer)
+
+
+SAMPLE_TABLES = (
+    Housekeeping,
+    DetectionFrame,
+    NavigationState,
+    FrameOutcome,
+    Event,
+    TimeReport,
+    Verification,
+)
+
+
+class Correlation(Base):
+    """A straight line from on-board ticks to UTC over one stretch of on-board time.
+
+    ``utc_ns = reference_utc_ns + (ticks - reference_ticks) * nanoseconds per tick * (1 + drift_ppb * 1e-9)``
+    """
+
+    __tablename__ = "correlations"
+    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"), index=True)
+    method: Mapped[str] = mapped_column(String(32))
+    boot_count: Mapped[int | None] = mapped_column(Integer)
+    start_ticks: Mapped[int] = mapped_column(BigInteger)
+    stop_ticks: Mapped[int] = mapped_column(BigInteger)
+    reference_ticks: Mapped[int] = mapped_column(BigInteger)
+    reference_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    drift_ppb: Mapped[float] = mapped_column(Double)
+    residual_rms_ns: Mapped[float | None] = mapped_column(Double)
+    points: Mapped[int] = mapped_column(Integer)
+    superseded: Mapped[int] = mapped_column(Flag, default=0)
+    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+
+
+class EphemerisRecord(Base):
+    """A reference ephemeris; the later uploaded of equal precedence wins where two cover a time."""
+
+    __tablename__ = "ephemerides"
+    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    file_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"))
+    name: Mapped[str] = mapped_column(Text)
+    object_name: Mapped[str] = mapped_column(Text)
+    frame: Mapped[str] = mapped_column(String(16))
+    start_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    stop_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    states: Mapped[int] = mapped_column(Integer)
+    precedence: Mapped[int] = mapped_column(Integer, default=0)
+    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+
+
+class Pass(Base):
+    """An observation window of one vehicle: an interval of time that samples belong to by on-board time."""
+
+    __tablename__ = "passes"
+    __table_args__ = (Index("ix_passes_vehicle_id_start_utc_ns", "vehicle_id", "start_utc_ns"),)
+    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"))
+    name: Mapped[str] = mapped_column(Text)
+    start_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    stop_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    archive_digest: Mapped[str | None] = mapped_column(String(64), unique=True)
+    manifest: Mapped[dict[str, Any]] = mapped_column(JSON)
+    ephemeris_id: Mapped[int | None] = mapped_column(ForeignKey("ephemerides.id"))
+    catalogue_sha256: Mapped[str | None] = mapped_column(ForeignKey("files.sha256"))
+    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+
+
+class PassFrame(Base):
+    """An image kept with a pass, for the galleries of its report."""
+
+    __tablename__ = "pass_frames"
+    pass_id: Mapped[int] = mapped_column(ForeignKey("passes.id"), primary_key=True)
+    frame_number: Mapped[int] = mapped_column(BigInteger, primary_key=True)
+    file_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"))
+
+
+class Job(Base):
+    """A piece of background work, visible from queued to its end."""
+
+    __tablename__ = "jobs"
+    id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    kind: Mapped[str] = mapped_column(String(32))
+    state: Mapped[str] = mapped_column(String(16), index=True)
+    arguments: Mapped[dict[str, Any]] = mapped_column(JSON)
+    progress: Mapped[float] = mapped_column(Double)
+    attempts: Mapped[int] = mapped_column(Integer)
+    result: Mapped[dict[str, Any] | None] = mapped_column(JSON)
+    error: Mapped[str | None] = mapped_column(Text)
+    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    started_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
+    finished_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
+
+
+class Report(Base):
+    """A report made of a pass; its documents are files of the archive."""
+
+    __tablename__ = "reports"
+    id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    pass_id: Mapped[int] = mapped_column(ForeignKey("passes.id"), index=True)
+    html_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"))
+    json_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"))
+    summary: Mapped[dict[str, Any]] = mapped_column(JSON)
+    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
