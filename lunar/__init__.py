@@ -1,0 +1,5 @@
+"""The Moon, its orbiters and the camera: constants, time, frames, gravity, propagation, ephemerides, craters, visibility.
+
+The frames and conventions that every module here follows are on one page beside this file, ``CONVENTIONS.md``.
+Importing this package does nothing; import the module that is needed.
+"""

@@ -1,0 +1,363 @@
+"""Crater catalogues as arrays, with a spatial index, size classes and the published file formats.
+
+Latitude and longitude are of the mean-Earth frame, in rad; longitudes are kept as 0..2 pi.  Heights are of the rim above
+the sphere of `MOON_RADIUS_M`.  NaN stands for what a catalogue does not say.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lunar.constants import MOON_RADIUS_M
+from lunar.errors import DataFileError
+from lunar.frames import mcmf_from_spherical
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+TWO_PI = 2.0 * math.pi
+
+CLASS_LIMITS_M = (5_000.0, 10_000.0, 15_000.0, 30_000.0)
+"""Limits of the paper's size classes 0, 1 and 2; each class holds its lower limit."""
+
+NAVIGATION_CLASS = 3
+NAVIGATION_MINIMUM_M = 3_000.0
+"""Craters of 3 to 5 km serve navigation only and form class 3."""
+
+PAPER_CLASS_COUNTS = (58_649, 12_830, 7_908)
+"""Craters of 5-10, 10-15 and 15-30 km over the whole Moon (the paper, section V-B.2)."""
+
+OWN_COLUMNS = ("id", "latitude_deg", "longitude_deg", "diameter_m", "rim_height_m", "depth_m", "complete")
+
+BAND_RAD = math.radians(1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class CraterCatalogue:
+    """Craters as equally long arrays.  ``complete`` is True where the source holds every crater of the region.
+
+    Not slotted: the index is built on first use and kept.
+    """
+
+    ids: IntArray
+    latitude_rad: FloatArray
+    longitude_rad: FloatArray
+    diameter_m: FloatArray
+    rim_height_m: FloatArray
+    depth_m: FloatArray
+    source: str
+    complete: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @cached_property
+    def position_mcmf_m(self) -> FloatArray:
+        """Return the centres at rim height, (n, 3); on the sphere where the height is not known."""
+        return mcmf_from_spherical(self.latitude_rad, self.longitude_rad, np.nan_to_num(self.rim_height_m, nan=0.0))
+
+    @cached_property
+    def size_class(self) -> NDArray[np.int8]:
+        """Return the size class of every crater, (n,)."""
+        return size_class(self.diameter_m)
+
+    def select(self, mask_or_indices: ArrayLike | slice) -> CraterCatalogue:
+        """Return the craters of a mask, of indices or of a slice, in that order."""
+        chosen: Any = mask_or_indices if isinstance(mask_or_indices, slice) else np.asarray(mask_or_indices)
+        if not isinstance(chosen, slice) and chosen.size == 0:
+            chosen = chosen.astype(np.int64)
+        return CraterCatalogue(
+            self.ids[chosen],
+            self.latitude_rad[chosen],
+            self.longitude_rad[chosen],
+            self.diameter_m[chosen],
+            self.rim_height_m[chosen],
+            self.depth_m[chosen],
+            self.source,
+            self.complete[chosen],
+        )
+
+    def near(self, latitude_rad: float, longitude_rad: float, radius_m: float) -> IntArray:
+        """Return ascending indices of the craters whose centres lie within an arc of ``radius_m`` of a place."""
+        if len(self) == 0 or not radius_m >= 0.0:
+            return np.zeros(0, dtype=np.int64)
+        arc = radius_m / MOON_RADIUS_M
+        keys, order, unit = self._index
+        low, high = latitude_rad - arc, latitude_rad + arc
+        bands = np.arange(_band(max(low, -math.pi / 2)), _band(min(high, math.pi / 2)) + 1)
+        if low <= -math.pi / 2 or high >= math.pi / 2:
+            half_width = math.pi
+        else:
+            half_width = math.asin(min(1.0, math.sin(arc) / math.cos(latitude_rad))) + 1e-9
+        west = (longitude_rad - half_width) % TWO_PI
+        if half_width >= math.pi:
+            spans = [(0.0, TWO_PI)]
+        elif west + 2.0 * half_width > TWO_PI:
+            spans = [(west, TWO_PI), (0.0, west + 2.0 * half_width - TWO_PI)]
+        else:
+            spans = [(west, west + 2.0 * half_width)]
+        pieces = []
+        for span_low, span_high in spans:
+            first = np.searchsorted(keys, bands * TWO_PI + span_low, side="left")
+            last = np.searchsorted(keys, bands * TWO_PI + span_high, side="right")
+            pieces += [order[a:b] for a, b in zip(first, last, strict=True) if b > a]
+        if not pieces:
+            return np.zeros(0, dtype=np.int64)
+        candidates = np.unique(np.concatenate(pieces))
+        cos_latitude = math.cos(latitude_rad)
+        place = np.array(
+            [cos_latitude * math.cos(longitude_rad), cos_latitude * math.sin(longitude_rad), math.sin(latitude_rad)]
+        )
+        chord = np.linalg.norm(unit[candidates] - place, axis=-1)
+        return np.asarray(candidates[chord <= 2.0 * math.sin(min(arc, math.pi) / 2.0)])
+
+    @cached_property
+    def _index(self) -> tuple[FloatArray, IntArray, FloatArray]:
+        """Return sort keys (latitude band, then longitude), the order of the craters in them, and unit vectors."""
+        bands = np.floor((self.latitude_rad + math.pi / 2) / BAND_RAD)
+        key = bands * TWO_PI + np.mod(self.longitude_rad, TWO_PI)
+        order = np.argsort(key, kind="stable").astype(np.int64)
+        unit = mcmf_from_spherical(self.latitude_rad, self.longitude_rad) / MOON_RADIUS_M
+        return key[order], order, unit
+
+
+def size_class(diameter_m: ArrayLike) -> NDArray[np.int8]:
+    """Return 0 for 5-10 km, 1 for 10-15 km, 2 for 15-30 km, 3 for 3-5 km (navigation only), -1 otherwise."""
+    diameter = np.asarray(diameter_m, dtype=np.float64)
+    edges = np.array([NAVIGATION_MINIMUM_M, *CLASS_LIMITS_M])
+    classes = np.array([-1, NAVIGATION_CLASS, 0, 1, 2, -1], dtype=np.int8)
+    # NaN sorts last, into the class of what is too large: -1.
+    return np.asarray(classes[np.searchsorted(edges, diameter, side="right")])
+
+
+def class_counts(catalogue: CraterCatalogue) -> IntArray:
+    """Return the number of craters in the classes 0, 1 and 2, shape (3,)."""
+    classes = size_class(catalogue.diameter_m)
+    return np.array([np.count_nonzero(classes == k) for k in range(3)], dtype=np.int64)
+
+
+def make_catalogue(
+    latitude_rad: ArrayLike,
+    longitude_rad: ArrayLike,
+    diameter_m: ArrayLike,
+    *,
+    source: str,
+    ids: ArrayLike | None = None,
+    rim_height_m: ArrayLike | None = None,
+    depth_m: ArrayLike | None = None,
+    complete: ArrayLike | bool = True,
+) -> CraterCatalogue:
+    """Return a catalogue of arrays (n,), with numbered ids and NaN heights and depths where none are given."""
+    latitude = np.asarray(latitude_rad, dtype=np.float64)
+    n = len(latitude)
+    unknown = np.full(n, np.nan)
+    return CraterCatalogue(
+        np.arange(n, dtype=np.int64) if ids is None else np.asarray(ids, dtype=np.int64),
+        latitude,
+        np.mod(np.asarray(longitude_rad, dtype=np.float64), TWO_PI),
+        np.asarray(diameter_m, dtype=np.float64),
+        unknown if rim_height_m is None else np.asarray(rim_height_m, dtype=np.float64),
+        unknown if depth_m is None else np.asarray(depth_m, dtype=np.float64),
+        source,
+        np.array(np.broadcast_to(np.asarray(complete, dtype=np.bool_), (n,))),
+    )
+
+
+def paper_density_catalogue(seed: int) -> CraterCatalogue:
+    """Return a synthetic catalogue of the paper's density: its class counts, places uniform over the sphere.
+
+    Diameters follow a power law inside each class, N(>D) ~ D^-2.
+    """
+    rng = np.random.Generator(np.random.PCG64(seed))
+    diameters = []
+    for low, high, count in zip(CLASS_LIMITS_M[:-1], CLASS_LIMITS_M[1:], PAPER_CLASS_COUNTS, strict=True):
+        share = rng.random(count)
+        diameters.append((low**-2 + share * (high**-2 - low**-2)) ** -0.5)
+    n = sum(PAPER_CLASS_COUNTS)
+    return make_catalogue(
+        np.arcsin(rng.uniform(-1.0, 1.0, n)),
+        rng.uniform(0.0, TWO_PI, n),
+        np.concatenate(diameters),
+        source=f"synthetic, the paper's class counts, seed {seed}",
+    )
+
+
+def load_catalogue(path: Path | str) -> CraterCatalogue:
+    """Return the craters of a CSV file (plain or gzip), recognised by its columns.
+
+    Known are LU1319381 (``longitude_deg, latitude_deg, diameter_m, depth_m``), the composite of several sources
+    (``diameter_km, source, tile_complete``), Robbins (``lat, lon, diam`` in km) and our own.  Exact repetitions of a
+    crater are kept once.
+
+    Raises
+    ------
+    DataFileError
+        Where the file cannot be read, its columns are not known, or a value is no number or out of range.
+    """
+    path = Path(path)
+    columns = _read_columns(path)
+    names = set(columns)
+    for reader, needed in _READERS:
+        if needed <= names:
+            catalogue = reader(path, columns)
+            _check_ranges(path, catalogue)
+            return _without_repetitions(catalogue)
+    known = "; ".join(", ".join(sorted(needed)) for _, needed in _READERS)
+    raise DataFileError(path, "line 1", f"the columns of a crater catalogue ({known})", ", ".join(columns) or "nothing")
+
+
+def save_catalogue(catalogue: CraterCatalogue, path: Path | str) -> None:
+    """Write our own CSV: id, latitude_deg, longitude_deg, diameter_m, rim_height_m, depth_m, complete."""
+    Path(path).write_text(format_catalogue(catalogue), encoding="ascii", newline="\n")
+
+
+def format_catalogue(catalogue: CraterCatalogue) -> str:
+    """Return our own CSV text; angles to 1e-9 deg (30 um on the ground), lengths to 1 mm, unknown values empty."""
+    rows = zip(
+        catalogue.ids.tolist(),
+        np.degrees(catalogue.latitude_rad).tolist(),
+        (np.degrees(catalogue.longitude_rad) % 360.0).tolist(),
+        catalogue.diameter_m.tolist(),
+        catalogue.rim_height_m.tolist(),
+        catalogue.depth_m.tolist(),
+        catalogue.complete.tolist(),
+        strict=True,
+    )
+    lines = [",".join(OWN_COLUMNS)]
+    lines += [
+        f"{i},{lat:.9f},{lon:.9f},{diameter:.3f},{_or_empty(rim)},{_or_empty(depth)},{int(complete)}"
+        for i, lat, lon, diameter, rim, depth, complete in rows
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _or_empty(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.3f}"
+
+
+def _band(latitude_rad: float) -> int:
+    return math.floor((latitude_rad + math.pi / 2) / BAND_RAD)
+
+
+def _read_columns(path: Path) -> dict[str, list[str]]:
+    try:
+        octets = path.read_bytes()
+        if octets[:2] == b"\x1f\x8b":
+            octets = gzip.decompress(octets)
+        rows = list(csv.reader(io.StringIO(octets.decode("utf-8-sig"))))
+    except OSError as error:
+        found = error.strerror or str(error)
+        raise DataFileError(path, "", "a crater catalogue in CSV, plain or gzip", found) from None
+    except (EOFError, ValueError, csv.Error) as error:
+        raise DataFileError(path, "", "a whole CSV or gzip file", str(error)) from None
+    rows = [row for row in rows if row]
+    if not rows:
+        raise DataFileError(path, "line 1", "the column names of a crater catalogue", "an empty file")
+    header = [name.strip() for name in rows[0]]
+    for number, row in enumerate(rows[1:], start=2):
+        if len(row) != len(header):
+            raise DataFileError(path, f"line {number}", f"{len(header)} values", f"{len(row)}")
+    return dict(zip(header, map(list, zip(*rows[1:], strict=True)) if len(rows) > 1 else [[]] * len(header), strict=True))
+
+
+def _numbers(path: Path, columns: dict[str, list[str]], name: str, missing: bool = False) -> FloatArray:
+    texts = columns[name]
+    if missing:
+        texts = [text if text.strip() else "nan" for text in texts]
+    try:
+        return np.array(texts, dtype=np.float64)
+    except ValueError:
+        for number, text in enumerate(texts, start=2):
+            try:
+                float(text)
+            except ValueError:
+                raise DataFileError(path, f"line {number}, column {name}", "a number", repr(text)) from None
+        raise
+
+
+def _flags(texts: list[str]) -> NDArray[np.bool_]:
+    return np.array([text.strip().lower() in ("1", "true") for text in texts], dtype=np.bool_)
+
+
+def _read_lu(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
+    return make_catalogue(
+        np.radians(_numbers(path, columns, "latitude_deg")),
+        np.radians(_numbers(path, columns, "longitude_deg")),
+        _numbers(path, columns, "diameter_m"),
+        source="LU1319381",
+        ids=_numbers(path, columns, "id").astype(np.int64),
+        depth_m=_numbers(path, columns, "depth_m", missing=True),
+    )
+
+
+def _read_composite(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
+    return make_catalogue(
+        np.radians(_numbers(path, columns, "latitude_deg")),
+        np.radians(_numbers(path, columns, "longitude_deg")),
+        1000.0 * _numbers(path, columns, "diameter_km"),
+        source="composite of " + ", ".join(sorted(set(columns["source"]))),
+        complete=_flags(columns["tile_complete"]),
+    )
+
+
+def _read_robbins(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
+    return make_catalogue(
+        np.radians(_numbers(path, columns, "lat")),
+        np.radians(_numbers(path, columns, "lon")),
+        1000.0 * _numbers(path, columns, "diam"),
+        source="Robbins",
+    )
+
+
+def _read_own(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
+    return make_catalogue(
+        np.radians(_numbers(path, columns, "latitude_deg")),
+        np.radians(_numbers(path, columns, "longitude_deg")),
+        _numbers(path, columns, "diameter_m"),
+        source=path.name,
+        ids=_numbers(path, columns, "id").astype(np.int64),
+        rim_height_m=_numbers(path, columns, "rim_height_m", missing=True),
+        depth_m=_numbers(path, columns, "depth_m", missing=True),
+        complete=_flags(columns["complete"]),
+    )
+
+
+Reader = Callable[[Path, dict[str, list[str]]], CraterCatalogue]
+_READERS: tuple[tuple[Reader, set[str]], ...] = (
+    (_read_own, set(OWN_COLUMNS)),
+    (_read_composite, {"latitude_deg", "longitude_deg", "diameter_km", "source", "tile_complete"}),
+    (_read_lu, {"id", "latitude_deg", "longitude_deg", "diameter_m", "depth_m"}),
+    (_read_robbins, {"lat", "lon", "diam"}),
+)
+
+
+def _check_ranges(path: Path, catalogue: CraterCatalogue) -> None:
+    checks = (
+        (np.abs(catalogue.latitude_rad) <= math.pi / 2 + 1e-12, "a latitude of -90..90 deg", catalogue.latitude_rad),
+        (np.isfinite(catalogue.longitude_rad), "a longitude", catalogue.longitude_rad),
+        (catalogue.diameter_m > 0.0, "a diameter above 0", catalogue.diameter_m),
+    )
+    for good, expected, values in checks:
+        if not np.all(good):
+            row = int(np.flatnonzero(~good)[0])
+            value = math.degrees(values[row]) if "itude" in expected else values[row]
+            raise DataFileError(path, f"line {row + 2}", expected, f"{value:g}")
+
+
+def _without_repetitions(catalogue: CraterCatalogue) -> CraterCatalogue:
+    if len(catalogue) == 0:
+        return catalogue
+    rows = np.column_stack([catalogue.latitude_rad, catalogue.longitude_rad, catalogue.diameter_m])
+    _, first = np.unique(rows, axis=0, return_index=True)
+    return catalogue if len(first) == len(catalogue) else catalogue.select(np.sort(first))

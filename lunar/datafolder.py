@@ -1,0 +1,110 @@
+"""Which of the public data products are present in a folder, and the models to use with them.
+
+A folder is laid out as ``gravity/ kernels/ craters/ dem/ albedo/ photometry/``; any part may be absent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lunar.errors import DataFileError
+from lunar.frames import IauOrientation, Orientation, load_orientation
+
+if TYPE_CHECKING:
+    from lunar.gravity import GravityField
+
+
+@dataclass(frozen=True, slots=True)
+class DataFolder:
+    """Paths of the data products found under ``root``; None or an empty tuple for what is absent."""
+
+    root: Path | None = None
+    gravity: Path | None = None
+    gravity_alternative: Path | None = None
+    orientation_bpc: Path | None = None
+    orientation_tf: Path | None = None
+    catalogue_lu: Path | None = None
+    catalogue_composite: Path | None = None
+    catalogue_robbins: Path | None = None
+    dem_tiles: tuple[Path, ...] = ()
+    dem_global: Path | None = None
+    albedo: Path | None = None
+    photometry: Path | None = None
+
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the products present, for the ``data`` field of outputs."""
+        present = (
+            (self.gravity, f"gravity {_stem(self.gravity)} (GRAIL, NASA GSFC)"),
+            (self.gravity_alternative, f"gravity {_stem(self.gravity_alternative)} (Lunar Prospector, JPL)"),
+            (self.orientation_bpc, "lunar orientation DE421 (JPL, NAIF)"),
+            (self.catalogue_lu, "crater catalogue LU1319381 (Wang et al. 2022)"),
+            (
+                self.catalogue_composite,
+                "crater catalogue composite (LU1319381; Robbins 2019; Povilaitis et al. 2018)",
+            ),
+            (self.catalogue_robbins, "crater catalogue Robbins 2019"),
+            (self.dem_tiles or None, "height model LROC WAC GLD100 (Scholten et al. 2012)"),
+            (self.dem_global, "height model LROC WAC GLD100, 16 px/deg"),
+            (self.albedo, "albedo map"),
+            (self.photometry, "photometry SELENE SP (Kouyama et al. 2016)"),
+        )
+        return tuple(name for path, name in present if path is not None)
+
+
+def find_data(path: Path | str | None) -> DataFolder:
+    """Return what is present under ``path``; the empty folder for None.
+
+    Raises
+    ------
+    DataFileError
+        Where ``path`` is given and is no folder.
+    """
+    if path is None:
+        return DataFolder()
+    root = Path(path)
+    if not root.is_dir():
+        raise DataFileError(root, "", "a data folder", "a file" if root.exists() else "nothing there")
+    global_dem = _first(root, "dem/*_global.jp2", "dem/*_global.tif")
+    tiles = sorted([*root.glob("dem/*ppd_*E_*.jp2"), *root.glob("dem/*ppd_*E_*.tif")])
+    return DataFolder(
+        root=root,
+        gravity=_first(root, "gravity/GRGM*.gfc", "gravity/*.gfc", "gravity/*GRGM*", "gravity/*.tab"),
+        gravity_alternative=_first(root, "gravity/LP165P.cof", "gravity/*.cof"),
+        orientation_bpc=_first(root, "kernels/moon_pa_de421*.bpc"),
+        orientation_tf=_first(root, "kernels/moon_080317.tf", "kernels/moon*.tf"),
+        catalogue_lu=_first(root, "craters/lu1319381*.csv.gz", "craters/lu1319381*.csv"),
+        catalogue_composite=_first(root, "craters/composite*.csv.gz", "craters/composite*.csv"),
+        catalogue_robbins=_first(root, "craters/lunar_craters_ge20km.csv", "craters/*robbins*.csv*"),
+        dem_tiles=tuple(tiles),
+        dem_global=global_dem,
+        albedo=_first(root, "albedo/moon_albedo*.jpg", "albedo/*.jpg", "albedo/*.tif"),
+        photometry=_first(root, "photometry/parameters"),
+    )
+
+
+def default_orientation(data: DataFolder) -> Orientation:
+    """Return the DE421 orientation where its file is present, else the IAU series."""
+    if data.orientation_bpc is None:
+        return IauOrientation()
+    return load_orientation(data.orientation_bpc, data.orientation_tf)
+
+
+def default_gravity(data: DataFolder) -> GravityField:
+    """Return the GRAIL field where its file is present, else the built-in low-degree field."""
+    from lunar.gravity import builtin_gravity, load_gravity
+
+    return builtin_gravity() if data.gravity is None else load_gravity(data.gravity)
+
+
+def _first(root: Path, *patterns: str) -> Path | None:
+    for pattern in patterns:
+        found = sorted(root.glob(pattern))
+        if found:
+            return found[0]
+    return None
+
+
+def _stem(path: Path | None) -> str:
+    return "" if path is None else path.name.split(".")[0]

@@ -1,0 +1,87 @@
+"""What can go wrong in ``lunar``, each error one clear line.
+
+LunarError
+├── DataFileError            a file is missing, cut short or says something that cannot be
+├── TimeFormatError          a text is not a UTC epoch
+├── UnknownTimeSystemError   a time scale that cannot be converted
+├── UnknownFrameError        a reference frame or centre that cannot be converted
+├── EphemerisCoverageError   an epoch outside the span of an ephemeris or orientation, or inside a gap of it
+└── OrbitError               elements or states that are no orbit about the Moon
+    └── ImpactError          the orbit meets the ground, with epoch and place
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+
+
+class LunarError(Exception):
+    """Base of all errors raised by ``lunar``."""
+
+
+class DataFileError(LunarError):
+    """A data file that cannot be used: which file, the place in it, what was expected there and what was found."""
+
+    def __init__(self, path: Path | str, where: str, expected: str, found: str) -> None:
+        self.path = path
+        self.where = where
+        self.expected = expected
+        self.found = found
+        place = f"{path}: {where}" if where else str(path)
+        super().__init__(f"{place}: expected {expected}, found {found}")
+
+
+class TimeFormatError(LunarError):
+    """A text that is not a UTC epoch."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        super().__init__(f"expected a UTC epoch like 2029-08-07T00:00:00.000Z, found {text!r}")
+
+
+class UnknownTimeSystemError(LunarError):
+    """A time scale that cannot be converted."""
+
+    def __init__(self, name: str, known: Iterable[str], where: str = "") -> None:
+        self.name = name
+        prefix = f"{where}: " if where else ""
+        super().__init__(f"{prefix}expected a time system out of {', '.join(known)}, found {name!r}")
+
+
+class UnknownFrameError(LunarError):
+    """A reference frame or centre that cannot be converted."""
+
+    def __init__(self, name: str, known: Iterable[str], where: str = "") -> None:
+        self.name = name
+        prefix = f"{where}: " if where else ""
+        super().__init__(f"{prefix}expected a reference frame out of {', '.join(known)}, found {name!r}")
+
+
+class EphemerisCoverageError(LunarError):
+    """An epoch at which nothing is known: outside the covered span, or in a gap between segments."""
+
+    def __init__(self, requested: str, covered: str, what: str = "ephemeris") -> None:
+        self.requested = requested
+        self.covered = covered
+        super().__init__(f"{what}: expected an epoch within {covered}, found {requested}; nothing is extrapolated")
+
+
+class OrbitError(LunarError):
+    """Elements or states that are no orbit about the Moon."""
+
+
+class ImpactError(OrbitError):
+    """The orbit meets the ground; angles are mean-Earth latitude and east longitude of the place."""
+
+    def __init__(self, utc_ns: int, latitude_rad: float, longitude_rad: float) -> None:
+        from lunar.timescales import format_utc
+
+        self.utc_ns = utc_ns
+        self.latitude_rad = latitude_rad
+        self.longitude_rad = longitude_rad
+        super().__init__(
+            f"the orbit hits the Moon at {format_utc(utc_ns)}, latitude {math.degrees(latitude_rad):.3f} deg, "
+            f"longitude {math.degrees(longitude_rad) % 360.0:.3f} deg E"
+        )

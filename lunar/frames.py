@@ -1,0 +1,354 @@
+"""Rotations between the frames of the Moon, the local frames of an orbiter, and quaternions.
+
+All rotations are target-from-source matrices, shape ``(..., 3, 3)``: ``position_mcmf = mcmf_from_icrf @ position_icrf``.
+
+ICRF   axes of the International Celestial Reference Frame, origin at the centre of the Moon here; inertial
+MCI    Moon's equator and node of date at a stated epoch (IAU pole), held inertial; orbital elements are read in it
+MCMF   mean-Earth/polar-axis (ME) axes, fixed to the Moon: maps, height models, crater catalogues
+PA     principal axes of the Moon's inertia, fixed to the Moon: gravity fields.  About 0.9 km from ME on the ground
+ENU    east, north, up at a place on the sphere
+RTN    radial, along-track (transverse), cross-track (normal) of an orbit
+
+The orientation of the Moon comes from `IauOrientation` (series, no file) or `De421Orientation` (binary PCK file).  They
+differ by up to some hundred metres on the ground, because the IAU series holds no physical libration beyond its terms.
+
+References
+----------
+Archinal et al. 2011, Report of the IAU WGCCRE 2009, table 2 (the Moon), as printed in NAIF pck00010.tpc.
+Williams, Boggs, Folkner 2008, JPL IOM 335-JW,DB,WF-20080314-001: DE421 lunar orientation, and ME from PA.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lunar.constants import MOON_RADIUS_M
+from lunar.errors import DataFileError, EphemerisCoverageError
+
+FloatArray = NDArray[np.float64]
+
+ARCSECOND_RAD = np.pi / 648_000.0
+DAY_S = 86_400.0
+CENTURY_S = 36_525.0 * DAY_S
+
+# WGCCRE 2009: E1..E13 in degrees at J2000 and degrees per day, then their coefficients in right ascension (sine) and
+# declination (cosine) of the pole and in the prime meridian (sine), in degrees.
+_E_DEG = np.array(
+    [125.045, 250.089, 260.008, 176.625, 357.529, 311.589, 134.963, 276.617, 34.226, 15.134, 119.743, 239.961, 25.053]
+)
+_E_RATE_DEG_DAY = np.array(
+    [
+        *(-0.0529921, -0.1059842, 13.0120009, 13.3407154, 0.9856003, 26.4057084, 13.0649930),
+        *(0.3287146, 1.7484877, -0.1589763, 0.0036096, 0.1643573, 12.9590088),
+    ]
+)
+_POLE_RA_DEG = np.array([-3.8787, -0.1204, 0.0700, -0.0172, 0, 0.0072, 0, 0, 0, -0.0052, 0, 0, 0.0043])
+_POLE_DEC_DEG = np.array([1.5419, 0.0239, -0.0278, 0.0068, 0, -0.0029, 0.0009, 0, 0, 0.0008, 0, 0, -0.0009])
+_MERIDIAN_DEG = np.array(
+    [
+        *(3.5610, 0.1208, -0.0642, 0.0158, 0.0252, -0.0066, -0.0047),
+        *(-0.0046, 0.0028, 0.0052, 0.0040, 0.0019, -0.0044),
+    ]
+)
+
+DE421_PA_FROM_ME_ARCSECONDS = (67.92, 78.56, 0.30)
+"""Turns about z, y and x that lead from mean-Earth to DE421 principal axes: R_z(67.92") R_y(78.56") R_x(0.30")."""
+
+
+class Orientation(Protocol):
+    """Orientation of the Moon in ICRF; ``tdb_s`` may have any shape ``(...)``, the answer has ``(..., 3, 3)``."""
+
+    @property
+    def name(self) -> str: ...
+
+    def mcmf_from_icrf(self, tdb_s: ArrayLike) -> FloatArray: ...
+
+    def pa_from_icrf(self, tdb_s: ArrayLike) -> FloatArray: ...
+
+
+@dataclass(frozen=True, slots=True)
+class IauOrientation:
+    """The IAU WGCCRE 2009 series for the mean-Earth frame; principal axes follow by the constant DE421 rotation."""
+
+    name: str = "IAU WGCCRE 2009"
+
+    def mcmf_from_icrf(self, tdb_s: ArrayLike) -> FloatArray:
+        right_ascension, declination, meridian = iau_pole_and_meridian_rad(tdb_s)
+        return zxz_rotation(right_ascension + np.pi / 2, np.pi / 2 - declination, meridian)
+
+    def pa_from_icrf(self, tdb_s: ArrayLike) -> FloatArray:
+        return np.asarray(PA_FROM_ME_DE421 @ self.mcmf_from_icrf(tdb_s))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class De421Orientation:
+    """Orientation integrated by JPL: Chebyshev series of three Euler angles, and the constant turn to mean-Earth.
+
+    ``coefficients`` has the shape (records, 3, terms): the angles phi, theta, psi in rad of
+    R_z(psi) R_x(theta) R_z(phi), each record spanning ``record_s`` seconds of TDB from ``start_tdb_s`` on.
+    """
+
+    start_tdb_s: float
+    record_s: float
+    coefficients: FloatArray
+    me_from_pa: FloatArray
+    name: str = "DE421"
+
+    @property
+    def stop_tdb_s(self) -> float:
+        return self.start_tdb_s + self.record_s * len(self.coefficients)
+
+    def euler_angles_rad(self, tdb_s: ArrayLike) -> FloatArray:
+        """Return phi, theta, psi, shape ``(..., 3)``.
+
+        Raises
+        ------
+        EphemerisCoverageError
+            Where an epoch is outside the span of the file.
+        """
+        seconds = np.asarray(tdb_s, dtype=np.float64)
+        since_start = seconds - self.start_tdb_s
+        inside = (since_start >= 0.0) & (seconds <= self.stop_tdb_s)
+        if not np.all(inside):
+            worst = float(np.atleast_1d(seconds)[~np.atleast_1d(inside)][0])
+            raise EphemerisCoverageError(
+                f"{worst:.3f}", f"{self.start_tdb_s:.0f}..{self.stop_tdb_s:.0f} TDB s past J2000", self.name
+            )
+        record = np.minimum((since_start / self.record_s).astype(np.int64), len(self.coefficients) - 1)
+        x = 2.0 * (since_start - record * self.record_s) / self.record_s - 1.0
+        terms = self.coefficients[record]
+        x = x[..., None]
+        newer, older = np.zeros_like(terms[..., 0]), np.zeros_like(terms[..., 0])
+        for k in range(terms.shape[-1] - 1, 0, -1):
+            newer, older = terms[..., k] + 2.0 * x * newer - older, newer
+        return np.asarray(terms[..., 0] + x * newer - older)
+
+    def pa_from_icrf(self, tdb_s: ArrayLike) -> FloatArray:
+        angles = self.euler_angles_rad(tdb_s)
+        return zxz_rotation(angles[..., 0], angles[..., 1], angles[..., 2])
+
+    def mcmf_from_icrf(self, tdb_s: ArrayLike) -> FloatArray:
+        return np.asarray(self.me_from_pa @ self.pa_from_icrf(tdb_s))
+
+
+def iau_pole_and_meridian_rad(tdb_s: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return right ascension and declination of the Moon's pole and its prime meridian W in rad, each ``(...)``."""
+    seconds = np.asarray(tdb_s, dtype=np.float64)
+    days = seconds / DAY_S
+    centuries = seconds / CENTURY_S
+    e_rad = np.radians(_E_DEG + _E_RATE_DEG_DAY * days[..., None])
+    sine, cosine = np.sin(e_rad), np.cos(e_rad)
+    right_ascension = 269.9949 + 0.0031 * centuries + sine @ _POLE_RA_DEG
+    declination = 66.5392 + 0.0130 * centuries + cosine @ _POLE_DEC_DEG
+    meridian = 38.3213 + 13.17635815 * days - 1.4e-12 * days**2 + sine @ _MERIDIAN_DEG
+    return np.radians(right_ascension), np.radians(declination), np.radians(meridian)
+
+
+def mci_from_icrf(tdb_s: float) -> FloatArray:
+    """Return the rotation to the Moon's equator and node of date at ``tdb_s``, shape (3, 3).
+
+    z is the IAU pole, x the ascending node of the Moon's equator on the ICRF equator.
+    """
+    right_ascension, declination, _ = iau_pole_and_meridian_rad(float(tdb_s))
+    return zxz_rotation(right_ascension + np.pi / 2, np.pi / 2 - declination, np.zeros(()))
+
+
+def load_orientation(bpc_path: Path | str, tf_path: Path | str | None = None) -> De421Orientation:
+    """Return the orientation in a binary PCK file, with mean-Earth axes as the text frame kernel gives them.
+
+    Without a frame kernel the DE421 rotation of `DE421_PA_FROM_ME_ARCSECONDS` is used.
+
+    Raises
+    ------
+    DataFileError
+        Where a file is missing, is no binary PCK of type 2 in ICRF axes, is cut short, or lacks the rotation.
+    """
+    from jplephem.daf import DAF
+
+    path = Path(bpc_path)
+    expected = "a binary PCK kernel (DAF/PCK) with one type 2 segment"
+    try:
+        with path.open("rb") as stream:
+            daf = DAF(stream)
+            if daf.locidw.strip() != b"DAF/PCK":
+                raise DataFileError(path, "file header", expected, repr(daf.locidw.decode("latin-1")))
+            summaries = [values for _, values in daf.summaries()]
+            if len(summaries) != 1 or int(summaries[0][3]) != 1 or int(summaries[0][4]) != 2:
+                found = f"{len(summaries)} segments" if len(summaries) != 1 else f"descriptor {summaries[0][2:5]}"
+                raise DataFileError(path, "segment summary", expected, found)
+            frame, first, last = (int(summaries[0][k]) for k in (2, 5, 6))
+            start, record_s, words, count = (float(v) for v in daf.read_array(last - 3, last))
+            values = np.array(daf.read_array(first, last - 4), dtype=np.float64)
+    except OSError as error:
+        raise DataFileError(path, "", expected, error.strerror or str(error)) from None
+    except (ValueError, IndexError, UnicodeDecodeError) as error:
+        raise DataFileError(path, "file structure", expected, f"{error}") from None
+    except Exception as error:
+        # jplephem lets struct.error and its own classes through on damaged files; none of them is a fault of ours.
+        if isinstance(error, DataFileError):
+            raise
+        raise DataFileError(path, "file structure", expected, f"{type(error).__name__}: {error}") from None
+    if values.size != int(words) * int(count) or int(words) < 5 or (int(words) - 2) % 3:
+        raise DataFileError(path, "coefficients", f"{int(count)} records of {int(words)} words", f"{values.size} words")
+    if not np.all(np.isfinite(values)):
+        raise DataFileError(path, "coefficients", "finite numbers", "not-a-number values")
+    coefficients = values.reshape(int(count), int(words))[:, 2:].reshape(int(count), 3, (int(words) - 2) // 3)
+    me_from_pa = PA_FROM_ME_DE421.T if tf_path is None else _me_from_pa_of_kernel(Path(tf_path), frame)
+    name = "DE421" if frame == 31006 else f"binary PCK frame {frame}"
+    return De421Orientation(start, record_s, np.ascontiguousarray(coefficients), me_from_pa, name)
+
+
+def zxz_rotation(first_rad: ArrayLike, second_rad: ArrayLike, third_rad: ArrayLike) -> FloatArray:
+    """Return R_z(third) R_x(second) R_z(first) of frame turns by angles ``(...)``, shape ``(..., 3, 3)``."""
+    c1, s1 = np.cos(first_rad), np.sin(first_rad)
+    c2, s2 = np.cos(second_rad), np.sin(second_rad)
+    c3, s3 = np.cos(third_rad), np.sin(third_rad)
+    rows = [
+        [c3 * c1 - s3 * c2 * s1, c3 * s1 + s3 * c2 * c1, s3 * s2],
+        [-s3 * c1 - c3 * c2 * s1, -s3 * s1 + c3 * c2 * c1, c3 * s2],
+        [s2 * s1, -s2 * c1, c2 + 0.0 * c1],
+    ]
+    return _stack_rows(rows)
+
+
+def axis_rotation(axis: int, angle_rad: float) -> FloatArray:
+    """Return the (3, 3) matrix of a frame turned by ``angle_rad`` about axis 1 (x), 2 (y) or 3 (z)."""
+    i, j = axis % 3, (axis + 1) % 3
+    matrix = np.eye(3)
+    matrix[i, i] = matrix[j, j] = np.cos(angle_rad)
+    matrix[i, j] = np.sin(angle_rad)
+    matrix[j, i] = -matrix[i, j]
+    return matrix
+
+
+def enu_from_mcmf(latitude_rad: ArrayLike, longitude_rad: ArrayLike) -> FloatArray:
+    """Return the rotation to east, north, up at places on the sphere, shape ``(..., 3, 3)``."""
+    latitude, longitude = np.broadcast_arrays(
+        np.asarray(latitude_rad, dtype=np.float64), np.asarray(longitude_rad, dtype=np.float64)
+    )
+    cl, sl = np.cos(longitude), np.sin(longitude)
+    cp, sp = np.cos(latitude), np.sin(latitude)
+    zero = np.zeros_like(cl)
+    return _stack_rows([[-sl, cl, zero], [-sp * cl, -sp * sl, cp], [cp * cl, cp * sl, sp]])
+
+
+def rtn_from_inertial(position_m: ArrayLike, velocity_m_s: ArrayLike) -> FloatArray:
+    """Return the rotation to radial, transverse, normal axes of states ``(..., 3)``, shape ``(..., 3, 3)``."""
+    position = np.asarray(position_m, dtype=np.float64)
+    radial = position / np.linalg.norm(position, axis=-1, keepdims=True)
+    momentum = np.cross(position, np.asarray(velocity_m_s, dtype=np.float64))
+    normal = momentum / np.linalg.norm(momentum, axis=-1, keepdims=True)
+    return np.stack([radial, np.cross(normal, radial), normal], axis=-2)
+
+
+def spherical_from_mcmf(position_mcmf_m: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return latitude and east longitude (-pi..pi) in rad and altitude above `MOON_RADIUS_M` in m, each ``(...)``."""
+    position = np.asarray(position_mcmf_m, dtype=np.float64)
+    x, y, z = position[..., 0], position[..., 1], position[..., 2]
+    equatorial = np.hypot(x, y)
+    return np.arctan2(z, equatorial), np.arctan2(y, x), np.asarray(np.hypot(equatorial, z) - MOON_RADIUS_M)
+
+
+def mcmf_from_spherical(latitude_rad: ArrayLike, longitude_rad: ArrayLike, altitude_m: ArrayLike = 0.0) -> FloatArray:
+    """Return positions in m, shape ``(..., 3)``, of places at altitudes above `MOON_RADIUS_M`."""
+    latitude, longitude, altitude = np.broadcast_arrays(
+        np.asarray(latitude_rad, dtype=np.float64),
+        np.asarray(longitude_rad, dtype=np.float64),
+        np.asarray(altitude_m, dtype=np.float64),
+    )
+    radius = MOON_RADIUS_M + altitude
+    equatorial = radius * np.cos(latitude)
+    parts = [equatorial * np.cos(longitude), equatorial * np.sin(longitude), radius * np.sin(latitude)]
+    return np.stack(parts, axis=-1)
+
+
+def matrix_from_quaternion(q_wxyz: ArrayLike) -> FloatArray:
+    """Return the target-from-source matrix ``(..., 3, 3)`` of unit quaternions ``(..., 4)``: v_t = q v_s q*.
+
+    Quaternions are Hamilton's (ij = k); they are normalised first.
+    """
+    q = np.asarray(q_wxyz, dtype=np.float64)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    return _stack_rows(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion_from_matrix(matrix: ArrayLike) -> FloatArray:
+    """Return unit quaternions ``(..., 4)`` with w >= 0 of rotation matrices ``(..., 3, 3)``."""
+    m = np.asarray(matrix, dtype=np.float64)
+    m00, m01, m02 = m[..., 0, 0], m[..., 0, 1], m[..., 0, 2]
+    m10, m11, m12 = m[..., 1, 0], m[..., 1, 1], m[..., 1, 2]
+    m20, m21, m22 = m[..., 2, 0], m[..., 2, 1], m[..., 2, 2]
+    # Rows are 4 q_i q: four expressions of the same quaternion, of which the one with the largest part is well scaled.
+    candidates = _stack_rows(
+        [
+            [1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01],
+            [m21 - m12, 1 + m00 - m11 - m22, m10 + m01, m02 + m20],
+            [m02 - m20, m10 + m01, 1 - m00 + m11 - m22, m21 + m12],
+            [m10 - m01, m02 + m20, m21 + m12, 1 - m00 - m11 + m22],
+        ]
+    )
+    best = np.argmax(np.diagonal(candidates, axis1=-2, axis2=-1), axis=-1)
+    q = np.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.asarray(np.where(q[..., :1] < 0.0, -q, q))
+
+
+def _stack_rows(rows: list[list[Any]]) -> FloatArray:
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _me_from_pa_of_kernel(path: Path, pa_frame: int) -> FloatArray:
+    """Return the mean-Earth from principal-axes rotation that a text frame kernel defines relative to ``pa_frame``."""
+    try:
+        text = path.read_text(encoding="ascii", errors="replace")
+    except OSError as error:
+        raise DataFileError(path, "", "a text frame kernel", error.strerror or str(error)) from None
+    data = "\n".join(re.findall(r"(?ms)^\s*\\begindata\s*$(.*?)(?:^\s*\\begintext\s*$|\Z)", text))
+    pool = {key: value.strip() for key, value in re.findall(r"(\w+)\s*=\s*(\([^)]*\)|'[^']*'|\S+)", data)}
+    pa_names = {value for key, value in pool.items() if key == f"FRAME_{pa_frame}_NAME"}
+    for key, relative in pool.items():
+        match = re.fullmatch(r"TKFRAME_(\d+)_RELATIVE", key)
+        if match is None or relative not in pa_names or "_ME" not in pool.get(f"FRAME_{match[1]}_NAME", ""):
+            continue
+        prefix = f"TKFRAME_{match[1]}_"
+        units = pool.get(prefix + "UNITS", "'RADIANS'").strip("'").upper()
+        scale = {"ARCSECONDS": ARCSECOND_RAD, "DEGREES": np.pi / 180.0, "RADIANS": 1.0}.get(units)
+        try:
+            angles = [float(v.upper().replace("D", "E")) for v in _kernel_values(pool[prefix + "ANGLES"])]
+            axes = [int(v) for v in _kernel_values(pool[prefix + "AXES"])]
+        except (KeyError, ValueError):
+            break
+        if scale is None or len(angles) != 3 or len(axes) != 3 or not set(axes) <= {1, 2, 3}:
+            break
+        # The frame kernel's rule: turns in the order printed lead from this frame to the one it is relative to.
+        turns = [axis_rotation(axis, angle * scale) for axis, angle in zip(axes, angles, strict=True)]
+        return np.ascontiguousarray((turns[0] @ turns[1] @ turns[2]).T)
+    raise DataFileError(
+        path, "frame specifications", f"three angles of a mean-Earth frame relative to frame {pa_frame}", "none"
+    )
+
+
+def _kernel_values(text: str) -> list[str]:
+    return text.strip("()").replace(",", " ").split()
+
+
+def _pa_from_me_de421() -> FloatArray:
+    z, y, x = (angle * ARCSECOND_RAD for angle in DE421_PA_FROM_ME_ARCSECONDS)
+    return np.asarray(axis_rotation(3, z) @ axis_rotation(2, y) @ axis_rotation(1, x))
+
+
+PA_FROM_ME_DE421 = _pa_from_me_de421()
+"""Principal axes of DE421 from mean-Earth axes, (3, 3)."""

@@ -1,0 +1,188 @@
+"""UTC, TAI, TDB and the on-board clock.
+
+``utc_ns`` is a count of nanoseconds since 1970-01-01T00:00:00 UTC in days of 86,400 s (the POSIX count): an ``int`` or
+an int64 array.  It repeats itself during a leap second.  ``tai_ns`` counts nanoseconds since 1970-01-01T00:00:00 TAI.
+``tdb_s`` is a float64 of TDB seconds past J2000 (2000-01-01T12:00:00 TDB), good to 0.1 us in this century, for dynamics
+and frames only.  ``ticks`` counts units of 2^-16 s since the on-board epoch 2000-01-01T00:00:00 TAI.
+
+Every conversion takes a number and gives a number, or an array and gives an array of the same shape.
+
+References
+----------
+Leap seconds: IERS Bulletin C; none is announced after 2017-01-01, and later epochs use 37 s.  Before 1972 UTC was not
+kept in whole seconds of TAI; those epochs use 10 s.
+TDB - TT: Kaplan 2005, USNO Circular 179, equation 2.6 (good to 10 us from 1600 to 2200).
+"""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime, timedelta
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lunar.errors import TimeFormatError
+
+IntArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+
+NS = 1_000_000_000
+TT_MINUS_TAI_NS = 32_184_000_000
+TICKS_PER_SECOND = 65_536
+
+J2000_TT_AS_UTC_COUNT_NS = 946_728_000 * NS
+"""2000-01-01T12:00:00 as a count of 86,400 s days since 1970, in whatever scale it is read."""
+
+ONBOARD_EPOCH_TAI_NS = 946_684_800 * NS
+"""2000-01-01T00:00:00 TAI, counted since 1970-01-01T00:00:00 TAI."""
+
+_LEAP_DATES = (
+    "1972-01-01 1972-07-01 1973-01-01 1974-01-01 1975-01-01 1976-01-01 1977-01-01 1978-01-01 1979-01-01 1980-01-01 "
+    "1981-07-01 1982-07-01 1983-07-01 1985-07-01 1988-01-01 1990-01-01 1991-01-01 1992-07-01 1993-07-01 1994-07-01 "
+    "1996-01-01 1997-07-01 1999-01-01 2006-01-01 2009-01-01 2012-07-01 2015-07-01 2017-01-01"
+).split()
+_LEAP_UTC_NS: IntArray = np.array(_LEAP_DATES, dtype="datetime64[ns]").astype(np.int64)
+_TAI_MINUS_UTC_NS: IntArray = (10 + np.arange(len(_LEAP_DATES), dtype=np.int64)) * NS
+_LEAP_TAI_NS: IntArray = _LEAP_UTC_NS + _TAI_MINUS_UTC_NS
+
+# Kaplan 2005, equation 2.6: amplitude in s, rate in rad per Julian century, phase in rad.
+_TDB_TERMS = np.array(
+    [
+        (0.001657, 628.3076, 6.2401),
+        (0.000022, 575.3385, 4.2970),
+        (0.000014, 1256.6152, 6.1969),
+        (0.000005, 606.9777, 4.0212),
+        (0.000005, 52.9691, 0.4444),
+        (0.000002, 21.3299, 5.5431),
+    ]
+)
+
+_ISO = re.compile(
+    r"(\d{4})-(?:(\d{2})-(\d{2})|(\d{3}))(?:[T ](\d{2}):(\d{2})(?::(\d{2})(?:\.(\d*))?)?)?(?:Z|\+00:00)?\Z", re.ASCII
+)
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def parse_utc(text: str) -> int:
+    """Return ``utc_ns`` of a text like ``2029-08-07T00:00:00.000Z`` or ``2029-219T00:00:00`` (year and day of year).
+
+    The time of day and the ``Z`` may be absent; a second 60 counts as the first of the next minute; digits past the
+    nanosecond are dropped.
+
+    Raises
+    ------
+    TimeFormatError
+        Where the text is no such epoch, or names a day or an hour that does not exist.
+    """
+    match = _ISO.match(text.strip())
+    if match is None:
+        raise TimeFormatError(text)
+    year, month, day, day_of_year, hour, minute, second, fraction = match.groups()
+    try:
+        if day_of_year is None:
+            date = datetime(int(year), int(month), int(day), tzinfo=UTC)
+        else:
+            date = datetime(int(year), 1, 1, tzinfo=UTC) + timedelta(days=int(day_of_year) - 1)
+            if int(day_of_year) < 1 or date.year != int(year):
+                raise TimeFormatError(text)
+    except ValueError:
+        raise TimeFormatError(text) from None
+    hours, minutes, seconds = int(hour or 0), int(minute or 0), int(second or 0)
+    if hours > 23 or minutes > 59 or seconds > 60 or (seconds == 60 and minutes != 59):
+        raise TimeFormatError(text)
+    whole = (date - _EPOCH).days * 86_400 + hours * 3600 + minutes * 60 + seconds
+    return whole * NS + int(((fraction or "") + "000000000")[:9])
+
+
+def format_utc(utc_ns: int, digits: int = 3) -> str:
+    """Return the ISO 8601 text of an epoch, rounded to ``digits`` (0 to 9) decimals of a second, ending in ``Z``."""
+    step = 10 ** (9 - digits)
+    whole, rest = divmod((int(utc_ns) + step // 2) // step * step, NS)
+    fraction = f".{rest // step:0{digits}d}" if digits else ""
+    return (_EPOCH + timedelta(seconds=whole)).strftime("%Y-%m-%dT%H:%M:%S") + fraction + "Z"
+
+
+@overload
+def tai_ns_from_utc_ns(utc_ns: int) -> int: ...
+@overload
+def tai_ns_from_utc_ns(utc_ns: IntArray) -> IntArray: ...
+def tai_ns_from_utc_ns(utc_ns: Any) -> Any:
+    """Return nanoseconds since 1970-01-01T00:00:00 TAI."""
+    counts = np.asarray(utc_ns, dtype=np.int64)
+    index = np.searchsorted(_LEAP_UTC_NS, counts, side="right") - 1
+    return _as_given(counts + _TAI_MINUS_UTC_NS[np.maximum(index, 0)], int)
+
+
+@overload
+def utc_ns_from_tai_ns(tai_ns: int) -> int: ...
+@overload
+def utc_ns_from_tai_ns(tai_ns: IntArray) -> IntArray: ...
+def utc_ns_from_tai_ns(tai_ns: Any) -> Any:
+    """Return ``utc_ns``; the leap second itself gives the counts of the second after it."""
+    counts = np.asarray(tai_ns, dtype=np.int64)
+    # A leap second starts one second before the new offset holds, and is counted like the first second after it.
+    index = np.searchsorted(_LEAP_TAI_NS, counts, side="right") - 1
+    return _as_given(counts - _TAI_MINUS_UTC_NS[np.maximum(index, 0)], int)
+
+
+@overload
+def tdb_s_from_utc_ns(utc_ns: int) -> float: ...
+@overload
+def tdb_s_from_utc_ns(utc_ns: IntArray) -> FloatArray: ...
+def tdb_s_from_utc_ns(utc_ns: Any) -> Any:
+    """Return TDB seconds past J2000."""
+    tai_ns = tai_ns_from_utc_ns(np.asarray(utc_ns, dtype=np.int64))
+    tt_s = (tai_ns + (TT_MINUS_TAI_NS - J2000_TT_AS_UTC_COUNT_NS)) / NS
+    return _as_given(tt_s + tdb_minus_tt_s(tt_s), float)
+
+
+@overload
+def utc_ns_from_tdb_s(tdb_s: float) -> int: ...
+@overload
+def utc_ns_from_tdb_s(tdb_s: FloatArray) -> IntArray: ...
+def utc_ns_from_tdb_s(tdb_s: Any) -> Any:
+    """Return ``utc_ns``, to the 0.1 us that a float64 of seconds can tell apart."""
+    seconds = np.asarray(tdb_s, dtype=np.float64)
+    # TDB - TT changes by less than 1e-9 of the 2 ms between the two arguments: no iteration is needed.
+    correction_ns = np.rint(tdb_minus_tt_s(seconds) * NS).astype(np.int64)
+    whole = np.floor(seconds)
+    tdb_ns = whole.astype(np.int64) * NS + np.rint((seconds - whole) * NS).astype(np.int64)
+    tai_ns = tdb_ns - correction_ns + (J2000_TT_AS_UTC_COUNT_NS - TT_MINUS_TAI_NS)
+    return _as_given(np.asarray(utc_ns_from_tai_ns(tai_ns)), int)
+
+
+def tdb_minus_tt_s(tt_s: FloatArray | float) -> FloatArray:
+    """Return TDB - TT in seconds at TT (or TDB) seconds past J2000."""
+    centuries = np.asarray(tt_s, dtype=np.float64) / (36_525.0 * 86_400.0)
+    amplitude, rate, phase = _TDB_TERMS.T
+    periodic = np.sum(amplitude * np.sin(rate * centuries[..., None] + phase), axis=-1)
+    return np.asarray(periodic + 0.000010 * centuries * np.sin(628.3076 * centuries + 4.2490), dtype=np.float64)
+
+
+@overload
+def ticks_from_utc_ns(utc_ns: int) -> int: ...
+@overload
+def ticks_from_utc_ns(utc_ns: IntArray) -> IntArray: ...
+def ticks_from_utc_ns(utc_ns: Any) -> Any:
+    """Return the reading of an ideal on-board clock, rounded to the nearest tick of 2^-16 s."""
+    since_epoch = tai_ns_from_utc_ns(np.asarray(utc_ns, dtype=np.int64)) - ONBOARD_EPOCH_TAI_NS
+    whole, rest = np.divmod(since_epoch, NS)
+    return _as_given(np.asarray(whole * TICKS_PER_SECOND + (rest * TICKS_PER_SECOND + NS // 2) // NS), int)
+
+
+@overload
+def utc_ns_from_ticks(ticks: int) -> int: ...
+@overload
+def utc_ns_from_ticks(ticks: IntArray) -> IntArray: ...
+def utc_ns_from_ticks(ticks: Any) -> Any:
+    """Return the ``utc_ns`` at which an ideal on-board clock shows ``ticks``."""
+    whole, rest = np.divmod(np.asarray(ticks, dtype=np.int64), TICKS_PER_SECOND)
+    tai_ns = ONBOARD_EPOCH_TAI_NS + whole * NS + (rest * NS + TICKS_PER_SECOND // 2) // TICKS_PER_SECOND
+    return _as_given(np.asarray(utc_ns_from_tai_ns(np.asarray(tai_ns))), int)
+
+
+def _as_given(values: Any, scalar: type[int] | type[float]) -> Any:
+    array = np.asarray(values)
+    return scalar(array) if array.ndim == 0 else array
