@@ -1,0 +1,215 @@
+"""Compiled part of packet cutting: walks a buffer of octets, checks checksums, finds its way back after
+damage.
+
+While packets follow each other without damage, each costs one checksum over its octets. After damage every
+octet is a candidate for a packet's beginning. To test a candidate in constant time, whatever length its
+header claims, the checksum register after every octet is kept (`prefix`, started at zero): with S the
+register before the packet, E after it, and n its octets, the packet's own checksum is E xor (S xor 0xFFFF)
+* x**(8n) modulo the generator polynomial, and must be zero.
+"""
+
+# numba wants numpy integers where annotations say int
+# mypy: disable-error-code="return-value,arg-type,no-any-return"
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tmtc._compile import njit
+
+Array = npt.NDArray[Any]
+
+GOOD = 0
+POLYNOMIAL = 0x1021
+_PUS_TM_LENGTH = 22
+_PUS_TC_LENGTH = 13
+_CUC_P_FIELD = 0x2E
+_PACKET_MAX = 65_542
+# farthest that one decision looks ahead: a window of search, one packet begun in it, and its successor
+LOOK_AHEAD = 3 * _PACKET_MAX + 6
+
+
+def crc_tables() -> Array:
+    """(8, 256) int32: the register's change by an octet that is followed by 0..7 zero octets."""
+    tables = np.zeros((8, 256), dtype=np.int32)
+    for octet in range(256):
+        register = octet << 8
+        for _ in range(8):
+            register = (register << 1 ^ (POLYNOMIAL if register & 0x8000 else 0)) & 0xFFFF
+        tables[0, octet] = register
+    for row in range(1, 8):
+        before = tables[row - 1]
+        tables[row] = (before << 8 & 0xFFFF) ^ tables[0, before >> 8]
+    return tables
+
+
+def powers_of_octets() -> Array:
+    """(65543,) int32: x**(8n) modulo the generator polynomial."""
+    tables = crc_tables()[0].tolist()
+    power, powers = 1, []
+    for _ in range(_PACKET_MAX + 1):
+        powers.append(power)
+        power = (power << 8 & 0xFFFF) ^ tables[power >> 8]
+    return np.array(powers, dtype=np.int32)
+
+
+@njit
+def _crc(buffer: Array, start: int, stop: int, tables: Array) -> int:
+    crc = 0xFFFF
+    i = start
+    while i + 8 <= stop:
+        crc = (
+            tables[7, buffer[i] ^ (crc >> 8)]
+            ^ tables[6, buffer[i + 1] ^ (crc & 0xFF)]
+            ^ tables[5, buffer[i + 2]]
+            ^ tables[4, buffer[i + 3]]
+            ^ tables[3, buffer[i + 4]]
+            ^ tables[2, buffer[i + 5]]
+            ^ tables[1, buffer[i + 6]]
+            ^ tables[0, buffer[i + 7]]
+        )
+        i += 8
+    while i < stop:
+        crc = ((crc << 8) & 0xFFFF) ^ tables[0, (crc >> 8) ^ buffer[i]]
+        i += 1
+    return crc
+
+
+@njit
+def length_at(buffer: Array, p: int, stop: int, packet_type: int, longest: int) -> int:
+    """Octets of the packet whose header stands at `p`, or 0 where no such header can stand."""
+    if stop - p < 7 or (buffer[p] >> 4) != packet_type:
+        return 0
+    length = (np.int64(buffer[p + 4]) << 8 | np.int64(buffer[p + 5])) + 7
+    if length > stop - p or length > longest or (length < 9 and not is_idle(buffer, p)):
+        return 0
+    return length
+
+
+@njit
+def is_idle(buffer: Array, p: int) -> bool:
+    return (buffer[p] & 0x0F) == 0x07 and buffer[p + 1] == 0xFF
+
+
+@njit
+def walk(
+    buffer: Array, p: int, stop: int, packet_type: int, longest: int, tables: Array, rows: Array, count: int
+) -> tuple[int, int]:
+    """(position, number of rows) after the undamaged packets from `p` on have been written as rows kind,
+    start, stop.
+
+    Stops at the end, at the first position where no right packet stands (an idle one included), or with
+    full rows.
+    """
+    while p < stop and count < rows.shape[0]:
+        length = length_at(buffer, p, stop, packet_type, longest)
+        if length == 0 or is_idle(buffer, p) or _crc(buffer, p, p + length, tables) != 0:
+            break
+        rows[count, 0] = GOOD
+        rows[count, 1] = p
+        p += length
+        rows[count, 2] = p
+        count += 1
+    return p, count
+
+
+@njit
+def _is_pus(buffer: Array, p: int, length: int, packet_type: int) -> bool:
+    """Whether a PUS-C secondary header stands where it should."""
+    if not buffer[p] & 0x08:
+        return False
+    if packet_type == 0:
+        return length >= _PUS_TM_LENGTH and buffer[p + 6] >> 4 == 2 and buffer[p + 13] == _CUC_P_FIELD
+    return length >= _PUS_TC_LENGTH and buffer[p + 6] >> 4 == 2
+
+
+@njit
+def _multiply(a: int, b: int) -> int:
+    product = 0
+    for bit in range(15, -1, -1):
+        product = (product << 1) ^ (0x11021 if product & 0x8000 else 0)
+        if b >> bit & 1:
+            product ^= a
+    return product
+
+
+@njit
+def _prefix_holds(
+    buffer: Array, p: int, length: int, prefix: Array, known: Array, tables: Array, powers: Array
+) -> bool:
+    """Whether the packet at `p` ends with its checksum; `prefix` is filled over [known[0], known[1]]."""
+    e = p + length
+    if p < known[0] or p > known[1]:
+        # what was filled does not reach here: start afresh
+        known[0] = p
+        known[1] = p
+        prefix[p] = 0
+    i = known[1]
+    register = np.int64(prefix[i])
+    while i < e:
+        register = ((register << 8) & 0xFFFF) ^ tables[0, (register >> 8) ^ buffer[i]]
+        i += 1
+        prefix[i] = register
+    known[1] = i
+    return prefix[e] == _multiply(np.int64(prefix[p]) ^ 0xFFFF, np.int64(powers[length]))
+
+
+@njit
+def _stands(
+    buffer: Array, p: int, stop: int, packet_type: int, longest: int,
+    prefix: Array, known: Array, tables: Array, powers: Array,
+) -> bool:  # fmt: skip
+    """Whether a whole packet with a right checksum, or the header of an idle packet, stands at `p`."""
+    length = length_at(buffer, p, stop, packet_type, longest)
+    if length == 0:
+        return False
+    return is_idle(buffer, p) or _prefix_holds(buffer, p, length, prefix, known, tables, powers)
+
+
+@njit
+def chain_start(
+    buffer: Array, first: int, end: int, packet_type: int, longest: int,
+    prefix: Array, known: Array, tables: Array, powers: Array,
+) -> int:  # fmt: skip
+    """Least position in [first, end) from which right packets lead exactly to `end`, or -1."""
+    leads = np.zeros(end - first + 1, dtype=np.uint8)
+    leads[end - first] = 1
+    # fill forwards, once, what the candidates below ask for
+    _prefix_holds(buffer, first, end - first, prefix, known, tables, powers)
+    found = -1
+    for q in range(end - 9, first - 1, -1):
+        length = length_at(buffer, q, end, packet_type, longest)
+        if length == 0 or is_idle(buffer, q) or not leads[q + length - first]:
+            continue
+        if _prefix_holds(buffer, q, length, prefix, known, tables, powers):
+            leads[q - first] = 1
+            found = q
+    return found
+
+
+@njit
+def search(
+    buffer: Array, first: int, limit: int, stop: int, packet_type: int, longest: int,
+    prefix: Array, known: Array, tables: Array, powers: Array,
+) -> int:  # fmt: skip
+    """First position in [first, limit) at which a packet is believed to begin, or `limit`.
+
+    One right checksum is not enough among so many candidates: it also takes a PUS-C header, or the buffer's
+    end or another right packet just after.
+    """
+    for q in range(first, limit):
+        length = length_at(buffer, q, stop, packet_type, longest)
+        if length == 0 or is_idle(buffer, q):
+            continue
+        if _prefix_holds(buffer, q, length, prefix, known, tables, powers):
+            e = q + length
+            if (
+                _is_pus(buffer, q, length, packet_type)
+                or e == stop
+                or _stands(buffer, e, stop, packet_type, longest, prefix, known, tables, powers)
+            ):
+                return q
+    return limit

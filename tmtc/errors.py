@@ -1,0 +1,66 @@
+"""What can be wrong with octets, or with values that shall become octets.
+
+TmtcError
+├── TruncatedPacket       fewer octets than the header or the definition asks for
+├── MalformedPacket       header fields or lengths contradict the standard or the dictionary
+├── ChecksumError         packet error control, frame error control or BCH does not hold
+├── UnknownPacket         no such name or (APID, service, subtype) in the dictionary
+├── ValueRefused          a value that its field cannot hold or its range forbids
+├── FrameError            a transfer frame that cannot be built or read
+├── UncorrectableCodeword more symbol errors than the Reed-Solomon code can repair
+└── LinkFormatError       a stream whose framing cannot be told, or settings that contradict each other
+"""
+
+from __future__ import annotations
+
+
+class TmtcError(Exception):
+    """Base of every error raised by this package; `str(error)` is one line."""
+
+
+class TruncatedPacket(TmtcError):
+    """Octets end before the thing they announce."""
+
+    def __init__(self, what: str, expected: int, found: int) -> None:
+        self.expected = expected
+        self.found = found
+        super().__init__(f"{what}: expected {expected} octets, found {found}")
+
+
+class MalformedPacket(TmtcError):
+    """Header fields or lengths contradict the standard or the dictionary."""
+
+
+class ChecksumError(TmtcError):
+    """A checksum carried by the octets does not hold."""
+
+    def __init__(self, what: str, expected: int, found: int) -> None:
+        self.expected = expected
+        self.found = found
+        super().__init__(f"{what}: expected checksum 0x{expected:04X}, found 0x{found:04X}")
+
+
+class UnknownPacket(TmtcError):
+    """The dictionary does not know this packet."""
+
+
+class ValueRefused(TmtcError):
+    """A value that its field cannot hold, or that its range forbids."""
+
+    def __init__(self, packet: str, field: str, value: object, expected: str) -> None:
+        self.packet = packet
+        self.field = field
+        self.value = value
+        super().__init__(f"{packet}.{field}: expected {expected}, found {value!r}")
+
+
+class FrameError(TmtcError):
+    """A transfer frame that cannot be built or read."""
+
+
+class UncorrectableCodeword(TmtcError):
+    """A Reed-Solomon codeword with more symbol errors than the code repairs."""
+
+
+class LinkFormatError(TmtcError):
+    """A stream whose framing cannot be told, or link settings that contradict each other."""

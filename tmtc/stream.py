@@ -1,0 +1,219 @@
+"""Packets cut out of octets, with every octet accounted for.
+
+A stream of packets has no marks between them: one wrong length field and everything after it is lost,
+unless the cutter finds its way back. `cut_packets` accepts a packet when its checksum holds, keeps a
+damaged one (right length, wrong checksum) as such, and skips what is neither until a right packet stands
+again. No whole packet is lost to damage before it.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tmtc.crc import crc16
+from tmtc.packets import PACKET_MAX_LENGTH, TYPE_TELEMETRY
+from tmtc.schema import as_octets
+
+Octets = bytes | bytearray | memoryview | npt.NDArray[np.uint8]
+IntArray = npt.NDArray[np.int64]
+
+_GOOD, _BAD, _SKIPPED, _IDLE = 0, 1, 2, 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PacketCut:
+    """Where packets stand in a buffer.
+
+    `offsets`, `lengths` (n,) and `crc_ok` (n,) hold the packets in the buffer's order, the damaged ones
+    included; `idle` (m, 2) and `skipped` (k, 2) are ranges [start, stop) of idle packets and of octets that
+    belong to no packet. All of them together are [0, consumed) without overlap.
+    """
+
+    offsets: IntArray
+    lengths: IntArray
+    crc_ok: npt.NDArray[np.bool_]
+    skipped: IntArray
+    idle: IntArray
+    consumed: int
+
+    def __len__(self) -> int:
+        return int(self.offsets.size)
+
+    @property
+    def octets_skipped(self) -> int:
+        """Octets that belong to no packet."""
+        return int((self.skipped[:, 1] - self.skipped[:, 0]).sum())
+
+    @property
+    def octets_idle(self) -> int:
+        """Octets of idle packets."""
+        return int((self.idle[:, 1] - self.idle[:, 0]).sum())
+
+    @property
+    def crc_errors(self) -> int:
+        """Packets whose checksum does not hold."""
+        return int(self.crc_ok.size - np.count_nonzero(self.crc_ok))
+
+    def packets(self, buffer: Octets) -> Iterator[bytes]:
+        """The octets of every packet whose checksum holds."""
+        view = as_octets(buffer).data
+        for start, length, good in zip(
+            self.offsets.tolist(), self.lengths.tolist(), self.crc_ok.tolist(), strict=True
+        ):
+            if good:
+                yield view[start : start + length].tobytes()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PrimaryHeaders:
+    """Primary header fields of n packets as columns."""
+
+    apid: IntArray
+    sequence_count: IntArray
+    sequence_flags: IntArray
+    secondary_header: npt.NDArray[np.bool_]
+
+
+def cut_packets(
+    buffer: Octets,
+    *,
+    packet_type: int = TYPE_TELEMETRY,
+    longest: int = PACKET_MAX_LENGTH,
+    segments: IntArray | None = None,
+    final: bool = True,
+) -> PacketCut:
+    """Where packets stand in `buffer`.
+
+    Parameters
+    ----------
+    packet_type
+        Only packets of this type are packets.
+    longest
+        Octets that no packet exceeds; a good bound shortens the search after damage.
+    segments : (s, 2), optional
+        Ranges that are cut each for itself, for example between lost frames; the whole buffer by default.
+    final
+        False when more octets may follow: `consumed` then tells from where to go on.
+    """
+    octets = as_octets(buffer).view()
+    octets.flags.writeable = False  # one compiled variant for bytes and arrays alike
+    if segments is None:
+        segments = np.array([[0, octets.size]], dtype=np.int64)
+    consumed = 0
+    cutter = _Cutter(octets, packet_type, longest)
+    for start, stop in segments.tolist():
+        consumed = cutter.cut(start, stop, final)
+    rows = cutter.rows[: cutter.count]
+    kind = rows[:, 0]
+    chosen = rows[kind <= _BAD]
+    return PacketCut(
+        offsets=chosen[:, 1].copy(),
+        lengths=chosen[:, 2] - chosen[:, 1],
+        crc_ok=chosen[:, 0] == _GOOD,
+        skipped=rows[kind == _SKIPPED, 1:],
+        idle=rows[kind == _IDLE, 1:],
+        consumed=octets.size if final else consumed,
+    )
+
+
+def primary_headers(buffer: Octets, cut: PacketCut) -> PrimaryHeaders:
+    """Primary header fields of the packets of `cut`, damaged ones included."""
+    octets = as_octets(buffer)
+    first = octets[cut.offsets].astype(np.int64) << 8 | octets[cut.offsets + 1]
+    second = octets[cut.offsets + 2].astype(np.int64) << 8 | octets[cut.offsets + 3]
+    return PrimaryHeaders(
+        apid=first & 0x7FF,
+        sequence_count=second & 0x3FFF,
+        sequence_flags=second >> 14,
+        secondary_header=(first & 0x800) != 0,
+    )
+
+
+class _Cutter:
+    """One pass over a buffer: compiled walks over undamaged packets, a decision wherever one ends."""
+
+    def __init__(self, octets: npt.NDArray[np.uint8], packet_type: int, longest: int) -> None:
+        from tmtc import _cutting  # numba is imported only where it is used
+
+        self.kernels: Any = _cutting
+        self.tables, self.powers = _tables()
+        self.octets = octets
+        self.packet_type = packet_type
+        self.longest = longest
+        self.rows = np.empty((octets.size // 128 + 64, 3), dtype=np.int64)
+        self.count = 0
+        self.prefix: npt.NDArray[np.uint16] | None = None
+        self.known = np.full(2, -1, dtype=np.int64)
+
+    def cut(self, p: int, stop: int, final: bool) -> int:
+        """The position reached in [p, stop): `stop`, or earlier where octets to come could change what follows."""
+        begin = self.count
+        self.known[:] = -1
+        while p < stop:
+            p, self.count = self.kernels.walk(
+                self.octets, p, stop, self.packet_type, self.longest, self.tables, self.rows, self.count
+            )
+            if self.count == self.rows.shape[0]:
+                self.rows = np.concatenate((self.rows, np.empty_like(self.rows)))
+                continue
+            if p == stop:
+                break
+            if not final and stop - p < self.kernels.LOOK_AHEAD:
+                return p
+            kind, q = self.decide(p, stop)
+            last = self.rows[self.count - 1]
+            if kind == _SKIPPED and self.count > begin and last[0] == _SKIPPED:
+                last[2] = q
+            else:
+                self.rows[self.count] = kind, p, q
+                self.count += 1
+            p = q
+        return p
+
+    def decide(self, p: int, stop: int) -> tuple[int, int]:
+        """(kind, end) of what stands at `p`, where no packet with a right checksum stands."""
+        if self.prefix is None:
+            self.prefix = np.empty(self.octets.size + 1, dtype=np.uint16)
+        state = (self.prefix, self.known, self.tables, self.powers)
+        length = self.length_at(p, stop)
+        e = p + length
+        if length and (e == stop or self.stands(e, stop)):
+            if self.is_idle(p) and np.all(self.octets[p + 6 : e] == self.octets[p + 6]):
+                return _IDLE, e
+            # the damage is inside [p, e), unless the length is wrong and right packets fill the end of that range
+            q = self.kernels.chain_start(self.octets, p + 1, e, self.packet_type, self.longest, *state)
+            return (self.kind_of(p), e) if q < 0 else (_SKIPPED, q)
+        limit = min(stop, p + PACKET_MAX_LENGTH)
+        q = self.kernels.search(self.octets, p + 1, limit, stop, self.packet_type, self.longest, *state)
+        # several damaged packets in a row, whose lengths still lead to the next right one
+        r = p
+        while r < q and (length := self.length_at(r, q)):
+            r += length
+        return (self.kind_of(p), e) if r == q else (_SKIPPED, q)
+
+    def kind_of(self, p: int) -> int:
+        return _IDLE if self.is_idle(p) else _BAD
+
+    def is_idle(self, p: int) -> bool:
+        return bool(self.octets[p] & 0x0F == 0x07 and self.octets[p + 1] == 0xFF)
+
+    def length_at(self, p: int, stop: int) -> int:
+        return int(self.kernels.length_at(self.octets, p, stop, self.packet_type, self.longest))
+
+    def stands(self, p: int, stop: int) -> bool:
+        """Whether a whole packet with a right checksum, or the header of an idle packet, stands at `p`."""
+        length = self.length_at(p, stop)
+        return bool(length) and (self.is_idle(p) or crc16(self.octets[p : p + length].data) == 0)
+
+
+@functools.cache
+def _tables() -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    from tmtc import _cutting
+
+    return _cutting.crc_tables(), _cutting.powers_of_octets()
