@@ -1,0 +1,70 @@
+"""What a detector hands to navigation: crater positions and sizes in one image, in pixels.
+
+Pixel centres lie at integer coordinates, u to the right, v down.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from payload_emulator.flight.preprocess import ImageQuality
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detections:
+    """Craters found in one image; float64 arrays of one length n, NaN where a quantity is not known.
+
+    Attributes
+    ----------
+    u_px, v_px
+        Centre of the crater.
+    diameter_px
+        Diameter across the line of sight: focal length times diameter over depth along the boresight.
+    score
+        Confidence, 0 to 1.
+    sigma_px
+        Standard deviation of the centre along each axis.
+    """
+
+    u_px: Float
+    v_px: Float
+    diameter_px: Float
+    score: Float
+    sigma_px: Float
+
+    def __len__(self) -> int:
+        return int(self.u_px.shape[0])
+
+    def select(self, which: NDArray[Any]) -> Detections:
+        """Return the detections of a mask or of indices, in that order."""
+        return Detections(
+            self.u_px[which],
+            self.v_px[which],
+            self.diameter_px[which],
+            self.score[which],
+            self.sigma_px[which],
+        )
+
+
+def no_detections() -> Detections:
+    """Return an empty set of detections."""
+    return Detections(*(np.empty(0) for _ in range(5)))
+
+
+class Detector(Protocol):
+    """Anything that finds craters in a camera frame."""
+
+    def examine(
+        self, image: NDArray[Any], sun_in_camera: Float | None = None
+    ) -> tuple[ImageQuality, Detections]:
+        """Return the verdict on an image (H, W) or (H, W, 3) and its craters; none unless the verdict is OK.
+
+        The Sun vector, camera frame, helps and may be absent.
+        """
+        ...
