@@ -1,0 +1,76 @@
+"""How the regolith scatters: Lambert, Lunar-Lambert and Hapke, as tables over the phase angle.
+
+Radiance is in units of a white Lambert surface under a perpendicular Sun; the reflectance of every law is
+``albedo * phase(g) * [2 w(g) mu0 / (mu0 + mu) + (1 - w(g)) mu0]``, Hapke's with an added multiple-scattering term.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from payload_emulator.errors import PayloadError
+
+LAWS = ("lunar-lambert", "lambert", "hapke")
+TABLE_SIZE = 512
+
+HAPKE_SINGLE_SCATTERING = 0.21
+HAPKE_SURGE = 2.01
+HAPKE_SURGE_WIDTH = 0.07
+"""Parameters of an average Moon after Helfenstein and Veverka (1987, Icarus 72, 342-357), smooth surface."""
+
+
+@dataclass(frozen=True, slots=True)
+class Photometry:
+    """A photometric law.
+
+    Attributes
+    ----------
+    law
+        ``lunar-lambert`` (McEwen 1996 limb darkening), ``lambert`` or ``hapke``.
+    phase_slope_per_rad
+        Exponential fall of brightness with phase angle of the first two laws; 0.7 follows Hapke's lunar phase curve from 20 to
+        100 degrees.
+    albedo_contrast
+        Scales the departures of the albedo from its mean: 0 is a surface of one albedo.
+    """
+
+    law: str = "lunar-lambert"
+    phase_slope_per_rad: float = 0.7
+    albedo_contrast: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.law not in LAWS:
+            raise PayloadError(f"photometry: expected a law out of {', '.join(LAWS)}, found {self.law!r}")
+
+    def tables(self) -> npt.NDArray[np.float32]:
+        """Table (3, 514) over ``(cos g + 1) * 256``: weight of Lommel-Seeliger, of Lambert, multiple scattering."""
+        cosine = np.clip(np.arange(TABLE_SIZE + 2) / (TABLE_SIZE / 2) - 1.0, -1.0, 1.0)
+        g = np.arccos(cosine)
+        if self.law == "hapke":
+            surge = HAPKE_SURGE / (1.0 + np.tan(np.minimum(0.5 * g, 1.55)) / HAPKE_SURGE_WIDTH)
+            # Legendre phase function of Hapke's lunar fit: 1 + b cos g + c (1.5 cos^2 g - 0.5).
+            single = np.maximum(1.0 + 0.29 * cosine + 0.39 * (1.5 * cosine**2 - 0.5), 0.0)
+            # The normal reflectance at g = 0 is scaled to the albedo, so that laws agree in what albedo means.
+            w = HAPKE_SINGLE_SCATTERING
+            h_one = 3.0 / (1.0 + 2.0 * math.sqrt(1.0 - w))
+            normal = 0.5 * ((1.0 + HAPKE_SURGE) * 1.68 + h_one * h_one - 1.0)
+            return np.asarray(
+                np.stack(
+                    [((1.0 + surge) * single - 1.0) / normal, np.zeros_like(g), np.full_like(g, 1.0 / normal)]
+                ),
+                dtype=np.float32,
+            )
+        phase = np.exp(-self.phase_slope_per_rad * g)
+        if self.law == "lambert":
+            weight = np.zeros_like(g)
+        else:
+            degrees = np.degrees(g)
+            # McEwen (1996, LPSC 27, 841): partition between Lommel-Seeliger and Lambert for the Moon.
+            weight = np.clip(1.0 - 0.019 * degrees + 0.242e-3 * degrees**2 - 1.46e-6 * degrees**3, 0.0, 1.0)
+        return np.asarray(
+            np.stack([2.0 * weight * phase, (1.0 - weight) * phase, np.zeros_like(g)]), dtype=np.float32
+        )

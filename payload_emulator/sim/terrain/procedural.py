@@ -1,0 +1,261 @@
+"""A seeded Moon that needs no data: fractal relief with plains, and craters of a synthetic catalogue."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from lunar.catalogue import CLASS_LIMITS_M, PAPER_CLASS_COUNTS, CraterCatalogue, make_catalogue
+from lunar.constants import MOON_RADIUS_M
+from payload_emulator.sim.terrain import kernels
+from payload_emulator.sim.terrain.craters import (
+    DEPTH_QUANTILES,
+    CraterShapes,
+    SmallCraters,
+    crater_profiles,
+    draw_depth_ratio,
+    draw_power_law,
+    shape_craters,
+)
+from payload_emulator.sim.terrain.tiles import (
+    ALBEDO_SHIFT,
+    MEAN_ALBEDO,
+    TILE_PIXELS,
+    Floats,
+    Heights,
+    TiledTerrain,
+    tile_angles,
+)
+
+COARSE_STEP = 8
+"""Long waves are computed at every eighth pixel and resampled."""
+
+LONG_WAVES_KM = (
+    (1600.0, 900.0),
+    (800.0, 600.0),
+    (400.0, 420.0),
+    (200.0, 260.0),
+    (100.0, 170.0),
+    (50.0, 105.0),
+    (25.0, 62.0),
+    (12.0, 36.0),
+    (6.5, 22.0),
+)
+SHORT_WAVES_KM = ((3.1, 11.5), (1.5, 6.3), (0.7, 3.2), (0.33, 1.6))
+"""Wavelength in km and rms in m of every octave of the uplands."""
+
+PLAIN_SHARE = 0.22
+PLAIN_DROP_M = 1500.0
+PLAIN_ROUGHNESS = 0.3
+PLAIN_CRATERS = 0.3
+"""A fifth of the surface is plains: lower, smoother, with fewer craters (maria cover 16 % of the Moon)."""
+
+LARGE_CRATERS = 3_674
+"""Craters above 30 km (the paper, section V-B.2)."""
+
+CATALOGUE_LOW_M = 2_000.0
+SMALL_LOW_M = 400.0
+BELOW_CLASSES_EXPONENT = 1.8
+"""Cumulative slope from 5 to 2 km; the catalogue LU1319381 falls as D^-1.79 there."""
+
+SMALL_EXPONENT = 2.2
+"""Below 2 km: meets the equilibrium density of Trask (1966), 0.079 per km2 above 1 km, near 0.7 km."""
+
+
+class ProceduralTerrain(TiledTerrain):
+    """The whole Moon from a seed, on 256 pixels per degree (118 m)."""
+
+    def __init__(self, seed: int, pixels_per_degree: int = 256, cache_tiles: int = 192) -> None:
+        self.seed = seed
+        self._profiles = crater_profiles()
+        rng = np.random.Generator(np.random.PCG64([seed, 0x4D4F4F4E]))
+        salts = rng.integers(1, 2**31 - 1, 64)
+        self._salts = [int(salt) for salt in salts]
+        self._plains = _plains_map(self._salts[60:])
+        catalogue, self._shapes = _draw_catalogue(rng, self._plains, seed)
+        count_2km = np.count_nonzero(catalogue.diameter_m >= CATALOGUE_LOW_M)
+        sphere_km2 = 4.0 * math.pi * (MOON_RADIUS_M / 1000.0) ** 2
+        density = 1.0 - (1.0 - PLAIN_CRATERS) * self._plains[::2, ::2][:180, :360]
+        weight = np.cos(np.radians(89.5 - np.arange(180)))[:, None]
+        density = density / np.average(density, weights=np.broadcast_to(weight, density.shape))
+        self._small = SmallCraters(
+            seed,
+            SMALL_LOW_M,
+            CATALOGUE_LOW_M,
+            count_2km / sphere_km2 * (CATALOGUE_LOW_M / SMALL_LOW_M) ** SMALL_EXPONENT,
+            SMALL_EXPONENT,
+            density,
+        )
+        name = f"procedural Moon, seed {seed}"
+        super().__init__(name, (name,), catalogue, pixels_per_degree, cache_tiles)
+        # Widest first: a tile asks for the craters of each size band within that band's reach.
+        reach = kernels.PROFILE_REACH * 1.05 * self._shapes.radius_rad * MOON_RADIUS_M
+        edges = (0.0, 8.0e3, 25.0e3, 80.0e3, np.inf)
+        self._bands = []
+        for low, high in zip(edges[:-1], edges[1:], strict=True):
+            chosen = np.flatnonzero((reach >= low) & (reach < high))
+            if chosen.size:
+                self._bands.append((float(reach[chosen].max()), chosen, catalogue.select(chosen)))
+
+    def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Whether the source itself holds each place: everywhere but within six degrees of the poles."""
+        latitude, _ = np.broadcast_arrays(
+            np.asarray(latitude_rad, dtype=np.float64), np.asarray(longitude_rad)
+        )
+        return np.asarray(np.abs(latitude) < math.radians(83.0))
+
+    def make_heights(self, tile_row: int, tile_column: int) -> Heights:
+        """One tile of heights (513, 513) in metres."""
+        latitude, longitude = tile_angles(tile_row, tile_column, self.pixels_per_degree)
+        size = TILE_PIXELS + 1
+        nodes = TILE_PIXELS // COARSE_STEP + 4
+        index = (np.arange(nodes) - 1) * COARSE_STEP
+        step = 1.0 / self.pixels_per_degree
+        node_latitude = latitude[0] - np.radians(index * step)
+        node_longitude = longitude[0] + np.radians(index * step)
+        plain = self._plain(node_latitude, node_longitude)
+        roughness = (1.0 - (1.0 - PLAIN_ROUGHNESS) * plain).astype(np.float32)
+        coarse = (-PLAIN_DROP_M * plain).astype(np.float32)
+        even = np.ones_like(coarse)
+        angles = (
+            np.cos(node_latitude),
+            np.sin(node_latitude),
+            np.cos(node_longitude),
+            np.sin(node_longitude),
+        )
+        for n, (wavelength, rms) in enumerate(LONG_WAVES_KM):
+            gain = even if wavelength > 300.0 else roughness
+            kernels.add_noise(coarse, *angles, MOON_RADIUS_M / 1000.0 / wavelength, rms, self._salts[n], gain)
+        out = np.empty((size, size), np.float32)
+        kernels.resample_cubic(coarse, 1.0, 1.0 / COARSE_STEP, 1.0, 1.0 / COARSE_STEP, out)
+        gain = np.empty((size, size), np.float32)
+        kernels.resample_cubic(roughness, 1.0, 1.0 / COARSE_STEP, 1.0, 1.0 / COARSE_STEP, gain)
+        angles = (np.cos(latitude), np.sin(latitude), np.cos(longitude), np.sin(longitude))
+        for n, (wavelength, rms) in enumerate(SHORT_WAVES_KM):
+            frequency = MOON_RADIUS_M / 1000.0 / wavelength
+            kernels.add_noise(out, *angles, frequency, rms, self._salts[20 + n], gain)
+        stamp(out, latitude, longitude, self._craters_about(latitude, longitude), self._profiles)
+        stamp(out, latitude, longitude, self._small.around(latitude, longitude), self._profiles)
+        return out
+
+    def make_albedo(self, tile_row: int, tile_column: int) -> Heights:
+        """One tile of normal albedo (65, 65): dark plains, bright uplands, mottled."""
+        latitude, longitude = tile_angles(tile_row, tile_column, self.pixels_per_degree)
+        step = TILE_PIXELS >> ALBEDO_SHIFT
+        latitude, longitude = latitude[::step], longitude[::step]
+        plain = self._plain(latitude, longitude)
+        return mottled_albedo(1.12 - 0.5 * plain, latitude, longitude, self._salts[40:46])
+
+    def _plain(self, latitude: Floats, longitude: Floats) -> Floats:
+        """How much of a plain (0..1) a grid of places is, (rows, columns), cubic in a half-degree map."""
+        rows = (90.0 - np.degrees(latitude)) * 2.0
+        columns = np.degrees(longitude) * 2.0
+        left = int(math.floor(columns[0])) - 2
+        width = int(math.ceil(columns[-1])) + 4 - left
+        # Rows beyond a pole are not used (see POLE_LIMIT_RAD); the clip only keeps the index in the map.
+        top = int(math.floor(rows[0])) - 2
+        height = int(math.ceil(rows[-1])) + 4 - top
+        source = self._plains[np.clip(np.arange(top, top + height), 0, 360)][
+            :, np.arange(left, left + width) % 720
+        ]
+        out = np.empty((rows.size, columns.size), np.float32)
+        kernels.resample_cubic(
+            np.ascontiguousarray(source, dtype=np.float32),
+            float(rows[0] - top),
+            float(rows[1] - rows[0]),
+            float(columns[0] - left),
+            float(columns[1] - columns[0]),
+            out,
+        )
+        return out.astype(np.float64)
+
+    def _craters_about(self, latitude: Floats, longitude: Floats) -> CraterShapes:
+        middle_latitude = 0.5 * float(latitude[0] + latitude[-1])
+        middle_longitude = 0.5 * float(longitude[0] + longitude[-1])
+        half = float(latitude[0] - latitude[-1]) * 0.75 * MOON_RADIUS_M
+        found = [
+            chosen[np.asarray(part.near(middle_latitude, middle_longitude, half + reach), dtype=np.int64)]
+            for reach, chosen, part in self._bands
+        ]
+        return self._shapes.select(np.sort(np.concatenate(found)))
+
+
+def stamp(
+    out: Heights, latitude: Floats, longitude: Floats, shapes: CraterShapes, profiles: npt.NDArray[np.float32]
+) -> None:
+    """Add craters to a tile of heights in place."""
+    kernels.stamp_craters(
+        out,
+        latitude,
+        longitude,
+        shapes.latitude_rad,
+        shapes.longitude_rad,
+        shapes.radius_rad,
+        shapes.depth_m,
+        shapes.profile_row,
+        shapes.wobble,
+        profiles,
+    )
+
+
+def mottled_albedo(base: Floats, latitude: Floats, longitude: Floats, salts: list[int]) -> Heights:
+    """Normal albedo: a smooth map relative to the mean, with seeded mottling of 3 to 60 km."""
+    angles = (np.cos(latitude), np.sin(latitude), np.cos(longitude), np.sin(longitude))
+    mottle = np.zeros(base.shape, np.float32)
+    even = np.ones_like(mottle)
+    for wavelength, rms, salt in zip(
+        (60.0, 25.0, 11.0, 5.0, 3.0), (0.05, 0.045, 0.04, 0.03, 0.02), salts, strict=False
+    ):
+        kernels.add_noise(mottle, *angles, MOON_RADIUS_M / 1000.0 / wavelength, rms, salt, even)
+    return np.asarray(np.clip(MEAN_ALBEDO * base * (1.0 + mottle), 0.04, 0.3), dtype=np.float32)
+
+
+def _plains_map(salts: list[int]) -> npt.NDArray[np.float32]:
+    """How much of a plain each half-degree node is, 0..1, (361, 720); node rows start at the north pole."""
+    latitude = np.radians(90.0 - np.arange(361) * 0.5)
+    longitude = np.radians(np.arange(720) * 0.5)
+    field = np.zeros((361, 720), np.float32)
+    even = np.ones_like(field)
+    angles = (np.cos(latitude), np.sin(latitude), np.cos(longitude), np.sin(longitude))
+    for wavelength, rms, salt in zip(
+        (2600.0, 1200.0, 500.0, 200.0), (1.0, 0.7, 0.35, 0.15), salts, strict=False
+    ):
+        kernels.add_noise(field, *angles, MOON_RADIUS_M / 1000.0 / wavelength, rms, salt, even)
+    weights = np.repeat(np.cos(latitude)[:, None], 720, axis=1).ravel()
+    order = np.argsort(field, axis=None)
+    share = np.cumsum(weights[order]) / weights.sum()
+    limit = float(field.ravel()[order[np.searchsorted(share, 1.0 - PLAIN_SHARE)]])
+    edge = np.clip((field - limit) / 0.35 + 0.5, 0.0, 1.0)
+    return np.asarray(edge * edge * (3.0 - 2.0 * edge), dtype=np.float32)
+
+
+def _draw_catalogue(
+    rng: np.random.Generator, plains: npt.NDArray[np.float32], seed: int
+) -> tuple[CraterCatalogue, CraterShapes]:
+    """The synthetic catalogue from 2 km up, largest first, and the shapes that are stamped for it."""
+    above = sum(PAPER_CLASS_COUNTS) + LARGE_CRATERS
+    below = round(above * ((CLASS_LIMITS_M[0] / CATALOGUE_LOW_M) ** BELOW_CLASSES_EXPONENT - 1.0))
+    spans = (
+        (LARGE_CRATERS, CLASS_LIMITS_M[3] * 1.0001, 300.0e3, 1.9),
+        (PAPER_CLASS_COUNTS[2], CLASS_LIMITS_M[2], CLASS_LIMITS_M[3], 1.66),
+        (PAPER_CLASS_COUNTS[1], CLASS_LIMITS_M[1], CLASS_LIMITS_M[2], 1.84),
+        (PAPER_CLASS_COUNTS[0], CLASS_LIMITS_M[0], CLASS_LIMITS_M[1], 1.77),
+        (below, CATALOGUE_LOW_M, CLASS_LIMITS_M[0] * 0.9999, BELOW_CLASSES_EXPONENT),
+    )
+    diameter = np.concatenate([draw_power_law(rng, *span) for span in spans])
+    diameter = diameter[np.argsort(-diameter, kind="stable")]
+    count = diameter.size
+    latitude, longitude = np.empty(count), np.empty(count)
+    todo = np.arange(count)
+    while todo.size:
+        latitude[todo] = np.arcsin(rng.uniform(-1.0, 1.0, todo.size))
+        longitude[todo] = rng.uniform(0.0, 2.0 * math.pi, todo.size)
+        row = np.rint((90.0 - np.degrees(latitude[todo])) * 2.0).astype(np.int64)
+        column = np.rint(np.degrees(longitude[todo]) * 2.0).astype(np.int64) % 720
+        keep = 1.0 - (1.0 - PLAIN_CRATERS) * plains[row, column]
+        todo = todo[rng.random(todo.size) > keep]
+    ratio = draw_depth_ratio(rng, count, DEPTH_QUANTILES)
+    catalogue = make_catalogue(latitude, longitude, diameter, source=f"synthetic, seed {seed}")
+    return catalogue, shape_craters(latitude, longitude, diameter, ratio, rng)

@@ -1,0 +1,311 @@
+"""Terrain as square tiles made on demand and kept in one pool.
+
+The whole Moon is one equirectangular grid of pixels (areas; the first row touches the north pole, the first column the
+prime meridian), cut into tiles of 512 x 512.  A tile is a pure function of the source, the seed and its place, so
+every window is the same bits whatever was asked before, and no seam can appear at tile edges or at 0/360 degrees.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from lunar.catalogue import CraterCatalogue
+from lunar.constants import MOON_RADIUS_M
+from payload_emulator.errors import TerrainError
+
+Floats = npt.NDArray[np.float64]
+Heights = npt.NDArray[np.float32]
+
+TILE_SHIFT = 9
+TILE_PIXELS = 1 << TILE_SHIFT
+ALBEDO_SHIFT = 6
+"""An albedo tile has 64 x 64 pixels over the same ground."""
+
+MEAN_ALBEDO = 0.12
+"""Normal albedo of an average lunar surface (the maps of Hapke 2012 span about 0.06 to 0.2)."""
+
+RIM_AZIMUTHS = 48
+FLOOR_AZIMUTHS = 16
+POLE_LIMIT_RAD = math.radians(84.0)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TerrainPatch:
+    """Heights and albedo over one window, as tiles in a shared pool: good until the next patch is asked for.
+
+    Attributes
+    ----------
+    heights, albedo
+        Pools of tiles, float32 (slots, n + 1, n + 1): metres above the map sphere; normal albedo.
+    table
+        Slot of every tile of the window, int32 (rows, columns); -1 for tiles that were not asked for.
+    first_row, first_column
+        Grid pixel of the window's north-west corner; the column may be negative or beyond 360 degrees.
+    pixels_per_radian
+        Of the height grid.
+    low_m, high_m
+        Bounds of the heights in the window.
+    """
+
+    heights: Heights
+    albedo: Heights
+    table: npt.NDArray[np.int32]
+    first_row: int
+    first_column: int
+    pixels_per_radian: float
+    low_m: float
+    high_m: float
+
+    def coordinates(self, latitude_rad: Floats, longitude_rad: Floats) -> tuple[Floats, Floats]:
+        """Pixel coordinates (row, column) of places within the window; integers are pixel centres."""
+        rows = (0.5 * math.pi - latitude_rad) * self.pixels_per_radian - 0.5 - self.first_row
+        middle = (self.first_column + 0.5 * self.table.shape[1] * TILE_PIXELS) / self.pixels_per_radian
+        turn = 2.0 * math.pi
+        unwrapped = longitude_rad + turn * np.round((middle - longitude_rad) / turn)
+        return rows, unwrapped * self.pixels_per_radian - 0.5 - self.first_column
+
+
+class Terrain(Protocol):
+    """What a renderer and a labeller need of a Moon."""
+
+    name: str
+    data_names: tuple[str, ...]
+    catalogue: CraterCatalogue
+    pixel_m: float
+
+    def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Whether the source itself holds each place."""
+        ...
+
+    def height_m(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> Floats:
+        """Height above the map sphere, bilinear on the grid."""
+        ...
+
+    def patch(self, latitude_rad: Floats, longitude_rad: Floats, spacing_m: float = 0.0) -> TerrainPatch:
+        """Tiles within ``spacing_m`` of the given places (which must lie within half a turn of each other)."""
+        ...
+
+    def craters_near(self, latitude_rad: float, longitude_rad: float, radius_m: float) -> CraterCatalogue:
+        """Catalogue craters about a place, rim heights and depths measured on this terrain."""
+        ...
+
+
+class TiledTerrain(ABC):
+    """Cache of tiles and everything that follows from it; a source only has to make one tile."""
+
+    def __init__(
+        self,
+        name: str,
+        data_names: tuple[str, ...],
+        catalogue: CraterCatalogue,
+        pixels_per_degree: int,
+        cache_tiles: int,
+    ) -> None:
+        if (180 * pixels_per_degree) % TILE_PIXELS:
+            raise TerrainError(
+                f"terrain {name}: expected pixels per degree so that {TILE_PIXELS} divides the meridian, "
+                f"found {pixels_per_degree}"
+            )
+        self.name = name
+        self.data_names = data_names
+        self.catalogue = catalogue
+        self.pixels_per_degree = pixels_per_degree
+        self.pixels_per_radian = math.degrees(pixels_per_degree)
+        self.pixel_m = MOON_RADIUS_M / self.pixels_per_radian
+        self.tile_rows = 180 * pixels_per_degree // TILE_PIXELS
+        self.tile_columns = 2 * self.tile_rows
+        self.cache_tiles = cache_tiles
+        self._pool: Heights | None = None
+        self._albedo: Heights | None = None
+        self._bounds = np.zeros((cache_tiles, 2))
+        self._slots: OrderedDict[tuple[int, int], int] = OrderedDict()
+        self._rim_m = np.array(catalogue.rim_height_m, dtype=np.float64)
+        self._depth_m = np.array(catalogue.depth_m, dtype=np.float64)
+        self._measured = np.zeros(len(catalogue), dtype=bool)
+
+    @abstractmethod
+    def make_heights(self, tile_row: int, tile_column: int) -> Heights:
+        """One tile of heights (513, 513): the last row and column repeat the neighbours' first."""
+
+    @abstractmethod
+    def make_albedo(self, tile_row: int, tile_column: int) -> Heights:
+        """One tile of normal albedo (65, 65), likewise."""
+
+    @abstractmethod
+    def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Whether the source itself holds each place."""
+
+    def patch(self, latitude_rad: Floats, longitude_rad: Floats, spacing_m: float = 0.0) -> TerrainPatch:
+        """Tiles within ``spacing_m`` (and two pixels) of the given places.
+
+        Raises
+        ------
+        TerrainError
+            Beyond 84 degrees of latitude, where an equirectangular grid is no use, or wider than the cache.
+        """
+        latitude = np.asarray(latitude_rad, dtype=np.float64).ravel()
+        longitude = np.asarray(longitude_rad, dtype=np.float64).ravel()
+        worst = int(np.abs(latitude).argmax())
+        if not abs(latitude[worst]) < POLE_LIMIT_RAD:
+            raise TerrainError(
+                f"terrain {self.name}: expected latitudes within {math.degrees(POLE_LIMIT_RAD):.0f} deg, "
+                f"found {math.degrees(latitude[worst]):.2f} deg"
+            )
+        turn = 2.0 * math.pi
+        longitude = longitude + turn * np.round((longitude[0] - longitude) / turn)
+        scale = self.pixels_per_radian
+        spare = 2.5 + spacing_m / self.pixel_m
+        wide = 2.5 + spacing_m / self.pixel_m / np.cos(latitude)
+        rows = (0.5 * math.pi - latitude) * scale - 0.5
+        columns = longitude * scale - 0.5
+        above = np.floor((rows - spare) / TILE_PIXELS).astype(np.int64)
+        below = np.floor((rows + spare) / TILE_PIXELS).astype(np.int64)
+        before = np.floor((columns - wide) / TILE_PIXELS).astype(np.int64)
+        behind = np.floor((columns + wide) / TILE_PIXELS).astype(np.int64)
+        top, left = int(above.min()), int(before.min())
+        wanted = np.zeros((int(below.max()) - top + 1, int(behind.max()) - left + 1), dtype=bool)
+        # A tile is wider than twice the spacing in any sane call; ranges cover the rest.
+        for row in range(int((below - above).max()) + 1):
+            for column in range(int((behind - before).max()) + 1):
+                wanted[np.minimum(above + row, below) - top, np.minimum(before + column, behind) - left] = (
+                    True
+                )
+        count = int(np.count_nonzero(wanted))
+        if count > self.cache_tiles or wanted.shape[1] > self.tile_columns:
+            raise TerrainError(
+                f"terrain {self.name}: expected a window of at most {self.cache_tiles} tiles, found {count}: "
+                "the view is too wide or too near a pole"
+            )
+        table = np.full(wanted.shape, -1, np.int32)
+        places = [(int(row), int(column)) for row, column in np.argwhere(wanted)]
+        keys = [(top + row, (left + column) % self.tile_columns) for row, column in places]
+        for key in keys:
+            if key in self._slots:
+                self._slots.move_to_end(key)
+        for place, key in zip(places, keys, strict=True):
+            table[place] = self._slot(key)
+        bounds = self._bounds[table[wanted]]
+        assert self._pool is not None and self._albedo is not None
+        return TerrainPatch(
+            heights=self._pool,
+            albedo=self._albedo,
+            table=table,
+            first_row=top * TILE_PIXELS,
+            first_column=left * TILE_PIXELS,
+            pixels_per_radian=scale,
+            low_m=float(bounds[:, 0].min()),
+            high_m=float(bounds[:, 1].max()),
+        )
+
+    def height_m(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> Floats:
+        """Height above the map sphere (...) in metres, bilinear on the grid; places may lie anywhere apart."""
+        from payload_emulator.sim.terrain import kernels
+
+        latitude, longitude = np.broadcast_arrays(
+            np.asarray(latitude_rad, dtype=np.float64), np.asarray(longitude_rad, dtype=np.float64)
+        )
+        out = np.empty(latitude.size)
+        flat_latitude, flat_longitude = latitude.ravel(), longitude.ravel()
+        tile_row = np.floor(((0.5 * math.pi - flat_latitude) * self.pixels_per_radian - 0.5) / TILE_PIXELS)
+        tile_column = (
+            np.floor((flat_longitude * self.pixels_per_radian - 0.5) / TILE_PIXELS) % self.tile_columns
+        )
+        for block in np.unique(np.stack([tile_row, tile_column]), axis=1).T if out.size else ():
+            chosen = np.flatnonzero((tile_row == block[0]) & (tile_column == block[1]))
+            patch = self.patch(flat_latitude[chosen], flat_longitude[chosen])
+            rows, columns = patch.coordinates(flat_latitude[chosen], flat_longitude[chosen])
+            values = np.empty(chosen.size)
+            kernels.sample_pool(patch.heights, patch.table, TILE_SHIFT, rows, columns, values)
+            out[chosen] = values
+        return out.reshape(latitude.shape)
+
+    def craters_near(self, latitude_rad: float, longitude_rad: float, radius_m: float) -> CraterCatalogue:
+        """Catalogue craters with centres within ``radius_m``, with rims and depths as this terrain shows them."""
+        indices = np.asarray(self.catalogue.near(latitude_rad, longitude_rad, radius_m), dtype=np.int64)
+        return self.measured(indices)
+
+    def measured(self, indices: npt.NDArray[np.int64]) -> CraterCatalogue:
+        """The craters of these indices: rim height as the mean on the rim circle, depth below it to the inner 0.4 radius.
+
+        Craters whose surroundings this terrain cannot give keep NaN.
+        """
+        self._measure(indices[~self._measured[indices]])
+        chosen = self.catalogue.select(indices)
+        return CraterCatalogue(
+            ids=chosen.ids,
+            latitude_rad=chosen.latitude_rad,
+            longitude_rad=chosen.longitude_rad,
+            diameter_m=chosen.diameter_m,
+            rim_height_m=self._rim_m[indices],
+            depth_m=self._depth_m[indices],
+            source=chosen.source,
+            complete=chosen.complete,
+        )
+
+    def _measure(self, indices: npt.NDArray[np.int64]) -> None:
+        if indices.size == 0:
+            return
+        latitude = self.catalogue.latitude_rad[indices]
+        indices = indices[np.abs(latitude) < POLE_LIMIT_RAD - 0.05]
+        order = np.lexsort(
+            (self.catalogue.longitude_rad[indices], np.round(self.catalogue.latitude_rad[indices], 1))
+        )
+        for part in np.array_split(indices[order], max(1, indices.size // 256)):
+            latitude = self.catalogue.latitude_rad[part][:, None]
+            longitude = self.catalogue.longitude_rad[part][:, None]
+            radius = 0.5 * self.catalogue.diameter_m[part][:, None] / MOON_RADIUS_M
+            rim = self.height_m(*_circle(latitude, longitude, radius, RIM_AZIMUTHS)).mean(axis=1)
+            rings = [
+                self.height_m(*_circle(latitude, longitude, fraction * radius, FLOOR_AZIMUTHS)).mean(axis=1)
+                for fraction in (0.1, 0.22, 0.34)
+            ]
+            # Rings stand for equal-width annuli of the inner 0.4 radius: weights are their areas.
+            floor = (1.0 * rings[0] + 2.2 * rings[1] + 3.4 * rings[2]) / 6.6
+            self._rim_m[part] = rim
+            self._depth_m[part] = rim - floor
+            self._measured[part] = True
+
+    def _slot(self, key: tuple[int, int]) -> int:
+        slot = self._slots.get(key)
+        if slot is not None:
+            self._slots.move_to_end(key)
+            return slot
+        if self._pool is None:
+            size = TILE_PIXELS + 1
+            self._pool = np.empty((self.cache_tiles, size, size), np.float32)
+            small = (1 << ALBEDO_SHIFT) + 1
+            self._albedo = np.empty((self.cache_tiles, small, small), np.float32)
+        heights = self.make_heights(*key)
+        albedo = self.make_albedo(*key)
+        assert self._pool is not None and self._albedo is not None
+        slot = (
+            self._slots.popitem(last=False)[1] if len(self._slots) == self.cache_tiles else len(self._slots)
+        )
+        self._pool[slot] = heights
+        self._albedo[slot] = albedo
+        self._bounds[slot] = heights.min(), heights.max()
+        self._slots[key] = slot
+        return slot
+
+
+def tile_angles(tile_row: int, tile_column: int, pixels_per_degree: int) -> tuple[Floats, Floats]:
+    """Latitudes and longitudes (513,) in radians of a tile's pixel centres, the neighbours' first pixel included."""
+    index = np.arange(TILE_PIXELS + 1)
+    latitude = np.radians(90.0 - (tile_row * TILE_PIXELS + index + 0.5) / pixels_per_degree)
+    longitude = np.radians((tile_column * TILE_PIXELS + index + 0.5) / pixels_per_degree)
+    return latitude, longitude
+
+
+def _circle(latitude: Floats, longitude: Floats, radius: Floats, azimuths: int) -> tuple[Floats, Floats]:
+    """Places (n, azimuths) on small circles of angular ``radius`` about centres (n, 1)."""
+    azimuth = (np.arange(azimuths) + 0.5) * (2.0 * math.pi / azimuths)
+    sine = np.sin(latitude) * np.cos(radius) + np.cos(latitude) * np.sin(radius) * np.cos(azimuth)
+    east = np.sin(azimuth) * np.sin(radius) * np.cos(latitude)
+    return np.arcsin(sine), longitude + np.arctan2(east, np.cos(radius) - np.sin(latitude) * sine)

@@ -1,0 +1,166 @@
+"""The true flight: trajectory of the spacecraft, when it observes, how it points, where the Sun stands.
+
+Everything here is truth: it reaches flight software as images, attitude readings and clock ticks only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lunar.constants import MOON_RADIUS_M
+from lunar.frames import (
+    Orientation,
+    enu_from_mcmf,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    spherical_from_mcmf,
+)
+from lunar.timescales import format_utc, tdb_s_from_utc_ns
+from payload_emulator.errors import ScenarioError
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_SEARCH_STEP_NS = 20_000_000_000
+_POLAR_NORTH_LIMIT_RAD = np.radians(89.9)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """A flown trajectory and the rotation of the Moon it was flown with.
+
+    Attributes
+    ----------
+    state_icrf
+        Function from TDB seconds past J2000, shape (n,), to position (m) and velocity (m/s), shape (n, 6), ICRF axes.
+    start_utc_ns, stop_utc_ns
+        Span that `state_icrf` covers.
+    orientation
+        Rotation of the Moon in the simulated world.
+    """
+
+    state_icrf: Callable[[FloatArray], FloatArray]
+    start_utc_ns: int
+    stop_utc_ns: int
+    orientation: Orientation
+
+    def states(self, utc_ns: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Position (n, 3) in metres and velocity (n, 3) in m/s, Moon-centred ICRF axes, at UTC instants (n,)."""
+        state = self.state_icrf(np.asarray(tdb_s_from_utc_ns(np.atleast_1d(utc_ns)), dtype=np.float64))
+        return state[:, :3], state[:, 3:]
+
+    def positions_mcmf(self, utc_ns: ArrayLike) -> FloatArray:
+        """Position in MCMF, metres, shape (n, 3), at UTC instants (n,)."""
+        times = np.atleast_1d(utc_ns)
+        position, _ = self.states(times)
+        rotation = self.orientation.mcmf_from_icrf(np.asarray(tdb_s_from_utc_ns(times), dtype=np.float64))
+        return np.einsum("nij,nj->ni", rotation, position)
+
+
+def frame_times(
+    truth: Truth, start_utc_ns: int, stop_utc_ns: int, interval_ns: int, latitude_limit_rad: float
+) -> IntArray:
+    """UTC instants of the frames between two instants: one each interval, where the sub-satellite latitude allows."""
+    times = np.arange(start_utc_ns, stop_utc_ns, interval_ns, dtype=np.int64)
+    if times.size == 0:
+        return times
+    latitude, _, _ = spherical_from_mcmf(truth.positions_mcmf(times))
+    return times[np.abs(latitude) <= latitude_limit_rad]
+
+
+def find_windows(
+    truth: Truth,
+    covers: Callable[[FloatArray, FloatArray], NDArray[np.bool_]],
+    *,
+    not_before_utc_ns: int,
+    latitude_limit_rad: float,
+    direction: str,
+    half_fov_rad: float,
+    count: int,
+) -> list[tuple[int, int]]:
+    """Observation windows whose whole swath lies over known terrain: (first, last) UTC instants, earliest first.
+
+    A window is one crossing of the latitude band northwards ("ascending"), southwards ("descending") or either ("any").
+    The swath is the footprint's half-width either side of the track, as wide in longitude as the latitude makes it.
+    """
+    times = np.arange(not_before_utc_ns, truth.stop_utc_ns, _SEARCH_STEP_NS, dtype=np.int64)
+    latitude, longitude, altitude = spherical_from_mcmf(truth.positions_mcmf(times))
+    inside = np.abs(latitude) <= latitude_limit_rad
+    northward = np.gradient(latitude) > 0.0
+    wanted = inside & {"ascending": northward, "descending": ~northward, "any": inside}[direction]
+    half_width_rad = altitude * np.tan(half_fov_rad) / MOON_RADIUS_M
+    margin_rad = half_width_rad / np.cos(np.minimum(np.abs(latitude), _POLAR_NORTH_LIMIT_RAD))
+    good = np.zeros(times.size, dtype=bool)
+    place = np.flatnonzero(wanted)
+    good[place] = (
+        covers(latitude[place], longitude[place])
+        & covers(latitude[place], longitude[place] - margin_rad[place])
+        & covers(latitude[place], longitude[place] + margin_rad[place])
+    )
+    windows: list[tuple[int, int]] = []
+    for first, last in _runs(wanted):
+        cut_short = first == 0 or last == times.size - 1
+        if not cut_short and bool(np.all(good[first : last + 1])):
+            windows.append((int(times[first]) - _SEARCH_STEP_NS, int(times[last]) + _SEARCH_STEP_NS))
+            if len(windows) == count:
+                break
+    return windows
+
+
+def perturbed(camera_from_source: FloatArray, error_rad: FloatArray) -> FloatArray:
+    """The attitude turned by a small rotation vector `error_rad` (3,) given in camera axes."""
+    angle = float(np.linalg.norm(error_rad))
+    if angle == 0.0:
+        return camera_from_source
+    axis = error_rad / angle
+    quaternion = np.concatenate([[np.cos(angle / 2.0)], np.sin(angle / 2.0) * axis])
+    return np.asarray(matrix_from_quaternion(quaternion) @ camera_from_source, dtype=np.float64)
+
+
+def attitude_message(camera_from_icrf: FloatArray, sun_direction_camera: FloatArray) -> FloatArray:
+    """What the ADCS tells the payload: q_wxyz of camera_from_icrf, then the unit Sun vector in the camera, shape (7,)."""
+    return np.concatenate([quaternion_from_matrix(camera_from_icrf), sun_direction_camera])
+
+
+def paper_sun_direction(position_mcmf_m: FloatArray, elevation_rad: float, azimuth_rad: float) -> FloatArray:
+    """Unit vector to the Sun in MCMF for an elevation and an azimuth (from north, clockwise) at the sub-satellite point."""
+    latitude, longitude, _ = spherical_from_mcmf(position_mcmf_m)
+    enu = np.array(
+        [
+            np.sin(azimuth_rad) * np.cos(elevation_rad),
+            np.cos(azimuth_rad) * np.cos(elevation_rad),
+            np.sin(elevation_rad),
+        ]
+    )
+    return np.asarray(enu_from_mcmf(float(latitude), float(longitude)).T @ enu, dtype=np.float64)
+
+
+def require_above_ground(
+    truth: Truth, utc_ns: IntArray, height_m: Callable[[FloatArray, FloatArray], FloatArray]
+) -> None:
+    """Refuse a trajectory that dips below the terrain at any of the instants.
+
+    Raises
+    ------
+    ScenarioError
+        With the epoch, the place and the depth.
+    """
+    latitude, longitude, altitude = spherical_from_mcmf(truth.positions_mcmf(utc_ns))
+    clearance = altitude - height_m(latitude, longitude)
+    lowest = int(np.argmin(clearance))
+    if clearance[lowest] <= 0.0:
+        raise ScenarioError(
+            f"trajectory: expected to stay above the terrain, found it {-clearance[lowest]:.0f} m below at "
+            f"{format_utc(int(utc_ns[lowest]))}, latitude {np.degrees(latitude[lowest]):.2f}, longitude "
+            f"{np.degrees(longitude[lowest]) % 360.0:.2f} deg"
+        )
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and last index of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(first), int(stop) - 1) for first, stop in zip(edges[::2], edges[1::2], strict=True)]
