@@ -85,8 +85,14 @@ def _guarded(handler, namespace: argparse.Namespace) -> int:
 
 def _known_errors() -> tuple[type[Exception], ...]:
     """The base errors of the packages that have been imported by now (none is imported for this)."""
-    bases = {"lunar": "LunarError", "tmtc": "TmtcError", "reports": "ReportError",
-             "payload_emulator": "PayloadError", "ground_service": "GroundError", "linna": "UsageError"}
+    bases = {
+        "lunar": "LunarError",
+        "tmtc": "TmtcError",
+        "reports": "ReportError",
+        "payload_emulator": "PayloadError",
+        "ground_service": "GroundError",
+        "linna": "UsageError",
+    }
     loaded = (getattr(sys.modules.get(f"{package}.errors"), name, None) for package, name in bases.items())
     return tuple(error for error in loaded if error is not None)
 
@@ -109,9 +115,13 @@ def _nearest(name: str) -> str:
 
 def _overview() -> str:
     width = max(map(len, GROUPS))
-    lines = ["usage: linna COMMAND [options]", "",
-             "LINNA: crater-based navigation for a lunar CubeSat, payload emulator and ground segment.", "",
-             "commands:"]
+    lines = [
+        "usage: linna COMMAND [options]",
+        "",
+        "LINNA: crater-based navigation for a lunar CubeSat, payload emulator and ground segment.",
+        "",
+        "commands:",
+    ]
     lines += [f"  {name:<{width}}  {help_line}" for name, (_, help_line) in GROUPS.items()]
     lines += ["", "linna COMMAND --help tells more; --version prints the version."]
     return "\n".join(lines)

@@ -15,7 +15,9 @@ _PLAIN_LINE_INTERVAL_S = 5.0
 
 
 def add_json_flag(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout, everything else on stderr")
+    parser.add_argument(
+        "--json", action="store_true", help="print one JSON object on stdout, everything else on stderr"
+    )
 
 
 def emit(arguments: argparse.Namespace, figures: Mapping[str, Any], text: str | None = None) -> None:
@@ -34,7 +36,9 @@ def log(message: str) -> None:
     print(message, file=sys.stderr, flush=True)
 
 
-def progress(items: Iterable[Item], total: int | None = None, label: str = "", unit: str = "") -> Iterator[Item]:
+def progress(
+    items: Iterable[Item], total: int | None = None, label: str = "", unit: str = ""
+) -> Iterator[Item]:
     """Yield `items`, showing a bar with rate and time left on a terminal, plain lines otherwise."""
     if sys.stderr.isatty():
         from tqdm import tqdm

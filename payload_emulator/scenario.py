@@ -9,6 +9,7 @@ import dataclasses
 import difflib
 import math
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import UnionType
@@ -178,6 +179,15 @@ class Scenario:
     def epoch_utc_ns(self) -> int:
         return parse_utc(self.orbit.epoch)
 
+    def with_choices(self, *, modes: Sequence[str] | None = None, seed: int | None = None) -> Scenario:
+        """The same scenario with other estimators or another seed; None keeps what it has."""
+        navigation = (
+            self.navigation
+            if modes is None
+            else dataclasses.replace(self.navigation, estimators=tuple(dict.fromkeys(modes)))
+        )
+        return dataclasses.replace(self, navigation=navigation, seed=self.seed if seed is None else seed)
+
 
 def load_scenario(path: Path | str) -> Scenario:
     """The scenario in a TOML file; a bare name means one of those shipped (`scenarios/NAME.toml`).
@@ -196,8 +206,9 @@ def load_scenario(path: Path | str) -> Scenario:
         shipped = ", ".join(sorted(file.stem for file in SHIPPED.glob("*.toml")))
         raise ScenarioError(f"{path}: no such scenario file; shipped scenarios: {shipped}") from None
     except UnicodeDecodeError as error:
-        raise ScenarioError(f"{where}: expected UTF-8 text, found octet {error.object[error.start]:#04x} "
-                            f"at {error.start}") from None
+        raise ScenarioError(
+            f"{where}: expected UTF-8 text, found octet {error.object[error.start]:#04x} at {error.start}"
+        ) from None
     return parse_scenario(text, source=str(where))
 
 
@@ -222,7 +233,9 @@ def format_scenario(scenario: Scenario) -> str:
         value = getattr(scenario, item.name)
         if dataclasses.is_dataclass(value):
             sections += ["", f"[{item.name}]"]
-            sections += [f"{key.name} = {_toml(getattr(value, key.name))}" for key in dataclasses.fields(value)]
+            sections += [
+                f"{key.name} = {_toml(getattr(value, key.name))}" for key in dataclasses.fields(value)
+            ]
         else:
             lines.append(f"{item.name} = {_toml(value)}")
     return "\n".join(lines + sections) + "\n"
@@ -297,29 +310,64 @@ def _check(scenario: Scenario, source: str) -> None:
         except (LunarError, ValueError):
             require(False, key, "a UTC time such as 2029-08-07T00:00:00Z", text)
     if not orbit.oem:
-        require(0.0 <= orbit.eccentricity < 1.0, "orbit.eccentricity", "from 0 to below 1", orbit.eccentricity)
+        require(
+            0.0 <= orbit.eccentricity < 1.0, "orbit.eccentricity", "from 0 to below 1", orbit.eccentricity
+        )
         perilune_km = orbit.semi_major_axis_km * (1.0 - orbit.eccentricity)
-        require(perilune_km > 1737.4, "orbit.semi_major_axis_km and eccentricity",
-                "an orbit above the ground (perilune radius over 1737.4 km)", round(perilune_km, 3))
-        require(0.0 <= orbit.inclination_deg <= 180.0, "orbit.inclination_deg", "from 0 to 180", orbit.inclination_deg)
-    require(2 <= scenario.dynamics.degree <= 1200, "dynamics.degree", "from 2 to 1200", scenario.dynamics.degree)
+        require(
+            perilune_km > 1737.4,
+            "orbit.semi_major_axis_km and eccentricity",
+            "an orbit above the ground (perilune radius over 1737.4 km)",
+            round(perilune_km, 3),
+        )
+        require(
+            0.0 <= orbit.inclination_deg <= 180.0,
+            "orbit.inclination_deg",
+            "from 0 to 180",
+            orbit.inclination_deg,
+        )
+    require(
+        2 <= scenario.dynamics.degree <= 1200, "dynamics.degree", "from 2 to 1200", scenario.dynamics.degree
+    )
     require(16 <= camera.width_px <= 8192, "camera.width_px", "from 16 to 8192", camera.width_px)
     require(16 <= camera.height_px <= 8192, "camera.height_px", "from 16 to 8192", camera.height_px)
     require(1.0 <= camera.fov_deg <= 170.0, "camera.fov_deg", "from 1 to 170", camera.fov_deg)
     require(camera.frame_interval_s > 0.0, "camera.frame_interval_s", "positive", camera.frame_interval_s)
-    require(0.0 < window.latitude_limit_deg <= 90.0, "window.latitude_limit_deg", "over 0 and up to 90",
-            window.latitude_limit_deg)
+    require(
+        0.0 < window.latitude_limit_deg <= 90.0,
+        "window.latitude_limit_deg",
+        "over 0 and up to 90",
+        window.latitude_limit_deg,
+    )
     require(window.passes >= 1, "window.passes", "at least 1", window.passes)
-    require(window.search != "none" or window.duration_s > 0.0, "window.duration_s",
-            "positive when window.search is 'none'", window.duration_s)
+    require(
+        window.search != "none" or window.duration_s > 0.0,
+        "window.duration_s",
+        "positive when window.search is 'none'",
+        window.duration_s,
+    )
     light = scenario.light
-    require(light.elevation_min_deg <= light.elevation_max_deg, "light.elevation_min_deg",
-            "no more than light.elevation_max_deg", light.elevation_min_deg)
-    require(light.azimuth_min_deg <= light.azimuth_max_deg, "light.azimuth_min_deg",
-            "no more than light.azimuth_max_deg", light.azimuth_min_deg)
+    require(
+        light.elevation_min_deg <= light.elevation_max_deg,
+        "light.elevation_min_deg",
+        "no more than light.elevation_max_deg",
+        light.elevation_min_deg,
+    )
+    require(
+        light.azimuth_min_deg <= light.azimuth_max_deg,
+        "light.azimuth_min_deg",
+        "no more than light.azimuth_max_deg",
+        light.azimuth_min_deg,
+    )
     for name in scenario.navigation.estimators:
         require(name in ESTIMATORS, "navigation.estimators", f"of {', '.join(ESTIMATORS)}", name)
     require(len(scenario.navigation.estimators) > 0, "navigation.estimators", "at least one estimator", ())
-    require(0.0 <= scenario.link.frame_loss <= 1.0, "link.frame_loss", "from 0 to 1", scenario.link.frame_loss)
-    require(0.0 <= scenario.link.bit_error_rate <= 0.5, "link.bit_error_rate", "from 0 to 0.5",
-            scenario.link.bit_error_rate)
+    require(
+        0.0 <= scenario.link.frame_loss <= 1.0, "link.frame_loss", "from 0 to 1", scenario.link.frame_loss
+    )
+    require(
+        0.0 <= scenario.link.bit_error_rate <= 0.5,
+        "link.bit_error_rate",
+        "from 0 to 0.5",
+        scenario.link.bit_error_rate,
+    )

@@ -122,12 +122,12 @@ def perturbed(camera_from_source: FloatArray, error_rad: FloatArray) -> FloatArr
 
 
 def attitude_message(camera_from_icrf: FloatArray, sun_direction_camera: FloatArray) -> FloatArray:
-    """What the ADCS tells the payload: q_wxyz of camera_from_icrf, then the unit Sun vector in the camera, shape (7,)."""
+    """What the ADCS tells: q_wxyz of camera_from_icrf, then the unit Sun vector in the camera, shape (7,)."""
     return np.concatenate([quaternion_from_matrix(camera_from_icrf), sun_direction_camera])
 
 
 def paper_sun_direction(position_mcmf_m: FloatArray, elevation_rad: float, azimuth_rad: float) -> FloatArray:
-    """Unit vector to the Sun in MCMF for an elevation and an azimuth (from north, clockwise) at the sub-satellite point."""
+    """Unit vector to the Sun in MCMF; elevation and azimuth (from north, clockwise) at the sub-satellite point."""
     latitude, longitude, _ = spherical_from_mcmf(position_mcmf_m)
     enu = np.array(
         [

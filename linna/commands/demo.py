@@ -1,0 +1,95 @@
+"""`linna demo`: one observation window from the orbit to the report."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+from linna.output import add_json_flag, emit, log, progress
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("linna-demo"),
+        metavar="DIR",
+        help="folder for the pass archive, the ground database and the report (default: linna-demo)",
+    )
+    parser.add_argument("--scenario", default="selenita", help="scenario file or name (default: selenita)")
+    parser.add_argument("--seed", type=int, help="another seed than the scenario's")
+    add_json_flag(parser)
+    parser.set_defaults(handler=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from ground_service.services.archive_import import import_archive
+    from ground_service.services.reports import write_report
+    from ground_service.services.summary import pass_summary
+
+    from ground_service.settings import load_settings
+    from ground_service.store.database import open_store
+    from linna.data import data_folder
+    from payload_emulator.emulator import emulate
+    from payload_emulator.scenario import load_scenario
+
+    started = time.monotonic()
+    data = data_folder()
+    scenario = load_scenario(arguments.scenario).with_choices(seed=arguments.seed)
+    archive = arguments.out / "pass"
+    log("emulating the payload ...")
+    emulated = emulate(
+        scenario,
+        data,
+        archive,
+        frames_kept=8,
+        progress=lambda frames, total: progress(frames, total, "frames", "frame"),
+    )
+    log("ingesting the downlink, aligning, reporting ...")
+    settings = load_settings(home=arguments.out / "ground", data=data.root)
+    with open_store(settings) as store:
+        pass_id = import_archive(store, archive, data)
+        report = write_report(store, pass_id, data)
+        ground = pass_summary(store, pass_id)
+    figures = {
+        "report": str(report),
+        "pass_id": pass_id,
+        "frames": emulated["frames"],
+        **ground,
+        "wall_s": round(time.monotonic() - started, 2),
+        "data": emulated["data"],
+    }
+    emit(arguments, figures, text=describe(figures))
+    return 0
+
+
+def describe(figures: dict) -> str:
+    """The short table at the end of the demo."""
+    detector = figures["detector"]
+    lines = [
+        "",
+        f"pass {figures['pass_id']}: {figures['frames']} frames, {figures['packets']} packets, "
+        f"{figures['packets_lost']} lost",
+        f"detector, 5-30 km against the catalogue: precision {_number(detector['precision'], '.2f')}, "
+        f"recall {_number(detector['recall'], '.2f')}, localisation {_number(detector['loc_px'], '.2f')} px",
+        "",
+        f"{'navigation':<28}{'median':>10}{'p95':>10}{'max':>10}{'drift':>10}",
+        f"{'':<28}{'m':>10}{'m':>10}{'m':>10}{'% of path':>10}",
+    ]
+    for name, row in figures["navigation"].items():
+        lines.append(
+            f"{name:<28}{_number(row['median_3d_m'], '.0f'):>10}{_number(row['p95_3d_m'], '.0f'):>10}"
+            f"{_number(row['max_3d_m'], '.0f'):>10}{_number(row['drift_percent'], '.3f'):>10}"
+        )
+    lines += [
+        "",
+        f"data: {'; '.join(figures['data'])}",
+        f"{figures['wall_s']:.1f} s",
+        f"report: {figures['report']}",
+    ]
+    return "\n".join(lines)
+
+
+def _number(value: float | None, layout: str) -> str:
+    return "-" if value is None or value != value else format(value, layout)
