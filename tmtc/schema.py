@@ -15,7 +15,7 @@ import math
 import operator
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -505,7 +505,8 @@ class _Compiled:
             elements = list(value) if isinstance(value, (Sequence, np.ndarray)) else [value]
             if len(elements) != f.size:
                 raise ValueRefused(definition.name, f.name, value, f"{f.size} numbers")
-            numbers.extend(_encode(definition.name, f, element) for element in elements)
+            one = replace(f, size=1)
+            numbers.extend(_encode(definition.name, one, element) for element in elements)
         try:
             return self.struct.pack(*numbers) + items
         except OverflowError:
