@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import size_class
 from lunar.constants import MOON_RADIUS_M
-from payload_emulator.flight.detector import Detections
+from payload_emulator.flight.detections import Detections
 from payload_emulator.flight.matcher import GroundFeatures, Match, MatcherParameters, match_frames
 from payload_emulator.flight.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.tables import TICKS_PER_SECOND, AnchorTable
@@ -201,6 +201,12 @@ def frame_features(
     return FrameFeatures(
         detections.u_px, detections.v_px, GroundFeatures(east, north, size_class), altitude_m
     )
+
+
+def depth_on_sphere(u_px: Float, v_px: Float, altitude_m: float, camera: PinholeCamera) -> Float:
+    """Return the depth along the boresight of the ground behind pixels, nadir camera, NaN beyond the limb."""
+    x, y = _tangents(u_px, v_px, camera)
+    return _depth(x * x + y * y, altitude_m)
 
 
 def solve_planar(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from payload_emulator.flight.detector import Detections
+from payload_emulator.flight.detections import Detections
 
 Float = NDArray[np.float64]
 RADIUS_M = 1_737_400.0

@@ -1,0 +1,202 @@
+"""The payload's door: frames and telecommands in, packets of the dictionary out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from payload_emulator.flight.detections import Detections, no_detections
+from payload_emulator.flight.outcomes import Mode
+from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload
+from payload_emulator.flight.preprocess import ImageQuality
+from payload_emulator.flight.tables import pack_anchor_table, table_hash
+from tmtc.dictionary import DICTIONARY
+from tmtc.packets import unpack_primary_header
+
+IMAGE = np.zeros((4, 4, 3), dtype=np.uint8)
+ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
+FIRST_S = 6_600.0
+
+
+DARK = (ImageQuality.DARK, no_detections())
+EMPTY = (ImageQuality.OK, no_detections())
+
+
+class ScriptedDetector:
+    """Hands out prepared detections, one set per image."""
+
+    def __init__(self, frames: list[Any]) -> None:
+        self.frames = list(frames)
+
+    def examine(self, image: Any, sun_in_camera: Any = None) -> tuple[ImageQuality, Detections]:
+        frame = self.frames.pop(0)
+        return frame if isinstance(frame, tuple) else (ImageQuality.OK, frame)
+
+
+def anchor_octets(moon: Any) -> bytes:
+    seconds = np.arange(6_000.0, 9_000.0, 30.0)
+    return pack_anchor_table([moon.ticks_at(second) for second in seconds], moon.orbit(seconds))
+
+
+def true_frames(moon: Any, count: int) -> list[Detections]:
+    field = moon.crater_field(1)
+    return [field.perfect_detections(moon.orbit([FIRST_S + 15.0 * k])[0]) for k in range(count)]
+
+
+def payload(moon: Any, frames: list[Any], **options: Any) -> Payload:
+    tables = FlightTables(anchor_ephemeris=options.pop("anchor", anchor_octets(moon)))
+    return Payload(ScriptedDetector(frames), FlightParameters(), tables, **options)
+
+
+def fly(moon: Any, flown: Payload, count: int, start: int = 0) -> list[bytes]:
+    packets = []
+    for k in range(start, start + count):
+        packets += flown.step(IMAGE, ATTITUDE, moon.ticks_at(FIRST_S + 15.0 * k), b"")
+    return packets
+
+
+def named(packets: list[bytes], name: str) -> list[dict[str, Any]]:
+    decoded = [DICTIONARY.unpack(packet) for packet in packets]
+    return [values for found, values in decoded if found == name]
+
+
+def command(name: str, **values: Any) -> bytes:
+    return DICTIONARY.pack_command(name, values, sequence_count=5)
+
+
+def test_each_frame_reports_detections_states_and_outcomes_of_every_estimator(moon: Any) -> None:
+    frames = true_frames(moon, 4)
+    packets = fly(moon, payload(moon, frames, model_hash=0xDEADBEEF), 4)
+    detections = named(packets, "detections")
+    assert [values["frame_number"] for values in detections] == [0, 1, 2, 3]
+    assert [values["count"] for values in detections] == [len(frame) for frame in frames]
+    # 1/64 px quantisation.
+    np.testing.assert_allclose(detections[2]["items"]["u_px"], frames[2].u_px, atol=1 / 128)
+    assert set(detections[2]["items"]["size_class"].tolist()) <= {0, 1, 2}
+    outcomes = named(packets, "frame_outcome")
+    assert [(v["estimator"], v["outcome"]) for v in outcomes[:2]] == [(0, 0), (1, 0)]
+    assert [v["outcome"] for v in outcomes[2:]] == [1] * 6
+    assert [v["anchor_reads"] for v in outcomes if v["estimator"] == 0] == [1, 2, 3, 4]
+    states = named(packets, "navigation_state")
+    truth = moon.place(moon.orbit([FIRST_S + 45.0])[0])
+    last = next(v for v in states if v["frame_number"] == 3 and v["estimator"] == 1)
+    assert last["latitude_deg"] == pytest.approx(np.degrees(truth[0]), abs=1e-4)
+    assert last["longitude_deg"] == pytest.approx(np.degrees(truth[1]) % 360.0, abs=1e-4)
+    assert np.all(np.isnan(last["velocity_icrf_m_s"]))
+
+
+def test_housekeeping_counts_what_happened(moon: Any) -> None:
+    octets = anchor_octets(moon)
+    frames = [*true_frames(moon, 5), DARK]
+    flown = payload(moon, frames, model_hash=0xDEADBEEF, boot_count=3)
+    packets = fly(moon, flown, 6)
+    # One at boot, one a minute later.
+    first, second = named(packets, "housekeeping")
+    assert (first["boot_count"], first["mode"], first["model_hash"]) == (3, 2, 0xDEADBEEF)
+    assert second["anchor_table_hash"] == table_hash(octets)
+    assert second["frames_processed"] == 5
+    assert second["detections_total"] == sum(len(frame) for frame in frames[:5])
+    # Two estimators: five altitudes and one reset each.
+    assert second["anchor_reads"] == 12
+    fly_on = named(fly(moon, payload(moon, [DARK]), 1), "housekeeping")[0]
+    assert (fly_on["frames_bad"], fly_on["last_image_quality"]) == (1, 1)
+    summary = flown.summary()
+    assert summary["frames_bad"] == 1
+    assert summary["estimators"]["paper"]["outcomes"] == {
+        "anchored": 1, "multi": 4, "single": 0, "predicted": 1, "missed": 0, "rejected": 0
+    }  # fmt: skip
+    assert summary["estimators"]["paper"]["reset_triggers"] == {"initialization": 1}
+    assert summary["truth_reads_after_start"] == 5
+
+
+def test_sequence_counts_of_each_apid_have_no_gaps(moon: Any) -> None:
+    packets = fly(moon, payload(moon, true_frames(moon, 3)), 3)
+    counts: dict[int, list[int]] = {}
+    for packet in packets:
+        header = unpack_primary_header(packet)
+        counts.setdefault(header.apid, []).append(header.sequence_count)
+    assert len(counts) >= 5
+    for values in counts.values():
+        assert values == list(range(len(values)))
+
+
+def test_a_manual_step_command_resets_both_estimators_and_is_verified(moon: Any) -> None:
+    flown = payload(moon, true_frames(moon, 3))
+    fly(moon, flown, 2)
+    order = command("perform_function", function_id="manual_step", argument_1=0.0, argument_2=0.0)
+    packets = flown.step(IMAGE, ATTITUDE, moon.ticks_at(FIRST_S + 30.0), order)
+    assert [v["reset_trigger"] for v in named(packets, "frame_outcome")] == [3, 3]
+    request = int.from_bytes(order[:4], "big")
+    for stage in ("accepted", "started", "completed"):
+        assert named(packets, f"verification_{stage}") == [{"request_id": request}]
+
+
+def test_outside_observing_no_frame_is_processed(moon: Any) -> None:
+    flown = payload(moon, true_frames(moon, 1))
+    standby = command("perform_function", function_id="set_mode", argument_1=1.0, argument_2=0.0)
+    packets = flown.step(IMAGE, ATTITUDE, moon.ticks_at(FIRST_S), standby)
+    assert not named(packets, "detections")
+    assert named(packets, "housekeeping")[0]["mode"] == 1
+    observe = command("perform_function", function_id="start_observation", argument_1=60.0, argument_2=15.0)
+    packets = flown.step(IMAGE, ATTITUDE, moon.ticks_at(FIRST_S + 15.0), observe)
+    assert len(named(packets, "detections")) == 1
+
+
+def test_telecommands_that_make_no_sense_are_refused_with_a_reason(moon: Any) -> None:
+    good = command("perform_function", function_id="set_mode", argument_1=9.0, argument_2=0.0)
+    damaged = good[:-1] + bytes([good[-1] ^ 1])
+    cases = [(good, 4), (damaged, 2), (good[:-3], 3), (b"\x18", 3), (command("reset_schedule"), 9)]
+    for octets, code in cases:
+        flown = payload(moon, [EMPTY])
+        packets = flown.step(IMAGE, ATTITUDE, moon.ticks_at(FIRST_S), octets)
+        assert [v["failure_code"] for v in named(packets, "verification_not_accepted")] == [code]
+        assert named(packets, "housekeeping")[0]["telecommands_rejected"] == 1
+
+
+def test_two_telecommands_in_one_delivery_are_both_obeyed(moon: Any) -> None:
+    ping = command("test_connection")
+    packets = payload(moon, [EMPTY]).step(IMAGE, ATTITUDE, moon.ticks_at(FIRST_S), ping + ping)
+    assert len(named(packets, "connection_report")) == 2
+
+
+def test_without_a_usable_anchor_table_frames_are_missed_and_detections_still_come_down(moon: Any) -> None:
+    for octets, events in ((b"", 0), (anchor_octets(moon)[:-1], 1)):
+        packets = fly(moon, payload(moon, true_frames(moon, 2), anchor=octets), 2)
+        assert {v["outcome"] for v in named(packets, "frame_outcome")} == {4}
+        assert len(named(packets, "detections")) == 2
+        assert not named(packets, "navigation_state")
+        assert len(named(packets, "event_high")) == events
+
+
+def test_nothing_a_camera_or_adcs_can_send_stops_the_payload(moon: Any) -> None:
+    nan = np.full(7, np.nan)
+    wild = Detections(
+        np.array([-3.0, 5e3, np.nan, np.inf]),
+        np.array([4.0, -9.0, 1.0, 2.0]),
+        np.array([1e9, -5.0, 30.0, 1.0]),
+        np.array([2.0, -1.0, np.nan, 0.5]),
+        np.array([np.nan, 1e9, 0.1, 0.1]),
+    )
+    flown = payload(moon, [wild, wild, (ImageQuality.INVALID, no_detections()), wild])
+    packets = []
+    for k, attitude in enumerate([nan, np.empty(0), ATTITUDE, ATTITUDE]):
+        # The clock jumps back at the last frame.
+        second = FIRST_S + 15.0 * k if k < 3 else FIRST_S - 1_000.0
+        packets += flown.step(np.empty((0, 0)), attitude, moon.ticks_at(second), b"")
+    events = [v["event_id"] for v in named(packets, "event_low")]
+    assert events.count(21) == 2
+    assert named(packets, "event_medium")[0]["value_1"] == pytest.approx(-1_030.0)
+    assert named(packets, "housekeeping")[-1]["clock_status"] == 2
+
+
+def test_the_same_inputs_give_the_same_octets(moon: Any) -> None:
+    runs = [fly(moon, payload(moon, true_frames(moon, 3)), 3) for _ in range(2)]
+    assert runs[0] == runs[1]
+
+
+def test_parameters_have_a_hash_that_changes_with_them() -> None:
+    one, two = FlightParameters(), FlightParameters(modes=(Mode.paper,))
+    assert one.hash == FlightParameters().hash != two.hash
+    assert one.sha256.startswith(f"{one.hash:08x}")
