@@ -1,8 +1,8 @@
 """Pinhole camera over the sphere: projection, rays, ground points and footprints.
 
-Camera axes: x right (image u), y down (image v), z along the boresight.  Pixel centres have integer coordinates, so 512
-pixels reach from -0.5 to 511.5 and their centre is at 255.5.  The nadir camera looks down with image up to the north:
-x = east, y = south, z = down.  All lengths in m, angles in rad.
+Camera axes: x right (image u), y down (image v), z along the boresight.  Pixel centres have integer
+coordinates, so 512 pixels reach from -0.5 to 511.5 and their centre is at 255.5.  The nadir camera looks down
+with image up to the north: x = east, y = south, z = down.  All lengths in m, angles in rad.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class PinholeCamera:
         return (self.width_px - 1) / 2.0, (self.height_px - 1) / 2.0
 
     def project(self, points_camera_m: ArrayLike) -> FloatArray:
-        """Return pixel coordinates ``(..., 2)`` of points ``(..., 3)`` in camera axes; NaN behind the camera."""
+        """Return pixel coordinates ``(..., 2)`` of points ``(..., 3)``; NaN behind the camera."""
         points = np.asarray(points_camera_m, dtype=np.float64)
         depth = np.where(points[..., 2] > 0.0, points[..., 2], np.nan)
         return np.asarray(self.focal_px * points[..., :2] / depth[..., None] + np.array(self.centre_px))
@@ -56,7 +56,7 @@ class PinholeCamera:
         return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
 
     def contains(self, uv: ArrayLike, margin_px: float = 0.0) -> NDArray[np.bool_]:
-        """Return whether pixel coordinates ``(..., 2)`` lie in the image, ``margin_px`` inside its edges."""
+        """Return whether pixels ``(..., 2)`` lie in the image, ``margin_px`` inside its edges."""
         u, v = np.moveaxis(np.asarray(uv, dtype=np.float64), -1, 0)
         low = -0.5 + margin_px
         inside_u = (u >= low) & (u <= self.width_px - 1 - low)
@@ -69,15 +69,18 @@ class PinholeCamera:
 
 
 def nadir_camera_from_mcmf(position_mcmf_m: ArrayLike) -> FloatArray:
-    """Return the rotation ``(..., 3, 3)`` to a nadir camera with image up to the north, at positions ``(..., 3)``."""
+    """Return the rotation ``(..., 3, 3)`` to the north-up nadir camera at positions ``(..., 3)``."""
     latitude_rad, longitude_rad, _ = spherical_from_mcmf(position_mcmf_m)
     return np.asarray(CAMERA_FROM_ENU @ enu_from_mcmf(latitude_rad, longitude_rad))
 
 
-def intersect_sphere(origin_m: ArrayLike, direction: ArrayLike, radius_m: ArrayLike = MOON_RADIUS_M) -> FloatArray:
-    """Return the range ``(...)`` in m along unit directions to the first point of a sphere about the frame's origin.
+def intersect_sphere(
+    origin_m: ArrayLike, direction: ArrayLike, radius_m: ArrayLike = MOON_RADIUS_M
+) -> FloatArray:
+    """Return the range ``(...)`` in m along unit directions to a sphere about the frame's origin.
 
-    NaN where the line misses the sphere or the sphere lies behind.  From inside the sphere, the range to the way out.
+    NaN where the line misses the sphere or the sphere lies behind.  From inside the sphere, the range to the
+    way out.
     """
     origin = np.asarray(origin_m, dtype=np.float64)
     heading = np.asarray(direction, dtype=np.float64)
@@ -96,23 +99,27 @@ def intersect_sphere(origin_m: ArrayLike, direction: ArrayLike, radius_m: ArrayL
 def project_mcmf(
     camera: PinholeCamera, camera_from_mcmf: ArrayLike, position_mcmf_m: ArrayLike, points_mcmf_m: ArrayLike
 ) -> FloatArray:
-    """Return pixel coordinates ``(..., 2)`` of points ``(..., 3)``; pose and points broadcast against each other.
+    """Return pixel coordinates ``(..., 2)`` of points ``(..., 3)``; pose and points broadcast.
 
-    One pose, shapes (3, 3) and (3,), serves any number of points; n poses serve (n, 3) points one each, or (n, m, 3)
-    points when given as (n, 1, 3, 3) and (n, 1, 3).  Points behind the limb are projected too: see `above_horizon`.
+    One pose, shapes (3, 3) and (3,), serves any number of points; n poses serve (n, 3) points one each, or
+    (n, m, 3) points when given as (n, 1, 3, 3) and (n, 1, 3).  Points behind the limb are projected too: see
+    `above_horizon`.
     """
     rotation = np.asarray(camera_from_mcmf, dtype=np.float64)
-    line_of_sight = np.asarray(points_mcmf_m, dtype=np.float64) - np.asarray(position_mcmf_m, dtype=np.float64)
+    line_of_sight = np.asarray(points_mcmf_m, dtype=np.float64) - np.asarray(
+        position_mcmf_m, dtype=np.float64
+    )
     return camera.project(np.einsum("...ij,...j->...i", rotation, line_of_sight))
 
 
 def above_horizon(position_mcmf_m: ArrayLike, points_mcmf_m: ArrayLike) -> NDArray[np.bool_]:
-    """Return whether the ground sphere leaves points ``(..., 3)`` at or above it in sight of a position ``(..., 3)``."""
+    """Return whether the ground leaves points ``(..., 3)`` in sight of a position ``(..., 3)``."""
     position = np.asarray(position_mcmf_m, dtype=np.float64)
     points = np.asarray(points_mcmf_m, dtype=np.float64)
     leg = position - points
     length = np.linalg.norm(leg, axis=-1)
-    # Closest approach of the segment to the centre: hidden only where it is inside the segment and under the ground.
+    # Closest approach of the segment to the centre: hidden only where it is inside the segment and under the
+    # ground.
     toward = -np.sum(points * leg, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         fraction = np.clip(toward / length**2, 0.0, 1.0)
@@ -128,7 +135,7 @@ def ground_point_sphere(
     uv: ArrayLike,
     height_m: ArrayLike = 0.0,
 ) -> FloatArray:
-    """Return points ``(..., 3)`` where pixels ``(..., 2)`` see a sphere ``height_m`` above `MOON_RADIUS_M`; NaN off it."""
+    """Return points ``(..., 3)`` where pixels ``(..., 2)`` see the sphere ``height_m`` up; NaN off it."""
     rotation = np.asarray(camera_from_mcmf, dtype=np.float64)
     position = np.asarray(position_mcmf_m, dtype=np.float64)
     direction = np.einsum("...ji,...j->...i", rotation, camera.rays(uv))
@@ -137,7 +144,7 @@ def ground_point_sphere(
 
 
 def ground_arc_m(off_nadir_rad: ArrayLike, altitude_m: ArrayLike) -> FloatArray:
-    """Return the arc in m on the sphere from the sub-camera point to where a ray meets the ground; NaN past the limb."""
+    """Return the ground arc in m from the sub-camera point to where a ray lands; NaN past the limb."""
     off_nadir = np.asarray(off_nadir_rad, dtype=np.float64)
     ratio = 1.0 + np.asarray(altitude_m, dtype=np.float64) / MOON_RADIUS_M
     with np.errstate(invalid="ignore"):
@@ -151,7 +158,9 @@ def flat_footprint_m(fov_rad: ArrayLike, altitude_m: ArrayLike) -> FloatArray:
 
 def horizon_arc_m(altitude_m: ArrayLike) -> FloatArray:
     """Return the arc in m on the sphere from the sub-camera point to the horizon."""
-    return np.asarray(MOON_RADIUS_M * np.arccos(1.0 / (1.0 + np.asarray(altitude_m, dtype=np.float64) / MOON_RADIUS_M)))
+    return np.asarray(
+        MOON_RADIUS_M * np.arccos(1.0 / (1.0 + np.asarray(altitude_m, dtype=np.float64) / MOON_RADIUS_M))
+    )
 
 
 def ground_sample_m(camera: PinholeCamera, altitude_m: ArrayLike) -> FloatArray:

@@ -1,7 +1,7 @@
 """Crater catalogues as arrays, with a spatial index, size classes and the published file formats.
 
-Latitude and longitude are of the mean-Earth frame, in rad; longitudes are kept as 0..2 pi.  Heights are of the rim above
-the sphere of `MOON_RADIUS_M`.  NaN stands for what a catalogue does not say.
+Latitude and longitude are of the mean-Earth frame, in rad; longitudes are kept as 0..2 pi.  Heights are of
+the rim above the sphere of `MOON_RADIUS_M`.  NaN stands for what a catalogue does not say.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import csv
 import gzip
 import io
 import math
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,7 +30,7 @@ IntArray = NDArray[np.int64]
 TWO_PI = 2.0 * math.pi
 
 CLASS_LIMITS_M = (5_000.0, 10_000.0, 15_000.0, 30_000.0)
-"""Limits of the paper's size classes 0, 1 and 2; each class holds its lower limit."""
+"""Limits of the paper's size classes 0, 1 and 2; each holds its lower limit, the last also its upper."""
 
 NAVIGATION_CLASS = 3
 NAVIGATION_MINIMUM_M = 3_000.0
@@ -45,7 +46,7 @@ BAND_RAD = math.radians(1.0)
 
 @dataclass(frozen=True, eq=False)
 class CraterCatalogue:
-    """Craters as equally long arrays.  ``complete`` is True where the source holds every crater of the region.
+    """Craters as arrays of one length; ``complete`` is True where the source holds all of the region.
 
     Not slotted: the index is built on first use and kept.
     """
@@ -65,7 +66,9 @@ class CraterCatalogue:
     @cached_property
     def position_mcmf_m(self) -> FloatArray:
         """Return the centres at rim height, (n, 3); on the sphere where the height is not known."""
-        return mcmf_from_spherical(self.latitude_rad, self.longitude_rad, np.nan_to_num(self.rim_height_m, nan=0.0))
+        return mcmf_from_spherical(
+            self.latitude_rad, self.longitude_rad, np.nan_to_num(self.rim_height_m, nan=0.0)
+        )
 
     @cached_property
     def size_class(self) -> NDArray[np.int8]:
@@ -89,7 +92,7 @@ class CraterCatalogue:
         )
 
     def near(self, latitude_rad: float, longitude_rad: float, radius_m: float) -> IntArray:
-        """Return ascending indices of the craters whose centres lie within an arc of ``radius_m`` of a place."""
+        """Return ascending indices of craters whose centres lie within an arc of ``radius_m`` of a place."""
         if len(self) == 0 or not radius_m >= 0.0:
             return np.zeros(0, dtype=np.int64)
         arc = radius_m / MOON_RADIUS_M
@@ -117,14 +120,18 @@ class CraterCatalogue:
         candidates = np.unique(np.concatenate(pieces))
         cos_latitude = math.cos(latitude_rad)
         place = np.array(
-            [cos_latitude * math.cos(longitude_rad), cos_latitude * math.sin(longitude_rad), math.sin(latitude_rad)]
+            [
+                cos_latitude * math.cos(longitude_rad),
+                cos_latitude * math.sin(longitude_rad),
+                math.sin(latitude_rad),
+            ]
         )
         chord = np.linalg.norm(unit[candidates] - place, axis=-1)
         return np.asarray(candidates[chord <= 2.0 * math.sin(min(arc, math.pi) / 2.0)])
 
     @cached_property
     def _index(self) -> tuple[FloatArray, IntArray, FloatArray]:
-        """Return sort keys (latitude band, then longitude), the order of the craters in them, and unit vectors."""
+        """Return sort keys (latitude band, then longitude), the craters in that order, and unit vectors."""
         bands = np.floor((self.latitude_rad + math.pi / 2) / BAND_RAD)
         key = bands * TWO_PI + np.mod(self.longitude_rad, TWO_PI)
         order = np.argsort(key, kind="stable").astype(np.int64)
@@ -136,6 +143,7 @@ def size_class(diameter_m: ArrayLike) -> NDArray[np.int8]:
     """Return 0 for 5-10 km, 1 for 10-15 km, 2 for 15-30 km, 3 for 3-5 km (navigation only), -1 otherwise."""
     diameter = np.asarray(diameter_m, dtype=np.float64)
     edges = np.array([NAVIGATION_MINIMUM_M, *CLASS_LIMITS_M])
+    edges[-1] = np.nextafter(edges[-1], np.inf)
     classes = np.array([-1, NAVIGATION_CLASS, 0, 1, 2, -1], dtype=np.int8)
     # NaN sorts last, into the class of what is too large: -1.
     return np.asarray(classes[np.searchsorted(edges, diameter, side="right")])
@@ -158,7 +166,7 @@ def make_catalogue(
     depth_m: ArrayLike | None = None,
     complete: ArrayLike | bool = True,
 ) -> CraterCatalogue:
-    """Return a catalogue of arrays (n,), with numbered ids and NaN heights and depths where none are given."""
+    """Return a catalogue of arrays (n,), with running ids and NaN heights and depths where none are given."""
     latitude = np.asarray(latitude_rad, dtype=np.float64)
     n = len(latitude)
     unknown = np.full(n, np.nan)
@@ -196,9 +204,9 @@ def paper_density_catalogue(seed: int) -> CraterCatalogue:
 def load_catalogue(path: Path | str) -> CraterCatalogue:
     """Return the craters of a CSV file (plain or gzip), recognised by its columns.
 
-    Known are LU1319381 (``longitude_deg, latitude_deg, diameter_m, depth_m``), the composite of several sources
-    (``diameter_km, source, tile_complete``), Robbins (``lat, lon, diam`` in km) and our own.  Exact repetitions of a
-    crater are kept once.
+    Known are LU1319381 (``longitude_deg, latitude_deg, diameter_m, depth_m``), the composite of several
+    sources (``diameter_km, source, tile_complete``), Robbins (``lat, lon, diam`` in km) and our own.  Exact
+    repetitions of a crater are kept once.
 
     Raises
     ------
@@ -214,7 +222,9 @@ def load_catalogue(path: Path | str) -> CraterCatalogue:
             _check_ranges(path, catalogue)
             return _without_repetitions(catalogue)
     known = "; ".join(", ".join(sorted(needed)) for _, needed in _READERS)
-    raise DataFileError(path, "line 1", f"the columns of a crater catalogue ({known})", ", ".join(columns) or "nothing")
+    raise DataFileError(
+        path, "line 1", f"the columns of a crater catalogue ({known})", ", ".join(columns) or "nothing"
+    )
 
 
 def save_catalogue(catalogue: CraterCatalogue, path: Path | str) -> None:
@@ -223,7 +233,7 @@ def save_catalogue(catalogue: CraterCatalogue, path: Path | str) -> None:
 
 
 def format_catalogue(catalogue: CraterCatalogue) -> str:
-    """Return our own CSV text; angles to 1e-9 deg (30 um on the ground), lengths to 1 mm, unknown values empty."""
+    """Return our own CSV text; angles to 1e-9 deg (30 um on the ground), lengths to 1 mm, unknown empty."""
     rows = zip(
         catalogue.ids.tolist(),
         np.degrees(catalogue.latitude_rad).tolist(),
@@ -255,20 +265,31 @@ def _read_columns(path: Path) -> dict[str, list[str]]:
         octets = path.read_bytes()
         if octets[:2] == b"\x1f\x8b":
             octets = gzip.decompress(octets)
-        rows = list(csv.reader(io.StringIO(octets.decode("utf-8-sig"))))
+        text = octets.decode("utf-8-sig")
+        lines = text.split("\n") if '"' not in text else None
+        rows = list(csv.reader(io.StringIO(text))) if lines is None else []
     except OSError as error:
         found = error.strerror or str(error)
         raise DataFileError(path, "", "a crater catalogue in CSV, plain or gzip", found) from None
-    except (EOFError, ValueError, csv.Error) as error:
+    except (EOFError, ValueError, csv.Error, zlib.error) as error:
         raise DataFileError(path, "", "a whole CSV or gzip file", str(error)) from None
-    rows = [row for row in rows if row]
-    if not rows:
+    if lines is not None:
+        # Without quotes a plain split does, five times quicker than the csv module.
+        lines = [line for line in text.replace("\r", "").split("\n") if line]
+        header = lines[0].split(",") if lines else []
+        widths = [line.count(",") + 1 for line in lines]
+        flat = ",".join(lines[1:]).split(",") if len(lines) > 1 else []
+    else:
+        rows = [row for row in rows if row]
+        header = rows[0]
+        widths = [len(row) for row in rows]
+        flat = [value for row in rows[1:] for value in row]
+    if not header:
         raise DataFileError(path, "line 1", "the column names of a crater catalogue", "an empty file")
-    header = [name.strip() for name in rows[0]]
-    for number, row in enumerate(rows[1:], start=2):
-        if len(row) != len(header):
-            raise DataFileError(path, f"line {number}", f"{len(header)} values", f"{len(row)}")
-    return dict(zip(header, map(list, zip(*rows[1:], strict=True)) if len(rows) > 1 else [[]] * len(header), strict=True))
+    for number, width in enumerate(widths, start=1):
+        if width != len(header):
+            raise DataFileError(path, f"line {number}", f"{len(header)} values", f"{width}")
+    return {name.strip(): flat[k :: len(header)] for k, name in enumerate(header)}
 
 
 def _numbers(path: Path, columns: dict[str, list[str]], name: str, missing: bool = False) -> FloatArray:
@@ -276,7 +297,7 @@ def _numbers(path: Path, columns: dict[str, list[str]], name: str, missing: bool
     if missing:
         texts = [text if text.strip() else "nan" for text in texts]
     try:
-        return np.array(texts, dtype=np.float64)
+        return np.array([float(text) for text in texts], dtype=np.float64)
     except ValueError:
         for number, text in enumerate(texts, start=2):
             try:
@@ -344,7 +365,11 @@ _READERS: tuple[tuple[Reader, set[str]], ...] = (
 
 def _check_ranges(path: Path, catalogue: CraterCatalogue) -> None:
     checks = (
-        (np.abs(catalogue.latitude_rad) <= math.pi / 2 + 1e-12, "a latitude of -90..90 deg", catalogue.latitude_rad),
+        (
+            np.abs(catalogue.latitude_rad) <= math.pi / 2 + 1e-12,
+            "a latitude of -90..90 deg",
+            catalogue.latitude_rad,
+        ),
         (np.isfinite(catalogue.longitude_rad), "a longitude", catalogue.longitude_rad),
         (catalogue.diameter_m > 0.0, "a diameter above 0", catalogue.diameter_m),
     )
@@ -358,6 +383,10 @@ def _check_ranges(path: Path, catalogue: CraterCatalogue) -> None:
 def _without_repetitions(catalogue: CraterCatalogue) -> CraterCatalogue:
     if len(catalogue) == 0:
         return catalogue
-    rows = np.column_stack([catalogue.latitude_rad, catalogue.longitude_rad, catalogue.diameter_m])
-    _, first = np.unique(rows, axis=0, return_index=True)
-    return catalogue if len(first) == len(catalogue) else catalogue.select(np.sort(first))
+    columns = (catalogue.diameter_m, catalogue.longitude_rad, catalogue.latitude_rad)
+    order = np.lexsort(columns)
+    same = np.ones(len(order) - 1, dtype=np.bool_)
+    for column in columns:
+        same &= np.diff(column[order]) == 0.0
+    # The sort is stable, so the first of equal rows stays.
+    return catalogue.select(np.delete(np.arange(len(order)), order[1:][same])) if np.any(same) else catalogue

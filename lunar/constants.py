@@ -8,7 +8,7 @@ MOON_RADIUS_M = 1_737_400.0
 """Radius of the sphere that lunar maps, height models and altitudes refer to (IAU WGCCRE 2009 and 2015)."""
 
 GM_MOON_M3_S2 = 4.902_800_066e12
-"""Gravitational parameter of the Moon (JPL DE430 and DE431; Folkner et al. 2014, IPN Progress Report 42-196, table 8)."""
+"""Gravitational parameter of the Moon (JPL DE430 and DE431; Folkner et al. 2014, IPN PR 42-196)."""
 
 GM_EARTH_M3_S2 = 3.986_004_354_36e14
 """Gravitational parameter of the Earth (JPL DE430 and DE431, TDB-compatible)."""
@@ -32,7 +32,7 @@ SPEED_OF_LIGHT_M_S = 299_792_458.0
 """Speed of light in vacuum (SI, exact)."""
 
 SOLAR_PRESSURE_1AU_N_M2 = 1361.0 / SPEED_OF_LIGHT_M_S
-"""Radiation pressure of sunlight at 1 au (nominal total solar irradiance 1361 W/m2, IAU 2015 resolution B3)."""
+"""Radiation pressure of sunlight at 1 au (nominal irradiance 1361 W/m2, IAU 2015 resolution B3)."""
 
 SECONDS_PER_DAY = 86_400.0
 NANOSECONDS_PER_SECOND = 1_000_000_000

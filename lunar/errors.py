@@ -5,6 +5,7 @@ LunarError
 ├── TimeFormatError          a text is not a UTC epoch
 ├── UnknownTimeSystemError   a time scale that cannot be converted
 ├── UnknownFrameError        a reference frame or centre that cannot be converted
+├── EphemerisError           states that form no ephemeris, or that a file format cannot hold
 ├── EphemerisCoverageError   an epoch outside the span of an ephemeris or orientation, or inside a gap of it
 └── OrbitError               elements or states that are no orbit about the Moon
     └── ImpactError          the orbit meets the ground, with epoch and place
@@ -22,7 +23,7 @@ class LunarError(Exception):
 
 
 class DataFileError(LunarError):
-    """A data file that cannot be used: which file, the place in it, what was expected there and what was found."""
+    """A data file that cannot be used: which file, where in it, what was expected and found."""
 
     def __init__(self, path: Path | str, where: str, expected: str, found: str) -> None:
         self.path = path
@@ -59,13 +60,19 @@ class UnknownFrameError(LunarError):
         super().__init__(f"{prefix}expected a reference frame out of {', '.join(known)}, found {name!r}")
 
 
+class EphemerisError(LunarError):
+    """States that form no ephemeris, or that a file format cannot hold."""
+
+
 class EphemerisCoverageError(LunarError):
     """An epoch at which nothing is known: outside the covered span, or in a gap between segments."""
 
     def __init__(self, requested: str, covered: str, what: str = "ephemeris") -> None:
         self.requested = requested
         self.covered = covered
-        super().__init__(f"{what}: expected an epoch within {covered}, found {requested}; nothing is extrapolated")
+        super().__init__(
+            f"{what}: expected an epoch within {covered}, found {requested}; nothing is extrapolated"
+        )
 
 
 class OrbitError(LunarError):
@@ -82,6 +89,7 @@ class ImpactError(OrbitError):
         self.latitude_rad = latitude_rad
         self.longitude_rad = longitude_rad
         super().__init__(
-            f"the orbit hits the Moon at {format_utc(utc_ns)}, latitude {math.degrees(latitude_rad):.3f} deg, "
+            f"the orbit hits the Moon at {format_utc(utc_ns)}, "
+            f"latitude {math.degrees(latitude_rad):.3f} deg, "
             f"longitude {math.degrees(longitude_rad) % 360.0:.3f} deg E"
         )

@@ -1,16 +1,18 @@
 """Rotations between the frames of the Moon, the local frames of an orbiter, and quaternions.
 
-All rotations are target-from-source matrices, shape ``(..., 3, 3)``: ``position_mcmf = mcmf_from_icrf @ position_icrf``.
+All rotations are target-from-source matrices, shape ``(..., 3, 3)``: ``position_mcmf = mcmf_from_icrf @
+position_icrf``.
 
 ICRF   axes of the International Celestial Reference Frame, origin at the centre of the Moon here; inertial
-MCI    Moon's equator and node of date at a stated epoch (IAU pole), held inertial; orbital elements are read in it
-MCMF   mean-Earth/polar-axis (ME) axes, fixed to the Moon: maps, height models, crater catalogues
-PA     principal axes of the Moon's inertia, fixed to the Moon: gravity fields.  About 0.9 km from ME on the ground
-ENU    east, north, up at a place on the sphere
-RTN    radial, along-track (transverse), cross-track (normal) of an orbit
+MCI    Moon's equator and node of date at a stated epoch (IAU pole), held inertial; orbital elements are read
+in it MCMF   mean-Earth/polar-axis (ME) axes, fixed to the Moon: maps, height models, crater catalogues PA
+principal axes of the Moon's inertia, fixed to the Moon: gravity fields.  About 0.9 km from ME on the ground
+ENU    east, north, up at a place on the sphere RTN    radial, along-track (transverse), cross-track (normal)
+of an orbit
 
-The orientation of the Moon comes from `IauOrientation` (series, no file) or `De421Orientation` (binary PCK file).  They
-differ by up to some hundred metres on the ground, because the IAU series holds no physical libration beyond its terms.
+The orientation of the Moon comes from `IauOrientation` (series, no file) or `De421Orientation` (binary PCK
+file).  They differ by up to some hundred metres on the ground, because the IAU series holds no physical
+libration beyond its terms.
 
 References
 ----------
@@ -21,6 +23,7 @@ Williams, Boggs, Folkner 2008, JPL IOM 335-JW,DB,WF-20080314-001: DE421 lunar or
 from __future__ import annotations
 
 import re
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -37,10 +40,25 @@ ARCSECOND_RAD = np.pi / 648_000.0
 DAY_S = 86_400.0
 CENTURY_S = 36_525.0 * DAY_S
 
-# WGCCRE 2009: E1..E13 in degrees at J2000 and degrees per day, then their coefficients in right ascension (sine) and
+# WGCCRE 2009: E1..E13 in degrees at J2000 and degrees per day, then their coefficients in right ascension
+# (sine) and
 # declination (cosine) of the pole and in the prime meridian (sine), in degrees.
 _E_DEG = np.array(
-    [125.045, 250.089, 260.008, 176.625, 357.529, 311.589, 134.963, 276.617, 34.226, 15.134, 119.743, 239.961, 25.053]
+    [
+        125.045,
+        250.089,
+        260.008,
+        176.625,
+        357.529,
+        311.589,
+        134.963,
+        276.617,
+        34.226,
+        15.134,
+        119.743,
+        239.961,
+        25.053,
+    ]
 )
 _E_RATE_DEG_DAY = np.array(
     [
@@ -58,11 +76,20 @@ _MERIDIAN_DEG = np.array(
 )
 
 DE421_PA_FROM_ME_ARCSECONDS = (67.92, 78.56, 0.30)
-"""Turns about z, y and x that lead from mean-Earth to DE421 principal axes: R_z(67.92") R_y(78.56") R_x(0.30")."""
+"""From mean-Earth to DE421 principal axes: R_z(67.92") R_y(78.56") R_x(0.30")."""
+
+
+_PCK_EXPECTED = "a binary PCK kernel (DAF/PCK)"
+_DAF_RECORD = 1024
+
+
+ICRF_NAMES = ("ICRF", "ICRF1", "ICRF2", "ICRF3", "GCRF")
+J2000_NAMES = ("EME2000", "J2000")
+"""Names of inertial axes in ephemeris files."""
 
 
 class Orientation(Protocol):
-    """Orientation of the Moon in ICRF; ``tdb_s`` may have any shape ``(...)``, the answer has ``(..., 3, 3)``."""
+    """Orientation of the Moon in ICRF: ``tdb_s`` of any shape ``(...)`` gives ``(..., 3, 3)``."""
 
     @property
     def name(self) -> str: ...
@@ -74,7 +101,7 @@ class Orientation(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class IauOrientation:
-    """The IAU WGCCRE 2009 series for the mean-Earth frame; principal axes follow by the constant DE421 rotation."""
+    """The IAU WGCCRE 2009 series for the mean-Earth frame; principal axes by the constant DE421 rotation."""
 
     name: str = "IAU WGCCRE 2009"
 
@@ -88,7 +115,7 @@ class IauOrientation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class De421Orientation:
-    """Orientation integrated by JPL: Chebyshev series of three Euler angles, and the constant turn to mean-Earth.
+    """Orientation integrated by JPL: Chebyshev series of three Euler angles, and a constant turn to ME.
 
     ``coefficients`` has the shape (records, 3, terms): the angles phi, theta, psi in rad of
     R_z(psi) R_x(theta) R_z(phi), each record spanning ``record_s`` seconds of TDB from ``start_tdb_s`` on.
@@ -138,7 +165,7 @@ class De421Orientation:
 
 
 def iau_pole_and_meridian_rad(tdb_s: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return right ascension and declination of the Moon's pole and its prime meridian W in rad, each ``(...)``."""
+    """Return right ascension and declination of the Moon's pole and the prime meridian W, rad, ``(...)``."""
     seconds = np.asarray(tdb_s, dtype=np.float64)
     days = seconds / DAY_S
     centuries = seconds / CENTURY_S
@@ -169,39 +196,38 @@ def load_orientation(bpc_path: Path | str, tf_path: Path | str | None = None) ->
     DataFileError
         Where a file is missing, is no binary PCK of type 2 in ICRF axes, is cut short, or lacks the rotation.
     """
-    from jplephem.daf import DAF
-
     path = Path(bpc_path)
-    expected = "a binary PCK kernel (DAF/PCK) with one type 2 segment"
     try:
-        with path.open("rb") as stream:
-            daf = DAF(stream)
-            if daf.locidw.strip() != b"DAF/PCK":
-                raise DataFileError(path, "file header", expected, repr(daf.locidw.decode("latin-1")))
-            summaries = [values for _, values in daf.summaries()]
-            if len(summaries) != 1 or int(summaries[0][3]) != 1 or int(summaries[0][4]) != 2:
-                found = f"{len(summaries)} segments" if len(summaries) != 1 else f"descriptor {summaries[0][2:5]}"
-                raise DataFileError(path, "segment summary", expected, found)
-            frame, first, last = (int(summaries[0][k]) for k in (2, 5, 6))
-            start, record_s, words, count = (float(v) for v in daf.read_array(last - 3, last))
-            values = np.array(daf.read_array(first, last - 4), dtype=np.float64)
+        octets = path.read_bytes()
     except OSError as error:
-        raise DataFileError(path, "", expected, error.strerror or str(error)) from None
-    except (ValueError, IndexError, UnicodeDecodeError) as error:
-        raise DataFileError(path, "file structure", expected, f"{error}") from None
-    except Exception as error:
-        # jplephem lets struct.error and its own classes through on damaged files; none of them is a fault of ours.
-        if isinstance(error, DataFileError):
-            raise
-        raise DataFileError(path, "file structure", expected, f"{type(error).__name__}: {error}") from None
-    if values.size != int(words) * int(count) or int(words) < 5 or (int(words) - 2) % 3:
-        raise DataFileError(path, "coefficients", f"{int(count)} records of {int(words)} words", f"{values.size} words")
+        raise DataFileError(path, "", _PCK_EXPECTED, error.strerror or str(error)) from None
+    frame, words = _pck_segment(path, octets)
+    start, record_s, record_words, record_count = (float(v) for v in words[-4:])
+    values = words[:-4]
+    if (
+        values.size != int(record_words) * int(record_count)
+        or record_words < 5
+        or (int(record_words) - 2) % 3
+    ):
+        expected = f"{record_count:.0f} records of {record_words:.0f} words"
+        raise DataFileError(path, "coefficients", expected, f"{values.size} words")
     if not np.all(np.isfinite(values)):
         raise DataFileError(path, "coefficients", "finite numbers", "not-a-number values")
-    coefficients = values.reshape(int(count), int(words))[:, 2:].reshape(int(count), 3, (int(words) - 2) // 3)
+    records = values.reshape(int(record_count), int(record_words))
+    # Each record starts with its own middle and half-length, which the directory already gives.
+    coefficients = records[:, 2:].reshape(len(records), 3, -1)
     me_from_pa = PA_FROM_ME_DE421.T if tf_path is None else _me_from_pa_of_kernel(Path(tf_path), frame)
     name = "DE421" if frame == 31006 else f"binary PCK frame {frame}"
     return De421Orientation(start, record_s, np.ascontiguousarray(coefficients), me_from_pa, name)
+
+
+def icrf_from_j2000() -> FloatArray:
+    """Return the constant frame bias from mean equator and equinox of J2000 (EME2000), (3, 3); 23 mas.
+
+    IERS Conventions 2010, section 5.4.4: xi0 = -16.617 mas, eta0 = -6.8192 mas, dalpha0 = -14.6 mas.
+    """
+    xi, eta, alpha = (v * 1e-3 * ARCSECOND_RAD for v in (-16.6170, -6.8192, -14.6))
+    return np.asarray((axis_rotation(1, -eta) @ axis_rotation(2, xi) @ axis_rotation(3, alpha)).T)
 
 
 def zxz_rotation(first_rad: ArrayLike, second_rad: ArrayLike, third_rad: ArrayLike) -> FloatArray:
@@ -239,7 +265,7 @@ def enu_from_mcmf(latitude_rad: ArrayLike, longitude_rad: ArrayLike) -> FloatArr
 
 
 def rtn_from_inertial(position_m: ArrayLike, velocity_m_s: ArrayLike) -> FloatArray:
-    """Return the rotation to radial, transverse, normal axes of states ``(..., 3)``, shape ``(..., 3, 3)``."""
+    """Return the rotation ``(..., 3, 3)`` to radial, transverse, normal axes of states ``(..., 3)``."""
     position = np.asarray(position_m, dtype=np.float64)
     radial = position / np.linalg.norm(position, axis=-1, keepdims=True)
     momentum = np.cross(position, np.asarray(velocity_m_s, dtype=np.float64))
@@ -248,14 +274,16 @@ def rtn_from_inertial(position_m: ArrayLike, velocity_m_s: ArrayLike) -> FloatAr
 
 
 def spherical_from_mcmf(position_mcmf_m: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return latitude and east longitude (-pi..pi) in rad and altitude above `MOON_RADIUS_M` in m, each ``(...)``."""
+    """Return latitude, east longitude (-pi..pi) in rad and altitude above `MOON_RADIUS_M` in m, ``(...)``."""
     position = np.asarray(position_mcmf_m, dtype=np.float64)
     x, y, z = position[..., 0], position[..., 1], position[..., 2]
     equatorial = np.hypot(x, y)
     return np.arctan2(z, equatorial), np.arctan2(y, x), np.asarray(np.hypot(equatorial, z) - MOON_RADIUS_M)
 
 
-def mcmf_from_spherical(latitude_rad: ArrayLike, longitude_rad: ArrayLike, altitude_m: ArrayLike = 0.0) -> FloatArray:
+def mcmf_from_spherical(
+    latitude_rad: ArrayLike, longitude_rad: ArrayLike, altitude_m: ArrayLike = 0.0
+) -> FloatArray:
     """Return positions in m, shape ``(..., 3)``, of places at altitudes above `MOON_RADIUS_M`."""
     latitude, longitude, altitude = np.broadcast_arrays(
         np.asarray(latitude_rad, dtype=np.float64),
@@ -291,7 +319,8 @@ def quaternion_from_matrix(matrix: ArrayLike) -> FloatArray:
     m00, m01, m02 = m[..., 0, 0], m[..., 0, 1], m[..., 0, 2]
     m10, m11, m12 = m[..., 1, 0], m[..., 1, 1], m[..., 1, 2]
     m20, m21, m22 = m[..., 2, 0], m[..., 2, 1], m[..., 2, 2]
-    # Rows are 4 q_i q: four expressions of the same quaternion, of which the one with the largest part is well scaled.
+    # Rows are 4 q_i q: four expressions of the same quaternion, of which the one with the largest part is
+    # well scaled.
     candidates = _stack_rows(
         [
             [1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01],
@@ -311,7 +340,7 @@ def _stack_rows(rows: list[list[Any]]) -> FloatArray:
 
 
 def _me_from_pa_of_kernel(path: Path, pa_frame: int) -> FloatArray:
-    """Return the mean-Earth from principal-axes rotation that a text frame kernel defines relative to ``pa_frame``."""
+    """Return the mean-Earth from principal-axes rotation of a text frame kernel, relative to ``pa_frame``."""
     try:
         text = path.read_text(encoding="ascii", errors="replace")
     except OSError as error:
@@ -333,12 +362,41 @@ def _me_from_pa_of_kernel(path: Path, pa_frame: int) -> FloatArray:
             break
         if scale is None or len(angles) != 3 or len(axes) != 3 or not set(axes) <= {1, 2, 3}:
             break
-        # The frame kernel's rule: turns in the order printed lead from this frame to the one it is relative to.
+        # The frame kernel's rule: turns in the order printed lead from this frame to the one it is relative
+        # to.
         turns = [axis_rotation(axis, angle * scale) for axis, angle in zip(axes, angles, strict=True)]
         return np.ascontiguousarray((turns[0] @ turns[1] @ turns[2]).T)
     raise DataFileError(
-        path, "frame specifications", f"three angles of a mean-Earth frame relative to frame {pa_frame}", "none"
+        path,
+        "frame specifications",
+        f"three angles of a mean-Earth frame relative to frame {pa_frame}",
+        "none",
     )
+
+
+def _pck_segment(path: Path, octets: bytes) -> tuple[int, FloatArray]:
+    """Return frame class id and words of the one type 2 segment of a binary PCK (NAIF DAF required reading)."""
+    order = {b"LTL-IEEE": "<", b"BIG-IEEE": ">"}.get(octets[88:96], "")
+    if octets[:7] != b"DAF/PCK" or not order:
+        raise DataFileError(path, "file header", _PCK_EXPECTED, repr(octets[:8].decode("latin-1")))
+    if len(octets) < 3 * _DAF_RECORD:
+        raise DataFileError(path, "summary record", f"at least {3 * _DAF_RECORD} octets", f"{len(octets)}")
+    nd, ni = struct.unpack_from(order + "2i", octets, 8)
+    (first_summary,) = struct.unpack_from(order + "i", octets, 76)
+    at = (first_summary - 1) * _DAF_RECORD
+    if (nd, ni) != (2, 5) or not 0 < at <= len(octets) - _DAF_RECORD:
+        raise DataFileError(
+            path, "file header", "ND = 2, NI = 5 and a summary record", f"ND = {nd}, NI = {ni}"
+        )
+    following, _, count = struct.unpack_from(order + "3d", octets, at)
+    frame, axes, kind, first, last = struct.unpack_from(order + "5i", octets, at + 24 + 16)
+    if count != 1 or following != 0 or axes != 1 or kind != 2:
+        found = f"{count:.0f} segments, the first of type {kind} in frame {axes}"
+        raise DataFileError(path, "segment summary", "one segment of type 2 in frame 1 (J2000)", found)
+    if not 1 <= first <= last - 4 or 8 * last > len(octets):
+        raise DataFileError(path, "coefficients", f"{8 * last} octets in the file", f"{len(octets)}")
+    words = np.frombuffer(octets, dtype=order + "f8", count=last - first + 1, offset=8 * (first - 1))
+    return frame, words.astype(np.float64)
 
 
 def _kernel_values(text: str) -> list[str]:

@@ -1,17 +1,18 @@
 """UTC, TAI, TDB and the on-board clock.
 
-``utc_ns`` is a count of nanoseconds since 1970-01-01T00:00:00 UTC in days of 86,400 s (the POSIX count): an ``int`` or
-an int64 array.  It repeats itself during a leap second.  ``tai_ns`` counts nanoseconds since 1970-01-01T00:00:00 TAI.
-``tdb_s`` is a float64 of TDB seconds past J2000 (2000-01-01T12:00:00 TDB), good to 0.1 us in this century, for dynamics
-and frames only.  ``ticks`` counts units of 2^-16 s since the on-board epoch 2000-01-01T00:00:00 TAI.
+``utc_ns`` is a count of nanoseconds since 1970-01-01T00:00:00 UTC in days of 86,400 s (the POSIX count): an
+``int`` or an int64 array.  It repeats itself during a leap second.  ``tai_ns`` counts nanoseconds since
+1970-01-01T00:00:00 TAI. ``tdb_s`` is a float64 of TDB seconds past J2000 (2000-01-01T12:00:00 TDB), good to
+0.1 us in this century, for dynamics and frames only.  ``ticks`` counts units of 2^-16 s since the on-board
+epoch 2000-01-01T00:00:00 TAI.
 
 Every conversion takes a number and gives a number, or an array and gives an array of the same shape.
 
 References
 ----------
-Leap seconds: IERS Bulletin C; none is announced after 2017-01-01, and later epochs use 37 s.  Before 1972 UTC was not
-kept in whole seconds of TAI; those epochs use 10 s.
-TDB - TT: Kaplan 2005, USNO Circular 179, equation 2.6 (good to 10 us from 1600 to 2200).
+Leap seconds: IERS Bulletin C; none is announced after 2017-01-01, and later epochs use 37 s.  Before 1972 UTC
+was not kept in whole seconds of TAI; those epochs use 10 s. TDB - TT: Kaplan 2005, USNO Circular 179,
+equation 2.6 (good to 10 us from 1600 to 2200).
 """
 
 from __future__ import annotations
@@ -32,17 +33,25 @@ NS = 1_000_000_000
 TT_MINUS_TAI_NS = 32_184_000_000
 TICKS_PER_SECOND = 65_536
 
+TIME_SYSTEMS = ("UTC", "TAI", "TT", "TDB", "GPS")
+"""Time scales that ephemeris files may use."""
+
+_COUNT_MINUS_TAI_NS = {"TAI": 0, "TT": TT_MINUS_TAI_NS, "TDB": TT_MINUS_TAI_NS, "GPS": -19 * NS}
+
 J2000_TT_AS_UTC_COUNT_NS = 946_728_000 * NS
 """2000-01-01T12:00:00 as a count of 86,400 s days since 1970, in whatever scale it is read."""
 
 ONBOARD_EPOCH_TAI_NS = 946_684_800 * NS
 """2000-01-01T00:00:00 TAI, counted since 1970-01-01T00:00:00 TAI."""
 
-_LEAP_DATES = (
-    "1972-01-01 1972-07-01 1973-01-01 1974-01-01 1975-01-01 1976-01-01 1977-01-01 1978-01-01 1979-01-01 1980-01-01 "
-    "1981-07-01 1982-07-01 1983-07-01 1985-07-01 1988-01-01 1990-01-01 1991-01-01 1992-07-01 1993-07-01 1994-07-01 "
-    "1996-01-01 1997-07-01 1999-01-01 2006-01-01 2009-01-01 2012-07-01 2015-07-01 2017-01-01"
-).split()
+# fmt: off
+_LEAP_DATES = [
+    "1972-01-01", "1972-07-01", "1973-01-01", "1974-01-01", "1975-01-01", "1976-01-01", "1977-01-01",
+    "1978-01-01", "1979-01-01", "1980-01-01", "1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01",
+    "1988-01-01", "1990-01-01", "1991-01-01", "1992-07-01", "1993-07-01", "1994-07-01", "1996-01-01",
+    "1997-07-01", "1999-01-01", "2006-01-01", "2009-01-01", "2012-07-01", "2015-07-01", "2017-01-01",
+]
+# fmt: on
 _LEAP_UTC_NS: IntArray = np.array(_LEAP_DATES, dtype="datetime64[ns]").astype(np.int64)
 _TAI_MINUS_UTC_NS: IntArray = (10 + np.arange(len(_LEAP_DATES), dtype=np.int64)) * NS
 _LEAP_TAI_NS: IntArray = _LEAP_UTC_NS + _TAI_MINUS_UTC_NS
@@ -60,16 +69,17 @@ _TDB_TERMS = np.array(
 )
 
 _ISO = re.compile(
-    r"(\d{4})-(?:(\d{2})-(\d{2})|(\d{3}))(?:[T ](\d{2}):(\d{2})(?::(\d{2})(?:\.(\d*))?)?)?(?:Z|\+00:00)?\Z", re.ASCII
+    r"(\d{4})-(?:(\d{2})-(\d{2})|(\d{3}))(?:[T ](\d{2}):(\d{2})(?::(\d{2})(?:\.(\d*))?)?)?(?:Z|\+00:00)?\Z",
+    re.ASCII,
 )
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def parse_utc(text: str) -> int:
-    """Return ``utc_ns`` of a text like ``2029-08-07T00:00:00.000Z`` or ``2029-219T00:00:00`` (year and day of year).
+    """Return ``utc_ns`` of a text like ``2029-08-07T00:00:00.000Z`` or ``2029-219T00:00:00`` (day of year).
 
-    The time of day and the ``Z`` may be absent; a second 60 counts as the first of the next minute; digits past the
-    nanosecond are dropped.
+    The time of day and the ``Z`` may be absent; a second 60 counts as the first of the next minute; digits
+    past the nanosecond are dropped.
 
     Raises
     ------
@@ -97,7 +107,7 @@ def parse_utc(text: str) -> int:
 
 
 def format_utc(utc_ns: int, digits: int = 3) -> str:
-    """Return the ISO 8601 text of an epoch, rounded to ``digits`` (0 to 9) decimals of a second, ending in ``Z``."""
+    """Return the ISO 8601 text of an epoch, rounded to ``digits`` (0 to 9) decimals, with ``Z``."""
     step = 10 ** (9 - digits)
     whole, rest = divmod((int(utc_ns) + step // 2) // step * step, NS)
     fraction = f".{rest // step:0{digits}d}" if digits else ""
@@ -122,7 +132,8 @@ def utc_ns_from_tai_ns(tai_ns: IntArray) -> IntArray: ...
 def utc_ns_from_tai_ns(tai_ns: Any) -> Any:
     """Return ``utc_ns``; the leap second itself gives the counts of the second after it."""
     counts = np.asarray(tai_ns, dtype=np.int64)
-    # A leap second starts one second before the new offset holds, and is counted like the first second after it.
+    # A leap second starts one second before the new offset holds, and is counted like the first second after
+    # it.
     index = np.searchsorted(_LEAP_TAI_NS, counts, side="right") - 1
     return _as_given(counts - _TAI_MINUS_UTC_NS[np.maximum(index, 0)], int)
 
@@ -158,7 +169,32 @@ def tdb_minus_tt_s(tt_s: FloatArray | float) -> FloatArray:
     centuries = np.asarray(tt_s, dtype=np.float64) / (36_525.0 * 86_400.0)
     amplitude, rate, phase = _TDB_TERMS.T
     periodic = np.sum(amplitude * np.sin(rate * centuries[..., None] + phase), axis=-1)
-    return np.asarray(periodic + 0.000010 * centuries * np.sin(628.3076 * centuries + 4.2490), dtype=np.float64)
+    return np.asarray(
+        periodic + 0.000010 * centuries * np.sin(628.3076 * centuries + 4.2490), dtype=np.float64
+    )
+
+
+def to_utc_ns(counts: Any, time_system: str) -> Any:
+    """Return ``utc_ns`` of calendar counts (ns of 86,400 s days since 1970) read in one of `TIME_SYSTEMS`."""
+    values = np.asarray(counts, dtype=np.int64)
+    if time_system == "UTC":
+        return _as_given(values, int)
+    if time_system == "TDB":
+        tdb_s = (values - J2000_TT_AS_UTC_COUNT_NS) / NS
+        values = values - np.rint(tdb_minus_tt_s(tdb_s) * NS).astype(np.int64)
+    return _as_given(np.asarray(utc_ns_from_tai_ns(values - _COUNT_MINUS_TAI_NS[time_system])), int)
+
+
+def from_utc_ns(utc_ns: Any, time_system: str) -> Any:
+    """Return calendar counts (ns of 86,400 s days since 1970) in one of `TIME_SYSTEMS` at ``utc_ns``."""
+    values = np.asarray(utc_ns, dtype=np.int64)
+    if time_system == "UTC":
+        return _as_given(values, int)
+    counts = np.asarray(tai_ns_from_utc_ns(values)) + _COUNT_MINUS_TAI_NS[time_system]
+    if time_system == "TDB":
+        tt_s = (counts - J2000_TT_AS_UTC_COUNT_NS) / NS
+        counts = counts + np.rint(tdb_minus_tt_s(tt_s) * NS).astype(np.int64)
+    return _as_given(counts, int)
 
 
 @overload

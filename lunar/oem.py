@@ -1,0 +1,458 @@
+"""CCSDS Orbit Ephemeris Message in keyword notation: reads versions 1.0, 2.0 and 3.0, writes 2.0.
+
+Files are Moon-centred, in km and km/s.  States come out in ICRF axes, m and m/s; a file in EME2000 (J2000)
+axes is turned by the constant frame bias.  Covariances keep their own frame and come out in m and m/s.
+Accelerations, where a file has them, are not used.
+
+References
+----------
+CCSDS 502.0-B-1 (2004), 502.0-B-2 (2009) and 502.0-B-3 (2023), Orbit Data Messages, section 5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lunar.ephemeris import (
+    INTERPOLATIONS,
+    Covariance,
+    Ephemeris,
+    EphemerisSegment,
+    read_text,
+)
+from lunar.errors import DataFileError, TimeFormatError, UnknownFrameError, UnknownTimeSystemError
+from lunar.frames import ICRF_NAMES, J2000_NAMES, icrf_from_j2000
+from lunar.timescales import NS, TIME_SYSTEMS, format_utc, from_utc_ns, parse_utc, to_utc_ns
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+VERSIONS = ("1.0", "2.0", "3.0")
+CENTRES = ("MOON",)
+
+_HEADER_KEYS = ("CCSDS_OEM_VERS", "CLASSIFICATION", "CREATION_DATE", "ORIGINATOR", "MESSAGE_ID")
+_MANDATORY = (
+    "OBJECT_NAME",
+    "OBJECT_ID",
+    "CENTER_NAME",
+    "REF_FRAME",
+    "TIME_SYSTEM",
+    "START_TIME",
+    "STOP_TIME",
+)
+_META_KEYS = (
+    *_MANDATORY,
+    "REF_FRAME_EPOCH",
+    "USEABLE_START_TIME",
+    "USEABLE_STOP_TIME",
+    "INTERPOLATION",
+    "INTERPOLATION_DEGREE",
+)
+_LOWER = np.tril_indices(6)
+
+
+def load_oem(path: Path | str) -> Ephemeris:
+    """Return the ephemeris in an OEM file; raises as `parse_oem`."""
+    return parse_oem(read_text(path, "a CCSDS OEM"), source=str(path))
+
+
+def save_oem(
+    ephemeris: Ephemeris,
+    path: Path | str,
+    *,
+    time_system: str | None = None,
+    creation_utc_ns: int | None = None,
+) -> None:
+    """Write an OEM 2.0 file."""
+    text = format_oem(ephemeris, time_system=time_system, creation_utc_ns=creation_utc_ns)
+    Path(path).write_text(text, encoding="utf-8", newline="\n")
+
+
+def parse_oem(text: str, source: str = "OEM text") -> Ephemeris:
+    """Return the ephemeris in the text of an OEM; ``source`` names it in errors.
+
+    Raises
+    ------
+    DataFileError
+        Where the text is cut short or says something that cannot be, with its line.
+    UnknownFrameError, UnknownTimeSystemError
+        Where axes, centre or time scale are none that can be converted.
+    """
+    reader = _Lines(text, source)
+    header, comments = _read_header(reader)
+    segments = []
+    while reader.peek() is not None:
+        segments.append(_read_segment(reader))
+    if not segments:
+        raise reader.error("META_START", "the end of the file")
+    for k, (earlier, later) in enumerate(pairwise(segments), start=2):
+        if later.start_utc_ns < earlier.stop_utc_ns:
+            expected = f"a start at or after {format_utc(earlier.stop_utc_ns)}, the end of the segment before"
+            raise DataFileError(source, f"segment {k}", expected, format_utc(later.start_utc_ns))
+    return Ephemeris(tuple(segments), header["ORIGINATOR"], comments)
+
+
+def format_oem(
+    ephemeris: Ephemeris, *, time_system: str | None = None, creation_utc_ns: int | None = None
+) -> str:
+    """Return OEM 2.0 text; positions to 1 um, velocities to 1 nm/s, epochs exact to the nanosecond.
+
+    ``time_system`` overrides the segments' own.  CREATION_DATE is the first epoch of the ephemeris unless
+    given, so that the same states give the same octets.
+    """
+    created = ephemeris.start_utc_ns if creation_utc_ns is None else creation_utc_ns
+    lines = ["CCSDS_OEM_VERS = 2.0"]
+    lines += _comment_lines(ephemeris.comments)
+    lines += [
+        f"CREATION_DATE = {format_utc(created).rstrip('Z')}",
+        f"ORIGINATOR = {ephemeris.originator}",
+        "",
+    ]
+    for segment in ephemeris.segments:
+        lines += _segment_lines(segment, time_system or segment.time_system)
+    return "\n".join(lines) + "\n"
+
+
+@dataclass(slots=True)
+class _Lines:
+    """The lines of a text that are not blank, with their numbers, and the place reached."""
+
+    text: str
+    source: str
+    numbered: list[tuple[int, str]] = field(init=False)
+    at: int = 0
+
+    def __post_init__(self) -> None:
+        stripped = enumerate(map(str.strip, self.text.splitlines()), start=1)
+        self.numbered = [item for item in stripped if item[1]]
+
+    def peek(self) -> str | None:
+        return self.numbered[self.at][1] if self.at < len(self.numbered) else None
+
+    def take(self) -> str:
+        line = self.peek()
+        if line is None:
+            raise self.error("more lines", "the end of the file")
+        self.at += 1
+        return line
+
+    def number(self, at: int | None = None) -> int:
+        """Return the line number of the line last taken, or of index ``at``."""
+        index = self.at - 1 if at is None else at
+        return self.numbered[min(max(index, 0), len(self.numbered) - 1)][0] if self.numbered else 1
+
+    def error(self, expected: str, found: str, at: int | None = None) -> DataFileError:
+        return DataFileError(self.source, f"line {self.number(at)}", expected, found)
+
+    def comments(self) -> Iterator[str]:
+        while (line := self.peek()) is not None and line.split(None, 1)[0] == "COMMENT":
+            self.at += 1
+            yield line[7:].strip()
+
+    def keyword(self, allowed: Iterable[str]) -> tuple[str, str]:
+        line = self.take()
+        key, equals, value = line.partition("=")
+        key, value = key.strip().upper(), value.strip()
+        if not equals or key not in allowed:
+            raise self.error(f"one of {', '.join(allowed)}", repr(line[:60]))
+        if not value:
+            raise self.error(f"a value of {key}", "nothing")
+        return key, value
+
+    def epoch(self, value: str, time_system: str, at: int | None = None) -> int:
+        try:
+            return int(to_utc_ns(parse_utc(value), time_system))
+        except TimeFormatError:
+            raise self.error("an epoch like 2029-08-07T00:00:00.000", repr(value), at) from None
+
+
+def _read_header(reader: _Lines) -> tuple[dict[str, str], tuple[str, ...]]:
+    comments: list[str] = []
+    header: dict[str, str] = {}
+    first = reader.peek()
+    if first is None or not first.startswith("CCSDS_OEM_VERS"):
+        found = "nothing" if first is None else repr(first[:40])
+        raise reader.error("CCSDS_OEM_VERS = 1.0, 2.0 or 3.0", found, reader.at)
+    while True:
+        comments += reader.comments()
+        line = reader.peek()
+        if line is None or line == "META_START":
+            break
+        key, value = reader.keyword(_HEADER_KEYS)
+        if key in header:
+            raise reader.error(f"{key} once", "it again")
+        if key == "CCSDS_OEM_VERS" and value not in VERSIONS:
+            raise reader.error(f"an OEM version out of {', '.join(VERSIONS)}", repr(value))
+        header[key] = value
+    for key in ("CREATION_DATE", "ORIGINATOR"):
+        if key not in header:
+            raise reader.error(f"{key} in the header", "none" if line else "the end of the file")
+    return header, tuple(comments)
+
+
+def _read_segment(reader: _Lines) -> EphemerisSegment:
+    line = reader.take()
+    if line != "META_START":
+        raise reader.error("META_START", repr(line[:60]))
+    comments, meta, where = _read_metadata(reader)
+    system = meta["TIME_SYSTEM"].upper()
+    if system not in TIME_SYSTEMS:
+        place = f"{reader.source}: line {reader.number(where['TIME_SYSTEM'])}"
+        raise UnknownTimeSystemError(meta["TIME_SYSTEM"], TIME_SYSTEMS, place)
+    frame = meta["REF_FRAME"].upper().replace(" ", "")
+    if frame not in ICRF_NAMES + J2000_NAMES:
+        place = f"{reader.source}: line {reader.number(where['REF_FRAME'])}"
+        raise UnknownFrameError(meta["REF_FRAME"], (*ICRF_NAMES, *J2000_NAMES), place)
+    if meta["CENTER_NAME"].upper() not in CENTRES:
+        raise reader.error("CENTER_NAME = MOON", repr(meta["CENTER_NAME"]), where["CENTER_NAME"])
+    method = meta.get("INTERPOLATION", "HERMITE").upper()
+    if method not in INTERPOLATIONS:
+        raise reader.error(
+            f"an INTERPOLATION out of {', '.join(INTERPOLATIONS)}", repr(method), where["INTERPOLATION"]
+        )
+    degree = _degree(reader, meta, where, method)
+    times: dict[str, int] = {
+        key: reader.epoch(meta[key], system, where[key])
+        for key in ("START_TIME", "USEABLE_START_TIME", "USEABLE_STOP_TIME", "STOP_TIME")
+        if key in meta
+    }
+    comments += reader.comments()
+    utc_ns, states, lines_at = _read_states(reader, system)
+    _check_epochs(reader, utc_ns, times, lines_at)
+    position_m, velocity_m_s = 1e3 * states[:, :3], 1e3 * states[:, 3:6]
+    if frame in J2000_NAMES:
+        position_m, velocity_m_s = position_m @ icrf_from_j2000().T, velocity_m_s @ icrf_from_j2000().T
+    return EphemerisSegment(
+        utc_ns,
+        position_m,
+        velocity_m_s,
+        centre="MOON",
+        frame="ICRF",
+        object_name=meta["OBJECT_NAME"],
+        object_id=meta["OBJECT_ID"],
+        time_system=system,
+        interpolation=method,
+        degree=degree,
+        useable_start_utc_ns=times.get("USEABLE_START_TIME"),
+        useable_stop_utc_ns=times.get("USEABLE_STOP_TIME"),
+        comments=tuple(comments),
+        covariances=tuple(_read_covariances(reader, system, meta["REF_FRAME"])),
+    )
+
+
+def _read_metadata(reader: _Lines) -> tuple[list[str], dict[str, str], dict[str, int]]:
+    """Return comments, values and line indices of the keywords up to META_STOP."""
+    comments: list[str] = []
+    meta: dict[str, str] = {}
+    where: dict[str, int] = {}
+    while True:
+        comments += reader.comments()
+        if reader.peek() == "META_STOP":
+            reader.take()
+            break
+        key, value = reader.keyword(_META_KEYS)
+        if key in meta:
+            raise reader.error(f"{key} once", "it again")
+        meta[key], where[key] = value, reader.at - 1
+    missing = [key for key in _MANDATORY if key not in meta]
+    if missing:
+        raise reader.error(f"{missing[0]} before META_STOP", "none")
+    return comments, meta, where
+
+
+def _degree(reader: _Lines, meta: dict[str, str], where: dict[str, int], method: str) -> int:
+    if "INTERPOLATION_DEGREE" not in meta:
+        if "INTERPOLATION" in meta and method != "LINEAR":
+            raise reader.error("INTERPOLATION_DEGREE with INTERPOLATION", "none", where["INTERPOLATION"])
+        return 1 if method == "LINEAR" else 7
+    text = meta["INTERPOLATION_DEGREE"]
+    if not text.isdigit() or not 1 <= int(text) <= 30:
+        raise reader.error("an INTERPOLATION_DEGREE of 1 to 30", repr(text), where["INTERPOLATION_DEGREE"])
+    return int(text)
+
+
+def _read_states(reader: _Lines, system: str) -> tuple[IntArray, FloatArray, int]:
+    """Return epochs (n,), states (n, 6 or 9) in km and the line index of the first."""
+    begin = reader.at
+    end = begin
+    lines = reader.numbered
+    while end < len(lines) and lines[end][1][0].isdigit():
+        end += 1
+    rows = [line for _, line in lines[begin:end]]
+    reader.at = end
+    if not rows:
+        found = reader.peek()
+        raise reader.error(
+            "a state: epoch x y z vx vy vz", "the end of the file" if found is None else repr(found[:60]), end
+        )
+    width = len(rows[0].split())
+    table = None
+    if width in (7, 10):
+        # The reader of numpy takes epochs and numbers in one go; what it refuses is gone through line by line.
+        with suppress(ValueError):
+            table = np.loadtxt(
+                rows, dtype=[("epoch", "U40"), ("state", "f8", width - 1)], comments=None, ndmin=1
+            )
+    if table is None:
+        for k, row in enumerate(rows):
+            count = len(row.split())
+            if count not in (7, 10) or count != width:
+                expected = (
+                    "an epoch and 6 or 9 numbers" if k == 0 else f"{width} values as in the line before"
+                )
+                raise reader.error(expected, f"{count} values", begin + k)
+            for token in row.split()[1:]:
+                if not _is_number(token):
+                    raise reader.error("a number", repr(token), begin + k)
+        raise reader.error("states of numbers", "others", begin)
+    numbers = table["state"]
+    bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
+    if bad.size:
+        raise reader.error("finite numbers", "NaN or infinity", begin + int(bad[0]))
+    return to_utc_ns(_epochs(reader, table["epoch"], begin), system), numbers, begin
+
+
+def _epochs(reader: _Lines, texts: NDArray[np.str_], begin: int) -> IntArray:
+    # numpy reads calendar dates in one go; other notations and faults go through the slow reader, which names the line.
+    if np.all(np.strings.endswith(texts, "Z")):
+        texts = np.strings.rstrip(texts, "Z")
+    if texts[0][4:5] == "-" and texts[0][7:8] == "-":
+        with suppress(ValueError):
+            return texts.astype("datetime64[ns]").astype(np.int64)
+    return np.array(
+        [reader.epoch(str(text), "UTC", begin + k) for k, text in enumerate(texts)], dtype=np.int64
+    )
+
+
+def _check_epochs(reader: _Lines, utc_ns: IntArray, times: dict[str, int], begin: int) -> None:
+    late = np.flatnonzero(np.diff(utc_ns) <= 0)
+    if late.size:
+        k = int(late[0])
+        raise reader.error(
+            f"an epoch after {format_utc(int(utc_ns[k]), 6)}",
+            format_utc(int(utc_ns[k + 1]), 6),
+            begin + k + 1,
+        )
+    # START_TIME and STOP_TIME may be rounded: a millisecond of grace.
+    outside = np.flatnonzero((utc_ns < times["START_TIME"] - 10**6) | (utc_ns > times["STOP_TIME"] + 10**6))
+    if outside.size:
+        span = f"{format_utc(times['START_TIME'])}..{format_utc(times['STOP_TIME'])} (START_TIME..STOP_TIME)"
+        k = int(outside[0])
+        raise reader.error(f"an epoch within {span}", format_utc(int(utc_ns[k])), begin + k)
+    if times["STOP_TIME"] > utc_ns[-1] + 10**6 or times["START_TIME"] < utc_ns[0] - 10**6:
+        side, key = (-1, "STOP_TIME") if times["STOP_TIME"] > utc_ns[-1] + 10**6 else (0, "START_TIME")
+        word = "last" if side else "first"
+        raise reader.error(
+            f"a {word} state at {key} = {format_utc(times[key])}",
+            f"{format_utc(int(utc_ns[side]))}; the segment is cut short",
+            begin + (len(utc_ns) - 1 if side else 0),
+        )
+    low = times.get("USEABLE_START_TIME", int(utc_ns[0]))
+    high = times.get("USEABLE_STOP_TIME", int(utc_ns[-1]))
+    if low > high or low > utc_ns[-1] or high < utc_ns[0]:
+        raise reader.error(
+            f"a useable interval within {format_utc(int(utc_ns[0]))}..{format_utc(int(utc_ns[-1]))}",
+            f"{format_utc(low)}..{format_utc(high)}",
+            begin,
+        )
+
+
+def _read_covariances(reader: _Lines, system: str, segment_frame: str) -> Iterator[Covariance]:
+    """Yield the covariances of the block that the next line opens, if it opens one."""
+    trailing = list(reader.comments())
+    del trailing  # Comments after the states belong to nothing that is kept.
+    if reader.peek() != "COVARIANCE_START":
+        return
+    reader.take()
+    # A frame holds until the next is named; without any, the covariance is in the frame of the segment.
+    frame = segment_frame
+    while True:
+        for _ in reader.comments():
+            pass
+        if reader.peek() == "COVARIANCE_STOP":
+            reader.take()
+            return
+        _, value = reader.keyword(("EPOCH",))
+        epoch = reader.epoch(value, system)
+        for _ in reader.comments():
+            pass
+        if (reader.peek() or "").startswith("COV_REF_FRAME"):
+            _, frame = reader.keyword(("COV_REF_FRAME",))
+        values: list[float] = []
+        for row in range(1, 7):
+            tokens = reader.take().split()
+            if len(tokens) != row or not all(map(_is_number, tokens)):
+                raise reader.error(f"{row} numbers of row {row} of a covariance", repr(" ".join(tokens)[:60]))
+            values += map(float, tokens)
+        matrix = np.zeros((6, 6))
+        matrix[_LOWER] = values
+        yield Covariance(epoch, frame, 1e6 * (matrix + np.tril(matrix, -1).T))
+
+
+def _is_number(token: str) -> bool:
+    try:
+        float(token)
+    except ValueError:
+        return False
+    return True
+
+
+def _comment_lines(comments: Iterable[str]) -> list[str]:
+    return [f"COMMENT {line}".rstrip() for comment in comments for line in (comment.splitlines() or [""])]
+
+
+def _segment_lines(segment: EphemerisSegment, system: str) -> list[str]:
+    if system not in TIME_SYSTEMS:
+        raise UnknownTimeSystemError(system, TIME_SYSTEMS)
+    counts = from_utc_ns(segment.utc_ns, system)
+    texts = _epoch_texts(counts)
+    lines = [
+        "META_START",
+        *_comment_lines(segment.comments),
+        f"OBJECT_NAME = {segment.object_name}",
+        f"OBJECT_ID = {segment.object_id or segment.object_name}",
+        f"CENTER_NAME = {segment.centre}",
+        f"REF_FRAME = {segment.frame}",
+        f"TIME_SYSTEM = {system}",
+        f"START_TIME = {texts[0]}",
+    ]
+    for key, epoch in (
+        ("USEABLE_START_TIME", segment.useable_start_utc_ns),
+        ("USEABLE_STOP_TIME", segment.useable_stop_utc_ns),
+    ):
+        if epoch is not None:
+            lines.append(f"{key} = {_epoch_texts(from_utc_ns(np.array([epoch]), system))[0]}")
+    lines += [
+        f"STOP_TIME = {texts[-1]}",
+        f"INTERPOLATION = {segment.interpolation}",
+        f"INTERPOLATION_DEGREE = {segment.degree}",
+        "META_STOP",
+        "",
+    ]
+    states = np.concatenate([segment.position_m, segment.velocity_m_s], axis=1) / 1e3
+    row = "%s %.9f %.9f %.9f %.12f %.12f %.12f"
+    lines += [row % (text, *state) for text, state in zip(texts, states.tolist(), strict=True)]
+    if segment.covariances:
+        lines += ["", "COVARIANCE_START"]
+        for covariance in segment.covariances:
+            lines.append(f"EPOCH = {_epoch_texts(from_utc_ns(np.array([covariance.utc_ns]), system))[0]}")
+            lines.append(f"COV_REF_FRAME = {covariance.frame}")
+            lines += [" ".join(f"{v:.15e}" for v in covariance.matrix[k, : k + 1] / 1e6) for k in range(6)]
+        lines.append("COVARIANCE_STOP")
+    return [*lines, ""]
+
+
+def _epoch_texts(counts: IntArray) -> list[str]:
+    """Return calendar texts, with three decimals where that is exact for all of them and else nine."""
+    unit = "ms" if np.all(counts % (NS // 1000) == 0) else "ns"
+    return [
+        str(text)
+        for text in np.datetime_as_string(counts.astype("datetime64[ns]").astype(f"datetime64[{unit}]"))
+    ]
