@@ -16,8 +16,10 @@ from typing import Any, TypeVar, overload
 os.environ.setdefault("NUMBA_SLP_VECTORIZE", "1")
 
 import numba
+from numba.core import cgutils, types
+from numba.extending import intrinsic
 
-__all__ = ["njit", "prange"]
+__all__ = ["cgutils", "intrinsic", "njit", "prange", "types"]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
