@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import (
     Orientation,
-    enu_from_mcmf,
     matrix_from_quaternion,
     quaternion_from_matrix,
     spherical_from_mcmf,
@@ -124,19 +123,6 @@ def perturbed(camera_from_source: FloatArray, error_rad: FloatArray) -> FloatArr
 def attitude_message(camera_from_icrf: FloatArray, sun_direction_camera: FloatArray) -> FloatArray:
     """What the ADCS tells: q_wxyz of camera_from_icrf, then the unit Sun vector in the camera, shape (7,)."""
     return np.concatenate([quaternion_from_matrix(camera_from_icrf), sun_direction_camera])
-
-
-def paper_sun_direction(position_mcmf_m: FloatArray, elevation_rad: float, azimuth_rad: float) -> FloatArray:
-    """Unit vector to the Sun in MCMF; elevation and azimuth (from north, clockwise) at the sub-satellite point."""
-    latitude, longitude, _ = spherical_from_mcmf(position_mcmf_m)
-    enu = np.array(
-        [
-            np.sin(azimuth_rad) * np.cos(elevation_rad),
-            np.cos(azimuth_rad) * np.cos(elevation_rad),
-            np.sin(elevation_rad),
-        ]
-    )
-    return np.asarray(enu_from_mcmf(float(latitude), float(longitude)).T @ enu, dtype=np.float64)
 
 
 def require_above_ground(

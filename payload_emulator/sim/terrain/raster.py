@@ -1,0 +1,436 @@
+"""Real terrain from georeferenced rasters, sharpened below their resolution by seeded craters and roughness.
+
+Heights are metres above the map sphere (kilometres where the raster's unit says so).  Pixels are areas.  Rasters of one
+resolution form a layer; the finest layer that holds a place gives its height, and layers join over a feathered edge.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lunar.catalogue import CraterCatalogue
+from lunar.constants import MOON_RADIUS_M
+from payload_emulator.errors import TerrainError
+from payload_emulator.sim.terrain import kernels
+from payload_emulator.sim.terrain.craters import SmallCraters, crater_profiles
+from payload_emulator.sim.terrain.procedural import mottled_albedo, stamp
+from payload_emulator.sim.terrain.tiles import (
+    ALBEDO_SHIFT,
+    TILE_PIXELS,
+    Floats,
+    Heights,
+    TiledTerrain,
+    tile_angles,
+)
+
+SMOOTHING_PIXELS = 1.0
+"""GLD100 is quantised to 1 m, which shows as a weave under a low Sun; one pixel of smoothing removes it."""
+
+REGISTRATION_NORTH_M = -59.0
+"""Default shift of GLD100 to the north: half a pixel of 256 px/deg to the south.
+
+Rims fitted on the raster as georeferenced lie 46 to 71 m north of the crater catalogue LU1319381; which of the two is
+wrong is not known.  The shift makes them agree; give 0 for the raster as it is.
+"""
+
+FEATHER_DEG = 0.12
+ROUGHNESS_WAVES_KM = ((1.7, 3.6), (0.85, 2.3), (0.42, 1.4), (0.26, 0.8))
+"""Wavelength in km and rms in m added below the raster's effective resolution, on ground of average slope."""
+
+REFERENCE_SLOPE = 0.10
+"""Rms slope of the smoothed raster over 1 km on which the roughness above is added as it stands."""
+
+SLOPE_STEP = 8
+SMALL_LOW_M = 350.0
+SMALL_HIGH_M = 1_800.0
+SMALL_EXPONENT = 2.2
+CATALOGUE_DENSITY_2KM = 0.0080
+"""Craters above 2 km per km2 in LU1319381 (222,451 over 53 of 72 tiles); scales the smaller ones by place."""
+
+CHUNK_PIXELS = 1024
+CHUNKS_KEPT = 96
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RasterFile:
+    """One georeferenced file: its place on the pixel lattice of its layer."""
+
+    path: Path
+    first_row: int
+    first_column: int
+    rows: int
+    columns: int
+    scale_m: float
+    nodata: float | None
+
+
+class RasterLayer:
+    """Files of one resolution on one global pixel lattice, read in chunks as they are needed."""
+
+    def __init__(self, pixels_per_degree: float, north_offset: float, west_offset: float, files: Sequence[RasterFile]) -> None:
+        """The lattice has pixel centres at latitude ``90 - (row + 0.5 + north_offset) / ppd``, likewise longitude."""
+        self.pixels_per_degree = pixels_per_degree
+        self.north_offset = north_offset
+        self.west_offset = west_offset
+        self.files = tuple(files)
+        self.turn = round(360.0 * pixels_per_degree)
+        self._chunks: OrderedDict[tuple[int, int, int], Heights] = OrderedDict()
+
+    def read(self, first_row: int, first_column: int, rows: int, columns: int) -> Heights:
+        """Heights (rows, columns) in metres of a window of the lattice; NaN where no file has data."""
+        out = np.full((rows, columns), np.nan, np.float32)
+        for number, file in enumerate(self.files):
+            top = max(first_row, file.first_row)
+            bottom = min(first_row + rows, file.first_row + file.rows)
+            if top >= bottom:
+                continue
+            turns = {
+                math.floor((first_column - file.first_column) / self.turn),
+                math.floor((first_column + columns - 1 - file.first_column) / self.turn),
+            }
+            for turn in turns:
+                west = file.first_column + turn * self.turn
+                left, right = max(first_column, west), min(first_column + columns, west + file.columns)
+                if left < right:
+                    self._copy(number, file, out, (top, bottom), (left, right), (first_row, first_column), west)
+        return out
+
+    def holds(self, latitude_rad: Floats, longitude_rad: Floats) -> npt.NDArray[np.bool_]:
+        """Whether a file spans each place."""
+        row = (90.0 - np.degrees(latitude_rad)) * self.pixels_per_degree - self.north_offset
+        column = np.degrees(longitude_rad) * self.pixels_per_degree - self.west_offset
+        held = np.zeros(row.shape, dtype=bool)
+        for file in self.files:
+            east = (column - file.first_column) % self.turn
+            held |= (row >= file.first_row) & (row <= file.first_row + file.rows) & (east <= file.columns)
+        return held
+
+    def _copy(
+        self,
+        number: int,
+        file: RasterFile,
+        out: Heights,
+        rows: tuple[int, int],
+        columns: tuple[int, int],
+        origin: tuple[int, int],
+        west: int,
+    ) -> None:
+        top, bottom = rows[0] - file.first_row, rows[1] - file.first_row
+        left, right = columns[0] - west, columns[1] - west
+        for i in range(top // CHUNK_PIXELS, (bottom - 1) // CHUNK_PIXELS + 1):
+            for j in range(left // CHUNK_PIXELS, (right - 1) // CHUNK_PIXELS + 1):
+                chunk = self._chunk(number, file, i, j)
+                a, b = max(top, i * CHUNK_PIXELS), min(bottom, i * CHUNK_PIXELS + chunk.shape[0])
+                c, d = max(left, j * CHUNK_PIXELS), min(right, j * CHUNK_PIXELS + chunk.shape[1])
+                part = chunk[a - i * CHUNK_PIXELS : b - i * CHUNK_PIXELS, c - j * CHUNK_PIXELS : d - j * CHUNK_PIXELS]
+                row = a + file.first_row - origin[0]
+                column = c + west - origin[1]
+                place = out[row : row + part.shape[0], column : column + part.shape[1]]
+                np.copyto(place, part, where=~np.isnan(part))
+
+    def _chunk(self, number: int, file: RasterFile, i: int, j: int) -> Heights:
+        key = (number, i, j)
+        found = self._chunks.get(key)
+        if found is not None:
+            self._chunks.move_to_end(key)
+            return found
+        import rasterio
+        from rasterio.windows import Window
+
+        top, left = i * CHUNK_PIXELS, j * CHUNK_PIXELS
+        window = Window(left, top, min(CHUNK_PIXELS, file.columns - left), min(CHUNK_PIXELS, file.rows - top))
+        try:
+            with rasterio.open(file.path) as source:
+                raw = source.read(1, window=window)
+        except rasterio.errors.RasterioError as error:
+            raise TerrainError(f"{file.path}: expected readable raster data, found {error}") from None
+        values = raw.astype(np.float32)
+        if file.nodata is not None:
+            values[raw == file.nodata] = np.nan
+        if file.scale_m != 1.0:
+            values *= np.float32(file.scale_m)
+        if len(self._chunks) >= CHUNKS_KEPT:
+            self._chunks.popitem(last=False)
+        self._chunks[key] = values
+        return values
+
+
+class RasterTerrain(TiledTerrain):
+    """Terrain of georeferenced height rasters on a grid of 256 pixels per degree."""
+
+    def __init__(
+        self,
+        paths: Sequence[Path | str],
+        catalogue: CraterCatalogue,
+        *,
+        coarse_paths: Sequence[Path | str] = (),
+        albedo_path: Path | str | None = None,
+        name: str = "rasters",
+        data_names: tuple[str, ...] = (),
+        seed: int = 0,
+        sharpen: bool = True,
+        registration_north_m: float = REGISTRATION_NORTH_M,
+        registration_east_m: float = 0.0,
+        smoothing_pixels: float = SMOOTHING_PIXELS,
+        pixels_per_degree: int = 256,
+        cache_tiles: int = 192,
+    ) -> None:
+        """``coarse_paths`` fill in around ``paths`` (under shadows and at edges) and do not count as covered.
+
+        ``sharpen`` adds seeded craters below 1.8 km and roughness; ``registration_*`` shift the rasters on the ground.
+        """
+        if not paths:
+            raise TerrainError("terrain rasters: expected at least one height raster, found none")
+        self._fine = open_layers(paths)
+        self._layers = [*open_layers(coarse_paths), *self._fine]
+        self._layers.sort(key=lambda layer: layer.pixels_per_degree)
+        self._shift_north_deg = math.degrees(registration_north_m / MOON_RADIUS_M)
+        self._shift_east_m = registration_east_m
+        self._smoothing = smoothing_pixels
+        self._sharpen = sharpen
+        self._profiles = crater_profiles()
+        rng = np.random.Generator(np.random.PCG64([seed, 0x52415354]))
+        self._salts = [int(salt) for salt in rng.integers(1, 2**31 - 1, 32)]
+        per_km2 = CATALOGUE_DENSITY_2KM * (2_000.0 / SMALL_LOW_M) ** SMALL_EXPONENT
+        self._small = SmallCraters(seed, SMALL_LOW_M, SMALL_HIGH_M, per_km2, SMALL_EXPONENT, _density_map(catalogue))
+        self._albedo_map = None if albedo_path is None else load_albedo_map(Path(albedo_path))
+        super().__init__(name, data_names or (name,), catalogue, pixels_per_degree, cache_tiles)
+
+    def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Whether a height raster (not a coarse one) spans each place."""
+        latitude, longitude = np.broadcast_arrays(
+            np.asarray(latitude_rad, dtype=np.float64), np.asarray(longitude_rad, dtype=np.float64)
+        )
+        held = np.zeros(latitude.shape, dtype=bool)
+        for layer in self._fine:
+            held |= layer.holds(latitude, longitude)
+        return held
+
+    def make_heights(self, tile_row: int, tile_column: int) -> Heights:
+        """One tile of heights (513, 513) in metres."""
+        latitude, longitude = tile_angles(tile_row, tile_column, self.pixels_per_degree)
+        out = self._resampled(latitude, longitude)
+        if not self._sharpen:
+            return out
+        gain = self._slope_gain(latitude, longitude)
+        angles = (np.cos(latitude), np.sin(latitude), np.cos(longitude), np.sin(longitude))
+        for n, (wavelength, rms) in enumerate(ROUGHNESS_WAVES_KM):
+            kernels.add_noise(out, *angles, MOON_RADIUS_M / 1000.0 / wavelength, rms, self._salts[n], gain)
+        stamp(out, latitude, longitude, self._small.around(latitude, longitude), self._profiles)
+        return out
+
+    def make_albedo(self, tile_row: int, tile_column: int) -> Heights:
+        """One tile of normal albedo (65, 65): the map where there is one, mottled."""
+        latitude, longitude = tile_angles(tile_row, tile_column, self.pixels_per_degree)
+        step = TILE_PIXELS >> ALBEDO_SHIFT
+        latitude, longitude = latitude[::step], longitude[::step]
+        if self._albedo_map is None:
+            base = np.ones((latitude.size, longitude.size))
+        else:
+            base = _sample_map(self._albedo_map, latitude, longitude)
+        return mottled_albedo(base, latitude, longitude, self._salts[10:15])
+
+    def _resampled(self, latitude: Floats, longitude: Floats) -> Heights:
+        """Heights on a grid of places from the finest layers, cubic."""
+        shape = (latitude.size, longitude.size)
+        result: Heights | None = None
+        for layer in reversed(self._layers):
+            values, weight = self._from_layer(layer, latitude, longitude)
+            if result is None:
+                result, share = values, weight
+            else:
+                result = np.asarray(share * result + (1.0 - share) * values, dtype=np.float32)
+                share = np.maximum(share, weight)
+            if share.min() >= 1.0:
+                return result
+        assert result is not None
+        if share.min() <= 0.0:
+            row, column = np.unravel_index(int(share.argmin()), shape)
+            raise TerrainError(
+                f"terrain {self.name}: expected height data at latitude {math.degrees(latitude[row]):.3f} deg, longitude "
+                f"{math.degrees(longitude[column]) % 360.0:.3f} deg E, found none in {len(self._layers)} layers"
+            )
+        return result
+
+    def _from_layer(self, layer: RasterLayer, latitude: Floats, longitude: Floats) -> tuple[Heights, Heights]:
+        """Smoothed heights of one layer and how much they count: 1 inside, falling to 0 at the edge of its data."""
+        ppd = layer.pixels_per_degree
+        middle = 0.5 * float(latitude[0] + latitude[-1])
+        east_deg = math.degrees(self._shift_east_m / MOON_RADIUS_M / math.cos(middle))
+        rows = (90.0 - (np.degrees(latitude) - self._shift_north_deg)) * ppd - 0.5 - layer.north_offset
+        columns = (np.degrees(longitude) - east_deg) * ppd - 0.5 - layer.west_offset
+        feather = math.ceil(FEATHER_DEG * ppd)
+        reach = math.ceil(4.0 * self._smoothing)
+        margin = max(reach, feather) + 3
+        top, left = math.floor(rows[0]) - margin, math.floor(columns[0]) - margin
+        height, width = math.ceil(rows[-1]) + margin + 1 - top, math.ceil(columns[-1]) + margin + 1 - left
+        source = layer.read(top, left, height, width)
+        out = np.zeros((latitude.size, longitude.size), np.float32)
+        hole = np.isnan(source)
+        if hole.all():
+            return out, np.zeros_like(out)
+        weight = np.ones_like(out)
+        if hole.any():
+            from scipy import ndimage
+
+            inside, nearest = ndimage.distance_transform_edt(~hole, return_indices=True)
+            outside = ndimage.distance_transform_edt(hole, return_indices=True, return_distances=False)
+            del nearest
+            source = source[tuple(outside)]
+            edge = np.clip((inside - 1.0) / feather, 0.0, 1.0)
+            smooth = np.asarray(edge * edge * (3.0 - 2.0 * edge), dtype=np.float32)
+            kernels.resample_cubic(smooth, *_span(rows, top), *_span(columns, left), weight)
+            weight = np.clip(weight, 0.0, 1.0)
+        if self._smoothing > 0.0:
+            source = _smoothed(source, self._smoothing, reach)
+        kernels.resample_cubic(source, *_span(rows, top), *_span(columns, left), out)
+        return out, weight
+
+    def _slope_gain(self, latitude: Floats, longitude: Floats) -> Heights:
+        """How rough the ground about each pixel is beside average ground, (rows, columns)."""
+        index = (np.arange(TILE_PIXELS // SLOPE_STEP + 8) - 3.0) * SLOPE_STEP
+        step = float(latitude[0] - latitude[1])
+        nodes_latitude, nodes_longitude = latitude[0] - index * step, longitude[0] + index * step
+        heights = self._resampled(nodes_latitude, nodes_longitude)
+        spacing = SLOPE_STEP * self.pixel_m
+        north = np.diff(heights, axis=0)[:, :-1] / spacing
+        east = np.diff(heights, axis=1)[:-1] / (spacing * np.cos(nodes_latitude[:-1])[:, None])
+        square = north * north + east * east
+        blurred = sum(square[i : square.shape[0] - 2 + i, j : square.shape[1] - 2 + j] for i in range(3) for j in range(3)) / 9.0
+        gain = np.clip(np.sqrt(blurred) / REFERENCE_SLOPE, 0.25, 1.6)
+        # Cell (k, l) of the blur is centred half a step after node k + 1.
+        out = np.empty((latitude.size, longitude.size), np.float32)
+        first = 3.0 - 1.5
+        kernels.resample_cubic(
+            np.ascontiguousarray(gain, dtype=np.float32), first, 1.0 / SLOPE_STEP, first, 1.0 / SLOPE_STEP, out
+        )
+        return out
+
+
+def open_layers(paths: Sequence[Path | str]) -> list[RasterLayer]:
+    """Files grouped by resolution into layers, coarsest first; reads headers only.
+
+    Raises
+    ------
+    TerrainError
+        A file is missing, has no georeference, is not in longitude and latitude, is rotated, or has uneven pixels.
+    """
+    groups: dict[tuple[float, float, float], list[RasterFile]] = {}
+    for path in paths:
+        key, file = _open_header(Path(path))
+        groups.setdefault(key, []).append(file)
+    layers = [RasterLayer(ppd, north, west, files) for (ppd, north, west), files in groups.items()]
+    return sorted(layers, key=lambda layer: layer.pixels_per_degree)
+
+
+def load_albedo_map(path: Path) -> npt.NDArray[np.float32]:
+    """Relative albedo (1 = mean) of the whole Moon, (rows, columns) from the north pole and 180 degrees west.
+
+    The map is a picture whose stretch is compressed; its 2nd and 98th percentiles are spread over the span that normal
+    albedo has on the Moon, 0.5 to 1.5 of the mean.
+    """
+    import rasterio
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+            with rasterio.open(path) as source:
+                values = source.read(1).astype(np.float32)
+    except rasterio.errors.RasterioError as error:
+        raise TerrainError(f"{path}: expected an albedo map, found {error}") from None
+    if values.shape[1] != 2 * values.shape[0]:
+        raise TerrainError(f"{path}: expected a map of the whole Moon twice as wide as high, found {values.shape[::-1]}")
+    middle = values[values.shape[0] // 6 : -values.shape[0] // 6]
+    low, mean, high = np.percentile(middle, 2), float(middle.mean()), np.percentile(middle, 98)
+    scaled = np.where(values < mean, 1.0 - 0.5 * (mean - values) / (mean - low), 1.0 + 0.5 * (values - mean) / (high - mean))
+    return np.asarray(np.clip(scaled, 0.3, 2.0), dtype=np.float32)
+
+
+def _open_header(path: Path) -> tuple[tuple[float, float, float], RasterFile]:
+    import rasterio
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+            with rasterio.open(path) as source:
+                profile: dict[str, Any] = dict(source.profile)
+                crs, transform = source.crs, source.transform
+                unit, scale = source.units[0], source.scales[0]
+    except rasterio.errors.RasterioError as error:
+        raise TerrainError(f"{path}: expected a height raster, found {error}") from None
+    if crs is None:
+        raise TerrainError(f"{path}: expected a georeferenced raster, found no coordinate system")
+    if not crs.is_geographic:
+        raise TerrainError(f"{path}: expected longitude and latitude in degrees, found the projection {crs.to_string()[:60]}")
+    if transform.b or transform.d or transform.a <= 0.0 or abs(transform.a + transform.e) > 1e-9 * transform.a:
+        raise TerrainError(f"{path}: expected square pixels, north up, found the transform {tuple(transform)[:6]}")
+    ppd = round(1.0 / transform.a, 6)
+    row, column = (90.0 - transform.f) * ppd, transform.c * ppd
+    first_row, first_column = round(row), round(column)
+    factor = 1000.0 if unit and unit.lower() in ("km", "kilometer", "kilometre") else 1.0
+    offsets = round(row - first_row, 3) + 0.0, round(column - first_column, 3) + 0.0
+    file = RasterFile(
+        path, first_row, first_column, profile["height"], profile["width"], factor * (scale or 1.0), profile.get("nodata")
+    )
+    return (ppd, *offsets), file
+
+
+def _span(places: Floats, origin: int) -> tuple[float, float]:
+    return float(places[0] - origin), float(places[1] - places[0])
+
+
+def _smoothed(values: Heights, sigma: float, reach: int) -> Heights:
+    """Gaussian of ``values``, separable; the outer ``reach`` pixels are left as they are."""
+    offsets = np.arange(-reach, reach + 1)
+    weights = np.exp(-0.5 * (offsets / sigma) ** 2)
+    weights = np.asarray(weights / weights.sum(), dtype=np.float32)
+    out = values.copy()
+    inner = slice(reach, -reach)
+    out[inner] = sum(w * values[k : values.shape[0] - 2 * reach + k] for k, w in enumerate(weights))
+    rows = out.copy()
+    out[:, inner] = sum(w * rows[:, k : values.shape[1] - 2 * reach + k] for k, w in enumerate(weights))
+    return out
+
+
+def _density_map(catalogue: CraterCatalogue) -> Floats:
+    """Small craters per cell of one degree (180, 360) relative to the mean, from the catalogue's own over 7 x 7 cells."""
+    density = np.ones((180, 360))
+    chosen = (catalogue.diameter_m >= 2_000.0) & (catalogue.diameter_m < 5_000.0)
+    if np.count_nonzero(chosen) < 1_000:
+        return density
+    row = np.clip(np.floor(90.0 - np.degrees(catalogue.latitude_rad[chosen])), 0, 179).astype(np.int64)
+    column = np.floor(np.degrees(catalogue.longitude_rad[chosen]) % 360.0).astype(np.int64) % 360
+    count = np.zeros((180, 360))
+    np.add.at(count, (row, column), 1.0)
+    area = np.repeat(np.cos(np.radians(89.5 - np.arange(180)))[:, None], 360, axis=1)
+    counted = _box(count)
+    expected = CATALOGUE_DENSITY_2KM * (1.0 - 0.4**1.8) * 919.4 * _box(area)
+    return np.clip(np.where(counted > 0.0, counted / expected, 1.0), 0.25, 2.0)
+
+
+def _box(values: Floats) -> Floats:
+    """Mean over 7 x 7 cells, around the meridian."""
+    padded = np.pad(np.pad(values, ((3, 3), (0, 0)), mode="edge"), ((0, 0), (3, 3)), mode="wrap")
+    return np.asarray(sum(padded[i : i + 180, j : j + 360] for i in range(7) for j in range(7)) / 49.0)
+
+
+def _sample_map(values: npt.NDArray[np.float32], latitude: Floats, longitude: Floats) -> Floats:
+    """Bilinear values (rows, columns) of a whole-Moon map that starts at the north pole and 180 degrees west."""
+    height, width = values.shape
+    row = np.clip((0.5 - latitude / math.pi) * height - 0.5, 0.0, height - 1.001)
+    column = ((np.degrees(longitude) + 180.0) % 360.0) / 360.0 * width - 0.5
+    i, j = np.floor(row).astype(np.int64), np.floor(column).astype(np.int64)
+    fi, fj = (row - i)[:, None], (column - j)[None, :]
+    west, east = j % width, (j + 1) % width
+    top = values[np.ix_(i, west)] * (1.0 - fj) + values[np.ix_(i, east)] * fj
+    low = values[np.ix_(i + 1, west)] * (1.0 - fj) + values[np.ix_(i + 1, east)] * fj
+    return np.asarray(top * (1.0 - fi) + low * fi)
