@@ -160,7 +160,7 @@ class Housekeeping(Sample, Base):
 
 
 class DetectionFrame(Sample, Base):
-    """Detections of one image; `ticks` is the image's time, `items` packed as `codec.DETECTION_ITEM`."""
+    """Detections of one image; `ticks` is the image's time, `items` packed as `store.codec.DETECTION_ITEM`."""
 
     __tablename__ = "detections"
     __table_args__ = CLUSTERED
@@ -239,6 +239,7 @@ class Verification(Sample, Base):
     __table_args__ = CLUSTERED
     subtype: Mapped[int] = mapped_column(SmallInteger)
     request_id: Mapped[int] = mapped_column(BigInteger)
+    step: Mapped[int | None] = mapped_column(SmallInteger)
     failure_code: Mapped[int | None] = mapped_column(Integer)
 
 

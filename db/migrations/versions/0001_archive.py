@@ -202,6 +202,7 @@ def upgrade() -> None:
         sa.Column("packet_id", sa.BigInteger(), autoincrement=False, nullable=False),
         sa.Column("subtype", sa.SmallInteger(), nullable=False),
         sa.Column("request_id", sa.BigInteger(), nullable=False),
+        sa.Column("step", sa.SmallInteger(), nullable=True),
         sa.Column("failure_code", sa.Integer(), nullable=True),
         sa.PrimaryKeyConstraint(
             "vehicle_id", "dictionary_version", "ticks", "packet_id", name=op.f("pk_verifications")

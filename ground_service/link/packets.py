@@ -1,0 +1,210 @@
+"""A batch of packets as the store takes it: headers, octets and digests, and decoded rows as columns."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmtc.dictionary import DICTIONARY
+from tmtc.schema import Dictionary, Table, as_octets, gather
+from tmtc.stream import Octets, PacketCut, primary_headers
+
+IntArray = NDArray[np.int64]
+Columns = dict[str, Any]
+
+NO_TICKS = -1
+DIGEST_OCTETS = 16
+
+_TIMED_HEADER = np.dtype(
+    [("primary", "V6"), ("pus", "u1"), ("kind", "V6"), ("p_field", "u1"), ("coarse", ">u4"), ("fine", ">u2")]
+)
+_PUS_C = 2
+_CUC_AGENCY_4_2 = 0x2E
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PacketBatch:
+    """Checked packets of one stretch of a downlink, arrays and lists (n,).
+
+    `ticks` is the on-board time of the packet, `NO_TICKS` where it carries none. `rows` holds, per kind of sample,
+    the decoded columns and in ``"packet"`` the index of each row's packet in this batch.
+    """
+
+    apid: IntArray
+    sequence_count: IntArray
+    ticks: IntArray
+    octets: list[bytes]
+    digest: list[bytes]
+    dictionary_version: int
+    rows: Mapping[str, Columns]
+    unknown: int
+
+    def __len__(self) -> int:
+        return len(self.octets)
+
+
+def batch_of_cut(buffer: Octets, cut: PacketCut, dictionary: Dictionary = DICTIONARY) -> PacketBatch:
+    """The packets of `cut` whose checksum holds, with what the dictionary decodes from them."""
+    good = np.flatnonzero(cut.crc_ok)
+    headers = primary_headers(buffer, cut)
+    tables = dictionary.unpack_many(buffer, cut)
+    place = np.full(len(cut), -1, dtype=np.int64)
+    place[good] = np.arange(len(good))
+    view = memoryview(as_octets(buffer))
+    octets = [
+        bytes(view[start : start + length])
+        for start, length in zip(cut.offsets[good].tolist(), cut.lengths[good].tolist(), strict=True)
+    ]
+    known = sum(len(table) for table in tables.values())
+    return PacketBatch(
+        apid=headers.apid[good],
+        sequence_count=headers.sequence_count[good],
+        ticks=_packet_ticks(buffer, cut, good, headers.secondary_header[good]),
+        octets=octets,
+        digest=[hashlib.blake2b(packet, digest_size=DIGEST_OCTETS).digest() for packet in octets],
+        dictionary_version=dictionary.version,
+        rows=decoded_rows(tables, place),
+        unknown=len(good) - known,
+    )
+
+
+def decoded_rows(tables: Mapping[str, Table], place: IntArray) -> dict[str, Columns]:
+    """Columns of each kind of sample; `place` maps the packet index of a table to the index in the batch."""
+    rows: dict[str, Columns] = {}
+    for kind, names, translate in _KINDS:
+        pieces = [translate(table, place) for name, table in tables.items() if name.startswith(names)]
+        if pieces:
+            rows[kind] = pieces[0] if len(pieces) == 1 else _joined(pieces)
+    return rows
+
+
+def _joined(pieces: list[Columns]) -> Columns:
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+
+
+def _packet_ticks(
+    buffer: Octets, cut: PacketCut, good: IntArray, secondary_header: NDArray[np.bool_]
+) -> IntArray:
+    """On-board time (n,) of PUS-C packets with the agency's CUC 4+2; `NO_TICKS` for all others."""
+    ticks = np.full(len(good), NO_TICKS, dtype=np.int64)
+    long_enough = np.flatnonzero(secondary_header & (cut.lengths[good] >= _TIMED_HEADER.itemsize))
+    header = gather(as_octets(buffer), cut.offsets[good[long_enough]], _TIMED_HEADER)
+    timed = (header["pus"] >> 4 == _PUS_C) & (header["p_field"] == _CUC_AGENCY_4_2)
+    ticks[long_enough[timed]] = header["coarse"][timed].astype(np.int64) << 16 | header["fine"][timed]
+    return ticks
+
+
+def _housekeeping(table: Table, place: IntArray) -> Columns:
+    columns = {name: column for name, column in table.columns.items() if name != "structure_id"}
+    return {"packet": place[table.packet_index], "ticks": table.ticks, **columns}
+
+
+def _frame_columns(table: Table, place: IntArray) -> Columns:
+    """Columns that every sample of an image has; its time is that of the image, not of the packet."""
+    return {
+        "packet": place[table.packet_index],
+        "ticks": table.columns["image_ticks"],
+        "packet_ticks": table.ticks,
+        "frame_number": table.columns["frame_number"],
+    }
+
+
+def _detections(table: Table, place: IntArray) -> Columns:
+    counts = table.columns["count"]
+    return {
+        **_frame_columns(table, place),
+        "image_quality": table.columns["image_quality"],
+        "count": counts,
+        "items": table.items,
+        "offsets": np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
+    }
+
+
+def _navigation(table: Table, place: IntArray) -> Columns:
+    columns = table.columns
+    velocity, sigma = columns["velocity_icrf_m_s"], columns["sigma_rtn_m"]
+    return {
+        **_frame_columns(table, place),
+        **{name: columns[name] for name in ("estimator", "outcome", "latitude_deg", "longitude_deg", "altitude_m")},
+        **{f"velocity_{axis}_m_s": velocity[:, i] for i, axis in enumerate("xyz")},
+        **{f"sigma_{axis}_m": sigma[:, i] for i, axis in enumerate("rtn")},
+        "nis": columns["nis"],
+        "matched": columns["matched"],
+    }
+
+
+def _outcomes(table: Table, place: IntArray) -> Columns:
+    names = (
+        "estimator",
+        "outcome",
+        "reset_trigger",
+        "detections",
+        "candidate_pairs",
+        "pairs",
+        "shift_east_m",
+        "shift_north_m",
+        "anchor_reads",
+    )
+    return {**_frame_columns(table, place), **{name: table.columns[name] for name in names}}
+
+
+_SEVERITIES = {"event_info": 1, "event_low": 2, "event_medium": 3, "event_high": 4}
+
+
+def _events(table: Table, place: IntArray) -> Columns:
+    return {
+        "packet": place[table.packet_index],
+        "ticks": table.ticks,
+        "severity": np.full(len(table), _SEVERITIES[table.name], dtype=np.int64),
+        **{name: table.columns[name] for name in ("event_id", "frame_number", "value_1", "value_2")},
+    }
+
+
+def _time_reports(table: Table, place: IntArray) -> Columns:
+    return {
+        "packet": place[table.packet_index],
+        "ticks": table.ticks,
+        "reported_ticks": table.columns["reported_ticks"],
+        "rate_exponent": table.columns["rate_exponent"],
+    }
+
+
+_VERIFICATION_SUBTYPES = {
+    definition.name: definition.subtype for definition in DICTIONARY.telemetry if definition.service == 1
+}
+
+
+def _verifications(table: Table, place: IntArray) -> Columns:
+    unknown = np.full(len(table), np.nan)
+    return {
+        "packet": place[table.packet_index],
+        "ticks": table.ticks,
+        "subtype": np.full(len(table), _VERIFICATION_SUBTYPES[table.name], dtype=np.int64),
+        "request_id": table.columns["request_id"],
+        "step": _optional(table.columns.get("step", unknown)),
+        "failure_code": _optional(table.columns.get("failure_code", unknown)),
+    }
+
+
+def _optional(column: NDArray[Any]) -> NDArray[np.object_]:
+    """Whole numbers or None, for a column that not every packet of the kind has."""
+    values = [None if value != value else int(value) for value in column.tolist()]
+    result = np.empty(len(values), dtype=object)
+    result[:] = values
+    return result
+
+
+_KINDS: tuple[tuple[str, str, Callable[[Table, IntArray], Columns]], ...] = (
+    ("housekeeping", "housekeeping", _housekeeping),
+    ("detections", "detections", _detections),
+    ("navigation_states", "navigation_state", _navigation),
+    ("frame_outcomes", "frame_outcome", _outcomes),
+    ("events", "event_", _events),
+    ("time_reports", "time_report", _time_reports),
+    ("verifications", "verification_", _verifications),
+)

@@ -1,0 +1,101 @@
+"""Estimates against the reference ephemeris at their own times, in R/T/N of the reference orbit.
+
+Nothing is fitted: no shift, rotation or scale is taken out before the errors are formed, since an alignment would
+hide drift. Positions of estimates are mean-Earth (MCMF); errors are formed in ICRF axes about the Moon.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lunar.ephemeris import Ephemeris
+from lunar.frames import Orientation, mcmf_from_spherical, rtn_from_inertial, spherical_from_mcmf
+from lunar.timescales import tdb_s_from_utc_ns
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReferenceStates:
+    """The reference at n epochs: ICRF states (n, 3) and mean-Earth place; NaN where `covered` is False."""
+
+    utc_ns: IntArray
+    covered: BoolArray
+    position_icrf_m: FloatArray
+    velocity_icrf_m_s: FloatArray
+    mcmf_from_icrf: FloatArray
+    position_mcmf_m: FloatArray
+    latitude_rad: FloatArray
+    longitude_rad: FloatArray
+    altitude_m: FloatArray
+
+    @property
+    def latitude_deg(self) -> FloatArray:
+        """Mean-Earth latitude in degrees."""
+        return np.degrees(self.latitude_rad)
+
+    @property
+    def longitude_deg(self) -> FloatArray:
+        """Mean-Earth east longitude in degrees, 0 to 360."""
+        return np.degrees(self.longitude_rad) % 360.0
+
+
+def reference_states(reference: Ephemeris, orientation: Orientation, utc_ns: IntArray) -> ReferenceStates:
+    """The reference at `utc_ns` (n,); epochs that it does not cover are NaN and not `covered`."""
+    utc_ns = np.asarray(utc_ns, dtype=np.int64)
+    covered = reference.covers(utc_ns)
+    position = np.full((len(utc_ns), 3), np.nan)
+    velocity = np.full((len(utc_ns), 3), np.nan)
+    if covered.any():
+        position[covered], velocity[covered] = reference.at(utc_ns[covered])
+    rotation = np.full((len(utc_ns), 3, 3), np.nan)
+    if covered.any():
+        rotation[covered] = orientation.mcmf_from_icrf(np.asarray(tdb_s_from_utc_ns(utc_ns[covered])))
+    position_mcmf = np.einsum("nij,nj->ni", rotation, position)
+    latitude, longitude, altitude = spherical_from_mcmf(position_mcmf)
+    return ReferenceStates(
+        utc_ns, covered, position, velocity, rotation, position_mcmf, latitude, longitude, altitude
+    )
+
+
+def error_of_places_rtn_m(
+    reference: ReferenceStates, latitude_deg: FloatArray, longitude_deg: FloatArray, altitude_m: FloatArray
+) -> FloatArray:
+    """Estimate minus reference (n, 3) in R/T/N, of estimates given as mean-Earth places at the same epochs."""
+    estimate_mcmf = mcmf_from_spherical(np.radians(latitude_deg), np.radians(longitude_deg), altitude_m)
+    estimate_icrf = np.einsum("nji,nj->ni", reference.mcmf_from_icrf, estimate_mcmf)
+    return error_of_positions_rtn_m(reference, estimate_icrf)
+
+
+def error_of_positions_rtn_m(reference: ReferenceStates, position_icrf_m: FloatArray) -> FloatArray:
+    """Estimate minus reference (n, 3) in R/T/N, of estimated ICRF positions (n, 3) at the same epochs."""
+    rotation = rtn_from_inertial(reference.position_icrf_m, reference.velocity_icrf_m_s)
+    return np.asarray(np.einsum("nij,nj->ni", rotation, position_icrf_m - reference.position_icrf_m))
+
+
+def places_of_positions(
+    reference: ReferenceStates, position_icrf_m: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean-Earth latitude and east longitude in degrees and altitude in m of ICRF positions (n, 3)."""
+    latitude, longitude, altitude = spherical_from_mcmf(
+        np.einsum("nij,nj->ni", reference.mcmf_from_icrf, position_icrf_m)
+    )
+    return np.degrees(latitude), np.degrees(longitude) % 360.0, altitude
+
+
+def ground_path_m(reference: ReferenceStates, radius_m: float) -> FloatArray:
+    """Length (n,) of the reference's ground track from the first epoch to each, along a sphere of `radius_m`."""
+    direction = reference.position_mcmf_m / np.linalg.norm(reference.position_mcmf_m, axis=-1, keepdims=True)
+    chord = np.linalg.norm(np.diff(direction, axis=0), axis=-1)
+    arc = 2.0 * np.arcsin(np.clip(chord / 2.0, 0.0, 1.0))
+    return radius_m * np.concatenate(([0.0] if len(direction) else [], np.cumsum(arc)))
+
+
+def horizontal_m(error_rtn_m: FloatArray) -> FloatArray:
+    """Horizontal part (...) of errors (..., 3): the transverse and normal components together."""
+    return np.asarray(np.hypot(error_rtn_m[..., 1], error_rtn_m[..., 2]))

@@ -1,0 +1,544 @@
+"""One pass, evaluated: decoded samples, reference, catalogue and camera in, a `PassReport` out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ground_service.processing.alignment import (
+    ReferenceStates,
+    error_of_places_rtn_m,
+    error_of_positions_rtn_m,
+    ground_path_m,
+    places_of_positions,
+    reference_states,
+)
+from ground_service.processing.baseline import BASELINE_DEGREE, StartState, propagated_positions
+from ground_service.processing.drift import drift_by_length, error_before_reset_m, navigation_statistics
+from ground_service.processing.recall import (
+    ExpectedCraters,
+    Matches,
+    expected_craters,
+    match_detections,
+    score_detections,
+)
+from ground_service.processing.samples import DetectionSamples, NavigationSamples, OutcomeSamples
+from lunar.camera import PinholeCamera
+from lunar.catalogue import CraterCatalogue
+from lunar.constants import MOON_RADIUS_M, NANOSECONDS_PER_SECOND
+from lunar.ephemeris import Ephemeris
+from lunar.errors import LunarError
+from lunar.frames import Orientation
+from lunar.gravity import GravityField
+from reports.values import (
+    AnchorRead,
+    CraterMap,
+    DetectorScore,
+    FrameAccounting,
+    GalleryFrame,
+    HeadlineFigure,
+    HousekeepingParameter,
+    NavigationSeries,
+    NavigationStatistics,
+    PacketAccounting,
+    PassEvent,
+    PassReport,
+    TimeSpan,
+    TrackSeries,
+)
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+ESTIMATOR_NAMES = ("paper", "spherical", "anchored")
+"""On-board estimators by their number in telemetry."""
+
+ESTIMATOR_DESCRIPTIONS = {
+    "paper": "the paper's visual odometry on a flat Moon",
+    "spherical": "the same odometry with exact spherical back-projection",
+    "anchored": "navigation filter on catalogued craters",
+}
+
+GALLERY_FRAMES = 6
+WORST_FRAMES = 6
+WORST_MINIMUM_EXPECTED = 3
+"""A frame with fewer expected craters says nothing about the detector and is no candidate for the worst ones."""
+
+RESETS = ("initialization", "time_gap", "manual_step", "safety_timeout")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PassInputs:
+    """Everything that the evaluation of a pass needs; None or empty where it is not known."""
+
+    pass_id: str
+    title: str
+    start_utc_ns: int
+    stop_utc_ns: int
+    packets: PacketAccounting
+    camera: PinholeCamera
+    orientation: Orientation
+    reference: Ephemeris | None
+    catalogue: CraterCatalogue | None
+    detections: DetectionSamples
+    navigation: tuple[NavigationSamples, ...] = ()
+    outcomes: tuple[OutcomeSamples, ...] = ()
+    start_state: StartState | None = None
+    gravity: GravityField | None = None
+    frames_expected: int | None = None
+    cadence_s: float | None = None
+    housekeeping: tuple[HousekeepingParameter, ...] = ()
+    events: tuple[PassEvent, ...] = ()
+    images: Mapping[int, NDArray[np.uint8]] = field(default_factory=dict)
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    data_sources: tuple[str, ...] = ()
+    evidence_rung: str = ""
+    configuration: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    scenario_text: str = ""
+    generated_for: str = ""
+    created_utc: str = ""
+
+
+def evaluate_pass(inputs: PassInputs) -> PassReport:
+    """The report of a pass: navigation against reference and baselines, detector against catalogue, accounting.
+
+    What cannot be evaluated (no reference, no catalogue, no images) is left out with its reason.
+    """
+    missing: dict[str, str] = {}
+    remarks: list[str] = []
+    provenance = dict(inputs.provenance)
+    reference, navigation = None, ()
+    if inputs.reference is None:
+        missing["navigation"] = missing["reference"] = "no reference ephemeris covers this pass"
+    else:
+        reference, navigation = _navigation(inputs, inputs.reference, provenance, remarks)
+    detector, gallery, worst, craters = _detector(inputs, missing, remarks)
+    if not inputs.images:
+        missing["gallery"] = missing["worst_frames"] = "no images came down with this pass"
+    verdict, level = _verdict(inputs, navigation, detector)
+    return PassReport(
+        title=inputs.title,
+        pass_id=inputs.pass_id,
+        verdict=verdict,
+        verdict_level=level,
+        generated_for=inputs.generated_for,
+        created_utc=inputs.created_utc,
+        evidence_rung=inputs.evidence_rung,
+        headline=_headline(inputs, navigation, detector),
+        provenance=provenance,
+        data_sources=inputs.data_sources,
+        span=TimeSpan(inputs.start_utc_ns, inputs.stop_utc_ns, "pass"),
+        accounting=_frame_accounting(inputs),
+        packets=inputs.packets,
+        reference=reference,
+        navigation=navigation,
+        gaps=_gaps(inputs),
+        detector=detector,
+        gallery=gallery,
+        worst_frames=worst,
+        craters=craters,
+        housekeeping=inputs.housekeeping,
+        events=inputs.events,
+        truth_ledger=_anchor_reads(inputs.outcomes),
+        configuration=inputs.configuration,
+        scenario_text=inputs.scenario_text,
+        remarks=tuple(remarks),
+        not_available=missing,
+    )
+
+
+def summary_of(report: PassReport) -> dict[str, Any]:
+    """The figures of a report that a script asks for: frames, packets, detector and navigation by mode."""
+    micro = report.detector.micro if report.detector else None
+    return {
+        "pass_id": report.pass_id,
+        "frames": report.accounting.processed if report.accounting else None,
+        "packets": report.packets.packets if report.packets else 0,
+        "packets_lost": report.packets.lost if report.packets else 0,
+        "detector": {
+            "precision": micro.precision if micro else None,
+            "recall": micro.recall if micro else None,
+            "loc_px": micro.localisation_px if micro else None,
+            "per_class": [
+                {
+                    "class": score.size_class,
+                    "expected": score.expected,
+                    "precision": score.precision,
+                    "recall": score.recall,
+                    "loc_px": score.localisation_px,
+                }
+                for score in (report.detector.per_class if report.detector else ())
+            ],
+        },
+        "navigation": {s.name: _figures(s.statistics) for s in report.navigation if s.kind == "estimate"},
+        "baselines": {s.name: _figures(s.statistics) for s in report.navigation if s.kind == "baseline"},
+        "verdict": report.verdict,
+        "evidence_rung": report.evidence_rung,
+        "data": list(report.data_sources),
+    }
+
+
+def _figures(statistics: NavigationStatistics) -> dict[str, float]:
+    names = ("median_3d_m", "p68_3d_m", "p95_3d_m", "p99_3d_m", "max_3d_m", "drift_percent", "end_of_pass_m")
+    return {name: getattr(statistics, name) for name in names}
+
+
+def _navigation(
+    inputs: PassInputs, reference: Ephemeris, provenance: dict[str, str], remarks: list[str]
+) -> tuple[TrackSeries, tuple[NavigationSeries, ...]]:
+    times = _sample_times(inputs)
+    track = reference_states(reference, inputs.orientation, times)
+    path_m = _path(track)
+    series = [
+        _estimate_series(samples, _outcomes_of(inputs, samples.estimator), track, path_m)
+        for samples in inputs.navigation
+        if len(samples.utc_ns)
+    ]
+    uncovered = int(np.count_nonzero(~track.covered))
+    if uncovered:
+        remarks.append(f"{uncovered} of {len(times)} sample times lie outside the reference ephemeris and have no error")
+    if inputs.start_state is not None and inputs.gravity is not None:
+        try:
+            series += _baselines(inputs, inputs.start_state, inputs.gravity, track, path_m)
+            provenance["gravity of the baseline"] = (
+                f"{inputs.gravity.name}, degree {min(BASELINE_DEGREE, inputs.gravity.degree)}, with Earth and Sun"
+            )
+        except LunarError as error:
+            remarks.append(f"no propagate-only baseline: {error}")
+    else:
+        remarks.append("no propagate-only baseline: the pass names no start state")
+    return (
+        TrackSeries(times, track.latitude_deg, track.longitude_deg, track.altitude_m),
+        tuple(series),
+    )
+
+
+def _sample_times(inputs: PassInputs) -> IntArray:
+    """Every time at which anything of the pass was sampled, ascending."""
+    times = [samples.utc_ns for samples in inputs.navigation] + [inputs.detections.utc_ns]
+    return np.unique(np.concatenate(times)).astype(np.int64)
+
+
+def _path(track: ReferenceStates) -> FloatArray:
+    """Ground path to each sample; NaN where the reference does not cover."""
+    path = np.full(len(track.utc_ns), np.nan)
+    path[track.covered] = ground_path_m(_at(track, np.flatnonzero(track.covered)), MOON_RADIUS_M)
+    return path
+
+
+def _at(track: ReferenceStates, rows: IntArray) -> ReferenceStates:
+    return ReferenceStates(
+        track.utc_ns[rows],
+        track.covered[rows],
+        track.position_icrf_m[rows],
+        track.velocity_icrf_m_s[rows],
+        track.mcmf_from_icrf[rows],
+        track.position_mcmf_m[rows],
+        track.latitude_rad[rows],
+        track.longitude_rad[rows],
+        track.altitude_m[rows],
+    )
+
+
+def _estimate_series(
+    samples: NavigationSamples, outcomes: OutcomeSamples | None, track: ReferenceStates, path_m: FloatArray
+) -> NavigationSeries:
+    rows = np.searchsorted(track.utc_ns, samples.utc_ns)
+    error = error_of_places_rtn_m(
+        _at(track, rows), samples.latitude_deg, samples.longitude_deg, samples.altitude_m
+    )
+    triggers, candidates, reads = _joined(samples, outcomes)
+    is_reset = np.array([trigger in RESETS for trigger in triggers], dtype=np.bool_)
+    if not triggers:
+        is_reset = np.zeros(len(samples.utc_ns), dtype=np.bool_)
+    sigma = samples.sigma_rtn_m
+    with np.errstate(invalid="ignore", divide="ignore"):
+        nees = np.sum((error / sigma) ** 2, axis=-1)
+    has_sigma = bool(np.isfinite(sigma).any())
+    return NavigationSeries(
+        name=samples.estimator,
+        kind="estimate",
+        utc_ns=samples.utc_ns,
+        latitude_deg=samples.latitude_deg,
+        longitude_deg=samples.longitude_deg % 360.0,
+        altitude_m=samples.altitude_m,
+        error_rtn_m=error,
+        sigma_rtn_m=sigma if has_sigma else None,
+        outcome=samples.outcome,
+        reset_trigger=triggers,
+        anchor_reads=int(reads[-1]) if len(reads) else 0,
+        anchor_reads_after_start=int(reads[-1] - reads[0]) if len(reads) else None,
+        statistics=navigation_statistics(error, path_m[rows], is_reset),
+        description=ESTIMATOR_DESCRIPTIONS.get(samples.estimator, ""),
+        reset_error_m=error_before_reset_m(error, is_reset) if triggers else None,
+        matched=samples.matched,
+        candidates=candidates,
+        nis=samples.nis if bool(np.isfinite(samples.nis).any()) else None,
+        nees=nees if has_sigma else None,
+        time_since_fix_s=_time_since_fix_s(samples),
+        drift_by_length=drift_by_length(error, path_m[rows], is_reset),
+    )
+
+
+def _joined(
+    samples: NavigationSamples, outcomes: OutcomeSamples | None
+) -> tuple[tuple[str, ...], IntArray | None, IntArray]:
+    """Reset triggers and candidate pairs of the estimator's outcomes at the frames of its states, and all its reads."""
+    if outcomes is None or len(outcomes.frame_number) == 0:
+        return (), None, np.zeros(0, dtype=np.int64)
+    order = np.argsort(outcomes.frame_number, kind="stable")
+    numbers = outcomes.frame_number[order]
+    at = np.minimum(np.searchsorted(numbers, samples.frame_number), len(numbers) - 1)
+    same = numbers[at] == samples.frame_number
+    rows = order[at]
+    triggers = tuple(
+        outcomes.reset_trigger[row] if hit else "none" for row, hit in zip(rows, same, strict=True)
+    )
+    candidates = np.where(same, outcomes.candidate_pairs[rows], 0).astype(np.int64)
+    return triggers, candidates, outcomes.anchor_reads
+
+
+def _time_since_fix_s(samples: NavigationSamples) -> FloatArray | None:
+    fixed = np.array([outcome == "fixed" for outcome in samples.outcome], dtype=np.bool_)
+    if not fixed.any():
+        return None
+    last = np.maximum.accumulate(np.where(fixed, np.arange(len(fixed)), -1))
+    since = (samples.utc_ns - samples.utc_ns[np.maximum(last, 0)]) / NANOSECONDS_PER_SECOND
+    return np.where(last >= 0, since, np.nan)
+
+
+def _baselines(
+    inputs: PassInputs, start: StartState, gravity: GravityField, track: ReferenceStates, path_m: FloatArray
+) -> list[NavigationSeries]:
+    degree = min(BASELINE_DEGREE, gravity.degree)
+    rows = np.flatnonzero(track.covered & (track.utc_ns >= start.utc_ns))
+    if len(rows) == 0:
+        return []
+    here = _at(track, rows)
+    series = []
+    for name, n, third, text in (
+        ("propagate-only", degree, True, f"start state propagated, gravity to degree {degree}, Earth and Sun"),
+        ("Kepler", 0, False, "start state on its two-body orbit"),
+    ):
+        position = propagated_positions(
+            start, here.utc_ns, gravity, n, inputs.orientation, third_bodies=third
+        )
+        error = error_of_positions_rtn_m(here, position)
+        latitude, longitude, altitude = places_of_positions(here, position)
+        never = np.zeros(len(rows), dtype=np.bool_)
+        series.append(
+            NavigationSeries(
+                name=name,
+                kind="baseline",
+                utc_ns=here.utc_ns,
+                latitude_deg=latitude,
+                longitude_deg=longitude,
+                altitude_m=altitude,
+                error_rtn_m=error,
+                statistics=navigation_statistics(error, path_m[rows], never),
+                description=text,
+                drift_by_length=drift_by_length(error, path_m[rows], never),
+            )
+        )
+    return series
+
+
+def _detector(
+    inputs: PassInputs, missing: dict[str, str], remarks: list[str]
+) -> tuple[DetectorScore | None, tuple[GalleryFrame, ...], tuple[GalleryFrame, ...], CraterMap | None]:
+    detections = inputs.detections
+    if len(detections) == 0:
+        missing["detector"] = missing["craters"] = "no detections came down"
+        return None, (), (), None
+    if inputs.catalogue is None or inputs.reference is None:
+        missing["detector"] = missing["craters"] = "it needs a crater catalogue and a reference ephemeris"
+        return None, (), (), None
+    track = reference_states(inputs.reference, inputs.orientation, detections.utc_ns)
+    expected = expected_craters(inputs.catalogue, inputs.camera, track.position_mcmf_m)
+    matches = match_detections(detections, expected)
+    score = score_detections(detections, expected, matches, track.altitude_m)
+    chosen, worst = _choose_frames(inputs, expected, matches)
+    frames = {
+        frame: _gallery_frame(inputs, expected, matches, frame) for frame in sorted({*chosen, *worst})
+    }
+    return (
+        score,
+        tuple(frames[frame] for frame in chosen),
+        tuple(frames[frame] for frame in worst),
+        _crater_map(inputs.catalogue, expected, matches),
+    )
+
+
+def _choose_frames(inputs: PassInputs, expected: ExpectedCraters, matches: Matches) -> tuple[list[int], list[int]]:
+    """Rows of frames for the galleries: some spread over the pass, and those where the detector did worst."""
+    detections = inputs.detections
+    with_image = np.array([int(n) in inputs.images for n in detections.frame_number], dtype=np.bool_)
+    rows = np.flatnonzero(with_image)
+    if len(rows) == 0:
+        return [], []
+    spread = rows[np.unique(np.linspace(0, len(rows) - 1, min(GALLERY_FRAMES, len(rows))).round().astype(np.int64))]
+    owner = np.repeat(np.arange(len(detections)), np.diff(expected.offsets))
+    scored = np.isin(expected.size_class, (0, 1, 2)) & expected.complete
+    total = np.bincount(owner[scored], minlength=len(detections))
+    hit = np.bincount(owner[scored & (matches.detection_of_crater >= 0)], minlength=len(detections))
+    candidates = rows[(total[rows] >= WORST_MINIMUM_EXPECTED) & (hit[rows] < total[rows])]
+    recall = hit[candidates] / np.maximum(total[candidates], 1)
+    worst = candidates[np.lexsort((candidates, recall))][:WORST_FRAMES]
+    return [int(row) for row in spread], sorted(int(row) for row in worst)
+
+
+def _gallery_frame(inputs: PassInputs, expected: ExpectedCraters, matches: Matches, row: int) -> GalleryFrame:
+    detections = inputs.detections
+    d = slice(int(detections.offsets[row]), int(detections.offsets[row + 1]))
+    c = np.arange(expected.offsets[row], expected.offsets[row + 1])
+    c = c[np.isin(expected.size_class[c], (0, 1, 2))]
+    found = matches.detection_of_crater[c] >= 0
+    number = int(detections.frame_number[row])
+    return GalleryFrame(
+        frame_number=number,
+        utc_ns=int(detections.utc_ns[row]),
+        image=inputs.images[number],
+        detection_u_px=detections.u_px[d],
+        detection_v_px=detections.v_px[d],
+        detection_diameter_px=detections.diameter_px[d],
+        detection_class=detections.size_class[d],
+        catalogue_u_px=expected.u_px[c],
+        catalogue_v_px=expected.v_px[c],
+        catalogue_diameter_px=expected.diameter_px[c],
+        catalogue_class=expected.size_class[c],
+        detection_matched=matches.crater_of_detection[d] >= 0,
+        catalogue_matched=found,
+        caption=f"{int(found.sum())} of {len(c)} catalogued craters of 5–30 km detected",
+    )
+
+
+def _crater_map(catalogue: CraterCatalogue, expected: ExpectedCraters, matches: Matches) -> CraterMap:
+    scored = np.isin(expected.size_class, (0, 1, 2))
+    index, inverse = np.unique(expected.index[scored], return_inverse=True)
+    times = np.bincount(inverse, minlength=len(index))
+    found = np.bincount(inverse[matches.detection_of_crater[scored] >= 0], minlength=len(index))
+    return CraterMap(
+        latitude_deg=np.degrees(catalogue.latitude_rad[index]),
+        longitude_deg=np.degrees(catalogue.longitude_rad[index]) % 360.0,
+        diameter_m=catalogue.diameter_m[index],
+        expected=times.astype(np.int64),
+        detected=found.astype(np.int64),
+        source=catalogue.source,
+    )
+
+
+def _frame_accounting(inputs: PassInputs) -> FrameAccounting:
+    detections = inputs.detections
+    quality: dict[str, int] = {}
+    for name in detections.quality:
+        quality[name] = quality.get(name, 0) + 1
+    processed = int(np.count_nonzero(detections.usable))
+    navigated = max((len(np.unique(s.frame_number)) for s in inputs.navigation), default=None)
+    return FrameAccounting(
+        expected=inputs.frames_expected,
+        acquired=len(detections),
+        processed=processed,
+        with_detections=int(np.count_nonzero(np.diff(detections.offsets) > 0)),
+        navigated=navigated,
+        bad_image=len(detections) - processed,
+        downlinked=len(inputs.images) or None,
+        quality=quality,
+    )
+
+
+def _gaps(inputs: PassInputs) -> tuple[TimeSpan, ...]:
+    """Silences of more than one and a half cadences between downlinked frames."""
+    times = inputs.detections.utc_ns
+    if inputs.cadence_s is None or len(times) < 2:
+        return ()
+    limit = 1.5 * inputs.cadence_s * NANOSECONDS_PER_SECOND
+    return tuple(
+        TimeSpan(int(times[i]), int(times[i + 1]), "no frames") for i in np.flatnonzero(np.diff(times) > limit)
+    )
+
+
+def _anchor_reads(outcomes: tuple[OutcomeSamples, ...]) -> tuple[AnchorRead, ...]:
+    """Every frame at which an estimator's count of anchor reads rose, in time order."""
+    reads = []
+    for samples in outcomes:
+        rose = np.flatnonzero(np.diff(samples.anchor_reads, prepend=0) > 0)
+        reads += [
+            AnchorRead(
+                samples.estimator, int(samples.utc_ns[i]), samples.reset_trigger[i], int(samples.frame_number[i])
+            )
+            for i in rose
+        ]
+    return tuple(sorted(reads, key=lambda read: (read.utc_ns, read.estimator)))
+
+
+def _outcomes_of(inputs: PassInputs, estimator: str) -> OutcomeSamples | None:
+    return next((samples for samples in inputs.outcomes if samples.estimator == estimator), None)
+
+
+def _best(navigation: tuple[NavigationSeries, ...], kind: str) -> NavigationSeries | None:
+    """The series of this kind with the smallest median error."""
+    known = [s for s in navigation if s.kind == kind and np.isfinite(s.statistics.median_3d_m)]
+    return min(known, key=lambda s: s.statistics.median_3d_m, default=None)
+
+
+def _headline(
+    inputs: PassInputs, navigation: tuple[NavigationSeries, ...], detector: DetectorScore | None
+) -> tuple[HeadlineFigure, ...]:
+    best = _best(navigation, "estimate")
+    only = next((s for s in navigation if s.name == "propagate-only"), None)
+    micro = detector.micro if detector else None
+    lost = inputs.packets.lost
+    return (
+        HeadlineFigure(
+            "Median position error",
+            best.statistics.median_3d_m if best else None,
+            "m",
+            f"{best.name}; 95 % below {best.statistics.p95_3d_m:.0f} m" if best else "",
+        ),
+        HeadlineFigure(
+            "Propagation alone, same start",
+            only.statistics.median_3d_m if only else None,
+            "m",
+            f"95 % below {only.statistics.p95_3d_m:.0f} m" if only else "no start state",
+        ),
+        HeadlineFigure(
+            "Drift",
+            best.statistics.drift_percent if best else None,
+            "% of path",
+            f"{best.name}, horizontal" if best else "",
+        ),
+        HeadlineFigure(
+            "Craters detected",
+            100.0 * micro.recall if micro and np.isfinite(micro.recall) else None,
+            "%",
+            f"precision {100.0 * micro.precision:.0f} %, centre {micro.localisation_px:.2f} px" if micro else "",
+        ),
+        HeadlineFigure("Packets lost", lost, "", f"of {inputs.packets.packets + lost}"),
+    )
+
+
+def _verdict(
+    inputs: PassInputs, navigation: tuple[NavigationSeries, ...], detector: DetectorScore | None
+) -> tuple[str, str]:
+    best = _best(navigation, "estimate")
+    only = next((s for s in navigation if s.name == "propagate-only"), None)
+    loss = "All packets arrived." if inputs.packets.lost == 0 else f"{inputs.packets.lost} packets were lost."
+    if best is None:
+        return f"No position estimate could be compared with a reference. {loss}", "bad"
+    figure = f"{best.name} navigation held a median 3-D error of {_length(best.statistics.median_3d_m)}"
+    if only is None:
+        return f"{figure}; there is no propagate-only baseline to judge it by. {loss}", "caution"
+    baseline = _length(only.statistics.median_3d_m)
+    if best.statistics.median_3d_m < only.statistics.median_3d_m:
+        level = "good" if inputs.packets.lost == 0 else "caution"
+        return f"{figure}, better than propagating the same start state without images ({baseline}). {loss}", level
+    return f"{figure}; propagating the same start state without images does better ({baseline}). {loss}", "caution"
+
+
+def _length(value_m: float) -> str:
+    return f"{value_m / 1e3:.1f} km" if value_m >= 9_950.0 else f"{value_m:.0f} m"

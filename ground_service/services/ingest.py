@@ -1,0 +1,160 @@
+"""Ingest of a downlink file: the raw file is archived, its packets are stored once each, everything is accounted for.
+
+The archive that results depends only on the octets that were ingested, not on their order, on how they were split into
+files or on how often they came. An ingest that was cut off can simply be run again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from ground_service.clock import utc_now_ns
+from ground_service.errors import GroundError, InvalidInput
+from ground_service.link.stream import DownlinkReader
+from ground_service.services.ground import Ground
+from ground_service.store import repository
+from ground_service.store.files import StoredFile, read_blocks
+from ground_service.store.packets import store_batch
+from tmtc.dictionary import DICTIONARY
+from tmtc.errors import TmtcError
+
+FLOWN = "flight"
+"""Instance of a spacecraft that telemetry belongs to when nothing else is said."""
+
+
+@dataclass(frozen=True, slots=True)
+class IngestResult:
+    """What one ingest found in its file, and what of it was new."""
+
+    ingest_id: int
+    vehicle_id: int | None
+    octets: int
+    packets: int
+    packets_new: int
+    packets_repeated: int
+    samples: int
+    crc_errors: int
+    octets_skipped: int
+    frames: int
+    frames_bad: int
+    symbols_corrected: int
+    unknown: int
+
+
+def ingest_file(
+    ground: Ground, path: Path, *, spacecraft_id: int, instance: str = FLOWN, name: str | None = None
+) -> IngestResult:
+    """Archive a downlink file and store what is in it.
+
+    Raises
+    ------
+    InvalidInput
+        If the file cannot be read or holds nothing of a downlink.
+    """
+    if not path.is_file():
+        raise InvalidInput(str(path), "", "a downlink file", "a folder" if path.is_dir() else "nothing there")
+    stored = ground.files.put_file(path)
+    return ingest_stored(ground, stored, spacecraft_id=spacecraft_id, instance=instance, name=name or path.name)
+
+
+def ingest_stored(
+    ground: Ground, stored: StoredFile, *, spacecraft_id: int, instance: str = FLOWN, name: str
+) -> IngestResult:
+    """Store what is in an archived downlink file; see `ingest_file`."""
+    ingest_id = begin_ingest(ground, stored, name)
+    return run_ingest(ground, ingest_id, spacecraft_id=spacecraft_id, instance=instance)
+
+
+def begin_ingest(ground: Ground, stored: StoredFile, name: str) -> int:
+    """Enter an archived file to be ingested; the id of the ingest."""
+    now = utc_now_ns()
+    with ground.database.writing() as connection:
+        repository.register_file(connection, stored, "downlink", name, now)
+        return int(
+            repository.add(
+                connection,
+                repository.INGESTS,
+                vehicle_id=None,
+                file_sha256=stored.sha256,
+                state="queued",
+                dictionary_version=DICTIONARY.version,
+                received_utc_ns=now,
+                accounting={},
+            )
+        )
+
+
+def run_ingest(ground: Ground, ingest_id: int, *, spacecraft_id: int, instance: str = FLOWN) -> IngestResult:
+    """Do what was entered with `begin_ingest`; running it again is harmless."""
+    with ground.database.writing() as connection:
+        record = repository.get(connection, repository.INGESTS, ingest_id, "ingest")
+        vehicle = repository.vehicle_id(connection, spacecraft_id, instance)
+        repository.change(connection, repository.INGESTS, ingest_id, state="running", vehicle_id=vehicle)
+    path = ground.files.path(record["file_sha256"])
+    try:
+        result = _store_stream(ground, ingest_id, vehicle, read_blocks(path))
+        if result.packets == 0 and result.octets > 0:
+            raise InvalidInput(
+                _name(ground, record["file_sha256"]),
+                "",
+                "a stream of CADUs or of space packets",
+                f"{result.octets} octets without a single good packet",
+            )
+    except (GroundError, TmtcError) as error:
+        with ground.database.writing() as connection:
+            repository.change(
+                connection,
+                repository.INGESTS,
+                ingest_id,
+                state="failed",
+                error=str(error),
+                finished_utc_ns=utc_now_ns(),
+            )
+        raise
+    with ground.database.writing() as connection:
+        repository.change(
+            connection,
+            repository.INGESTS,
+            ingest_id,
+            state="done",
+            error=None,
+            finished_utc_ns=utc_now_ns(),
+            accounting=asdict(result),
+        )
+    return result
+
+
+def _store_stream(ground: Ground, ingest_id: int, vehicle: int, blocks: Iterable[bytes]) -> IngestResult:
+    reader = DownlinkReader()
+    new = repeated = samples = packets = unknown = 0
+    for batch in reader.batches(blocks):
+        with ground.database.writing() as connection:
+            stored = store_batch(connection, vehicle, batch)
+        new += stored.new
+        repeated += stored.repeated
+        samples += stored.samples
+        packets += len(batch)
+        unknown += batch.unknown
+    found = reader.accounting
+    return IngestResult(
+        ingest_id=ingest_id,
+        vehicle_id=vehicle,
+        octets=found.octets,
+        packets=packets,
+        packets_new=new,
+        packets_repeated=repeated,
+        samples=samples,
+        crc_errors=found.crc_errors,
+        octets_skipped=found.octets_skipped,
+        frames=found.frames,
+        frames_bad=found.frames_bad,
+        symbols_corrected=found.symbols_corrected,
+        unknown=unknown,
+    )
+
+
+def _name(ground: Ground, sha256: str) -> str:
+    with ground.database.reading() as connection:
+        return str(repository.get(connection, repository.FILES, sha256, "file")["name"])

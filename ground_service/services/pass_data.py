@@ -1,0 +1,495 @@
+"""What is stored about a pass, read into the plain arrays that the evaluation takes."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection, func, select
+
+from ground_service.errors import InvalidInput
+from ground_service.processing.baseline import StartState
+from ground_service.processing.correlation import TimeCorrelation, ticks_of_utc_ns, utc_ns_of_ticks
+from ground_service.processing.pass_evaluation import PassInputs
+from ground_service.processing.samples import DetectionSamples, NavigationSamples, OutcomeSamples, no_detections
+from ground_service.processing.sequence import account_sequence
+from ground_service.services.ground import Ground
+from ground_service.store import repository
+from ground_service.store.codec import unpack_detections
+from ground_service.store.files import FileArchive
+from lunar.camera import PinholeCamera
+from lunar.catalogue import CraterCatalogue, load_catalogue
+from lunar.ephemeris import Ephemeris, load_ephemeris
+from lunar.timescales import parse_utc
+from reports.values import ApidAccounting, CompletenessSeries, HousekeepingParameter, PacketAccounting, PassEvent
+from tmtc.dictionary import DICTIONARY
+
+IntArray = NDArray[np.int64]
+
+PASS_MARGIN_NS = 60_000_000_000
+"""Samples this far outside a window still belong to it: housekeeping before the first and after the last image."""
+
+COMPLETENESS_BINS = 60
+
+_SEVERITIES = {1: "info", 2: "low", 3: "medium", 4: "high"}
+
+_TRENDS = (
+    ("temperature_c", "°C"),
+    ("bus_voltage_v", "V"),
+    ("power_w", "W"),
+    ("memory_used_kib", "KiB"),
+    ("queue_depth", "packets"),
+    ("storage_used_permille", "‰"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class PassSpan:
+    """The stretch of on-board time that belongs to a pass, and how it maps to UTC."""
+
+    vehicle: int
+    start_ticks: int
+    stop_ticks: int
+    correlations: tuple[TimeCorrelation, ...]
+
+    def utc_ns(self, ticks: Sequence[int]) -> IntArray:
+        """Correlated UTC (n,) of on-board ticks."""
+        return utc_ns_of_ticks(np.array(ticks, dtype=np.int64), self.correlations)[0]
+
+
+class ImageShelf(Mapping[int, NDArray[np.uint8]]):
+    """Images kept with a pass, read from the archive when they are asked for."""
+
+    def __init__(self, files: FileArchive, sha256_by_frame: Mapping[int, str]) -> None:
+        self._files = files
+        self._sha256 = dict(sha256_by_frame)
+
+    def __getitem__(self, frame_number: int) -> NDArray[np.uint8]:
+        return read_image(self._files.get(self._sha256[frame_number]), f"frame {frame_number}")
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._sha256)
+
+    def __len__(self) -> int:
+        return len(self._sha256)
+
+
+def read_image(octets: bytes, name: str) -> NDArray[np.uint8]:
+    """An 8-bit image (H, W) or (H, W, 3) from PNG octets.
+
+    Raises
+    ------
+    InvalidInput
+        If the octets are no such image.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(io.BytesIO(octets)) as image:
+            return np.asarray(image if image.mode in ("L", "RGB") else image.convert("RGB"), dtype=np.uint8)
+    except (UnidentifiedImageError, OSError, ValueError) as error:
+        raise InvalidInput(name, "", "a PNG image", str(error)) from None
+
+
+def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> PassInputs:
+    """Everything that the evaluation of a pass needs, as stored now.
+
+    Raises
+    ------
+    NotFound
+        If there is no such pass.
+    """
+    with ground.database.reading() as connection:
+        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        span = pass_span(connection, record)
+        manifest: dict[str, Any] = record["manifest"]
+        vehicle = repository.get(connection, repository.VEHICLES, record["vehicle_id"], "vehicle")
+        ephemeris = _ephemeris_row(connection, record)
+        frames = connection.execute(
+            select(repository.PASS_FRAMES.c.frame_number, repository.PASS_FRAMES.c.file_sha256)
+            .where(repository.PASS_FRAMES.c.pass_id == pass_id)
+            .order_by(repository.PASS_FRAMES.c.frame_number)
+        ).tuples()
+        return PassInputs(
+            pass_id=str(pass_id),
+            title=record["name"],
+            start_utc_ns=record["start_utc_ns"],
+            stop_utc_ns=record["stop_utc_ns"],
+            packets=packet_accounting(connection, record, span),
+            camera=camera_of(manifest),
+            orientation=ground.orientation,
+            reference=_reference(ground, ephemeris),
+            catalogue=_catalogue(ground, record),
+            detections=detection_samples(connection, span),
+            navigation=navigation_samples(connection, span),
+            outcomes=outcome_samples(connection, span),
+            start_state=start_state_of(manifest),
+            gravity=ground.gravity,
+            frames_expected=manifest.get("frames_expected"),
+            cadence_s=manifest.get("cadence_s"),
+            housekeeping=_housekeeping(connection, span),
+            events=_events(connection, span),
+            images=ImageShelf(ground.files, {int(number): sha256 for number, sha256 in frames}),
+            provenance=_provenance(ground, manifest, record, vehicle, ephemeris, span),
+            data_sources=tuple(str(name) for name in manifest.get("data_sources", ())),
+            evidence_rung=str(manifest.get("evidence_rung", "")) or _rung(manifest),
+            configuration=_configuration(manifest),
+            scenario_text=str(manifest.get("scenario_toml", "")),
+            generated_for="",
+            created_utc=created_utc,
+        )
+
+
+def pass_span(connection: Connection, record: Mapping[str, Any]) -> PassSpan:
+    """The stretch of on-board time of a pass, a margin included."""
+    correlations = load_correlations(connection, record["vehicle_id"])
+    return PassSpan(
+        vehicle=record["vehicle_id"],
+        start_ticks=ticks_of_utc_ns(record["start_utc_ns"] - PASS_MARGIN_NS, correlations),
+        stop_ticks=ticks_of_utc_ns(record["stop_utc_ns"] + PASS_MARGIN_NS, correlations),
+        correlations=correlations,
+    )
+
+
+def load_correlations(connection: Connection, vehicle: int) -> tuple[TimeCorrelation, ...]:
+    """The time correlations of a vehicle that are in force, by on-board time."""
+    table = repository.CORRELATIONS
+    rows = connection.execute(
+        select(table).where(table.c.vehicle_id == vehicle, table.c.superseded == 0).order_by(table.c.start_ticks)
+    ).mappings()
+    return tuple(
+        TimeCorrelation(
+            row["id"],
+            row["start_ticks"],
+            row["stop_ticks"],
+            row["reference_ticks"],
+            row["reference_utc_ns"],
+            row["drift_ppb"],
+        )
+        for row in rows
+    )
+
+
+def navigation_samples(connection: Connection, span: PassSpan) -> tuple[NavigationSamples, ...]:
+    """States of every estimator, in time order."""
+    names = (
+        "ticks", "estimator", "frame_number", "outcome", "latitude_deg", "longitude_deg", "altitude_m",
+        "sigma_r_m", "sigma_t_m", "sigma_n_m", "nis", "matched",
+    )  # fmt: skip
+    columns = _columns(connection, "navigation_states", span, names)
+    outcomes = DICTIONARY.labels("navigation_state", "outcome")
+    return tuple(
+        NavigationSamples(
+            estimator=name,
+            frame_number=part["frame_number"],
+            utc_ns=span.utc_ns(part["ticks"]),
+            latitude_deg=part["latitude_deg"],
+            longitude_deg=part["longitude_deg"],
+            altitude_m=part["altitude_m"],
+            sigma_rtn_m=np.column_stack([part["sigma_r_m"], part["sigma_t_m"], part["sigma_n_m"]]),
+            nis=part["nis"],
+            matched=part["matched"],
+            outcome=_labels(outcomes, part["outcome"]),
+        )
+        for name, part in _by_estimator(columns, "navigation_state")
+    )
+
+
+def outcome_samples(connection: Connection, span: PassSpan) -> tuple[OutcomeSamples, ...]:
+    """What every estimator made of every frame, in time order."""
+    names = (
+        "ticks", "estimator", "frame_number", "outcome", "reset_trigger", "candidate_pairs", "anchor_reads",
+    )  # fmt: skip
+    columns = _columns(connection, "frame_outcomes", span, names)
+    outcomes = DICTIONARY.labels("frame_outcome", "outcome")
+    triggers = DICTIONARY.labels("frame_outcome", "reset_trigger")
+    return tuple(
+        OutcomeSamples(
+            estimator=name,
+            frame_number=part["frame_number"],
+            utc_ns=span.utc_ns(part["ticks"]),
+            outcome=_labels(outcomes, part["outcome"]),
+            reset_trigger=_labels(triggers, part["reset_trigger"]),
+            candidate_pairs=part["candidate_pairs"],
+            anchor_reads=part["anchor_reads"],
+        )
+        for name, part in _by_estimator(columns, "frame_outcome")
+    )
+
+
+def detection_samples(connection: Connection, span: PassSpan) -> DetectionSamples:
+    """Detections of every frame, in time order; of two reports on one image the first by content counts."""
+    rows = repository.samples(
+        connection,
+        "detections",
+        span.vehicle,
+        span.start_ticks,
+        span.stop_ticks,
+        DICTIONARY.version,
+        ("ticks", "frame_number", "image_quality", "items"),
+    )
+    if not rows["ticks"]:
+        return no_detections()
+    order = sorted(
+        range(len(rows["ticks"])), key=lambda i: (rows["ticks"][i], rows["frame_number"][i], bytes(rows["items"][i]))
+    )
+    chosen = [
+        i
+        for place, i in enumerate(order)
+        if place == 0
+        or (rows["ticks"][i], rows["frame_number"][i])
+        != (rows["ticks"][order[place - 1]], rows["frame_number"][order[place - 1]])
+    ]
+    items, offsets = unpack_detections([bytes(rows["items"][i]) for i in chosen])
+    quality = [rows["image_quality"][i] for i in chosen]
+    return DetectionSamples(
+        frame_number=np.array([rows["frame_number"][i] for i in chosen], dtype=np.int64),
+        utc_ns=span.utc_ns([rows["ticks"][i] for i in chosen]),
+        usable=np.array([code == 0 for code in quality], dtype=np.bool_),
+        quality=_labels(DICTIONARY.labels("detections", "image_quality"), np.array(quality)),
+        offsets=offsets,
+        u_px=items["u_px"].astype(np.float64),
+        v_px=items["v_px"].astype(np.float64),
+        diameter_px=items["diameter_px"].astype(np.float64),
+        score=items["score"].astype(np.float64),
+        size_class=items["size_class"].astype(np.int64),
+    )
+
+
+def packet_accounting(connection: Connection, record: Mapping[str, Any], span: PassSpan) -> PacketAccounting:
+    """Packets of a pass and what is missing of them, with what its ingests met on the way."""
+    headers = repository.packet_headers(connection, span.vehicle, span.start_ticks, span.stop_ticks)
+    names = _apid_names()
+    by_apid: dict[int, ApidAccounting] = {}
+    lost_ticks: list[IntArray] = []
+    conflicts = 0
+    for apid in np.unique(headers["apid"]).tolist():
+        here = headers["apid"] == apid
+        account = account_sequence(headers["ticks"][here], headers["sequence_count"][here])
+        by_apid[apid] = ApidAccounting(
+            name=names.get(apid, "unknown"),
+            packets=int(np.count_nonzero(here)),
+            lost=account.lost,
+            conflicts=account.conflicts,
+        )
+        conflicts += account.conflicts
+        lost_ticks += [
+            np.linspace(gap.before_ticks, gap.after_ticks, gap.missing + 2)[1:-1].astype(np.int64)
+            for gap in account.gaps
+        ]
+    totals = _ingest_totals(connection, span.vehicle)
+    lost = np.concatenate(lost_ticks) if lost_ticks else np.zeros(0, dtype=np.int64)
+    return PacketAccounting(
+        packets=len(headers["apid"]),
+        lost=len(lost),
+        duplicates=totals["duplicates"],
+        conflicts=conflicts,
+        crc_errors=totals["crc_errors"],
+        octets_skipped=totals["octets_skipped"],
+        frames=totals["frames"] or None,
+        frames_bad=totals["frames_bad"],
+        symbols_corrected=totals["symbols_corrected"],
+        octets=totals["octets"] or None,
+        by_apid=by_apid,
+        completeness=_completeness(record, span, headers["ticks"], lost),
+    )
+
+
+def camera_of(manifest: Mapping[str, Any]) -> PinholeCamera:
+    """The camera that a manifest names; the payload's own where it names none."""
+    given = manifest.get("camera") or {}
+    default = PinholeCamera()
+    return PinholeCamera(
+        width_px=int(given.get("width_px", default.width_px)),
+        height_px=int(given.get("height_px", default.height_px)),
+        fov_rad=math.radians(given["fov_deg"]) if "fov_deg" in given else default.fov_rad,
+    )
+
+
+def start_state_of(manifest: Mapping[str, Any]) -> StartState | None:
+    """The state that the estimators were started from, where the manifest names it."""
+    given = manifest.get("start_state")
+    if not given:
+        return None
+    return StartState(
+        utc_ns=parse_utc(given["utc"]),
+        position_icrf_m=np.array(given["position_icrf_m"], dtype=np.float64),
+        velocity_icrf_m_s=np.array(given["velocity_icrf_m_s"], dtype=np.float64),
+    )
+
+
+def _columns(
+    connection: Connection, kind: str, span: PassSpan, names: Sequence[str]
+) -> dict[str, NDArray[Any]]:
+    """Samples as arrays: whole numbers as int64, all else as float64 with NaN for NULL."""
+    rows = repository.samples(
+        connection, kind, span.vehicle, span.start_ticks, span.stop_ticks, DICTIONARY.version, names
+    )
+    table = repository.SAMPLES[kind]
+    return {
+        name: np.array(values, dtype=np.int64 if table.c[name].type.python_type is int else np.float64)
+        for name, values in rows.items()
+    }
+
+
+def _by_estimator(columns: dict[str, NDArray[Any]], packet: str) -> list[tuple[str, dict[str, NDArray[Any]]]]:
+    """The columns of each estimator by name, one row per frame and time, in an order of content."""
+    names = DICTIONARY.labels(packet, "estimator")
+    keys = [column for name, column in columns.items() if name not in ("ticks", "frame_number", "estimator")]
+    order = np.lexsort([*keys, columns["frame_number"], columns["ticks"], columns["estimator"]])
+    identity = np.column_stack([columns[name][order] for name in ("estimator", "ticks", "frame_number")])
+    first = np.ones(len(order), dtype=np.bool_)
+    first[1:] = (np.diff(identity, axis=0) != 0).any(axis=1)
+    order = order[first]
+    parts = []
+    for code in np.unique(columns["estimator"]).tolist():
+        rows = order[columns["estimator"][order] == code]
+        parts.append((names.get(code, f"estimator {code}"), {name: column[rows] for name, column in columns.items()}))
+    return parts
+
+
+def _labels(labels: Mapping[int, str], codes: NDArray[Any]) -> tuple[str, ...]:
+    return tuple(labels.get(int(code), str(int(code))) for code in codes)
+
+
+def _apid_names() -> dict[int, str]:
+    names: dict[int, str] = {}
+    for definition in DICTIONARY.telemetry:
+        names.setdefault(definition.apid, definition.name.split("_info")[0].replace("_", " "))
+    return names
+
+
+def _ingest_totals(connection: Connection, vehicle: int) -> dict[str, int]:
+    """Sums over the ingests of a vehicle, each file counted once; duplicates are packets that came more than once."""
+    keys = ("crc_errors", "octets_skipped", "frames", "frames_bad", "symbols_corrected", "octets")
+    table = repository.INGESTS
+    rows = connection.execute(
+        select(table.c.file_sha256, table.c.accounting).where(
+            table.c.vehicle_id == vehicle, table.c.state == "done"
+        )
+    ).tuples()
+    by_file = dict(rows.all())
+    totals = {key: sum(int(accounting.get(key, 0)) for accounting in by_file.values()) for key in keys}
+    seen = sum(int(accounting.get("packets", 0)) for accounting in by_file.values())
+    stored = connection.execute(
+        select(func.count()).select_from(repository.PACKETS).where(repository.PACKETS.c.vehicle_id == vehicle)
+    ).scalar_one()
+    totals["duplicates"] = max(seen - int(stored), 0)
+    return totals
+
+
+def _completeness(
+    record: Mapping[str, Any], span: PassSpan, ticks: IntArray, lost_ticks: IntArray
+) -> CompletenessSeries | None:
+    if len(ticks) == 0:
+        return None
+    edges = np.linspace(record["start_utc_ns"], record["stop_utc_ns"], COMPLETENESS_BINS + 1).astype(np.int64)
+    received = np.histogram(np.clip(span.utc_ns(list(ticks)), edges[0], edges[-1]), edges)[0]
+    lost = np.histogram(np.clip(span.utc_ns(list(lost_ticks)), edges[0], edges[-1]), edges)[0]
+    return CompletenessSeries(edges, (received + lost).astype(np.int64), received.astype(np.int64))
+
+
+def _housekeeping(connection: Connection, span: PassSpan) -> tuple[HousekeepingParameter, ...]:
+    columns = _columns(connection, "housekeeping", span, ("ticks", *(name for name, _ in _TRENDS)))
+    if len(columns["ticks"]) == 0:
+        return ()
+    utc_ns = span.utc_ns(columns["ticks"].tolist())
+    return tuple(
+        HousekeepingParameter(name, unit, utc_ns, columns[name].astype(np.float64)) for name, unit in _TRENDS
+    )
+
+
+def _events(connection: Connection, span: PassSpan) -> tuple[PassEvent, ...]:
+    names = ("ticks", "severity", "event_id", "frame_number", "value_1", "value_2")
+    rows = repository.samples(
+        connection, "events", span.vehicle, span.start_ticks, span.stop_ticks, DICTIONARY.version, names
+    )
+    labels = DICTIONARY.labels("event_info", "event_id")
+    events = [
+        PassEvent(
+            utc_ns=int(utc),
+            severity=_SEVERITIES.get(rows["severity"][i], str(rows["severity"][i])),
+            name=labels.get(rows["event_id"][i], str(rows["event_id"][i])),
+            detail=_event_detail(rows["frame_number"][i], rows["value_1"][i], rows["value_2"][i]),
+        )
+        for i, utc in enumerate(span.utc_ns(rows["ticks"]))
+    ]
+    return tuple(sorted(events, key=lambda event: (event.utc_ns, event.name, event.detail)))
+
+
+def _event_detail(frame_number: int, *values: float | None) -> str:
+    given = ", ".join(f"{value:.6g}" for value in values if value is not None)
+    return f"frame {frame_number}: {given}" if given else f"frame {frame_number}"
+
+
+def _ephemeris_row(connection: Connection, record: Mapping[str, Any]) -> repository.Row | None:
+    if record["ephemeris_id"] is not None:
+        return repository.get(connection, repository.EPHEMERIDES, record["ephemeris_id"], "ephemeris")
+    covering = repository.covering_ephemerides(connection, record["start_utc_ns"], record["stop_utc_ns"])
+    return covering[0] if covering else None
+
+
+def _reference(ground: Ground, row: repository.Row | None) -> Ephemeris | None:
+    if row is None:
+        return None
+    return load_ephemeris(ground.files.path(row["file_sha256"]))
+
+
+def _catalogue(ground: Ground, record: Mapping[str, Any]) -> CraterCatalogue | None:
+    sha256 = record["catalogue_sha256"]
+    return load_catalogue(ground.files.path(sha256)) if sha256 is not None else None
+
+
+def _rung(manifest: Mapping[str, Any]) -> str:
+    sources = " ".join(str(name) for name in manifest.get("data_sources", ())).lower()
+    if "height model" in sources or "gld100" in sources:
+        return "3 (real terrain, rendered)"
+    return "2 (procedural Moon)"
+
+
+def _provenance(
+    ground: Ground,
+    manifest: Mapping[str, Any],
+    record: Mapping[str, Any],
+    vehicle: Mapping[str, Any],
+    ephemeris: Mapping[str, Any] | None,
+    span: PassSpan,
+) -> dict[str, str]:
+    build = manifest.get("build") or {}
+    gravity = manifest.get("gravity") or {}
+    entries = {
+        "spacecraft": f"{vehicle['ccsds_id']} ({vehicle['instance']})",
+        "payload build": " ".join(str(build[key]) for key in ("name", "version") if key in build),
+        "detector model SHA-256": str(build.get("model_sha256", "")),
+        "parameters SHA-256": str(build.get("parameters_sha256", "")),
+        "scenario": str(manifest.get("scenario", "")),
+        "seed": str(manifest.get("seed", "")),
+        "light": str(manifest.get("light", "")),
+        "gravity of the truth": f"{gravity['truth']}, degree {gravity.get('degree', '?')}" if "truth" in gravity else "",
+        "lunar orientation on the ground": ground.orientation.name,
+        "dictionary": f"version {DICTIONARY.version}, {DICTIONARY.hash[:16]}",
+        "time correlation": ", ".join(str(c.id) for c in span.correlations) or "0 (ideal clock)",
+        "reference ephemeris": (
+            f"{ephemeris['object_name']}, {ephemeris['frame']}, SHA-256 {ephemeris['file_sha256'][:16]}" if ephemeris else ""
+        ),
+        "crater catalogue SHA-256": str(record["catalogue_sha256"] or "")[:16],
+        "archive": str(record["archive_digest"] or "")[:16],
+    }
+    return {name: value for name, value in entries.items() if value}
+
+
+def _configuration(manifest: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    groups: dict[str, dict[str, Any]] = {}
+    if manifest.get("camera"):
+        groups["camera"] = dict(manifest["camera"])
+    groups["observation"] = {
+        key: manifest[key]
+        for key in ("start_utc", "stop_utc", "cadence_s", "frames_expected", "light")
+        if key in manifest
+    }
+    return {name: group for name, group in groups.items() if group}

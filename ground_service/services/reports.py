@@ -1,0 +1,108 @@
+"""Reports of passes: evaluated from the archive as it is now, rendered, and kept."""
+
+from __future__ import annotations
+
+import json
+import math
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ground_service.clock import utc_now_ns
+from ground_service.errors import storage_error
+from ground_service.processing.pass_evaluation import evaluate_pass, summary_of
+from ground_service.services.ground import Ground
+from ground_service.services.pass_data import load_pass_inputs
+from ground_service.store import repository
+from lunar.timescales import format_utc
+from reports.values import PassReport
+
+
+@dataclass(frozen=True, slots=True)
+class MadeReport:
+    """A report that was made, its files and its figures."""
+
+    report_id: str
+    pass_id: int
+    html: Path
+    json: Path
+    summary: dict[str, Any]
+
+
+def evaluate(ground: Ground, pass_id: int, *, created_utc: str = "") -> PassReport:
+    """The report of a pass as a value; the same archive gives the same value."""
+    return evaluate_pass(load_pass_inputs(ground, pass_id, created_utc=created_utc))
+
+
+def pass_summary(ground: Ground, pass_id: int) -> dict[str, Any]:
+    """The figures of a pass that a script asks for; see `summary_of`."""
+    return plain(summary_of(evaluate(ground, pass_id)))
+
+
+def make_report(ground: Ground, pass_id: int, *, report_id: str | None = None, out: Path | None = None) -> MadeReport:
+    """Evaluate a pass, render its report as HTML and JSON, and keep both.
+
+    Parameters
+    ----------
+    report_id
+        Name of the report; the same name again gives the report that was made under it.
+    out
+        Folder for the two documents; ``reports/pass-<id>`` under the service's home when None.
+    """
+    from reports import render_html, to_json
+
+    identity = report_id or uuid.uuid4().hex
+    now = utc_now_ns()
+    report = evaluate(ground, pass_id, created_utc=format_utc(now))
+    documents = {"html": render_html(report).encode(), "json": to_json(report).encode()}
+    stored = {kind: ground.files.put_octets(octets) for kind, octets in documents.items()}
+    summary = plain(summary_of(report))
+    with ground.database.writing() as connection:
+        for kind, file in stored.items():
+            repository.register_file(connection, file, "report", f"report of pass {pass_id} ({kind})", now)
+        if repository.find(connection, repository.REPORTS, id=identity) is None:
+            repository.add(
+                connection,
+                repository.REPORTS,
+                id=identity,
+                pass_id=pass_id,
+                html_sha256=stored["html"].sha256,
+                json_sha256=stored["json"].sha256,
+                summary=summary,
+                created_utc_ns=now,
+            )
+    folder = out if out is not None else ground.home / "reports" / f"pass-{pass_id}"
+    for kind, octets in documents.items():
+        _write_whole(folder / f"report.{kind}", octets)
+    return MadeReport(identity, pass_id, folder / "report.html", folder / "report.json", summary)
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON knows it: NaN and infinities as None, numbers of numpy as Python's."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
+    """Write a JSON document whole or not at all."""
+    _write_whole(path, json.dumps(plain(value), indent=2).encode())
+
+
+def _write_whole(path: Path, octets: bytes) -> None:
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_bytes(octets)
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise storage_error(error, path.parent) from None

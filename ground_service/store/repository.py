@@ -1,0 +1,200 @@
+"""Reading and writing of everything but packets: one function per question, plain rows out.
+
+Every function takes the connection of the caller's transaction. Rows come back as dictionaries of column values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection, Table, and_, func, insert, select, update
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.sql import Select
+
+from ground_service.errors import NotFound
+from ground_service.store import models
+from ground_service.store.files import StoredFile
+
+Row = dict[str, Any]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """One page of a list: its rows, and the number of rows in all."""
+
+    rows: list[Row]
+    total: int
+
+
+def _table(model: type[models.Base]) -> Table:
+    table = model.__table__
+    assert isinstance(table, Table)
+    return table
+
+
+FILES = _table(models.File)
+VEHICLES = _table(models.Vehicle)
+INGESTS = _table(models.Ingest)
+PACKETS = _table(models.Packet)
+PASSES = _table(models.Pass)
+PASS_FRAMES = _table(models.PassFrame)
+EPHEMERIDES = _table(models.EphemerisRecord)
+CORRELATIONS = _table(models.Correlation)
+JOBS = _table(models.Job)
+REPORTS = _table(models.Report)
+SAMPLES: dict[str, Table] = {model.__tablename__: _table(model) for model in models.SAMPLE_TABLES}
+
+
+def add(connection: Connection, table: Table, **values: Any) -> Any:
+    """Insert one row; its primary key."""
+    result = connection.execute(insert(table).values(**values))
+    key = result.inserted_primary_key
+    return key[0] if key is not None and len(key) == 1 else key
+
+
+def change(connection: Connection, table: Table, key: Any, **values: Any) -> None:
+    """Change columns of the row with this primary key."""
+    column = next(iter(table.primary_key.columns))
+    connection.execute(update(table).where(column == key).values(**values))
+
+
+def get(connection: Connection, table: Table, key: Any, kind: str) -> Row:
+    """The row with this primary key.
+
+    Raises
+    ------
+    NotFound
+        If there is none; `kind` names it in the message.
+    """
+    column = next(iter(table.primary_key.columns))
+    row = connection.execute(select(table).where(column == key)).mappings().first()
+    if row is None:
+        raise NotFound(kind, key)
+    return dict(row)
+
+
+def find(connection: Connection, table: Table, **equal: Any) -> Row | None:
+    """The first row whose columns have these values; None where there is none."""
+    row = connection.execute(_where(table, equal).limit(1)).mappings().first()
+    return dict(row) if row is not None else None
+
+
+def page(
+    connection: Connection,
+    table: Table,
+    *,
+    limit: int = 100,
+    offset: int = 0,
+    newest_first: bool = True,
+    conditions: Sequence[Any] = (),
+    **equal: Any,
+) -> Page:
+    """Rows of a table by primary key, a page of them, with the number of all."""
+    query = _where(table, equal)
+    if conditions:
+        query = query.where(and_(*conditions))
+    total = connection.execute(select(func.count()).select_from(query.subquery())).scalar_one()
+    key = next(iter(table.primary_key.columns))
+    if "created_utc_ns" in table.c:
+        order = [table.c.created_utc_ns, key]
+    else:
+        order = [key]
+    if newest_first:
+        order = [column.desc() for column in order]
+    rows = connection.execute(query.order_by(*order).limit(limit).offset(offset)).mappings()
+    return Page([dict(row) for row in rows], int(total))
+
+
+def vehicle_id(connection: Connection, ccsds_id: int, instance: str) -> int:
+    """The id of a spacecraft in one instance, made when it is new."""
+    found = find(connection, VEHICLES, ccsds_id=ccsds_id, instance=instance)
+    if found is not None:
+        return int(found["id"])
+    try:
+        with connection.begin_nested():
+            return int(add(connection, VEHICLES, ccsds_id=ccsds_id, instance=instance))
+    except IntegrityError:
+        again = find(connection, VEHICLES, ccsds_id=ccsds_id, instance=instance)
+        if again is None:
+            raise
+        return int(again["id"])
+
+
+def register_file(connection: Connection, stored: StoredFile, kind: str, name: str, now_utc_ns: int) -> None:
+    """Enter a file of the archive into the database; entering it again changes nothing."""
+    if find(connection, FILES, sha256=stored.sha256) is not None:
+        return
+    try:
+        with connection.begin_nested():
+            add(
+                connection,
+                FILES,
+                sha256=stored.sha256,
+                kind=kind,
+                name=name,
+                octets=stored.octets,
+                received_utc_ns=now_utc_ns,
+            )
+    except IntegrityError:
+        pass  # another process entered the same octets at the same time
+
+
+def covering_ephemerides(connection: Connection, start_utc_ns: int, stop_utc_ns: int) -> list[Row]:
+    """Reference ephemerides that overlap an interval, the one to prefer first: precedence, then the newest."""
+    query = (
+        select(EPHEMERIDES)
+        .where(EPHEMERIDES.c.start_utc_ns <= stop_utc_ns, EPHEMERIDES.c.stop_utc_ns >= start_utc_ns)
+        .order_by(EPHEMERIDES.c.precedence.desc(), EPHEMERIDES.c.id.desc())
+    )
+    return [dict(row) for row in connection.execute(query).mappings()]
+
+
+def packet_headers(
+    connection: Connection, vehicle: int, start_ticks: int | None = None, stop_ticks: int | None = None
+) -> dict[str, IntArray]:
+    """APID, on-board time and sequence count of the stored packets of a vehicle, by APID and time."""
+    query = select(PACKETS.c.apid, PACKETS.c.ticks, PACKETS.c.sequence_count).where(PACKETS.c.vehicle_id == vehicle)
+    if start_ticks is not None:
+        query = query.where(PACKETS.c.ticks >= start_ticks)
+    if stop_ticks is not None:
+        query = query.where(PACKETS.c.ticks <= stop_ticks)
+    query = query.order_by(PACKETS.c.apid, PACKETS.c.ticks, PACKETS.c.sequence_count, PACKETS.c.digest)
+    rows = np.array(connection.execute(query).tuples().all(), dtype=np.int64).reshape(-1, 3)
+    return {"apid": rows[:, 0], "ticks": rows[:, 1], "sequence_count": rows[:, 2]}
+
+
+def samples(
+    connection: Connection,
+    kind: str,
+    vehicle: int,
+    start_ticks: int,
+    stop_ticks: int,
+    dictionary_version: int,
+    columns: Sequence[str],
+) -> dict[str, list[Any]]:
+    """Columns of the samples of one kind between two on-board times (both included), in order of time."""
+    table = SAMPLES[kind]
+    query = (
+        select(*(table.c[name] for name in columns))
+        .where(
+            table.c.vehicle_id == vehicle,
+            table.c.dictionary_version == dictionary_version,
+            table.c.ticks >= start_ticks,
+            table.c.ticks <= stop_ticks,
+        )
+        .order_by(table.c.ticks, table.c.packet_id)
+    )
+    rows = connection.execute(query).tuples().all()
+    return {name: [row[i] for row in rows] for i, name in enumerate(columns)}
+
+
+def _where(table: Table, equal: dict[str, Any]) -> Select[Any]:
+    query = select(table)
+    for name, value in equal.items():
+        query = query.where(table.c[name] == value)
+    return query

@@ -1,0 +1,222 @@
+"""A synthetic pass made of packets, an ephemeris and a catalogue: what any emulator or spacecraft would hand over.
+
+The orbit is an exact circle, the craters are placed by chance, the detections are their exact projections with known
+noise and known faults, and the navigation states carry errors put in on purpose, so every figure is known beforehand.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ground_service.services.ground import Ground, open_ground
+from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
+from lunar.catalogue import CraterCatalogue, make_catalogue, save_catalogue, size_class
+from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
+from lunar.ephemeris import ephemeris_from_states
+from lunar.frames import IauOrientation, mcmf_from_spherical, rtn_from_inertial, spherical_from_mcmf
+from lunar.oem import save_oem
+from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
+from tmtc.dictionary import DICTIONARY
+from tmtc.packets import PacketSequencer
+
+NS = 1_000_000_000
+START = parse_utc("2029-08-07T06:00:00Z")
+CADENCE_S = 15
+SPACECRAFT = 76
+ALTITUDE_M = 30_000.0
+RESET_FRAME = 20
+PAPER_DRIFT_PER_FRAME_M = 400.0
+SPHERICAL_ERROR_RTN_M = np.array([30.0, -40.0, 120.0])  # 130 m in 3-D
+PIXEL_OFFSET = (0.5, -1.25)
+FALSE_ALARMS_PER_FRAME = 1
+
+
+@dataclass(frozen=True)
+class SyntheticPass:
+    """A pass archive folder and what was put into it."""
+
+    folder: Path
+    packets: list[bytes]
+    utc_ns: np.ndarray
+    expected: int
+    missed: int
+
+
+def circular_states(utc_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """ICRF states (n, 3) of a circular orbit, inclined by 80 degrees to the ICRF equator."""
+    radius = MOON_RADIUS_M + ALTITUDE_M
+    rate = np.sqrt(GM_MOON_M3_S2 / radius**3)
+    angle = rate * (np.asarray(utc_ns) - START) / NS - 0.3
+    tilt = np.radians(80.0)
+    across = np.array([0.0, np.cos(tilt), np.sin(tilt)])
+    along = np.array([1.0, 0.0, 0.0])
+    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    return radius * (c * along + s * across), radius * rate * (c * across - s * along)
+
+
+def _catalogue(latitude_rad: np.ndarray, longitude_rad: np.ndarray, rng: np.random.Generator) -> CraterCatalogue:
+    """Craters on a jittered grid of half a degree around the track, so that no two are near one another."""
+    cells = np.unique(np.round(np.degrees(np.column_stack([latitude_rad, longitude_rad])) / 0.5).astype(int), axis=0)
+    grid = np.unique((cells[:, None, :] + np.array([[i, j] for i in range(-3, 4) for j in range(-3, 4)])).reshape(-1, 2), axis=0)
+    places = np.radians(grid * 0.5 + rng.uniform(-0.08, 0.08, grid.shape))
+    diameter = rng.choice([6e3, 8e3, 11e3, 14e3, 4e3], len(grid))
+    return make_catalogue(
+        places[:, 0], places[:, 1], diameter, source="synthetic", rim_height_m=rng.uniform(-500.0, 500.0, len(grid))
+    )
+
+
+@pytest.fixture(scope="session")
+def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., SyntheticPass]:
+    """A function that writes a synthetic pass archive of `frames` frames."""
+
+    def make(frames: int = 40, seed: int = 1, encode: Callable[[list[bytes]], bytes] = b"".join) -> SyntheticPass:
+        folder = tmp_path_factory.mktemp("archive")
+        rng = np.random.default_rng(seed)
+        utc_ns = START + np.arange(frames, dtype=np.int64) * CADENCE_S * NS
+        every = START + np.arange(-40, frames + 40, dtype=np.int64) * CADENCE_S * NS
+        position, velocity = circular_states(utc_ns)
+        save_oem(ephemeris_from_states(every, *circular_states(every)), folder / "reference.oem")
+        rotation = IauOrientation().mcmf_from_icrf(np.asarray(tdb_s_from_utc_ns(utc_ns)))
+        position_mcmf = np.einsum("nij,nj->ni", rotation, position)
+        latitude, longitude, altitude = spherical_from_mcmf(position_mcmf)
+        catalogue = _catalogue(latitude, longitude, rng)
+        save_catalogue(catalogue, folder / "catalogue.csv")
+
+        camera = PinholeCamera()
+        classes = size_class(catalogue.diameter_m)
+        sequencer, packets = PacketSequencer(), []
+        tally = {"expected": 0, "missed": 0}
+
+        def send(name: str, values: dict[str, Any], ticks: int) -> None:
+            apid = DICTIONARY.packet(name).apid
+            packets.append(DICTIONARY.pack(name, values, ticks=ticks, sequence_count=sequencer.next(apid)))
+
+        for k in range(frames):
+            ticks = int(ticks_from_utc_ns(int(utc_ns[k])))
+            in_camera = (catalogue.position_mcmf_m - position_mcmf[k]) @ nadir_camera_from_mcmf(position_mcmf[k]).T
+            uv = camera.project(in_camera)
+            inside = np.flatnonzero(camera.contains(uv) & (in_camera[:, 2] > 0) & (in_camera[:, 2] < 1.2e5))
+            scored = inside[classes[inside] != 3]
+            missed = scored[::4]
+            seen = np.setdiff1d(inside, missed)
+            tally["expected"] += len(scored)
+            tally["missed"] += len(missed)
+            seen = seen[camera.contains(uv[seen] + PIXEL_OFFSET, 2.0)]
+            tally["missed"] += len(scored) - len(missed) - np.count_nonzero(classes[seen] != 3)
+            items = {
+                "u_px": np.append(uv[seen, 0] + PIXEL_OFFSET[0], 3.0),
+                "v_px": np.append(uv[seen, 1] + PIXEL_OFFSET[1], 3.0),
+                "diameter_px": np.append(camera.focal_px * catalogue.diameter_m[seen] / in_camera[seen, 2], 200.0),
+                "score": np.append(np.full(len(seen), 0.9), 0.4),
+                "size_class": np.append(classes[seen], 2),
+                "sigma_px": np.full(len(seen) + 1, 1.0),
+            }
+            frame = {"frame_number": k, "image_ticks": ticks}
+            send("detections", {**frame, "image_quality": 0, "items": items}, ticks + 100)
+            since = k - (RESET_FRAME if k >= RESET_FRAME else 0)
+            for estimator, error in (
+                (0, np.array([0.0, PAPER_DRIFT_PER_FRAME_M * since, 0.0])),
+                (1, SPHERICAL_ERROR_RTN_M),
+            ):
+                rtn = rtn_from_inertial(position[k], velocity[k])
+                place = spherical_from_mcmf(rotation[k] @ (position[k] + rtn.T @ error))
+                send(
+                    "navigation_state",
+                    {
+                        **frame,
+                        "estimator": estimator,
+                        "outcome": "multi",
+                        "latitude_deg": float(np.degrees(place[0])),
+                        "longitude_deg": float(np.degrees(place[1])),
+                        "altitude_m": float(place[2]),
+                        "velocity_icrf_m_s": [np.nan] * 3,
+                        "sigma_rtn_m": [np.nan] * 3,
+                        "nis": np.nan,
+                        "matched": 5,
+                    },
+                    ticks + 200 + estimator,
+                )
+                reset = {0: "initialization", RESET_FRAME: "safety_timeout"}.get(k, "none") if estimator == 0 else "none"
+                send(
+                    "frame_outcome",
+                    {
+                        **frame,
+                        "estimator": estimator,
+                        "outcome": "multi",
+                        "reset_trigger": reset,
+                        "detections": len(seen) + 1,
+                        "candidate_pairs": 9,
+                        "pairs": 5,
+                        "shift_east_m": 0.0,
+                        "shift_north_m": 24_500.0,
+                        "anchor_reads": (1 + (k >= RESET_FRAME)) if estimator == 0 else 1,
+                    },
+                    ticks + 300 + estimator,
+                )
+            send("housekeeping", _housekeeping(k), ticks + 400)
+        send("event_info", {"event_id": "observation_stopped", "frame_number": frames, "value_1": 0.0, "value_2": 0.0}, ticks + 500)
+
+        (folder / "downlink.cadu").write_bytes(encode(packets))
+        start = {"utc": format_utc(int(utc_ns[0])), "position_icrf_m": list(position[0]), "velocity_icrf_m_s": list(velocity[0])}
+        write_manifest(
+            folder,
+            {
+                "schema_version": 1,
+                "pass_name": "synthetic pass",
+                "spacecraft_id": SPACECRAFT,
+                "scenario": "synthetic",
+                "seed": seed,
+                "build": {"name": "nothing", "version": "0", "model_sha256": "00" * 32, "parameters_sha256": "11" * 32},
+                "data_sources": ["circular orbit", "synthetic craters"],
+                "start_utc": format_utc(int(utc_ns[0])),
+                "stop_utc": format_utc(int(utc_ns[-1])),
+                "cadence_s": CADENCE_S,
+                "frames_expected": frames,
+                "light": "paper",
+                "camera": {"width_px": 512, "height_px": 512, "fov_deg": 120.0},
+                "estimators": ["paper", "spherical"],
+                "start_state": start,
+                "gravity": {"truth": "two-body", "degree": 0},
+            },
+        )
+        return SyntheticPass(folder, packets, utc_ns, tally["expected"], tally["missed"])
+
+    return make
+
+
+def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
+    """Write manifest.json over the files that lie in `folder`."""
+    files = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path.name != "manifest.json":
+            octets = path.read_bytes()
+            files[str(path.relative_to(folder))] = {"sha256": hashlib.sha256(octets).hexdigest(), "bytes": len(octets)}
+    (folder / "manifest.json").write_text(json.dumps({**manifest, "files": files}))
+
+
+def _housekeeping(k: int) -> dict[str, Any]:
+    values: dict[str, Any] = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
+    values.update(structure_id=1, boot_count=1, mode="observing", frames_processed=k, temperature_c=20.0 + 0.1 * k, bus_voltage_v=12.0)
+    return values
+
+
+@pytest.fixture(scope="session")
+def synthetic_pass(make_pass: Callable[..., SyntheticPass]) -> SyntheticPass:
+    """The pass that most tests look at; not to be altered."""
+    return make_pass()
+
+
+@pytest.fixture
+def ground(tmp_path: Path) -> Iterator[Ground]:
+    """An empty ground service with a SQLite database of its own."""
+    opened = open_ground(tmp_path / "home")
+    yield opened
+    opened.close()

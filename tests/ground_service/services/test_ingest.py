@@ -1,0 +1,126 @@
+"""Ingest: any order, any split, any repetition of the same octets gives the same archive."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from sqlalchemy import func, select
+
+from ground_service.errors import InvalidInput
+from ground_service.services.ground import Ground, open_ground
+from ground_service.services.ingest import ingest_file
+from ground_service.store import repository
+from ground_service.store.canonical import archive_hash
+
+SPACECRAFT = 76
+
+
+def ingest(ground: Ground, octets: bytes, folder: Path, name: str = "downlink.bin") -> Any:
+    path = folder / name
+    path.write_bytes(octets)
+    return ingest_file(ground, path, spacecraft_id=SPACECRAFT)
+
+
+def archive(ground: Ground) -> str:
+    with ground.database.reading() as connection:
+        return archive_hash(connection, repository.vehicle_id(connection, SPACECRAFT, "flight"))
+
+
+def rows(ground: Ground, table: Any) -> int:
+    with ground.database.reading() as connection:
+        return int(connection.execute(select(func.count()).select_from(table)).scalar_one())
+
+
+@pytest.fixture(scope="module")
+def packets(make_pass: Callable[..., Any]) -> list[bytes]:
+    return list(make_pass(frames=6).packets)
+
+
+@pytest.fixture(scope="module")
+def expected(packets: list[bytes], tmp_path_factory: pytest.TempPathFactory) -> str:
+    folder = tmp_path_factory.mktemp("whole")
+    ground = open_ground(folder / "home")
+    ingest(ground, b"".join(packets), folder)
+    result = archive(ground)
+    ground.close()
+    return result
+
+
+def test_every_packet_is_stored_with_its_rows(ground: Ground, packets: list[bytes], tmp_path: Path) -> None:
+    result = ingest(ground, b"".join(packets), tmp_path)
+    assert result.packets == result.packets_new == len(packets)
+    assert result.samples == len(packets)
+    assert (result.crc_errors, result.octets_skipped, result.unknown) == (0, 0, 0)
+    assert rows(ground, repository.SAMPLES["detections"]) == 6
+    assert rows(ground, repository.SAMPLES["navigation_states"]) == 12
+
+
+def test_ingesting_twice_changes_nothing(ground: Ground, packets: list[bytes], expected: str, tmp_path: Path) -> None:
+    ingest(ground, b"".join(packets), tmp_path)
+    again = ingest(ground, b"".join(packets), tmp_path)
+    assert (again.packets_new, again.packets_repeated) == (0, len(packets))
+    assert archive(ground) == expected
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_any_order_split_and_repetition_gives_the_same_archive(
+    data: st.DataObject, packets: list[bytes], expected: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("shuffled")
+    seed = data.draw(st.integers(0, 2**32 - 1))
+    rng = np.random.default_rng(seed)
+    order = rng.permutation(len(packets)).tolist() + rng.integers(0, len(packets), 5).tolist()
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(order)), max_size=4)))
+    ground = open_ground(folder / "home")
+    for first, last in zip([0, *cuts], [*cuts, len(order)], strict=True):
+        if last > first:
+            ingest(ground, b"".join(packets[i] for i in order[first:last]), folder)
+    assert archive(ground) == expected
+    ground.close()
+
+
+def test_a_damaged_packet_is_counted_and_the_rest_is_stored(
+    ground: Ground, packets: list[bytes], tmp_path: Path
+) -> None:
+    octets = bytearray(b"".join(packets))
+    octets[len(packets[0]) + 30] ^= 0x10
+    result = ingest(ground, bytes(octets), tmp_path)
+    assert (result.packets, result.crc_errors) == (len(packets) - 1, 1)
+
+
+def test_a_file_cut_short_gives_what_is_whole(ground: Ground, packets: list[bytes], tmp_path: Path) -> None:
+    result = ingest(ground, b"".join(packets)[:-5], tmp_path)
+    assert result.packets == len(packets) - 1
+    assert result.octets_skipped == len(packets[-1]) - 5
+
+
+def test_clocks_of_1970_and_of_the_future_are_stored_as_they_are(
+    ground: Ground, packets: list[bytes], tmp_path: Path
+) -> None:
+    from tmtc.dictionary import DICTIONARY
+
+    values = {"event_id": 1, "frame_number": 0, "value_1": 0.0, "value_2": 0.0}
+    strays = [DICTIONARY.pack("event_info", values, ticks=t, sequence_count=9) for t in (0, (1 << 48) - 1)]
+    result = ingest(ground, b"".join([*packets, *strays]), tmp_path)
+    assert result.packets_new == len(packets) + 2
+    again = ingest(ground, b"".join(strays), tmp_path)
+    assert again.packets_new == 0
+
+
+def test_noise_is_refused_in_one_line_and_remembered(ground: Ground, tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match=r"noise\.bin: expected a stream of CADUs or of space packets, found 4000"):
+        ingest(ground, np.random.default_rng(3).bytes(4000), tmp_path, "noise.bin")
+    with ground.database.reading() as connection:
+        record = repository.page(connection, repository.INGESTS).rows[0]
+    assert record["state"] == "failed"
+    assert "noise.bin" in record["error"]
+
+
+def test_a_missing_file_is_refused(ground: Ground, tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match="expected a downlink file, found nothing there"):
+        ingest_file(ground, tmp_path / "no.bin", spacecraft_id=SPACECRAFT)
