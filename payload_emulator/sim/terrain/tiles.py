@@ -96,6 +96,10 @@ class Terrain(Protocol):
         """Catalogue craters about a place, rim heights and depths measured on this terrain."""
         ...
 
+    def measured(self, indices: npt.NDArray[np.int64]) -> CraterCatalogue:
+        """Catalogue craters of these indices, likewise measured."""
+        ...
+
 
 class TiledTerrain(ABC):
     """Cache of tiles and everything that follows from it; a source only has to make one tile."""
