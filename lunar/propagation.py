@@ -1,0 +1,445 @@
+"""Orbits about the Moon: force model, adaptive propagation with dense output, many states at once, transition matrix.
+
+States are position and velocity (m, m/s) from the Moon's centre along ICRF axes; time is TDB seconds past J2000.  Forces:
+gravity field to any degree in principal axes, tides of Earth and Sun, optionally the pressure of sunlight with the shadows
+of Moon and Earth.
+
+An adaptive Runge-Kutta method takes the steps (DOP853 of Hairer et al., or Fehlberg's 7(8)); every accepted step is kept, and
+between steps a quintic through position, velocity and acceleration at both ends is read.  Steps are kept to 60 s, at which
+that quintic is within 0.1 mm and 1e-6 m/s of the orbit.
+
+References
+----------
+Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I (1993), sections II.4 (step size) and II.10.
+Fehlberg, NASA TR R-287 (1968).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lunar import constants
+from lunar.errors import EphemerisCoverageError, ImpactError, OrbitError
+from lunar.gravity import GravityField, packed, packed_gradient
+from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
+
+if TYPE_CHECKING:
+    from lunar.frames import Orientation
+
+FloatArray = NDArray[np.float64]
+
+MAX_STEP_S = 60.0
+"""Longest step: the dense output then stays within 0.1 mm."""
+
+_TABLE_STEP_S = 43_200.0
+_TABLE_TERMS = 10
+_KNOTS = 16_384
+
+
+@dataclass(frozen=True, slots=True)
+class SolarPressure:
+    """Radiation pressure on a sphere: cross-section over mass, and the reflection coefficient (1 black, 2 mirror)."""
+
+    area_to_mass_m2_kg: float = 0.01
+    reflection: float = 1.3
+
+
+@dataclass(frozen=True, eq=False)
+class ForceModel:
+    """What acts on the orbiter.  ``degree`` None takes the whole field.
+
+    Tables of the Moon's orientation and of Earth and Sun are kept inside as they are asked for, per half day.
+    """
+
+    gravity: GravityField
+    orientation: Orientation
+    degree: int | None = None
+    earth: bool = True
+    sun: bool = True
+    solar_pressure: SolarPressure | None = None
+    _segments: dict[int, FloatArray] = field(default_factory=dict, init=False, repr=False)
+    _joined: dict[tuple[int, int], FloatArray] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.degree is not None and not 0 <= self.degree <= self.gravity.degree:
+            raise OrbitError(
+                f"gravity field {self.gravity.name}: expected a degree from 0 to {self.gravity.degree}, "
+                f"found {self.degree}"
+            )
+
+    @property
+    def name(self) -> str:
+        degree = self.gravity.degree if self.degree is None else self.degree
+        bodies = [name for name, on in (("Earth", self.earth), ("Sun", self.sun)) if on]
+        pressure = ["solar pressure"] if self.solar_pressure else []
+        return " + ".join([f"{self.gravity.name} {degree}x{degree}", *bodies, *pressure])
+
+    @property
+    def gm_m3_s2(self) -> float:
+        return self.gravity.gm_m3_s2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """An orbit known at all times from ``start_tdb_s`` to ``stop_tdb_s``.
+
+    ``elapsed_s`` (n,) are the times of the steps after ``epoch_tdb_s``, ``states`` (n, 6) and ``accelerations`` (n, 3) what
+    was there, ICRF.  A burn appears as two steps at the same time; from that time on the later one holds.
+    """
+
+    epoch_tdb_s: float
+    elapsed_s: FloatArray = field(repr=False)
+    states: FloatArray = field(repr=False)
+    accelerations: FloatArray = field(repr=False)
+    evaluations: int = 0
+
+    @property
+    def start_tdb_s(self) -> float:
+        return self.epoch_tdb_s + float(self.elapsed_s[0])
+
+    @property
+    def stop_tdb_s(self) -> float:
+        return self.epoch_tdb_s + float(self.elapsed_s[-1])
+
+    def state(self, tdb_s: ArrayLike) -> FloatArray:
+        """Return position and velocity, shape ``(..., 6)``, at TDB seconds past J2000, shape ``(...)``.
+
+        Raises
+        ------
+        EphemerisCoverageError
+            Where an epoch is outside the propagated span (beyond the microsecond that a float64 of seconds can tell).
+        """
+        return self.state_after(np.asarray(tdb_s, dtype=np.float64) - self.epoch_tdb_s)
+
+    def state_after(self, elapsed_s: ArrayLike) -> FloatArray:
+        """Return position and velocity, shape ``(..., 6)``, at seconds after ``epoch_tdb_s``, shape ``(...)``."""
+        from lunar import _dynamics_kernel as kernel
+
+        wanted = np.asarray(elapsed_s, dtype=np.float64)
+        flat = np.ascontiguousarray(wanted.reshape(-1))
+        slack = 1e-6
+        first, last = float(self.elapsed_s[0]), float(self.elapsed_s[-1])
+        outside = ~((flat >= first - slack) & (flat <= last + slack))
+        if np.any(outside):
+            raise EphemerisCoverageError(
+                f"{flat[outside][0]:.3f} s", f"{first:.3f}..{last:.3f} s after the start", "trajectory"
+            )
+        out = np.empty((len(flat), 6))
+        kernel.evaluate(self.elapsed_s, self.states, self.accelerations, flat, out)
+        return out.reshape(*wanted.shape, 6)
+
+    def apsides(self) -> tuple[FloatArray, FloatArray]:
+        """Return the elapsed times (k,) at which radial speed vanishes, and the radii (k,) there, m, in order of time."""
+        radial = np.einsum("ij,ij->i", self.states[:, :3], self.states[:, 3:])
+        spans = np.nonzero((radial[:-1] * radial[1:] < 0.0) & (np.diff(self.elapsed_s) > 0.0))[0]
+        low, high = self.elapsed_s[spans].copy(), self.elapsed_s[spans + 1].copy()
+        rising = radial[spans] < 0.0
+        for _ in range(50):
+            middle = 0.5 * (low + high)
+            state = self.state_after(middle)
+            before = (np.einsum("ij,ij->i", state[:, :3], state[:, 3:]) < 0.0) == rising
+            low, high = np.where(before, middle, low), np.where(before, high, middle)
+        times = 0.5 * (low + high)
+        return times, np.linalg.norm(self.state_after(times)[:, :3], axis=-1)
+
+
+def propagate(
+    epoch_tdb_s: float,
+    position_icrf_m: ArrayLike,
+    velocity_icrf_m_s: ArrayLike,
+    duration_s: float,
+    model: ForceModel,
+    integrator: str = "dop853",
+    rtol: float = 1e-11,
+    max_step_s: float = MAX_STEP_S,
+    ground_radius_m: float = constants.MOON_RADIUS_M,
+) -> Trajectory:
+    """Return the orbit from a state at ``epoch_tdb_s`` over ``duration_s`` (negative: backwards).
+
+    Raises
+    ------
+    ImpactError
+        Where the orbit meets the sphere of ``ground_radius_m`` (0 lets it pass).
+    OrbitError
+        Where the start is below ground, not finite, or no step size meets the tolerance.
+    """
+    arc = integrate_arc(epoch_tdb_s, 0.0, state_vector(position_icrf_m, velocity_icrf_m_s), float(duration_s), model,
+                        integrator, rtol, max_step_s, ground_radius_m)
+    return join(epoch_tdb_s, [arc])
+
+
+def propagate_many(
+    epoch_tdb_s: float,
+    states_icrf: ArrayLike,
+    elapsed_s: ArrayLike,
+    model: ForceModel,
+    integrator: str = "dop853",
+    rtol: float = 1e-11,
+    threads: int = 1,
+) -> FloatArray:
+    """Return the states of many orbits, shape ``(n, k, 6)``, from ``(n, 6)`` states at one epoch, at ``(k,)`` times after it.
+
+    Times ascend from 0 on.  An orbit that meets the ground has NaN from there on.
+    """
+    from concurrent.futures import ThreadPoolExecutor
+
+    from lunar import _dynamics_kernel as kernel
+
+    starts = np.asarray(states_icrf, dtype=np.float64).reshape(-1, 6)
+    times = np.asarray(elapsed_s, dtype=np.float64).reshape(-1)
+    if len(times) and (times[0] < 0.0 or np.any(np.diff(times) < 0.0)):
+        raise OrbitError("propagation times: expected ascending seconds from 0 on, found another order")
+    out = np.full((len(starts), len(times), 6), np.nan)
+    if not len(times) or not len(starts):
+        return out
+    duration = float(times[-1])
+
+    def one(number: int) -> None:
+        if duration == 0.0:
+            out[number] = starts[number]
+            return
+        try:
+            arc = integrate_arc(epoch_tdb_s, 0.0, starts[number], duration, model, integrator, rtol, MAX_STEP_S,
+                                constants.MOON_RADIUS_M, stop_at_ground=True)
+        except OrbitError:
+            return
+        inside = times <= arc.elapsed_s[-1] if arc.status != kernel.GROUND else times < arc.ground_s
+        kernel.evaluate(arc.elapsed_s, arc.states, arc.accelerations, times[inside], out[number, : inside.sum()])
+
+    force_arrays(model, epoch_tdb_s, 0.0, duration)  # fills the tables once, before threads share them
+    if threads > 1:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(one, range(len(starts))))
+    else:
+        for number in range(len(starts)):
+            one(number)
+    return out
+
+
+def propagate_with_stm(
+    epoch_tdb_s: float,
+    position_icrf_m: ArrayLike,
+    velocity_icrf_m_s: ArrayLike,
+    duration_s: float,
+    model: ForceModel,
+    stm_degree: int = 8,
+    step_s: float = 15.0,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return position (3,), velocity (3,) and transition matrix (6, 6) after ``duration_s`` (either sign).
+
+    The state moves under the whole model, the matrix under its field to ``stm_degree`` with Earth and Sun.  Equal steps of
+    the eighth-order method, none longer than ``step_s``: within 0.1 mm per orbit at 15 s and degree 100.
+    """
+    from lunar import _dynamics_kernel as kernel
+    from lunar._tableaux import DOP853
+
+    start = state_vector(position_icrf_m, velocity_icrf_m_s)
+    if duration_s == 0.0:
+        return start[:3], start[3:], np.eye(6)
+    gravity, force, table, scratch = force_arrays(model, epoch_tdb_s, 0.0, duration_s)
+    low = packed_gradient(model.gravity, min(stm_degree, _degree(model)))
+    steps = max(1, int(np.ceil(abs(duration_s) / step_s - 1e-9)))
+    y = kernel.transition(start, float(duration_s), steps, gravity, low, force, table, scratch, DOP853.a, DOP853.b,
+                          DOP853.c)
+    return y[:3], y[3:6], y[6:].reshape(6, 6)
+
+
+def acceleration_icrf(model: ForceModel, tdb_s: float, position_icrf_m: ArrayLike) -> FloatArray:
+    """Return the acceleration (3,) of the whole model at one place and time, ICRF, m/s^2."""
+    from lunar import _dynamics_kernel as kernel
+
+    gravity, force, table, scratch = force_arrays(model, tdb_s, 0.0, 0.0)
+    x, y, z = np.asarray(position_icrf_m, dtype=np.float64)
+    return np.array(
+        kernel.force_acceleration(0.0, x, y, z, gravity, force, table, np.empty(scratch), np.empty(kernel.COLUMNS))
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arc:
+    """One uninterrupted integration: knots in order of integration, why it ended, where it met the ground."""
+
+    elapsed_s: FloatArray
+    states: FloatArray
+    accelerations: FloatArray
+    status: int
+    evaluations: int
+    next_step_s: float
+    ground_s: float
+
+
+def integrate_arc(
+    epoch_tdb_s: float,
+    start_s: float,
+    state: FloatArray,
+    stop_s: float,
+    model: ForceModel,
+    integrator: str,
+    rtol: float,
+    max_step_s: float,
+    ground_radius_m: float,
+    *,
+    event: int = 0,
+    event_radius_m: float = 0.0,
+    first_step_s: float = 10.0,
+    stop_at_ground: bool = False,
+) -> Arc:
+    """Return the steps from ``start_s`` to ``stop_s`` after the epoch, or to the event asked for (see the kernel)."""
+    from lunar import _dynamics_kernel as kernel
+    from lunar._tableaux import TABLEAUX
+
+    if integrator not in TABLEAUX:
+        raise OrbitError(f"integrator: expected one of {', '.join(TABLEAUX)}, found {integrator!r}")
+    if not (1e-15 <= rtol <= 1e-3 and max_step_s > 0.0 and np.isfinite(stop_s)):
+        raise OrbitError(
+            f"propagation: expected a finite span, a step over 0 s and a tolerance from 1e-15 to 1e-3, "
+            f"found {stop_s} s, {max_step_s} s, {rtol}"
+        )
+    method = TABLEAUX[integrator]
+    radius = float(np.linalg.norm(state[:3]))
+    if not radius > max(ground_radius_m, 1.0):
+        raise OrbitError(
+            f"start of the orbit: expected a distance above {ground_radius_m / 1e3:.3f} km from the Moon's centre, "
+            f"found {radius / 1e3:.3f} km"
+        )
+    gravity, force, table, scratch = force_arrays(model, epoch_tdb_s, start_s, stop_s)
+    parts: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+    time, y, step, evaluations = start_s, np.ascontiguousarray(state), first_step_s, 0
+    status = kernel.STEP_LIMIT
+    while status == kernel.STEP_LIMIT:
+        times, states, rates = np.empty(_KNOTS), np.empty((_KNOTS, 6)), np.empty((_KNOTS, 3))
+        count, status, cost, step = kernel.integrate(
+            time, y, float(stop_s), gravity, force, table, scratch, method.a, method.b, method.c, method.error,
+            method.second_error, method.error_order, rtol, max_step_s, step, ground_radius_m, event, event_radius_m,
+            times, states, rates,
+        )
+        parts.append((times[:count], states[:count], rates[:count]) if not parts else
+                     (times[1:count], states[1:count], rates[1:count]))
+        time, y = times[count - 1], states[count - 1].copy()
+        evaluations += cost
+    elapsed = np.concatenate([part[0] for part in parts])
+    kept_states = np.concatenate([part[1] for part in parts])
+    kept_rates = np.concatenate([part[2] for part in parts])
+    if status == kernel.TOO_SMALL:
+        raise OrbitError(f"propagation: expected steps over 1 us to meet a tolerance of {rtol:g}, found none at {time:.3f} s")
+    ground_s = np.nan
+    if status == kernel.GROUND:
+        ground_s = _ground_time(elapsed[-2:], kept_states[-2:], kept_rates[-2:], ground_radius_m)
+        if not stop_at_ground:
+            raise _impact(epoch_tdb_s, ground_s, elapsed[-2:], kept_states[-2:], kept_rates[-2:], model)
+    return Arc(elapsed, kept_states, kept_rates, status, evaluations, step, ground_s)
+
+
+def join(epoch_tdb_s: float, arcs: list[Arc]) -> Trajectory:
+    """Return arcs that follow on each other as one trajectory, in ascending time."""
+    elapsed = np.concatenate([arc.elapsed_s for arc in arcs])
+    states = np.concatenate([arc.states for arc in arcs])
+    rates = np.concatenate([arc.accelerations for arc in arcs])
+    if len(elapsed) == 1:  # a propagation over no time at all
+        elapsed, states, rates = np.repeat(elapsed, 2), np.repeat(states, 2, axis=0), np.repeat(rates, 2, axis=0)
+        elapsed[1] += 1e-6
+        states[1, :3] += 1e-6 * states[0, 3:]
+    if elapsed[-1] < elapsed[0]:
+        elapsed, states, rates = elapsed[::-1].copy(), states[::-1].copy(), rates[::-1].copy()
+    return Trajectory(epoch_tdb_s, elapsed, states, rates, sum(arc.evaluations for arc in arcs))
+
+
+def state_vector(position_icrf_m: ArrayLike, velocity_icrf_m_s: ArrayLike) -> FloatArray:
+    """Return position and velocity as one array (6,)."""
+    state = np.concatenate([
+        np.asarray(position_icrf_m, dtype=np.float64).reshape(3), np.asarray(velocity_icrf_m_s, dtype=np.float64).reshape(3)
+    ])
+    if not np.all(np.isfinite(state)):
+        raise OrbitError(f"start of the orbit: expected six finite numbers, found {state.tolist()}")
+    return state
+
+
+def force_arrays(model: ForceModel, epoch_tdb_s: float, start_s: float, stop_s: float) -> tuple[
+    FloatArray, FloatArray, FloatArray, int
+]:
+    """Return what the compiled right-hand side reads: packed field, scalars, table over the span, scratch length."""
+    from lunar import _dynamics_kernel as kernel
+    from lunar._gravity_kernel import scratch_size
+
+    degree = _degree(model)
+    first = int(np.floor((epoch_tdb_s + min(start_s, stop_s)) / _TABLE_STEP_S))
+    last = int(np.floor((epoch_tdb_s + max(start_s, stop_s)) / _TABLE_STEP_S))
+    force = np.zeros(kernel.FORCES)
+    force[kernel.TABLE_START_S] = first * _TABLE_STEP_S - epoch_tdb_s
+    force[kernel.TABLE_STEP_S] = _TABLE_STEP_S
+    force[kernel.GM_EARTH] = constants.GM_EARTH_M3_S2 if model.earth else 0.0
+    force[kernel.GM_SUN] = constants.GM_SUN_M3_S2 if model.sun else 0.0
+    if model.solar_pressure is not None:
+        pressure = constants.SOLAR_PRESSURE_1AU_N_M2 * constants.ASTRONOMICAL_UNIT_M**2
+        force[kernel.PRESSURE] = pressure * model.solar_pressure.area_to_mass_m2_kg * model.solar_pressure.reflection
+    force[kernel.MOON_RADIUS] = constants.MOON_RADIUS_M
+    force[kernel.EARTH_RADIUS] = constants.EARTH_RADIUS_M
+    force[kernel.SUN_RADIUS] = constants.SUN_RADIUS_M
+    return packed(model.gravity, degree), force, _table(model, first, last), scratch_size(degree)
+
+
+def _degree(model: ForceModel) -> int:
+    return model.gravity.degree if model.degree is None else model.degree
+
+
+def _table(model: ForceModel, first: int, last: int) -> FloatArray:
+    """Return Chebyshev series over the half days ``first`` to ``last``; a half day has the same series in any span."""
+    if (first, last) in model._joined:
+        return model._joined[first, last]
+    missing = [k for k in range(first, last + 1) if k not in model._segments]
+    if missing:
+        model._segments.update(zip(missing, _series(model, np.array(missing)), strict=True))
+    joined = np.stack([model._segments[k] for k in range(first, last + 1)])
+    model._joined.clear()
+    model._joined[first, last] = joined
+    return joined
+
+
+def _series(model: ForceModel, segments: NDArray[np.int64]) -> FloatArray:
+    """Return Chebyshev coefficients (segments, terms, columns) of orientation, Earth and Sun."""
+    from lunar._dynamics_kernel import COLUMNS
+
+    node = np.pi * (np.arange(_TABLE_TERMS) + 0.5) / _TABLE_TERMS
+    times = (segments[:, None] + 0.5 * (1.0 + np.cos(node))) * _TABLE_STEP_S
+    values = np.zeros((len(segments), _TABLE_TERMS, COLUMNS))
+    values[..., :9] = model.orientation.pa_from_icrf(times).reshape(len(segments), _TABLE_TERMS, 9)
+    values[..., 9:12] = earth_position_icrf_m(times)
+    values[..., 12:15] = sun_position_icrf_m(times)
+    fit = 2.0 / _TABLE_TERMS * np.cos(np.arange(_TABLE_TERMS)[:, None] * node)
+    fit[0] *= 0.5
+    return np.ascontiguousarray(np.einsum("tn,snc->stc", fit, values))
+
+
+def _ground_time(elapsed: FloatArray, states: FloatArray, rates: FloatArray, ground_radius_m: float) -> float:
+    """Return when the last step first meets the ground radius, by a scan and bisection on the dense output."""
+    from lunar import _dynamics_kernel as kernel
+
+    # Two knots in ascending order, so that the evaluation can search them.
+    order = slice(None) if elapsed[1] > elapsed[0] else slice(None, None, -1)
+    knots = tuple(np.ascontiguousarray(array[order]) for array in (elapsed, states, rates))
+    fractions = np.linspace(0.0, 1.0, 257)
+    low, high = elapsed[0], elapsed[1]
+    out = np.empty((len(fractions), 6))
+    for _ in range(3):
+        times = low + (high - low) * fractions
+        kernel.evaluate(*knots, times, out)
+        below = np.nonzero(np.linalg.norm(out[:, :3], axis=-1) <= ground_radius_m)[0]
+        at = int(below[0]) if len(below) else len(times) - 1
+        low, high = times[max(at - 1, 0)], times[at]
+    return float(high)
+
+
+def _impact(epoch_tdb_s: float, ground_s: float, elapsed: FloatArray, states: FloatArray, rates: FloatArray,
+            model: ForceModel) -> ImpactError:
+    from lunar.frames import spherical_from_mcmf
+    from lunar.timescales import utc_ns_from_tdb_s
+
+    arc = Arc(elapsed, states, rates, 0, 0, 0.0, np.nan)
+    position = join(epoch_tdb_s, [arc]).state_after(ground_s)[:3]
+    tdb_s = epoch_tdb_s + ground_s
+    latitude, longitude, _ = spherical_from_mcmf(model.orientation.mcmf_from_icrf(tdb_s) @ position)
+    return ImpactError(utc_ns_from_tdb_s(tdb_s), float(latitude), float(longitude))
