@@ -1,0 +1,200 @@
+"""TM transfer frames: header, operational control field (CLCW), frame error control; many frames at once.
+
+References
+----------
+CCSDS 132.0-B section 4.1. Header of six octets: version 00 (2 bits), spacecraft id (10), virtual channel
+(3), OCF flag (1) | master channel count (8) | virtual channel count (8) | secondary header flag,
+synchronisation flag, packet order flag (1 each), segment length id 11 (2), first header pointer (11). CCSDS
+232.0-B 4.2 for the CLCW.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from tmtc.crc import CRC_LENGTH, crc16
+from tmtc.errors import FrameError, TruncatedPacket, ValueRefused
+
+OctetArray = npt.NDArray[np.uint8]
+IntArray = npt.NDArray[np.int64]
+
+FRAME_HEADER_LENGTH = 6
+FRAME_MAX_LENGTH = 2048
+OCF_LENGTH = 4
+NO_PACKET_BEGINS = 0x7FF
+ONLY_IDLE_DATA = 0x7FE
+IDLE_CHANNEL = 7
+
+_HEADER = struct.Struct(">HBBH")
+
+
+@dataclass(frozen=True, slots=True)
+class TmFrameHeader:
+    """Fields of one TM transfer frame header."""
+
+    spacecraft_id: int
+    virtual_channel: int
+    master_count: int
+    channel_count: int
+    first_header_pointer: int
+    ocf: bool = False
+    secondary_header: bool = False
+    synchronised: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TmFrameHeaders:
+    """Header fields of n frames as columns."""
+
+    version: IntArray
+    spacecraft_id: IntArray
+    virtual_channel: IntArray
+    master_count: IntArray
+    channel_count: IntArray
+    first_header_pointer: IntArray
+    ocf: npt.NDArray[np.bool_]
+    secondary_header: npt.NDArray[np.bool_]
+    synchronised: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Clcw:
+    """Command link control word: the spacecraft's view of the uplink."""
+
+    virtual_channel: int
+    report_value: int
+    lockout: bool = False
+    wait: bool = False
+    retransmit: bool = False
+    no_rf_available: bool = False
+    no_bit_lock: bool = False
+    farm_b_counter: int = 0
+    status: int = 0
+
+
+def pack_frame_header(header: TmFrameHeader) -> bytes:
+    """Six octets."""
+    for name, value, limit in (
+        ("spacecraft_id", header.spacecraft_id, 1 << 10),
+        ("virtual_channel", header.virtual_channel, 1 << 3),
+        ("master_count", header.master_count, 1 << 8),
+        ("channel_count", header.channel_count, 1 << 8),
+        ("first_header_pointer", header.first_header_pointer, 1 << 11),
+    ):
+        if not 0 <= value < limit:
+            raise ValueRefused("transfer frame", name, value, f"0..{limit - 1}")
+    first = header.spacecraft_id << 4 | header.virtual_channel << 1 | header.ocf
+    status = (
+        header.secondary_header << 15 | header.synchronised << 14 | 0b11 << 11 | header.first_header_pointer
+    )
+    return _HEADER.pack(first, header.master_count, header.channel_count, status)
+
+
+def unpack_frame_header(octets: bytes | memoryview) -> TmFrameHeader:
+    """The header at the start of a TM transfer frame."""
+    if len(octets) < FRAME_HEADER_LENGTH:
+        raise TruncatedPacket("transfer frame header", FRAME_HEADER_LENGTH, len(octets))
+    first, master_count, channel_count, status = _HEADER.unpack_from(octets)
+    if first >> 14:
+        raise FrameError(f"transfer frame: expected version 0, found {first >> 14}")
+    return TmFrameHeader(
+        spacecraft_id=first >> 4 & 0x3FF,
+        virtual_channel=first >> 1 & 7,
+        master_count=master_count,
+        channel_count=channel_count,
+        first_header_pointer=status & 0x7FF,
+        ocf=bool(first & 1),
+        secondary_header=bool(status >> 15),
+        synchronised=bool(status >> 14 & 1),
+    )
+
+
+def frame_headers(frames: OctetArray) -> TmFrameHeaders:
+    """Header fields of frames (n, length)."""
+    head = frames[:, :FRAME_HEADER_LENGTH].astype(np.int64)
+    first = head[:, 0] << 8 | head[:, 1]
+    status = head[:, 4] << 8 | head[:, 5]
+    return TmFrameHeaders(
+        version=first >> 14,
+        spacecraft_id=first >> 4 & 0x3FF,
+        virtual_channel=first >> 1 & 7,
+        master_count=head[:, 2],
+        channel_count=head[:, 3],
+        first_header_pointer=status & 0x7FF,
+        ocf=(first & 1) != 0,
+        secondary_header=status >> 15 != 0,
+        synchronised=(status >> 14 & 1) != 0,
+    )
+
+
+def frame_checksums_hold(frames: OctetArray) -> npt.NDArray[np.bool_]:
+    """Whether the last two octets of each frame (n, length) are the checksum of those before."""
+    if frames.shape[1] <= CRC_LENGTH:
+        return np.zeros(frames.shape[0], dtype=np.bool_)
+    rows = np.ascontiguousarray(frames)
+    return np.fromiter((crc16(row.data) == 0 for row in rows), dtype=np.bool_, count=rows.shape[0])
+
+
+def append_frame_checksums(frames: OctetArray) -> None:
+    """Write the checksum of each frame (n, length) into its last two octets, in place."""
+    for row in frames:
+        checksum = crc16(row[:-CRC_LENGTH].tobytes())
+        row[-2], row[-1] = checksum >> 8, checksum & 0xFF
+
+
+def pack_clcw(clcw: Clcw) -> bytes:
+    """Four octets for the operational control field."""
+    for name, value, limit in (
+        ("virtual_channel", clcw.virtual_channel, 1 << 6),
+        ("report_value", clcw.report_value, 1 << 8),
+        ("farm_b_counter", clcw.farm_b_counter, 1 << 2),
+        ("status", clcw.status, 1 << 3),
+    ):
+        if not 0 <= value < limit:
+            raise ValueRefused("CLCW", name, value, f"0..{limit - 1}")
+    word = clcw.status << 26 | 0b01 << 24 | clcw.virtual_channel << 18
+    word |= clcw.no_rf_available << 15 | clcw.no_bit_lock << 14 | clcw.lockout << 13
+    word |= clcw.wait << 12 | clcw.retransmit << 11 | clcw.farm_b_counter << 9 | clcw.report_value
+    return word.to_bytes(OCF_LENGTH, "big")
+
+
+def unpack_clcw(octets: bytes | memoryview) -> Clcw:
+    """The CLCW in an operational control field."""
+    if len(octets) < OCF_LENGTH:
+        raise TruncatedPacket("CLCW", OCF_LENGTH, len(octets))
+    word = int.from_bytes(octets[:OCF_LENGTH], "big")
+    if word >> 31 or word >> 29 & 0b11:
+        raise FrameError(f"CLCW: expected control word type 0, version 0, found 0x{word:08X}")
+    return Clcw(
+        virtual_channel=word >> 18 & 0x3F,
+        report_value=word & 0xFF,
+        lockout=bool(word >> 13 & 1),
+        wait=bool(word >> 12 & 1),
+        retransmit=bool(word >> 11 & 1),
+        no_rf_available=bool(word >> 15 & 1),
+        no_bit_lock=bool(word >> 14 & 1),
+        farm_b_counter=word >> 9 & 0b11,
+        status=word >> 26 & 0b111,
+    )
+
+
+def idle_data(length: int) -> bytes:
+    """Fill for frames without packets: the sequence of 1 + D + D^2 + D^22 + D^32, all ones at the start.
+
+    References
+    ----------
+    CCSDS 132.0-B-3 section 4.1.4.6 and its note on the recommended generator.
+    """
+    register, value, result = 0xFFFF_FFFF, 0, bytearray()
+    for bit in range(8 * length):
+        out = register >> 31
+        value = (value << 1 | out) & 0xFF
+        feedback = out ^ register >> 30 ^ register >> 9 ^ register
+        register = (register << 1 | (feedback & 1)) & 0xFFFF_FFFF
+        if bit & 7 == 7:
+            result.append(value)
+    return bytes(result)

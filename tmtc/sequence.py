@@ -1,0 +1,188 @@
+"""Completeness of a packet stream: sequence counts unwrapped to 64 bits, then gaps, duplicates and conflicts.
+
+The link carries 14 bits of count, so the same number returns every 16384 packets. Counts are therefore first
+extended, separately for every boot and APID and in the order of on-board time (arrival means nothing: dumps
+come late, interleaved and twice). Only extended counts are compared.
+
+Between two packets that follow each other in on-board time the count is taken to have moved by the least
+number of steps that explains what is seen: a loss of 8192 packets or more in one stretch looks like a
+shorter one, unless an `expected_rate` says how many to expect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from tmtc.cuc import TICKS_PER_SECOND
+from tmtc.packets import SEQUENCE_COUNT_LIMIT
+
+IntArray = npt.NDArray[np.int64]
+
+FIRST, DUPLICATE, CONFLICT = 0, 1, 2
+
+# A sender that starts anew counts from zero; a count that falls far, to nearly zero, as time goes on is such a start
+_RESET_FALL = 64
+_RESET_COUNT = 64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ApidAccount:
+    """What came of one APID during one boot.
+
+    `missing_ranges` (m, 2) are ranges [first, last] of extended counts that never came; `received` counts
+    different packets, not copies; `restarts` tells how often the counter began anew.
+    """
+
+    boot: int
+    apid: int
+    received: int
+    first_count: int
+    last_count: int
+    missing_ranges: IntArray
+    duplicates: int
+    conflicts: int
+    restarts: int
+
+    @property
+    def gaps(self) -> int:
+        """Stretches of missing packets."""
+        return int(self.missing_ranges.shape[0])
+
+    @property
+    def missing(self) -> int:
+        """Missing packets."""
+        return int((self.missing_ranges[:, 1] - self.missing_ranges[:, 0] + 1).sum())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SequenceReport:
+    """Accounts by boot and APID, and for every packet its extended count (n,) and whether it is a copy (n,)."""
+
+    accounts: tuple[ApidAccount, ...]
+    extended_count: IntArray
+    verdict: npt.NDArray[np.int8]
+
+    @property
+    def gaps(self) -> int:
+        """Stretches of missing packets, all APIDs."""
+        return sum(account.gaps for account in self.accounts)
+
+    @property
+    def missing(self) -> int:
+        """Missing packets, all APIDs."""
+        return sum(account.missing for account in self.accounts)
+
+    @property
+    def duplicates(self) -> int:
+        """Packets that came again with the same octets."""
+        return sum(account.duplicates for account in self.accounts)
+
+    @property
+    def conflicts(self) -> int:
+        """Packets with the count of another one but other octets."""
+        return sum(account.conflicts for account in self.accounts)
+
+
+def extend_counts(
+    sequence_count: IntArray, ticks: IntArray, expected_rate: float | None = None
+) -> tuple[IntArray, IntArray]:
+    """(extended counts (n,), extended counts at which the counter began anew (r,)) of one APID and boot.
+
+    Parameters
+    ----------
+    sequence_count, ticks : (n,)
+        The 14-bit counts and the on-board times, in any order.
+    expected_rate
+        Packets per second, where the sender is known to send steadily.
+    """
+    if not sequence_count.size:
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    order = np.lexsort((np.arange(ticks.size), ticks))
+    count, time = sequence_count[order], ticks[order]
+    step = _nearest(np.diff(count), 0)
+    if expected_rate is not None:
+        expected = np.rint(np.diff(time) * (expected_rate / TICKS_PER_SECOND)).astype(np.int64)
+        step = _nearest(np.diff(count), expected)
+    restart = (step < -_RESET_FALL) & (count[1:] < _RESET_COUNT) & (np.diff(time) > 0)
+    extended = np.empty(count.size, dtype=np.int64)
+    extended[0] = count[0]
+    extended[1:] = count[0] + np.cumsum(step)
+    # after a restart the extended count begins at the next multiple of the limit above all before it
+    bases = []
+    for at in (np.flatnonzero(restart) + 1).tolist():
+        highest = int(extended[:at].max())
+        base = (highest // SEQUENCE_COUNT_LIMIT + 1) * SEQUENCE_COUNT_LIMIT
+        extended[at:] += base + int(count[at]) - int(extended[at])
+        bases.append(base)
+    result = np.empty_like(extended)
+    result[order] = extended
+    return result, np.array(bases, dtype=np.int64)
+
+
+def account(
+    apid: IntArray,
+    sequence_count: IntArray,
+    ticks: IntArray,
+    same: Callable[[int, int], bool],
+    boot: IntArray | None = None,
+    expected_rate: Mapping[int, float] | None = None,
+) -> SequenceReport:
+    """Completeness of n packets in order of arrival.
+
+    Parameters
+    ----------
+    apid, sequence_count, ticks, boot : (n,)
+        `boot` tells which run of the sender made the packet (all the same by default).
+    same
+        Whether two packets, by index, hold the same octets.
+    """
+    n = apid.size
+    boots = np.zeros(n, dtype=np.int64) if boot is None else boot
+    extended = np.zeros(n, dtype=np.int64)
+    verdict = np.zeros(n, dtype=np.int8)
+    accounts = []
+    rates = expected_rate or {}
+    for key in np.unique(boots * (1 << 16) + apid).tolist():
+        this_boot, this_apid = divmod(key, 1 << 16)
+        rows = np.flatnonzero((boots == this_boot) & (apid == this_apid))
+        counts, restarts = extend_counts(sequence_count[rows], ticks[rows], rates.get(this_apid))
+        extended[rows] = counts
+        by_count = np.lexsort((rows, counts))
+        ordered = counts[by_count]
+        repeated = np.append(False, ordered[1:] == ordered[:-1])
+        original = -1
+        for at in np.flatnonzero(repeated).tolist():
+            if not repeated[at - 1]:
+                original = int(rows[by_count[at - 1]])
+            row = int(rows[by_count[at]])
+            verdict[row] = DUPLICATE if same(original, row) else CONFLICT
+        present = ordered[~repeated]
+        jump = np.flatnonzero(np.diff(present) > 1)
+        missing = np.stack((present[jump] + 1, present[jump + 1] - 1), axis=1)
+        # a restart is no gap: what was lost around it cannot be known
+        for base in restarts.tolist():
+            missing = missing[(missing[:, 0] > base) | (base > missing[:, 1] + 1)]
+        accounts.append(
+            ApidAccount(
+                boot=this_boot,
+                apid=this_apid,
+                received=int(present.size),
+                first_count=int(present[0]),
+                last_count=int(present[-1]),
+                missing_ranges=missing,
+                duplicates=int(np.count_nonzero(verdict[rows] == DUPLICATE)),
+                conflicts=int(np.count_nonzero(verdict[rows] == CONFLICT)),
+                restarts=int(restarts.size),
+            )
+        )
+    return SequenceReport(tuple(accounts), extended, verdict)
+
+
+def _nearest(difference: IntArray, expected: IntArray | int) -> IntArray:
+    """The step congruent to `difference` that lies nearest to `expected`."""
+    half = SEQUENCE_COUNT_LIMIT // 2
+    return (difference - expected + half) % SEQUENCE_COUNT_LIMIT - half + expected
