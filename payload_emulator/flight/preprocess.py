@@ -1,0 +1,151 @@
+"""Camera frame to network input: one gray plane, normalised, turned Sun-up, with a verdict on its quality.
+
+The network was trained on images whose Sun lies within 45 degrees of the top edge. The Sun direction in the camera
+frame is known on board, so a frame is turned by quarter turns, which lose nothing. Pixel centres are integers.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Fractions of full scale. A frame on the night side holds read noise and an offset of at most a few counts of 255.
+_DARK_LEVEL = 0.04
+_DARK_SHARE = 0.002  # fewer lit pixels than this (about a 23 px square of 512 x 512) hold no crater worth a match
+_SATURATED_LEVEL = 0.996
+_SATURATED_SHARE = 0.6  # the rest of the frame would still hold fewer craters than a fix needs
+_UNIFORM_DEVIATION = 0.004  # of the square root of full scale: one count of 8 bits at mid scale
+_CLIP = 4.0  # standard deviations: shadows and sunlit walls stay inside, hot pixels do not
+
+
+class ImageQuality(enum.IntEnum):
+    """Verdict on a frame; everything but OK yields no detections."""
+
+    OK = 0
+    DARK = 1
+    SATURATED = 2
+    UNIFORM = 3
+    INVALID = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreparedImage:
+    """Network input, float32 (H, W), zero mean and unit deviation; `quality` other than OK leaves it all zero."""
+
+    gray: NDArray[np.float32]
+    quality: ImageQuality
+
+
+def prepare_image(image: NDArray[np.generic]) -> PreparedImage:
+    """Normalised gray plane of a frame of (H, W) or (H, W, 1|3|4), unsigned integer or float in 0..1.
+
+    The square root of the mean of the colour channels is taken (shot noise becomes even, shadows open), then mean and
+    standard deviation of the frame are removed, so that exposure and gain do not matter.
+    """
+    image = np.asarray(image)
+    colours_ok = image.ndim == 2 or (image.ndim == 3 and image.shape[2] in (1, 3, 4))
+    if not colours_ok or image.size == 0 or image.dtype.kind not in "uf":
+        return PreparedImage(np.zeros(_plane_shape(image), np.float32), ImageQuality.INVALID)
+    gray = _square_root_gray(image)
+    if gray is None:
+        return PreparedImage(np.zeros(_plane_shape(image), np.float32), ImageQuality.INVALID)
+    quality = _judge(gray)
+    if quality is not ImageQuality.OK:
+        return PreparedImage(np.zeros(gray.shape, np.float32), quality)
+    return PreparedImage(normalise(gray), ImageQuality.OK)
+
+
+def normalise(square_root_gray: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Plane with the frame's mean and standard deviation removed, clipped at four deviations."""
+    mean = float(square_root_gray.mean(dtype=np.float64))
+    deviation = max(float(square_root_gray.std(dtype=np.float64)), 1e-6)
+    scaled: NDArray[np.float32] = (square_root_gray - np.float32(mean)) * np.float32(1.0 / deviation)
+    return np.clip(scaled, -_CLIP, _CLIP, out=scaled)
+
+
+def gray_levels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Mean of the colour channels of an 8-bit frame (H, W, 3), rounded: what a data set stores."""
+    total = image[..., 0].astype(np.uint16) + image[..., 1] + image[..., 2]
+    return ((total + 1) // 3).astype(np.uint8)
+
+
+def sun_up_turns(sun_in_camera: NDArray[np.float64] | None) -> int:
+    """Quarter turns (counter-clockwise, as `numpy.rot90`) that bring the Sun nearest the top of the image.
+
+    `sun_in_camera` is the direction to the Sun, (3,), camera frame (x right, y down, z boresight). None or NaN: 0.
+    """
+    if sun_in_camera is None:
+        return 0
+    right, down = float(sun_in_camera[0]), float(sun_in_camera[1])
+    if not np.isfinite(right + down) or right == down == 0.0:
+        return 0
+    # rot90 carries a direction at angle a (counter-clockwise from up, as seen) to a + 90 degrees per turn.
+    angle = np.arctan2(-right, -down)
+    return int(-np.rint(angle / (np.pi / 2.0))) % 4
+
+
+def turn_back(
+    u_px: NDArray[np.float64], v_px: NDArray[np.float64], turns: int, height_px: int, width_px: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Coordinates in the original frame (height, width) of points found in `numpy.rot90(frame, turns)`."""
+    turns %= 4
+    if turns == 1:
+        return (width_px - 1.0) - v_px, u_px
+    if turns == 2:
+        return (width_px - 1.0) - u_px, (height_px - 1.0) - v_px
+    if turns == 3:
+        return v_px, (height_px - 1.0) - u_px
+    return u_px, v_px
+
+
+def turn_forward(
+    u_px: NDArray[np.float64], v_px: NDArray[np.float64], turns: int, height_px: int, width_px: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Coordinates in `numpy.rot90(frame, turns)` of points of the original frame (height, width)."""
+    turns %= 4
+    if turns == 1:
+        return v_px, (width_px - 1.0) - u_px
+    if turns == 2:
+        return (width_px - 1.0) - u_px, (height_px - 1.0) - v_px
+    if turns == 3:
+        return (height_px - 1.0) - v_px, u_px
+    return u_px, v_px
+
+
+def _plane_shape(image: NDArray[np.generic]) -> tuple[int, int]:
+    return (int(image.shape[0]), int(image.shape[1])) if image.ndim >= 2 else (0, 0)
+
+
+def _square_root_gray(image: NDArray[np.generic]) -> NDArray[np.float32] | None:
+    """Square root of the channel mean as a fraction of full scale; None where a value is not a number."""
+    colours = 1 if image.ndim == 2 else min(image.shape[2], 3)
+    colours = 3 if colours == 3 else 1
+    planes = [image] if image.ndim == 2 else [image[..., k] for k in range(colours)]
+    if image.dtype == np.uint8:
+        total = planes[0].astype(np.uint16)
+        for plane in planes[1:]:
+            total += plane.astype(np.uint8)
+        table = np.sqrt(np.arange(255 * colours + 1, dtype=np.float64) / (255.0 * colours)).astype(np.float32)
+        taken: NDArray[np.float32] = table[total]
+        return taken
+    full_scale = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else 1.0
+    mean = np.zeros(_plane_shape(image), np.float32)
+    for plane in planes:
+        mean += plane.astype(np.float32)
+    mean *= np.float32(1.0 / (colours * full_scale))
+    if not np.isfinite(mean).all():
+        return None
+    return np.sqrt(np.clip(mean, 0.0, 1.0, out=mean), out=mean)
+
+
+def _judge(square_root_gray: NDArray[np.float32]) -> ImageQuality:
+    if float(np.mean(square_root_gray > np.float32(np.sqrt(_SATURATED_LEVEL)))) > _SATURATED_SHARE:
+        return ImageQuality.SATURATED
+    if float(np.mean(square_root_gray > np.float32(np.sqrt(_DARK_LEVEL)))) < _DARK_SHARE:
+        return ImageQuality.DARK
+    if float(square_root_gray.std(dtype=np.float64)) < _UNIFORM_DEVIATION:
+        return ImageQuality.UNIFORM
+    return ImageQuality.OK

@@ -1,0 +1,1 @@
+"""Offline work on the crater network: data sets, training, evaluation, export. Never imported by flight."""

@@ -1,0 +1,192 @@
+"""The crater network: MobileNetV3-small backbone, depthwise feature pyramid, CenterNet heads at stride 4.
+
+Input (B, 1, H, W), H and W multiples of 32, as `payload_emulator.flight.preprocess` makes it. Outputs at (H/4, W/4):
+heatmap logits (B, 1 or 4, h, w): any crater, then the paper's three classes where asked for; geometry (B, 4, h, w):
+offset to the centre in cells (right, down), ln(diameter / 16 px), ln(one-sigma centre error / 1 px).
+
+References
+----------
+A. Howard et al., "Searching for MobileNetV3", 2019, table 2. X. Zhou et al., "Objects as Points", 2019.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+
+import torch
+from torch import Tensor, nn
+
+# kernel, expanded channels, output channels, squeeze-excite, hard-swish (else ReLU), stride: MobileNetV3-small
+_BLOCKS = (
+    (3, 16, 16, True, False, 2),
+    (3, 72, 24, False, False, 2),
+    (3, 88, 24, False, False, 1),
+    (5, 96, 40, True, True, 2),
+    (5, 240, 40, True, True, 1),
+    (5, 240, 40, True, True, 1),
+    (5, 120, 48, True, True, 1),
+    (5, 144, 48, True, True, 1),
+    (5, 288, 96, True, True, 2),
+    (5, 576, 96, True, True, 1),
+    (5, 576, 96, True, True, 1),
+)
+_TAPS = (0, 2, 7, 10)  # last block of strides 4, 8, 16, 32
+_PRIOR_LOGIT = -4.0  # about one cell in fifty before training: keeps the first focal losses finite
+_INITIAL_LOG_SIGMA = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class ModelConfig:
+    """Shape of the network. `detail_blocks` adds blocks at stride 4, where small craters live."""
+
+    pyramid_channels: int = 64
+    detail_blocks: int = 1
+    detail_channels: int = 24
+    paper_classes: bool = False
+
+    def to_dict(self) -> dict[str, int | bool]:
+        return asdict(self)
+
+
+class CraterNet(nn.Module):
+    """Heatmap logits and geometry of a normalised gray image."""
+
+    def __init__(self, config: ModelConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or ModelConfig()
+        self.stem = _conv_norm(1, 16, 3, stride=2, activation=nn.Hardswish())
+        blocks: list[nn.Module] = []
+        tapped: list[int] = []
+        channels = 16
+        for index, (kernel, expanded, out, squeeze, swish, stride) in enumerate(_BLOCKS):
+            blocks.append(_InvertedResidual(channels, expanded, out, kernel, stride, squeeze, swish))
+            channels = out
+            if index in _TAPS:
+                tapped.append(out)
+        self.blocks = nn.ModuleList(blocks)
+        detail = self.config.detail_channels
+        self.detail = nn.Sequential(
+            *(
+                _InvertedResidual(tapped[0] if i == 0 else detail, 2 * detail, detail, 3, 1, False, False)
+                for i in range(self.config.detail_blocks)
+            )
+        )
+        if self.config.detail_blocks:
+            tapped[0] = detail
+        width = self.config.pyramid_channels
+        self.lateral = nn.ModuleList(nn.Conv2d(c, width, 1) for c in tapped)
+        self.smooth = nn.ModuleList(_separable(width, width) for _ in tapped[:-1])
+        self.trunk = _separable(width, width)
+        self.head = nn.Conv2d(width, self.heat_channels + 4, 1)
+        _initialise(self)
+        assert self.head.bias is not None
+        self.head.bias.data[: self.heat_channels] = _PRIOR_LOGIT
+        self.head.bias.data[self.heat_channels + 3] = _INITIAL_LOG_SIGMA
+
+    @property
+    def heat_channels(self) -> int:
+        return 4 if self.config.paper_classes else 1
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        features: list[Tensor] = []
+        x = self.stem(image)
+        for index, block in enumerate(self.blocks):
+            x = block(x)
+            if index in _TAPS:
+                features.append(x)
+        features[0] = self.detail(features[0])
+        merged = self.lateral[-1](features[-1])
+        for level in range(len(features) - 2, -1, -1):
+            merged = nn.functional.interpolate(merged, scale_factor=2.0, mode="nearest")
+            merged = self.smooth[level](self.lateral[level](features[level]) + merged)
+        out = self.head(self.trunk(merged))
+        if out.requires_grad:  # a gradient of another memory layout makes the backward pass several times slower
+            out.register_hook(lambda gradient: gradient.contiguous(memory_format=torch.channels_last))
+        return out[:, : self.heat_channels], out[:, self.heat_channels :]
+
+
+class ExportedCraterNet(nn.Module):
+    """The network as flight runs it: probabilities, and the calibrated logarithm of sigma."""
+
+    def __init__(self, network: CraterNet, log_sigma_shift: float = 0.0) -> None:
+        super().__init__()
+        self.network = network
+        shift = torch.zeros(1, 4, 1, 1)
+        shift[0, 3] = log_sigma_shift
+        self.register_buffer("shift", shift)
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        heat, geometry = self.network(image)
+        return torch.sigmoid(heat), geometry + self.shift
+
+
+def count_parameters(network: nn.Module) -> int:
+    """Number of trained values."""
+    return sum(p.numel() for p in network.parameters())
+
+
+class _SqueezeExcite(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        reduced = max(8, (channels // 4 + 4) // 8 * 8)
+        self.reduce = nn.Conv2d(channels, reduced, 1)
+        self.expand = nn.Conv2d(reduced, channels, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        pooled = x.mean((2, 3), keepdim=True)
+        gate = nn.functional.hardsigmoid(self.expand(nn.functional.relu(self.reduce(pooled))))
+        return x * gate
+
+
+class _InvertedResidual(nn.Module):
+    def __init__(
+        self, channels: int, expanded: int, out: int, kernel: int, stride: int, squeeze: bool, swish: bool
+    ) -> None:
+        super().__init__()
+        self.residual = stride == 1 and channels == out
+        layers: list[nn.Module] = []
+        if expanded != channels:
+            layers.append(_conv_norm(channels, expanded, 1, activation=_activation(swish)))
+        layers.append(
+            _conv_norm(expanded, expanded, kernel, stride=stride, groups=expanded, activation=_activation(swish))
+        )
+        if squeeze:
+            layers.append(_SqueezeExcite(expanded))
+        layers.append(_conv_norm(expanded, out, 1, activation=None))
+        self.body = nn.Sequential(*layers)
+
+    def forward(self, x: Tensor) -> Tensor:
+        y: Tensor = self.body(x)
+        return x + y if self.residual else y
+
+
+def _activation(swish: bool) -> nn.Module:
+    return nn.Hardswish() if swish else nn.ReLU()
+
+
+def _conv_norm(
+    channels: int, out: int, kernel: int, stride: int = 1, groups: int = 1, activation: nn.Module | None = None
+) -> nn.Sequential:
+    layers: list[nn.Module] = [
+        nn.Conv2d(channels, out, kernel, stride, kernel // 2, groups=groups, bias=False),
+        nn.BatchNorm2d(out, momentum=0.02),
+    ]
+    if activation is not None:
+        layers.append(activation)
+    return nn.Sequential(*layers)
+
+
+def _separable(channels: int, out: int) -> nn.Sequential:
+    depthwise = nn.Conv2d(channels, channels, 3, padding=1, groups=channels, bias=False)
+    return nn.Sequential(depthwise, _conv_norm(channels, out, 1, activation=nn.ReLU()))
+
+
+def _initialise(network: CraterNet) -> None:
+    for module in network.modules():
+        if isinstance(module, nn.Conv2d):
+            fan_out = module.kernel_size[0] * module.kernel_size[1] * module.out_channels / module.groups
+            nn.init.normal_(module.weight, 0.0, math.sqrt(2.0 / fan_out))
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)
+    nn.init.normal_(network.head.weight, 0.0, 0.01)

@@ -1,0 +1,157 @@
+"""What a data set is made of: sources of terrain by split, where frames may look, under which light and from where.
+
+A recipe is a TOML file with a `[dataset]` table and one `[[dataset.source]]` table per source. Angles are degrees and
+lengths kilometres in the file. Splits are separated by footprint: every pixel of a frame looks into one of its source's
+boxes and stays `buffer_km` away from every box it must avoid.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from payload_emulator.errors import DatasetError
+
+SPLITS = ("train", "val", "test")
+TERRAINS = ("procedural", "real")
+LIGHTS = ("wide", "low", "paper")
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """West, east, south, north in degrees; east may exceed 360."""
+
+    west_deg: float
+    east_deg: float
+    south_deg: float
+    north_deg: float
+
+
+EVERYWHERE = (Box(0.0, 360.0, -60.0, 60.0),)
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """One kind of frames.
+
+    terrain : "procedural" (one world per seed) or "real" (the tiles of the data folder; seeds vary what is stamped on it).
+    share : of all frames of the data set.
+    light : "wide" = 3..60 degrees of elevation, mostly 5..15, any azimuth; "low" = 5..15, any azimuth; "paper" = 5..15
+        and -45..45 degrees from north.
+    vary : photometry, sensor and pointing are randomised; otherwise they are nominal and the camera looks straight down.
+    """
+
+    name: str
+    split: str
+    terrain: str
+    share: float
+    seeds: tuple[int, ...] = (1,)
+    boxes: tuple[Box, ...] = EVERYWHERE
+    avoid: tuple[Box, ...] = ()
+    buffer_km: float = 60.0
+    light: str = "wide"
+    vary: bool = True
+    altitude_km: tuple[float, float] = (12.0, 50.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """A data set up to its number of frames."""
+
+    name: str
+    seed: int
+    sources: tuple[Source, ...]
+    width_px: int = 512
+    height_px: int = 512
+    fov_deg: float = 120.0
+    frames_per_shard: int = 20
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @property
+    def digest(self) -> str:
+        """Hash of everything that decides what the frames are."""
+        return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
+
+
+def procedural_recipe(seed: int = 1) -> Recipe:
+    """Recipe without data: training worlds, a validation world and a test world that share no seed."""
+    worlds = [seed * 100 + k for k in range(8)]
+    return Recipe(
+        "procedural",
+        seed,
+        (
+            Source("procedural", "train", "procedural", 0.8, tuple(worlds[:6])),
+            Source("procedural-val", "val", "procedural", 0.1, (worlds[6],), light="low", vary=False),
+            Source("procedural-test", "test", "procedural", 0.1, (worlds[7],), light="low", vary=False),
+        ),
+    )
+
+
+def load_recipe(path: Path) -> Recipe:
+    """Recipe of a TOML file; a file without a `[dataset]` table (a plain scenario) gives the procedural recipe.
+
+    Raises
+    ------
+    DatasetError
+        With the file, the key, what was expected and what was found.
+    """
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise DatasetError(f"{path}: expected a TOML file, found: {error}") from error
+    if "dataset" not in document:
+        return procedural_recipe(int(document.get("seed", 1)))
+    table = document["dataset"]
+    if not isinstance(table, dict):
+        raise DatasetError(f"{path}: dataset: expected a table, found {table!r}")
+    sources = table.get("source", [])
+    if not isinstance(sources, list) or not sources:
+        raise DatasetError(f"{path}: dataset.source: expected at least one [[dataset.source]] table, found none")
+    settings = {key: value for key, value in table.items() if key != "source"}
+    _refuse_unknown(path, "dataset", settings, {f.name for f in fields(Recipe)} - {"sources"})
+    for key in ("name", "seed"):
+        if key not in settings:
+            raise DatasetError(f"{path}: dataset.{key}: expected a value, found none")
+    return Recipe(sources=tuple(_source(path, n, item) for n, item in enumerate(sources)), **settings)
+
+
+def _source(path: Path, number: int, table: Mapping[str, Any]) -> Source:
+    where = f"dataset.source {number + 1}"
+    _refuse_unknown(path, where, table, {f.name for f in fields(Source)})
+    values = dict(table)
+    for key in ("name", "split", "terrain", "share"):
+        if key not in values:
+            raise DatasetError(f"{path}: {where}: {key}: expected a value, found none")
+    for key, allowed in (("split", SPLITS), ("terrain", TERRAINS), ("light", LIGHTS)):
+        if key in values and values[key] not in allowed:
+            raise DatasetError(f"{path}: {where}: {key}: expected one of {', '.join(allowed)}, found {values[key]!r}")
+    for key in ("boxes", "avoid"):
+        if key in values:
+            values[key] = tuple(_box(path, f"{where}: {key}", item) for item in values[key])
+    if "seeds" in values:
+        values["seeds"] = tuple(int(seed) for seed in values["seeds"])
+    if "altitude_km" in values:
+        values["altitude_km"] = tuple(float(value) for value in values["altitude_km"])
+    return Source(**values)
+
+
+def _box(path: Path, where: str, item: object) -> Box:
+    if not (isinstance(item, list) and len(item) == 4 and all(isinstance(value, (int, float)) for value in item)):
+        raise DatasetError(f"{path}: {where}: expected [west, east, south, north] in degrees, found {item!r}")
+    return Box(*(float(value) for value in item))
+
+
+def _refuse_unknown(path: Path, where: str, table: Mapping[str, Any], known: set[str]) -> None:
+    for key in table:
+        if key not in known:
+            close = difflib.get_close_matches(key, known, n=1)
+            hint = f" (did you mean {close[0]!r}?)" if close else ""
+            raise DatasetError(f"{path}: {where}: unknown key {key!r}{hint}")

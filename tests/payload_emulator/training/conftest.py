@@ -1,0 +1,80 @@
+"""Crude data sets for the tests: bright-and-dark blobs on a plain, drawn without any renderer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from payload_emulator.training import dataset as store
+from payload_emulator.training.recipe import Recipe, Source
+
+SIZE = 512
+
+
+def draw_blobs(rng: np.random.Generator, u, v, diameter) -> np.ndarray:
+    """Gray image (512, 512) with a crater-like blob (lit below, dark above: Sun at the top) at each centre."""
+    row, column = np.mgrid[0:SIZE, 0:SIZE].astype(np.float64)
+    image = 110.0 + 4.0 * rng.standard_normal((SIZE, SIZE))
+    for x, y, d in zip(u, v, diameter, strict=True):
+        dx, dy = (column - x) / (0.5 * d), (row - y) / (0.5 * d)
+        image += 90.0 * dy * np.exp(-1.5 * (dx * dx + dy * dy))
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def write_blob_dataset(folder: Path, frames_per_split: dict[str, int], seed: int = 3) -> store.Dataset:
+    """A data set of blobs in the project's own format, 30 km up over a plain."""
+    sources = tuple(Source(name, name, "procedural", 1.0) for name in frames_per_split)
+    recipe = Recipe("blobs", seed, sources)
+    for name in ("images", "metadata", "shards"):
+        (folder / name).mkdir(parents=True)
+    hashes, number = {}, 0
+    rng = np.random.default_rng(seed)
+    position = np.array([1_737_400.0 + 30_000.0, 0.0, 0.0])
+    # At latitude and longitude 0 the axes are up, east, north; the camera's are east, south, down.
+    rotation = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+    focal = 256.0 / np.tan(np.radians(60.0))
+    for shard, (split, count) in enumerate(frames_per_split.items()):
+        rows, craters, first = [], [], [0]
+        for _ in range(count):
+            n = 12
+            u, v = rng.uniform(25, SIZE - 25, n), rng.uniform(25, SIZE - 25, n)
+            far = np.array([i == 0 or np.hypot(u[:i] - u[i], v[:i] - v[i]).min() > 60 for i in range(n)])
+            u, v = u[far], v[far]
+            d = rng.uniform(26.0, 50.0, u.size)
+            store.write_gray(folder / "images" / f"{number:06d}.png", draw_blobs(rng, u, v, d))
+            store.write_json(folder / "metadata" / f"{number:06d}.json", {"frame": number})
+            rows.append(number)
+            craters.append(
+                {
+                    "id": np.arange(u.size) + 1000 * number,
+                    "u_px": u, "v_px": v, "diameter_px": d, "diameter_m": d * 30_000.0 / focal,
+                    "depth_ratio": np.full(u.size, 0.15), "lit": np.ones(u.size),
+                    "hidden": np.zeros(u.size, np.uint8),
+                    "latitude_deg": np.zeros(u.size), "longitude_deg": np.zeros(u.size),
+                }
+            )
+            first.append(first[-1] + u.size)
+            number += 1
+        values = {
+            "number": rows, "latitude_deg": 0.0, "longitude_deg": 0.0, "altitude_m": 30_000.0, "ground_m": 0.0,
+            "sun_elevation_deg": 10.0, "sun_azimuth_deg": 0.0, "block": rows,
+        }
+        labels = store.ShardLabels(
+            source=split, split=split, complete=True,
+            frames={key: np.broadcast_to(np.asarray(values[key], float), (count,)).copy() for key in store.FRAME_COLUMNS},
+            sun_camera=np.tile([0.0, -0.98, -0.17], (count, 1)),
+            camera_from_mcmf=np.tile(rotation, (count, 1, 1)),
+            position_mcmf_m=np.tile(position, (count, 1)),
+            craters={key: np.concatenate([part[key] for part in craters]) for key in store.CRATER_COLUMNS},
+            first=np.array(first),
+        )
+        hashes[f"{shard:05d}"] = store.write_shard(folder, f"{shard:05d}", labels)
+    store.write_index(folder, recipe, number, hashes, ["blobs"])
+    return store.Dataset(folder)
+
+
+@pytest.fixture(scope="session")
+def blob_dataset(tmp_path_factory) -> store.Dataset:
+    return write_blob_dataset(tmp_path_factory.mktemp("blobs") / "set", {"train": 24, "val": 6, "test": 4})
