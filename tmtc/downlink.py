@@ -222,15 +222,17 @@ class FrameTable:
 class DownlinkDecode:
     """What came out of a downlink, and what became of every octet of it.
 
-    `buffer` holds the packet octets that `cut` points into. `octets` says where the octets of the input
-    went; its values sum to their number. `frames_bad` counts frames that were found but could not be used,
-    truncated ones included.
+    `buffer` holds the packet octets that `cut` points into. `unknown` counts packets with a right checksum that the
+    dictionary does not know or that are not as long as it says. `octets` says where the octets of the input went;
+    its values sum to their number. `frames_bad` counts frames that were found but could not be used, truncated ones
+    included.
     """
 
     buffer: OctetArray
     cut: PacketCut
     headers: PrimaryHeaders
     sequence: SequenceReport
+    unknown: int
     settings: LinkSettings | None
     frames: FrameTable | None
     spacecraft_id: int | None
@@ -280,6 +282,24 @@ class DownlinkDecode:
         """Octets that belong to no frame or to no packet."""
         return sum(self.octets[k] for k in ("unsynchronised", "orphaned", "skipped"))
 
+    @property
+    def frame_count(self) -> int:
+        """CADUs found, good or bad."""
+        return 0 if self.frames is None else len(self.frames)
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is damaged, missing, unknown or left over."""
+        return not (
+            self.gaps
+            or self.conflicts
+            or self.crc_errors
+            or self.unknown
+            or self.octets_skipped
+            or self.frames_bad
+            or self.frames_lost
+        )
+
     def tables(self, dictionary: Dictionary = DICTIONARY) -> dict[str, Table]:
         """The packets as columns."""
         return dictionary.unpack_many(self.buffer, self.cut)
@@ -295,8 +315,9 @@ class DownlinkDecode:
             "duplicates": self.duplicates,
             "conflicts": self.conflicts,
             "crc_errors": self.crc_errors,
+            "unknown": self.unknown,
             "octets_skipped": self.octets_skipped,
-            "frames": 0 if self.frames is None else len(self.frames),
+            "frames": self.frame_count,
             "frames_bad": self.frames_bad,
             "frames_lost": self.frames_lost,
             "symbols_corrected": self.symbols_corrected,
@@ -343,7 +364,18 @@ def _bare_packets(stream: OctetArray, dictionary: Dictionary) -> DownlinkDecode:
     headers = primary_headers(stream, cut)
     octets = _octet_account(stream.size, cut)
     return DownlinkDecode(
-        stream, cut, headers, _account(stream, cut, headers, dictionary), None, None, None, octets, 0, 0, 0
+        buffer=stream,
+        cut=cut,
+        headers=headers,
+        sequence=_account(stream, cut, headers, dictionary),
+        unknown=_unknown(stream, cut, dictionary),
+        settings=None,
+        frames=None,
+        spacecraft_id=None,
+        octets=octets,
+        frames_bad=0,
+        frames_lost=0,
+        symbols_corrected=0,
     )
 
 
@@ -423,6 +455,7 @@ def _frames_to_packets(
         cut=cut,
         headers=headers,
         sequence=_account(buffer, cut, headers, dictionary),
+        unknown=_unknown(buffer, cut, dictionary),
         settings=settings,
         frames=table,
         spacecraft_id=spacecraft_id,
@@ -513,6 +546,10 @@ def _octet_account(total: int, cut: PacketCut) -> dict[str, int]:
     }
 
 
+def _unknown(buffer: OctetArray, cut: PacketCut, dictionary: Dictionary) -> int:
+    return int(np.count_nonzero(cut.crc_ok & (dictionary.identify(buffer, cut) < 0)))
+
+
 def _account(
     buffer: OctetArray, cut: PacketCut, headers: PrimaryHeaders, dictionary: Dictionary
 ) -> SequenceReport:
@@ -549,7 +586,7 @@ def _boots(buffer: OctetArray, cut: PacketCut, ticks: IntArray, dictionary: Dict
 
     Boots are taken to begin at their boot event, or else at their first housekeeping packet.
     """
-    tables = dictionary.unpack_many(buffer, cut)
+    tables = dictionary.unpack_many(buffer, cut, only=("housekeeping", "event_info"))
     housekeeping = tables.get("housekeeping")
     if housekeeping is None:
         return None

@@ -14,7 +14,7 @@ import json
 import math
 import operator
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -380,12 +380,19 @@ class Dictionary:
                 result[mine] = np.where(right, index, WRONG_LENGTH)
         return result
 
-    def unpack_many(self, buffer: Octets, cut: PacketCut) -> dict[str, Table]:
-        """A table for every kind of telemetry packet in `cut`; damaged and unknown ones are left out."""
+    def unpack_many(
+        self, buffer: Octets, cut: PacketCut, only: Collection[str] | None = None
+    ) -> dict[str, Table]:
+        """A table for every kind of telemetry packet in `cut`; damaged and unknown ones are left out.
+
+        `only` names the kinds that are wanted, all by default.
+        """
         octets = as_octets(buffer)
         which = self.identify(octets, cut)
         tables = {}
         for index, definition in enumerate(self.telemetry):
+            if only is not None and definition.name not in only:
+                continue
             rows = np.flatnonzero(which == index)
             if rows.size:
                 tables[definition.name] = self._compiled[definition.name].table(octets, cut.offsets, rows)

@@ -1,0 +1,128 @@
+"""Decoded packets as JSON, CSV or Parquet: one record for each packet, in the order of the stream."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Mapping
+from datetime import datetime, timedelta
+from typing import Any
+
+import numpy as np
+
+from tmtc.cuc import TICKS_PER_SECOND
+from tmtc.dictionary import DICTIONARY
+from tmtc.errors import UnknownPacket
+from tmtc.parquet import parquet_octets
+from tmtc.schema import Dictionary, Field, Table
+
+FORMATS = ("json", "csv", "parquet")
+
+_EPOCH_TAI = datetime(2000, 1, 1)
+
+Record = dict[str, Any]
+
+
+def format_onboard_time(ticks: int) -> str:
+    """On-board time of the ideal clock, TAI, to the microsecond: `2029-08-07T00:00:37.000000`."""
+    whole, fraction = divmod(int(ticks), TICKS_PER_SECOND)
+    try:
+        time = _EPOCH_TAI + timedelta(seconds=whole, microseconds=fraction * 1_000_000 // TICKS_PER_SECOND)
+    except OverflowError:
+        return ""
+    return time.isoformat(timespec="microseconds")
+
+
+def packet_records(tables: Mapping[str, Table], dictionary: Dictionary = DICTIONARY) -> list[Record]:
+    """A record for each packet, ordered as in the stream: header fields, then engineering values.
+
+    Enumerated fields give their names, vectors lists, repeated items a list of records, unknown numbers None.
+    """
+    numbered: list[tuple[int, Record]] = []
+    for name, table in tables.items():
+        definition = dictionary.packet(name)
+        columns = {f.name: _column(f, table.columns[f.name]) for f in definition.fields}
+        items: list[list[Record]] = []
+        if definition.group:
+            fields = definition.group.fields
+            cells = [_column(f, table.items[f.name]) for f in fields]
+            names = [f.name for f in fields]
+            flat = [dict(zip(names, row, strict=True)) for row in zip(*cells, strict=True)]
+            stops = np.searchsorted(table.item_owner, np.arange(len(table)), side="right").tolist()
+            items = [flat[start:stop] for start, stop in zip([0, *stops[:-1]], stops, strict=True)]
+        for row in range(len(table)):
+            ticks = int(table.ticks[row])
+            record: Record = {
+                "packet": name,
+                "apid": definition.apid,
+                "service": definition.service,
+                "subtype": definition.subtype,
+                "sequence_count": int(table.sequence_count[row]),
+                "ticks": ticks,
+                "onboard_tai": format_onboard_time(ticks),
+            }
+            for column, values in columns.items():
+                record[column] = values[row]
+            if definition.group:
+                record[definition.group.name] = items[row]
+            numbered.append((int(table.packet_index[row]), record))
+    numbered.sort(key=lambda pair: pair[0])
+    return [record for _, record in numbered]
+
+
+def format_records(records: list[Record], kind: str) -> bytes:
+    """The records as a file of that kind (`json`, `csv`, `parquet`).
+
+    CSV and Parquet hold one row for each packet and a column for every field that occurs; vectors are spread over
+    numbered columns, repeated items are JSON in one column.
+    """
+    if kind == "json":
+        lines = ",\n".join(json.dumps(record, allow_nan=False) for record in records)
+        return f"[\n{lines}\n]\n".encode()
+    if kind not in FORMATS:
+        raise UnknownPacket(f"format: expected one of {', '.join(FORMATS)}, found {kind!r}")
+    columns: dict[str, list[object]] = {}
+    for row, record in enumerate(records):
+        for key, value in _flat(record).items():
+            column = columns.setdefault(key, [])
+            column.extend([None] * (row - len(column)))
+            column.append(value)
+    for column in columns.values():
+        column.extend([None] * (len(records) - len(column)))
+    if kind == "parquet":
+        return parquet_octets(columns)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
+    return text.getvalue().encode()
+
+
+def _flat(record: Record) -> Record:
+    flat: Record = {}
+    for key, value in record.items():
+        if isinstance(value, list) and value and not isinstance(value[0], dict):
+            flat.update({f"{key}_{k}": element for k, element in enumerate(value, start=1)})
+        elif isinstance(value, list):
+            flat[key] = json.dumps(value, allow_nan=False)
+        else:
+            flat[key] = value
+    return flat
+
+
+def _column(f: Field, values: Any) -> list[Any]:
+    if f.labels:
+        names = dict(f.labels)
+        return [names.get(code, code) for code in values.tolist()]
+    listed: list[Any] = values.tolist()
+    if values.dtype.kind == "f":
+        return [_finite(value) for value in listed]
+    return listed
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_finite(element) for element in value]
+    return value if math.isfinite(value) else None
