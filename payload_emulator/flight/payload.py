@@ -8,21 +8,23 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lunar.camera import PinholeCamera
 from lunar.catalogue import size_class
+from lunar.frames import matrix_from_quaternion
 from payload_emulator.errors import TableError
 from payload_emulator.flight import odometry
+from payload_emulator.flight.anchored import AnchoredNavigator, AnchoredParameters
 from payload_emulator.flight.commanding import Command, Refusal, parse_commands
 from payload_emulator.flight.detections import Detections, Detector
-from payload_emulator.flight.odometry import OdometryParameters, OdometryReport, OdometryState
+from payload_emulator.flight.odometry import OdometryParameters, OdometryState
 from payload_emulator.flight.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.preprocess import ImageQuality
 from payload_emulator.flight.tables import (
@@ -30,16 +32,23 @@ from payload_emulator.flight.tables import (
     AnchorTable,
     table_hash,
     unpack_anchor_table,
+    unpack_catalogue_table,
+    unpack_gravity_table,
+    unpack_initial_state,
+    unpack_orientation_table,
 )
 from tmtc.dictionary import DICTIONARY
 from tmtc.packets import PacketSequencer
 from tmtc.pus import ACK_ACCEPTANCE, ACK_COMPLETION, ACK_START
 
 Float = NDArray[np.float64]
+Table = TypeVar("Table")
 
 _NAN = float("nan")
 _UNKNOWN_VECTOR = (_NAN, _NAN, _NAN)
 _PIXEL_LIMIT = 65_535 / 64.0
+# Numbers of tables in events, as in the dictionary's table of tables; orientation and initial state follow it.
+_TABLE_NUMBERS = {"anchor_ephemeris": 1, "catalogue": 2, "gravity": 3, "orientation": 8, "initial_state": 9}
 _STAGES = ((ACK_ACCEPTANCE, "accepted"), (ACK_START, "started"), (ACK_COMPLETION, "completed"))
 # Codes of the dictionary's failure table.
 _UNKNOWN_FUNCTION, _OUT_OF_RANGE = 9, 4
@@ -66,6 +75,8 @@ class FlightParameters:
         Estimators to run on each frame's detections.
     odometry
         Rules of `paper` and `spherical`.
+    anchored
+        Rules of `anchored`.
     housekeeping_interval_s
         Time between housekeeping packets.
     temperature_c, bus_voltage_v, power_w
@@ -75,6 +86,7 @@ class FlightParameters:
     camera: PinholeCamera = field(default_factory=PinholeCamera)
     modes: tuple[Mode, ...] = (Mode.paper, Mode.spherical)
     odometry: OdometryParameters = field(default_factory=OdometryParameters)
+    anchored: AnchoredParameters = field(default_factory=AnchoredParameters)
     housekeeping_interval_s: float = 60.0
     temperature_c: float = 20.0
     bus_voltage_v: float = 12.0
@@ -93,9 +105,16 @@ class FlightParameters:
 
 @dataclass(frozen=True, slots=True)
 class FlightTables:
-    """Tables as uploaded; empty octets where there is none."""
+    """Tables as uploaded; empty octets where there is none.
+
+    `paper` and `spherical` need the anchor ephemeris; `anchored` needs all the others and never reads that one.
+    """
 
     anchor_ephemeris: bytes = b""
+    catalogue: bytes = b""
+    gravity: bytes = b""
+    orientation: bytes = b""
+    initial_state: bytes = b""
 
 
 class Payload:
@@ -129,7 +148,7 @@ class Payload:
         self._parameters = parameters
         self._tables = tables
         self._model_hash = model_hash
-        self._memory_octets = model_octets + len(tables.anchor_ephemeris)
+        self._memory_octets = model_octets + sum(len(getattr(tables, name)) for name in _TABLE_NUMBERS)
         self._boot_count = boot_count
         self._mode = PayloadMode.observing
         self._sequencer = PacketSequencer()
@@ -139,6 +158,9 @@ class Payload:
         self._triggers: dict[Mode, Counter[ResetTrigger]] = {mode: Counter() for mode in parameters.modes}
         self._odometry: dict[Mode, OdometryState | None] = {}
         self._anchor: AnchorTable | None = None
+        self._navigator: AnchoredNavigator | None = None
+        self._reacquisitions = 0
+        self._in_trouble: set[str] = set()
         self._manual_step = False
         self._housekeeping_on = True
         self._housekeeping_interval_s = parameters.housekeeping_interval_s
@@ -188,6 +210,9 @@ class Payload:
         return {
             "estimators": estimators,
             "outcomes": chosen.get("outcomes", {}),
+            "fixes": {**estimators["anchored"]["outcomes"], "reacquired": self._reacquisitions}
+            if "anchored" in estimators
+            else {},
             "truth_reads_after_start": chosen.get("anchor_reads_after_start", 0),
             "frames_processed": self._counts["frames"],
             "frames_bad": self._counts["frames_bad"],
@@ -209,17 +234,36 @@ class Payload:
 
     def _boot(self) -> None:
         self._event("info", "boot", float(self._boot_count))
-        if self._tables.anchor_ephemeris:
-            try:
-                self._anchor = unpack_anchor_table(self._tables.anchor_ephemeris)
-                self._event("info", "table_loaded", 1.0, float(table_hash(self._tables.anchor_ephemeris)))
-            except TableError:
-                self._event("high", "table_refused", 1.0, float(table_hash(self._tables.anchor_ephemeris)))
+        self._anchor = self._load("anchor_ephemeris", unpack_anchor_table)
+        if Mode.anchored in self._parameters.modes:
+            catalogue = self._load("catalogue", unpack_catalogue_table)
+            gravity = self._load("gravity", unpack_gravity_table)
+            orientation = self._load("orientation", unpack_orientation_table)
+            state = self._load("initial_state", unpack_initial_state)
+            if catalogue and gravity and orientation and state:
+                self._navigator = AnchoredNavigator(
+                    catalogue, gravity, orientation, state, self._parameters.camera, self._parameters.anchored
+                )
+
+    def _load(self, name: str, unpack: Callable[[bytes], Table]) -> Table | None:
+        """Return a table as uploaded; None, with an event, where it is damaged, and None where there is none."""
+        octets: bytes = getattr(self._tables, name)
+        if not octets:
+            return None
+        number, identity = float(_TABLE_NUMBERS[name]), float(table_hash(octets))
+        try:
+            table = unpack(octets)
+        except TableError:
+            self._event("high", "table_refused", number, identity)
+            return None
+        self._event("info", "table_loaded", number, identity)
+        return table
 
     def _observe(self, image: NDArray[Any], attitude: Float) -> None:
         """Detect craters in one frame, run every estimator on them, report both."""
         sun = attitude[4:7] if attitude.size == 7 and np.all(np.isfinite(attitude[4:7])) else None
-        if attitude.size != 7 or not np.all(np.isfinite(attitude[:4])):
+        camera_from_icrf = _rotation(attitude)
+        if camera_from_icrf is None:
             self._event("low", "attitude_missing")
         quality, found = self._detector.examine(image, sun)
         finite = np.isfinite(found.u_px) & np.isfinite(found.v_px) & np.isfinite(found.diameter_px)
@@ -230,18 +274,76 @@ class Payload:
             self._event("low", f"image_{quality.name.lower()}")
         altitude_m = _NAN
         for mode in self._parameters.modes:
-            altitude_m = self._odometry_frame(mode, found)
+            if mode is Mode.anchored:
+                usable = found if quality is ImageQuality.OK else None
+                below_m = self._anchored_frame(usable, camera_from_icrf)
+            else:
+                below_m = self._odometry_frame(mode, found)
+            altitude_m = below_m if np.isfinite(below_m) else altitude_m
         self._report_detections(found, altitude_m)
         self._manual_step = False
         self._counts["frames"] += 1
         self._counts["detections"] += len(found)
 
+    def _anchored_frame(self, found: Detections | None, camera_from_icrf: Float | None) -> float:
+        """Run the anchored estimator on one frame, report it, and return its altitude."""
+        mode, detections = Mode.anchored, 0 if found is None else len(found)
+        navigator = self._navigator
+        report = None
+        if navigator is not None:
+            try:
+                report = navigator.step(self._ticks, found, camera_from_icrf)
+            except np.linalg.LinAlgError:
+                self._event("high", "estimator_error", float(mode))
+        outcome = Outcome.refused if report is None else report.outcome
+        self._outcomes[mode][outcome] += 1
+        self._send_outcome(
+            mode,
+            outcome,
+            ResetTrigger.none,
+            detections,
+            (0, 0) if report is None else (report.candidates, report.matched),
+            (_NAN, _NAN),
+            0,
+        )
+        if report is None or navigator is None or not np.isfinite(report.latitude_rad):
+            return _NAN
+        if report.reacquired:
+            self._reacquisitions += 1
+            self._event("medium", "filter_reset", float(report.matched), max(report.sigma_rtn_m))
+        self._trouble(
+            "fix_refused", outcome is Outcome.refused, float(report.candidates), float(report.expected)
+        )
+        self._trouble("filter_divergence", navigator.lost, max(report.sigma_rtn_m), 0.0)
+        self._send(
+            "navigation_state",
+            {
+                "frame_number": self._counts["frames"],
+                "image_ticks": self._ticks,
+                "estimator": int(mode),
+                "outcome": int(outcome),
+                "latitude_deg": float(np.degrees(report.latitude_rad)),
+                "longitude_deg": float(np.degrees(report.longitude_rad)) % 360.0,
+                "altitude_m": report.altitude_m,
+                "velocity_icrf_m_s": report.velocity_icrf_m_s,
+                "sigma_rtn_m": report.sigma_rtn_m,
+                "nis": report.nis,
+                "matched": report.matched,
+            },
+        )
+        return report.altitude_m
+
+    def _trouble(self, event: str, present: bool, value_1: float, value_2: float) -> None:
+        """Report the beginning of a lasting trouble, once."""
+        if present and event not in self._in_trouble:
+            self._event("medium", event, value_1, value_2)
+        (self._in_trouble.add if present else self._in_trouble.discard)(event)
+
     def _odometry_frame(self, mode: Mode, found: Detections) -> float:
         """Run one odometry on one frame, report it, and return the altitude it scaled the frame with."""
         if self._anchor is None:
             self._outcomes[mode][Outcome.missed] += 1
-            missed = OdometryReport(Outcome.missed, ResetTrigger.none, 0, 0, _NAN, _NAN)
-            self._report_outcome(mode, missed, len(found), 0)
+            self._send_outcome(mode, Outcome.missed, ResetTrigger.none, len(found), (0, 0), (_NAN, _NAN), 0)
             return _NAN
         state, report = odometry.step(
             self._odometry.get(mode),
@@ -258,7 +360,15 @@ class Payload:
         if report.reset_trigger is not ResetTrigger.none:
             self._triggers[mode][report.reset_trigger] += 1
             self._event("info", "anchor_read", float(report.reset_trigger), float(mode))
-        self._report_outcome(mode, report, len(found), 0 if state is None else state.altitude_reads)
+        self._send_outcome(
+            mode,
+            report.outcome,
+            report.reset_trigger,
+            len(found),
+            (report.candidate_pairs, report.pairs),
+            (report.shift_east_m, report.shift_north_m),
+            0 if state is None else state.altitude_reads,
+        )
         if state is None:
             return _NAN
         self._send(
@@ -279,20 +389,29 @@ class Payload:
         )
         return state.features.altitude_m
 
-    def _report_outcome(self, mode: Mode, report: OdometryReport, detections: int, reads: int) -> None:
+    def _send_outcome(
+        self,
+        mode: Mode,
+        outcome: Outcome,
+        trigger: ResetTrigger,
+        detections: int,
+        pairs: tuple[int, int],
+        shift_m: tuple[float, float],
+        reads: int,
+    ) -> None:
         self._send(
             "frame_outcome",
             {
                 "frame_number": self._counts["frames"],
                 "image_ticks": self._ticks,
                 "estimator": int(mode),
-                "outcome": int(report.outcome),
-                "reset_trigger": int(report.reset_trigger),
+                "outcome": int(outcome),
+                "reset_trigger": int(trigger),
                 "detections": detections,
-                "candidate_pairs": report.candidate_pairs,
-                "pairs": report.pairs,
-                "shift_east_m": report.shift_east_m,
-                "shift_north_m": report.shift_north_m,
+                "candidate_pairs": pairs[0],
+                "pairs": pairs[1],
+                "shift_east_m": shift_m[0],
+                "shift_north_m": shift_m[1],
                 "anchor_reads": reads,
             },
         )
@@ -421,7 +540,7 @@ class Payload:
                 "storage_used_permille": 0,
                 "model_hash": self._model_hash,
                 "parameters_hash": self._parameters.hash,
-                "catalogue_hash": 0,
+                "catalogue_hash": table_hash(self._tables.catalogue) if self._tables.catalogue else 0,
                 "anchor_table_hash": table_hash(anchor) if anchor else 0,
                 "clock_status": 2 if self._clock_suspect else 0,
                 "watchdog_resets": 0,
@@ -455,3 +574,14 @@ class Payload:
         )
         self._messages[kind] += 1
         self._counts["packets"] += 1
+
+
+def _rotation(attitude: Float) -> Float | None:
+    """Return camera_from_icrf of an ADCS message, None where it holds no rotation."""
+    if attitude.size != 7 or not np.all(np.isfinite(attitude[:4])):
+        return None
+    length = float(np.linalg.norm(attitude[:4]))
+    # Rounding of a unit quaternion is far below this; anything else is no attitude.
+    if abs(length - 1.0) > 1e-3:
+        return None
+    return matrix_from_quaternion(attitude[:4] / length)
