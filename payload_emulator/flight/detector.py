@@ -42,8 +42,8 @@ class DetectorParameters:
 
     score_threshold : None takes the threshold that the network's own metadata carry (fixed on its validation set).
     max_detections : the detections packet counts in one octet; 120 exceeds the craters of any frame seen.
-    duplicate_distance, duplicate_ratio : a weaker detection within this share of the smaller radius of a better one, and
-        with a diameter within this ratio of it, is the same crater found from two cells.
+    duplicate_distance, duplicate_ratio : a weaker detection within this share of the smaller radius of a better one,
+        and with a diameter within this ratio of it, is the same crater found from two cells.
     """
 
     score_threshold: float | None = None
@@ -61,12 +61,13 @@ class OnnxDetector:
     Raises
     ------
     ModelError
-        The octets do not load, their hash is not `expected_sha256`, or inputs and outputs are not those of this project.
+        The octets do not load, their hash is not `expected_sha256`, or inputs and outputs are of another network.
     """
 
     model_octets: bytes
     parameters: DetectorParameters = field(default_factory=DetectorParameters)
     expected_sha256: str = ""
+    threads: int = 1
     sha256: str = field(init=False)
     metadata: dict[str, str] = field(init=False)
     score_threshold: float = field(init=False)
@@ -78,10 +79,12 @@ class OnnxDetector:
             raise ModelError(
                 f"detector network: expected SHA-256 {self.expected_sha256.lower()}, found {self.sha256}"
             )
-        self._session = _open_session(self.model_octets)
+        self._session = _open_session(self.model_octets, self.threads)
         self.metadata = dict(self._session.get_modelmeta().custom_metadata_map)
         chosen = self.parameters.score_threshold
-        self.score_threshold = float(self.metadata.get("score_threshold", "0.4")) if chosen is None else chosen
+        self.score_threshold = (
+            float(self.metadata.get("score_threshold", "0.4")) if chosen is None else chosen
+        )
 
     @property
     def model_hash(self) -> int:
@@ -153,14 +156,10 @@ class OnnxDetector:
         found = decode(heatmap[0, 0], geometry[0], self.score_threshold)
         inside = (found.u_px < columns) & (found.v_px < rows)
         found = found.select(inside)
-        return Detections(
-            found.u_px + left, found.v_px + top, found.diameter_px, found.score, found.sigma_px
-        )
+        return Detections(found.u_px + left, found.v_px + top, found.diameter_px, found.score, found.sigma_px)
 
 
-def decode(
-    heatmap: NDArray[np.float32], geometry: NDArray[np.float32], score_threshold: float
-) -> Detections:
+def decode(heatmap: NDArray[np.float32], geometry: NDArray[np.float32], score_threshold: float) -> Detections:
     """Detections of one image from heatmap (h, w) and geometry (4, h, w): offsets in cells, ln diameter, ln sigma.
 
     A peak is a cell not below its eight neighbours. Its centre and diameter are the score-weighted means of what the
@@ -223,16 +222,18 @@ def drop_duplicates(found: Detections, parameters: DetectorParameters) -> Detect
         distance = np.hypot(found.u_px[later] - found.u_px[i], found.v_px[later] - found.v_px[i])
         smaller = 0.5 * np.minimum(found.diameter_px[later], found.diameter_px[i])
         ratio = np.abs(np.log(found.diameter_px[later] / found.diameter_px[i]))
-        same = (distance < parameters.duplicate_distance * smaller) & (ratio < np.log(parameters.duplicate_ratio))
+        same = (distance < parameters.duplicate_distance * smaller) & (
+            ratio < np.log(parameters.duplicate_ratio)
+        )
         keep[later] &= ~same
     return found.select(keep)
 
 
-def _open_session(model_octets: bytes) -> onnxruntime.InferenceSession:
+def _open_session(model_octets: bytes, threads: int) -> onnxruntime.InferenceSession:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
+    options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
     try:

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 # Fractions of full scale. A frame on the night side holds read noise and an offset of at most a few counts of 255.
 _DARK_LEVEL = 0.04
-_DARK_SHARE = 0.002  # fewer lit pixels than this (about a 23 px square of 512 x 512) hold no crater worth a match
+_DARK_SHARE = (
+    0.002  # fewer lit pixels than this (about a 23 px square of 512 x 512) hold no crater worth a match
+)
 _SATURATED_LEVEL = 0.996
 _SATURATED_SHARE = 0.6  # the rest of the frame would still hold fewer craters than a fix needs
 _UNIFORM_DEVIATION = 0.004  # of the square root of full scale: one count of 8 bits at mid scale
@@ -131,7 +133,7 @@ def _square_root_gray(image: NDArray[np.generic]) -> NDArray[np.float32] | None:
         table = np.sqrt(np.arange(255 * colours + 1, dtype=np.float64) / (255.0 * colours)).astype(np.float32)
         taken: NDArray[np.float32] = table[total]
         return taken
-    full_scale = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else 1.0
+    full_scale = float(np.iinfo(np.dtype(image.dtype).str).max) if image.dtype.kind == "u" else 1.0
     mean = np.zeros(_plane_shape(image), np.float32)
     for plane in planes:
         mean += plane.astype(np.float32)

@@ -80,7 +80,11 @@ def make_crop(
     shift = 0.5 * (size_px - 1) - matrix @ np.array([centre_u, centre_v])
     warp = np.concatenate([matrix, shift[:, None]], axis=1)
     picture = cv2.warpAffine(
-        np.ascontiguousarray(turned), warp, (size_px, size_px), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
+        np.ascontiguousarray(turned),
+        warp,
+        (size_px, size_px),
+        flags=cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REFLECT_101,
     ).astype(np.float32)
     moved = matrix @ np.stack([u, v]) + shift[:, None]
     tone = _vary_tone(picture * np.float32(1.0 / 255.0), parameters, rng)
@@ -114,4 +118,6 @@ def _vary_tone(
 @functools.cache
 def _noise() -> NDArray[np.float32]:
     """One large picture of unit noise; crops take a window of it, which is ten times quicker than drawing anew."""
-    return np.random.Generator(np.random.PCG64(5)).standard_normal((_NOISE_SIZE, _NOISE_SIZE), dtype=np.float32)
+    return np.random.Generator(np.random.PCG64(5)).standard_normal(
+        (_NOISE_SIZE, _NOISE_SIZE), dtype=np.float32
+    )

@@ -32,6 +32,7 @@ _ATTEMPTS = 4000
 _LOWEST_FLIGHT_M = 9_000.0  # above the ground: lower, a 5 km crater fills more than a sixth of the frame
 _LABEL_MINIMUM_M = 2_000.0
 _LABEL_MINIMUM_PX = 5.0
+_STAMPED_MINIMUM_PX = 9.0
 _BLOCK_DEG = 8.0
 _SHARD_REACH_DEG = 2.5  # frames of a shard look at neighbouring ground, so that its terrain is made once
 
@@ -50,7 +51,7 @@ class Shard:
 
 @dataclass(slots=True)
 class _Place:
-    """Where a shard draws its frames: the box of its source, and after the first frame the part of it about that frame."""
+    """Where a shard draws its frames: the box of its source; after the first frame, the part about that frame."""
 
     box: Box
     near: Box | None = None
@@ -60,7 +61,9 @@ def plan_shards(recipe: Recipe, frames: int) -> list[Shard]:
     """Shards of a data set of about `frames` frames; each source gets its share, rounded to whole frames."""
     total = sum(source.share for source in recipe.sources)
     if frames < len(recipe.sources) or total <= 0.0:
-        raise DatasetError(f"data set: expected at least one frame per source ({len(recipe.sources)}), found {frames}")
+        raise DatasetError(
+            f"data set: expected at least one frame per source ({len(recipe.sources)}), found {frames}"
+        )
     shards: list[Shard] = []
     first = 0
     for source in recipe.sources:
@@ -126,7 +129,9 @@ def make_shard(recipe: Recipe, shard: Shard, folder: Path, data_root: str) -> No
         number = shard.first_frame + k
         image, row, craters, pose = _make_frame(terrain, camera, shard.source, place, number, rng)
         store.write_gray(folder / "images" / f"{number:06d}.png", image)
-        store.write_json(folder / "metadata" / f"{number:06d}.json", _metadata(camera, shard, row, pose, terrain))
+        store.write_json(
+            folder / "metadata" / f"{number:06d}.json", _metadata(camera, shard, row, pose, terrain)
+        )
         frame_rows.append(row)
         crater_rows.append(craters)
         poses.append(pose)
@@ -153,7 +158,9 @@ def _make_frame(
     from payload_emulator.sim.sensor import expose
 
     for _ in range(20):
-        latitude, longitude, altitude_m, ground_m, position, rotation = _draw_pose(terrain, camera, source, place, rng)
+        latitude, longitude, altitude_m, ground_m, position, rotation = _draw_pose(
+            terrain, camera, source, place, rng
+        )
         elevation, azimuth = _draw_sun(source.light, rng)
         sun = sun_direction_mcmf(elevation, azimuth, latitude, longitude)
         rendering = render(terrain, camera, position, rotation, sun, _draw_photometry(source.vary, rng))
@@ -162,7 +169,11 @@ def _make_frame(
         if prepare_image(image).quality is ImageQuality.OK:
             break
     craters = _label(terrain, camera, position, rotation, rendering)
-    block = int((math.degrees(latitude) + 90.0) // _BLOCK_DEG) * 100 + int(math.degrees(longitude) % 360.0 // _BLOCK_DEG)
+    small = stamped_craters(terrain, camera, position, rotation, image)
+    craters = {key: np.concatenate([craters[key], small[key]]) for key in craters}
+    block = int((math.degrees(latitude) + 90.0) // _BLOCK_DEG) * 100 + int(
+        math.degrees(longitude) % 360.0 // _BLOCK_DEG
+    )
     row = {
         "number": number,
         "latitude_deg": math.degrees(latitude),
@@ -228,7 +239,9 @@ def _allowed(source: Source, box: Box, latitude_deg: Floats, longitude_deg: Floa
     """Whether a footprint's edge lies in the box and clear of every box to avoid, buffer included."""
     if not _inside(box, latitude_deg, longitude_deg, 0.0).all():
         return False
-    return not any(_inside(other, latitude_deg, longitude_deg, source.buffer_km).any() for other in source.avoid)
+    return not any(
+        _inside(other, latitude_deg, longitude_deg, source.buffer_km).any() for other in source.avoid
+    )
 
 
 def _inside(box: Box, latitude_deg: Floats, longitude_deg: Floats, buffer_km: float) -> NDArray[np.bool_]:
@@ -256,7 +269,8 @@ def _edge_pixels(camera: PinholeCamera) -> Floats:
 def _draw_box(source: Source, rng: np.random.Generator) -> Box:
     areas = np.array(
         [
-            (b.east_deg - b.west_deg) * (math.sin(math.radians(b.north_deg)) - math.sin(math.radians(b.south_deg)))
+            (b.east_deg - b.west_deg)
+            * (math.sin(math.radians(b.north_deg)) - math.sin(math.radians(b.south_deg)))
             for b in source.boxes
         ]
     )
@@ -269,7 +283,9 @@ def _draw_sun(light: str, rng: np.random.Generator) -> tuple[float, float]:
     azimuth = math.radians(rng.uniform(-180.0, 180.0))
     if light == "low":
         return math.radians(rng.uniform(5.0, 15.0)), azimuth
-    limits = ((5.0, 15.0), (15.0, 35.0), (35.0, 60.0), (3.0, 5.0))[int(rng.choice(4, p=(0.7, 0.17, 0.07, 0.06)))]
+    limits = ((5.0, 15.0), (15.0, 35.0), (35.0, 60.0), (3.0, 5.0))[
+        int(rng.choice(4, p=(0.7, 0.17, 0.07, 0.06)))
+    ]
     return math.radians(rng.uniform(*limits)), azimuth
 
 
@@ -342,8 +358,74 @@ def _label(
     }
 
 
+def stamped_craters(
+    terrain: Any, camera: PinholeCamera, position: Floats, rotation: Floats, image: NDArray[np.uint8]
+) -> dict[str, NDArray[Any]]:
+    """Craters below the catalogue's limit that the terrain draws from its seed, where they are large in the image.
+
+    Their ids are negative: they teach what a crater looks like at any scale (from 12 km one of 1.5 km is 18 px wide),
+    and are no part of scoring. No shadow picture is kept for them, so "lit" is judged on the image.
+    """
+    latitude, longitude, altitude_m = (float(value) for value in spherical_from_mcmf(position))
+    reach = (altitude_m + 4_000.0) * math.tan(camera.fov_rad / 2.0) * 1.1 / MOON_RADIUS_M
+    wide = reach / max(math.cos(latitude), 0.2)
+    shapes = terrain._small.around(
+        np.array([latitude - reach, latitude + reach]), np.array([longitude - wide, longitude + wide])
+    )
+    diameter_m = 2.0 * shapes.radius_rad * MOON_RADIUS_M
+    flat = mcmf_from_spherical(shapes.latitude_rad, shapes.longitude_rad, 0.0) - position
+    rough = np.asarray(flat) @ rotation.T
+    uv = camera.project(rough)
+    with np.errstate(invalid="ignore"):
+        large = camera.focal_px * diameter_m / rough[:, 2] >= 0.75 * _STAMPED_MINIMUM_PX
+        chosen = np.flatnonzero(large & camera.contains(uv, -40.0))
+    place_latitude, place_longitude = shapes.latitude_rad[chosen], shapes.longitude_rad[chosen]
+    azimuth = np.arange(8) * (math.pi / 4.0)
+    arc = shapes.radius_rad[chosen][:, None]
+    rim_latitude = place_latitude[:, None] + arc * np.cos(azimuth)
+    rim_longitude = place_longitude[:, None] + arc * np.sin(azimuth) / np.cos(place_latitude)[:, None]
+    height = terrain.height_m(rim_latitude, rim_longitude).mean(axis=1) if chosen.size else np.zeros(0)
+    points = (
+        np.asarray(mcmf_from_spherical(place_latitude, place_longitude, height)) - position
+    ) @ rotation.T
+    uv = camera.project(points)
+    diameter_px = camera.focal_px * diameter_m[chosen] / points[:, 2]
+    keep = np.flatnonzero((diameter_px >= _STAMPED_MINIMUM_PX) & camera.contains(uv))
+    chosen, uv, diameter_px = chosen[keep], uv[keep], diameter_px[keep]
+    return {
+        "id": -1 - np.arange(chosen.size, dtype=np.int64),
+        "u_px": uv[:, 0].astype(np.float32),
+        "v_px": uv[:, 1].astype(np.float32),
+        "diameter_px": diameter_px.astype(np.float32),
+        "diameter_m": diameter_m[chosen].astype(np.float32),
+        "depth_ratio": (shapes.depth_m[chosen] / diameter_m[chosen]).astype(np.float32),
+        "lit": _bright_share(image, uv, diameter_px).astype(np.float32),
+        "hidden": np.zeros(chosen.size, np.uint8),
+        "latitude_deg": np.degrees(shapes.latitude_rad[chosen]),
+        "longitude_deg": np.degrees(shapes.longitude_rad[chosen]) % 360.0,
+    }
+
+
+def _bright_share(image: NDArray[np.uint8], uv: Floats, diameter_px: Floats) -> Floats:
+    """Share of 16 points around each centre that are brighter than a third of the frame's median bright pixel."""
+    bright = image[image > 8]
+    level = float(np.median(bright)) / 3.0 if bright.size else 255.0
+    radius = np.repeat([0.6, 1.25], 8)
+    angle = np.tile(np.arange(8) * (math.pi / 4.0), 2)
+    u = uv[:, :1] + 0.5 * diameter_px[:, None] * radius * np.cos(angle)
+    v = uv[:, 1:] + 0.5 * diameter_px[:, None] * radius * np.sin(angle)
+    rows = np.clip(np.rint(v).astype(int), 0, image.shape[0] - 1)
+    columns = np.clip(np.rint(u).astype(int), 0, image.shape[1] - 1)
+    share: Floats = (image[rows, columns] > level).mean(axis=1) if uv.shape[0] else np.zeros(0)
+    return share
+
+
 def _metadata(
-    camera: PinholeCamera, shard: Shard, row: dict[str, float], pose: tuple[Floats, Floats, Floats], terrain: Any
+    camera: PinholeCamera,
+    shard: Shard,
+    row: dict[str, float],
+    pose: tuple[Floats, Floats, Floats],
+    terrain: Any,
 ) -> dict[str, Any]:
     position, rotation, sun_camera = pose
     corners = ground_point_sphere(camera, rotation, position, camera.corners_px())
@@ -397,7 +479,8 @@ def _claim(folder: Path, recipe: Recipe, frames: int) -> None:
         found = json.loads(claim.read_text(encoding="utf-8"))
         if found != wanted:
             raise DatasetError(
-                f"{folder}: expected an empty folder or the same data set (recipe {recipe.digest[:12]}, {frames} frames), "
+                f"{folder}: expected an empty folder or the same data set (recipe {recipe.digest[:12]}, "
+                f"{frames} frames), "
                 f"found one of recipe {str(found.get('recipe_sha256'))[:12]}, {found.get('frames')} frames"
             )
     elif folder.exists() and any(folder.iterdir()):

@@ -27,9 +27,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.catalogue import size_class
 from payload_emulator.errors import DatasetError
 from payload_emulator.training.recipe import SPLITS, Recipe
-from payload_emulator.training.scoring import FrameTruth, size_class
+from payload_emulator.training.scoring import FrameTruth
 from payload_emulator.training.targets import Tier
 
 SCHEMA_VERSION = 1
@@ -44,10 +45,26 @@ LABEL_MINIMUM_LIT = 0.06
 LABEL_MAXIMUM_DIAMETER_PX = 380.0
 
 CRATER_COLUMNS = (
-    "id", "u_px", "v_px", "diameter_px", "diameter_m", "depth_ratio", "lit", "hidden", "latitude_deg", "longitude_deg",
+    "id",
+    "u_px",
+    "v_px",
+    "diameter_px",
+    "diameter_m",
+    "depth_ratio",
+    "lit",
+    "hidden",
+    "latitude_deg",
+    "longitude_deg",
 )
 FRAME_COLUMNS = (
-    "number", "latitude_deg", "longitude_deg", "altitude_m", "ground_m", "sun_elevation_deg", "sun_azimuth_deg", "block",
+    "number",
+    "latitude_deg",
+    "longitude_deg",
+    "altitude_m",
+    "ground_m",
+    "sun_elevation_deg",
+    "sun_azimuth_deg",
+    "block",
 )
 
 
@@ -128,7 +145,9 @@ class Dataset:
 
     def frames(self, split: str = "", source: str = "") -> list[Frame]:
         """Frames of a split and a source; every one where not named."""
-        return [f for f in self._frames if (not split or f.split == split) and (not source or f.source == source)]
+        return [
+            f for f in self._frames if (not split or f.split == split) and (not source or f.source == source)
+        ]
 
     def image(self, frame: Frame) -> NDArray[np.uint8]:
         """Gray image (H, W) of a frame."""
@@ -136,9 +155,14 @@ class Dataset:
 
 
 def choose_tiers(
-    craters: dict[str, NDArray[Any]], width_px: int, height_px: int
+    craters: dict[str, NDArray[Any]], width_px: int, height_px: int, complete: bool
 ) -> tuple[NDArray[np.int8], NDArray[np.float64]]:
-    """Tier and weight of the craters of a frame, (n,) each, by what can be seen of them."""
+    """Tier and weight of the craters of a frame, (n,) each, by what can be seen of them.
+
+    `complete` (procedural terrain) says that the terrain shows craters of any size; real terrain does so only for those
+    stamped on it (negative id) and for what its rasters resolve.
+    """
+    resolved = complete | (craters["id"] < 0) | (craters["diameter_m"] >= LABEL_MINIMUM_DIAMETER_M)
     inside = (
         (craters["u_px"] >= 2.0)
         & (craters["u_px"] <= width_px - 3.0)
@@ -149,7 +173,7 @@ def choose_tiers(
         inside
         & (craters["diameter_px"] >= LABEL_MINIMUM_DIAMETER_PX)
         & (craters["diameter_px"] <= LABEL_MAXIMUM_DIAMETER_PX)
-        & (craters["diameter_m"] >= LABEL_MINIMUM_DIAMETER_M)
+        & resolved
         & (craters["depth_ratio"] >= LABEL_MINIMUM_DEPTH_RATIO)
         & (craters["lit"] >= LABEL_MINIMUM_LIT)
         & ~craters["hidden"].astype(bool)
@@ -160,8 +184,9 @@ def choose_tiers(
 
 
 def frame_truth(dataset: Dataset, frame: Frame) -> FrameTruth:
-    """The frame's craters as scoring wants them."""
-    craters = frame.craters
+    """The frame's catalogued craters as scoring wants them."""
+    listed = frame.craters["id"] >= 0
+    craters = {key: values[listed] for key, values in frame.craters.items()}
     return FrameTruth(
         u_px=craters["u_px"].astype(np.float64),
         v_px=craters["v_px"].astype(np.float64),
@@ -187,7 +212,9 @@ def diameter_on_ground_m(
     from lunar.camera import PinholeCamera, intersect_sphere
     from lunar.constants import MOON_RADIUS_M
 
-    camera = PinholeCamera(dataset.width_px, dataset.height_px, math.radians(dataset.index["camera"]["fov_deg"]))
+    camera = PinholeCamera(
+        dataset.width_px, dataset.height_px, math.radians(dataset.index["camera"]["fov_deg"])
+    )
     rays = camera.rays(np.stack([u_px, v_px], axis=-1))
     heading = rays @ frame.camera_from_mcmf
     ground = MOON_RADIUS_M + frame.values["ground_m"]
@@ -253,7 +280,9 @@ def shard_frames(labels: ShardLabels) -> Iterator[Frame]:
         )
 
 
-def write_index(folder: Path, recipe: Recipe, frames: int, shards: dict[str, str], data_names: Sequence[str]) -> None:
+def write_index(
+    folder: Path, recipe: Recipe, frames: int, shards: dict[str, str], data_names: Sequence[str]
+) -> None:
     """Write dataset.json and the COCO files of a finished data set."""
     index = {
         "schema_version": SCHEMA_VERSION,
@@ -300,9 +329,14 @@ def check(folder: Path) -> list[str]:
             problems.append(str(error))
             continue
         if image.shape != (dataset.height_px, dataset.width_px):
-            problems.append(f"{path}: expected {dataset.width_px} x {dataset.height_px} pixels, found {image.shape[1]} x {image.shape[0]}")
+            problems.append(
+                f"{path}: expected {dataset.width_px} x {dataset.height_px} pixels, "
+                f"found {image.shape[1]} x {image.shape[0]}"
+            )
         if not (folder / "metadata" / f"{frame.number:06d}.json").is_file():
-            problems.append(f"{folder}/metadata/{frame.number:06d}.json: expected frame metadata, found no file")
+            problems.append(
+                f"{folder}/metadata/{frame.number:06d}.json: expected frame metadata, found no file"
+            )
     return problems
 
 
@@ -352,7 +386,7 @@ def _coco(dataset: Dataset, frames: Sequence[Frame]) -> dict[str, Any]:
     for frame in frames:
         craters = frame.craters
         classes = size_class(craters["diameter_m"].astype(np.float64))
-        tiers, _ = choose_tiers(craters, dataset.width_px, dataset.height_px)
+        tiers, _ = choose_tiers(craters, dataset.width_px, dataset.height_px, frame.complete)
         chosen = np.flatnonzero(_inside(craters, dataset.width_px, dataset.height_px) & (classes >= 0))
         for k in chosen:
             u, v, d = (float(craters[name][k]) for name in ("u_px", "v_px", "diameter_px"))
@@ -374,7 +408,9 @@ def _coco(dataset: Dataset, frames: Sequence[Frame]) -> dict[str, Any]:
             )
     return {
         "info": {"description": str(dataset.index["name"]), "version": str(SCHEMA_VERSION)},
-        "categories": [{"id": number, "name": name, "supercategory": "crater"} for number, name in CATEGORIES],
+        "categories": [
+            {"id": number, "name": name, "supercategory": "crater"} for number, name in CATEGORIES
+        ],
         "images": [
             {
                 "id": frame.number,

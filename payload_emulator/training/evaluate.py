@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -39,7 +40,9 @@ def detect_with_network(network: Any, dataset: Dataset, frame: Frame, device: st
         image = torch.from_numpy(np.ascontiguousarray(np.rot90(gray, turns)))[None, None].to(device)
         heat, geometry = network(image.contiguous(memory_format=torch.channels_last))
     found = decode(
-        torch.sigmoid(heat)[0, 0].cpu().contiguous().numpy(), geometry[0].cpu().contiguous().numpy(), SCORE_FLOOR
+        torch.sigmoid(heat)[0, 0].cpu().contiguous().numpy(),
+        geometry[0].cpu().contiguous().numpy(),
+        SCORE_FLOOR,
     )
     found = drop_duplicates(found.select(np.argsort(-found.score, kind="stable")), DetectorParameters())
     u_px, v_px = turn_back(found.u_px, found.v_px, turns, *gray.shape)
@@ -109,7 +112,10 @@ def evidence_rung(frames: Sequence[Frame]) -> str:
 
 
 def score(
-    truths: Sequence[FrameTruth], found: Sequence[FrameDetections], threshold: float, navigation_threshold: float
+    truths: Sequence[FrameTruth],
+    found: Sequence[FrameDetections],
+    threshold: float,
+    navigation_threshold: float,
 ) -> dict[str, Any]:
     """All figures of detections against truths."""
     radius_rule = MatchRule(radii=0.5)
@@ -143,12 +149,21 @@ def score(
             "strict": strict.figures(navigation_threshold).to_dict(),
             "ignore_aware": fair.figures(navigation_threshold).to_dict(),
         },
-        "recall_by_degradation": _recall_by(strict, strict.crater_depth_ratio, DEGRADATION_EDGES, threshold, "depth_ratio"),
-        "recall_by_diameter_px": _recall_by(fair, fair.crater_diameter_px, _DIAMETER_EDGES_PX, threshold, "diameter_px"),
+        "recall_by_degradation": _recall_by(
+            strict, strict.crater_depth_ratio, DEGRADATION_EDGES, threshold, "depth_ratio"
+        ),
+        "recall_by_diameter_px": _recall_by(
+            fair, fair.crater_diameter_px, _DIAMETER_EDGES_PX, threshold, "diameter_px"
+        ),
         "bias_px_by_sun_octant": _bias_by_octant(strict, threshold),
         "sigma_calibration": _calibration(fair, threshold),
         "precision_recall": [
-            {"threshold": t, **{k: v for k, v in strict.figures(t).to_dict().items() if k in ("precision", "recall", "f1")}}
+            {
+                "threshold": t,
+                **{
+                    k: v for k, v in strict.figures(t).to_dict().items() if k in ("precision", "recall", "f1")
+                },
+            }
             for t in _CURVE_THRESHOLDS
         ],
         "unique_craters": int(np.unique(strict.crater_id).size),
@@ -170,7 +185,9 @@ def format_figures(figures: dict[str, Any]) -> str:
             _row(name, row) + f"   {paper['precision']:.2f} / {paper['recall']:.2f} / {paper['loc_px']:.2f}"
         )
     lines.append(_row("5-30 km strict", figures["micro"]) + f"   F1 {_interval(figures['micro'])}")
-    lines.append(_row("5-30 km ignore-aware", figures["ignore_aware"]) + f"   F1 {_interval(figures['ignore_aware'])}")
+    lines.append(
+        _row("5-30 km ignore-aware", figures["ignore_aware"]) + f"   F1 {_interval(figures['ignore_aware'])}"
+    )
     lines.append(_row("3-30 km ignore-aware", figures["ignore_aware_3_to_30_km"]))
     lines.append(_row("5-30 km within 0.5 R", figures["micro_half_radius"]))
     lines.append(
@@ -186,7 +203,11 @@ def format_figures(figures: dict[str, Any]) -> str:
 
 def _row(name: str, row: dict[str, float]) -> str:
     values = (row["precision"], row["recall"], row["f1"])
-    return f"{name:24}" + "".join(f"{v:7.3f}" for v in values) + f"{row['loc_px']:8.2f}{row['loc_median_px']:8.2f}"
+    return (
+        f"{name:24}"
+        + "".join(f"{v:7.3f}" for v in values)
+        + f"{row['loc_px']:8.2f}{row['loc_median_px']:8.2f}"
+    )
 
 
 def _interval(row: dict[str, Any]) -> str:
@@ -204,7 +225,7 @@ def _recall_by(
     with np.errstate(invalid="ignore"):
         found = tallied.crater_score >= threshold
     rows = []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in itertools.pairwise(edges):
         chosen = (values >= low) & (values < high) if low > edges[0] else values < high
         count = int(chosen.sum())
         rows.append(
@@ -232,7 +253,9 @@ def _bias_by_octant(tallied: Tally, threshold: float) -> list[dict[str, Any]]:
                 "pairs": count,
                 "du_px": float(np.mean(tallied.error_u[chosen])) if count else float("nan"),
                 "dv_px": float(np.mean(tallied.error_v[chosen])) if count else float("nan"),
-                "standard_error_px": float(np.std(tallied.error_u[chosen]) / np.sqrt(count)) if count else float("nan"),
+                "standard_error_px": float(np.std(tallied.error_u[chosen]) / np.sqrt(count))
+                if count
+                else float("nan"),
             }
         )
     return rows

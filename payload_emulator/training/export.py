@@ -14,14 +14,22 @@ from typing import Any
 import numpy as np
 
 from payload_emulator.errors import ModelError
-from payload_emulator.flight.detector import GEOMETRY_NAME, HEATMAP_NAME, INPUT_NAME, INPUT_SIZE_PX, OnnxDetector
+from payload_emulator.flight.detector import (
+    GEOMETRY_NAME,
+    HEATMAP_NAME,
+    INPUT_NAME,
+    INPUT_SIZE_PX,
+    OnnxDetector,
+)
 from payload_emulator.training.dataset import Dataset, frame_truth
 
 PARITY_LIMIT = 2e-4
 """Greatest difference allowed between torch and ONNX Runtime: far under one count of a score in telemetry (1/255)."""
 
 NAVIGATION_PRECISION = 0.90
-INPUT_CONVENTION = "float32 (1, 1, 512, 512): square root of gray, zero mean, unit deviation, clipped at 4; Sun-up"
+INPUT_CONVENTION = (
+    "float32 (1, 1, 512, 512): square root of gray, zero mean, unit deviation, clipped at 4; Sun-up"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +55,9 @@ def load_network(path: Path) -> tuple[Any, dict[str, Any]]:
     except FileNotFoundError:
         raise ModelError(f"{path}: expected a checkpoint of a training run, found no file") from None
     except Exception as error:  # torch raises whatever its unpickler meets
-        raise ModelError(f"{path}: expected a checkpoint of a training run, found: {str(error)[:120]}") from error
+        raise ModelError(
+            f"{path}: expected a checkpoint of a training run, found: {str(error)[:120]}"
+        ) from error
     return network.eval(), stored
 
 
@@ -83,7 +93,11 @@ def calibrate(network: Any, datasets: Sequence[Dataset], limit: int = 400) -> Ca
 
 
 def export(
-    checkpoint: Path, out: Path, datasets: Sequence[Dataset], revision: str = "", notes: dict[str, str] | None = None
+    checkpoint: Path,
+    out: Path,
+    datasets: Sequence[Dataset],
+    revision: str = "",
+    notes: dict[str, str] | None = None,
 ) -> dict[str, Any]:
     """Write the ONNX network of a checkpoint; its parity with torch and its metadata come back.
 
@@ -126,7 +140,9 @@ def export(
         "training_steps": str(stored["progress"]["step"]),
         "training_minutes": f"{stored['progress']['seconds'] / 60:.1f}",
         "model_config": json.dumps(stored["config"]),
-        "data": json.dumps([{"name": d.index["name"], "labels_sha256": d.digest, "data": d.index["data"]} for d in datasets]),
+        "data": json.dumps(
+            [{"name": d.index["name"], "labels_sha256": d.digest, "data": d.index["data"]} for d in datasets]
+        ),
         "git_revision": revision,
         **(notes or {}),
     }
@@ -140,7 +156,9 @@ def export(
     octets = buffer.getvalue()
     difference = parity(exported, octets)
     if difference > PARITY_LIMIT:
-        raise ModelError(f"{out}: expected torch and ONNX to agree within {PARITY_LIMIT:g}, found {difference:.2g}")
+        raise ModelError(
+            f"{out}: expected torch and ONNX to agree within {PARITY_LIMIT:g}, found {difference:.2g}"
+        )
     unfinished = out.with_name(f".{out.name}.unfinished")
     out.parent.mkdir(parents=True, exist_ok=True)
     unfinished.write_bytes(octets)

@@ -47,13 +47,15 @@ def crater_loss(
     incomplete: Tensor,
     weights: LossWeights,
 ) -> LossTerms:
-    """Loss of a batch; tensors as `targets.Targets` stacked, `incomplete` (B,) bool: the catalogue lacks craters there."""
+    """Loss of a batch; tensors as `targets.Targets` stacked; `incomplete` (B,) bool: its catalogue lacks craters."""
     probability = torch.sigmoid(heat_logit)
     log_p = torch.nn.functional.logsigmoid(heat_logit)
     log_not_p = log_p - heat_logit
     centres = target_weight.sum().clamp(min=1.0)
     positive = -(target_weight * (1.0 - probability) ** 2 * log_p).sum()
-    unlisted = incomplete[:, None, None, None] & (probability.detach() > weights.high_score) & (target_heat < 0.05)
+    unlisted = (
+        incomplete[:, None, None, None] & (probability.detach() > weights.high_score) & (target_heat < 0.05)
+    )
     negative_weight = negative_weight.masked_fill(unlisted, 0.0).masked_fill(target_weight > 0.0, 0.0)
     negative = -(negative_weight * (1.0 - target_heat) ** 4 * probability**2 * log_not_p).sum()
     heat = (positive + negative) / centres

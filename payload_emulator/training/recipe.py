@@ -40,11 +40,11 @@ EVERYWHERE = (Box(0.0, 360.0, -60.0, 60.0),)
 class Source:
     """One kind of frames.
 
-    terrain : "procedural" (one world per seed) or "real" (the tiles of the data folder; seeds vary what is stamped on it).
+    terrain : "procedural" (one world per seed) or "real" (tiles of the data folder; seeds vary what is stamped).
     share : of all frames of the data set.
     light : "wide" = 3..60 degrees of elevation, mostly 5..15, any azimuth; "low" = 5..15, any azimuth; "paper" = 5..15
         and -45..45 degrees from north.
-    vary : photometry, sensor and pointing are randomised; otherwise they are nominal and the camera looks straight down.
+    vary : photometry, sensor and pointing are randomised; else they are nominal and the camera looks straight down.
     """
 
     name: str
@@ -114,7 +114,9 @@ def load_recipe(path: Path) -> Recipe:
         raise DatasetError(f"{path}: dataset: expected a table, found {table!r}")
     sources = table.get("source", [])
     if not isinstance(sources, list) or not sources:
-        raise DatasetError(f"{path}: dataset.source: expected at least one [[dataset.source]] table, found none")
+        raise DatasetError(
+            f"{path}: dataset.source: expected at least one [[dataset.source]] table, found none"
+        )
     settings = {key: value for key, value in table.items() if key != "source"}
     _refuse_unknown(path, "dataset", settings, {f.name for f in fields(Recipe)} - {"sources"})
     for key in ("name", "seed"):
@@ -132,7 +134,9 @@ def _source(path: Path, number: int, table: Mapping[str, Any]) -> Source:
             raise DatasetError(f"{path}: {where}: {key}: expected a value, found none")
     for key, allowed in (("split", SPLITS), ("terrain", TERRAINS), ("light", LIGHTS)):
         if key in values and values[key] not in allowed:
-            raise DatasetError(f"{path}: {where}: {key}: expected one of {', '.join(allowed)}, found {values[key]!r}")
+            raise DatasetError(
+                f"{path}: {where}: {key}: expected one of {', '.join(allowed)}, found {values[key]!r}"
+            )
     for key in ("boxes", "avoid"):
         if key in values:
             values[key] = tuple(_box(path, f"{where}: {key}", item) for item in values[key])
@@ -144,7 +148,9 @@ def _source(path: Path, number: int, table: Mapping[str, Any]) -> Source:
 
 
 def _box(path: Path, where: str, item: object) -> Box:
-    if not (isinstance(item, list) and len(item) == 4 and all(isinstance(value, (int, float)) for value in item)):
+    if not (
+        isinstance(item, list) and len(item) == 4 and all(isinstance(value, (int, float)) for value in item)
+    ):
         raise DatasetError(f"{path}: {where}: expected [west, east, south, north] in degrees, found {item!r}")
     return Box(*(float(value) for value in item))
 

@@ -17,6 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.catalogue import CLASS_LIMITS_M, size_class
+
 Floats = NDArray[np.float64]
 
 PAPER_TABLE_2 = (
@@ -25,15 +27,13 @@ PAPER_TABLE_2 = (
     {"precision": 0.8131, "recall": 0.4659, "loc_px": 4.75},
 )
 MATCH_RADIUS_PX = 10.0  # the pixel rule, as in the project's first studies; the paper does not print its own
-CLASS_LIMITS_M = (5_000.0, 10_000.0, 15_000.0, 30_000.0)
-NAVIGATION_MINIMUM_M = 3_000.0
 FAIR_DEPTH_RATIO = 0.03
 DEGRADATION_EDGES = (0.0, 0.03, 0.06, 0.10, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameTruth:
-    """Catalogued craters of one frame with anything in view, arrays (n,); `block` names the independent piece of ground."""
+    """Catalogued craters in view of one frame, arrays (n,); `block` names the independent piece of ground."""
 
     u_px: Floats
     v_px: Floats
@@ -94,7 +94,12 @@ class MatchRule:
 
 
 def match(
-    detection_u: Floats, detection_v: Floats, truth_u: Floats, truth_v: Floats, truth_diameter: Floats, rule: MatchRule
+    detection_u: Floats,
+    detection_v: Floats,
+    truth_u: Floats,
+    truth_v: Floats,
+    truth_diameter: Floats,
+    rule: MatchRule,
 ) -> NDArray[np.int64]:
     """Index of the crater that each detection (best first) takes, -1 for none; nearest free crater within the rule."""
     taken = np.zeros(truth_u.shape[0], bool)
@@ -112,18 +117,12 @@ def match(
     return found
 
 
-def size_class(diameter_m: Floats) -> NDArray[np.int8]:
-    """0, 1, 2 for the paper's classes, 3 for 3-5 km, -1 otherwise; limits belong to the larger class, 30 km to class 2."""
-    edges = np.array([NAVIGATION_MINIMUM_M, *CLASS_LIMITS_M[:3], np.nextafter(CLASS_LIMITS_M[3], np.inf)])
-    return np.array([-1, 3, 0, 1, 2, -1], np.int8)[np.searchsorted(edges, diameter_m, side="right")]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Tally:
     """Every detection and every wanted crater of a set of frames after matching, for one rule and one truth.
 
-    Detections: score, outcome (1 right, 0 wrong, -1 not counted), error_u, error_v (detection minus crater), the crater's
-    values where right. Craters: score at which each was found (NaN: never).
+    Detections: score, outcome (1 right, 0 wrong, -1 not counted), error_u, error_v (detection minus
+    crater) where right. Craters: score at which each was found (NaN: never).
     """
 
     score: Floats
@@ -158,7 +157,11 @@ def make_figures(expected: int, found: int, false_alarms: int, errors_px: Floats
     """Figures of counts; NaN where nothing was expected or claimed."""
     precision = found / (found + false_alarms) if found + false_alarms else float("nan")
     recall = found / expected if expected else float("nan")
-    f1 = 2.0 * found / (2 * found + false_alarms + (expected - found)) if expected + false_alarms else float("nan")
+    f1 = (
+        2.0 * found / (2 * found + false_alarms + (expected - found))
+        if expected + false_alarms
+        else float("nan")
+    )
     return Figures(
         expected,
         found,
@@ -181,7 +184,7 @@ def tally(
     ignore_aware: bool = False,
     rule: MatchRule | None = None,
 ) -> Tally:
-    """Match frame by frame. `classes` given: only detections and craters of those size classes; else by diameter limits.
+    """Match frame by frame. `classes` given: detections and craters of those size classes; else by diameter.
 
     Detections are matched best first, so the outcome at every threshold is that of the detections above it.
     """
@@ -217,7 +220,12 @@ def tally(
         if ignore_aware:
             other = np.flatnonzero(~wanted)
             near = match_any(
-                found.u_px[d], found.v_px[d], truth.u_px[other], truth.v_px[other], truth.diameter_px[other], rule
+                found.u_px[d],
+                found.v_px[d],
+                truth.u_px[other],
+                truth.v_px[other],
+                truth.diameter_px[other],
+                rule,
             )
             outcome[(outcome == 0) & near] = -1
         error_u = np.where(hit >= 0, found.u_px[d] - truth.u_px[w][hit] if w.size else np.nan, np.nan)
@@ -250,7 +258,12 @@ def tally(
 
 
 def match_any(
-    detection_u: Floats, detection_v: Floats, truth_u: Floats, truth_v: Floats, truth_diameter: Floats, rule: MatchRule
+    detection_u: Floats,
+    detection_v: Floats,
+    truth_u: Floats,
+    truth_v: Floats,
+    truth_diameter: Floats,
+    rule: MatchRule,
 ) -> NDArray[np.bool_]:
     """Whether each detection lies on any of the craters by the rule; several may share one."""
     if truth_u.size == 0 or detection_u.size == 0:

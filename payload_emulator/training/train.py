@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.catalogue import size_class
 from payload_emulator.errors import DatasetError
 from payload_emulator.training.augment import AugmentParameters, make_crop
 from payload_emulator.training.dataset import Dataset, Frame, choose_tiers
-from payload_emulator.training.scoring import size_class
 from payload_emulator.training.targets import Tier, make_targets
 
 ENVIRONMENT = {
@@ -90,6 +90,7 @@ def train(
     DatasetError
         No training frames, or data sets of different cameras.
     """
+    import cv2
     import torch
 
     from payload_emulator.training.model import CraterNet, ModelConfig
@@ -101,13 +102,17 @@ def train(
     if len({(d.width_px, d.height_px, round(d.focal_px, 3)) for d in datasets}) > 1:
         raise DatasetError("training: expected data sets of one camera, found several")
     run.mkdir(parents=True, exist_ok=True)
+    cv2.setNumThreads(1)
     torch.manual_seed(parameters.seed)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     replicas = parameters.replicas or (1 if device == "cuda" else max(1, min(os.cpu_count() or 1, 8)))
     if device == "cpu":
         torch.set_num_threads(1)
     config = ModelConfig(
-        parameters.pyramid_channels, parameters.detail_blocks, parameters.detail_channels, parameters.paper_classes
+        parameters.pyramid_channels,
+        parameters.detail_blocks,
+        parameters.detail_channels,
+        parameters.paper_classes,
     )
     network = CraterNet(config).to(device, memory_format=torch.channels_last)
     average = copy.deepcopy(network).eval()
@@ -143,7 +148,9 @@ def train(
         terms = team.step(feeder, state.step, optimiser)
         state.step += 1
         state.seconds = time.monotonic() - began
-        _update_average(average, network, min(parameters.average_decay, (1.0 + state.step) / (10.0 + state.step)))
+        _update_average(
+            average, network, min(parameters.average_decay, (1.0 + state.step) / (10.0 + state.step))
+        )
         shown.add(terms)
         if state.step % 50 == 0:
             line = shown.line(state, rate, parameters.batch)
@@ -218,12 +225,15 @@ class _Feeder:
     """Crops by number: crop k of a run is the same whatever thread asks for it."""
 
     def __init__(
-        self, frames: list[tuple[Dataset, Frame]], images: list[NDArray[np.uint8]], parameters: TrainParameters
+        self,
+        frames: list[tuple[Dataset, Frame]],
+        images: list[NDArray[np.uint8]],
+        parameters: TrainParameters,
     ) -> None:
         self.frames = frames
         self.images = images
         self.parameters = parameters
-        self.tiers = [choose_tiers(f.craters, d.width_px, d.height_px) for d, f in frames]
+        self.tiers = [choose_tiers(f.craters, d.width_px, d.height_px, f.complete) for d, f in frames]
 
     def batch(self, first: int, count: int) -> dict[str, NDArray[Any]]:
         """Arrays of `count` crops from crop number `first` on."""
@@ -373,7 +383,11 @@ def _parameter_groups(network: Any, weight_decay: float) -> list[dict[str, Any]]
 
 def _learning_rate(state: _Progress, parameters: TrainParameters) -> float:
     """Linear warm-up, then a cosine to zero over the budget."""
-    done = state.seconds / (60.0 * parameters.minutes) if parameters.minutes > 0 else state.step / max(parameters.steps, 1)
+    done = (
+        state.seconds / (60.0 * parameters.minutes)
+        if parameters.minutes > 0
+        else state.step / max(parameters.steps, 1)
+    )
     warm = min(1.0, (state.step + 1) / max(parameters.warm_up_steps, 1))
     return parameters.learning_rate * warm * max(0.5 * (1.0 + math.cos(math.pi * min(done, 1.0))), 2e-3)
 
@@ -394,10 +408,12 @@ def _update_average(average: Any, network: Any, decay: float) -> None:
             held.copy_(value)
 
 
-def _validate(network: Any, validation: list[tuple[Dataset, Frame]], limit: int, device: str) -> dict[str, float]:
+def _validate(
+    network: Any, validation: list[tuple[Dataset, Frame]], limit: int, device: str
+) -> dict[str, float]:
     """Strict figures of 5-30 km craters at the threshold of the greatest F1, over evenly chosen frames."""
-    from payload_emulator.training.evaluate import detect_with_network
     from payload_emulator.training.dataset import frame_truth
+    from payload_emulator.training.evaluate import detect_with_network
     from payload_emulator.training.scoring import best_threshold, tally
 
     if not validation:
@@ -415,7 +431,9 @@ def _validate(network: Any, validation: list[tuple[Dataset, Frame]], limit: int,
     }
 
 
-def _load_images(frames: list[tuple[Dataset, Frame]], report: Callable[[str], None]) -> list[NDArray[np.uint8]]:
+def _load_images(
+    frames: list[tuple[Dataset, Frame]], report: Callable[[str], None]
+) -> list[NDArray[np.uint8]]:
     began = time.monotonic()
     images = [dataset.image(frame) for dataset, frame in frames]
     report(f"{len(images)} training images loaded in {time.monotonic() - began:.1f} s")
@@ -423,7 +441,13 @@ def _load_images(frames: list[tuple[Dataset, Frame]], report: Callable[[str], No
 
 
 def _save(
-    path: Path, network: Any, average: Any, optimiser: Any, state: _Progress, config: dict[str, Any], figures: dict[str, float]
+    path: Path,
+    network: Any,
+    average: Any,
+    optimiser: Any,
+    state: _Progress,
+    config: dict[str, Any],
+    figures: dict[str, float],
 ) -> None:
     import torch
 
@@ -442,12 +466,19 @@ def _save(
 
 
 def _write_run(
-    run: Path, parameters: TrainParameters, datasets: Sequence[Dataset], config: dict[str, Any], replicas: int, device: str
+    run: Path,
+    parameters: TrainParameters,
+    datasets: Sequence[Dataset],
+    config: dict[str, Any],
+    replicas: int,
+    device: str,
 ) -> None:
     document = {
         "parameters": asdict(parameters),
         "model": config,
-        "datasets": [{"name": d.index["name"], "labels_sha256": d.digest, "data": d.index["data"]} for d in datasets],
+        "datasets": [
+            {"name": d.index["name"], "labels_sha256": d.digest, "data": d.index["data"]} for d in datasets
+        ],
         "replicas": replicas,
         "device": device,
     }
@@ -455,7 +486,18 @@ def _write_run(
 
 
 _CURVE_COLUMNS = (
-    "step", "minutes", "total", "heat", "offset", "diameter", "sigma", "f1", "precision", "recall", "loc_px", "threshold",
+    "step",
+    "minutes",
+    "total",
+    "heat",
+    "offset",
+    "diameter",
+    "sigma",
+    "f1",
+    "precision",
+    "recall",
+    "loc_px",
+    "threshold",
 )
 
 

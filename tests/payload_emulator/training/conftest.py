@@ -49,21 +49,37 @@ def write_blob_dataset(folder: Path, frames_per_split: dict[str, int], seed: int
             craters.append(
                 {
                     "id": np.arange(u.size) + 1000 * number,
-                    "u_px": u, "v_px": v, "diameter_px": d, "diameter_m": d * 30_000.0 / focal,
-                    "depth_ratio": np.full(u.size, 0.15), "lit": np.ones(u.size),
+                    "u_px": u,
+                    "v_px": v,
+                    "diameter_px": d,
+                    "diameter_m": d * 30_000.0 / focal,
+                    "depth_ratio": np.full(u.size, 0.15),
+                    "lit": np.ones(u.size),
                     "hidden": np.zeros(u.size, np.uint8),
-                    "latitude_deg": np.zeros(u.size), "longitude_deg": np.zeros(u.size),
+                    "latitude_deg": np.zeros(u.size),
+                    "longitude_deg": np.zeros(u.size),
                 }
             )
             first.append(first[-1] + u.size)
             number += 1
         values = {
-            "number": rows, "latitude_deg": 0.0, "longitude_deg": 0.0, "altitude_m": 30_000.0, "ground_m": 0.0,
-            "sun_elevation_deg": 10.0, "sun_azimuth_deg": 0.0, "block": rows,
+            "number": rows,
+            "latitude_deg": 0.0,
+            "longitude_deg": 0.0,
+            "altitude_m": 30_000.0,
+            "ground_m": 0.0,
+            "sun_elevation_deg": 10.0,
+            "sun_azimuth_deg": 0.0,
+            "block": rows,
         }
         labels = store.ShardLabels(
-            source=split, split=split, complete=True,
-            frames={key: np.broadcast_to(np.asarray(values[key], float), (count,)).copy() for key in store.FRAME_COLUMNS},
+            source=split,
+            split=split,
+            complete=True,
+            frames={
+                key: np.broadcast_to(np.asarray(values[key], float), (count,)).copy()
+                for key in store.FRAME_COLUMNS
+            },
             sun_camera=np.tile([0.0, -0.98, -0.17], (count, 1)),
             camera_from_mcmf=np.tile(rotation, (count, 1, 1)),
             position_mcmf_m=np.tile(position, (count, 1)),

@@ -1,0 +1,248 @@
+"""`linna detector`: train, export, evaluate and run the crater detector."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+_TRAIN_MODULE_MISSING = "training needs torch: install the extra 'train' (pip install 'linna[train]')"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    from linna.output import add_json_flag
+
+    verbs = parser.add_subparsers(title="verbs", required=True)
+
+    train = verbs.add_parser("train", help="train a network; resumes the run of the same folder")
+    train.add_argument("datasets", type=Path, nargs="+", metavar="DATASET")
+    train.add_argument("--out", type=Path, required=True, metavar="RUN")
+    train.add_argument(
+        "--minutes", type=float, default=90.0, help="wall-clock budget of the learning-rate schedule"
+    )
+    train.add_argument("--steps", type=int, default=0, help="budget in optimiser steps instead")
+    train.add_argument("--seed", type=int, default=1)
+    train.add_argument("--crop", type=int, default=384, metavar="PX")
+    train.add_argument("--batch", type=int, default=8)
+    train.add_argument(
+        "--patience", type=int, default=0, help="stop after this many validations without gain (0: never)"
+    )
+    train.add_argument("--learning-rate", type=float, default=2.5e-3)
+    train.add_argument("--start-from", type=Path, default=None, metavar="CHECKPOINT")
+    train.add_argument("--paper-classes", action="store_true", help="add the paper's three class heatmaps")
+    add_json_flag(train)
+    train.set_defaults(handler=_train)
+
+    export = verbs.add_parser("export", help="write the ONNX network of a run, checked against torch")
+    export.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or a checkpoint file")
+    export.add_argument("--out", type=Path, required=True, metavar="M.onnx")
+    export.add_argument(
+        "--dataset",
+        type=Path,
+        nargs="*",
+        default=[],
+        metavar="DIR",
+        help="whose validation split fixes the thresholds",
+    )
+    export.add_argument("--revision", default="", help="source revision for the model's metadata")
+    add_json_flag(export)
+    export.set_defaults(handler=_export)
+
+    evaluate = verbs.add_parser("evaluate", help="precision, recall and localisation on a data set")
+    _add_model(evaluate)
+    evaluate.add_argument("--dataset", type=Path, required=True, metavar="DIR")
+    evaluate.add_argument("--split", choices=("train", "val", "test"), default="test")
+    evaluate.add_argument("--source", default="", help="only the frames of this source")
+    evaluate.add_argument("--threshold", type=float, default=None, help="instead of the model's own")
+    add_json_flag(evaluate)
+    evaluate.set_defaults(handler=_evaluate)
+
+    detect = verbs.add_parser("detect", help="craters in any PNG, TIFF or JPEG")
+    detect.add_argument("images", type=Path, nargs="+", metavar="IMAGE")
+    _add_model(detect)
+    detect.add_argument(
+        "--altitude-km", type=float, default=None, help="above the ground; gives size classes"
+    )
+    detect.add_argument("--fov-deg", type=float, default=120.0)
+    detect.add_argument(
+        "--sun-azimuth-deg", type=float, default=None, help="of the Sun in the image, clockwise from its top"
+    )
+    detect.add_argument("--threshold", type=float, default=None)
+    add_json_flag(detect)
+    detect.set_defaults(handler=_detect)
+
+    bench = verbs.add_parser("bench", help="latency and memory on this machine")
+    _add_model(bench)
+    bench.add_argument("--threads", type=int, default=1)
+    bench.add_argument("--frames", type=int, default=100)
+    add_json_flag(bench)
+    bench.set_defaults(handler=_bench)
+
+    info = verbs.add_parser("info", help="what a model says of itself")
+    _add_model(info)
+    add_json_flag(info)
+    info.set_defaults(handler=_info)
+
+
+def _add_model(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--model", type=Path, default=None, metavar="M.onnx", help="instead of the shipped one"
+    )
+
+
+def _model_octets(path: Path | None) -> bytes:
+    from payload_emulator.flight.models import load_shipped_model
+
+    return load_shipped_model() if path is None else path.read_bytes()
+
+
+def _train(arguments: argparse.Namespace) -> int:
+    import importlib.util
+    import os
+    import sys
+
+    from linna.errors import UsageError
+    from linna.output import emit, log
+
+    if importlib.util.find_spec("torch") is None:
+        raise UsageError(_TRAIN_MODULE_MISSING)
+    from payload_emulator.training.dataset import Dataset
+    from payload_emulator.training.train import ENVIRONMENT, TrainParameters, set_environment, train
+
+    if (
+        any(os.environ.get(name) is None for name in ENVIRONMENT)
+        and sys.argv
+        and os.environ.get("LINNA_TRAIN_CHILD") is None
+    ):
+        # The allocator reads its settings when the process starts, so start once more with them.
+        os.execve(
+            sys.executable,
+            [sys.executable, "-m", "linna", *sys.argv[1:]],
+            set_environment() | {"LINNA_TRAIN_CHILD": "1"},
+        )
+    parameters = TrainParameters(
+        minutes=0.0 if arguments.steps else arguments.minutes,
+        steps=arguments.steps,
+        batch=arguments.batch,
+        crop_px=arguments.crop,
+        learning_rate=arguments.learning_rate,
+        patience=arguments.patience,
+        seed=arguments.seed,
+        paper_classes=arguments.paper_classes,
+    )
+    datasets = [Dataset(folder) for folder in arguments.datasets]
+    figures = train(datasets, arguments.out, parameters, start_from=arguments.start_from, report=log)
+    emit(arguments, figures)
+    return 0
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    import importlib.util
+
+    from linna.errors import UsageError
+    from linna.output import emit
+
+    if importlib.util.find_spec("torch") is None:
+        raise UsageError(_TRAIN_MODULE_MISSING)
+    from payload_emulator.training.dataset import Dataset
+    from payload_emulator.training.export import export
+
+    checkpoint = arguments.run
+    if checkpoint.is_dir():
+        best = checkpoint / "best.pt"
+        checkpoint = best if best.is_file() else checkpoint / "checkpoint.pt"
+    datasets = [Dataset(folder) for folder in arguments.dataset]
+    emit(arguments, export(checkpoint, arguments.out, datasets, arguments.revision))
+    return 0
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    from linna.output import emit, progress
+    from payload_emulator.training.dataset import Dataset
+    from payload_emulator.training.evaluate import evaluate, format_figures
+
+    figures = evaluate(
+        _model_octets(arguments.model),
+        Dataset(arguments.dataset),
+        arguments.split,
+        arguments.source,
+        arguments.threshold,
+        lambda frames: progress(frames, len(frames), "evaluate", "frames"),
+    )
+    emit(arguments, figures, format_figures(figures))
+    return 0
+
+
+def _detect(arguments: argparse.Namespace) -> int:
+    import math
+
+    import numpy as np
+
+    from linna.output import emit
+    from lunar.catalogue import size_class
+    from payload_emulator.flight.detector import DetectorParameters, OnnxDetector
+
+    detector = OnnxDetector(
+        _model_octets(arguments.model), DetectorParameters(score_threshold=arguments.threshold)
+    )
+    sun = None
+    if arguments.sun_azimuth_deg is not None:
+        azimuth = math.radians(arguments.sun_azimuth_deg)
+        sun = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0])
+    images: list[dict[str, Any]] = []
+    for path in arguments.images:
+        image = _read_image(path)
+        quality, found = detector.examine_any_size(image, sun)
+        classes = np.full(len(found), -1)
+        if arguments.altitude_km is not None:
+            focal = 0.5 * image.shape[1] / math.tan(math.radians(arguments.fov_deg) / 2.0)
+            classes = size_class(found.diameter_px * arguments.altitude_km * 1000.0 / focal)
+        detections = [
+            {
+                "u_px": round(float(found.u_px[k]), 3),
+                "v_px": round(float(found.v_px[k]), 3),
+                "diameter_px": round(float(found.diameter_px[k]), 3),
+                "score": round(float(found.score[k]), 4),
+                "sigma_px": round(float(found.sigma_px[k]), 3),
+                "class": int(classes[k]),
+            }
+            for k in range(len(found))
+        ]
+        images.append({"file": str(path), "quality": quality.name.lower(), "detections": detections})
+    text = "\n".join(
+        f"{item['file']}: {item['quality']}, {len(item['detections'])} craters" for item in images
+    )
+    emit(arguments, {"images": images, "model_sha256": detector.sha256}, text)
+    return 0
+
+
+def _read_image(path: Path) -> Any:
+    """Pixels of an image file, 8 or 16 bits or float; colours in RGB order."""
+    import cv2
+    import numpy as np
+
+    from linna.errors import UsageError
+
+    octets = np.frombuffer(path.read_bytes(), np.uint8)
+    image = cv2.imdecode(octets, cv2.IMREAD_UNCHANGED) if octets.size else None
+    if image is None:
+        raise UsageError(f"{path}: expected an image (PNG, TIFF, JPEG), found none that can be read")
+    return image[..., [2, 1, 0]] if image.ndim == 3 and image.shape[2] >= 3 else image
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    from linna.output import emit
+    from payload_emulator.training.bench import bench
+
+    emit(arguments, bench(_model_octets(arguments.model), arguments.threads, arguments.frames))
+    return 0
+
+
+def _info(arguments: argparse.Namespace) -> int:
+    from linna.output import emit
+    from payload_emulator.flight.detector import OnnxDetector
+
+    octets = _model_octets(arguments.model)
+    detector = OnnxDetector(octets)
+    emit(arguments, {"sha256": detector.sha256, "model_bytes": len(octets), **detector.metadata})
+    return 0
