@@ -12,6 +12,8 @@ from lunar.constants import MOON_RADIUS_M
 NODE_STEP = 32
 BLOCK_SHIFT = 3
 SHARP = 4.0
+CLOSE_TEXELS = 0.04
+"""A clearance that ends the search for a hit: a hundredth of a pixel at the corners of a 120 degree picture."""
 
 
 @njit(fastmath=True, error_model="numpy")
@@ -125,232 +127,388 @@ def block_peaks(heights):  # type: ignore[no-untyped-def]
     return peaks
 
 
+@njit(fastmath=True, error_model="numpy")
+def fill_albedo(out, step, node_row, node_column, pool, table, shift, pixel_step):  # type: ignore[no-untyped-def]
+    """Fill ``out`` with the albedo at every ``step``-th grid point; an albedo pixel spans ``pixel_step`` height pixels."""
+    mask = (1 << shift) - 1
+    scale = 1.0 / pixel_step
+    for i in range(out.shape[0]):
+        ni = min(i * step // NODE_STEP, node_row.shape[0] - 2)
+        fi = (i * step - ni * NODE_STEP) / NODE_STEP
+        for j in range(out.shape[1]):
+            nj = min(j * step // NODE_STEP, node_row.shape[1] - 2)
+            fj = (j * step - nj * NODE_STEP) / NODE_STEP
+            top = node_row[ni, nj] + fj * (node_row[ni, nj + 1] - node_row[ni, nj])
+            low = node_row[ni + 1, nj] + fj * (node_row[ni + 1, nj + 1] - node_row[ni + 1, nj])
+            r = (top + fi * (low - top)) * scale
+            top = node_column[ni, nj] + fj * (node_column[ni, nj + 1] - node_column[ni, nj])
+            low = node_column[ni + 1, nj] + fj * (node_column[ni + 1, nj + 1] - node_column[ni + 1, nj])
+            c = (top + fi * (low - top)) * scale
+            a = int(r)
+            b = int(c)
+            slot = table[a >> shift, b >> shift]
+            fr = r - a
+            fc = c - b
+            a &= mask
+            b &= mask
+            top = pool[slot, a, b] + fc * (pool[slot, a, b + 1] - pool[slot, a, b])
+            low = pool[slot, a + 1, b] + fc * (pool[slot, a + 1, b + 1] - pool[slot, a + 1, b])
+            out[i, j] = top + fr * (low - top)
+
+
 @njit(fastmath=True, error_model="numpy", inline="always")
-def _bilinear(grid, i, j):  # type: ignore[no-untyped-def]
-    a = int(i)
-    b = int(j)
-    fi = i - a
-    fj = j - b
-    top = grid[a, b] + fj * (grid[a, b + 1] - grid[a, b])
-    low = grid[a + 1, b] + fj * (grid[a + 1, b + 1] - grid[a + 1, b])
-    return top + fi * (low - top)
+def _clearance(heights, i, j, z):  # type: ignore[no-untyped-def]
+    """How far a point lies above the ground, bilinear."""
+    a = np.uint64(i)
+    b = np.uint64(j)
+    one = np.uint64(1)
+    fi = np.float32(i - a)
+    fj = np.float32(j - b)
+    top = heights[a, b] + fj * (heights[a, b + one] - heights[a, b])
+    low = heights[a + one, b] + fj * (heights[a + one, b + one] - heights[a + one, b])
+    return z - (top + fi * (low - top))
 
 
 @njit(fastmath=True, error_model="numpy")
 def find_hit(heights, peaks, i0, j0, z0, di, dj, dz, start, stop):  # type: ignore[no-untyped-def]
-    """First parameter t in [start, stop] at which a ray (i0 + t di, j0 + t dj, z0 + t dz) meets the ground, or -1.
+    """First parameter t in [start, stop] at which a ray (i0 + t di, j0 + t dj, z0 + t dz) meets the ground.
 
-    Blocks whose highest point lies under the ray are leapt over; inside the others the ray goes by one texel.
+    Steps are as long as the clearance and its last rate of change allow, at most one texel; a ray still high after four leaps over
+    blocks whose highest point lies under it.  -1 where nothing is hit, -2 where the ray starts under ground.
     """
-    speed = max(abs(di), abs(dj))
+    pace = 1.0 / max(abs(di), abs(dj), 1.0e-9)
     size = 1 << BLOCK_SHIFT
-    inverse_i = 1.0 / di if di != 0.0 else 1.0e30
-    inverse_j = 1.0 / dj if dj != 0.0 else 1.0e30
-    ahead_i = 1 if di > 0.0 else 0
-    ahead_j = 1 if dj > 0.0 else 0
-    nudge = 1.0e-4 / max(speed, 1.0e-12)
-    t = start
-    while t < stop:
-        bi = min(max(int(i0 + t * di) >> BLOCK_SHIFT, 0), peaks.shape[0] - 1)
-        bj = min(max(int(j0 + t * dj) >> BLOCK_SHIFT, 0), peaks.shape[1] - 1)
-        leave = min(((bi + ahead_i) * size - i0) * inverse_i, ((bj + ahead_j) * size - j0) * inverse_j)
-        if di == 0.0 and dj == 0.0:
+    begin = start
+    above = _clearance(heights, i0 + begin * di, j0 + begin * dj, z0 + begin * dz)
+    if above <= 0.0:
+        return -2.0
+    slowest = max(-0.25 * dz, 1.0e-3)
+    rate = max(-dz, 1.0e-3)
+    steps = 0
+    while begin < stop:
+        if steps >= 4:
+            bi = min(int(i0 + begin * di) >> BLOCK_SHIFT, peaks.shape[0] - 1)
+            bj = min(int(j0 + begin * dj) >> BLOCK_SHIFT, peaks.shape[1] - 1)
             leave = stop
-        leave = min(max(leave, t) + nudge, stop)
-        top = peaks[bi, bj]
-        if min(z0 + t * dz, z0 + leave * dz) <= top:
-            begin = t
-            if dz < 0.0:
-                begin = min(max(t, (top - z0) / dz), leave)
-            count = max(1, int(math.ceil((leave - begin) * speed)))
-            step = (leave - begin) / count
-            above = z0 + begin * dz - _bilinear(heights, i0 + begin * di, j0 + begin * dj)
-            if above <= 0.0:
-                return begin
-            for n in range(1, count + 1):
-                end = begin + step
-                under = z0 + end * dz - _bilinear(heights, i0 + end * di, j0 + end * dj)
-                if under <= 0.0:
-                    # Bracketed: false position, three times (Illinois halving keeps it from sticking).
-                    for _ in range(4):
-                        middle = begin + (end - begin) * above / (above - under)
-                        value = z0 + middle * dz - _bilinear(heights, i0 + middle * di, j0 + middle * dj)
-                        if abs(value) < 0.3:
-                            return middle
-                        if value > 0.0:
-                            begin = middle
-                            above = value
-                            under *= 0.5
-                        else:
-                            end = middle
-                            under = value
-                            above *= 0.5
-                    return begin + (end - begin) * above / (above - under)
-                begin = end
-                above = under
-        t = leave
+            if di != 0.0:
+                leave = min(leave, ((bi + (1 if di > 0.0 else 0)) * size - i0) / di)
+            if dj != 0.0:
+                leave = min(leave, ((bj + (1 if dj > 0.0 else 0)) * size - j0) / dj)
+            leave = min(max(leave, begin) + 1.0e-4 * pace, stop)
+            if min(z0 + begin * dz, z0 + leave * dz) > peaks[bi, bj]:
+                begin = leave
+                above = _clearance(heights, i0 + begin * di, j0 + begin * dj, z0 + begin * dz)
+                if above <= 0.0:
+                    return begin
+                continue
+            steps = 0
+        step = min(1.02 * above / rate + 1.0e-3 * pace, pace)
+        end = min(begin + step, stop)
+        under = _clearance(heights, i0 + end * di, j0 + end * dj, z0 + end * dz)
+        if under <= 0.0:
+            # Bracketed: false position with the Illinois halving.
+            for _ in range(6):
+                middle = begin + (end - begin) * above / (above - under)
+                value = _clearance(heights, i0 + middle * di, j0 + middle * dj, z0 + middle * dz)
+                if abs(value) < 0.3:
+                    return middle
+                if value > 0.0:
+                    begin = middle
+                    above = value
+                    under *= 0.5
+                else:
+                    end = middle
+                    under = value
+                    above *= 0.5
+                if abs(value) < 3.0:
+                    break
+            return begin + (end - begin) * above / (above - under)
+        rate = max((above - under) / (end - begin), slowest)
+        if under < 0.3:
+            return end + under / rate
+        begin = end
+        above = under
+        steps += 1
     return -1.0
 
 
 @njit(fastmath=True, error_model="numpy")
-def shade_pixels(  # type: ignore[no-untyped-def]
-    heights,
-    depth,
-    peaks,
-    x0,
-    y0,
-    texel,
-    altitude,
-    tangent_from_camera,
-    focal,
-    centre_u,
-    centre_v,
-    sun_up,
-    sun_flat,
-    law,
-    multiple,
-    node_row,
-    node_column,
-    albedo,
-    table,
-    shift,
-    albedo_step,
-    mean_albedo,
-    contrast,
-    radiance,
-    lit,
-    range_m,
+def trace_pixels(  # type: ignore[no-untyped-def]
+    heights, peaks, x0, y0, texel, altitude, tangent_from_camera, focal, centre_u, centre_v, depth_along
 ):
-    """Fill the three pictures.  The Sun stands at -x: its vector is (-sun_flat, 0, sun_up)."""
+    """Fill ``depth_along`` (H, W) with the distance of the first hit along the boresight; -1 where there is none.
+
+    The picture is walked outward from the nadir, in lines of four sectors.  The ray of a pixel passes above those of its two
+    neighbours nearer the nadir, so the ground up to their hits is clear and the search starts at the nearer of them.  Three
+    evaluations without a branch settle most pixels (many in flight at once); the others are searched one by one.
+    """
     rows, columns = heights.shape
+    high, wide = depth_along.shape
+    flat = heights.ravel()
+    inverse = 1.0 / texel
+    i0 = np.float32(-x0 * inverse)
+    j0 = np.float32(-y0 * inverse)
+    top = float(peaks.max()) + 1.0
+    low = float(heights.min()) - 1.0
+    down = -tangent_from_camera[2, 2]
+    nadir_u = wide // 2
+    nadir_v = high // 2
+    if down > 0.05:
+        nadir_u = min(max(int(centre_u - focal * tangent_from_camera[2, 0] / down), 0), wide - 1)
+        nadir_v = min(max(int(centre_v - focal * tangent_from_camera[2, 1] / down), 0), high - 1)
+    longest = high + wide
+    clear = np.empty(longest, np.float32)
+    inner = np.empty(longest, np.float32)
+    first = np.empty(longest, np.float32)
+    found = np.empty(longest, np.float32)
+    doubt = np.empty(longest, np.bool_)
+    z0 = np.float32(altitude)
+    last_i = np.float32(rows - 2.01)
+    last_j = np.float32(columns - 2.01)
+    near = np.float32(1.01)
+    stride = np.int32(columns)
+    close = np.float32(CLOSE_TEXELS * texel)
+    tiny = np.float32(1.0e-9)
+    zero = np.float32(0.0)
+    next_one = np.uint64(1)
+    next_row = np.uint64(columns)
+    for sector in range(4):
+        upright = sector < 2
+        forward = sector % 2 == 0
+        main0 = nadir_v if upright else nadir_u
+        cross0 = nadir_u if upright else nadir_v
+        main_size = high if upright else wide
+        cross_size = wide if upright else high
+        lines = main_size - main0 if forward else main0 + 1
+        for n in range(lines):
+            main = main0 + n if forward else main0 - n
+            # Left and right sectors leave the diagonals to the others.
+            half = n if upright else n - 1
+            if half < 0:
+                continue
+            begin = max(cross0 - half, 0)
+            end = min(cross0 + half, cross_size - 1) + 1
+            for k in range(begin, end):
+                # Where the inner line was shorter its end stands in.
+                if n == 0 or (not upright and n == 1):
+                    clear[k] = zero
+                else:
+                    short = half - 1
+                    left = max(cross0 - short, 0)
+                    right = min(cross0 + short, cross_size - 1)
+                    same = min(max(k, left), right)
+                    toward = k - 1 if k > cross0 else (k + 1 if k < cross0 else k)
+                    toward = min(max(toward, left), right)
+                    clear[k] = min(inner[same], inner[toward])
+            if upright:
+                ax = tangent_from_camera[0, 0] / focal
+                ay = tangent_from_camera[1, 0] / focal
+                az = tangent_from_camera[2, 0] / focal
+                b = (main - centre_v) / focal
+                bx = tangent_from_camera[0, 1] * b + tangent_from_camera[0, 2] - ax * centre_u
+                by = tangent_from_camera[1, 1] * b + tangent_from_camera[1, 2] - ay * centre_u
+                bz = tangent_from_camera[2, 1] * b + tangent_from_camera[2, 2] - az * centre_u
+            else:
+                ax = tangent_from_camera[0, 1] / focal
+                ay = tangent_from_camera[1, 1] / focal
+                az = tangent_from_camera[2, 1] / focal
+                b = (main - centre_u) / focal
+                bx = tangent_from_camera[0, 0] * b + tangent_from_camera[0, 2] - ax * centre_v
+                by = tangent_from_camera[1, 0] * b + tangent_from_camera[1, 2] - ay * centre_v
+                bz = tangent_from_camera[2, 0] * b + tangent_from_camera[2, 2] - az * centre_v
+            fax = np.float32(ax * inverse)
+            fay = np.float32(ay * inverse)
+            faz = np.float32(az)
+            fbx = np.float32(bx * inverse)
+            fby = np.float32(by * inverse)
+            fbz = np.float32(bz)
+            for k in range(begin, end):
+                c = np.float32(k)
+                di = fax * c + fbx
+                dj = fay * c + fby
+                fall = max(-(faz * c + fbz), np.float32(1.0e-3))
+                out = np.float32(math.sqrt(di * di + dj * dj)) + tiny
+                pace = np.float32(1.0) / out
+                # Without inner neighbours the start is the height of the highest ground: wrong, and settled below.
+                t0 = clear[k] * pace
+                i = min(max(i0 + t0 * di, near), last_i)
+                j = min(max(j0 + t0 * dj, near), last_j)
+                p = np.int32(i)
+                q = np.int32(j)
+                m = np.uint64(p * stride + q)
+                fj = j - np.float32(q)
+                h0 = flat[m] + fj * (flat[m + next_one] - flat[m])
+                h1 = flat[m + next_row] + fj * (flat[m + next_row + next_one] - flat[m + next_row])
+                f0 = z0 - t0 * fall - (h0 + (i - np.float32(p)) * (h1 - h0))
+                t1 = t0 + min(f0 / fall, pace)
+                i = min(max(i0 + t1 * di, near), last_i)
+                j = min(max(j0 + t1 * dj, near), last_j)
+                p = np.int32(i)
+                q = np.int32(j)
+                m = np.uint64(p * stride + q)
+                fj = j - np.float32(q)
+                h0 = flat[m] + fj * (flat[m + next_one] - flat[m])
+                h1 = flat[m + next_row] + fj * (flat[m + next_row + next_one] - flat[m + next_row])
+                f1 = z0 - t1 * fall - (h0 + (i - np.float32(p)) * (h1 - h0))
+                rate = max((f0 - f1) / max(t1 - t0, tiny), np.float32(0.25) * fall)
+                t2 = t1 + min(max(f1 / rate, t0 - t1), pace)
+                i = min(max(i0 + t2 * di, near), last_i)
+                j = min(max(j0 + t2 * dj, near), last_j)
+                p = np.int32(i)
+                q = np.int32(j)
+                m = np.uint64(p * stride + q)
+                fj = j - np.float32(q)
+                h0 = flat[m] + fj * (flat[m + next_one] - flat[m])
+                h1 = flat[m + next_row] + fj * (flat[m + next_row + next_one] - flat[m + next_row])
+                f2 = z0 - t2 * fall - (h0 + (i - np.float32(p)) * (h1 - h0))
+                inside = i > near and i < last_i and j > near and j < last_j
+                doubt[k] = not (f0 > zero and abs(f2) < close and inside)
+                first[k] = t0 if f0 > zero else zero
+                found[k] = t2 + f2 / rate
+            for k in range(begin, end):
+                c = np.float32(k)
+                di = fax * c + fbx
+                dj = fay * c + fby
+                t = found[k]
+                if doubt[k]:
+                    t = _search(heights, peaks, i0, j0, altitude, di, dj, faz * c + fbz, first[k], top, low)
+                if upright:
+                    depth_along[main, k] = t
+                else:
+                    depth_along[k, main] = t
+                inner[k] = t * np.float32(math.sqrt(di * di + dj * dj)) if t > zero else zero
+
+
+@njit(fastmath=True, error_model="numpy")
+def _search(heights, peaks, i0, j0, altitude, di, dj, dz, first, top, low):  # type: ignore[no-untyped-def]
+    """First hit of one ray: from ``first`` if that is above ground, else from the highest ground down; -1 for none."""
+    rows, columns = heights.shape
+    start = 0.0
+    stop = 1.0e9
+    if dz < -1.0e-9:
+        start = max(0.0, (top - altitude) / dz)
+        stop = (low - altitude) / dz
+    # Keep within the grid, one texel inside for the gradients.
+    if di > 1.0e-12:
+        stop = min(stop, (rows - 2.001 - i0) / di)
+    elif di < -1.0e-12:
+        stop = min(stop, (1.001 - i0) / di)
+    if dj > 1.0e-12:
+        stop = min(stop, (columns - 2.001 - j0) / dj)
+    elif dj < -1.0e-12:
+        stop = min(stop, (1.001 - j0) / dj)
+    t = -2.0
+    if first > start and first < stop:
+        t = find_hit(heights, peaks, i0, j0, altitude, di, dj, dz, first, stop)
+    if t == -2.0 and start < stop:
+        t = find_hit(heights, peaks, i0, j0, altitude, di, dj, dz, start, stop)
+    return t if t > 0.0 else -1.0
+
+
+@njit(fastmath=True, error_model="numpy")
+def shade_pixels(  # type: ignore[no-untyped-def]
+    heights, depth, x0, y0, texel, tangent_from_camera, focal, centre_u, centre_v,
+    sun_up, sun_flat, law, hapke, albedo, albedo_step, mean_albedo, contrast,
+    radiance, lit, range_m,
+):
+    """Fill the pictures from ``range_m``, which comes as the depth along the boresight.
+
+    The Sun stands at -x: its vector is (-sun_flat, 0, sun_up).
+    """
     inverse = 1.0 / texel
     i0 = -x0 * inverse
     j0 = -y0 * inverse
-    top = peaks.max()
-    low = heights.min()
-    albedo_shift = shift - albedo_step
-    albedo_mask = (1 << albedo_shift) - 1
-    albedo_scale = np.float32(1.0 / (1 << albedo_step))
-    share = 1.0 / NODE_STEP
     one = np.float32(1.0)
     half = np.float32(0.5)
+    zero = np.float32(0.0)
+    next_one = np.uint64(1)
+    next_two = np.uint64(2)
     up = np.float32(sun_up)
     flat = np.float32(sun_flat)
     half_inverse = np.float32(0.5 * inverse)
-    many = law.shape[1] - 2
+    many = np.float32(law.shape[1] - 2)
     gamma = np.float32(math.sqrt(1.0 - 0.21))
-    hapke = multiple > 0.0
+    albedo_scale = 1.0 / albedo_step
     for v in range(radiance.shape[0]):
+        b = (v - centre_v) / focal
         for u in range(radiance.shape[1]):
             a = (u - centre_u) / focal
-            b = (v - centre_v) / focal
+            t = np.float64(range_m[v, u])
+            if t < 0.0:
+                radiance[v, u] = zero
+                lit[v, u] = zero
+                range_m[v, u] = np.float32(np.nan)
+                continue
             dx = tangent_from_camera[0, 0] * a + tangent_from_camera[0, 1] * b + tangent_from_camera[0, 2]
             dy = tangent_from_camera[1, 0] * a + tangent_from_camera[1, 1] * b + tangent_from_camera[1, 2]
             dz = tangent_from_camera[2, 0] * a + tangent_from_camera[2, 1] * b + tangent_from_camera[2, 2]
-            di = dx * inverse
-            dj = dy * inverse
-            start = 0.0
-            stop = 1.0e9
-            if dz < -1.0e-9:
-                start = max(0.0, (top - altitude) / dz)
-                stop = (low - 1.0 - altitude) / dz
-            # Keep within the grid, one texel inside for the gradients.
-            if di > 1.0e-12:
-                stop = min(stop, (rows - 2.001 - i0) / di)
-            elif di < -1.0e-12:
-                stop = min(stop, (1.001 - i0) / di)
-            if dj > 1.0e-12:
-                stop = min(stop, (columns - 2.001 - j0) / dj)
-            elif dj < -1.0e-12:
-                stop = min(stop, (1.001 - j0) / dj)
-            t = find_hit(heights, peaks, i0, j0, altitude, di, dj, dz, start, stop) if start < stop else -1.0
-            if t < 0.0:
-                radiance[v, u] = np.float32(0.0)
-                lit[v, u] = np.float32(0.0)
-                range_m[v, u] = np.float32(np.nan)
-                continue
-            i = i0 + t * di
-            j = j0 + t * dj
-            length = math.sqrt(a * a + b * b + 1.0)
-            range_m[v, u] = t * length
-            p = int(i)
-            q = int(j)
+            i = i0 + t * dx * inverse
+            j = j0 + t * dy * inverse
+            length = np.float32(math.sqrt(a * a + b * b + 1.0))
+            range_m[v, u] = np.float32(t) * length
+            p = np.uint64(i)
+            q = np.uint64(j)
             fi = np.float32(i - p)
             fj = np.float32(j - q)
-            w00 = (one - fi) * (one - fj)
-            w01 = (one - fi) * fj
-            w10 = fi * (one - fj)
+            p1 = p + next_one
+            q1 = q + next_one
             w11 = fi * fj
-            rise = (
-                w00 * depth[p, q] + w01 * depth[p, q + 1] + w10 * depth[p + 1, q] + w11 * depth[p + 1, q + 1]
-            )
+            w01 = fj - w11
+            w10 = fi - w11
+            w00 = one - fi - w01
+            rise = w00 * depth[p, q] + w01 * depth[p, q1] + w10 * depth[p1, q] + w11 * depth[p1, q1]
+            h00 = heights[p, q]
+            h01 = heights[p, q1]
+            h10 = heights[p1, q]
+            h11 = heights[p1, q1]
+            p0 = p - next_one
+            q0 = q - next_one
+            p2 = p + next_two
+            q2 = q + next_two
             gx = half_inverse * (
-                w00 * (heights[p + 1, q] - heights[p - 1, q])
-                + w01 * (heights[p + 1, q + 1] - heights[p - 1, q + 1])
-                + w10 * (heights[p + 2, q] - heights[p, q])
-                + w11 * (heights[p + 2, q + 1] - heights[p, q + 1])
+                w00 * (h10 - heights[p0, q])
+                + w01 * (h11 - heights[p0, q1])
+                + w10 * (heights[p2, q] - h00)
+                + w11 * (heights[p2, q1] - h01)
             )
             gy = half_inverse * (
-                w00 * (heights[p, q + 1] - heights[p, q - 1])
-                + w01 * (heights[p, q + 2] - heights[p, q])
-                + w10 * (heights[p + 1, q + 1] - heights[p + 1, q - 1])
-                + w11 * (heights[p + 1, q + 2] - heights[p + 1, q])
+                w00 * (h01 - heights[p, q0])
+                + w01 * (heights[p, q2] - h00)
+                + w10 * (h11 - heights[p1, q0])
+                + w11 * (heights[p1, q2] - h10)
             )
-            norm = one / math.sqrt(gx * gx + gy * gy + one)
+            norm = one / np.float32(math.sqrt(gx * gx + gy * gy + one))
             mu0 = (gx * flat + up) * norm
-            sun = np.float32(0.0)
-            if rise > -one and mu0 > np.float32(0.0):
-                s = min(rise, one)
-                sun = half + s * (np.float32(0.75) - np.float32(0.25) * s * s)
-            lit[v, u] = sun
-            if sun <= np.float32(0.0):
-                radiance[v, u] = np.float32(0.0)
+            if rise <= -one or mu0 <= zero:
+                lit[v, u] = zero
+                radiance[v, u] = zero
                 continue
-            reach = np.float32(1.0 / length)
+            s = min(rise, one)
+            sun = half + s * (np.float32(0.75) - np.float32(0.25) * s * s)
+            lit[v, u] = sun
+            reach = one / length
             vx = np.float32(-dx) * reach
             vy = np.float32(-dy) * reach
             vz = np.float32(-dz) * reach
             mu = max((vz - gx * vx - gy * vy) * norm, np.float32(0.02))
-            place = min(max((vz * up - vx * flat + one) * half, np.float32(0.0)), one) * np.float32(many)
-            k = int(place)
+            place = min(max((vz * up - vx * flat + one) * half, zero), one) * many
+            k = np.uint64(place)
             f = place - np.float32(k)
-            seeliger = law[0, k] + f * (law[0, k + 1] - law[0, k])
-            lambert = law[1, k] + f * (law[1, k + 1] - law[1, k])
-            value = seeliger * mu0 / (mu0 + mu) + lambert * mu0
+            seeliger = law[0, k] + f * (law[0, k + next_one] - law[0, k])
+            lambert = law[1, k] + f * (law[1, k + next_one] - law[1, k])
+            both = mu0 / (mu0 + mu)
+            value = seeliger * both + lambert * mu0
             if hapke:
                 h0 = (one + np.float32(2.0) * mu0) / (one + np.float32(2.0) * mu0 * gamma)
                 h1 = (one + np.float32(2.0) * mu) / (one + np.float32(2.0) * mu * gamma)
-                value += law[2, k] * h0 * h1 * mu0 / (mu0 + mu)
-            ni = min(p // NODE_STEP, node_row.shape[0] - 2)
-            nj = min(q // NODE_STEP, node_row.shape[1] - 2)
-            ti = np.float32((i - ni * NODE_STEP) * share)
-            tj = np.float32((j - nj * NODE_STEP) * share)
-            w00 = (one - ti) * (one - tj)
-            w01 = (one - ti) * tj
-            w10 = ti * (one - tj)
-            w11 = ti * tj
-            r = albedo_scale * (
-                w00 * node_row[ni, nj]
-                + w01 * node_row[ni, nj + 1]
-                + w10 * node_row[ni + 1, nj]
-                + w11 * node_row[ni + 1, nj + 1]
-            )
-            c = albedo_scale * (
-                w00 * node_column[ni, nj]
-                + w01 * node_column[ni, nj + 1]
-                + w10 * node_column[ni + 1, nj]
-                + w11 * node_column[ni + 1, nj + 1]
-            )
-            p = int(r)
-            q = int(c)
-            fi = r - np.float32(p)
-            fj = c - np.float32(q)
-            slot = table[p >> albedo_shift, q >> albedo_shift]
-            p &= albedo_mask
-            q &= albedo_mask
-            a0 = albedo[slot, p, q] + fj * (albedo[slot, p, q + 1] - albedo[slot, p, q])
-            a1 = albedo[slot, p + 1, q] + fj * (albedo[slot, p + 1, q + 1] - albedo[slot, p + 1, q])
-            shade = np.float32(mean_albedo) + np.float32(contrast) * (
-                a0 + fi * (a1 - a0) - np.float32(mean_albedo)
-            )
+                value += law[2, k] * h0 * h1 * both
+            i *= albedo_scale
+            j *= albedo_scale
+            p = np.uint64(i)
+            q = np.uint64(j)
+            fi = np.float32(i - p)
+            fj = np.float32(j - q)
+            a0 = albedo[p, q] + fj * (albedo[p, q + next_one] - albedo[p, q])
+            a1 = albedo[p + next_one, q] + fj * (albedo[p + next_one, q + next_one] - albedo[p + next_one, q])
+            shade = np.float32(mean_albedo) + np.float32(contrast) * (a0 + fi * (a1 - a0) - np.float32(mean_albedo))
             radiance[v, u] = shade * value * sun

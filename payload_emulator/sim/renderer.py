@@ -35,6 +35,7 @@ NODE_STEP = 32
 """Latitude and longitude are exact at every 32nd grid point and bilinear between: about 2 m off at most."""
 
 TEXEL_PER_PIXEL = 0.8
+ALBEDO_TEXELS = 4
 COARSE_TEXELS = 4
 """Texel of the grid toward the Sun that only casts, in texels of the picture's."""
 
@@ -131,35 +132,46 @@ def render(
         _penumbra(view.sun_elevation_rad),
         lit,
     )
-    peaks = kernels.block_peaks(heights)
-    shape = (camera.height_px, camera.width_px)
-    radiance, mask, range_m = (
-        np.empty(shape, np.float32),
-        np.empty(shape, np.float32),
-        np.empty(shape, np.float32),
-    )
-    kernels.shade_pixels(
-        heights,
-        lit,
-        peaks,
-        grid.x0_m,
-        grid.y0_m,
-        grid.texel_m,
-        view.altitude_m,
-        np.ascontiguousarray(view.tangent_from_camera),
-        camera.focal_px,
-        camera.centre_px[0],
-        camera.centre_px[1],
-        math.sin(view.sun_elevation_rad),
-        math.cos(view.sun_elevation_rad),
-        photometry.tables(),
-        1.0 if photometry.law == "hapke" else 0.0,
+    albedo = np.empty(((grid.rows - 1) // ALBEDO_TEXELS + 1, (grid.columns - 1) // ALBEDO_TEXELS + 1), np.float32)
+    kernels.fill_albedo(
+        albedo,
+        ALBEDO_TEXELS,
         nodes[0],
         nodes[1],
         patch.albedo,
         patch.table,
-        TILE_SHIFT,
-        TILE_SHIFT - ALBEDO_SHIFT,
+        ALBEDO_SHIFT,
+        1 << (TILE_SHIFT - ALBEDO_SHIFT),
+    )
+    shape = (camera.height_px, camera.width_px)
+    radiance, mask, range_m = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
+    eye = np.ascontiguousarray(view.tangent_from_camera)
+    lens = (camera.focal_px, *camera.centre_px)
+    kernels.trace_pixels(
+        heights,
+        kernels.block_peaks(heights),
+        grid.x0_m,
+        grid.y0_m,
+        grid.texel_m,
+        view.altitude_m,
+        eye,
+        *lens,
+        range_m,
+    )
+    kernels.shade_pixels(
+        heights,
+        lit,
+        grid.x0_m,
+        grid.y0_m,
+        grid.texel_m,
+        eye,
+        *lens,
+        math.sin(view.sun_elevation_rad),
+        math.cos(view.sun_elevation_rad),
+        photometry.tables(),
+        photometry.law == "hapke",
+        albedo,
+        float(ALBEDO_TEXELS),
         MEAN_ALBEDO,
         photometry.albedo_contrast,
         radiance,
