@@ -94,3 +94,8 @@ def write_blob_dataset(folder: Path, frames_per_split: dict[str, int], seed: int
 @pytest.fixture(scope="session")
 def blob_dataset(tmp_path_factory) -> store.Dataset:
     return write_blob_dataset(tmp_path_factory.mktemp("blobs") / "set", {"train": 24, "val": 6, "test": 4})
+
+
+@pytest.fixture(scope="session")
+def make_blob_dataset():
+    return write_blob_dataset

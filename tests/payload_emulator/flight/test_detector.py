@@ -1,0 +1,155 @@
+"""The flight detector with the shipped network: coordinates, bad input, bad models."""
+
+import hashlib
+
+import numpy as np
+import pytest
+
+from payload_emulator.errors import ModelError
+from payload_emulator.flight.detections import detections_from_lists
+from payload_emulator.flight.detector import DetectorParameters, OnnxDetector, decode, drop_duplicates
+from payload_emulator.flight.models import load_shipped_model
+from payload_emulator.flight.preprocess import ImageQuality
+
+
+@pytest.fixture(scope="module")
+def detector():
+    return OnnxDetector(load_shipped_model())
+
+
+def bowl_image(centres, radius=20.0, sun_azimuth_deg=0.0):
+    """Bowls of spherical section under a Sun at an image azimuth (clockwise from the top), Lambert, 15 degrees up."""
+    row, column = np.mgrid[0:512, 0:512].astype(float)
+    azimuth, elevation = np.radians(sun_azimuth_deg), np.radians(15.0)
+    sun = np.array(
+        [np.sin(azimuth) * np.cos(elevation), -np.cos(azimuth) * np.cos(elevation), np.sin(elevation)]
+    )
+    height = np.zeros((512, 512))
+    for u, v in centres:
+        s = np.hypot(column - u, row - v) / radius
+        inside = s < 1
+        height += np.where(
+            inside, 0.36 * radius * (s**2 - 1) + 0.08 * radius, 0.08 * radius * np.maximum(s, 1) ** -4
+        )
+    down, right = np.gradient(height)
+    shade = (-right * sun[0] - down * sun[1] + sun[2]) / np.sqrt(1 + right**2 + down**2)
+    noise = np.random.default_rng(0).normal(0, 0.004, shade.shape)
+    return np.clip((np.maximum(shade, 0) * 0.8 + 0.02 + noise) * 255, 0, 255).astype(np.uint8)
+
+
+CENTRES = [(130.0, 140.0), (300.0, 210.0), (220.0, 380.0), (400.0, 390.0)]
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 90.0, 180.0, 270.0])
+def test_fresh_bowls_are_found_where_they_are_whatever_the_sun(detector, azimuth):
+    angle = np.radians(azimuth)
+    found = detector.detect(
+        bowl_image(CENTRES, sun_azimuth_deg=azimuth), np.array([np.sin(angle), -np.cos(angle), 0.25])
+    )
+    for u, v in CENTRES:
+        distance = np.hypot(found.u_px - u, found.v_px - v)
+        best = int(np.argmin(distance))
+        # Four pixels: a fifth of the radius, well inside the matching rule; the network never saw such bowls.
+        assert distance[best] < 4.0
+        # A diameter within a quarter keeps a crater in its class or the next.
+        assert found.diameter_px[best] == pytest.approx(40.0, rel=0.25)
+
+
+def test_turning_the_frame_with_the_sun_turns_the_detections(detector):
+    image = bowl_image(CENTRES)
+    reference = detector.detect(image, np.array([0.0, -1.0, 0.25]))
+    turned = detector.detect(np.rot90(image), np.array([-1.0, 0.0, 0.25]))
+    assert len(reference) == len(turned) > 0
+    # The same pixels reach the network, so only the change of coordinates remains.
+    assert turned.u_px == pytest.approx(reference.v_px, abs=1e-9)
+    assert turned.v_px == pytest.approx(511.0 - reference.u_px, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("image", "verdict"),
+    [
+        (np.zeros((512, 512, 3), np.uint8), ImageQuality.DARK),
+        (np.full((512, 512, 3), 255, np.uint8), ImageQuality.SATURATED),
+        (np.full((512, 512, 3), 99, np.uint8), ImageQuality.UNIFORM),
+        (np.full((512, 512), np.nan), ImageQuality.INVALID),
+        (np.zeros((511, 512, 3), np.uint8), ImageQuality.INVALID),
+        (np.zeros((512, 512, 7), np.uint8), ImageQuality.INVALID),
+        (np.zeros(4, np.uint8), ImageQuality.INVALID),
+    ],
+)
+def test_a_bad_frame_is_a_verdict_and_no_detections(detector, image, verdict):
+    quality, found = detector.examine(image)
+    assert quality is verdict
+    assert len(found) == 0
+
+
+def test_images_of_any_size_are_searched_in_tiles(detector):
+    large = np.full((900, 1300), 60, np.uint8)
+    tile = bowl_image(CENTRES)
+    large[300:812, 700:1212] = tile
+    quality, found = detector.examine_any_size(large, np.array([0.0, -1.0, 0.2]))
+    assert quality is ImageQuality.OK
+    for u, v in CENTRES:
+        assert np.hypot(found.u_px - u - 700, found.v_px - v - 300).min() < 4.0
+    small_quality, small = detector.examine_any_size(tile[:200, :300])
+    assert small_quality is ImageQuality.OK
+    assert (small.u_px < 300).all() and (small.v_px < 200).all()
+
+
+def test_the_same_frame_gives_the_same_octets(detector):
+    image = bowl_image(CENTRES)
+    first, second = detector.detect(image), detector.detect(image)
+    assert first.u_px.tobytes() == second.u_px.tobytes()
+    assert first.score.tobytes() == second.score.tobytes()
+
+
+def test_detections_come_best_first_and_no_more_than_asked_for():
+    detector = OnnxDetector(load_shipped_model(), DetectorParameters(score_threshold=0.05, max_detections=3))
+    found = detector.detect(bowl_image(CENTRES))
+    assert len(found) == 3
+    assert (np.diff(found.score) <= 0).all()
+
+
+def test_the_shipped_network_is_small_and_tells_what_it_is(detector):
+    assert len(detector.model_octets) <= 6_000_000
+    assert detector.model_hash == int(hashlib.sha256(detector.model_octets).hexdigest()[:8], 16)
+    assert 0.1 <= detector.score_threshold <= 0.9
+    for key in ("input", "outputs", "score_threshold", "navigation_threshold", "data", "validation"):
+        assert detector.metadata[key]
+
+
+def test_a_network_of_another_hash_is_refused():
+    with pytest.raises(ModelError, match="expected SHA-256 00"):
+        OnnxDetector(load_shipped_model(), expected_sha256="00" * 32)
+
+
+def test_octets_that_are_no_network_are_refused():
+    with pytest.raises(ModelError, match="expected an ONNX model"):
+        OnnxDetector(b"not a network")
+    with pytest.raises(ModelError, match="expected an ONNX model"):
+        OnnxDetector(load_shipped_model()[:100_000])
+
+
+def test_a_network_with_other_inputs_is_refused():
+    onnx = pytest.importorskip("onnx")
+    tensor = onnx.TensorProto.FLOAT
+    graph = onnx.helper.make_graph(
+        [onnx.helper.make_node("Identity", ["x"], ["y"])],
+        "other",
+        [onnx.helper.make_tensor_value_info("x", tensor, [1, 3])],
+        [onnx.helper.make_tensor_value_info("y", tensor, [1, 3])],
+    )
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=10)
+    with pytest.raises(ModelError, match="expected input image"):
+        OnnxDetector(model.SerializeToString())
+
+
+def test_a_flat_heatmap_gives_no_detections():
+    found = decode(np.zeros((128, 128), np.float32), np.zeros((4, 128, 128), np.float32), 0.1)
+    assert len(found) == 0
+
+
+def test_a_weaker_repetition_is_dropped_and_a_nested_crater_kept():
+    found = detections_from_lists([100, 104, 102], [100, 101, 100], [40, 44, 12], [0.9, 0.8, 0.7], [1, 1, 1])
+    kept = drop_duplicates(found, DetectorParameters())
+    assert kept.diameter_px.tolist() == [40, 12]
