@@ -31,7 +31,8 @@ _CUC_AGENCY_4_2 = 0x2E
 class PacketBatch:
     """Checked packets of one stretch of a downlink, arrays and lists (n,).
 
-    `ticks` is the on-board time of the packet, `NO_TICKS` where it carries none. `rows` holds, per kind of sample,
+    `spacecraft_id` is None where the stream does not say whose the packets are. `ticks` is the on-board time of the
+    packet, `NO_TICKS` where it carries none. `rows` holds, per kind of sample,
     the decoded columns and in ``"packet"`` the index of each row's packet in this batch.
     """
 
@@ -40,6 +41,7 @@ class PacketBatch:
     ticks: IntArray
     octets: list[bytes]
     digest: list[bytes]
+    spacecraft_id: int | None
     dictionary_version: int
     rows: Mapping[str, Columns]
     unknown: int
@@ -48,7 +50,9 @@ class PacketBatch:
         return len(self.octets)
 
 
-def batch_of_cut(buffer: Octets, cut: PacketCut, dictionary: Dictionary = DICTIONARY) -> PacketBatch:
+def batch_of_cut(
+    buffer: Octets, cut: PacketCut, dictionary: Dictionary = DICTIONARY, spacecraft_id: int | None = None
+) -> PacketBatch:
     """The packets of `cut` whose checksum holds, with what the dictionary decodes from them."""
     good = np.flatnonzero(cut.crc_ok)
     headers = primary_headers(buffer, cut)
@@ -67,6 +71,7 @@ def batch_of_cut(buffer: Octets, cut: PacketCut, dictionary: Dictionary = DICTIO
         ticks=_packet_ticks(buffer, cut, good, headers.secondary_header[good]),
         octets=octets,
         digest=[hashlib.blake2b(packet, digest_size=DIGEST_OCTETS).digest() for packet in octets],
+        spacecraft_id=spacecraft_id,
         dictionary_version=dictionary.version,
         rows=decoded_rows(tables, place),
         unknown=len(good) - known,

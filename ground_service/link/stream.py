@@ -1,17 +1,29 @@
-"""A downlink, read block by block: packets are handed on as soon as they are whole, every octet is accounted for."""
+"""A downlink, read window by window: packets are handed on as soon as they are whole, every octet is accounted for.
+
+CADU streams are decoded in windows that overlap by as many frames as the longest packet can span. A packet in the
+overlap is met twice and stored once, so no packet is lost at a border; the accounting of each overlap by itself is
+taken off again, so the sums are those of the stream read at once.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
+import numpy as np
+
 from ground_service.link.packets import PacketBatch, batch_of_cut
 from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import FRAME_FOREIGN, DownlinkDecode, LinkSettings, decode
+from tmtc.packets import PACKET_MAX_LENGTH
 from tmtc.schema import Dictionary
-from tmtc.stream import cut_packets
+from tmtc.stream import PacketCut, cut_packets
 
-BATCH_OCTETS = 4 << 20
+WINDOW_OCTETS = 8 << 20
 """Octets decoded and stored at a time: large enough to spread the cost of a transaction, small against memory."""
+
+FOREIGN_FRAMES = 2
+"""A spacecraft is believed to be in a stream from this many good frames on."""
 
 
 @dataclass(slots=True)
@@ -19,6 +31,7 @@ class LinkAccounting:
     """What was met on the way so far."""
 
     octets: int = 0
+    packets: int = 0
     crc_errors: int = 0
     octets_skipped: int = 0
     frames: int = 0
@@ -27,23 +40,104 @@ class LinkAccounting:
 
 
 class DownlinkReader:
-    """Reads one stream: CADUs or bare space packets, told apart by content."""
+    """Reads one stream: CADUs or bare space packets, told apart by content.
 
-    def __init__(self, dictionary: Dictionary = DICTIONARY) -> None:
+    Parameters
+    ----------
+    spacecraft_id
+        Only frames of this spacecraft are used; None: those of every spacecraft in the stream. Bare packets do not
+        say whose they are.
+    """
+
+    def __init__(
+        self,
+        spacecraft_id: int | None = None,
+        dictionary: Dictionary = DICTIONARY,
+        window_octets: int = WINDOW_OCTETS,
+    ) -> None:
         self.accounting = LinkAccounting()
+        self._spacecraft_id = spacecraft_id
         self._dictionary = dictionary
+        self._window_octets = window_octets
 
     def batches(self, blocks: Iterable[bytes]) -> Iterator[PacketBatch]:
-        """The packets of the stream, in batches."""
+        """The packets of the stream, in batches.
+
+        Raises
+        ------
+        LinkFormatError
+            If frames stand in the stream whose coding is not known.
+        """
+        windows = _last_marked(_rebuffered(blocks, self._window_octets))
         rest = b""
-        for block, final in _last_marked(_rebuffered(blocks, BATCH_OCTETS)):
+        settings: LinkSettings | None = None
+        bare: bool | None = None
+        for block, final in windows:
             self.accounting.octets += len(block)
-            buffer = rest + block
-            cut = cut_packets(buffer, final=final)
-            self.accounting.crc_errors += cut.crc_errors
-            self.accounting.octets_skipped += cut.octets_skipped
-            rest = b"" if final else bytes(memoryview(buffer)[cut.consumed :])
-            yield batch_of_cut(buffer, cut, self._dictionary)
+            window = rest + block
+            if bare is None:
+                settings = decode(window[: 4 * self._window_octets], dictionary=self._dictionary).settings
+                bare = settings is None
+            if settings is None:
+                cut = cut_packets(window, final=final)
+                self.accounting.octets_skipped += cut.octets_skipped
+                self._count(cut)
+                rest = b"" if final else bytes(memoryview(window)[cut.consumed :])
+                yield batch_of_cut(window, cut, self._dictionary, self._spacecraft_id)
+                continue
+            yield from self._frames(window, settings, sign=1)
+            rest = b""
+            if not final:
+                rest = _overlap(window, settings)
+                for _ in self._frames(rest, settings, sign=-1):
+                    pass
+
+    def _frames(self, window: bytes, settings: LinkSettings, sign: int) -> Iterator[PacketBatch]:
+        """Batches of every spacecraft in a window; `sign` -1 takes the window off the accounting again."""
+        first = decode(window, settings=settings, spacecraft_id=self._spacecraft_id, dictionary=self._dictionary)
+        found = [first]
+        if self._spacecraft_id is None:
+            found += [
+                decode(window, settings=settings, spacecraft_id=other, dictionary=self._dictionary)
+                for other in _other_spacecraft(first)
+            ]
+        own = sum(_good_frames(one) for one in found)
+        frames = len(first.frames) if first.frames is not None else 0
+        truncated = first.frames_bad - (frames - _good_frames(first))
+        self.accounting.frames += sign * frames
+        self.accounting.frames_bad += sign * (frames - own + truncated)
+        self.accounting.symbols_corrected += sign * first.symbols_corrected
+        self.accounting.octets_skipped += sign * first.octets["unsynchronised"]
+        for one in found:
+            self.accounting.octets_skipped += sign * (one.octets["orphaned"] + one.octets["skipped"])
+            self._count(one.cut, sign)
+            if sign > 0:
+                yield batch_of_cut(one.buffer, one.cut, self._dictionary, one.spacecraft_id)
+
+    def _count(self, cut: PacketCut, sign: int = 1) -> None:
+        self.accounting.packets += sign * int(np.count_nonzero(cut.crc_ok))
+        self.accounting.crc_errors += sign * cut.crc_errors
+
+
+def _good_frames(result: DownlinkDecode) -> int:
+    """Frames of the spacecraft that was decoded that are without fault."""
+    return int(np.count_nonzero(result.frames.verdict == 0)) if result.frames is not None else 0
+
+
+def _other_spacecraft(result: DownlinkDecode) -> list[int]:
+    """Ids of further spacecraft in a window, by their good frames."""
+    if result.frames is None:
+        return []
+    foreign = result.frames.spacecraft_id[result.frames.verdict == FRAME_FOREIGN]
+    ids, counts = np.unique(foreign, return_counts=True)
+    return [int(i) for i, n in zip(ids, counts, strict=True) if n >= FOREIGN_FRAMES and i != result.spacecraft_id]
+
+
+def _overlap(window: bytes, settings: LinkSettings) -> bytes:
+    """The end of a window that the next one has to begin with: the longest packet may begin anywhere in it."""
+    frames = PACKET_MAX_LENGTH // max(settings.frame_length - 16, 1) + 2
+    length = min((frames + 1) * settings.cadu_length, len(window) // 2)
+    return window[len(window) - length :]
 
 
 def _rebuffered(blocks: Iterable[bytes], octets: int) -> Iterator[bytes]:

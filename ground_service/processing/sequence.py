@@ -22,6 +22,9 @@ REORDER_TICKS = TICKS_PER_SECOND
 """Counts may fall back within this time without meaning a restart: packets made in the same instant are stored in
 no particular order. One second is far above the time between making two packets of one frame."""
 
+RATE_PACKETS = 64
+"""Packets over which a rate is taken."""
+
 
 @dataclass(frozen=True, slots=True)
 class Gap:
@@ -106,8 +109,14 @@ def account_sequence(ticks: IntArray, sequence_count: IntArray) -> SequenceAccou
 
 
 def _usual_rate(near: IntArray, step_ticks: IntArray) -> float:
-    """Packets per tick of the median forward step; 0 where too few packets say."""
-    forward = (near > 0) & (step_ticks > 0)
-    if np.count_nonzero(forward) < 3:
+    """Packets per tick, as the median over stretches of `RATE_PACKETS` packets; 0 where too few packets say.
+
+    Stretches, because packets come in bursts: the time between two of one burst says nothing about the rate.
+    """
+    if len(near) < RATE_PACKETS:
         return 0.0
-    return float(np.median(near[forward] / step_ticks[forward]))
+    count = np.concatenate(([0], np.cumsum(near)))
+    time = np.concatenate(([0], np.cumsum(step_ticks)))
+    packets, ticks = count[RATE_PACKETS:] - count[:-RATE_PACKETS], time[RATE_PACKETS:] - time[:-RATE_PACKETS]
+    forward = (packets > 0) & (ticks > 0)
+    return float(np.median(packets[forward] / ticks[forward])) if forward.any() else 0.0

@@ -37,6 +37,12 @@ class Ground:
         """The gravity field of the data at hand."""
         return _gravity(self.data)
 
+    def __enter__(self) -> Ground:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def close(self) -> None:
         """Give the database connections back."""
         self.database.engine.dispose()

@@ -44,9 +44,17 @@ class IngestResult:
 
 
 def ingest_file(
-    ground: Ground, path: Path, *, spacecraft_id: int, instance: str = FLOWN, name: str | None = None
+    ground: Ground, path: Path, *, spacecraft_id: int | None = None, instance: str = FLOWN, name: str | None = None
 ) -> IngestResult:
     """Archive a downlink file and store what is in it.
+
+    Parameters
+    ----------
+    spacecraft_id
+        Whose the file is: frames of other spacecraft are left out. None takes the ids from the frames; bare packets
+        carry none, so they need it.
+    instance
+        Which instance of the spacecraft the telemetry belongs to.
 
     Raises
     ------
@@ -60,7 +68,7 @@ def ingest_file(
 
 
 def ingest_stored(
-    ground: Ground, stored: StoredFile, *, spacecraft_id: int, instance: str = FLOWN, name: str
+    ground: Ground, stored: StoredFile, *, spacecraft_id: int | None = None, instance: str = FLOWN, name: str
 ) -> IngestResult:
     """Store what is in an archived downlink file; see `ingest_file`."""
     ingest_id = begin_ingest(ground, stored, name)
@@ -86,15 +94,16 @@ def begin_ingest(ground: Ground, stored: StoredFile, name: str) -> int:
         )
 
 
-def run_ingest(ground: Ground, ingest_id: int, *, spacecraft_id: int, instance: str = FLOWN) -> IngestResult:
+def run_ingest(
+    ground: Ground, ingest_id: int, *, spacecraft_id: int | None = None, instance: str = FLOWN
+) -> IngestResult:
     """Do what was entered with `begin_ingest`; running it again is harmless."""
     with ground.database.writing() as connection:
         record = repository.get(connection, repository.INGESTS, ingest_id, "ingest")
-        vehicle = repository.vehicle_id(connection, spacecraft_id, instance)
-        repository.change(connection, repository.INGESTS, ingest_id, state="running", vehicle_id=vehicle)
+        repository.change(connection, repository.INGESTS, ingest_id, state="running")
     path = ground.files.path(record["file_sha256"])
     try:
-        result = _store_stream(ground, ingest_id, vehicle, read_blocks(path))
+        result = _store_stream(ground, ingest_id, DownlinkReader(spacecraft_id), instance, read_blocks(path))
         if result.packets == 0 and result.octets > 0:
             raise InvalidInput(
                 _name(ground, record["file_sha256"]),
@@ -120,31 +129,38 @@ def run_ingest(ground: Ground, ingest_id: int, *, spacecraft_id: int, instance: 
             ingest_id,
             state="done",
             error=None,
+            vehicle_id=result.vehicle_id,
             finished_utc_ns=utc_now_ns(),
             accounting=asdict(result),
         )
     return result
 
 
-def _store_stream(ground: Ground, ingest_id: int, vehicle: int, blocks: Iterable[bytes]) -> IngestResult:
-    reader = DownlinkReader()
-    new = repeated = samples = packets = unknown = 0
+def _store_stream(
+    ground: Ground, ingest_id: int, reader: DownlinkReader, instance: str, blocks: Iterable[bytes]
+) -> IngestResult:
+    vehicles: dict[int, int] = {}
+    new = samples = unknown = 0
     for batch in reader.batches(blocks):
+        if len(batch) == 0:
+            continue
+        if batch.spacecraft_id is None:
+            raise InvalidInput("downlink of bare packets", "", "the id of their spacecraft", "none given")
         with ground.database.writing() as connection:
-            stored = store_batch(connection, vehicle, batch)
+            if batch.spacecraft_id not in vehicles:
+                vehicles[batch.spacecraft_id] = repository.vehicle_id(connection, batch.spacecraft_id, instance)
+            stored = store_batch(connection, vehicles[batch.spacecraft_id], batch)
         new += stored.new
-        repeated += stored.repeated
         samples += stored.samples
-        packets += len(batch)
         unknown += batch.unknown
     found = reader.accounting
     return IngestResult(
         ingest_id=ingest_id,
-        vehicle_id=vehicle,
+        vehicle_id=next(iter(vehicles.values()), None),
         octets=found.octets,
-        packets=packets,
+        packets=found.packets,
         packets_new=new,
-        packets_repeated=repeated,
+        packets_repeated=found.packets - new,
         samples=samples,
         crc_errors=found.crc_errors,
         octets_skipped=found.octets_skipped,

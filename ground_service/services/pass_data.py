@@ -17,7 +17,7 @@ from ground_service.processing.baseline import StartState
 from ground_service.processing.correlation import TimeCorrelation, ticks_of_utc_ns, utc_ns_of_ticks
 from ground_service.processing.pass_evaluation import PassInputs
 from ground_service.processing.samples import DetectionSamples, NavigationSamples, OutcomeSamples, no_detections
-from ground_service.processing.sequence import account_sequence
+from ground_service.processing.sequence import Gap, account_sequence
 from ground_service.services.ground import Ground
 from ground_service.store import repository
 from ground_service.store.codec import unpack_detections
@@ -35,6 +35,7 @@ PASS_MARGIN_NS = 60_000_000_000
 """Samples this far outside a window still belong to it: housekeeping before the first and after the last image."""
 
 COMPLETENESS_BINS = 60
+GAP_POINTS = 256
 
 _SEVERITIES = {1: "info", 2: "low", 3: "medium", 4: "high"}
 
@@ -266,7 +267,7 @@ def packet_accounting(connection: Connection, record: Mapping[str, Any], span: P
     headers = repository.packet_headers(connection, span.vehicle, span.start_ticks, span.stop_ticks)
     names = _apid_names()
     by_apid: dict[int, ApidAccounting] = {}
-    lost_ticks: list[IntArray] = []
+    lost = np.zeros((0, 2), dtype=np.float64)
     conflicts = 0
     for apid in np.unique(headers["apid"]).tolist():
         here = headers["apid"] == apid
@@ -278,15 +279,11 @@ def packet_accounting(connection: Connection, record: Mapping[str, Any], span: P
             conflicts=account.conflicts,
         )
         conflicts += account.conflicts
-        lost_ticks += [
-            np.linspace(gap.before_ticks, gap.after_ticks, gap.missing + 2)[1:-1].astype(np.int64)
-            for gap in account.gaps
-        ]
+        lost = np.concatenate([lost, *(_spread(gap) for gap in account.gaps)])
     totals = _ingest_totals(connection, span.vehicle)
-    lost = np.concatenate(lost_ticks) if lost_ticks else np.zeros(0, dtype=np.int64)
     return PacketAccounting(
         packets=len(headers["apid"]),
-        lost=len(lost),
+        lost=sum(apid.lost for apid in by_apid.values()),
         duplicates=totals["duplicates"],
         conflicts=conflicts,
         crc_errors=totals["crc_errors"],
@@ -384,14 +381,22 @@ def _ingest_totals(connection: Connection, vehicle: int) -> dict[str, int]:
 
 
 def _completeness(
-    record: Mapping[str, Any], span: PassSpan, ticks: IntArray, lost_ticks: IntArray
+    record: Mapping[str, Any], span: PassSpan, ticks: IntArray, lost: NDArray[np.float64]
 ) -> CompletenessSeries | None:
     if len(ticks) == 0:
         return None
     edges = np.linspace(record["start_utc_ns"], record["stop_utc_ns"], COMPLETENESS_BINS + 1).astype(np.int64)
     received = np.histogram(np.clip(span.utc_ns(list(ticks)), edges[0], edges[-1]), edges)[0]
-    lost = np.histogram(np.clip(span.utc_ns(list(lost_ticks)), edges[0], edges[-1]), edges)[0]
-    return CompletenessSeries(edges, (received + lost).astype(np.int64), received.astype(np.int64))
+    when = np.clip(span.utc_ns(lost[:, 0].astype(np.int64).tolist()), edges[0], edges[-1])
+    missing = np.histogram(when, edges, weights=lost[:, 1])[0]
+    return CompletenessSeries(edges, received + np.rint(missing).astype(np.int64), received.astype(np.int64))
+
+
+def _spread(gap: Gap) -> NDArray[np.float64]:
+    """On-board times (k, 2) over which the packets of a gap are taken to be spread, and how many at each."""
+    points = min(gap.missing, GAP_POINTS)
+    ticks = np.linspace(gap.before_ticks, gap.after_ticks, points + 2)[1:-1]
+    return np.column_stack([ticks, np.full(points, gap.missing / points)])
 
 
 def _housekeeping(connection: Connection, span: PassSpan) -> tuple[HousekeepingParameter, ...]:

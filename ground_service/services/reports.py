@@ -51,7 +51,7 @@ def make_report(ground: Ground, pass_id: int, *, report_id: str | None = None, o
     out
         Folder for the two documents; ``reports/pass-<id>`` under the service's home when None.
     """
-    from reports import render_html, to_json
+    from reports.render import render_html, to_json
 
     identity = report_id or uuid.uuid4().hex
     now = utc_now_ns()

@@ -25,6 +25,7 @@ from lunar.frames import IauOrientation, mcmf_from_spherical, rtn_from_inertial,
 from lunar.oem import save_oem
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
 from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import encode_cadus
 from tmtc.packets import PacketSequencer
 
 NS = 1_000_000_000
@@ -48,6 +49,11 @@ class SyntheticPass:
     utc_ns: np.ndarray
     expected: int
     missed: int
+
+
+def encode_downlink(packets: list[bytes]) -> bytes:
+    """CADUs of the synthetic spacecraft."""
+    return encode_cadus(packets, spacecraft_id=SPACECRAFT)
 
 
 def circular_states(utc_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -77,7 +83,7 @@ def _catalogue(latitude_rad: np.ndarray, longitude_rad: np.ndarray, rng: np.rand
 def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., SyntheticPass]:
     """A function that writes a synthetic pass archive of `frames` frames."""
 
-    def make(frames: int = 40, seed: int = 1, encode: Callable[[list[bytes]], bytes] = b"".join) -> SyntheticPass:
+    def make(frames: int = 40, seed: int = 1, encode: Callable[[list[bytes]], bytes] = encode_downlink) -> SyntheticPass:
         folder = tmp_path_factory.mktemp("archive")
         rng = np.random.default_rng(seed)
         utc_ns = START + np.arange(frames, dtype=np.int64) * CADENCE_S * NS

@@ -1,0 +1,96 @@
+"""The Celery application: the jobs of `ground_service.services.jobs`, done by workers over a broker.
+
+Tasks are acknowledged when they are done and given to another worker when theirs dies; since every job may be done
+twice without harm, that loses and doubles nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from celery import Celery
+
+from ground_service.services.ground import Ground, ground_from_settings
+from ground_service.services.jobs import run_job
+from ground_service.settings import Settings, load_settings
+
+RUN_JOB = "ground_service.run_job"
+TIME_LIMIT_S = 1800
+RETRIES = 5
+VISIBILITY_TIMEOUT_S = 2 * TIME_LIMIT_S
+
+
+def make_app(settings: Settings) -> Celery:
+    """A Celery application over the deployment's broker; without one, tasks run where they are called."""
+    broker = settings.resolved_broker_url()
+    app = Celery("linna", broker=broker or "memory://", backend=None)
+    app.conf.update(
+        task_always_eager=broker is None,
+        task_eager_propagates=True,
+        task_ignore_result=True,
+        task_acks_late=True,
+        task_reject_on_worker_lost=True,
+        task_time_limit=TIME_LIMIT_S,
+        task_soft_time_limit=TIME_LIMIT_S - 30,
+        task_serializer="json",
+        accept_content=["json"],
+        worker_prefetch_multiplier=1,
+        worker_hijack_root_logger=False,
+        broker_connection_retry_on_startup=True,
+        broker_transport_options={"visibility_timeout": VISIBILITY_TIMEOUT_S},
+        task_default_queue="linna",
+        worker_max_tasks_per_child=200,
+    )
+
+    @app.task(
+        name=RUN_JOB,
+        bind=True,
+        autoretry_for=(OSError,),
+        retry_backoff=2,
+        retry_backoff_max=120,
+        max_retries=RETRIES,
+    )
+    def run(_task: Any, job_id: str) -> None:
+        run_job(_ground_of(settings), job_id)
+
+    return app
+
+
+def send_job(settings: Settings, job_id: str) -> None:
+    """Hand a job that was entered to the workers.
+
+    Raises
+    ------
+    kombu.exceptions.OperationalError
+        If the broker cannot be reached.
+    """
+    _app_of(settings).send_task(RUN_JOB, args=(job_id,))
+
+
+def application() -> Celery:
+    """The application of the environment's settings, for `celery -A ground_service.worker.app:application`."""
+    return make_app(load_settings())
+
+
+_grounds: dict[str, Ground] = {}
+_apps: dict[str, Celery] = {}
+
+
+def _key(settings: Settings) -> str:
+    return f"{settings.resolved_database_url()} {settings.home} {settings.resolved_broker_url()}"
+
+
+def _ground_of(settings: Settings) -> Ground:
+    """The service opened once per process."""
+    key = _key(settings)
+    if key not in _grounds:
+        _grounds[key] = ground_from_settings(settings)
+    return _grounds[key]
+
+
+def _app_of(settings: Settings) -> Celery:
+    key = _key(settings)
+    if key not in _apps:
+        _apps[key] = make_app(settings)
+    return _apps[key]
+
