@@ -1,0 +1,172 @@
+"""Figures of filter consistency (NEES, NIS) and of what the error depends on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from reports.figures.canvas import Canvas, TimeScale, log_length_axis, shade_arcs, thinned, time_axis
+from reports.figures.theme import color
+from reports.statistics import (
+    Binned,
+    binned,
+    chi2_quantile,
+    error_3d_m,
+    quantiles,
+    round_edges,
+    running_mean,
+)
+from reports.values import FloatArray, NavigationSeries, TimeSpan
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Styles = Mapping[str, tuple[str, tuple[float, ...] | None]]
+
+_LEFT, _RIGHT, _BOTTOM = 0.72, 1.85, 0.50
+
+
+def draw_consistency(
+    canvas: Canvas, one: NavigationSeries, styles: Styles, time: TimeScale, arcs: Sequence[TimeSpan]
+) -> None:
+    """Normalised errors and innovations, each divided by its degrees of freedom, with the 95 % bounds of one sample."""
+    parts: list[tuple[str, FloatArray, FloatArray]] = []
+    if one.nees is not None and np.isfinite(one.nees).any():
+        parts.append(("NEES per degree of freedom", one.nees, np.full(len(one.nees), 3.0)))
+    if one.nis is not None and one.nis_dof is not None and np.isfinite(one.nis).any():
+        parts.append(("NIS per degree of freedom", one.nis, np.maximum(one.nis_dof, 1).astype(np.float64)))
+    gap = 0.34
+    height = (canvas.height_in - _BOTTOM - 0.28 - gap * (len(parts) - 1)) / max(len(parts), 1)
+    keep = time.inside(one.utc_ns)
+    x = time.x(one.utc_ns[keep])
+    for i, (name, value, dof) in enumerate(parts):
+        row = len(parts) - 1 - i
+        axes = canvas.axes(_LEFT, _BOTTOM + row * (height + gap), canvas.width_in - _LEFT - _RIGHT, height)
+        time_axis(axes, time, labelled=row == 0)
+        shade_arcs(axes, time, arcs)
+        scaled, freedom = value[keep] / dof[keep], dof[keep]
+        finite = np.isfinite(scaled)
+        axes.set_yscale("log")
+        axes.set_title(name)
+        typical = float(np.median(freedom[finite])) if finite.any() else 3.0
+        low = float(chi2_quantile(0.025, typical)) / typical
+        high = float(chi2_quantile(0.975, typical)) / typical
+        axes.axhspan(max(low, 1e-3), high, color=color("silver"), alpha=0.45, linewidth=0)
+        axes.axhline(1.0, color=color("muted"), linewidth=canvas.pt(0.8), linestyle=(0, (4.0, 3.0)))
+        tint = styles[one.name][0]
+        shown = np.flatnonzero(finite)[:: max(1, int(finite.sum()) // 700)]
+        axes.plot(x[shown], scaled[shown], ".", color=tint, markersize=canvas.pt(3.0), alpha=0.55)
+        window = max(5, int(finite.sum() // 40))
+        axes.plot(*thinned(x, running_mean(scaled, window), 400), color=tint, linewidth=canvas.pt(1.6))
+        bottom, top = quantiles(scaled, (0.005, 0.995))
+        axes.set_ylim(min(max(bottom, 1e-3), 0.1) * 0.8, max(top * 1.3, 10.0))
+        ticks = [
+            t for t in (0.01, 0.1, 1.0, 10.0, 100.0, 1000.0) if axes.get_ylim()[0] <= t <= axes.get_ylim()[1]
+        ]
+        axes.set_yticks(ticks, [f"{t:g}" for t in ticks])
+        axes.set_yticks([], minor=True)
+        within = np.mean((value[keep][finite] >= chi2_quantile(0.025, freedom[finite]))
+                         & (value[keep][finite] <= chi2_quantile(0.975, freedom[finite])))  # fmt: skip
+        axes.text(
+            1.015, 0.96,
+            f"mean {float(np.mean(scaled[finite])):.2f}\n{100 * float(within):.0f} % inside 95 "
+            f"%\n{int(finite.sum())} samples",
+            transform=axes.transAxes, va="top", fontsize="small", color=color("muted"), linespacing=1.45,
+        )  # fmt: skip
+
+
+def dependences(one: NavigationSeries) -> list[tuple[str, str, Binned]]:
+    """Error of one solution by what it may depend on: name, axis label and bins of each quantity known."""
+    error = error_3d_m(one.error_rtn_m)
+    quantities: list[tuple[str, str, FloatArray | None]] = [
+        ("altitude", "altitude, km", one.altitude_m / 1e3),
+        ("sun_elevation", "Sun elevation, degrees", one.sun_elevation_deg),
+        ("matched", "craters matched", None if one.matched is None else one.matched.astype(np.float64)),
+        (
+            "time_since_fix",
+            "time since last fix, min",
+            None if one.time_since_fix_s is None else one.time_since_fix_s / 60.0,
+        ),
+    ]
+    found = []
+    for name, label, quantity in quantities:
+        if quantity is None:
+            continue
+        edges = round_edges(quantity[np.isfinite(error)])
+        if name == "matched" and len(edges) > 1 and edges[1] - edges[0] <= 1.0:
+            edges = np.arange(np.floor(edges[0]), np.ceil(edges[-1]) + 1) - 0.5
+        bins = binned(quantity, error, edges)
+        if len(bins.centre) >= 3:
+            found.append((name, label, bins))
+    return found
+
+
+def draw_dependence(canvas: Canvas, series: Sequence[NavigationSeries], styles: Styles) -> None:
+    """Median (dot) and 95th percentile (bar) of the error by altitude, light, matches and time since a fix."""
+    known = {one.name: dependences(one) for one in series}
+    names = [n for n in ("altitude", "sun_elevation", "matched", "time_since_fix")
+             if any(n == name for items in known.values() for name, _, _ in items)]  # fmt: skip
+    terrain = sorted({t for one in series for t in one.terrain if t})
+    panels = len(names) + bool(terrain)
+    if not panels:
+        return
+    columns = min(panels, 3)
+    rows = -(-panels // columns)
+    gap, between = 0.30, 0.66
+    width = (canvas.width_in - _LEFT - 0.12 - gap * (columns - 1)) / columns
+    height = (canvas.height_in - _BOTTOM - 0.36 - between * (rows - 1)) / rows
+    values = [np.concatenate([b.median, b.p95]) for items in known.values() for _, _, b in items]
+
+    def panel(i: int) -> Axes:
+        row, column = divmod(i, columns)
+        axes = canvas.axes(
+            _LEFT + column * (width + gap), _BOTTOM + (rows - 1 - row) * (height + between), width, height
+        )
+        log_length_axis(axes, "y", values)
+        if column:
+            axes.tick_params(axis="y", labelleft=False)
+        return axes
+
+    for i, name in enumerate(names):
+        axes = panel(i)
+        for k, one in enumerate(series):
+            for found, label, bins in known[one.name]:
+                if found != name:
+                    continue
+                step = float(np.diff(bins.centre).min()) if len(bins.centre) > 1 else 1.0
+                x = bins.centre + (k - (len(series) - 1) / 2) * 0.16 * step
+                tint = styles[one.name][0]
+                axes.vlines(x, bins.median, bins.p95, color=tint, linewidth=canvas.pt(1.2))
+                axes.plot(x, bins.median, "o", color=tint, markersize=canvas.pt(4.0))
+                axes.set_xlabel(label)
+    if terrain:
+        axes = panel(len(names))
+        for k, one in enumerate(series):
+            error = error_3d_m(one.error_rtn_m)
+            for j, kind in enumerate(terrain):
+                chosen = (
+                    error[np.array([t == kind for t in one.terrain], dtype=np.bool_)]
+                    if one.terrain
+                    else error[:0]
+                )
+                p50, p95 = quantiles(chosen, (0.5, 0.95))
+                if np.isfinite(p50):
+                    place = j + (k - (len(series) - 1) / 2) * 0.16
+                    axes.vlines([place], [p50], [p95], color=styles[one.name][0], linewidth=canvas.pt(1.2))
+                    axes.plot([place], [p50], "o", color=styles[one.name][0], markersize=canvas.pt(4.0))
+        axes.set_xlim(-0.6, len(terrain) - 0.4)
+        axes.set_xticks(range(len(terrain)), terrain)
+        axes.set_xlabel("terrain")
+    for k, one in enumerate(series):
+        left = _LEFT + 1.5 * k
+        canvas.text(
+            left,
+            canvas.height_in - 0.16,
+            "●",
+            color=styles[one.name][0],
+            fontsize="medium",
+            va="center_baseline",
+        )
+        canvas.text(left + 0.18, canvas.height_in - 0.16, one.name, fontsize="small", va="center_baseline")

@@ -1,0 +1,37 @@
+"""Any report value as HTML, PDF or JSON."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from reports.errors import UnknownReportKind
+from reports.json_form import to_json
+from reports.values import PassReport
+
+if TYPE_CHECKING:
+    from reports.document import Document
+
+__all__ = ["render_html", "to_json"]
+
+
+def render_html(report: Any) -> str:
+    """One self-contained HTML page; the same value gives the same text.
+
+    Raises
+    ------
+    UnknownReportKind
+        when the value is none of those of `reports.values`
+    InconsistentReport
+        when parts of the value do not fit together
+    """
+    from reports.html_page import html_page
+
+    return html_page(_document(report))
+
+
+def _document(report: Any) -> Document:
+    if isinstance(report, PassReport):
+        from reports.pass_report import pass_document
+
+        return pass_document(report)
+    raise UnknownReportKind(type(report).__name__)

@@ -1,0 +1,152 @@
+"""Frames and packets: what was expected, what came."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from reports.document import Block, Column, Facts, Heading, Paragraph, Picture, Table
+from reports.figures import accounting
+from reports.sections.common import PassView, arc_words
+from reports.text import count_text, duration_text, percent_text, utc_text
+from reports.values import FrameAccounting
+
+_MOST_GAPS = 40
+
+
+def _frame_steps(count: FrameAccounting) -> list[tuple[str, int]]:
+    steps = (
+        ("expected", count.expected),
+        ("acquired", count.acquired),
+        ("lit", count.lit),
+        ("processed", count.processed),
+        ("with detections", count.with_detections),
+        ("used to navigate", count.navigated),
+        ("in the downlink", count.downlinked),
+    )
+    return [(name, n) for name, n in steps if n is not None]
+
+
+def frames_and_packets(view: PassView) -> list[Block]:
+    report = view.report
+    blocks: list[Block] = [Heading("Frames and packets")]
+    count = report.accounting
+    steps = _frame_steps(count) if count is not None else []
+    if count is None or not steps:
+        blocks.append(view.absent("accounting", "Frame accounting"))
+    else:
+        last = steps[-1]
+        bad = "" if not count.bad_image else f" {count.bad_image} could not be used as images."
+        blocks.append(
+            Picture(
+                "frames",
+                f"Frames left after each step. Of {count_text(steps[0][1])} {steps[0][0]}, {count_text(last[1])} "
+                f"({percent_text(last[1], steps[0][1])}) are {last[0]}.{bad}",
+                "Bars: " + ", ".join(f"{name} {n}" for name, n in steps),
+                0.28 + 0.27 * len(steps),
+                lambda c: accounting.draw_frame_steps(c, steps),
+            )
+        )
+        if count.quality:
+            words = ", ".join(f"{name} {count_text(n)}" for name, n in count.quality.items())
+            blocks.append(Paragraph(f"Image quality as judged on board: {words}.", small=True))
+    packets = report.packets
+    if packets is None:
+        blocks.append(view.absent("packets", "Packet accounting"))
+        return blocks
+    whole = packets.packets + packets.lost
+    blocks.append(Heading("Downlink", 3))
+    blocks.append(
+        Facts(
+            (
+                (
+                    "Packets received",
+                    f"{count_text(packets.packets)} ({percent_text(packets.packets, whole, 2)} of those sent)",
+                ),
+                ("Packets lost", count_text(packets.lost)),
+                (
+                    "Duplicates, conflicts",
+                    f"{count_text(packets.duplicates)}, {count_text(packets.conflicts)}",
+                ),
+                ("Packets with CRC errors", count_text(packets.crc_errors)),
+                (
+                    "Transfer frames, of these bad",
+                    f"{count_text(packets.frames)}, {count_text(packets.frames_bad)}",
+                ),
+                ("Symbols corrected", count_text(packets.symbols_corrected)),
+                (
+                    "Octets, of these skipped",
+                    f"{count_text(packets.octets)}, {count_text(packets.octets_skipped)}",
+                ),
+            )
+        )
+    )
+    completeness = packets.completeness
+    if completeness is not None and len(completeness.expected):
+        faulty = int(np.sum(completeness.received < completeness.expected))
+        said = (
+            "Every interval is complete."
+            if not faulty
+            else f"{faulty} of {len(completeness.expected)} intervals are not complete."
+        )
+        blocks.append(
+            Picture(
+                "completeness",
+                f"Packets received of those expected, by on-board time. {said} Complete intervals are blue, others "
+                f"vermillion.{arc_words(view.time, report.imaging_arcs)}",
+                f"Completeness over time. {said}",
+                1.85,
+                lambda c: accounting.draw_completeness(
+                    c, completeness, view.time, report.imaging_arcs, report.gaps
+                ),
+            )
+        )
+    if packets.by_apid:
+        rows = tuple(
+            (
+                f"0x{apid:03X}",
+                a.name,
+                count_text(a.packets),
+                count_text(a.lost),
+                count_text(a.duplicates),
+                count_text(a.conflicts),
+                count_text(a.crc_errors),
+            )
+            for apid, a in sorted(packets.by_apid.items())
+        )
+        blocks.append(
+            Table(
+                "Packets by application process.",
+                (
+                    Column("APID", numeric=False),
+                    Column("packet", numeric=False),
+                    Column("received"),
+                    Column("lost"),
+                    Column("duplicates"),
+                    Column("conflicts"),
+                    Column("CRC errors"),
+                ),
+                rows,
+            )
+        )
+    if report.gaps:
+        blocks.append(
+            Table(
+                "Gaps in what was received.",
+                (
+                    Column("from", numeric=False),
+                    Column("to", numeric=False),
+                    Column("length"),
+                    Column("of", numeric=False),
+                ),
+                tuple(
+                    (
+                        utc_text(g.start_utc_ns),
+                        utc_text(g.stop_utc_ns),
+                        duration_text((g.stop_utc_ns - g.start_utc_ns) / 1e9),
+                        g.label or "packets",
+                    )
+                    for g in report.gaps[:_MOST_GAPS]
+                ),
+            )
+        )
+    return blocks

@@ -1,0 +1,98 @@
+"""What all sections of a pass report share: the value, its time axis, its colours, and why things are missing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from reports.document import Absent
+from reports.figures.canvas import TimeScale, arcs_differ
+from reports.text import hash_text
+from reports.values import ODOMETRY_OUTCOMES, NavigationSeries, PassReport, TimeSpan
+
+_USUAL_REASON = {
+    "verdict": "nobody has judged this pass",
+    "headline": "no figure was computed",
+    "accounting": "the frames of the pass were not counted",
+    "packets": "no account of the downlink came with the pass",
+    "reference": "no reference ephemeris covers the pass",
+    "navigation": "no navigation telemetry was received",
+    "outcomes": "no estimator reported what its matcher did",
+    "detector": "detections, catalogue and reference orbit were not all at hand",
+    "gallery": "the pass has no images on the ground",
+    "worst_frames": "the pass has no images on the ground",
+    "craters": "no catalogue was given for the map",
+    "housekeeping": "no housekeeping packet was received",
+    "events": "no event report was received",
+    "consistency": "no estimator reported its own uncertainty",
+    "drift": "no odometry was flown, or no path was long enough",
+    "configuration": "none was archived with the pass",
+    "provenance": "none was archived with the pass",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class PassView:
+    """A pass report with what all its sections share."""
+
+    report: PassReport
+    time: TimeScale
+    styles: Mapping[str, tuple[str, tuple[float, ...] | None]]
+
+    @property
+    def estimates(self) -> tuple[NavigationSeries, ...]:
+        return tuple(s for s in self.report.navigation if s.kind != "baseline")
+
+    @property
+    def odometry(self) -> tuple[NavigationSeries, ...]:
+        return tuple(s for s in self.estimates if any(o in ODOMETRY_OUTCOMES for o in s.outcome))
+
+    @property
+    def with_outcomes(self) -> tuple[NavigationSeries, ...]:
+        return tuple(s for s in self.report.navigation if any(s.outcome))
+
+    @property
+    def with_error(self) -> tuple[NavigationSeries, ...]:
+        return tuple(s for s in self.report.navigation if np.isfinite(s.error_rtn_m).any())
+
+    def absent(self, field: str, what: str) -> Absent:
+        """The block that says that a section is not available."""
+        why = self.report.not_available.get(field) or _USUAL_REASON.get(field, "not given")
+        return Absent(what, why)
+
+
+def role_of(tint: str) -> str:
+    """Role of a light colour."""
+    from reports.figures.theme import LIGHT
+
+    return next(role for role, value in LIGHT.items() if value == tint)
+
+
+def slug(name: str) -> str:
+    """A name as part of an id."""
+    return "".join(c if c.isalnum() else "-" for c in name.lower()).strip("-") or "series"
+
+
+def arc_words(time: TimeScale, arcs: tuple[TimeSpan, ...]) -> str:
+    """What a caption says of the tint of imaging arcs."""
+    if arcs_differ(time, arcs):
+        return " Tinted ground marks imaging arcs."
+    return " The whole span is one imaging arc." if len(arcs) == 1 else ""
+
+
+def is_hash(text: str) -> bool:
+    """True for the hexadecimal digest of anything."""
+    return len(text) >= 32 and all(c in "0123456789abcdef" for c in text)
+
+
+def setting_text(value: object) -> str:
+    """A setting as it is printed."""
+    if isinstance(value, str) and is_hash(value):
+        return hash_text(value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return ", ".join(setting_text(v) for v in value)
+    return str(value)

@@ -1,0 +1,189 @@
+"""The detector: scores beside the paper's, bias, curves, galleries."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from reports.document import Block, Cell, Column, Heading, Paragraph, Picture, Table
+from reports.figures import detector, gallery
+from reports.figures.canvas import WIDTH_IN
+from reports.published import SOURCE, TABLE_II
+from reports.sections.common import PassView
+from reports.text import NOT_A_VALUE, count_text, number_text, percent_text, significant_text
+from reports.values import ClassScore, DetectorScore, GalleryFrame
+
+
+def detector_table(score: DetectorScore) -> Table:
+    """Scores by class beside the paper's."""
+    rows: list[tuple[Cell | str, ...]] = []
+
+    def row(s: ClassScore, strong: bool) -> tuple[Cell | str, ...]:
+        paper = TABLE_II.get(s.size_class)
+        return (
+            Cell(s.label, strong=strong),
+            count_text(s.expected),
+            count_text(s.detected_true),
+            count_text(s.false_alarms),
+            number_text(s.precision, 4),
+            number_text(paper.precision, 4) if paper else NOT_A_VALUE,
+            number_text(s.recall, 4),
+            number_text(paper.recall, 4) if paper else NOT_A_VALUE,
+            number_text(s.localisation_px, 2),
+            number_text(paper.localisation_px, 2) if paper else NOT_A_VALUE,
+        )
+
+    rows = [row(s, False) for s in score.per_class]
+    if score.micro is not None:
+        rows.append(row(score.micro, True))
+    return Table(
+        f"Detection by size class, beside the {SOURCE}.",
+        (
+            Column("class", numeric=False),
+            Column("expected", group="craters"),
+            Column("found", group="craters"),
+            Column("false", group="craters"),
+            Column("here", group="precision"),
+            Column("paper", group="precision"),
+            Column("here", group="recall"),
+            Column("paper", group="recall"),
+            Column("here", group="localisation, px"),
+            Column("paper", group="localisation, px"),
+        ),
+        tuple(rows),
+        note=f"{score.method} The paper's figures are for its own synthetic test set: a mark to compare with, not the "
+        "same experiment.".strip(),
+    )
+
+
+def detector_blocks(score: DetectorScore) -> list[Block]:
+    """Table and figures of a detector score."""
+    blocks: list[Block] = []
+    scores = tuple(score.per_class)
+    if scores:
+        blocks.append(detector_table(score))
+        beats = sum(
+            s.size_class in TABLE_II
+            and s.precision > TABLE_II[s.size_class].precision
+            and s.recall > TABLE_II[s.size_class].recall
+            and s.localisation_px < TABLE_II[s.size_class].localisation_px
+            for s in scores
+        )
+        blocks.append(
+            Picture(
+                "classes",
+                "Precision, recall and mean distance of the centres by size class. Filled: here; open: the paper. "
+                f"Better than the paper in all three: {beats} of {len(scores)} classes.",
+                f"Precision, recall and localisation by class; better than the paper in all three: {beats} of "
+                f"{len(scores)} classes.",
+                1.15 + 0.34 * len(scores),
+                lambda c: detector.draw_class_scores(c, scores),
+            )
+        )
+    parts = [
+        (label, bins)
+        for label, bins in (
+            ("altitude, km", score.by_altitude_km),
+            ("Sun elevation, degrees", score.by_sun_elevation_deg),
+        )
+        if bins
+    ]
+    if parts:
+        blocks.append(
+            Picture(
+                "detector-bins",
+                "Precision and recall by altitude and by light, over the craters expected in each bin (gray, "
+                "to its own scale).",
+                "Precision and recall in bins of altitude and Sun elevation.",
+                2.3,
+                lambda c: detector.draw_bins(c, parts),
+            )
+        )
+    if score.curves or score.calibration:
+        blocks.append(
+            Picture(
+                "curves",
+                "Left: precision against recall as the threshold moves. Right: how often a detection of a "
+                "given score is true; on the "
+                "dashed line a score could be read as a probability.",
+                "Precision-recall curves and calibration.",
+                2.95,
+                lambda c: detector.draw_curves(c, score.curves, score.calibration),
+            )
+        )
+    residuals = score.residuals
+    if residuals is not None and np.isfinite(residuals.du_px).any():
+        mean, _ = detector.octant_bias(residuals)
+        whole = float(np.hypot(np.nanmean(residuals.du_px), np.nanmean(residuals.dv_px)))
+        worst = float(np.nanmax(np.hypot(mean[:, 0], mean[:, 1]))) if np.isfinite(mean).any() else math.nan
+        text = (
+            f", and {significant_text(worst, 2)} px in the worst octant of Sun azimuth"
+            if math.isfinite(worst)
+            else ""
+        )
+        blocks.append(
+            Picture(
+                "residuals",
+                "Mean signed distance between detected and expected centres. Over all it is "
+                f"{significant_text(whole, 2)} px{text}. A bias "
+                "common to a frame moves the whole fix and does not show in the innovations.",
+                f"Mean residual over all {significant_text(whole, 2)} px.",
+                3.5,
+                lambda c: detector.draw_residuals(c, residuals),
+            )
+        )
+    if score.repeatability is not None and math.isfinite(score.repeatability):
+        blocks.append(
+            Paragraph(
+                f"Repeatability: a crater detected in one frame and visible in the next is detected again in "
+                f"{percent_text(score.repeatability, 1.0)} of cases. Frame-to-frame matching needs this twice, "
+                "a catalogue once.",
+                small=True,
+            )
+        )
+    return blocks
+
+
+def detector_section(view: PassView) -> list[Block]:
+    blocks: list[Block] = [Heading("The detector")]
+    score = view.report.detector
+    found = detector_blocks(score) if score is not None else []
+    return (
+        [*blocks, *found] if found else [*blocks, view.absent("detector", "Recall, precision, localisation")]
+    )
+
+
+def gallery_picture(key: str, frames: tuple[GalleryFrame, ...], columns: int, lead: str) -> Picture:
+    """A sheet of frames with the key to its marks in the caption."""
+    return Picture(
+        key,
+        f"{lead} Crosses: detections (colour of their class; vermillion: no crater of the catalogue). Dashed "
+        "circles: craters of the "
+        "catalogue at their own size; dotted: not detected. Cyan: 5–10 km, yellow: 10–15 km, pink: 15–30 km, "
+        "gray: smaller.",
+        f"{len(frames)} image frames with detections and catalogue craters.",
+        gallery.gallery_height_in(len(frames), columns, WIDTH_IN),
+        lambda c: gallery.draw_gallery(c, frames, columns),
+    )
+
+
+def galleries(view: PassView) -> list[Block]:
+    report = view.report
+    blocks: list[Block] = [Heading("Detections over the images")]
+    if report.gallery:
+        blocks.append(
+            gallery_picture(
+                "gallery", report.gallery[:9], 3, "Frames of the pass (form of the paper's Fig. 6)."
+            )
+        )
+    else:
+        blocks.append(view.absent("gallery", "Gallery of detections"))
+    if report.worst_frames:
+        worst = report.worst_frames[:10]
+        blocks.append(
+            gallery_picture(
+                "worst", worst, 5, f"The worst {len(worst)} frames, chosen by number, not by hand."
+            )
+        )
+    return blocks

@@ -1,0 +1,336 @@
+"""Position error, drift, altitude, consistency of the filters, and what the error depends on."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from reports.document import Block, Cell, Column, Heading, Picture, Table
+from reports.figures import consistency, navigation
+from reports.sections.common import PassView, role_of, slug
+from reports.sections.summary import error_picture
+from reports.statistics import chi2_quantile, containment, error_3d_m, inside, quantiles
+from reports.text import NOT_A_VALUE, count_text, number_text
+from reports.values import NavigationSeries
+
+
+def errors(view: PassView) -> list[Block]:
+    report = view.report
+    blocks: list[Block] = [Heading("Position error")]
+    if not view.with_error:
+        field = "navigation" if not report.navigation else "reference"
+        blocks.append(view.absent(field, "Position error"))
+        return blocks
+    zoom = navigation.zoom_span(view.time, report.imaging_arcs)
+    if zoom is not None:
+        blocks.append(error_picture(view, "error-hour", 3.1, zoom))
+    arcs = report.imaging_arcs
+    blocks.append(
+        Picture(
+            "distribution",
+            "Cumulative distribution of the error. A curve further left is better; where it crosses 50 % is "
+            "its median.",
+            "Cumulative distribution of the 3-D error of every solution.",
+            2.7,
+            lambda c: navigation.draw_distribution(c, view.with_error, view.styles, arcs),
+        )
+    )
+    blocks.append(_arc_table(view))
+    for one in view.estimates:
+        if not np.isfinite(one.error_rtn_m).any():
+            continue
+        bounds = one.sigma_rtn_m is not None and np.isfinite(one.sigma_rtn_m).any()
+        text = (
+            "The gray band is three times the uncertainty that the estimator itself reports."
+            if bounds
+            else ("This estimator reports no uncertainty of its own.")
+        )
+        blocks.append(
+            Picture(
+                f"rtn-{slug(one.name)}",
+                f"Error of {one.name} in the radial, along-track and cross-track directions of the reference "
+                f"orbit. {text}",
+                f"Radial, along-track and cross-track error of {one.name}.",
+                3.6,
+                lambda c, one=one: navigation.draw_rtn(c, one, view.styles, view.time, arcs),  # type: ignore[misc]
+            )
+        )
+    return blocks
+
+
+def _arc_table(view: PassView) -> Table:
+    rows: list[tuple[Cell | str, ...]] = []
+    for one in view.with_error:
+        error = error_3d_m(one.error_rtn_m)
+        lit = inside(one.utc_ns, view.report.imaging_arcs)
+        first = True
+        for name, mask in (("imaging", lit), ("between", ~lit)):
+            finite = mask & np.isfinite(error)
+            if not finite.any():
+                continue
+            p50, p95 = quantiles(error[mask], (0.5, 0.95))
+            rms = [float(np.sqrt(np.mean(one.error_rtn_m[finite, i] ** 2))) for i in range(3)]
+            held = [
+                containment(one.error_rtn_m[mask, i], one.sigma_rtn_m[mask, i])
+                if one.sigma_rtn_m is not None
+                else math.nan
+                for i in range(3)
+            ]
+            rows.append(
+                (
+                    Cell(
+                        one.name if first else "", swatch=role_of(view.styles[one.name][0]) if first else ""
+                    ),
+                    name,
+                    count_text(int(finite.sum())),
+                    number_text(p50, 0),
+                    number_text(p95, 0),
+                    *(number_text(v, 0) for v in rms),
+                    *(NOT_A_VALUE if math.isnan(v) else number_text(100 * v, 1) for v in held),
+                )
+            )
+            first = False
+    return Table(
+        "The same errors inside imaging arcs and between them.",
+        (
+            Column("solution", numeric=False),
+            Column("arc", numeric=False),
+            Column("samples"),
+            Column("median", group="3-D error, m"),
+            Column("95 %", group="3-D error, m"),
+            Column("radial", group="rms error, m"),
+            Column("along", group="rms error, m"),
+            Column("cross", group="rms error, m"),
+            Column("radial", group="within ±3σ, %"),
+            Column("along", group="within ±3σ, %"),
+            Column("cross", group="within ±3σ, %"),
+        ),
+        tuple(rows),
+        note="A filter that knows its own error keeps 99.7 % of a Gaussian error within ±3σ.",
+    )
+
+
+def drift(view: PassView) -> list[Block]:
+    report, odometry = view.report, view.odometry
+    if not odometry:
+        return []
+    blocks: list[Block] = [Heading("Odometry: drift and resets")]
+    track = report.reference
+    if track is not None and len(track.utc_ns):
+        spans = [("ground-error", view.time, "")]
+        zoom = navigation.zoom_span(view.time, report.imaging_arcs)
+        if zoom is not None:
+            spans.append(("ground-error-hour", zoom, " One hour of it."))
+        for key, time, extra in spans:
+            resets = len(navigation.resets_of(odometry, time))
+            noun = "reset" if resets == 1 else "resets"
+            blocks.append(
+                Picture(
+                    key,
+                    "Accumulated error in latitude and longitude of the odometry, as lengths on the ground "
+                    "(form of the paper's Fig. 8)."
+                    f"{extra} It grows until the estimate is set back to the anchor ephemeris; "
+                    f"{count_text(resets)} {noun} shown.",
+                    f"Latitude and longitude error of the odometry over time, {resets} resets.",
+                    3.7,
+                    lambda c, time=time: navigation.draw_ground_error(  # type: ignore[misc]
+                        c, odometry, track, view.styles, time, report.imaging_arcs
+                    ),
+                )
+            )
+    else:
+        blocks.append(view.absent("reference", "Error in latitude and longitude"))
+    swept = tuple(s for s in view.estimates if s.drift_by_length)
+    reset = tuple(s for s in odometry if s.reset_error_m is not None and np.isfinite(s.reset_error_m).any())
+    if swept or reset:
+        shown = tuple(s for s in view.estimates if s in swept or s in reset)
+        parts = []
+        if swept:
+            parts.append(
+                "relative drift by the length of path over which it is taken (dots: median; tint: up to the "
+                "95th percentile)"
+            )
+        if reset:
+            parts.append("horizontal error at the instant before each reset")
+        caption = "; ".join(parts)
+        blocks.append(
+            Picture(
+                "drift",
+                f"{caption[0].upper()}{caption[1:]}.",
+                "Drift of the odometry.",
+                2.6,
+                lambda c: navigation.draw_drift(c, shown, view.styles),
+            )
+        )
+    if swept:
+        blocks.append(_drift_table(swept))
+    return blocks
+
+
+def _drift_table(series: tuple[NavigationSeries, ...]) -> Table:
+    lengths = sorted({d.path_length_m for s in series for d in s.drift_by_length})
+    columns = [Column("path length", unit="km")]
+    for one in series:
+        columns += [Column("median", group=f"{one.name}, %"), Column("95 %", group=f"{one.name}, %")]
+    rows = []
+    for length in lengths:
+        row: list[Cell | str] = [number_text(length / 1e3, 0)]
+        for one in series:
+            found = next((d for d in one.drift_by_length if d.path_length_m == length), None)
+            row += (
+                [number_text(found.median_percent, 3), number_text(found.p95_percent, 3)]
+                if found
+                else [NOT_A_VALUE] * 2
+            )
+        rows.append(tuple(row))
+    return Table("Relative drift by path length, percent of path.", tuple(columns), tuple(rows))
+
+
+def altitude(view: PassView) -> list[Block]:
+    report = view.report
+    blocks: list[Block] = [Heading("Altitude")]
+    track = report.reference
+    if track is None or not len(track.utc_ns):
+        blocks.append(view.absent("reference", "Altitude against the reference"))
+        return blocks
+    series = tuple(s for s in view.estimates if np.isfinite(s.altitude_m).any())
+    spans = [("altitude", view.time, "")]
+    zoom = navigation.zoom_span(view.time, report.imaging_arcs)
+    if zoom is not None:
+        spans.append(("altitude-hour", zoom, " One hour of it."))
+    low, high = float(np.nanmin(track.altitude_m)), float(np.nanmax(track.altitude_m))
+    for key, time, extra in spans:
+        blocks.append(
+            Picture(
+                key,
+                "Estimated altitude over the reference (wide green line), and the magnitude of its error "
+                f"(form of the paper's Fig. 10).{extra} "
+                f"The reference runs from {low / 1e3:.1f} to {high / 1e3:.1f} km.",
+                f"Altitude over time; the reference runs from {low / 1e3:.1f} to {high / 1e3:.1f} km.",
+                3.9,
+                lambda c, time=time: navigation.draw_altitude(  # type: ignore[misc]
+                    c, series, track, view.styles, time, report.imaging_arcs
+                ),
+            )
+        )
+    return blocks
+
+
+def consistency_section(view: PassView) -> list[Block]:
+    series = tuple(
+        s
+        for s in view.estimates
+        if (s.nees is not None and np.isfinite(s.nees).any())
+        or (s.nis is not None and s.nis_dof is not None and np.isfinite(s.nis).any())
+    )
+    if not series and not view.report.sensitivities:
+        if not view.estimates:
+            return []
+        return [Heading("Filter consistency"), view.absent("consistency", "NEES and NIS")]
+    blocks: list[Block] = [Heading("Filter consistency")]
+    for one in series:
+        both = (
+            one.nees is not None
+            and np.isfinite(one.nees).any()
+            and one.nis is not None
+            and np.isfinite(one.nis).any()
+        )
+        blocks.append(
+            Picture(
+                f"consistency-{slug(one.name)}",
+                f"Normalised estimation error squared and normalised innovation squared of {one.name}, each "
+                "divided by its degrees of "
+                "freedom, so that one is right. Dots: samples; line: running mean; band: where 95 % of the "
+                "samples of a consistent filter "
+                "lie. NIS alone cannot see an error common to all craters of a view.",
+                f"NEES and NIS of {one.name} over time.",
+                3.4 if both else 2.1,
+                lambda c, one=one: consistency.draw_consistency(
+                    c, one, view.styles, view.time, view.report.imaging_arcs
+                ),  # type: ignore[misc]
+            )
+        )
+    rows: list[tuple[Cell | str, ...]] = []
+    for one in series:
+        for name, value, dof in (
+            ("NEES", one.nees, np.full(len(one.utc_ns), 3.0)),
+            ("NIS", one.nis, one.nis_dof),
+        ):
+            if value is None or dof is None or not np.isfinite(value).any():
+                continue
+            good = np.isfinite(value) & (dof > 0)
+            freedom = np.asarray(dof, dtype=np.float64)[good]
+            inside_bounds = (value[good] >= chi2_quantile(0.025, freedom)) & (
+                value[good] <= chi2_quantile(0.975, freedom)
+            )
+            rows.append(
+                (
+                    Cell(one.name, swatch=role_of(view.styles[one.name][0])),
+                    name,
+                    count_text(int(good.sum())),
+                    number_text(float(np.sum(value[good]) / np.sum(freedom)), 2),
+                    number_text(100.0 * float(np.mean(inside_bounds)), 1),
+                )
+            )
+    if rows:
+        blocks.append(
+            Table(
+                "Consistency over the pass.",
+                (
+                    Column("solution", numeric=False),
+                    Column("quantity", numeric=False),
+                    Column("samples"),
+                    Column("mean per degree of freedom"),
+                    Column("inside the 95 % bounds", unit="%"),
+                ),
+                tuple(rows),
+            )
+        )
+    if view.report.sensitivities:
+        blocks.append(
+            Table(
+                "What a change of one setting does.",
+                (
+                    Column("setting", numeric=False),
+                    Column("value", numeric=False),
+                    Column("median", group="3-D error, m"),
+                    Column("95 %", group="3-D error, m"),
+                    Column("NEES"),
+                ),
+                tuple(
+                    (
+                        s.name,
+                        s.setting,
+                        number_text(s.median_3d_m, 0),
+                        number_text(s.p95_3d_m, 0),
+                        number_text(s.nees, 1),
+                    )
+                    for s in view.report.sensitivities
+                ),
+            )
+        )
+    return blocks
+
+
+def dependence(view: PassView) -> list[Block]:
+    series = tuple(s for s in view.estimates if np.isfinite(s.error_rtn_m).any())
+    found = {name for s in series for name, _, _ in consistency.dependences(s)}
+    terrain = navigation.terrain_kinds(series)
+    panels = len(found) + bool(terrain)
+    if not panels or sum(len(s.utc_ns) for s in series) < 20:
+        return []
+    rows = -(-panels // 3)
+    return [
+        Heading("What the error depends on"),
+        Picture(
+            "dependence",
+            "3-D error by altitude, light, number of craters matched, time since the last fix and terrain, as "
+            "far as they are known. "
+            "Dot: median of a bin; line above it: up to the 95th percentile. Bins with fewer than five "
+            "samples are left out.",
+            "Median and 95th percentile of the error in bins of each quantity.",
+            0.86 + rows * 1.75 + (rows - 1) * 0.66,
+            lambda c: consistency.draw_dependence(c, series, view.styles),
+        ),
+    ]

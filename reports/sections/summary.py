@@ -1,0 +1,103 @@
+"""The first page: verdict, figures, the errors of all solutions at a glance, what is missing."""
+
+from __future__ import annotations
+
+import math
+
+from reports.document import Block, Bullets, Cell, Column, Heading, Headline, Picture, Table, Verdict
+from reports.figures import navigation
+from reports.figures.canvas import TimeScale
+from reports.sections.common import PassView, arc_words, role_of
+from reports.statistics import completed, error_3d_m, quantiles
+from reports.text import NOT_A_VALUE, count_text, length_text, number_text
+
+
+def summary(view: PassView) -> list[Block]:
+    report = view.report
+    blocks: list[Block] = []
+    if report.verdict:
+        blocks.append(Verdict(report.verdict, report.verdict_level))
+    else:
+        blocks.append(view.absent("verdict", "Verdict"))
+    if report.headline:
+        blocks.append(Headline(report.headline, report.evidence_rung))
+    else:
+        blocks.append(view.absent("headline", "Five figures"))
+    blocks.append(Heading("At a glance"))
+    if view.with_error:
+        blocks.append(error_picture(view, "glance", 2.75, view.time))
+        blocks.append(_statistics_table(view))
+    else:
+        blocks.append(view.absent("navigation", "Navigation"))
+    missing = sorted(set(report.not_available))
+    if missing:
+        blocks.append(Heading("What this report does not show", 3))
+        blocks.append(Bullets(tuple(f"{m.replace('_', ' ')}: {report.not_available[m]}" for m in missing)))
+    if report.remarks:
+        blocks.append(Heading("Remarks", 3))
+        blocks.append(Bullets(report.remarks))
+    return blocks
+
+
+def _statistics_table(view: PassView) -> Table:
+    rows: list[tuple[Cell | str, ...]] = []
+    for one in view.report.navigation:
+        s = completed(one)
+        color = view.styles[one.name][0]
+        reads = one.anchor_reads_after_start
+        kind = "baseline" if one.kind == "baseline" else "flown"
+        rows.append(
+            (
+                Cell(one.name, swatch=role_of(color), strong=one.kind != "baseline"),
+                kind,
+                number_text(s.median_3d_m, 0),
+                number_text(s.p68_3d_m, 0),
+                number_text(s.p95_3d_m, 0),
+                number_text(s.p99_3d_m, 0),
+                number_text(s.max_3d_m, 0),
+                number_text(s.end_of_pass_m, 0),
+                number_text(s.drift_percent, 3),
+                NOT_A_VALUE
+                if kind == "baseline"
+                else count_text(one.anchor_reads if reads is None else reads),
+            )
+        )
+    return Table(
+        "3-D position error against the reference, over all samples and without any alignment.",
+        (
+            Column("solution", numeric=False),
+            Column("kind", numeric=False),
+            Column("median", group="3-D error, m"),
+            Column("68 %", group="3-D error, m"),
+            Column("95 %", group="3-D error, m"),
+            Column("99 %", group="3-D error, m"),
+            Column("largest", group="3-D error, m"),
+            Column("at the end", group="3-D error, m"),
+            Column("drift", unit="% of path"),
+            Column("anchor reads", unit="after start"),
+        ),
+        tuple(rows),
+        note="Drift is the horizontal error gathered since the last reset, at the instant before the next, over the "
+        "path since that reset; the median over resets. A dash means that there is no such value.",
+    )
+
+
+def error_picture(view: PassView, key: str, height_in: float, time: TimeScale) -> Picture:
+    series, arcs = view.with_error, view.report.imaging_arcs
+    known = [(s.name, quantiles(error_3d_m(s.error_rtn_m)[time.inside(s.utc_ns)], (0.5,))[0]) for s in series]
+    best = min((k for k in known if math.isfinite(k[1])), key=lambda k: k[1], default=("none", math.nan))
+    resets = len(navigation.resets_of(view.estimates, time))
+    marks = ""
+    if resets == 1:
+        marks = " The dashed gray line marks a reset to the anchor ephemeris."
+    elif resets:
+        marks = f" Dashed gray lines, or ticks at the top, mark {count_text(resets)} resets to the anchor."
+    return Picture(
+        key,
+        f"{'' if time is view.time else 'One hour of it: '}3-D position error of every solution, flown (full "
+        "lines) and computed for comparison (gray), on a logarithmic axis. "
+        f"Smallest median: {best[0]}, {length_text(best[1])}.{arc_words(time, arcs)}{marks}",
+        f"Error over time. Smallest median: {best[0]}, {length_text(best[1])}.",
+        height_in,
+        lambda c: navigation.draw_error_over_time(c, series, view.styles, time, arcs),
+    )
