@@ -18,44 +18,45 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lunar.elements import Elements, state_from_elements
-from lunar.gravity import GravityField, builtin_gravity, load_gravity
-from lunar.maneuvers import Maneuver, ManeuverRule, propagate_with_maneuvers
-from lunar.propagation import ForceModel, propagate
-from lunar.third_bodies import sun_position_icrf_m
 from numpy.typing import NDArray
-from tmtc.downlink import encode_cadus
 
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue, save_catalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder, default_gravity, default_orientation
+from lunar.elements import Elements, icrf_state_from_elements, state_from_elements
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
-from lunar.frames import IauOrientation, Orientation, mci_from_icrf, rtn_from_inertial, spherical_from_mcmf
+from lunar.frames import IauOrientation, Orientation, rtn_from_inertial, spherical_from_mcmf
+from lunar.gravity import GravityField, builtin_gravity, load_gravity
+from lunar.maneuvers import Maneuver, ManeuverRule, propagate_with_maneuvers
 from lunar.oem import load_oem, save_oem
+from lunar.propagation import ForceModel, propagate
+from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns, utc_ns_from_tdb_s
 from payload_emulator.errors import ScenarioError
 from payload_emulator.loading import LoadedPayload, load_payload
 from payload_emulator.scenario import Scenario, format_scenario
+from payload_emulator.sim.light import sun_direction_mcmf
 from payload_emulator.sim.renderer import render
 from payload_emulator.sim.sensor import SensorModel, expose
-from payload_emulator.sim.terrain import Terrain, open_terrain
+from payload_emulator.sim.terrain.opening import open_terrain
+from payload_emulator.sim.terrain.tiles import TiledTerrain
 from payload_emulator.sim.truth import (
     Truth,
     attitude_message,
     find_windows,
     frame_times,
-    paper_sun_direction,
     perturbed,
     require_above_ground,
 )
+from tmtc.downlink import encode_cadus
 
 SPACECRAFT_ID = 0x4C
 _NS = 1_000_000_000
 _EPHEMERIS_STEP_NS = 10 * _NS
 _EPHEMERIS_MARGIN_NS = 120 * _NS
-_SEARCH_CHUNK_DAYS = 3.0
-_CATALOGUE_MARGIN_M = 30_000.0
+_SEARCH_CHUNK_DAYS = 15.0
+_CATALOGUE_MARGIN_M = 15_000.0
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -68,7 +69,7 @@ class World:
 
     scenario: Scenario
     truth: Truth
-    terrain: Terrain
+    terrain: TiledTerrain
     gravity: GravityField
     maneuvers: tuple[Maneuver, ...]
     frame_utc_ns: IntArray
@@ -316,7 +317,8 @@ def _sun_direction(
     if light.mode == "paper":
         elevation = np.radians(rng.uniform(light.elevation_min_deg, light.elevation_max_deg))
         azimuth = np.radians(rng.uniform(light.azimuth_min_deg, light.azimuth_max_deg))
-        return paper_sun_direction(position_mcmf_m, elevation, azimuth)
+        latitude, longitude, _ = spherical_from_mcmf(position_mcmf_m)
+        return sun_direction_mcmf(elevation, azimuth, float(latitude), float(longitude))
     from_moon = sun_position_icrf_m(tdb_s) - world.truth.state_icrf(np.array([tdb_s]))[0, :3]
     return world.truth.orientation.mcmf_from_icrf(tdb_s) @ (from_moon / np.linalg.norm(from_moon))
 
@@ -330,7 +332,7 @@ def _clock_ticks(world: World, utc_ns: int) -> int:
 
 
 def _fly_to_windows(
-    scenario: Scenario, gravity: GravityField, orientation: Orientation, terrain: Terrain
+    scenario: Scenario, gravity: GravityField, orientation: Orientation, terrain: TiledTerrain
 ) -> tuple[Truth, tuple[Maneuver, ...], list[tuple[int, int]]]:
     """Propagate in chunks until the wanted windows are found; truth, burns on the way, windows."""
     window = scenario.window
@@ -358,16 +360,23 @@ def _fly_to_windows(
 
 
 def _windows(
-    scenario: Scenario, truth: Truth, terrain: Terrain, not_before_utc_ns: int
+    scenario: Scenario, truth: Truth, terrain: TiledTerrain, not_before_utc_ns: int
 ) -> list[tuple[int, int]]:
     window = scenario.window
     if window.search == "none":
         return [
             (not_before_utc_ns, min(not_before_utc_ns + round(window.duration_s * _NS), truth.stop_utc_ns))
         ]
+    west_deg, width_deg = window.longitude_min_deg, window.longitude_max_deg - window.longitude_min_deg
+
+    def observable(latitude_rad: FloatArray, longitude_rad: FloatArray) -> NDArray[np.bool_]:
+        return terrain.covers(latitude_rad, longitude_rad) & (
+            (np.degrees(longitude_rad) - west_deg) % 360.0 <= width_deg
+        )
+
     return find_windows(
         truth,
-        terrain.covers,
+        observable,
         not_before_utc_ns=not_before_utc_ns,
         latitude_limit_rad=np.radians(window.latitude_limit_deg),
         direction=window.direction,
@@ -387,11 +396,10 @@ def initial_state_icrf(scenario: Scenario, gravity: GravityField) -> FloatArray:
         np.radians(orbit.argument_of_perilune_deg),
         np.radians(orbit.true_anomaly_deg),
     )
-    position, velocity = state_from_elements(elements, gravity.gm_m3_s2)
-    if orbit.frame == "MCI":
-        icrf_from_mci = mci_from_icrf(float(tdb_s_from_utc_ns(scenario.epoch_utc_ns))).T
-        position, velocity = icrf_from_mci @ position, icrf_from_mci @ velocity
-    return np.concatenate([position, velocity])
+    if orbit.frame == "ICRF":
+        return np.concatenate(state_from_elements(elements, gravity.gm_m3_s2))
+    epoch_tdb_s = float(tdb_s_from_utc_ns(scenario.epoch_utc_ns))
+    return np.concatenate(icrf_state_from_elements(elements, epoch_tdb_s, gravity.gm_m3_s2))
 
 
 def _propagate(
@@ -399,7 +407,7 @@ def _propagate(
 ) -> tuple[Truth, tuple[Maneuver, ...]]:
     dynamics, rule = scenario.dynamics, scenario.maneuvers
     model = ForceModel(
-        gravity, min(dynamics.degree, gravity.degree), orientation, earth=dynamics.earth, sun=dynamics.sun
+        gravity, orientation, min(dynamics.degree, gravity.degree), earth=dynamics.earth, sun=dynamics.sun
     )
     start_tdb_s = float(tdb_s_from_utc_ns(scenario.epoch_utc_ns))
     state = initial_state_icrf(scenario, gravity)
@@ -464,12 +472,13 @@ def _catalogue_near_track(world: World) -> CraterCatalogue:
         )
         for i in range(latitude.size)
     ]
-    chosen = world.terrain.catalogue.select(np.unique(np.concatenate(near)))
+    chosen = np.unique(np.concatenate(near))
+    diameter_m = world.terrain.catalogue.diameter_m[chosen]
     navigation = world.scenario.navigation
-    useful = (chosen.diameter_m >= 1e3 * navigation.catalogue_min_diameter_km) & (
-        chosen.diameter_m <= 1e3 * navigation.catalogue_max_diameter_km
+    useful = (diameter_m >= 1e3 * navigation.catalogue_min_diameter_km) & (
+        diameter_m <= 1e3 * navigation.catalogue_max_diameter_km
     )
-    return world.terrain.with_rim_heights(chosen.select(useful))
+    return world.terrain.measured(chosen[useful])
 
 
 def _gravity(name: str, data: DataFolder) -> GravityField:

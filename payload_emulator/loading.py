@@ -7,8 +7,7 @@ simulated truth passes through here except what a scenario declares to be known.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
-from importlib import resources
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +16,44 @@ from numpy.typing import NDArray
 
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
+from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris
-from lunar.frames import Orientation
+from lunar.frames import IauOrientation, Orientation
+from lunar.gravity import GravityField, builtin_gravity, load_gravity
 from lunar.timescales import format_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
 from payload_emulator.errors import ModelError
+from payload_emulator.flight.anchored import AnchoredParameters
 from payload_emulator.flight.detector import DetectorParameters, OnnxDetector
+from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.odometry import OdometryParameters
 from payload_emulator.flight.outcomes import Mode
 from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload
-from payload_emulator.flight.tables import pack_anchor_table
+from payload_emulator.flight.tables import (
+    CatalogueTable,
+    GravityTable,
+    InitialState,
+    pack_anchor_table,
+    pack_catalogue_table,
+    pack_gravity_table,
+    pack_initial_state,
+    pack_orientation_table,
+)
 from payload_emulator.scenario import Scenario
 
-SHIPPED_MODEL = "linna.onnx"
 _ANCHOR_STEP_NS = 15_000_000_000
+_ORIENTATION_STEP_NS = 3_600_000_000_000
+_ORIENTATION_MARGIN_NS = 4 * _ORIENTATION_STEP_NS
+
+# Without a second field at hand the filter flies the built-in one cut to this degree: never the field of the truth.
+_CUT_DEGREE = 8
+# Craters shallower than this share of their diameter can hardly be seen by anyone; a quarter of a real list is so.
+_VISIBLE_DEPTH_RATIO = 0.025
+# Error of a catalogue's centres, 1 sigma per axis: 107 m (median) for fresh craters of 5 to 15 km on GLD100, growing
+# with size; of rim heights taken from a raster of 128 pixels per degree.
+_CENTRE_SIGMA_FLOOR_M = 90.0
+_CENTRE_SIGMA_OF_DIAMETER = 0.03
+_HEIGHT_SIGMA_M = 50.0
 
 FloatArray = NDArray[np.float64]
 
@@ -67,16 +90,31 @@ def load_payload(
     detector = OnnxDetector(
         model_octets, DetectorParameters(width_px=camera.width_px, height_px=camera.height_px)
     )
+    navigation = scenario.navigation
+    field = _filter_field(navigation.filter_gravity, navigation.filter_degree, data)
     parameters = FlightParameters(
         camera=camera,
-        modes=tuple(Mode[name] for name in scenario.navigation.estimators),
-        odometry=OdometryParameters(safety_timeout_s=scenario.navigation.safety_timeout_s or None),
+        modes=tuple(Mode[name] for name in navigation.estimators),
+        odometry=OdometryParameters(safety_timeout_s=navigation.safety_timeout_s or None),
+        anchored=AnchoredParameters(gravity_degree=field.degree),
     )
-    tables = FlightTables(anchor_ephemeris=_anchor_table(reference, orientation))
+    start, stop = reference.start_utc_ns, reference.stop_utc_ns
+    flight_orientation = IauOrientation()
+    position, velocity = reference.at(np.array([first_frame_utc_ns]))
+    tables = FlightTables(
+        anchor_ephemeris=_anchor_table(reference, orientation),
+        catalogue=pack_catalogue_table(_catalogue_table(scenario, catalogue)),
+        gravity=pack_gravity_table(
+            GravityTable(field.name, field.gm_m3_s2, field.radius_m, field.c_bar, field.s_bar)
+        ),
+        orientation=_orientation_table(flight_orientation, start, stop),
+        initial_state=pack_initial_state(
+            _initial_state(scenario, first_frame_utc_ns, position[0], velocity[0])
+        ),
+    )
     payload = Payload(
         detector, parameters, tables, model_hash=detector.model_hash, model_octets=len(model_octets)
     )
-    position, velocity = reference.at(np.array([first_frame_utc_ns]))
     return LoadedPayload(
         payload,
         build={
@@ -90,9 +128,80 @@ def load_payload(
             "position_icrf_m": position[0].tolist(),
             "velocity_icrf_m_s": velocity[0].tolist(),
         },
-        table_hashes={"anchor_ephemeris": hashlib.sha256(tables.anchor_ephemeris).hexdigest()},
-        gravity={},
+        table_hashes={
+            item.name: hashlib.sha256(getattr(tables, item.name)).hexdigest() for item in fields(tables)
+        },
+        gravity={
+            "filter": field.name,
+            "filter_degree": field.degree,
+            "filter_orientation": flight_orientation.name,
+        },
     )
+
+
+def _catalogue_table(scenario: Scenario, catalogue: CraterCatalogue) -> CatalogueTable:
+    """The anchoring catalogue: craters deep enough to be seen, with their errors' sizes and (seeded) their errors."""
+    with np.errstate(invalid="ignore"):
+        depth_ratio = catalogue.depth_m / catalogue.diameter_m
+    known = np.isfinite(catalogue.rim_height_m) & ~(depth_ratio < _VISIBLE_DEPTH_RATIO)
+    chosen = catalogue.select(known)
+    navigation = scenario.navigation
+    rng = np.random.default_rng((scenario.seed, 2**34))
+    horizontal_m = navigation.catalogue_error_fraction_of_diameter * chosen.diameter_m
+    north_m, east_m = horizontal_m * rng.standard_normal((2, len(chosen)))
+    height_m = navigation.catalogue_height_error_m * rng.standard_normal(len(chosen))
+    centre_sigma_m = np.maximum(_CENTRE_SIGMA_FLOOR_M, _CENTRE_SIGMA_OF_DIAMETER * chosen.diameter_m)
+    return CatalogueTable(
+        chosen.ids,
+        chosen.latitude_rad + north_m / MOON_RADIUS_M,
+        chosen.longitude_rad + east_m / (MOON_RADIUS_M * np.cos(chosen.latitude_rad)),
+        chosen.diameter_m,
+        chosen.rim_height_m + height_m,
+        np.stack([centre_sigma_m, centre_sigma_m, np.full(len(chosen), _HEIGHT_SIGMA_M)], axis=1),
+    )
+
+
+def _initial_state(
+    scenario: Scenario, utc_ns: int, position_icrf_m: FloatArray, velocity_icrf_m_s: FloatArray
+) -> InitialState:
+    """The state that starts the filter: the reference, displaced by a (seeded) error of the declared size."""
+    navigation = scenario.navigation
+    directions = np.random.default_rng((scenario.seed, 2**35)).standard_normal((2, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    position_error_m = max(navigation.initial_position_error_m, 1.0)
+    velocity_error_m_s = max(navigation.initial_velocity_error_m_s, 1e-3)
+    return InitialState(
+        int(ticks_from_utc_ns(utc_ns)),
+        position_icrf_m + navigation.initial_position_error_m * directions[0],
+        velocity_icrf_m_s + navigation.initial_velocity_error_m_s * directions[1],
+        position_error_m,
+        velocity_error_m_s,
+    )
+
+
+def _filter_field(name: str, degree: int, data: DataFolder) -> GravityField:
+    """The gravity field the filter flies: by default another one than the truth's."""
+    if name == "auto":
+        if data.gravity_alternative is None:
+            return builtin_gravity().truncated(min(degree, _CUT_DEGREE))
+        field = load_gravity(data.gravity_alternative)
+    else:
+        field = builtin_gravity() if name == "builtin" else load_gravity(Path(name))
+    return field.truncated(min(degree, field.degree))
+
+
+def _orientation_table(orientation: Orientation, start_utc_ns: int, stop_utc_ns: int) -> bytes:
+    """The rotation of the Moon as uploaded, an hour between samples, with a margin for interpolation."""
+    times = np.arange(
+        start_utc_ns - _ORIENTATION_MARGIN_NS,
+        stop_utc_ns + _ORIENTATION_MARGIN_NS,
+        _ORIENTATION_STEP_NS,
+        np.int64,
+    )
+    tdb_s = np.asarray(tdb_s_from_utc_ns(times), dtype=np.float64)
+    mcmf_from_icrf = orientation.mcmf_from_icrf(tdb_s)
+    pa_from_mcmf = orientation.pa_from_icrf(tdb_s[0]) @ mcmf_from_icrf[0].T
+    return pack_orientation_table(np.asarray(ticks_from_utc_ns(times)), mcmf_from_icrf, pa_from_mcmf)
 
 
 def _anchor_table(reference: Ephemeris, orientation: Orientation) -> bytes:
@@ -106,12 +215,9 @@ def _anchor_table(reference: Ephemeris, orientation: Orientation) -> bytes:
 
 
 def _model_octets(model: Path | None) -> bytes:
-    if model is not None:
-        return model.read_bytes()
-    shipped = resources.files("payload_emulator.flight") / "models" / SHIPPED_MODEL
     try:
-        return shipped.read_bytes()
+        return load_shipped_model() if model is None else model.read_bytes()
     except FileNotFoundError:
         raise ModelError(
-            f"shipped detector model {SHIPPED_MODEL}: expected beside flight software, found none"
+            f"detector model {model or 'shipped with flight'}: expected an ONNX file, found none"
         ) from None

@@ -64,7 +64,8 @@ class WindowSection:
     """When the payload observes.
 
     `search`: "terrain" takes the first window of the wanted direction whose whole track lies over the terrain at hand,
-    no earlier than `start` (the orbit's epoch when empty); "none" observes from `start` for `duration_s`.
+    no earlier than `start` (the orbit's epoch when empty), between the two longitudes (east-positive; the second may
+    exceed 360); "none" observes from `start` for `duration_s`.
     Frames are taken where the sub-satellite latitude is within `latitude_limit_deg`.
     """
 
@@ -74,6 +75,8 @@ class WindowSection:
     passes: int = 1
     direction: Literal["ascending", "descending", "any"] = "ascending"
     latitude_limit_deg: float = 60.0
+    longitude_min_deg: float = 0.0
+    longitude_max_deg: float = 360.0
     search_days: float = 30.0
 
 
@@ -102,17 +105,21 @@ class LightSection:
 class TerrainSection:
     """`auto`: the real terrain where its rasters are at hand, else the procedural Moon."""
 
-    source: Literal["auto", "real", "procedural"] = "auto"
+    source: Literal["auto", "raster", "procedural"] = "auto"
     sub_resolution_craters: bool = True
 
 
 @dataclass(frozen=True, slots=True)
 class NavigationSection:
-    """Estimators on board, and what they are started and fed with."""
+    """Estimators on board, and what they are started and fed with.
 
-    estimators: tuple[str, ...] = ("paper", "spherical")
-    initial_position_error_m: float = 0.0
-    initial_velocity_error_m_s: float = 0.0
+    The initial errors are of the state that starts the filter (1 sigma per axis declared, that length drawn). Errors of
+    the on-board catalogue come on top of those that the terrain's own catalogue has.
+    """
+
+    estimators: tuple[str, ...] = ("paper", "spherical", "anchored")
+    initial_position_error_m: float = 1000.0
+    initial_velocity_error_m_s: float = 1.0
     filter_gravity: str = "auto"
     filter_degree: int = 100
     catalogue_min_diameter_km: float = 3.0
@@ -338,6 +345,12 @@ def _check(scenario: Scenario, source: str) -> None:
         "window.latitude_limit_deg",
         "over 0 and up to 90",
         window.latitude_limit_deg,
+    )
+    require(
+        0.0 < window.longitude_max_deg - window.longitude_min_deg <= 360.0,
+        "window.longitude_max_deg",
+        "over window.longitude_min_deg by up to 360",
+        window.longitude_max_deg,
     )
     require(window.passes >= 1, "window.passes", "at least 1", window.passes)
     require(

@@ -25,11 +25,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from ground_service.services.archive_import import import_archive
-    from ground_service.services.reports import write_report
-    from ground_service.services.summary import pass_summary
-
-    from ground_service.settings import load_settings
-    from ground_service.store.database import open_store
+    from ground_service.services.ground import open_ground
+    from ground_service.services.reports import make_report
     from linna.data import data_folder
     from payload_emulator.emulator import emulate
     from payload_emulator.scenario import load_scenario
@@ -47,16 +44,14 @@ def run(arguments: argparse.Namespace) -> int:
         progress=lambda frames, total: progress(frames, total, "frames", "frame"),
     )
     log("ingesting the downlink, aligning, reporting ...")
-    settings = load_settings(home=arguments.out / "ground", data=data.root)
-    with open_store(settings) as store:
-        pass_id = import_archive(store, archive, data)
-        report = write_report(store, pass_id, data)
-        ground = pass_summary(store, pass_id)
+    with open_ground(arguments.out / "ground", data) as ground:
+        pass_id = import_archive(ground, archive)
+        made = make_report(ground, pass_id)
     figures = {
-        "report": str(report),
+        "report": str(made.html),
         "pass_id": pass_id,
         "frames": emulated["frames"],
-        **ground,
+        **made.summary,
         "wall_s": round(time.monotonic() - started, 2),
         "data": emulated["data"],
     }
