@@ -1,8 +1,9 @@
-"""Compiled loops of the fast renderer: tangent grid, shadow sweep, per-pixel hit and shade.  See `renderer` for the frame."""
+"""Compiled loops of the fast renderer and the sensor; `renderer` explains the frame."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -17,9 +18,19 @@ CLOSE_TEXELS = 0.04
 
 
 @njit(fastmath=True, error_model="numpy")
-def fill_grid(  # type: ignore[no-untyped-def]
-    heights, node_row, node_column, slope_row, slope_column, pool, table, shift, x0, y0, texel
-):
+def fill_grid(
+    heights: Any,
+    node_row: Any,
+    node_column: Any,
+    slope_row: Any,
+    slope_column: Any,
+    pool: Any,
+    table: Any,
+    shift: Any,
+    x0: Any,
+    y0: Any,
+    texel: Any,
+) -> Any:
     """Fill ``heights`` with z of the ground in the tangent frame.
 
     A grid point sees ground of height h at the place ``node + h * slope``; the height of the row before is close enough
@@ -80,7 +91,9 @@ def fill_grid(  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=True, error_model="numpy")
-def sweep_shadows(heights, shadow, distance, texel, tangent, penumbra, depth):  # type: ignore[no-untyped-def]
+def sweep_shadows(
+    heights: Any, shadow: Any, distance: Any, texel: Any, tangent: Any, penumbra: Any, depth: Any
+) -> Any:
     """Fill ``depth`` with how far the ground rises out of shadow, in half widths of the penumbra (-1..1 is partly lit).
 
     ``shadow`` and ``distance`` (columns) hold the height of the line of light and the distance of its caster one texel
@@ -105,7 +118,7 @@ def sweep_shadows(heights, shadow, distance, texel, tangent, penumbra, depth):  
 
 
 @njit(fastmath=True, error_model="numpy")
-def block_peaks(heights):  # type: ignore[no-untyped-def]
+def block_peaks(heights: Any) -> Any:
     """Highest z of every block of 8 x 8 grid cells (their borders included)."""
     rows, columns = heights.shape
     size = 1 << BLOCK_SHIFT
@@ -128,8 +141,13 @@ def block_peaks(heights):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=True, error_model="numpy")
-def fill_albedo(out, step, node_row, node_column, pool, table, shift, pixel_step):  # type: ignore[no-untyped-def]
-    """Fill ``out`` with the albedo at every ``step``-th grid point; an albedo pixel spans ``pixel_step`` height pixels."""
+def fill_albedo(
+    out: Any, step: Any, node_row: Any, node_column: Any, pool: Any, table: Any, shift: Any, pixel_step: Any
+) -> Any:
+    """Fill ``out`` with the albedo at every ``step``-th grid point.
+
+    An albedo pixel spans ``pixel_step`` height pixels.
+    """
     mask = (1 << shift) - 1
     scale = 1.0 / pixel_step
     for i in range(out.shape[0]):
@@ -157,7 +175,7 @@ def fill_albedo(out, step, node_row, node_column, pool, table, shift, pixel_step
 
 
 @njit(fastmath=True, error_model="numpy", inline="always")
-def _clearance(heights, i, j, z):  # type: ignore[no-untyped-def]
+def _clearance(heights: Any, i: Any, j: Any, z: Any) -> Any:
     """How far a point lies above the ground, bilinear."""
     a = np.uint64(i)
     b = np.uint64(j)
@@ -170,11 +188,14 @@ def _clearance(heights, i, j, z):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=True, error_model="numpy")
-def find_hit(heights, peaks, i0, j0, z0, di, dj, dz, start, stop):  # type: ignore[no-untyped-def]
+def find_hit(
+    heights: Any, peaks: Any, i0: Any, j0: Any, z0: Any, di: Any, dj: Any, dz: Any, start: Any, stop: Any
+) -> Any:
     """First parameter t in [start, stop] at which a ray (i0 + t di, j0 + t dj, z0 + t dz) meets the ground.
 
-    Steps are as long as the clearance and its last rate of change allow, at most one texel; a ray still high after four leaps over
-    blocks whose highest point lies under it.  -1 where nothing is hit, -2 where the ray starts under ground.
+    Steps are as long as the clearance and its last rate of change allow, at most one texel; a ray still high
+    after four leaps over blocks whose highest point lies under it.  -1 where nothing is hit, -2 where the ray
+    starts under ground.
     """
     pace = 1.0 / max(abs(di), abs(dj), 1.0e-9)
     size = 1 << BLOCK_SHIFT
@@ -233,14 +254,25 @@ def find_hit(heights, peaks, i0, j0, z0, di, dj, dz, start, stop):  # type: igno
 
 
 @njit(fastmath=True, error_model="numpy")
-def trace_pixels(  # type: ignore[no-untyped-def]
-    heights, peaks, x0, y0, texel, altitude, tangent_from_camera, focal, centre_u, centre_v, depth_along
-):
+def trace_pixels(
+    heights: Any,
+    peaks: Any,
+    x0: Any,
+    y0: Any,
+    texel: Any,
+    altitude: Any,
+    tangent_from_camera: Any,
+    focal: Any,
+    centre_u: Any,
+    centre_v: Any,
+    depth_along: Any,
+) -> Any:
     """Fill ``depth_along`` (H, W) with the distance of the first hit along the boresight; -1 where there is none.
 
-    The picture is walked outward from the nadir, in lines of four sectors.  The ray of a pixel passes above those of its two
-    neighbours nearer the nadir, so the ground up to their hits is clear and the search starts at the nearer of them.  Three
-    evaluations without a branch settle most pixels (many in flight at once); the others are searched one by one.
+    The picture is walked outward from the nadir, in lines of four sectors.  The ray of a pixel passes above those
+    of its two neighbours nearer the nadir, so the ground up to their hits is clear and the search starts at the
+    nearer of them.  Three evaluations without a branch settle most pixels (many in flight at once); the others are
+    searched one by one.
     """
     rows, columns = heights.shape
     high, wide = depth_along.shape
@@ -380,7 +412,19 @@ def trace_pixels(  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=True, error_model="numpy")
-def _search(heights, peaks, i0, j0, altitude, di, dj, dz, first, top, low):  # type: ignore[no-untyped-def]
+def _search(
+    heights: Any,
+    peaks: Any,
+    i0: Any,
+    j0: Any,
+    altitude: Any,
+    di: Any,
+    dj: Any,
+    dz: Any,
+    first: Any,
+    top: Any,
+    low: Any,
+) -> Any:
     """First hit of one ray: from ``first`` if that is above ground, else from the highest ground down; -1 for none."""
     rows, columns = heights.shape
     start = 0.0
@@ -406,11 +450,28 @@ def _search(heights, peaks, i0, j0, altitude, di, dj, dz, first, top, low):  # t
 
 
 @njit(fastmath=True, error_model="numpy")
-def shade_pixels(  # type: ignore[no-untyped-def]
-    heights, depth, x0, y0, texel, tangent_from_camera, focal, centre_u, centre_v,
-    sun_up, sun_flat, law, hapke, albedo, albedo_step, mean_albedo, contrast,
-    radiance, lit, range_m,
-):
+def shade_pixels(
+    heights: Any,
+    depth: Any,
+    x0: Any,
+    y0: Any,
+    texel: Any,
+    tangent_from_camera: Any,
+    focal: Any,
+    centre_u: Any,
+    centre_v: Any,
+    sun_up: Any,
+    sun_flat: Any,
+    law: Any,
+    hapke: Any,
+    albedo: Any,
+    albedo_step: Any,
+    mean_albedo: Any,
+    contrast: Any,
+    radiance: Any,
+    lit: Any,
+    range_m: Any,
+) -> Any:
     """Fill the pictures from ``range_m``, which comes as the depth along the boresight.
 
     The Sun stands at -x: its vector is (-sun_flat, 0, sun_up).
@@ -510,5 +571,36 @@ def shade_pixels(  # type: ignore[no-untyped-def]
             fj = np.float32(j - q)
             a0 = albedo[p, q] + fj * (albedo[p, q + next_one] - albedo[p, q])
             a1 = albedo[p + next_one, q] + fj * (albedo[p + next_one, q + next_one] - albedo[p + next_one, q])
-            shade = np.float32(mean_albedo) + np.float32(contrast) * (a0 + fi * (a1 - a0) - np.float32(mean_albedo))
+            shade = np.float32(mean_albedo) + np.float32(contrast) * (
+                a0 + fi * (a1 - a0) - np.float32(mean_albedo)
+            )
             radiance[v, u] = shade * value * sun
+
+
+@njit(fastmath=True, error_model="numpy")
+def read_out(
+    signal: Any,
+    noise: Any,
+    colour: Any,
+    full_well: Any,
+    dark: Any,
+    read_noise: Any,
+    offset: Any,
+    transfer: Any,
+    out: Any,
+) -> Any:
+    """Fill ``out`` (H, W, 3) with levels of ``transfer``: a signal in shares of full scale plus shot and read noise."""
+    last = np.float32(transfer.size - 1)
+    well = np.float32(full_well)
+    ground = np.float32(dark)
+    floor = np.float32(read_noise * read_noise)
+    scale = last / well
+    black = np.float32(offset) * last + np.float32(0.5)
+    zero = np.float32(0.0)
+    for i in range(signal.shape[0]):
+        for j in range(signal.shape[1]):
+            electrons = min(max(signal[i, j], zero), np.float32(1.0)) * well + ground
+            deviation = np.float32(math.sqrt(electrons + floor))
+            for k in range(3):
+                level = (colour[k] * electrons + deviation * noise[i, j, k]) * scale + black
+                out[i, j, k] = transfer[np.uint64(min(max(level, zero), last))]

@@ -65,7 +65,9 @@ class Labels:
         return self.index.size
 
 
-def view_radius_m(camera: PinholeCamera, position_mcmf_m: npt.ArrayLike, camera_from_mcmf: npt.ArrayLike) -> float:
+def view_radius_m(
+    camera: PinholeCamera, position_mcmf_m: npt.ArrayLike, camera_from_mcmf: npt.ArrayLike
+) -> float:
     """Ground distance from below the camera to the farthest ground in the picture, with room for relief of 5 km."""
     position = np.asarray(position_mcmf_m, dtype=np.float64)
     distance = float(np.linalg.norm(position))
@@ -102,11 +104,13 @@ def label_frame(
     local = catalogue.select(near)
     up = mcmf_from_spherical(local.latitude_rad, local.longitude_rad, 0.0) / MOON_RADIUS_M
     # A crater can only be in the picture if it is at one of the heights that ground has.
-    margin = 0.5 * local.diameter_m / max(float(np.linalg.norm(position)) - MOON_RADIUS_M, 1.0e3) * camera.focal_px
+    margin = (
+        0.5 * local.diameter_m / max(float(np.linalg.norm(position)) - MOON_RADIUS_M, 1.0e3) * camera.focal_px
+    )
     possible = np.zeros(near.size, dtype=bool)
     for height in (-4_000.0, 0.0, 4_000.0):
         uv = project_mcmf(camera, rotation, position, up * (MOON_RADIUS_M + height))
-        off = np.maximum(np.abs(uv - np.array(camera.centre_px)) - np.array([camera.width_px, camera.height_px]) / 2.0, 0.0)
+        off = np.abs(uv - np.array(camera.centre_px)) - np.array([camera.width_px, camera.height_px]) / 2.0
         possible |= off.max(axis=1) <= 1.3 * margin + 4.0
     measured = terrain.measured(near[possible])
     labels = project_craters(measured, camera, position, rotation, minimum_diameter_m, lit)
@@ -131,7 +135,9 @@ def project_craters(
     latitude, longitude, _ = spherical_from_mcmf(position)
     radius = view_radius_m(camera, position, rotation)
     largest = float(catalogue.diameter_m.max()) if len(catalogue) else 0.0
-    near = np.asarray(catalogue.near(float(latitude), float(longitude), radius + 0.5 * largest), dtype=np.int64)
+    near = np.asarray(
+        catalogue.near(float(latitude), float(longitude), radius + 0.5 * largest), dtype=np.int64
+    )
     near = near[catalogue.diameter_m[near] >= minimum_diameter_m]
     centre, rim = _rim_points(catalogue.select(near))
     centre_uv = project_mcmf(camera, rotation, position, centre)
@@ -165,16 +171,15 @@ def _rim_points(catalogue: CraterCatalogue) -> tuple[Floats, Floats]:
     height = np.nan_to_num(catalogue.rim_height_m, nan=0.0)
     latitude, longitude = catalogue.latitude_rad, catalogue.longitude_rad
     up = np.stack(
-        [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)], axis=-1
+        [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)],
+        axis=-1,
     )
     east = np.stack([-np.sin(longitude), np.cos(longitude), np.zeros_like(longitude)], axis=-1)
     north = np.cross(up, east)
     arc = 0.5 * catalogue.diameter_m / MOON_RADIUS_M
     azimuth = np.arange(RIM_POINTS) * (2.0 * math.pi / RIM_POINTS)
-    circle = (
-        np.cos(arc)[:, None, None] * up[:, None]
-        + np.sin(arc)[:, None, None]
-        * (np.cos(azimuth)[:, None] * north[:, None] + np.sin(azimuth)[:, None] * east[:, None])
+    circle = np.cos(arc)[:, None, None] * up[:, None] + np.sin(arc)[:, None, None] * (
+        np.cos(azimuth)[:, None] * north[:, None] + np.sin(azimuth)[:, None] * east[:, None]
     )
     distance = (MOON_RADIUS_M + height)[:, None]
     return distance * up, distance[..., None] * circle

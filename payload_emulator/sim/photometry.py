@@ -32,8 +32,8 @@ class Photometry:
     law
         ``lunar-lambert`` (McEwen 1996 limb darkening), ``lambert`` or ``hapke``.
     phase_slope_per_rad
-        Exponential fall of brightness with phase angle of the first two laws; 0.7 follows Hapke's lunar phase curve from 20 to
-        100 degrees.
+        Exponential fall of brightness with phase angle of the first two laws; 0.7 follows Hapke's lunar phase
+        curve from 20 to 100 degrees.
     albedo_contrast
         Scales the departures of the albedo from its mean: 0 is a surface of one albedo.
     """

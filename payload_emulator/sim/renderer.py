@@ -1,15 +1,16 @@
-"""The fast renderer: heights in a tangent grid turned to the Sun, shadows by sweeping it, then one pass over the pixels.
+"""The fast renderer: heights in a grid turned to the Sun, shadows by sweeping it, then one pass over the pixels.
 
 The tangent frame has its origin on the map sphere below the camera; its rows run away from the Sun (x), its columns
-across (y), z is up along the local vertical, and z of the ground includes the fall of the curved Moon.  The Sun is so far away
-that its direction is one in this frame, so the shadow of a whole line of ground is a running maximum: exact, and a few
-milliseconds.  Far casters toward the Sun enter through a coarser grid first.
+across (y), z is up along the local vertical, and z of the ground includes the fall of the curved Moon.  The Sun is so
+far away that its direction is one in this frame, so the shadow of a whole line of ground is a running maximum: exact,
+and a few milliseconds.  Far casters toward the Sun enter through a coarser grid first.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -68,7 +69,7 @@ class Rendering:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TangentGrid:
-    """A rectangle of ground in the Sun-turned tangent frame: texel (i, j) lies at ``x0 + i * texel``, ``y0 + j * texel``."""
+    """A rectangle of ground in the Sun-turned frame: point (i, j) lies at ``x0 + i * texel``, ``y0 + j * texel``."""
 
     x0_m: float
     y0_m: float
@@ -132,7 +133,9 @@ def render(
         _penumbra(view.sun_elevation_rad),
         lit,
     )
-    albedo = np.empty(((grid.rows - 1) // ALBEDO_TEXELS + 1, (grid.columns - 1) // ALBEDO_TEXELS + 1), np.float32)
+    albedo = np.empty(
+        ((grid.rows - 1) // ALBEDO_TEXELS + 1, (grid.columns - 1) // ALBEDO_TEXELS + 1), np.float32
+    )
     kernels.fill_albedo(
         albedo,
         ALBEDO_TEXELS,
@@ -144,7 +147,11 @@ def render(
         1 << (TILE_SHIFT - ALBEDO_SHIFT),
     )
     shape = (camera.height_px, camera.width_px)
-    radiance, mask, range_m = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
+    radiance, mask, range_m = (
+        np.empty(shape, np.float32),
+        np.empty(shape, np.float32),
+        np.empty(shape, np.float32),
+    )
     eye = np.ascontiguousarray(view.tangent_from_camera)
     lens = (camera.focal_px, *camera.centre_px)
     kernels.trace_pixels(
@@ -207,8 +214,10 @@ def tangent_view(
     )
 
 
-def places_of_tangent(view: View, x_m: Floats, y_m: Floats, height_m: npt.ArrayLike) -> tuple[Floats, Floats]:
-    """Latitude and longitude of ground of a given height that lies at (x, y) of the tangent frame; NaN past the limb."""
+def places_of_tangent(
+    view: View, x_m: npt.NDArray[Any], y_m: npt.NDArray[Any], height_m: npt.ArrayLike
+) -> tuple[Floats, Floats]:
+    """Latitude and longitude of ground of a given height at (x, y) of the tangent frame; NaN past the limb."""
     radius = MOON_RADIUS_M + np.asarray(height_m, dtype=np.float64)
     with np.errstate(invalid="ignore"):
         z = np.sqrt(radius**2 - x_m**2 - y_m**2)
@@ -275,14 +284,14 @@ def _rectangle(
     columns = _whole_nodes((y_high - y_low) / texel)
     if max(rows, columns) > LARGEST_GRID:
         raise TerrainError(
-            f"render: expected a view of at most {LARGEST_GRID} x {LARGEST_GRID} grid points, found {rows} x {columns}: "
-            "the camera looks too near the horizon"
+            f"render: expected a view of at most {LARGEST_GRID} x {LARGEST_GRID} grid points, "
+            f"found {rows} x {columns}: the camera looks too near the horizon"
         )
     return TangentGrid(float(x_low), float(y_low), texel, rows, columns)
 
 
 def _whole_nodes(length: float) -> int:
-    return int(math.ceil(length / NODE_STEP)) * NODE_STEP + 1
+    return math.ceil(length / NODE_STEP) * NODE_STEP + 1
 
 
 def _outline(view: View, *grids: TangentGrid) -> tuple[Floats, Floats, float]:

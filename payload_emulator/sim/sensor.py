@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +18,9 @@ COLOUR = (1.06, 1.0, 0.90)
 
 FULL_RADIANCE_FLOOR = 1.0e-4
 """Auto exposure gives up below this: the night side stays dark."""
+
+
+TRANSFER_STEPS = 16_384
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +52,7 @@ class SensorModel:
     stray
         Share of the frame's mean signal spread evenly (stray light).
     bits
-        8 or 16 per channel out (12-bit data are carried in 16).
+        8, 12 or 16 per channel.
     """
 
     exposure: float = 0.0
@@ -76,14 +80,12 @@ def expose(radiance: Image, sensor: SensorModel, rng: np.random.Generator) -> np
     """RGB picture (H, W, 3) of a radiance (H, W), 8 bit; see `expose_deep` for more."""
     if sensor.bits != 8:
         raise PayloadError(f"sensor: expected 8 bits for an 8-bit picture, found {sensor.bits}")
-    return np.asarray(_read_out(radiance, sensor, rng, 255), dtype=np.uint8)
+    return np.asarray(_read_out(radiance, sensor, rng), dtype=np.uint8)
 
 
 def expose_deep(radiance: Image, sensor: SensorModel, rng: np.random.Generator) -> npt.NDArray[np.uint16]:
-    """RGB picture (H, W, 3) with the sensor's own depth in 16 bits; 12-bit data fill the upper bits."""
-    levels = (1 << sensor.bits) - 1
-    counts = _read_out(radiance, sensor, rng, levels).astype(np.uint32)
-    return np.asarray(counts * (65535 // levels) if sensor.bits == 8 else counts << (16 - sensor.bits), dtype=np.uint16)
+    """RGB picture (H, W, 3) in 16 bits with the sensor's own steps: full scale is 65535 at any depth."""
+    return _read_out(radiance, sensor, rng)
 
 
 def random_sensor(rng: np.random.Generator) -> SensorModel:
@@ -113,58 +115,68 @@ def auto_exposure(radiance: Image, sensor: SensorModel) -> float:
     return sensor.exposure_target / float(np.percentile(sunlit, sensor.exposure_percentile))
 
 
-def _read_out(radiance: Image, sensor: SensorModel, rng: np.random.Generator, levels: int) -> npt.NDArray[np.float32]:
+def _read_out(radiance: Image, sensor: SensorModel, rng: np.random.Generator) -> npt.NDArray[np.uint16]:
+    from payload_emulator.sim import kernels
+
     signal = _blurred(np.asarray(radiance, dtype=np.float32), sensor.psf_sigma_px)
     height, width = signal.shape
     signal *= np.float32(sensor.exposure or auto_exposure(radiance, sensor))
     if sensor.vignetting:
         v = np.linspace(-1.0, 1.0, height, dtype=np.float32)[:, None]
         u = np.linspace(-1.0, 1.0, width, dtype=np.float32)[None, :]
-        signal *= 1.0 - np.float32(0.5 * sensor.vignetting) * (u * u + v * v)
+        signal *= np.float32(1.0) - np.float32(0.5 * sensor.vignetting) * (u * u + v * v)
     if sensor.smear:
         signal += np.float32(sensor.smear) * signal.mean(axis=0)
     if sensor.stray:
         signal += np.float32(sensor.stray) * signal.mean()
     if sensor.gain_mismatch:
-        # One picture of fixed pattern per sensor: drawn from the parameters, not from the frame's generator.
-        fixed = np.random.Generator(np.random.PCG64([height, width, round(sensor.gain_mismatch * 1.0e6)]))
-        signal *= 1.0 + np.float32(sensor.gain_mismatch) * fixed.standard_normal(signal.shape, dtype=np.float32)
-    electrons = np.minimum(signal, 1.0) * np.float32(sensor.full_well_e) + np.float32(sensor.dark_e)
-    inverse = np.float32(1.0 / sensor.full_well_e)
+        signal *= _fixed_pattern(height, width, sensor.gain_mismatch)
+    out = np.empty((height, width, 3), np.uint16)
     noise = rng.standard_normal((height, width, 3), dtype=np.float32)
-    deviation = np.sqrt(electrons + np.float32(sensor.read_noise_e**2))
-    out = np.empty((height, width, 3), np.float32)
-    for channel, response in enumerate(COLOUR):
-        out[..., channel] = (np.float32(response) * electrons + deviation * noise[..., channel]) * inverse
-    out += np.float32(sensor.offset)
-    np.clip(out, 0.0, 1.0, out=out)
-    if sensor.gamma != 1.0:
-        np.power(out, np.float32(sensor.gamma), out=out)
+    kernels.read_out(
+        signal,
+        noise,
+        np.array(COLOUR, np.float32),
+        sensor.full_well_e,
+        sensor.dark_e,
+        sensor.read_noise_e,
+        sensor.offset,
+        _transfer(sensor.gamma, sensor.bits),
+        out,
+    )
     hot = round(sensor.hot_pixels * height * width)
     if hot:
         fixed = np.random.Generator(np.random.PCG64([width, height, hot]))
-        out[fixed.integers(0, height, hot), fixed.integers(0, width, hot)] = 1.0
-    out *= np.float32(levels)
-    return np.asarray(np.rint(out, out=out))
+        out[fixed.integers(0, height, hot), fixed.integers(0, width, hot)] = (
+            255 if sensor.bits == 8 else 65535
+        )
+    return out
+
+
+@lru_cache(maxsize=4)
+def _fixed_pattern(height: int, width: int, rms: float) -> Image:
+    """Response of every pixel, the same in every frame: drawn from the parameters, not from the frame's generator."""
+    fixed = np.random.Generator(np.random.PCG64([height, width, round(rms * 1.0e6)]))
+    return np.float32(1.0) + np.float32(rms) * fixed.standard_normal((height, width), dtype=np.float32)
+
+
+def _transfer(gamma: float, bits: int) -> npt.NDArray[np.uint16]:
+    """Output for each of 16384 steps of input from 0 to full scale."""
+    share = np.linspace(0.0, 1.0, TRANSFER_STEPS) ** gamma
+    if bits == 8:
+        return np.rint(255.0 * share).astype(np.uint16)
+    levels = (1 << bits) - 1
+    return np.rint(np.rint(levels * share) * (65535.0 / levels)).astype(np.uint16)
 
 
 def _blurred(values: Image, sigma: float) -> Image:
     """Gaussian blur; the picture's edge repeats outward."""
     if sigma <= 0.0:
         return values.copy()
+    import cv2
+
     reach = max(1, math.ceil(3.0 * sigma))
-    offsets = np.arange(-reach, reach + 1)
     # Integrals over pixels, not samples: right for sigmas below one pixel too.
-    edges = np.array([math.erf((offset - 0.5) / (sigma * math.sqrt(2.0))) for offset in range(-reach, reach + 2)])
-    weights = np.diff(edges).astype(np.float32)
-    weights /= weights.sum()
-    assert weights.size == offsets.size
-    rows = np.pad(values, ((reach, reach), (0, 0)), mode="edge")
-    out = np.zeros_like(values)
-    for k, weight in enumerate(weights):
-        out += weight * rows[k : k + values.shape[0]]
-    columns = np.pad(out, ((0, 0), (reach, reach)), mode="edge")
-    out = np.zeros_like(values)
-    for k, weight in enumerate(weights):
-        out += weight * columns[:, k : k + values.shape[1]]
-    return out
+    edges = np.array([math.erf((n - 0.5) / (sigma * math.sqrt(2.0))) for n in range(-reach, reach + 2)])
+    weights = np.diff(edges) / (edges[-1] - edges[0])
+    return np.asarray(cv2.sepFilter2D(values, cv2.CV_32F, weights, weights, borderType=cv2.BORDER_REPLICATE))

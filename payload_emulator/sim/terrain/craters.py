@@ -73,7 +73,7 @@ class CraterShapes:
 
 def crater_profiles() -> npt.NDArray[np.float32]:
     """Radial profiles of unit depth (rim to mean inner floor), (40, 258), sampled from the centre to 2.6 radii."""
-    s = np.arange(PROFILE_SAMPLES + 2) * (PROFILE_REACH / PROFILE_SAMPLES)
+    s = np.asarray(np.arange(PROFILE_SAMPLES + 2) * (PROFILE_REACH / PROFILE_SAMPLES), dtype=np.float64)
     rows = []
     for shape in range(SHAPES):
         fresh = _fresh_profile(s, shape)
@@ -119,7 +119,7 @@ def draw_power_law(
     """Diameters (count,) between two limits with cumulative numbers falling as ``D ** -exponent``."""
     share = rng.random(count)
     low, high = low_m**-exponent, high_m**-exponent
-    return (low + share * (high - low)) ** (-1.0 / exponent)
+    return np.asarray((low + share * (high - low)) ** (-1.0 / exponent))
 
 
 def draw_depth_ratio(
@@ -127,7 +127,7 @@ def draw_depth_ratio(
 ) -> Floats:
     """Depth over diameter (count,) by a table of (share, value)."""
     table = np.array(quantiles)
-    return np.interp(rng.random(count), table[:, 0], table[:, 1])
+    return np.asarray(np.interp(rng.random(count), table[:, 0], table[:, 1]))
 
 
 class SmallCraters:
@@ -223,7 +223,7 @@ def _aged_profile(s: Floats, fresh: Floats, age: float) -> Floats:
     """The profile after diffusion: rounded over a length that grows with age, scaled back to unit depth."""
     width = 0.025 + 0.30 * age
     step = s[1] - s[0]
-    half = int(math.ceil(3.5 * width / step))
+    half = math.ceil(3.5 * width / step)
     offsets = np.arange(-half, half + 1) * step
     weights = np.exp(-0.5 * (offsets / width) ** 2)
     weights /= weights.sum()

@@ -7,6 +7,7 @@ Heights are metres above the map sphere.  A *grid pixel* is an area; its centre 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,17 @@ LATTICE_SHIFT = 32768.37
 
 
 @njit(fastmath=True, error_model="numpy")
-def add_noise(out, cos_lat, sin_lat, cos_lon, sin_lon, frequency, amplitude, seed, gain):  # type: ignore[no-untyped-def]
+def add_noise(
+    out: Any,
+    cos_lat: Any,
+    sin_lat: Any,
+    cos_lon: Any,
+    sin_lon: Any,
+    frequency: Any,
+    amplitude: Any,
+    seed: Any,
+    gain: Any,
+) -> Any:
     """Add one octave of gradient noise on the unit sphere: lattice cells per radian ``frequency``.
 
     The lattice lives in three dimensions, so the field has no seam at any meridian and no pinch at the poles;
@@ -64,7 +75,7 @@ def add_noise(out, cos_lat, sin_lat, cos_lon, sin_lon, frequency, amplitude, see
 
 
 @njit(fastmath=True, inline="always")
-def _corner(h, dx, dy, dz):  # type: ignore[no-untyped-def]
+def _corner(h: Any, dx: Any, dy: Any, dz: Any) -> Any:
     h = np.uint32(h)
     h = np.uint32(h ^ (h >> np.uint32(15)))
     h = np.uint32(h * np.uint32(0x2C1B3C6D))
@@ -80,7 +91,9 @@ def _corner(h, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=True, error_model="numpy")
-def resample_cubic(source, first_row, row_step, first_column, column_step, out):  # type: ignore[no-untyped-def]
+def resample_cubic(
+    source: Any, first_row: Any, row_step: Any, first_column: Any, column_step: Any, out: Any
+) -> Any:
     """Fill ``out`` with ``source`` at rows ``first_row + i * row_step`` (and likewise columns), Catmull-Rom.
 
     The caller leaves one source pixel before and two after the span asked for.
@@ -90,7 +103,7 @@ def resample_cubic(source, first_row, row_step, first_column, column_step, out):
     line = np.empty(width, np.float32)
     for i in range(rows):
         r = first_row + i * row_step
-        k = int(math.floor(r))
+        k = math.floor(r)
         t = np.float32(r - k)
         w0 = np.float32(0.5) * t * (t * (np.float32(2.0) - t) - np.float32(1.0))
         w1 = np.float32(0.5) * (t * t * (np.float32(3.0) * t - np.float32(5.0)) + np.float32(2.0))
@@ -112,18 +125,18 @@ def resample_cubic(source, first_row, row_step, first_column, column_step, out):
 
 
 @njit(fastmath=True, error_model="numpy")
-def stamp_craters(  # type: ignore[no-untyped-def]
-    out,
-    latitude_rad,
-    longitude_rad,
-    crater_latitude,
-    crater_longitude,
-    radius_rad,
-    depth_m,
-    profile_row,
-    wobble,
-    profiles,
-):
+def stamp_craters(
+    out: Any,
+    latitude_rad: Any,
+    longitude_rad: Any,
+    crater_latitude: Any,
+    crater_longitude: Any,
+    radius_rad: Any,
+    depth_m: Any,
+    profile_row: Any,
+    wobble: Any,
+    profiles: Any,
+) -> Any:
     """Add craters to heights; centres and angular radii in radians, profiles of unit depth in rows.
 
     ``wobble`` (n, 4) holds cosine and sine amplitudes of the second and third harmonic of the rim's radius; craters
@@ -141,8 +154,8 @@ def stamp_craters(  # type: ignore[no-untyped-def]
     for n in range(crater_latitude.size):
         lat = crater_latitude[n]
         radius = radius_rad[n]
-        first = max(0, int(math.ceil((latitude_rad[0] - lat - reach * radius) / row_step)))
-        last = min(rows - 1, int(math.floor((latitude_rad[0] - lat + reach * radius) / row_step)))
+        first = max(0, math.ceil((latitude_rad[0] - lat - reach * radius) / row_step))
+        last = min(rows - 1, math.floor((latitude_rad[0] - lat + reach * radius) / row_step))
         if first > last:
             continue
         lon = crater_longitude[n]
@@ -162,15 +175,15 @@ def stamp_craters(  # type: ignore[no-untyped-def]
             if rest <= 0.0:
                 continue
             half = math.sqrt(rest) / east_scale
-            left = max(0, int(math.ceil((lon - half - longitude_rad[0]) / column_step)))
-            right = min(columns - 1, int(math.floor((lon + half - longitude_rad[0]) / column_step)))
+            left = max(0, math.ceil((lon - half - longitude_rad[0]) / column_step))
+            right = min(columns - 1, math.floor((lon + half - longitude_rad[0]) / column_step))
             y = np.float32(north)
             x0 = np.float32((longitude_rad[0] - lon) * east_scale)
             dx = np.float32(column_step * east_scale)
             if round_rim:
                 for j in range(left, right + 1):
                     x = x0 + dx * np.float32(j)
-                    s = math.sqrt(x * x + y * y) * scale
+                    s = np.float32(math.sqrt(x * x + y * y)) * scale
                     k = min(int(s), samples)
                     f = min(s - np.float32(k), one)
                     out[i, j] += depth * (row[k] + f * (row[k + 1] - row[k]))
@@ -178,7 +191,7 @@ def stamp_craters(  # type: ignore[no-untyped-def]
                 for j in range(left, right + 1):
                     x = x0 + dx * np.float32(j)
                     s2 = x * x + y * y
-                    s = math.sqrt(s2)
+                    s = np.float32(math.sqrt(s2))
                     g = one / (s2 + soft)
                     p = (x * x - y * y) * g
                     q = np.float32(2.0) * x * y * g
@@ -192,14 +205,14 @@ def stamp_craters(  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=True, error_model="numpy")
-def sample_pool(pool, table, shift, rows, columns, out):  # type: ignore[no-untyped-def]
+def sample_pool(pool: Any, table: Any, shift: Any, rows: Any, columns: Any, out: Any) -> Any:
     """Fill ``out`` (n) with bilinear values at pool rows and columns (pixel coordinates within the patch)."""
     mask = (1 << shift) - 1
     for n in range(rows.size):
         r = rows[n]
         c = columns[n]
-        i = int(math.floor(r))
-        j = int(math.floor(c))
+        i = math.floor(r)
+        j = math.floor(c)
         fr = r - i
         fc = c - j
         slot = table[i >> shift, j >> shift]

@@ -14,7 +14,7 @@ KINDS = ("auto", "raster", "procedural")
 
 
 def open_terrain(kind: str, data: DataFolder, seed: int, **options: object) -> TiledTerrain:
-    """The terrain ``raster`` (real heights and catalogue of the data folder), ``procedural``, or whichever is possible (``auto``).
+    """The terrain ``raster`` (real heights and catalogue of the data folder), ``procedural``, or the better (``auto``).
 
     Raises
     ------
@@ -37,7 +37,9 @@ def open_terrain(kind: str, data: DataFolder, seed: int, **options: object) -> T
     from payload_emulator.sim.terrain.raster import RasterTerrain
 
     assert catalogue_path is not None
-    names = tuple(name for name in data.names() if name.startswith(("height model", "crater catalogue LU", "albedo")))
+    names = tuple(
+        name for name in data.names() if name.startswith(("height model", "crater catalogue LU", "albedo"))
+    )
     return RasterTerrain(
         data.dem_tiles,
         load_catalogue(catalogue_path),

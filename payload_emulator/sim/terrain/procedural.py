@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -94,7 +95,7 @@ class ProceduralTerrain(TiledTerrain):
         reach = kernels.PROFILE_REACH * 1.05 * self._shapes.radius_rad * MOON_RADIUS_M
         edges = (0.0, 8.0e3, 25.0e3, 80.0e3, np.inf)
         self._bands = []
-        for low, high in zip(edges[:-1], edges[1:], strict=True):
+        for low, high in itertools.pairwise(edges):
             chosen = np.flatnonzero((reach >= low) & (reach < high))
             if chosen.size:
                 self._bands.append((float(reach[chosen].max()), chosen, catalogue.select(chosen)))
@@ -152,11 +153,11 @@ class ProceduralTerrain(TiledTerrain):
         """How much of a plain (0..1) a grid of places is, (rows, columns), cubic in a half-degree map."""
         rows = (90.0 - np.degrees(latitude)) * 2.0
         columns = np.degrees(longitude) * 2.0
-        left = int(math.floor(columns[0])) - 2
-        width = int(math.ceil(columns[-1])) + 4 - left
+        left = math.floor(columns[0]) - 2
+        width = math.ceil(columns[-1]) + 4 - left
         # Rows beyond a pole are not used (see POLE_LIMIT_RAD); the clip only keeps the index in the map.
-        top = int(math.floor(rows[0])) - 2
-        height = int(math.ceil(rows[-1])) + 4 - top
+        top = math.floor(rows[0]) - 2
+        height = math.ceil(rows[-1]) + 4 - top
         source = self._plains[np.clip(np.arange(top, top + height), 0, 360)][
             :, np.arange(left, left + width) % 720
         ]

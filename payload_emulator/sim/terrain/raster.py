@@ -76,7 +76,9 @@ class RasterFile:
 class RasterLayer:
     """Files of one resolution on one global pixel lattice, read in chunks as they are needed."""
 
-    def __init__(self, pixels_per_degree: float, north_offset: float, west_offset: float, files: Sequence[RasterFile]) -> None:
+    def __init__(
+        self, pixels_per_degree: float, north_offset: float, west_offset: float, files: Sequence[RasterFile]
+    ) -> None:
         """The lattice has pixel centres at latitude ``90 - (row + 0.5 + north_offset) / ppd``, likewise longitude."""
         self.pixels_per_degree = pixels_per_degree
         self.north_offset = north_offset
@@ -101,7 +103,9 @@ class RasterLayer:
                 west = file.first_column + turn * self.turn
                 left, right = max(first_column, west), min(first_column + columns, west + file.columns)
                 if left < right:
-                    self._copy(number, file, out, (top, bottom), (left, right), (first_row, first_column), west)
+                    self._copy(
+                        number, file, out, (top, bottom), (left, right), (first_row, first_column), west
+                    )
         return out
 
     def holds(self, latitude_rad: Floats, longitude_rad: Floats) -> npt.NDArray[np.bool_]:
@@ -131,7 +135,9 @@ class RasterLayer:
                 chunk = self._chunk(number, file, i, j)
                 a, b = max(top, i * CHUNK_PIXELS), min(bottom, i * CHUNK_PIXELS + chunk.shape[0])
                 c, d = max(left, j * CHUNK_PIXELS), min(right, j * CHUNK_PIXELS + chunk.shape[1])
-                part = chunk[a - i * CHUNK_PIXELS : b - i * CHUNK_PIXELS, c - j * CHUNK_PIXELS : d - j * CHUNK_PIXELS]
+                part = chunk[
+                    a - i * CHUNK_PIXELS : b - i * CHUNK_PIXELS, c - j * CHUNK_PIXELS : d - j * CHUNK_PIXELS
+                ]
                 row = a + file.first_row - origin[0]
                 column = c + west - origin[1]
                 place = out[row : row + part.shape[0], column : column + part.shape[1]]
@@ -153,7 +159,7 @@ class RasterLayer:
                 raw = source.read(1, window=window)
         except rasterio.errors.RasterioError as error:
             raise TerrainError(f"{file.path}: expected readable raster data, found {error}") from None
-        values = raw.astype(np.float32)
+        values: Heights = raw.astype(np.float32)
         if file.nodata is not None:
             values[raw == file.nodata] = np.nan
         if file.scale_m != 1.0:
@@ -201,7 +207,9 @@ class RasterTerrain(TiledTerrain):
         rng = np.random.Generator(np.random.PCG64([seed, 0x52415354]))
         self._salts = [int(salt) for salt in rng.integers(1, 2**31 - 1, 32)]
         per_km2 = CATALOGUE_DENSITY_2KM * (2_000.0 / SMALL_LOW_M) ** SMALL_EXPONENT
-        self._small = SmallCraters(seed, SMALL_LOW_M, SMALL_HIGH_M, per_km2, SMALL_EXPONENT, _density_map(catalogue))
+        self._small = SmallCraters(
+            seed, SMALL_LOW_M, SMALL_HIGH_M, per_km2, SMALL_EXPONENT, _density_map(catalogue)
+        )
         self._albedo_map = None if albedo_path is None else load_albedo_map(Path(albedo_path))
         super().__init__(name, data_names or (name,), catalogue, pixels_per_degree, cache_tiles)
 
@@ -256,8 +264,8 @@ class RasterTerrain(TiledTerrain):
         if share.min() <= 0.0:
             row, column = np.unravel_index(int(share.argmin()), shape)
             raise TerrainError(
-                f"terrain {self.name}: expected height data at latitude {math.degrees(latitude[row]):.3f} deg, longitude "
-                f"{math.degrees(longitude[column]) % 360.0:.3f} deg E, found none in {len(self._layers)} layers"
+                f"terrain {self.name}: expected heights at latitude {math.degrees(latitude[row]):.3f} deg, "
+                f"longitude {math.degrees(longitude[column]) % 360.0:.3f} deg E, found none"
             )
         return result
 
@@ -280,12 +288,16 @@ class RasterTerrain(TiledTerrain):
             return out, np.zeros_like(out)
         weight = np.ones_like(out)
         if hole.any():
-            from scipy import ndimage
+            import cv2
 
-            inside, nearest = ndimage.distance_transform_edt(~hole, return_indices=True)
-            outside = ndimage.distance_transform_edt(hole, return_indices=True, return_distances=False)
-            del nearest
-            source = source[tuple(outside)]
+            inside = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
+            _, labels = cv2.distanceTransformWithLabels(
+                hole.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+            )
+            # Holes take the nearest height, so that the smoothing has something to work on at edges.
+            of_label = np.zeros(int(labels.max()) + 1, np.float32)
+            of_label[labels[~hole]] = source[~hole]
+            source = of_label[labels]
             edge = np.clip((inside - 1.0) / feather, 0.0, 1.0)
             smooth = np.asarray(edge * edge * (3.0 - 2.0 * edge), dtype=np.float32)
             kernels.resample_cubic(smooth, *_span(rows, top), *_span(columns, left), weight)
@@ -305,13 +317,19 @@ class RasterTerrain(TiledTerrain):
         north = np.diff(heights, axis=0)[:, :-1] / spacing
         east = np.diff(heights, axis=1)[:-1] / (spacing * np.cos(nodes_latitude[:-1])[:, None])
         square = north * north + east * east
-        blurred = sum(square[i : square.shape[0] - 2 + i, j : square.shape[1] - 2 + j] for i in range(3) for j in range(3)) / 9.0
+        height, width = square.shape[0] - 2, square.shape[1] - 2
+        blurred = sum(square[i : i + height, j : j + width] for i in range(3) for j in range(3)) / 9.0
         gain = np.clip(np.sqrt(blurred) / REFERENCE_SLOPE, 0.25, 1.6)
         # Cell (k, l) of the blur is centred half a step after node k + 1.
         out = np.empty((latitude.size, longitude.size), np.float32)
         first = 3.0 - 1.5
         kernels.resample_cubic(
-            np.ascontiguousarray(gain, dtype=np.float32), first, 1.0 / SLOPE_STEP, first, 1.0 / SLOPE_STEP, out
+            np.ascontiguousarray(gain, dtype=np.float32),
+            first,
+            1.0 / SLOPE_STEP,
+            first,
+            1.0 / SLOPE_STEP,
+            out,
         )
         return out
 
@@ -348,15 +366,24 @@ def load_albedo_map(path: Path) -> npt.NDArray[np.float32]:
     except rasterio.errors.RasterioError as error:
         raise TerrainError(f"{path}: expected an albedo map, found {error}") from None
     if values.shape[1] != 2 * values.shape[0]:
-        raise TerrainError(f"{path}: expected a map of the whole Moon twice as wide as high, found {values.shape[::-1]}")
+        raise TerrainError(
+            f"{path}: expected a map of the whole Moon, twice as wide as high, "
+            f"found {values.shape[1]} x {values.shape[0]} pixels"
+        )
     middle = values[values.shape[0] // 6 : -values.shape[0] // 6]
     low, mean, high = np.percentile(middle, 2), float(middle.mean()), np.percentile(middle, 98)
-    scaled = np.where(values < mean, 1.0 - 0.5 * (mean - values) / (mean - low), 1.0 + 0.5 * (values - mean) / (high - mean))
+    darker, brighter = (mean - values) / (mean - low), (values - mean) / (high - mean)
+    scaled = np.where(values < mean, 1.0 - 0.5 * darker, 1.0 + 0.5 * brighter)
     return np.asarray(np.clip(scaled, 0.3, 2.0), dtype=np.float32)
 
 
 def _open_header(path: Path) -> tuple[tuple[float, float, float], RasterFile]:
-    import rasterio
+    try:
+        import rasterio
+    except ImportError:
+        raise TerrainError(
+            f"{path}: expected rasterio, which reads height rasters, found it not installed (pip install rasterio)"
+        ) from None
 
     try:
         with warnings.catch_warnings():
@@ -370,16 +397,31 @@ def _open_header(path: Path) -> tuple[tuple[float, float, float], RasterFile]:
     if crs is None:
         raise TerrainError(f"{path}: expected a georeferenced raster, found no coordinate system")
     if not crs.is_geographic:
-        raise TerrainError(f"{path}: expected longitude and latitude in degrees, found the projection {crs.to_string()[:60]}")
-    if transform.b or transform.d or transform.a <= 0.0 or abs(transform.a + transform.e) > 1e-9 * transform.a:
-        raise TerrainError(f"{path}: expected square pixels, north up, found the transform {tuple(transform)[:6]}")
+        raise TerrainError(
+            f"{path}: expected longitude and latitude in degrees, found the projection {crs.to_string()[:60]}"
+        )
+    if (
+        transform.b
+        or transform.d
+        or transform.a <= 0.0
+        or abs(transform.a + transform.e) > 1e-9 * transform.a
+    ):
+        raise TerrainError(
+            f"{path}: expected square pixels, north up, found the transform {tuple(transform)[:6]}"
+        )
     ppd = round(1.0 / transform.a, 6)
     row, column = (90.0 - transform.f) * ppd, transform.c * ppd
     first_row, first_column = round(row), round(column)
     factor = 1000.0 if unit and unit.lower() in ("km", "kilometer", "kilometre") else 1.0
     offsets = round(row - first_row, 3) + 0.0, round(column - first_column, 3) + 0.0
     file = RasterFile(
-        path, first_row, first_column, profile["height"], profile["width"], factor * (scale or 1.0), profile.get("nodata")
+        path,
+        first_row,
+        first_column,
+        profile["height"],
+        profile["width"],
+        factor * (scale or 1.0),
+        profile.get("nodata"),
     )
     return (ppd, *offsets), file
 
@@ -402,7 +444,7 @@ def _smoothed(values: Heights, sigma: float, reach: int) -> Heights:
 
 
 def _density_map(catalogue: CraterCatalogue) -> Floats:
-    """Small craters per cell of one degree (180, 360) relative to the mean, from the catalogue's own over 7 x 7 cells."""
+    """Craters of 2 to 5 km about each cell of one degree relative to the mean, (180, 360), over 7 x 7 cells."""
     density = np.ones((180, 360))
     chosen = (catalogue.diameter_m >= 2_000.0) & (catalogue.diameter_m < 5_000.0)
     if np.count_nonzero(chosen) < 1_000:

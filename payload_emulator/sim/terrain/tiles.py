@@ -217,12 +217,12 @@ class TiledTerrain(ABC):
         )
         out = np.empty(latitude.size)
         flat_latitude, flat_longitude = latitude.ravel(), longitude.ravel()
-        tile_row = np.floor(((0.5 * math.pi - flat_latitude) * self.pixels_per_radian - 0.5) / TILE_PIXELS)
-        tile_column = (
-            np.floor((flat_longitude * self.pixels_per_radian - 0.5) / TILE_PIXELS) % self.tile_columns
-        )
-        for block in np.unique(np.stack([tile_row, tile_column]), axis=1).T if out.size else ():
-            chosen = np.flatnonzero((tile_row == block[0]) & (tile_column == block[1]))
+        # Blocks of 4 x 4 tiles: few calls, and no window wider than the cache.
+        block_row = np.floor((0.5 * math.pi - flat_latitude) * self.pixels_per_radian / (4 * TILE_PIXELS))
+        block_column = np.floor(flat_longitude * self.pixels_per_radian / (4 * TILE_PIXELS))
+        blocks, block = np.unique(block_row * 1.0e6 + block_column, return_inverse=True)
+        for number in range(blocks.size):
+            chosen = np.flatnonzero(block == number)
             patch = self.patch(flat_latitude[chosen], flat_longitude[chosen])
             rows, columns = patch.coordinates(flat_latitude[chosen], flat_longitude[chosen])
             values = np.empty(chosen.size)
@@ -236,9 +236,9 @@ class TiledTerrain(ABC):
         return self.measured(indices)
 
     def measured(self, indices: npt.NDArray[np.int64]) -> CraterCatalogue:
-        """The craters of these indices: rim height as the mean on the rim circle, depth below it to the inner 0.4 radius.
+        """The craters of these indices, measured: rim height is the mean on the rim circle, depth from it to the floor.
 
-        Craters whose surroundings this terrain cannot give keep NaN.
+        The floor is the mean within 0.4 radius.  Craters whose surroundings this terrain cannot give keep NaN.
         """
         self._measure(indices[~self._measured[indices]])
         chosen = self.catalogue.select(indices)
