@@ -113,52 +113,62 @@ def force_acceleration(t, x, y, z, gravity, force, table, scratch, frame):  # ty
 
 
 @njit(error_model="numpy", boundscheck=False)
-def _derivative(t, y, gravity, force, table, scratch, frame, out):  # type: ignore[no-untyped-def]
-    ax, ay, az = force_acceleration(t, y[0], y[1], y[2], gravity, force, table, scratch, frame)
-    out[0], out[1], out[2] = y[3], y[4], y[5]
-    out[3], out[4], out[5] = ax, ay, az
-
-
-@njit(error_model="numpy", boundscheck=False)
-def _stages(t, h, y, k, a, c, gravity, force, table, scratch, frame, work):  # type: ignore[no-untyped-def]
-    """Fill the derivatives k[1:] of one step from k[0]."""
-    for i in range(1, len(c)):
-        for d in range(6):
-            total = 0.0
-            for j in range(i):
-                total += a[i, j] * k[j, d]
-            work[d] = y[d] + h * total
-        _derivative(t + c[i] * h, work, gravity, force, table, scratch, frame, k[i])
-
-
-@njit(error_model="numpy", boundscheck=False)
-def interpolate(s, h, first, first_a, last, last_a, out):  # type: ignore[no-untyped-def]
-    """Write the state at the fraction ``s`` of a step: quintic through position, velocity, acceleration at both ends."""
+def interpolate(times, states, rates, k, s, out):  # type: ignore[no-untyped-def]
+    """Write the state at the fraction ``s`` of the step from knot ``k``: the quintic through both ends (r, v, a)."""
+    h = times[k + 1] - times[k]
     for d in range(3):
-        v0, v1 = h * first[d + 3], h * last[d + 3]
-        a0, a1 = 0.5 * h * h * first_a[d], 0.5 * h * h * last_a[d]
-        gap = last[d] - first[d] - v0 - a0
+        v0, v1 = h * states[k, d + 3], h * states[k + 1, d + 3]
+        a0, a1 = 0.5 * h * h * rates[k, d], 0.5 * h * h * rates[k + 1, d]
+        gap = states[k + 1, d] - states[k, d] - v0 - a0
         slope = v1 - v0 - 2.0 * a0
         bend = a1 - a0
         c3 = 10.0 * gap - 4.0 * slope + bend
         c4 = -15.0 * gap + 7.0 * slope - 2.0 * bend
         c5 = 6.0 * gap - 3.0 * slope + bend
-        out[d] = first[d] + s * (v0 + s * (a0 + s * (c3 + s * (c4 + s * c5))))
+        out[d] = states[k, d] + s * (v0 + s * (a0 + s * (c3 + s * (c4 + s * c5))))
         out[d + 3] = (v0 + s * (2.0 * a0 + s * (3.0 * c3 + s * (4.0 * c4 + s * 5.0 * c5)))) / h
 
 
 @njit(error_model="numpy", boundscheck=False)
-def _apsis(h, first, first_a, last, last_a, out):  # type: ignore[no-untyped-def]
-    """Return the fraction of a step at which r.v = 0 (bracketed by its ends), by the Illinois rule; state to ``out``."""
+def evaluate(times, states, rates, wanted, out):  # type: ignore[no-untyped-def]
+    """Write the states at ``wanted`` times; where two knots share a time (a burn) the later one rules from there on."""
+    for i in range(len(wanted)):
+        low = 0
+        high = len(times) - 1
+        while high - low > 1:  # the last knot at or before the wanted time
+            middle = (low + high) // 2
+            if times[middle] <= wanted[i]:
+                low = middle
+            else:
+                high = middle
+        while low > 0 and times[low + 1] == times[low]:
+            low -= 1
+        interpolate(times, states, rates, low, (wanted[i] - times[low]) / (times[low + 1] - times[low]), out[i])
+
+
+@njit(error_model="numpy", boundscheck=False)
+def _radial(state):  # type: ignore[no-untyped-def]
+    return state[0] * state[3] + state[1] * state[4] + state[2] * state[5]
+
+
+@njit(error_model="numpy", boundscheck=False)
+def _events(times, states, rates, k, sign, ground_m, event, event_radius_m, out):  # type: ignore[no-untyped-def]
+    """Return what happened in the step from knot ``k`` and at which fraction of it; for EVENT the state is in ``out``."""
+    end = states[k + 1]
+    if end[0] * end[0] + end[1] * end[1] + end[2] * end[2] < ground_m * ground_m:
+        return GROUND, 1.0
     low, high = 0.0, 1.0
-    f_low = first[0] * first[3] + first[1] * first[4] + first[2] * first[5]
-    f_high = last[0] * last[3] + last[1] * last[4] + last[2] * last[5]
+    f_low, f_high = sign * _radial(states[k]), sign * _radial(end)
+    rising = f_low < 0.0 <= f_high
+    if not rising and not (event == APOSELENE and f_high < 0.0 <= f_low):
+        return REACHED, 1.0
+    # The zero of radial speed, by regula falsi with the Illinois rule.
     side = 0
     s = 0.5
     for _ in range(60):
         s = (low * f_high - high * f_low) / (f_high - f_low)
-        interpolate(s, h, first, first_a, last, last_a, out)
-        f = out[0] * out[3] + out[1] * out[4] + out[2] * out[5]
+        interpolate(times, states, rates, k, s, out)
+        f = sign * _radial(out)
         if abs(f) < 1e-3 or high - low < 1e-14:
             break
         if f * f_high > 0.0:
@@ -171,129 +181,119 @@ def _apsis(h, first, first_a, last, last_a, out):  # type: ignore[no-untyped-def
             if side == 1:
                 f_high *= 0.5
             side = 1
-    return s
+    radius = math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+    if rising and radius < ground_m:
+        return GROUND, s
+    if rising and event == PERISELENE and radius < event_radius_m:
+        return EVENT, s
+    if not rising and radius > event_radius_m:
+        return EVENT, s
+    return REACHED, 1.0
 
 
 @njit(error_model="numpy", boundscheck=False, nogil=True)
 def integrate(start_s, y0, stop_s, gravity, force, table, scratch_size, a, b, c, error, second_error, error_order, rtol,
-              max_step_s, first_step_s, ground_m, event, event_radius_m, times, states, accelerations):
-    # type: ignore[no-untyped-def]
+              max_step_s, first_step_s, ground_m, event, event_radius_m, times, states, rates):  # type: ignore[no-untyped-def]
     """Integrate adaptively from ``start_s`` to ``stop_s`` (either may be the later), keeping every accepted step.
 
-    Returns (number of knots, why it ended, evaluations, next step).  Knots go to ``times``, ``states``, ``accelerations``
-    until these are full (STEP_LIMIT).  EVENT: the last knot is a periselene below ``event_radius_m``, or an aposelene above
-    it, whichever ``event`` asks for.  GROUND: the last step met radius ``ground_m``, at its end or at a periselene in it.
+    Returns (number of knots, why it ended, evaluations, next step).  Knots go to ``times``, ``states`` (n, 6) and ``rates``
+    (n, 3), the accelerations, until these are full (STEP_LIMIT).  EVENT: the last knot is a periselene below
+    ``event_radius_m``, or an aposelene above it, whichever ``event`` asks for.  GROUND: the last step met radius
+    ``ground_m``, at its end or at a periselene in it.
+
+    One loop over stages, with the forces evaluated in one place (each further one would be compiled anew).  Stage 0 is at a
+    new knot; only there is the step that led to it searched for events, as its quintic needs the acceleration at both ends.
     """
     stages = len(c)
-    scratch = np.empty(scratch_size)
-    frame = np.empty(COLUMNS)
-    work = np.empty(6)
-    middle = np.empty(6)
+    scratch, frame, work, y, new = np.empty(scratch_size), np.empty(COLUMNS), np.empty(6), np.empty(6), np.empty(6)
     k = np.empty((stages, 6))
-    y = y0.copy()
-    new = np.empty(6)
-    derivative = np.empty(6)
-    sign = 1.0 if stop_s >= start_s else -1.0
-    t = start_s
-    _derivative(t, y, gravity, force, table, scratch, frame, k[0])
-    evaluations = 1
-    times[0] = t
-    states[0] = y
-    accelerations[0] = k[0, 3:]
-    count = 1
-    h = min(abs(first_step_s), max_step_s)
-    rejected = False
+    for d in range(6):
+        y[d] = y0[d]
     two_estimates = False
     for i in range(stages):
         two_estimates = two_estimates or second_error[i] != 0.0
-    while sign * (stop_s - t) > 0.0:
-        if count >= len(times):
-            return count, STEP_LIMIT, evaluations, h
+    sign = 1.0 if stop_s >= start_s else -1.0
+    t = t_new = start_s
+    h = min(abs(first_step_s), max_step_s)
+    step = signed = 0.0
+    count = evaluations = stage = 0
+    status = REACHED
+    rejected = False
+    while True:
+        for d in range(6):
+            total = 0.0
+            for j in range(stage):
+                total += a[stage, j] * k[j, d]
+            work[d] = y[d] + signed * total
+        ax, ay, az = force_acceleration(t + c[stage] * signed, work[0], work[1], work[2], gravity, force, table, scratch,
+                                        frame)
+        evaluations += 1
+        for d in range(3):
+            k[stage, d] = work[d + 3]
+        k[stage, 3], k[stage, 4], k[stage, 5] = ax, ay, az
+        if stage == 0:
+            times[count] = t
+            for d in range(6):
+                states[count, d] = y[d]
+            for d in range(3):
+                rates[count, d] = k[0, d + 3]
+            if count > 0 and status == REACHED:
+                status, fraction = _events(times, states, rates, count - 1, sign, ground_m, event, event_radius_m, work)
+                if status == EVENT:  # the knot moves to the event
+                    t = times[count - 1] + fraction * (t - times[count - 1])
+                    for d in range(6):
+                        y[d] = work[d]
+                    continue
+            count += 1
+            if status != REACHED or sign * (stop_s - t) <= 0.0:
+                return count, status, evaluations, h
+            if count == len(times):
+                return count, STEP_LIMIT, evaluations, h
+        elif stage < stages - 1:
+            stage += 1
+            continue
+        else:
+            size_r = rtol * rtol * (y[0] * y[0] + y[1] * y[1] + y[2] * y[2])
+            size_v = rtol * rtol * (y[3] * y[3] + y[4] * y[4] + y[5] * y[5])
+            fine = coarse = 0.0
+            for d in range(6):
+                total = first = second = 0.0
+                for i in range(stages):
+                    total += b[i] * k[i, d]
+                    first += error[i] * k[i, d]
+                    second += second_error[i] * k[i, d]
+                new[d] = y[d] + signed * total
+                size = size_r if d < 3 else size_v
+                fine += first * first / size
+                coarse += second * second / size
+            if not two_estimates:
+                estimate = step * math.sqrt(fine / 6.0)
+            elif fine > 0.0:
+                estimate = step * fine / math.sqrt(6.0 * (fine + 0.01 * coarse))
+            else:
+                estimate = 0.0
+            factor = 0.9 * estimate ** (-1.0 / (error_order + 1)) if estimate > 0.0 else 5.0
+            if estimate <= 1.0:
+                grown = step * min(1.0 if rejected else 5.0, max(0.2, factor))
+                # A step cut short at the end of the span says nothing against the size in use.
+                h = min(max_step_s, grown if step >= 0.999 * h else max(h, grown))
+                rejected = False
+                t = t_new
+                for d in range(6):
+                    y[d] = new[d]
+                stage = 0
+                signed = 0.0
+                continue
+            h = step * max(0.2, factor) if estimate == estimate else 0.1 * step
+            if h < 1e-6:
+                return count, TOO_SMALL, evaluations, h
+            rejected = True
         left = sign * (stop_s - t)
         # The last two steps share what is left, so that no tiny step is made.
         step = h if left > 2.0 * h else (left if left <= h else 0.5 * left)
-        final = step == left
+        t_new = stop_s if step == left else t + sign * step
         signed = sign * step
-        _stages(t, signed, y, k, a, c, gravity, force, table, scratch, frame, work)
-        evaluations += stages - 1
-        size_r = rtol * math.sqrt(y[0] * y[0] + y[1] * y[1] + y[2] * y[2])
-        size_v = rtol * math.sqrt(y[3] * y[3] + y[4] * y[4] + y[5] * y[5])
-        e_r = e_v = e2_r = e2_v = 0.0
-        for d in range(6):
-            total = first = second = 0.0
-            for i in range(stages):
-                total += b[i] * k[i, d]
-                first += error[i] * k[i, d]
-                second += second_error[i] * k[i, d]
-            new[d] = y[d] + signed * total
-            if d < 3:
-                e_r += first * first
-                e2_r += second * second
-            else:
-                e_v += first * first
-                e2_v += second * second
-        estimate = e_r / size_r**2 + e_v / size_v**2
-        if two_estimates:
-            coarse = e2_r / size_r**2 + e2_v / size_v**2
-            size = step * estimate / math.sqrt(estimate + 0.01 * coarse) if estimate > 0.0 else 0.0
-        else:
-            size = step * math.sqrt(estimate)
-        size *= math.sqrt(1.0 / 6.0)
-        factor = 0.9 * size ** (-1.0 / (error_order + 1)) if size > 0.0 else 5.0
-        if not size <= 1.0:
-            rejected = True
-            h = step * max(0.2, factor) if size == size else 0.1 * step
-            if h < 1e-6:
-                return count, TOO_SMALL, evaluations, h
-            continue
-        grown = step * min(1.0 if rejected else 5.0, max(0.2, factor))
-        h = min(max_step_s, grown if step >= h * 0.999 else max(h, grown))
-        rejected = False
-        t_new = stop_s if final else t + signed
-        _derivative(t_new, new, gravity, force, table, scratch, frame, derivative)
-        evaluations += 1
-        before = sign * (y[0] * y[3] + y[1] * y[4] + y[2] * y[5])
-        after = sign * (new[0] * new[3] + new[1] * new[4] + new[2] * new[5])
-        radius = math.sqrt(new[0] * new[0] + new[1] * new[1] + new[2] * new[2])
-        status = REACHED
-        if radius < ground_m:
-            status = GROUND
-        elif (before < 0.0 <= after) or (event == APOSELENE and after < 0.0 <= before):
-            low = before < 0.0
-            fraction = _apsis(signed, y, k[0, 3:], new, derivative[3:], middle)
-            apsis = math.sqrt(middle[0] ** 2 + middle[1] ** 2 + middle[2] ** 2)
-            if low and apsis < ground_m:
-                status = GROUND
-            elif (low and event == PERISELENE and apsis < event_radius_m) or (
-                not low and event == APOSELENE and apsis > event_radius_m
-            ):
-                status = EVENT
-                t_new = t + fraction * signed
-                new[:] = middle
-                _derivative(t_new, new, gravity, force, table, scratch, frame, derivative)
-                evaluations += 1
-        t = t_new
-        y[:] = new
-        k[0] = derivative
-        times[count] = t
-        states[count] = y
-        accelerations[count] = derivative[3:]
-        count += 1
-        if status != REACHED:
-            return count, status, evaluations, h
-    return count, REACHED, evaluations, h
-
-
-@njit(error_model="numpy", boundscheck=False)
-def evaluate(times, states, accelerations, wanted, out):  # type: ignore[no-untyped-def]
-    """Write the states at ``wanted`` times; where two knots share a time (a burn) the later one rules from there on."""
-    for i in range(len(wanted)):
-        k = min(max(np.searchsorted(times, wanted[i], side="right") - 1, 0), len(times) - 2)
-        while k > 0 and times[k + 1] == times[k]:
-            k -= 1
-        h = times[k + 1] - times[k]
-        s = (wanted[i] - times[k]) / h
-        interpolate(s, h, states[k], accelerations[k], states[k + 1], accelerations[k + 1], out[i])
+        stage = 1
 
 
 @njit(error_model="numpy", boundscheck=False)
@@ -311,63 +311,60 @@ def _tide_gradient(gm, sx, sy, sz, x, y, z, g):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy", boundscheck=False)
-def _variational(t, y, gravity, low, force, table, scratch, frame, out):  # type: ignore[no-untyped-def]
-    """State and transition matrix: y = r, v, then Phi (6 x 6, row by row)."""
-    ax, ay, az = force_acceleration(t, y[0], y[1], y[2], gravity, force, table, scratch, frame)
-    out[0], out[1], out[2] = y[3], y[4], y[5]
-    out[3], out[4], out[5] = ax, ay, az
-    m = frame[:9].copy().reshape(3, 3)
-    p = m @ y[:3]
-    xx, xy, xz, yy, yz, zz = acceleration_gradient(low, p[0], p[1], p[2])
-    body = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    g = np.zeros((3, 3))
+def _force_gradient(low, force, frame, x, y, z, g):  # type: ignore[no-untyped-def]
+    """Write the derivative of the acceleration by position, ICRF, of the field ``low`` with Earth and Sun."""
+    xx, xy, xz, yy, yz, zz = acceleration_gradient(
+        low,
+        frame[0] * x + frame[1] * y + frame[2] * z,
+        frame[3] * x + frame[4] * y + frame[5] * z,
+        frame[6] * x + frame[7] * y + frame[8] * z,
+    )
     for i in range(3):
+        px, py, pz = frame[i], frame[3 + i], frame[6 + i]
+        qx, qy, qz = px * xx + py * xy + pz * xz, px * xy + py * yy + pz * yz, px * xz + py * yz + pz * zz
         for j in range(i, 3):
-            total = 0.0
-            for a in range(3):
-                for b in range(3):
-                    total += m[a, i] * body[a, b] * m[b, j]
-            g[i, j] = total
+            g[i, j] = qx * frame[j] + qy * frame[3 + j] + qz * frame[6 + j]
     if force[GM_EARTH] > 0.0:
-        _tide_gradient(force[GM_EARTH], frame[9], frame[10], frame[11], y[0], y[1], y[2], g)
+        _tide_gradient(force[GM_EARTH], frame[9], frame[10], frame[11], x, y, z, g)
     if force[GM_SUN] > 0.0:
-        _tide_gradient(force[GM_SUN], frame[12], frame[13], frame[14], y[0], y[1], y[2], g)
+        _tide_gradient(force[GM_SUN], frame[12], frame[13], frame[14], x, y, z, g)
     g[1, 0], g[2, 0], g[2, 1] = g[0, 1], g[0, 2], g[1, 2]
-    for j in range(6):
-        for i in range(3):
-            out[6 + 6 * i + j] = y[6 + 6 * (i + 3) + j]
-            total = 0.0
-            for a in range(3):
-                total += g[i, a] * y[6 + 6 * a + j]
-            out[6 + 6 * (i + 3) + j] = total
 
 
-@njit(error_model="numpy", boundscheck=False)
+@njit(error_model="numpy", boundscheck=False, nogil=True)
 def transition(y0, duration_s, steps, gravity, low, force, table, scratch_size, a, b, c):  # type: ignore[no-untyped-def]
-    """Return state and transition matrix (42 numbers) after ``steps`` equal steps of the method's higher order."""
-    scratch = np.empty(scratch_size)
-    frame = np.empty(COLUMNS)
+    """Return state and transition matrix (42 numbers, the matrix row by row) after ``steps`` equal steps."""
+    scratch, frame, work, y = np.empty(scratch_size), np.empty(COLUMNS), np.empty(42), np.zeros(42)
+    g = np.empty((3, 3))
     stages = len(c)
     k = np.empty((stages, 42))
-    work = np.empty(42)
-    y = np.zeros(42)
-    y[:6] = y0
     for i in range(6):
+        y[i] = y0[i]
         y[6 + 7 * i] = 1.0
     h = duration_s / steps
     for number in range(steps):
-        t = number * h
-        _variational(t, y, gravity, low, force, table, scratch, frame, k[0])
-        for i in range(1, stages):
-            work[:] = y
-            for j in range(i):
-                if a[i, j] != 0.0:
-                    f = h * a[i, j]
-                    for d in range(42):
-                        work[d] += f * k[j, d]
-            _variational(t + c[i] * h, work, gravity, low, force, table, scratch, frame, k[i])
-        for i in range(stages):
-            f = h * b[i]
+        for stage in range(stages):
             for d in range(42):
-                y[d] += f * k[i, d]
+                work[d] = y[d]
+            for j in range(stage):
+                factor = h * a[stage, j]
+                for d in range(42):
+                    work[d] += factor * k[j, d]
+            t = (number + c[stage]) * h
+            ax, ay, az = force_acceleration(t, work[0], work[1], work[2], gravity, force, table, scratch, frame)
+            _force_gradient(low, force, frame, work[0], work[1], work[2], g)
+            for d in range(3):
+                k[stage, d] = work[d + 3]
+            k[stage, 3], k[stage, 4], k[stage, 5] = ax, ay, az
+            for j in range(6):
+                for i in range(3):
+                    k[stage, 6 + 6 * i + j] = work[24 + 6 * i + j]
+                    total = 0.0
+                    for d in range(3):
+                        total += g[i, d] * work[6 + 6 * d + j]
+                    k[stage, 24 + 6 * i + j] = total
+        for stage in range(stages):
+            factor = h * b[stage]
+            for d in range(42):
+                y[d] += factor * k[stage, d]
     return y
