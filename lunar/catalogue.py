@@ -11,7 +11,7 @@ import gzip
 import io
 import math
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lunar.constants import MOON_RADIUS_M
-from lunar.errors import DataFileError
+from lunar.errors import DataFileError, LunarError
 from lunar.frames import mcmf_from_spherical
 
 FloatArray = NDArray[np.float64]
@@ -65,12 +65,11 @@ MARIA = (
 )
 """Latitude and east longitude in deg and diameter in km of the maria (IAU gazetteer, rounded)."""
 
-MARE_DENSITY_RATIO = 0.055
+MARE_DENSITY_RATIO = 0.045
 """Craters of 5-30 km in maria per one in highlands of the same area, for the synthetic catalogue.
 
-LU1319381 has between 0.01 (Fecunditatis) and 0.15 (Procellarum); with this value the chance of three craters
-in a footprint of 120 deg agrees with that of LU1319381 over its complete tiles, brought to the paper's
-density (0.88).
+LU1319381 has between 0.01 (Fecunditatis) and 0.15 (Procellarum).  With this value the chance of three craters in a
+footprint of 120 deg from the paper's orbit is that of LU1319381 completed to the paper's class counts (0.92).
 """
 
 OWN_COLUMNS = ("id", "latitude_deg", "longitude_deg", "diameter_m", "rim_height_m", "depth_m", "complete")
@@ -222,26 +221,88 @@ def paper_density_catalogue(seed: int, uniform: bool = False) -> CraterCatalogue
     Places are random over the sphere; diameters follow N(>D) ~ D^-2 inside each class.
     """
     rng = np.random.Generator(np.random.PCG64(seed))
-    diameters = []
-    for (low, high), count in zip(pairwise(CLASS_LIMITS_M), PAPER_CLASS_COUNTS, strict=True):
-        diameters.append((low**-2 + rng.random(count) * (high**-2 - low**-2)) ** -0.5)
-    diameter_m = rng.permutation(np.concatenate(diameters))
-    n = len(diameter_m)
     mare = np.radians([(latitude, longitude) for latitude, longitude, _ in MARIA])
     mare_unit = mcmf_from_spherical(mare[:, 0], mare[:, 1]) / MOON_RADIUS_M
     mare_cos = np.cos([500.0 * diameter_km / MOON_RADIUS_M for _, _, diameter_km in MARIA])
+
+    def accepted(latitude_rad: FloatArray, longitude_rad: FloatArray) -> NDArray[np.bool_]:
+        chance = rng.random(len(latitude_rad))
+        unit = mcmf_from_spherical(latitude_rad, longitude_rad) / MOON_RADIUS_M
+        in_mare = np.any(unit @ mare_unit.T > mare_cos, axis=1)
+        return np.asarray(uniform | ~in_mare | (chance < MARE_DENSITY_RATIO))
+
+    diameter_m = _class_diameters_m(rng, PAPER_CLASS_COUNTS)
+    latitude, longitude = _random_places(rng, len(diameter_m), accepted)
+    where = "uniform places" if uniform else "sparse maria"
+    return make_catalogue(
+        latitude, longitude, diameter_m, source=f"synthetic, the paper's class counts, {where}, seed {seed}"
+    )
+
+
+def completed_to_paper(catalogue: CraterCatalogue, seed: int) -> CraterCatalogue:
+    """Return the complete craters of 5-30 km of a catalogue, with random ones up to the paper's class counts added.
+
+    The added craters lie in the tiles of 30 x 30 degrees in which the catalogue has no complete crater, where it is
+    silent; they have the ids -1, -2, ...
+
+    Raises
+    ------
+    LunarError
+        Where no tile is empty, or a class already has more craters than the paper's catalogue.
+    """
+    in_range = catalogue.complete & (size_class(catalogue.diameter_m) >= 0)
+    known = catalogue.select(in_range & (catalogue.diameter_m >= CLASS_LIMITS_M[0]))
+    missing = np.array(PAPER_CLASS_COUNTS) - class_counts(known)
+    tiles = np.bincount(
+        _tile(catalogue.latitude_rad, catalogue.longitude_rad)[catalogue.complete], minlength=72
+    )
+    empty = tiles == 0
+    if np.any(missing < 0) or not np.any(empty):
+        raise LunarError(
+            f"{catalogue.source}: expected a catalogue with empty tiles and at most {PAPER_CLASS_COUNTS} craters of the "
+            f"three classes, found {np.count_nonzero(empty)} and {tuple(class_counts(known).tolist())}"
+        )
+    rng = np.random.Generator(np.random.PCG64(seed))
+    diameter_m = _class_diameters_m(rng, missing.tolist())
+    latitude, longitude = _random_places(rng, len(diameter_m), lambda lat, lon: empty[_tile(lat, lon)])
+    n = len(diameter_m)
+    return make_catalogue(
+        np.concatenate([known.latitude_rad, latitude]),
+        np.concatenate([known.longitude_rad, longitude]),
+        np.concatenate([known.diameter_m, diameter_m]),
+        source=f"{catalogue.source}, with {n} random craters (seed {seed}) in {np.count_nonzero(empty)} empty tiles",
+        ids=np.concatenate([known.ids, -1 - np.arange(n)]),
+        rim_height_m=np.concatenate([known.rim_height_m, np.full(n, np.nan)]),
+        depth_m=np.concatenate([known.depth_m, np.full(n, np.nan)]),
+    )
+
+
+def _class_diameters_m(rng: np.random.Generator, counts: Sequence[int]) -> FloatArray:
+    """Return shuffled diameters with ``counts`` in the classes 0, 1 and 2."""
+    parts = []
+    for (low, high), count in zip(pairwise(CLASS_LIMITS_M), counts, strict=True):
+        parts.append((low**-2 + rng.random(count) * (high**-2 - low**-2)) ** -0.5)
+    return rng.permutation(np.concatenate(parts))
+
+
+def _random_places(
+    rng: np.random.Generator, n: int, accepted: Callable[[FloatArray, FloatArray], NDArray[np.bool_]]
+) -> tuple[FloatArray, FloatArray]:
+    """Return n latitudes and longitudes, uniform over the part of the sphere that is accepted."""
     latitude_rad, longitude_rad = np.empty(0), np.empty(0)
     while len(latitude_rad) < n:
         latitude, longitude = np.arcsin(rng.uniform(-1.0, 1.0, n)), rng.uniform(0.0, TWO_PI, n)
-        chance = rng.random(n)
-        unit = mcmf_from_spherical(latitude, longitude) / MOON_RADIUS_M
-        in_mare = np.any(unit @ mare_unit.T > mare_cos, axis=1)
-        kept = np.ones(n, dtype=np.bool_) if uniform else ~in_mare | (chance < MARE_DENSITY_RATIO)
+        kept = accepted(latitude, longitude)
         latitude_rad = np.concatenate([latitude_rad, latitude[kept]])
         longitude_rad = np.concatenate([longitude_rad, longitude[kept]])
-    where = "uniform places" if uniform else "sparse maria"
-    source = f"synthetic, the paper's class counts, {where}, seed {seed}"
-    return make_catalogue(latitude_rad[:n], longitude_rad[:n], diameter_m, source=source)
+    return latitude_rad[:n], longitude_rad[:n]
+
+
+def _tile(latitude_rad: FloatArray, longitude_rad: FloatArray) -> IntArray:
+    """Return the number of the tile of 30 x 30 degrees, 0..71."""
+    row = np.clip(np.floor((latitude_rad + math.pi / 2) / (math.pi / 6)), 0, 5)
+    column = np.clip(np.floor(np.mod(longitude_rad, TWO_PI) / (math.pi / 6)), 0, 11)
+    return np.asarray(12 * row + column, dtype=np.int64)
 
 
 def load_catalogue(path: Path | str) -> CraterCatalogue:

@@ -220,9 +220,14 @@ class Ephemeris:
         return np.where((owner >= 0) & (flat <= stops[np.maximum(owner, 0)]), owner, -1)
 
     def _refuse(self, utc_ns: int) -> None:
-        spans = [f"{format_utc(s.start_utc_ns)}..{format_utc(s.stop_utc_ns)}" for s in self.segments[:4]]
-        more = f" and {len(self.segments) - 4} more spans" if len(self.segments) > 4 else ""
-        raise EphemerisCoverageError(format_utc(utc_ns), ", ".join(spans) + more)
+        spans: list[tuple[int, int]] = []
+        for segment in self.segments:
+            joined = bool(spans) and spans[-1][1] == segment.start_utc_ns
+            start = spans.pop()[0] if joined else segment.start_utc_ns
+            spans.append((start, segment.stop_utc_ns))
+        texts = [f"{format_utc(start)}..{format_utc(stop)}" for start, stop in spans[:3]]
+        more = f" or {len(spans) - 3} later spans" if len(spans) > 3 else ""
+        raise EphemerisCoverageError(format_utc(utc_ns), ", ".join(texts) + more)
 
 
 def ephemeris_from_states(

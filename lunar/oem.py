@@ -423,12 +423,11 @@ def _segment_lines(segment: EphemerisSegment, system: str) -> list[str]:
         f"TIME_SYSTEM = {system}",
         f"START_TIME = {texts[0]}",
     ]
-    for key, epoch in (
-        ("USEABLE_START_TIME", segment.useable_start_utc_ns),
-        ("USEABLE_STOP_TIME", segment.useable_stop_utc_ns),
-    ):
-        if epoch is not None:
-            lines.append(f"{key} = {_epoch_texts(from_utc_ns(np.array([epoch]), system))[0]}")
+    if segment.useable_start_utc_ns is not None or segment.useable_stop_utc_ns is not None:
+        # Some readers want both or none.
+        useable = from_utc_ns(np.array([segment.start_utc_ns, segment.stop_utc_ns]), system)
+        first, last = (_epoch_texts(useable[k : k + 1])[0] for k in (0, 1))
+        lines += [f"USEABLE_START_TIME = {first}", f"USEABLE_STOP_TIME = {last}"]
     lines += [
         f"STOP_TIME = {texts[-1]}",
         f"INTERPOLATION = {segment.interpolation}",

@@ -4,11 +4,16 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
 os.environ.setdefault("NUMBA_SLP_VECTORIZE", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
+
+# Properties are tried on the same examples everywhere, and a busy machine is no failure.
+settings.register_profile("linna", deadline=None, derandomize=True, max_examples=50)
+settings.load_profile("linna")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

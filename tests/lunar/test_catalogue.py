@@ -1,0 +1,179 @@
+"""Crater catalogues: the spatial index against brute force, the published files, our own file."""
+
+import gzip
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lunar.catalogue import (
+    PAPER_CLASS_COUNTS,
+    class_counts,
+    completed_to_paper,
+    load_catalogue,
+    make_catalogue,
+    paper_density_catalogue,
+    save_catalogue,
+    size_class,
+)
+from lunar.constants import MOON_RADIUS_M
+from lunar.errors import DataFileError, LunarError
+
+
+def random_catalogue(n, seed=0):
+    rng = np.random.default_rng(seed)
+    return make_catalogue(
+        np.arcsin(rng.uniform(-1, 1, n)),
+        rng.uniform(-np.pi, np.pi, n),
+        rng.uniform(3e3, 30e3, n),
+        source="random",
+        rim_height_m=np.where(rng.random(n) < 0.5, np.nan, rng.uniform(-3e3, 3e3, n)),
+    )
+
+
+CATALOGUE = random_catalogue(5000)
+
+
+def haversine_m(latitude, longitude, other_latitude, other_longitude):
+    h = (
+        np.sin((other_latitude - latitude) / 2) ** 2
+        + np.cos(latitude) * np.cos(other_latitude) * np.sin((other_longitude - longitude) / 2) ** 2
+    )
+    return 2 * MOON_RADIUS_M * np.arcsin(np.sqrt(np.clip(h, 0, 1)))
+
+
+@given(st.floats(-math.pi / 2, math.pi / 2), st.floats(-7.0, 7.0), st.floats(0.0, 5.6e6))
+def test_the_index_finds_what_brute_force_finds(latitude, longitude, radius_m):
+    distance = haversine_m(latitude, longitude, CATALOGUE.latitude_rad, CATALOGUE.longitude_rad)
+    found = CATALOGUE.near(latitude, longitude, radius_m)
+    assert np.all(np.diff(found) > 0)
+    # A millimetre either side of the radius may go either way; near the far side haversine is good to 0.1 m.
+    slack = 1e-3 if radius_m < 5e6 else 1.0
+    assert set(np.flatnonzero(distance < radius_m - slack)) <= set(found)
+    assert set(found) <= set(np.flatnonzero(distance < radius_m + slack))
+
+
+@pytest.mark.parametrize("place_deg", [(0.0, 0.0), (0.0, 360.0), (10.0, -0.1), (90.0, 12.0), (-89.5, 200.0)])
+def test_the_index_holds_over_the_meridian_and_at_the_poles(place_deg):
+    latitude, longitude = np.radians(place_deg)
+    distance = haversine_m(latitude, longitude, CATALOGUE.latitude_rad, CATALOGUE.longitude_rad)
+    found = CATALOGUE.near(latitude, longitude, 200e3)
+    assert len(found) > 3
+    assert np.array_equal(found, np.flatnonzero(distance <= 200e3))
+
+
+def test_an_empty_catalogue_answers_with_nothing():
+    empty = CATALOGUE.select(np.zeros(0, dtype=bool))
+    assert len(empty) == 0
+    assert empty.near(0.0, 0.0, 1e6).shape == (0,)
+    assert empty.position_mcmf_m.shape == (0, 3)
+    assert class_counts(empty).tolist() == [0, 0, 0]
+    assert len(CATALOGUE.select([])) == 0
+
+
+def test_classes_hold_their_lower_limits_and_the_last_its_upper():
+    diameters = [2999.9, 3000, 4999.9, 5000, 9999.9, 10_000, 14_999.9, 15_000, 30_000, 30_000.1, np.nan]
+    assert size_class(diameters).tolist() == [-1, 3, 3, 0, 0, 1, 1, 2, 2, -1, -1]
+    assert size_class(7000.0).shape == ()
+
+
+def test_positions_stand_at_rim_height_and_on_the_sphere_where_it_is_not_known():
+    radius = np.linalg.norm(CATALOGUE.position_mcmf_m, axis=1)
+    assert np.allclose(radius, MOON_RADIUS_M + np.nan_to_num(CATALOGUE.rim_height_m), atol=1e-6)
+
+
+def test_our_own_file_gives_back_what_was_saved(tmp_path):
+    path = tmp_path / "own.csv"
+    save_catalogue(CATALOGUE, path)
+    back = load_catalogue(path)
+    assert np.array_equal(back.ids, CATALOGUE.ids)
+    # 1e-9 deg is 30 um on the ground.
+    assert np.max(np.abs(back.latitude_rad - CATALOGUE.latitude_rad)) * MOON_RADIUS_M < 1e-4
+    assert np.max(np.abs(back.diameter_m - CATALOGUE.diameter_m)) <= 5.1e-4
+    assert np.array_equal(np.isnan(back.rim_height_m), np.isnan(CATALOGUE.rim_height_m))
+    assert np.all(np.isnan(back.depth_m))
+    assert back.complete.all()
+    save_catalogue(back, tmp_path / "again.csv")
+    assert (tmp_path / "again.csv").read_bytes() == path.read_bytes()
+
+
+@pytest.mark.real_data
+def test_lu1319381_has_the_class_counts_of_its_readme(data_path):
+    catalogue = load_catalogue(data_path / "craters/lu1319381_ge2km.csv.gz")
+    assert class_counts(catalogue).tolist() == [30_494, 6_677, 3_983]
+    # 222,451 lines, of which four repeat the place and diameter of another.
+    assert len(catalogue) == 222_447
+    assert catalogue.longitude_rad.min() >= 0.0 and catalogue.longitude_rad.max() < 2 * np.pi
+    assert np.nanmedian(catalogue.depth_m / catalogue.diameter_m) == pytest.approx(0.1, abs=0.05)
+
+
+@pytest.mark.real_data
+def test_the_composite_is_complete_where_lu1319381_is(data_path):
+    composite = load_catalogue(data_path / "craters/composite_ge5km.csv.gz")
+    assert class_counts(composite.select(composite.complete)).tolist() == [30_494, 6_677, 3_983]
+    assert len(composite) == 52_552  # 52,554 lines, two of them repetitions
+
+
+@pytest.mark.real_data
+def test_robbins_is_read_by_its_columns(data_path):
+    catalogue = load_catalogue(data_path / "craters/lunar_craters_ge20km.csv")
+    assert len(catalogue) == 6_973
+    assert catalogue.diameter_m.min() >= 20e3
+
+
+def test_the_synthetic_catalogue_has_the_papers_class_counts_and_is_the_same_again():
+    catalogue = paper_density_catalogue(7)
+    assert tuple(class_counts(catalogue)) == PAPER_CLASS_COUNTS
+    again = paper_density_catalogue(7)
+    assert np.array_equal(catalogue.latitude_rad, again.latitude_rad)
+    # Imbrium's inner 400 km against the same area of far-side highland.
+    mare, highland = (len(catalogue.near(*np.radians(p), 400e3)) for p in ((32.8, -15.6), (10.0, 180.0)))
+    assert mare < 0.1 * highland
+
+
+def test_completing_fills_the_empty_tiles_up_to_the_papers_counts():
+    east = random_catalogue(3000, seed=3)
+    east = east.select(east.longitude_rad < np.pi)
+    whole = completed_to_paper(east, 1)
+    assert tuple(class_counts(whole)) == PAPER_CLASS_COUNTS
+    assert np.all(whole.longitude_rad[whole.ids < 0] >= np.pi)
+    with pytest.raises(LunarError, match="empty tiles"):
+        completed_to_paper(paper_density_catalogue(1), 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ("", "line 1: expected the column names"),
+        ("a,b\n1,2\n", "line 1: expected the columns of a crater catalogue"),
+        ("lat,lon,diam\n1,2\n", "line 2: expected 3 values, found 2"),
+        ("lat,lon,diam\n1,2,3\n1,2,x\n", "line 3, column diam: expected a number, found 'x'"),
+        ("lat,lon,diam\n91,2,3\n", "line 2: expected a latitude"),
+        ("lat,lon,diam\n1,2,-3\n", "line 2: expected a diameter above 0"),
+        ("lat,lon,diam\n1,nan,3\n", "line 2: expected a longitude"),
+    ],
+)
+def test_a_faulty_file_is_refused_with_file_line_and_what_was_found(tmp_path, text, place):
+    path = tmp_path / "faulty.csv"
+    path.write_text(text)
+    with pytest.raises(DataFileError) as caught:
+        load_catalogue(path)
+    assert str(caught.value).startswith(f"{path}: {place}")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_a_folder_and_a_cut_gzip_are_refused(tmp_path):
+    cut = tmp_path / "cut.csv.gz"
+    cut.write_bytes(gzip.compress(b"lat,lon,diam\n" + b"1,2,3\n" * 1000)[:-20])
+    for path in (tmp_path / "none.csv", tmp_path, cut):
+        with pytest.raises(DataFileError, match="expected"):
+            load_catalogue(path)
+
+
+def test_quoted_values_are_read_too(tmp_path):
+    path = tmp_path / "quoted.csv"
+    path.write_text('"lat","lon","diam"\n"1.5","-10","25"\n')
+    catalogue = load_catalogue(path)
+    assert np.degrees(catalogue.longitude_rad) == pytest.approx([350.0])

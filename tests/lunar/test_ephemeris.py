@@ -1,0 +1,219 @@
+"""Segments, coverage and interpolation, against SciPy, SPICE and orbits in closed form."""
+
+import numpy as np
+import pytest
+import spiceypy
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.interpolate import KroghInterpolator
+
+from lunar.ephemeris import Ephemeris, EphemerisSegment, ephemeris_from_states, load_ephemeris
+from lunar.errors import DataFileError, EphemerisCoverageError, EphemerisError
+from lunar.timescales import NS, parse_utc
+
+START = parse_utc("2029-08-07T00:00:00")
+RADIUS_M = 1_768_180.0
+RATE_RAD_S = 2 * np.pi / 6672.0
+
+
+def circle(elapsed_s):
+    """Position and velocity on a circular orbit, tilted."""
+    angle = RATE_RAD_S * np.asarray(elapsed_s)
+    position = RADIUS_M * np.stack([np.cos(angle), 0.6 * np.sin(angle), 0.8 * np.sin(angle)], -1)
+    velocity = RADIUS_M * RATE_RAD_S * np.stack([-np.sin(angle), 0.6 * np.cos(angle), 0.8 * np.cos(angle)], -1)
+    return position, velocity
+
+
+def arc(elapsed_s, **fields):
+    elapsed_s = np.asarray(elapsed_s, dtype=np.float64)
+    utc_ns = START + np.rint(elapsed_s * NS).astype(np.int64)
+    return ephemeris_from_states(utc_ns, *circle(elapsed_s), **fields)
+
+
+def at_s(ephemeris, elapsed_s):
+    return ephemeris.at(START + np.rint(np.asarray(elapsed_s) * NS).astype(np.int64))
+
+
+IRREGULAR_S = np.cumsum(np.random.default_rng(2).uniform(10.0, 60.0, 120)) - 10.0
+
+
+@pytest.mark.parametrize("degree", [1, 3, 5, 7, 9, 11])
+def test_hermite_interpolation_is_that_of_scipy_on_the_same_states(degree):
+    ephemeris = arc(IRREGULAR_S, degree=degree)
+    count = max((degree + 1) // 2, 2)
+    asked = np.random.default_rng(3).uniform(IRREGULAR_S[0] + 1, IRREGULAR_S[-1] - 1, 300)
+    position, velocity = at_s(ephemeris, asked)
+    for k, t in enumerate(asked):
+        step = np.searchsorted(IRREGULAR_S, t, side="right") - 1
+        first = np.clip(step - (count - 1) // 2, 0, len(IRREGULAR_S) - count)
+        nodes = IRREGULAR_S[first : first + count]
+        p, v = circle(nodes)
+        middle = nodes.mean()
+        knots = np.repeat(nodes - middle, 2)
+        theirs = KroghInterpolator(knots, np.stack([p, v], 1).reshape(-1, 3))
+        # Rounding of 1.8e6 m in float64 is 0.2 nm; epochs are rounded to 1 ns = 2 um along track.
+        assert np.allclose(position[k], theirs(t - middle), atol=1e-5)
+        assert np.allclose(velocity[k], theirs.derivative(t - middle), atol=1e-8)
+
+
+def test_hermite_interpolation_is_that_of_spice():
+    elapsed_s = np.arange(8) * 60.0
+    position, velocity = at_s(arc(elapsed_s, degree=15), [200.5])
+    for axis in range(3):
+        p, v = circle(elapsed_s)
+        table = np.stack([p[:, axis], v[:, axis]], 1).ravel()
+        value, rate = spiceypy.hrmint(elapsed_s, table, 200.5)
+        assert position[0, axis] == pytest.approx(value, abs=1e-6)
+        assert velocity[0, axis] == pytest.approx(rate, abs=1e-9)
+
+
+def test_thirty_second_states_of_a_low_orbit_interpolate_to_micrometres():
+    # The error of degree 7 is 0.316 (w h)^8 / 8! x radius = 6 um inside the table and some tens at its ends.
+    ephemeris = arc(np.arange(300) * 30.0)
+    asked = np.linspace(0.0, 299 * 30.0, 5001)
+    position, velocity = at_s(ephemeris, asked)
+    truth = circle(np.rint(asked * NS) / NS)
+    assert np.max(np.abs(position - truth[0])) < 5e-5
+    assert np.max(np.abs(velocity - truth[1])) < 5e-6
+
+
+@pytest.mark.parametrize("interpolation", ["HERMITE", "LAGRANGE", "LINEAR"])
+def test_states_come_back_as_they_are_at_their_own_epochs(interpolation):
+    ephemeris = arc(IRREGULAR_S, interpolation=interpolation)
+    position, velocity = ephemeris.at(ephemeris.utc_ns)
+    assert np.allclose(position, ephemeris.segments[0].position_m, atol=1e-6, rtol=0)
+    if interpolation != "LINEAR":
+        assert np.allclose(velocity, ephemeris.segments[0].velocity_m_s, atol=1e-8, rtol=0)
+
+
+def test_lagrange_interpolation_of_degree_seven_uses_eight_states():
+    ephemeris = arc(np.arange(100) * 30.0, interpolation="LAGRANGE", degree=7)
+    position, velocity = at_s(ephemeris, [1500.3])
+    # 30 s is 0.028 rad: (w h)^8 / 8! x the product of distances (70) x radius is 0.1 mm at most.
+    assert np.allclose(position, circle([1500.3])[0], atol=1e-3)
+    assert np.allclose(velocity, circle([1500.3])[1], atol=1e-5)
+
+
+@given(st.lists(st.floats(0.0, 3000.0), min_size=1, max_size=40))
+def test_any_order_and_repetition_of_epochs_gives_the_same_states(elapsed):
+    ephemeris = arc(IRREGULAR_S[IRREGULAR_S < 3500.0])
+    elapsed = np.clip(elapsed, IRREGULAR_S[0], None)
+    together, _ = at_s(ephemeris, elapsed)
+    for k, t in enumerate(elapsed):
+        alone, _ = at_s(ephemeris, t)
+        assert np.allclose(alone, together[k], atol=1e-8, rtol=0)
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (1,), (2, 3)])
+def test_leading_dimensions_are_kept(shape):
+    position, velocity = at_s(arc(np.arange(20) * 30.0), np.full(shape, 100.0))
+    assert position.shape == velocity.shape == (*shape, 3)
+    assert arc(np.arange(20) * 30.0).covers(np.full(shape, START)).shape == shape
+
+
+@pytest.mark.parametrize("outside_s", [-1e-9, 570.000000001])
+def test_a_nanosecond_outside_is_refused(outside_s):
+    ephemeris = arc(np.arange(20) * 30.0)
+    epoch = START + round(outside_s * NS)
+    assert not ephemeris.covers(epoch)
+    with pytest.raises(EphemerisCoverageError, match="nothing is extrapolated"):
+        ephemeris.at(epoch)
+
+
+def test_the_useable_interval_is_honoured_and_the_states_beyond_it_still_serve():
+    low, high = START + 90 * NS, START + 480 * NS
+    whole = arc(np.arange(20) * 30.0)
+    ephemeris = arc(np.arange(20) * 30.0, useable_start_utc_ns=low, useable_stop_utc_ns=high)
+    assert (ephemeris.start_utc_ns, ephemeris.stop_utc_ns) == (low, high)
+    assert ephemeris.utc_ns[0] == low and ephemeris.utc_ns[-1] == high
+    assert ephemeris.covers([low - 1, low, high, high + 1]).tolist() == [False, True, True, False]
+    assert np.array_equal(ephemeris.at(low + NS)[0], whole.at(low + NS)[0])
+
+
+def two_arcs(second_start_s=600.0, kick_m_s=5.0):
+    first = arc(np.arange(0.0, 601.0, 30.0)).segments[0]
+    elapsed = np.arange(second_start_s, second_start_s + 601.0, 30.0)
+    position, velocity = circle(elapsed)
+    utc_ns = START + np.rint(elapsed * NS).astype(np.int64)
+    return Ephemeris((first, EphemerisSegment(utc_ns, position, velocity + kick_m_s)))
+
+
+def test_nothing_is_interpolated_across_the_edge_of_a_segment():
+    ephemeris = two_arcs()
+    _, before = at_s(ephemeris, 599.999)
+    _, after = at_s(ephemeris, [600.0, 600.001])
+    assert np.allclose(before, circle(599.999)[1], atol=1e-6)
+    # The later segment holds at the shared epoch.
+    assert np.allclose(after[0] - circle(600.0)[1], 5.0, atol=1e-6)
+    assert len(ephemeris.utc_ns) == 41
+
+
+def test_epochs_between_segments_are_refused():
+    ephemeris = two_arcs(second_start_s=900.0)
+    assert ephemeris.covers(START + np.array([600, 601, 899, 900]) * NS).tolist() == [True, False, False, True]
+    with pytest.raises(EphemerisCoverageError, match=r"00:10:00.000Z, 2029-08-07T00:15:00.000Z"):
+        at_s(ephemeris, 700.0)
+
+
+def test_a_hole_in_the_states_of_a_segment_is_a_gap():
+    elapsed = np.concatenate([np.arange(0.0, 601.0, 30.0), np.arange(3600.0, 4201.0, 30.0)])
+    ephemeris = arc(elapsed)
+    assert ephemeris.covers(START + np.array([600, 601, 3599, 3600]) * NS).tolist() == [True, False, False, True]
+    at_s(ephemeris, [600.0, 3600.0])
+    with pytest.raises(EphemerisCoverageError, match=r"with a gap 2029-08-07T00:10:00.000Z..2029-08-07T01:00:00.000Z"):
+        at_s(ephemeris, [30.0, 2000.0])
+
+
+def test_a_lone_state_is_known_at_its_epoch_only():
+    ephemeris = arc([0.0])
+    assert np.array_equal(ephemeris.at(START)[0], circle(0.0)[0])
+    assert not ephemeris.covers(START + 1)
+
+
+def test_a_leap_second_inside_a_segment_does_no_harm():
+    leap = parse_utc("2017-01-01T00:00:00")
+    # 30 s of true time before midnight it is 23:59:31: the day has 86,401 s.
+    elapsed = np.arange(-300.0, 301.0, 30.0)
+    utc_ns = leap + np.rint((elapsed + (elapsed < 0.0)) * NS).astype(np.int64)
+    ephemeris = ephemeris_from_states(utc_ns, *circle(elapsed))
+    position, _ = ephemeris.at(leap + np.array([-9, 15]) * NS)
+    assert np.allclose(position, circle([-10.0, 15.0])[0], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t, p, v: (t[::-1], p, v), "expected an epoch after"),
+        (lambda t, p, v: (np.r_[t[:1], t[:-1]], p, v), "expected an epoch after"),
+        (lambda t, p, v: (t, p[:-1], v), "expected positions (20, 3), found (19, 3)"),
+        (lambda t, p, v: (t, p, v * np.nan), "state 0: expected finite velocities"),
+        (lambda t, p, v: (t[:0], p[:0], v[:0]), "at least one state"),
+    ],
+)
+def test_states_that_form_no_segment_are_refused(change, message):
+    states = change(START + np.arange(20) * 30 * NS, *circle(np.arange(20) * 30.0))
+    with pytest.raises(EphemerisError) as caught:
+        EphemerisSegment(*states)
+    assert message in str(caught.value)
+
+
+def test_overlapping_segments_and_no_segments_are_refused():
+    with pytest.raises(EphemerisError, match="expected the next segment at or after"):
+        two_arcs(second_start_s=500.0)
+    with pytest.raises(EphemerisError, match="at least one segment"):
+        Ephemeris(())
+
+
+@pytest.mark.parametrize("text", ["", "\n\n", "once upon a time\n", "# a comment\nmore\n"])
+def test_a_file_of_neither_format_is_refused(tmp_path, text):
+    path = tmp_path / "orbit.txt"
+    path.write_text(text)
+    with pytest.raises(DataFileError, match=r"orbit\.txt: first line: expected CCSDS_OEM_VERS or stk\.v\."):
+        load_ephemeris(path)
+
+
+def test_missing_and_binary_files_are_refused(tmp_path):
+    (tmp_path / "binary").write_bytes(bytes(range(256)))
+    for name in ("binary", "missing"):
+        with pytest.raises(DataFileError, match=f"{name}.*expected a CCSDS OEM or STK"):
+            load_ephemeris(tmp_path / name)

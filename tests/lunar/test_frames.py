@@ -1,0 +1,221 @@
+"""Rotations against SPICE, pymap3d, ERFA and a published example of NAIF."""
+
+import json
+from pathlib import Path
+
+import erfa
+import numpy as np
+import pymap3d
+import pytest
+import spiceypy
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lunar.constants import MOON_RADIUS_M
+from lunar.errors import DataFileError, EphemerisCoverageError
+from lunar.frames import (
+    PA_FROM_ME_DE421,
+    IauOrientation,
+    enu_from_mcmf,
+    icrf_from_j2000,
+    load_orientation,
+    matrix_from_quaternion,
+    mci_from_icrf,
+    mcmf_from_spherical,
+    quaternion_from_matrix,
+    rtn_from_inertial,
+    spherical_from_mcmf,
+)
+
+SPICE = json.loads(Path(__file__).parents[1].joinpath("references/lunar/spice_moon_rotations.json").read_text())
+SPICE_EPOCHS_TDB_S = np.array(SPICE["epochs_tdb_s"])
+
+# The same model in the same arithmetic: 1e-9 rad is 1.7 mm on the ground.
+SAME_MODEL_RAD = 1e-9
+
+unit_quaternions = st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1)
+latitudes = st.floats(-np.pi / 2, np.pi / 2)
+longitudes = st.floats(-2 * np.pi, 2 * np.pi)
+
+
+def angle_rad(first, second):
+    """Angle of the rotation between matrices (..., 3, 3)."""
+    difference = first @ np.swapaxes(second, -1, -2)
+    off = difference - np.swapaxes(difference, -1, -2)
+    sine = np.linalg.norm(np.stack([off[..., 2, 1], off[..., 0, 2], off[..., 1, 0]]), axis=0) / 2
+    return np.arcsin(np.clip(sine, 0, 1))
+
+
+@pytest.fixture(scope="module")
+def de421(data_path):
+    return load_orientation(
+        data_path / "kernels/moon_pa_de421_1900-2050.bpc", data_path / "kernels/moon_080317.tf"
+    )
+
+
+@pytest.fixture(scope="module")
+def spice_kernels(data_path):
+    names = ("pck00010.tpc", "moon_pa_de421_1900-2050.bpc", "moon_080317.tf")
+    for name in names:
+        spiceypy.furnsh(str(data_path / "kernels" / name))
+    yield
+    spiceypy.kclear()
+
+
+def spice_rotations(frame, epochs_tdb_s):
+    return np.array([spiceypy.pxform("J2000", frame, epoch) for epoch in epochs_tdb_s])
+
+
+def test_the_iau_series_is_that_of_spice_at_stored_epochs():
+    ours = IauOrientation().mcmf_from_icrf(SPICE_EPOCHS_TDB_S)
+    assert np.max(angle_rad(ours, np.array(SPICE["rotations"]["IAU_MOON"]))) < SAME_MODEL_RAD
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("frame", ["IAU_MOON", "MOON_PA", "MOON_ME"])
+def test_rotations_are_those_of_spice_with_the_same_kernels(frame, de421, spice_kernels):
+    # From 1905 to 2049, both sides of every record edge that falls in between.
+    epochs = np.concatenate([np.linspace(-3.0e9, 1.55e9, 301), de421.start_tdb_s + de421.record_s * np.arange(5000, 5010)])
+    ours = {
+        "IAU_MOON": IauOrientation().mcmf_from_icrf,
+        "MOON_PA": de421.pa_from_icrf,
+        "MOON_ME": de421.mcmf_from_icrf,
+    }[frame](epochs)
+    assert np.max(angle_rad(ours, spice_rotations(frame, epochs))) < SAME_MODEL_RAD
+
+
+@pytest.mark.real_data
+def test_the_kernel_file_gives_the_constant_rotation_that_is_built_in(de421):
+    assert np.max(np.abs(de421.me_from_pa @ PA_FROM_ME_DE421 - np.eye(3))) < 1e-15
+
+
+def test_the_constant_rotation_takes_the_earth_from_pa_to_me_as_naif_prints_it():
+    # moon_080317.tf, "Program output": state of the Earth at 2008 MAR 17 20:10:00, km and km/s.
+    earth_me = (379892.825, 33510.118, -12661.5278, 0.0400357582, 0.0117963334, 0.115130508)
+    earth_pa = (379908.634, 33385.003, -12516.8859, 0.0399957879, 0.0117833314, 0.115145731)
+    turned = PA_FROM_ME_DE421.T @ np.reshape(earth_pa, (2, 3)).T
+    # Positions are printed to 1 m in 380,000 km.
+    assert np.max(np.abs(turned.T[0] - earth_me[:3])) < 1e-3
+    assert np.max(np.abs(turned.T[1] - earth_me[3:])) < 1e-9
+
+
+def test_principal_and_mean_earth_axes_are_nine_hundred_metres_apart_on_the_ground():
+    # Williams, Boggs, Folkner 2008: 860 m at most on the surface ("about 0.9 km").
+    place = mcmf_from_spherical(*np.meshgrid(np.linspace(-1.5, 1.5, 61), np.linspace(0, 6.2, 63)))
+    offset_m = np.linalg.norm(place @ PA_FROM_ME_DE421.T - place, axis=-1)
+    assert 850.0 < offset_m.max() < 900.0
+
+
+@pytest.mark.real_data
+def test_the_iau_series_is_within_two_hundred_metres_of_de421_in_this_century(de421):
+    epochs = np.linspace(0.0, 1.55e9, 500)
+    apart_m = MOON_RADIUS_M * angle_rad(IauOrientation().mcmf_from_icrf(epochs), de421.mcmf_from_icrf(epochs))
+    assert 20.0 < np.median(apart_m) < 150.0
+    assert apart_m.max() < 200.0
+
+
+def test_mci_has_the_iau_pole_and_its_node_on_the_icrf_equator():
+    tdb_s = 934_027_269.183
+    mci = mci_from_icrf(tdb_s)
+    assert mci.shape == (3, 3)
+    assert np.allclose(mci[2], IauOrientation().mcmf_from_icrf(tdb_s)[2], atol=1e-15)
+    assert abs(mci[0, 2]) < 1e-15  # x lies in the equator of ICRF
+    assert np.cross([0, 0, 1.0], mci[2]) @ mci[0] > 0.0  # and is the ascending node
+
+
+def test_the_frame_bias_of_j2000_is_that_of_erfa():
+    bias, _, _ = erfa.bp06(2_451_545.0, 0.0)
+    # ERFA carries second-order terms; they are 1e-13 rad, far below a micrometre on an orbit.
+    assert np.max(np.abs(icrf_from_j2000().T - bias)) < 1e-11
+
+
+@given(latitudes, longitudes)
+def test_enu_is_that_of_pymap3d_on_a_sphere(latitude, longitude):
+    ball = pymap3d.Ellipsoid(MOON_RADIUS_M, MOON_RADIUS_M)
+    place = mcmf_from_spherical(latitude, longitude)
+    beyond = place + np.array([300.0, -200.0, 500.0])
+    theirs = pymap3d.ecef2enu(*beyond, latitude, longitude, 0.0, ell=ball, deg=False)
+    ours = enu_from_mcmf(latitude, longitude) @ (beyond - place)
+    assert np.allclose(ours, np.array(theirs, dtype=float), atol=1e-6)
+
+
+@given(latitudes, longitudes, st.floats(-1000.0, 100_000.0))
+def test_spherical_coordinates_survive_cartesian_and_back(latitude, longitude, altitude_m):
+    back = spherical_from_mcmf(mcmf_from_spherical(latitude, longitude, altitude_m))
+    assert abs(back[0] - latitude) < 1e-12
+    if abs(latitude) < np.pi / 2 - 1e-6:
+        assert abs(np.exp(1j * back[1]) - np.exp(1j * longitude)) < 1e-9
+    assert abs(back[2] - altitude_m) < 1e-8
+
+
+def test_rtn_of_a_circular_equatorial_orbit_points_out_along_and_north():
+    rtn = rtn_from_inertial([[1.0, 0, 0], [0, 2.0, 0]], [[0, 1.0, 0], [-1.0, 0, 0]])
+    assert np.allclose(rtn[0], np.eye(3))
+    assert np.allclose(rtn[1], [[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+
+
+@given(unit_quaternions)
+def test_quaternions_are_those_of_spice_and_survive_the_matrix(values):
+    q = np.array(values) / np.linalg.norm(values)
+    matrix = matrix_from_quaternion(q)
+    # SPICE q2m: v_out = q v q*, scalar first, as here.
+    assert np.allclose(matrix, spiceypy.q2m(q), atol=1e-14)
+    back = quaternion_from_matrix(matrix)
+    assert back[0] >= 0.0
+    assert min(np.abs(back - q).max(), np.abs(back + q).max()) < 1e-12
+
+
+@pytest.mark.parametrize("axis", [1, 2, 3])
+def test_half_turns_have_quaternions_too(axis):
+    q = np.zeros(4)
+    q[axis] = 1.0
+    assert np.allclose(np.abs(quaternion_from_matrix(matrix_from_quaternion(q))), q)
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (1,), (2, 3)])
+def test_rotations_keep_leading_dimensions_and_are_orthonormal(shape):
+    epochs = np.full(shape, 9.0e8) + np.arange(np.prod(shape, dtype=int)).reshape(shape) * 1e5
+    places = np.broadcast_to(np.array([1.0, 2.0, 3.0]), (*shape, 3))
+    rotations = [
+        IauOrientation().mcmf_from_icrf(epochs),
+        IauOrientation().pa_from_icrf(epochs),
+        enu_from_mcmf(np.full(shape, 0.3), np.full(shape, 4.0)),
+        rtn_from_inertial(places, np.broadcast_to(np.array([-2.0, 1.0, 0.5]), (*shape, 3))),
+    ]
+    for rotation in rotations:
+        assert rotation.shape == (*shape, 3, 3)
+        assert np.allclose(rotation @ np.swapaxes(rotation, -1, -2), np.eye(3), atol=1e-14)
+        assert np.allclose(np.linalg.det(rotation), 1.0)
+    assert quaternion_from_matrix(rotations[0]).shape == (*shape, 4)
+
+
+@pytest.mark.real_data
+def test_epochs_outside_the_kernel_are_refused(de421):
+    with pytest.raises(EphemerisCoverageError, match=r"DE421: expected an epoch within"):
+        de421.mcmf_from_icrf([0.0, 2.0e9])
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("kept", [0, 500, 3000, 1_000_000])
+def test_a_kernel_cut_short_is_refused_with_its_name(data_path, tmp_path, kept):
+    octets = (data_path / "kernels/moon_pa_de421_1900-2050.bpc").read_bytes()
+    path = tmp_path / "cut.bpc"
+    path.write_bytes(octets[:kept])
+    with pytest.raises(DataFileError, match=r"cut\.bpc.*expected.*found"):
+        load_orientation(path)
+
+
+def test_a_file_of_another_kind_and_a_missing_one_are_refused(tmp_path):
+    other = tmp_path / "other.bpc"
+    other.write_bytes(b"DAF/SPK " + bytes(5000))
+    for path in (other, tmp_path / "none.bpc"):
+        with pytest.raises(DataFileError, match="expected a binary PCK kernel"):
+            load_orientation(path)
+
+
+@pytest.mark.real_data
+def test_a_frame_kernel_without_the_mean_earth_frame_is_refused(data_path, tmp_path):
+    path = tmp_path / "wrong.tf"
+    path.write_text("KPL/FK\n\\begindata\nFRAME_31006_NAME = 'MOON_PA_DE421'\n\\begintext\n")
+    with pytest.raises(DataFileError, match="three angles of a mean-Earth frame"):
+        load_orientation(data_path / "kernels/moon_pa_de421_1900-2050.bpc", path)

@@ -1,0 +1,276 @@
+"""CCSDS OEM both ways against the independent `oem` package, all versions, and every fault with its line."""
+
+import numpy as np
+import oem as independent
+import pytest
+
+from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment, load_ephemeris
+from lunar.errors import DataFileError, UnknownFrameError, UnknownTimeSystemError
+from lunar.frames import icrf_from_j2000
+from lunar.oem import format_oem, load_oem, parse_oem, save_oem
+from lunar.timescales import NS, format_utc, parse_utc
+
+# The independent package keeps time with ERFA, which warns of UTC more than five years after its own release.
+START = parse_utc("2029-08-07T00:00:00")
+
+VERSION_1 = """\
+CCSDS_OEM_VERS = 1.0
+COMMENT as the Blue Book of 2004 lays it out
+CREATION_DATE = 2029-08-01T10:00:00
+ORIGINATOR = ESA
+
+META_START
+OBJECT_NAME          = SELENITA
+OBJECT_ID            = 2029-123A
+CENTER_NAME          = MOON
+REF_FRAME            = EME2000
+TIME_SYSTEM          = UTC
+START_TIME           = 2029-08-07T00:00:00.000
+USEABLE_START_TIME   = 2029-08-07T00:01:00.000
+USEABLE_STOP_TIME    = 2029-08-07T00:03:00.000
+STOP_TIME            = 2029-08-07T00:04:00.000
+INTERPOLATION        = HERMITE
+INTERPOLATION_DEGREE = 5
+META_STOP
+COMMENT propagated with the plan of week 31
+2029-08-07T00:00:00.000   1768.0     0.0    10.0  0.0  1.665 0.1
+2029-08-07T00:01:00.000   1765.2    99.8    16.0 -0.1  1.662 0.1
+2029-219T00:02:00.000     1756.7   199.3    22.0 -0.2  1.655 0.1
+2029-08-07T00:03:00.000Z  1742.7   298.2    28.0 -0.3  1.641 0.1
+2029-08-07T00:04:00.000   1723.1   396.1    34.0 -0.4  1.623 0.1
+"""
+
+VERSION_3 = """\
+CCSDS_OEM_VERS = 3.0
+COMMENT two segments, accelerations, covariances
+CLASSIFICATION = public
+CREATION_DATE = 2029-213T10:00:00.5
+ORIGINATOR = LINNA
+MESSAGE_ID = OEM 17
+META_START
+COMMENT before the burn
+OBJECT_NAME = SELENITA
+OBJECT_ID = 2029-123A
+CENTER_NAME = Moon
+REF_FRAME = ICRF
+TIME_SYSTEM = TDB
+START_TIME = 2029-08-07T00:01:09.184
+STOP_TIME = 2029-08-07T00:02:09.184
+META_STOP
+2029-08-07T00:01:09.184 1768.0 0.0 10.0 0.0 1.665 0.1 0.001 0.0 0.0
+2029-08-07T00:02:09.184 1765.2 99.8 16.0 -0.1 1.662 0.1 0.001 0.0 0.0
+COVARIANCE_START
+EPOCH = 2029-08-07T00:01:09.184
+COV_REF_FRAME = RTN
+1e-6
+0 2e-6
+0 0 3e-6
+0 0 0 1e-12
+1e-10 0 0 0 2e-12
+0 0 0 0 0 3e-12
+EPOCH = 2029-08-07T00:02:09.184
+4e-6
+0 4e-6
+0 0 4e-6
+0 0 0 4e-12
+0 0 0 0 4e-12
+0 0 0 0 0 4e-12
+COVARIANCE_STOP
+META_START
+OBJECT_NAME = SELENITA
+OBJECT_ID = 2029-123A
+CENTER_NAME = MOON
+REF_FRAME = ICRF
+TIME_SYSTEM = TDB
+START_TIME = 2029-08-07T00:02:09.184
+STOP_TIME = 2029-08-07T00:03:09.184
+INTERPOLATION = LAGRANGE
+INTERPOLATION_DEGREE = 1
+META_STOP
+2029-08-07T00:02:09.184 1765.2 99.8 16.0 -0.1 1.665 0.1
+2029-08-07T00:03:09.184 1756.7 199.3 22.0 -0.2 1.655 0.1
+"""
+
+
+def example_ephemeris(n=50, covariances=()):
+    angle = np.arange(n) * 30.0 * 2 * np.pi / 6672.0
+    position = 1_768_180.0 * np.stack([np.cos(angle), 0.6 * np.sin(angle), 0.8 * np.sin(angle)], -1)
+    velocity = 1665.0 * np.stack([-np.sin(angle), 0.6 * np.cos(angle), 0.8 * np.cos(angle)], -1)
+    utc_ns = START + np.arange(n) * 30 * NS
+    later = utc_ns + (n - 1) * 30 * NS
+    first = EphemerisSegment(utc_ns, position, velocity, comments=("first", "of two"), covariances=covariances)
+    second = EphemerisSegment(later, position, velocity, degree=5, useable_stop_utc_ns=int(later[-3]))
+    return Ephemeris((first, second), comments=("whole file",))
+
+
+def test_version_1_is_read_with_units_frame_bias_comments_and_useable_interval():
+    ephemeris = parse_oem(VERSION_1)
+    (segment,) = ephemeris.segments
+    assert (ephemeris.originator, segment.object_id, segment.degree) == ("ESA", "2029-123A", 5)
+    assert ephemeris.comments == ("as the Blue Book of 2004 lays it out",)
+    assert segment.comments == ("propagated with the plan of week 31",)
+    assert format_utc(ephemeris.start_utc_ns) == "2029-08-07T00:01:00.000Z"
+    assert format_utc(ephemeris.stop_utc_ns) == "2029-08-07T00:03:00.000Z"
+    assert len(segment.utc_ns) == 5
+    assert np.allclose(segment.position_m[1], icrf_from_j2000() @ [1765.2e3, 99.8e3, 16e3], atol=1e-6)
+    # 23 mas: a fifth of a metre at this distance, and not to be lost.
+    assert 0.1 < np.linalg.norm(segment.position_m[1] - [1765.2e3, 99.8e3, 16e3]) < 0.3
+
+
+def test_version_3_is_read_with_time_system_covariances_and_segments():
+    ephemeris = parse_oem(VERSION_3)
+    first, second = ephemeris.segments
+    # TDB is ahead of UTC by 69.184 s; TDB - TT is some -0.9 ms in August.
+    assert abs(int(first.utc_ns[0]) - START) < 2_000_000
+    assert abs(int(first.utc_ns[0]) - START) > 100_000
+    assert second.interpolation == "LAGRANGE"
+    one, two = first.covariances
+    assert (one.frame, two.frame) == ("RTN", "RTN")
+    assert one.matrix[2, 2] == pytest.approx(3.0)  # 3e-6 km2
+    assert one.matrix[4, 0] == one.matrix[0, 4] == pytest.approx(1e-4)
+    assert two.matrix[5, 5] == pytest.approx(4e-6)
+    assert np.array_equal(first.velocity_m_s[:, 1], [1665.0, 1662.0])
+
+
+def test_what_is_written_is_read_back_to_a_micrometre_with_everything_else_the_same():
+    covariance = Covariance(START, "RTN", np.diag([1.0, 4.0, 9.0, 1e-6, 4e-6, 9e-6]))
+    ephemeris = example_ephemeris(covariances=(covariance,))
+    back = parse_oem(format_oem(ephemeris))
+    assert back.comments == ephemeris.comments
+    for was, now in zip(ephemeris.segments, back.segments, strict=True):
+        assert np.array_equal(was.utc_ns, now.utc_ns)
+        assert np.max(np.abs(was.position_m - now.position_m)) < 1e-6
+        assert np.max(np.abs(was.velocity_m_s - now.velocity_m_s)) < 1e-9
+        for name in ("centre", "frame", "object_name", "object_id", "time_system", "interpolation", "degree"):
+            assert getattr(was, name) == getattr(now, name)
+        assert (was.comments, was.useable_stop_utc_ns) == (now.comments, now.useable_stop_utc_ns)
+    assert np.allclose(back.segments[0].covariances[0].matrix, covariance.matrix, rtol=1e-12)
+    assert format_oem(back) == format_oem(parse_oem(format_oem(back)))
+
+
+@pytest.mark.parametrize("system", ["UTC", "TAI", "TT", "TDB", "GPS"])
+def test_every_time_system_keeps_the_epochs_to_the_nanosecond(system):
+    utc_ns = START + np.array([0, 1, 123_456_789, 30 * NS])
+    states = np.arange(12.0).reshape(4, 3) + 1.0
+    ephemeris = Ephemeris((EphemerisSegment(utc_ns, states, states),))
+    assert np.array_equal(parse_oem(format_oem(ephemeris, time_system=system)).utc_ns, utc_ns)
+
+
+@pytest.mark.filterwarnings("ignore:.*dubious year:erfa.ErfaWarning")
+def test_the_independent_reader_reads_what_we_write(tmp_path):
+    path = tmp_path / "ours.oem"
+    covariance = Covariance(START, "RTN", np.diag([1.0, 4.0, 9.0, 1e-6, 4e-6, 9e-6]))
+    ephemeris = example_ephemeris(covariances=(covariance,))
+    save_oem(ephemeris, path)
+    theirs = independent.OrbitEphemerisMessage.open(path)
+    assert theirs.version == "2.0"
+    assert len(theirs.segments) == 2
+    for ours, segment in zip(ephemeris.segments, theirs.segments, strict=True):
+        assert segment.metadata["CENTER_NAME"] == "MOON"
+        assert int(segment.metadata["INTERPOLATION_DEGREE"]) == ours.degree
+        assert len(segment.states) == len(ours.utc_ns)
+        for k in (0, 17, -1):
+            state = segment.states[k]
+            assert state.epoch.isot == format_utc(int(ours.utc_ns[k]), 6).rstrip("Z")
+            assert np.allclose(1e3 * np.array(state.position), ours.position_m[k], atol=1e-6, rtol=0)
+            assert np.allclose(1e3 * np.array(state.velocity), ours.velocity_m_s[k], atol=1e-9, rtol=0)
+    (block,) = theirs.segments[0].covariances
+    assert block.frame == "RTN"
+    assert np.allclose(block.matrix * 1e6, covariance.matrix, rtol=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore:.*dubious year:erfa.ErfaWarning")
+def test_we_read_what_the_independent_writer_writes(tmp_path):
+    ours, theirs = tmp_path / "ours.oem", tmp_path / "theirs.oem"
+    ephemeris = example_ephemeris()
+    save_oem(ephemeris, ours)
+    independent.OrbitEphemerisMessage.open(ours).save_as(theirs)
+    back = load_ephemeris(theirs)
+    assert np.array_equal(back.utc_ns, ephemeris.utc_ns)
+    for was, now in zip(ephemeris.segments, back.segments, strict=True):
+        assert np.allclose(was.position_m, now.position_m, atol=1e-3, rtol=0)
+        assert (was.degree, was.useable_stop_utc_ns) == (now.degree, now.useable_stop_utc_ns)
+
+
+@pytest.mark.filterwarnings("ignore:.*dubious year:erfa.ErfaWarning")
+def test_interpolation_agrees_with_the_independent_reader(tmp_path):
+    path = tmp_path / "ours.oem"
+    ephemeris = example_ephemeris()
+    save_oem(ephemeris, path)
+    theirs = independent.OrbitEphemerisMessage.open(path)
+    from astropy.time import Time
+
+    for seconds in (100, 731, 1400):
+        state = theirs(Time(format_utc(START + seconds * NS).rstrip("Z"), scale="utc"))
+        position, velocity = ephemeris.at(START + seconds * NS)
+        # The writer's micrometre, and two interpolators' ways of dealing with rounding.
+        assert np.allclose(1e3 * np.array(state.position), position, atol=1e-4, rtol=0)
+        assert np.allclose(1e3 * np.array(state.velocity), velocity, atol=1e-6, rtol=0)
+
+
+def test_the_same_ephemeris_gives_the_same_octets(tmp_path):
+    save_oem(example_ephemeris(), tmp_path / "a.oem")
+    save_oem(example_ephemeris(), tmp_path / "b.oem")
+    assert (tmp_path / "a.oem").read_bytes() == (tmp_path / "b.oem").read_bytes()
+    stamped = format_oem(example_ephemeris(), creation_utc_ns=parse_utc("2030-01-01"))
+    assert "CREATION_DATE = 2030-01-01T00:00:00.000" in stamped
+
+
+def replaced(old, new):
+    assert old in VERSION_1
+    return VERSION_1.replace(old, new)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "line 1: expected CCSDS_OEM_VERS = 1.0, 2.0 or 3.0, found nothing"),
+        (replaced("VERS = 1.0", "VERS = 4.0"), "line 1: expected an OEM version out of 1.0, 2.0, 3.0, found '4.0'"),
+        (replaced("ORIGINATOR = ESA", ""), "expected ORIGINATOR in the header"),
+        (replaced("OBJECT_ID            = 2029-123A\n", ""), "line 17: expected OBJECT_ID before META_STOP, found none"),
+        (replaced("REF_FRAME            = EME2000\n", "REF_FRAME = EME2000\nREF_FRAME = ICRF\n"), "line 11: expected REF_FRAME once"),
+        (replaced("CENTER_NAME          = MOON", "CENTER_NAME = EARTH"), "line 9: expected CENTER_NAME = MOON, found 'EARTH'"),
+        (replaced("= HERMITE", "= SPLINE"), "line 16: expected an INTERPOLATION out of"),
+        (replaced("INTERPOLATION_DEGREE = 5", "INTERPOLATION_DEGREE = x"), "line 17: expected an INTERPOLATION_DEGREE"),
+        (replaced("INTERPOLATION_DEGREE = 5\n", ""), "line 16: expected INTERPOLATION_DEGREE with INTERPOLATION"),
+        (replaced("START_TIME           = 2029-08-07", "START_TIME           = 2029-08-32"), "expected an epoch like"),
+        (replaced("OBJECT_NAME  ", "OBJEKT_NAME  "), "line 7: expected one of OBJECT_NAME"),
+        (replaced("1765.2    99.8", "1765.2    ninety"), "line 21: expected a number, found 'ninety'"),
+        (replaced("1765.2    99.8", "1765.2    nan"), "line 21: expected finite numbers"),
+        (replaced("   99.8    16.0 -0.1", "   99.8    16.0"), "line 21: expected 7 values as in the line before, found 6 values"),
+        (replaced("00:01:00.000   1765.2", "00:00:00.000   1765.2"), "line 21: expected an epoch after"),
+        (replaced("2029-219T00:02:00", "2029-219T00:62:00"), "line 22: expected an epoch like"),
+        (VERSION_1[: VERSION_1.index("2029-08-07T00:03:00.000Z")], "line 22: expected a last state at STOP_TIME"),
+        (VERSION_1[: VERSION_1.index("COMMENT propagated")], "expected a state: epoch x y z vx vy vz, found the end"),
+        (VERSION_1[: VERSION_1.index("META_STOP")], "expected more lines, found the end of the file"),
+        (VERSION_1[: VERSION_1.index("META_START")], "expected META_START, found the end of the file"),
+        (VERSION_1[:-8], "line 24: expected 7 values as in the line before, found 6"),
+        (VERSION_1 + "COVARIANCE_START\nEPOCH = 2029-08-07T00:00:00\n1\n1\n", "line 28: expected 2 numbers of row 2"),
+        (VERSION_1 + "COVARIANCE_START\nEPOCH = 2029-08-07T00:00:00\n1\n", "expected more lines, found the end of the file"),
+        (VERSION_1 + "what now\n", "line 25: expected META_START, found 'what now'"),
+        (
+            replaced("USEABLE_STOP_TIME    = 2029-08-07T00:03", "USEABLE_STOP_TIME    = 2029-08-06T00:03"),
+            "expected a useable interval within",
+        ),
+        (replaced("STOP_TIME            = 2029-08-07T00:04", "STOP_TIME = 2029-08-07T00:03"), "line 24: expected an epoch within"),
+        (VERSION_1 + VERSION_1[VERSION_1.index("META_START") :], "segment 2: expected a start at or after"),
+    ],
+)
+def test_a_faulty_file_is_refused_in_one_line_with_its_place(tmp_path, text, message):
+    path = tmp_path / "faulty.oem"
+    path.write_text(text)
+    with pytest.raises(DataFileError) as caught:
+        load_oem(path)
+    assert str(caught.value).startswith(str(path))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_frame_and_an_unknown_time_system_are_refused_with_what_is_known(tmp_path):
+    path = tmp_path / "faulty.oem"
+    path.write_text(replaced("= EME2000", "= MOON_TOD"))
+    with pytest.raises(UnknownFrameError, match=r"faulty\.oem: line 10: expected .*ICRF.*, found 'MOON_TOD'"):
+        load_oem(path)
+    path.write_text(replaced("TIME_SYSTEM          = UTC", "TIME_SYSTEM = LTC"))
+    with pytest.raises(UnknownTimeSystemError, match=r"faulty\.oem: line 11: expected .*TDB.*, found 'LTC'"):
+        load_oem(path)
