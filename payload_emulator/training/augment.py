@@ -53,7 +53,7 @@ def make_crop(
     parameters: AugmentParameters,
     rng: np.random.Generator,
 ) -> Crop:
-    """One training crop of a frame (H, W); most crops are drawn about a labelled crater."""
+    """One training crop of a frame (H, W); half of them are drawn about a labelled crater, large ones more often."""
     import cv2
 
     turns = sun_up_turns(sun_camera)
@@ -72,7 +72,8 @@ def make_crop(
     centre_u, centre_v = rng.uniform(low_u, max(high_u, low_u)), rng.uniform(low_v, max(high_v, low_v))
     candidates = np.flatnonzero(labelled)
     if candidates.size and rng.random() < 0.5:
-        chosen = int(candidates[int(rng.integers(candidates.size))])
+        share = np.asarray(diameter_px, float)[candidates]
+        chosen = int(rng.choice(candidates, p=share / share.sum()))
         centre_u = float(np.clip(u[chosen] + rng.uniform(-0.8, 0.8) * half, low_u, max(high_u, low_u)))
         centre_v = float(np.clip(v[chosen] + rng.uniform(-0.8, 0.8) * half, low_v, max(high_v, low_v)))
     cos, sin = scale * math.cos(angle), scale * math.sin(angle)
