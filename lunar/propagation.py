@@ -132,6 +132,16 @@ class Trajectory:
         kernel.evaluate(self.elapsed_s, self.states, self.accelerations, flat, out)
         return out.reshape(*wanted.shape, 6)
 
+    def arcs(self) -> tuple[Trajectory, ...]:
+        """Return the parts between burns, each smooth up to and including its ends."""
+        burns = np.nonzero(np.diff(self.elapsed_s) == 0.0)[0] + 1
+        edges = [0, *burns.tolist(), len(self.elapsed_s)]
+        return tuple(
+            Trajectory(self.epoch_tdb_s, self.elapsed_s[a:b], self.states[a:b], self.accelerations[a:b])
+            for a, b in zip(edges[:-1], edges[1:], strict=True)
+            if b - a > 1
+        )
+
     def apsides(self) -> tuple[FloatArray, FloatArray]:
         """Return the elapsed times (k,) at which radial speed vanishes, and the radii (k,) there, m, in order of time."""
         radial = np.einsum("ij,ij->i", self.states[:, :3], self.states[:, 3:])
