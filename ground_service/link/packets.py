@@ -135,7 +135,10 @@ def _navigation(table: Table, place: IntArray) -> Columns:
     velocity, sigma = columns["velocity_icrf_m_s"], columns["sigma_rtn_m"]
     return {
         **_frame_columns(table, place),
-        **{name: columns[name] for name in ("estimator", "outcome", "latitude_deg", "longitude_deg", "altitude_m")},
+        **{
+            name: columns[name]
+            for name in ("estimator", "outcome", "latitude_deg", "longitude_deg", "altitude_m")
+        },
         **{f"velocity_{axis}_m_s": velocity[:, i] for i, axis in enumerate("xyz")},
         **{f"sigma_{axis}_m": sigma[:, i] for i, axis in enumerate("rtn")},
         "nis": columns["nis"],

@@ -94,7 +94,9 @@ class DownlinkReader:
 
     def _frames(self, window: bytes, settings: LinkSettings, sign: int) -> Iterator[PacketBatch]:
         """Batches of every spacecraft in a window; `sign` -1 takes the window off the accounting again."""
-        first = decode(window, settings=settings, spacecraft_id=self._spacecraft_id, dictionary=self._dictionary)
+        first = decode(
+            window, settings=settings, spacecraft_id=self._spacecraft_id, dictionary=self._dictionary
+        )
         found = [first]
         if self._spacecraft_id is None:
             found += [
@@ -130,7 +132,9 @@ def _other_spacecraft(result: DownlinkDecode) -> list[int]:
         return []
     foreign = result.frames.spacecraft_id[result.frames.verdict == FRAME_FOREIGN]
     ids, counts = np.unique(foreign, return_counts=True)
-    return [int(i) for i, n in zip(ids, counts, strict=True) if n >= FOREIGN_FRAMES and i != result.spacecraft_id]
+    return [
+        int(i) for i, n in zip(ids, counts, strict=True) if n >= FOREIGN_FRAMES and i != result.spacecraft_id
+    ]
 
 
 def _overlap(window: bytes, settings: LinkSettings) -> bytes:

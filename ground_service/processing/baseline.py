@@ -56,7 +56,11 @@ def propagated_positions(
         positions[after] = start.position_icrf_m
         return positions
     model = ForceModel(
-        gravity=gravity, degree=min(degree, gravity.degree), orientation=orientation, earth=third_bodies, sun=third_bodies
+        gravity=gravity,
+        degree=min(degree, gravity.degree),
+        orientation=orientation,
+        earth=third_bodies,
+        sun=third_bodies,
     )
     trajectory = propagate(epoch, start.position_icrf_m, start.velocity_icrf_m_s, duration_s, model)
     positions[after] = trajectory.state(np.minimum(tdb_s, trajectory.stop_tdb_s))[:, :3]

@@ -201,7 +201,9 @@ def _navigation(
     ]
     uncovered = int(np.count_nonzero(~track.covered))
     if uncovered:
-        remarks.append(f"{uncovered} of {len(times)} sample times lie outside the reference ephemeris and have no error")
+        remarks.append(
+            f"{uncovered} of {len(times)} sample times lie outside the reference ephemeris and have no error"
+        )
     if inputs.start_state is not None and inputs.gravity is not None:
         try:
             series += _baselines(inputs, inputs.start_state, inputs.gravity, track, path_m)
@@ -322,7 +324,12 @@ def _baselines(
     here = _at(track, rows)
     series = []
     for name, n, third, text in (
-        ("propagate-only", degree, True, f"start state propagated, gravity to degree {degree}, Earth and Sun"),
+        (
+            "propagate-only",
+            degree,
+            True,
+            f"start state propagated, gravity to degree {degree}, Earth and Sun",
+        ),
         ("Kepler", 0, False, "start state on its two-body orbit"),
     ):
         position = propagated_positions(
@@ -363,9 +370,7 @@ def _detector(
     matches = match_detections(detections, expected)
     score = score_detections(detections, expected, matches, track.altitude_m)
     chosen, worst = _choose_frames(inputs, expected, matches)
-    frames = {
-        frame: _gallery_frame(inputs, expected, matches, frame) for frame in sorted({*chosen, *worst})
-    }
+    frames = {frame: _gallery_frame(inputs, expected, matches, frame) for frame in sorted({*chosen, *worst})}
     return (
         score,
         tuple(frames[frame] for frame in chosen),
@@ -374,14 +379,18 @@ def _detector(
     )
 
 
-def _choose_frames(inputs: PassInputs, expected: ExpectedCraters, matches: Matches) -> tuple[list[int], list[int]]:
+def _choose_frames(
+    inputs: PassInputs, expected: ExpectedCraters, matches: Matches
+) -> tuple[list[int], list[int]]:
     """Rows of frames for the galleries: some spread over the pass, and those where the detector did worst."""
     detections = inputs.detections
     with_image = np.array([int(n) in inputs.images for n in detections.frame_number], dtype=np.bool_)
     rows = np.flatnonzero(with_image)
     if len(rows) == 0:
         return [], []
-    spread = rows[np.unique(np.linspace(0, len(rows) - 1, min(GALLERY_FRAMES, len(rows))).round().astype(np.int64))]
+    spread = rows[
+        np.unique(np.linspace(0, len(rows) - 1, min(GALLERY_FRAMES, len(rows))).round().astype(np.int64))
+    ]
     owner = np.repeat(np.arange(len(detections)), np.diff(expected.offsets))
     scored = np.isin(expected.size_class, (0, 1, 2)) & expected.complete
     total = np.bincount(owner[scored], minlength=len(detections))
@@ -458,7 +467,8 @@ def _gaps(inputs: PassInputs) -> tuple[TimeSpan, ...]:
         return ()
     limit = 1.5 * inputs.cadence_s * NANOSECONDS_PER_SECOND
     return tuple(
-        TimeSpan(int(times[i]), int(times[i + 1]), "no frames") for i in np.flatnonzero(np.diff(times) > limit)
+        TimeSpan(int(times[i]), int(times[i + 1]), "no frames")
+        for i in np.flatnonzero(np.diff(times) > limit)
     )
 
 
@@ -469,7 +479,10 @@ def _anchor_reads(outcomes: tuple[OutcomeSamples, ...]) -> tuple[AnchorRead, ...
         rose = np.flatnonzero(np.diff(samples.anchor_reads, prepend=0) > 0)
         reads += [
             AnchorRead(
-                samples.estimator, int(samples.utc_ns[i]), samples.reset_trigger[i], int(samples.frame_number[i])
+                samples.estimator,
+                int(samples.utc_ns[i]),
+                samples.reset_trigger[i],
+                int(samples.frame_number[i]),
             )
             for i in rose
         ]
@@ -516,7 +529,9 @@ def _headline(
             "Craters detected",
             100.0 * micro.recall if micro and np.isfinite(micro.recall) else None,
             "%",
-            f"precision {100.0 * micro.precision:.0f} %, centre {micro.localisation_px:.2f} px" if micro else "",
+            f"precision {100.0 * micro.precision:.0f} %, centre {micro.localisation_px:.2f} px"
+            if micro
+            else "",
         ),
         HeadlineFigure("Packets lost", lost, "", f"of {inputs.packets.packets + lost}"),
     )
@@ -536,8 +551,14 @@ def _verdict(
     baseline = _length(only.statistics.median_3d_m)
     if best.statistics.median_3d_m < only.statistics.median_3d_m:
         level = "good" if inputs.packets.lost == 0 else "caution"
-        return f"{figure}, better than propagating the same start state without images ({baseline}). {loss}", level
-    return f"{figure}; propagating the same start state without images does better ({baseline}). {loss}", "caution"
+        return (
+            f"{figure}, better than propagating the same start state without images ({baseline}). {loss}",
+            level,
+        )
+    return (
+        f"{figure}; propagating the same start state without images does better ({baseline}). {loss}",
+        "caution",
+    )
 
 
 def _length(value_m: float) -> str:

@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from ground_service.processing.samples import DetectionSamples
 from lunar.camera import PinholeCamera, above_horizon, ground_arc_m, horizon_arc_m, nadir_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue, size_class
-from reports.values import BinScore, CalibrationBin, ClassScore, DetectorScore, PrecisionRecallCurve, ResidualSeries
+from reports.values import (
+    BinScore,
+    CalibrationBin,
+    ClassScore,
+    DetectorScore,
+    PrecisionRecallCurve,
+    ResidualSeries,
+)
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -89,7 +96,13 @@ def expected_craters(
     uv = np.concatenate([p[1] for p in pieces]) if pieces else np.zeros((0, 2))
     diameter = np.concatenate([p[2] for p in pieces]) if pieces else np.zeros(0)
     return ExpectedCraters(
-        np.cumsum(counts, dtype=np.int64), index, uv[:, 0], uv[:, 1], diameter, classes[index], catalogue.complete[index]
+        np.cumsum(counts, dtype=np.int64),
+        index,
+        uv[:, 0],
+        uv[:, 1],
+        diameter,
+        classes[index],
+        catalogue.complete[index],
     )
 
 
@@ -109,9 +122,8 @@ def match_detections(detections: DetectionSamples, expected: ExpectedCraters) ->
         radius = expected.diameter_px[None, c0:c1] / 2.0
         with np.errstate(divide="ignore"):
             ratio = np.abs(np.log2(detections.diameter_px[d0:d1, None] / expected.diameter_px[None, c0:c1]))
-        allowed = (
-            (separation <= np.minimum(CENTRE_TOLERANCE_RADII * radius, CENTRE_TOLERANCE_PX))
-            & (ratio <= math.log2(DIAMETER_TOLERANCE))
+        allowed = (separation <= np.minimum(CENTRE_TOLERANCE_RADII * radius, CENTRE_TOLERANCE_PX)) & (
+            ratio <= math.log2(DIAMETER_TOLERANCE)
         )
         rows, columns = np.nonzero(allowed)
         for pair in np.lexsort((columns, rows, (separation / radius)[rows, columns])):
@@ -181,9 +193,7 @@ def _tally(detections: DetectionSamples, expected: ExpectedCraters, matches: Mat
     score = np.where(found, detections.score[partner] if len(detections.score) else 0.0, np.nan)
     error = np.full(len(rows), np.nan)
     at, by = rows[found], partner[found]
-    error[found] = np.hypot(
-        detections.u_px[by] - expected.u_px[at], detections.v_px[by] - expected.v_px[at]
-    )
+    error[found] = np.hypot(detections.u_px[by] - expected.u_px[at], detections.v_px[by] - expected.v_px[at])
     alarms = np.flatnonzero(
         (matches.crater_of_detection < 0)
         & np.isin(detections.size_class, SCORED_CLASSES)
@@ -272,12 +282,16 @@ def _calibration(tally: _Tally) -> tuple[CalibrationBin, ...]:
     is_true = np.concatenate((np.ones(len(true)), np.zeros(len(tally.alarm_score))))
     number = np.clip((score * 10.0).astype(np.int64), 0, 9)
     return tuple(
-        CalibrationBin(float(score[number == k].mean()), float(is_true[number == k].mean()), int((number == k).sum()))
+        CalibrationBin(
+            float(score[number == k].mean()), float(is_true[number == k].mean()), int((number == k).sum())
+        )
         for k in np.unique(number)
     )
 
 
-def _residuals(detections: DetectionSamples, expected: ExpectedCraters, tally: _Tally) -> ResidualSeries | None:
+def _residuals(
+    detections: DetectionSamples, expected: ExpectedCraters, tally: _Tally
+) -> ResidualSeries | None:
     found = np.isfinite(tally.crater_error_px)
     at, by = tally.crater_rows[found], tally.crater_detection[found]
     if len(at) == 0:

@@ -74,7 +74,9 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
     """The manifest of a pass archive, checked for what must be in it, and the SHA-256 that names the archive."""
     path = folder / "manifest.json"
     if not folder.is_dir():
-        raise InvalidInput(str(folder), "", "a pass archive folder", "a file" if folder.exists() else "nothing there")
+        raise InvalidInput(
+            str(folder), "", "a pass archive folder", "a file" if folder.exists() else "nothing there"
+        )
     try:
         octets = path.read_bytes()
     except FileNotFoundError:
@@ -96,7 +98,10 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
             raise InvalidInput(str(path), key, expected, repr(manifest.get(key))[:80])
     if manifest["schema_version"] > SCHEMA_VERSION:
         raise InvalidInput(
-            str(path), "schema_version", f"{SCHEMA_VERSION} or less", f"{manifest['schema_version']} of a newer version"
+            str(path),
+            "schema_version",
+            f"{SCHEMA_VERSION} or less",
+            f"{manifest['schema_version']} of a newer version",
         )
     return manifest, hashlib.sha256(octets).hexdigest()
 
@@ -114,15 +119,22 @@ def _checked_files(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
     for name, entry in sorted(manifest["files"].items()):
         path = folder / name
         if not isinstance(entry, dict) or not isinstance(entry.get("sha256"), str):
-            raise InvalidInput(str(folder / "manifest.json"), f"files.{name}", "an object with sha256", repr(entry)[:80])
+            raise InvalidInput(
+                str(folder / "manifest.json"), f"files.{name}", "an object with sha256", repr(entry)[:80]
+            )
         if Path(name).is_absolute() or not path.resolve().is_relative_to(root):
-            raise InvalidInput(str(folder / "manifest.json"), f"files.{name}", "a path inside the archive", name)
+            raise InvalidInput(
+                str(folder / "manifest.json"), f"files.{name}", "a path inside the archive", name
+            )
         if not path.is_file():
             raise InvalidInput(str(folder), name, "a file of the archive", "nothing there")
         found = _sha256(path)
         if found != entry["sha256"]:
             raise InvalidInput(
-                str(path), "", f"SHA-256 {entry['sha256'][:16]}… of the manifest", f"{found[:16]}… (damaged or cut short)"
+                str(path),
+                "",
+                f"SHA-256 {entry['sha256'][:16]}… of the manifest",
+                f"{found[:16]}… (damaged or cut short)",
             )
         names.append(name)
     return names
@@ -207,7 +219,9 @@ def _register(
             repository.add(
                 connection,
                 repository.PASSES,
-                vehicle_id=repository.vehicle_id(connection, manifest["spacecraft_id"], instance_of(manifest, digest)),
+                vehicle_id=repository.vehicle_id(
+                    connection, manifest["spacecraft_id"], instance_of(manifest, digest)
+                ),
                 name=manifest["pass_name"],
                 start_utc_ns=start_utc_ns,
                 stop_utc_ns=stop_utc_ns,
@@ -220,6 +234,10 @@ def _register(
         )
         for number, file in images.items():
             repository.add(
-                connection, repository.PASS_FRAMES, pass_id=pass_id, frame_number=number, file_sha256=file.sha256
+                connection,
+                repository.PASS_FRAMES,
+                pass_id=pass_id,
+                frame_number=number,
+                file_sha256=file.sha256,
             )
         return pass_id

@@ -44,7 +44,12 @@ class IngestResult:
 
 
 def ingest_file(
-    ground: Ground, path: Path, *, spacecraft_id: int | None = None, instance: str = FLOWN, name: str | None = None
+    ground: Ground,
+    path: Path,
+    *,
+    spacecraft_id: int | None = None,
+    instance: str = FLOWN,
+    name: str | None = None,
 ) -> IngestResult:
     """Archive a downlink file and store what is in it.
 
@@ -64,7 +69,9 @@ def ingest_file(
     if not path.is_file():
         raise InvalidInput(str(path), "", "a downlink file", "a folder" if path.is_dir() else "nothing there")
     stored = ground.files.put_file(path)
-    return ingest_stored(ground, stored, spacecraft_id=spacecraft_id, instance=instance, name=name or path.name)
+    return ingest_stored(
+        ground, stored, spacecraft_id=spacecraft_id, instance=instance, name=name or path.name
+    )
 
 
 def ingest_stored(
@@ -148,7 +155,9 @@ def _store_stream(
             raise InvalidInput("downlink of bare packets", "", "the id of their spacecraft", "none given")
         with ground.database.writing() as connection:
             if batch.spacecraft_id not in vehicles:
-                vehicles[batch.spacecraft_id] = repository.vehicle_id(connection, batch.spacecraft_id, instance)
+                vehicles[batch.spacecraft_id] = repository.vehicle_id(
+                    connection, batch.spacecraft_id, instance
+                )
             stored = store_batch(connection, vehicles[batch.spacecraft_id], batch)
         new += stored.new
         samples += stored.samples

@@ -37,7 +37,7 @@ def _ingest(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[
     result = run_ingest(
         ground,
         int(arguments["ingest_id"]),
-        spacecraft_id=int(arguments["spacecraft_id"]),
+        spacecraft_id=arguments["spacecraft_id"],
         instance=str(arguments["instance"]),
     )
     return {"ingest_id": result.ingest_id, "packets": result.packets, "packets_new": result.packets_new}

@@ -16,7 +16,12 @@ from ground_service.errors import InvalidInput
 from ground_service.processing.baseline import StartState
 from ground_service.processing.correlation import TimeCorrelation, ticks_of_utc_ns, utc_ns_of_ticks
 from ground_service.processing.pass_evaluation import PassInputs
-from ground_service.processing.samples import DetectionSamples, NavigationSamples, OutcomeSamples, no_detections
+from ground_service.processing.samples import (
+    DetectionSamples,
+    NavigationSamples,
+    OutcomeSamples,
+    no_detections,
+)
 from ground_service.processing.sequence import Gap, account_sequence
 from ground_service.services.ground import Ground
 from ground_service.store import repository
@@ -26,7 +31,13 @@ from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.ephemeris import Ephemeris, load_ephemeris
 from lunar.timescales import parse_utc
-from reports.values import ApidAccounting, CompletenessSeries, HousekeepingParameter, PacketAccounting, PassEvent
+from reports.values import (
+    ApidAccounting,
+    CompletenessSeries,
+    HousekeepingParameter,
+    PacketAccounting,
+    PassEvent,
+)
 from tmtc.dictionary import DICTIONARY
 
 IntArray = NDArray[np.int64]
@@ -134,7 +145,7 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             frames_expected=manifest.get("frames_expected"),
             cadence_s=manifest.get("cadence_s"),
             housekeeping=_housekeeping(connection, span),
-            events=_events(connection, span),
+            events=event_list(connection, span),
             images=ImageShelf(ground.files, {int(number): sha256 for number, sha256 in frames}),
             provenance=_provenance(ground, manifest, record, vehicle, ephemeris, span),
             data_sources=tuple(str(name) for name in manifest.get("data_sources", ())),
@@ -161,7 +172,9 @@ def load_correlations(connection: Connection, vehicle: int) -> tuple[TimeCorrela
     """The time correlations of a vehicle that are in force, by on-board time."""
     table = repository.CORRELATIONS
     rows = connection.execute(
-        select(table).where(table.c.vehicle_id == vehicle, table.c.superseded == 0).order_by(table.c.start_ticks)
+        select(table)
+        .where(table.c.vehicle_id == vehicle, table.c.superseded == 0)
+        .order_by(table.c.start_ticks)
     ).mappings()
     return tuple(
         TimeCorrelation(
@@ -237,7 +250,8 @@ def detection_samples(connection: Connection, span: PassSpan) -> DetectionSample
     if not rows["ticks"]:
         return no_detections()
     order = sorted(
-        range(len(rows["ticks"])), key=lambda i: (rows["ticks"][i], rows["frame_number"][i], bytes(rows["items"][i]))
+        range(len(rows["ticks"])),
+        key=lambda i: (rows["ticks"][i], rows["frame_number"][i], bytes(rows["items"][i])),
     )
     chosen = [
         i
@@ -324,14 +338,9 @@ def _columns(
     connection: Connection, kind: str, span: PassSpan, names: Sequence[str]
 ) -> dict[str, NDArray[Any]]:
     """Samples as arrays: whole numbers as int64, all else as float64 with NaN for NULL."""
-    rows = repository.samples(
+    return repository.sample_arrays(
         connection, kind, span.vehicle, span.start_ticks, span.stop_ticks, DICTIONARY.version, names
     )
-    table = repository.SAMPLES[kind]
-    return {
-        name: np.array(values, dtype=np.int64 if table.c[name].type.python_type is int else np.float64)
-        for name, values in rows.items()
-    }
 
 
 def _by_estimator(columns: dict[str, NDArray[Any]], packet: str) -> list[tuple[str, dict[str, NDArray[Any]]]]:
@@ -346,7 +355,9 @@ def _by_estimator(columns: dict[str, NDArray[Any]], packet: str) -> list[tuple[s
     parts = []
     for code in np.unique(columns["estimator"]).tolist():
         rows = order[columns["estimator"][order] == code]
-        parts.append((names.get(code, f"estimator {code}"), {name: column[rows] for name, column in columns.items()}))
+        parts.append(
+            (names.get(code, f"estimator {code}"), {name: column[rows] for name, column in columns.items()})
+        )
     return parts
 
 
@@ -409,7 +420,8 @@ def _housekeeping(connection: Connection, span: PassSpan) -> tuple[HousekeepingP
     )
 
 
-def _events(connection: Connection, span: PassSpan) -> tuple[PassEvent, ...]:
+def event_list(connection: Connection, span: PassSpan) -> tuple[PassEvent, ...]:
+    """Event reports of a pass, in time order."""
     names = ("ticks", "severity", "event_id", "frame_number", "value_1", "value_2")
     rows = repository.samples(
         connection, "events", span.vehicle, span.start_ticks, span.stop_ticks, DICTIONARY.version, names
@@ -475,12 +487,16 @@ def _provenance(
         "scenario": str(manifest.get("scenario", "")),
         "seed": str(manifest.get("seed", "")),
         "light": str(manifest.get("light", "")),
-        "gravity of the truth": f"{gravity['truth']}, degree {gravity.get('degree', '?')}" if "truth" in gravity else "",
+        "gravity of the truth": f"{gravity['truth']}, degree {gravity.get('degree', '?')}"
+        if "truth" in gravity
+        else "",
         "lunar orientation on the ground": ground.orientation.name,
         "dictionary": f"version {DICTIONARY.version}, {DICTIONARY.hash[:16]}",
         "time correlation": ", ".join(str(c.id) for c in span.correlations) or "0 (ideal clock)",
         "reference ephemeris": (
-            f"{ephemeris['object_name']}, {ephemeris['frame']}, SHA-256 {ephemeris['file_sha256'][:16]}" if ephemeris else ""
+            f"{ephemeris['object_name']}, {ephemeris['frame']}, SHA-256 {ephemeris['file_sha256'][:16]}"
+            if ephemeris
+            else ""
         ),
         "crater catalogue SHA-256": str(record["catalogue_sha256"] or "")[:16],
         "archive": str(record["archive_digest"] or "")[:16],

@@ -38,10 +38,12 @@ def evaluate(ground: Ground, pass_id: int, *, created_utc: str = "") -> PassRepo
 
 def pass_summary(ground: Ground, pass_id: int) -> dict[str, Any]:
     """The figures of a pass that a script asks for; see `summary_of`."""
-    return plain(summary_of(evaluate(ground, pass_id)))
+    return _summary(evaluate(ground, pass_id), pass_id)
 
 
-def make_report(ground: Ground, pass_id: int, *, report_id: str | None = None, out: Path | None = None) -> MadeReport:
+def make_report(
+    ground: Ground, pass_id: int, *, report_id: str | None = None, out: Path | None = None
+) -> MadeReport:
     """Evaluate a pass, render its report as HTML and JSON, and keep both.
 
     Parameters
@@ -58,7 +60,7 @@ def make_report(ground: Ground, pass_id: int, *, report_id: str | None = None, o
     report = evaluate(ground, pass_id, created_utc=format_utc(now))
     documents = {"html": render_html(report).encode(), "json": to_json(report).encode()}
     stored = {kind: ground.files.put_octets(octets) for kind, octets in documents.items()}
-    summary = plain(summary_of(report))
+    summary = _summary(report, pass_id)
     with ground.database.writing() as connection:
         for kind, file in stored.items():
             repository.register_file(connection, file, "report", f"report of pass {pass_id} ({kind})", now)
@@ -77,6 +79,10 @@ def make_report(ground: Ground, pass_id: int, *, report_id: str | None = None, o
     for kind, octets in documents.items():
         _write_whole(folder / f"report.{kind}", octets)
     return MadeReport(identity, pass_id, folder / "report.html", folder / "report.json", summary)
+
+
+def _summary(report: PassReport, pass_id: int) -> dict[str, Any]:
+    return {**plain(summary_of(report)), "pass_id": pass_id}
 
 
 def plain(value: Any) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ def pack_detections(items: dict[str, NDArray[np.float64]], offsets: NDArray[np.i
         records[name] = items[name]
     octets = records.tobytes()
     ends = (offsets * DETECTION_ITEM.itemsize).tolist()
-    return [octets[start:stop] for start, stop in zip(ends[:-1], ends[1:], strict=True)]
+    return [octets[start:stop] for start, stop in pairwise(ends)]
 
 
 def unpack_detections(columns: Sequence[bytes]) -> tuple[NDArray[np.void], NDArray[np.int64]]:

@@ -167,7 +167,7 @@ def database_error(error: DBAPIError, label: str) -> GroundError:
         return StorageFull(label)
     if name.startswith("SQLITE_READONLY") or getattr(original, "sqlstate", None) == "25006":
         return StorageReadOnly(label)
-    if name.startswith("SQLITE_NOTADB") or name.startswith("SQLITE_CORRUPT"):
+    if name.startswith(("SQLITE_NOTADB", "SQLITE_CORRUPT")):
         return DatabaseUnavailable(label, f"{message}; expected a SQLite database")
     return DatabaseUnavailable(label, message)
 

@@ -345,3 +345,37 @@ class Report(Base):
     json_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"))
     summary: Mapped[dict[str, Any]] = mapped_column(JSON)
     created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+
+
+class User(Base):
+    """Somebody who may use the service, with one role."""
+
+    __tablename__ = "users"
+    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    name: Mapped[str] = mapped_column(String(64), unique=True)
+    role: Mapped[str] = mapped_column(String(16))
+    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+
+
+class Token(Base):
+    """A bearer token of a user; only its hash is kept."""
+
+    __tablename__ = "tokens"
+    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    user_id: Mapped[int] = mapped_column(ForeignKey("users.id"), index=True)
+    token_sha256: Mapped[str] = mapped_column(String(64), unique=True)
+    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    expires_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
+    revoked_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
+
+
+class AuditEntry(Base):
+    """Something that somebody did; entries are only ever added."""
+
+    __tablename__ = "audit"
+    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
+    utc_ns: Mapped[int] = mapped_column(BigInteger, index=True)
+    actor: Mapped[str] = mapped_column(String(64))
+    action: Mapped[str] = mapped_column(String(48))
+    target: Mapped[str] = mapped_column(Text)
+    detail: Mapped[dict[str, Any]] = mapped_column(JSON)

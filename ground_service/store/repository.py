@@ -47,6 +47,9 @@ EPHEMERIDES = _table(models.EphemerisRecord)
 CORRELATIONS = _table(models.Correlation)
 JOBS = _table(models.Job)
 REPORTS = _table(models.Report)
+USERS = _table(models.User)
+TOKENS = _table(models.Token)
+AUDIT = _table(models.AuditEntry)
 SAMPLES: dict[str, Table] = {model.__tablename__: _table(model) for model in models.SAMPLE_TABLES}
 
 
@@ -158,7 +161,9 @@ def packet_headers(
     connection: Connection, vehicle: int, start_ticks: int | None = None, stop_ticks: int | None = None
 ) -> dict[str, IntArray]:
     """APID, on-board time and sequence count of the stored packets of a vehicle, by APID and time."""
-    query = select(PACKETS.c.apid, PACKETS.c.ticks, PACKETS.c.sequence_count).where(PACKETS.c.vehicle_id == vehicle)
+    query = select(PACKETS.c.apid, PACKETS.c.ticks, PACKETS.c.sequence_count).where(
+        PACKETS.c.vehicle_id == vehicle
+    )
     if start_ticks is not None:
         query = query.where(PACKETS.c.ticks >= start_ticks)
     if stop_ticks is not None:
@@ -176,8 +181,12 @@ def samples(
     stop_ticks: int,
     dictionary_version: int,
     columns: Sequence[str],
+    **equal: int,
 ) -> dict[str, list[Any]]:
-    """Columns of the samples of one kind between two on-board times (both included), in order of time."""
+    """Columns of the samples of one kind between two on-board times (both included), in order of time.
+
+    `equal` keeps only rows whose columns have these values.
+    """
     table = SAMPLES[kind]
     query = (
         select(*(table.c[name] for name in columns))
@@ -186,11 +195,31 @@ def samples(
             table.c.dictionary_version == dictionary_version,
             table.c.ticks >= start_ticks,
             table.c.ticks <= stop_ticks,
+            *(table.c[name] == value for name, value in equal.items()),
         )
         .order_by(table.c.ticks, table.c.packet_id)
     )
     rows = connection.execute(query).tuples().all()
     return {name: [row[i] for row in rows] for i, name in enumerate(columns)}
+
+
+def sample_arrays(
+    connection: Connection,
+    kind: str,
+    vehicle: int,
+    start_ticks: int,
+    stop_ticks: int,
+    dictionary_version: int,
+    columns: Sequence[str],
+    **equal: int,
+) -> dict[str, NDArray[Any]]:
+    """As `samples`, as arrays: whole numbers as int64, all else as float64 with NaN for what is not known."""
+    rows = samples(connection, kind, vehicle, start_ticks, stop_ticks, dictionary_version, columns, **equal)
+    table = SAMPLES[kind]
+    return {
+        name: np.array(values, dtype=np.int64 if table.c[name].type.python_type is int else np.float64)
+        for name, values in rows.items()
+    }
 
 
 def _where(table: Table, equal: dict[str, Any]) -> Select[Any]:

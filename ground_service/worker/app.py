@@ -10,6 +10,7 @@ from typing import Any
 
 from celery import Celery
 
+from ground_service.errors import SettingsError
 from ground_service.services.ground import Ground, ground_from_settings
 from ground_service.services.jobs import run_job
 from ground_service.settings import Settings, load_settings
@@ -94,3 +95,18 @@ def _app_of(settings: Settings) -> Celery:
         _apps[key] = make_app(settings)
     return _apps[key]
 
+
+def run_worker(settings: Settings, concurrency: int = 1) -> None:
+    """Do jobs until stopped.
+
+    Raises
+    ------
+    SettingsError
+        If no broker is set: jobs are then done by the service itself.
+    """
+    if settings.resolved_broker_url() is None:
+        raise SettingsError("LINNA_BROKER_URL", "a broker such as redis://localhost:6379/0", "nothing")
+    _ground_of(settings).close()
+    make_app(settings).worker_main(
+        ["worker", "--loglevel=INFO", f"--concurrency={concurrency}", "--without-gossip", "--without-mingle"]
+    )

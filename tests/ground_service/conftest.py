@@ -21,7 +21,7 @@ from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue, make_catalogue, save_catalogue, size_class
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
-from lunar.frames import IauOrientation, mcmf_from_spherical, rtn_from_inertial, spherical_from_mcmf
+from lunar.frames import IauOrientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.oem import save_oem
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
 from tmtc.dictionary import DICTIONARY
@@ -68,14 +68,25 @@ def circular_states(utc_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return radius * (c * along + s * across), radius * rate * (c * across - s * along)
 
 
-def _catalogue(latitude_rad: np.ndarray, longitude_rad: np.ndarray, rng: np.random.Generator) -> CraterCatalogue:
+def _catalogue(
+    latitude_rad: np.ndarray, longitude_rad: np.ndarray, rng: np.random.Generator
+) -> CraterCatalogue:
     """Craters on a jittered grid of half a degree around the track, so that no two are near one another."""
-    cells = np.unique(np.round(np.degrees(np.column_stack([latitude_rad, longitude_rad])) / 0.5).astype(int), axis=0)
-    grid = np.unique((cells[:, None, :] + np.array([[i, j] for i in range(-3, 4) for j in range(-3, 4)])).reshape(-1, 2), axis=0)
+    cells = np.unique(
+        np.round(np.degrees(np.column_stack([latitude_rad, longitude_rad])) / 0.5).astype(int), axis=0
+    )
+    grid = np.unique(
+        (cells[:, None, :] + np.array([[i, j] for i in range(-3, 4) for j in range(-3, 4)])).reshape(-1, 2),
+        axis=0,
+    )
     places = np.radians(grid * 0.5 + rng.uniform(-0.08, 0.08, grid.shape))
     diameter = rng.choice([6e3, 8e3, 11e3, 14e3, 4e3], len(grid))
     return make_catalogue(
-        places[:, 0], places[:, 1], diameter, source="synthetic", rim_height_m=rng.uniform(-500.0, 500.0, len(grid))
+        places[:, 0],
+        places[:, 1],
+        diameter,
+        source="synthetic",
+        rim_height_m=rng.uniform(-500.0, 500.0, len(grid)),
     )
 
 
@@ -83,7 +94,9 @@ def _catalogue(latitude_rad: np.ndarray, longitude_rad: np.ndarray, rng: np.rand
 def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., SyntheticPass]:
     """A function that writes a synthetic pass archive of `frames` frames."""
 
-    def make(frames: int = 40, seed: int = 1, encode: Callable[[list[bytes]], bytes] = encode_downlink) -> SyntheticPass:
+    def make(
+        frames: int = 40, seed: int = 1, encode: Callable[[list[bytes]], bytes] = encode_downlink
+    ) -> SyntheticPass:
         folder = tmp_path_factory.mktemp("archive")
         rng = np.random.default_rng(seed)
         utc_ns = START + np.arange(frames, dtype=np.int64) * CADENCE_S * NS
@@ -92,7 +105,7 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
         save_oem(ephemeris_from_states(every, *circular_states(every)), folder / "reference.oem")
         rotation = IauOrientation().mcmf_from_icrf(np.asarray(tdb_s_from_utc_ns(utc_ns)))
         position_mcmf = np.einsum("nij,nj->ni", rotation, position)
-        latitude, longitude, altitude = spherical_from_mcmf(position_mcmf)
+        latitude, longitude, _ = spherical_from_mcmf(position_mcmf)
         catalogue = _catalogue(latitude, longitude, rng)
         save_catalogue(catalogue, folder / "catalogue.csv")
 
@@ -107,7 +120,9 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
 
         for k in range(frames):
             ticks = int(ticks_from_utc_ns(int(utc_ns[k])))
-            in_camera = (catalogue.position_mcmf_m - position_mcmf[k]) @ nadir_camera_from_mcmf(position_mcmf[k]).T
+            in_camera = (catalogue.position_mcmf_m - position_mcmf[k]) @ nadir_camera_from_mcmf(
+                position_mcmf[k]
+            ).T
             uv = camera.project(in_camera)
             inside = np.flatnonzero(camera.contains(uv) & (in_camera[:, 2] > 0) & (in_camera[:, 2] < 1.2e5))
             scored = inside[classes[inside] != 3]
@@ -120,7 +135,9 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
             items = {
                 "u_px": np.append(uv[seen, 0] + PIXEL_OFFSET[0], 3.0),
                 "v_px": np.append(uv[seen, 1] + PIXEL_OFFSET[1], 3.0),
-                "diameter_px": np.append(camera.focal_px * catalogue.diameter_m[seen] / in_camera[seen, 2], 200.0),
+                "diameter_px": np.append(
+                    camera.focal_px * catalogue.diameter_m[seen] / in_camera[seen, 2], 200.0
+                ),
                 "score": np.append(np.full(len(seen), 0.9), 0.4),
                 "size_class": np.append(classes[seen], 2),
                 "sigma_px": np.full(len(seen) + 1, 1.0),
@@ -150,7 +167,11 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
                     },
                     ticks + 200 + estimator,
                 )
-                reset = {0: "initialization", RESET_FRAME: "safety_timeout"}.get(k, "none") if estimator == 0 else "none"
+                reset = (
+                    {0: "initialization", RESET_FRAME: "safety_timeout"}.get(k, "none")
+                    if estimator == 0
+                    else "none"
+                )
                 send(
                     "frame_outcome",
                     {
@@ -168,10 +189,18 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
                     ticks + 300 + estimator,
                 )
             send("housekeeping", _housekeeping(k), ticks + 400)
-        send("event_info", {"event_id": "observation_stopped", "frame_number": frames, "value_1": 0.0, "value_2": 0.0}, ticks + 500)
+        send(
+            "event_info",
+            {"event_id": "observation_stopped", "frame_number": frames, "value_1": 0.0, "value_2": 0.0},
+            ticks + 500,
+        )
 
         (folder / "downlink.cadu").write_bytes(encode(packets))
-        start = {"utc": format_utc(int(utc_ns[0])), "position_icrf_m": list(position[0]), "velocity_icrf_m_s": list(velocity[0])}
+        start = {
+            "utc": format_utc(int(utc_ns[0])),
+            "position_icrf_m": list(position[0]),
+            "velocity_icrf_m_s": list(velocity[0]),
+        }
         write_manifest(
             folder,
             {
@@ -180,7 +209,12 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
                 "spacecraft_id": SPACECRAFT,
                 "scenario": "synthetic",
                 "seed": seed,
-                "build": {"name": "nothing", "version": "0", "model_sha256": "00" * 32, "parameters_sha256": "11" * 32},
+                "build": {
+                    "name": "nothing",
+                    "version": "0",
+                    "model_sha256": "00" * 32,
+                    "parameters_sha256": "11" * 32,
+                },
                 "data_sources": ["circular orbit", "synthetic craters"],
                 "start_utc": format_utc(int(utc_ns[0])),
                 "stop_utc": format_utc(int(utc_ns[-1])),
@@ -204,13 +238,23 @@ def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     for path in sorted(folder.rglob("*")):
         if path.is_file() and path.name != "manifest.json":
             octets = path.read_bytes()
-            files[str(path.relative_to(folder))] = {"sha256": hashlib.sha256(octets).hexdigest(), "bytes": len(octets)}
+            files[str(path.relative_to(folder))] = {
+                "sha256": hashlib.sha256(octets).hexdigest(),
+                "bytes": len(octets),
+            }
     (folder / "manifest.json").write_text(json.dumps({**manifest, "files": files}))
 
 
 def _housekeeping(k: int) -> dict[str, Any]:
     values: dict[str, Any] = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
-    values.update(structure_id=1, boot_count=1, mode="observing", frames_processed=k, temperature_c=20.0 + 0.1 * k, bus_voltage_v=12.0)
+    values.update(
+        structure_id=1,
+        boot_count=1,
+        mode="observing",
+        frames_processed=k,
+        temperature_c=20.0 + 0.1 * k,
+        bus_voltage_v=12.0,
+    )
     return values
 
 

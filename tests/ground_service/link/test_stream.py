@@ -25,7 +25,9 @@ def read(octets: bytes, block: int, window: int, spacecraft_id: int | None = Non
 
 
 @pytest.mark.parametrize(("block", "window"), [(997, 1 << 20), (997, 8_000), (1 << 20, 1 << 20)])
-def test_every_packet_comes_through_whatever_the_blocks(packets: list[bytes], block: int, window: int) -> None:
+def test_every_packet_comes_through_whatever_the_blocks(
+    packets: list[bytes], block: int, window: int
+) -> None:
     stream = encode_cadus(packets, spacecraft_id=SPACECRAFT, frame_length=223)
     found, accounting = read(stream, block, window)
     assert set(found) == set(packets)

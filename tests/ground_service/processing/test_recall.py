@@ -24,7 +24,9 @@ def field(complete: bool = True, rim_height_m: float = 0.0) -> CraterCatalogue:
     )
 
 
-def detections(u: list[float], v: list[float], d: list[float], classes: list[int], usable: bool = True) -> DetectionSamples:
+def detections(
+    u: list[float], v: list[float], d: list[float], classes: list[int], usable: bool = True
+) -> DetectionSamples:
     n = len(u)
     return DetectionSamples(
         frame_number=np.array([7]),
@@ -62,7 +64,10 @@ def test_rim_height_moves_a_crater_in_the_image() -> None:
 def test_a_perfect_detector_scores_one() -> None:
     expected = expected_craters(field(), CAMERA, POSITION)
     found = detections(
-        (expected.u_px + 0.3).tolist(), (expected.v_px - 0.4).tolist(), expected.diameter_px.tolist(), [0, 1, 2, 3]
+        (expected.u_px + 0.3).tolist(),
+        (expected.v_px - 0.4).tolist(),
+        expected.diameter_px.tolist(),
+        [0, 1, 2, 3],
     )
     score = score_detections(found, expected, match_detections(found, expected), np.array([ALTITUDE_M]))
     assert score.micro is not None
@@ -90,14 +95,22 @@ def test_the_limits_of_a_match(offset_px: float, width: float, hit: bool) -> Non
     """The 20 km crater is some 98 px wide: half a radius is 24 px, so the paper's 10 px decide."""
     expected = expected_craters(field(), CAMERA, POSITION)
     found = detections(
-        [float(expected.u_px[2]) - offset_px], [float(expected.v_px[2])], [float(expected.diameter_px[2]) * width], [2]
+        [float(expected.u_px[2]) - offset_px],
+        [float(expected.v_px[2])],
+        [float(expected.diameter_px[2]) * width],
+        [2],
     )
     assert bool(match_detections(found, expected).crater_of_detection[0] >= 0) is hit
 
 
 def test_small_craters_count_neither_for_nor_against() -> None:
     expected = expected_craters(field(), CAMERA, POSITION)
-    found = detections([float(expected.u_px[3]), 3.0], [float(expected.v_px[3]), 3.0], [float(expected.diameter_px[3]), 15.0], [3, 3])
+    found = detections(
+        [float(expected.u_px[3]), 3.0],
+        [float(expected.v_px[3]), 3.0],
+        [float(expected.diameter_px[3]), 15.0],
+        [3, 3],
+    )
     score = score_detections(found, expected, match_detections(found, expected), np.array([ALTITUDE_M]))
     assert score.micro is not None
     assert (score.micro.expected, score.micro.false_alarms) == (3, 0)

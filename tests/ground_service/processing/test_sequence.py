@@ -32,9 +32,13 @@ def test_a_wrap_is_no_gap() -> None:
     seed=st.integers(0, 2**32 - 1),
     first=st.integers(0, COUNT_MODULUS - 1),
 )
-def test_what_is_missing_is_found_whatever_the_order_of_arrival(lost: set[int], seed: int, first: int) -> None:
+def test_what_is_missing_is_found_whatever_the_order_of_arrival(
+    lost: set[int], seed: int, first: int
+) -> None:
     ticks, counts = stream(3000, first)
-    keep = np.random.default_rng(seed).permutation(np.setdiff1d(np.arange(3000), np.array(sorted(lost), dtype=int)))
+    keep = np.random.default_rng(seed).permutation(
+        np.setdiff1d(np.arange(3000), np.array(sorted(lost), dtype=int))
+    )
     account = account_sequence(ticks[keep], counts[keep])
     assert account.lost == len(lost)
     assert account.restarts == 0

@@ -59,7 +59,9 @@ def test_every_packet_is_stored_with_its_rows(ground: Ground, packets: list[byte
     assert rows(ground, repository.SAMPLES["navigation_states"]) == 12
 
 
-def test_ingesting_twice_changes_nothing(ground: Ground, packets: list[bytes], expected: str, tmp_path: Path) -> None:
+def test_ingesting_twice_changes_nothing(
+    ground: Ground, packets: list[bytes], expected: str, tmp_path: Path
+) -> None:
     ingest(ground, b"".join(packets), tmp_path)
     again = ingest(ground, b"".join(packets), tmp_path)
     assert (again.packets_new, again.packets_repeated) == (0, len(packets))
@@ -113,7 +115,9 @@ def test_clocks_of_1970_and_of_the_future_are_stored_as_they_are(
 
 
 def test_noise_is_refused_in_one_line_and_remembered(ground: Ground, tmp_path: Path) -> None:
-    with pytest.raises(InvalidInput, match=r"noise\.bin: expected a stream of CADUs or of space packets, found 4000"):
+    with pytest.raises(
+        InvalidInput, match=r"noise\.bin: expected a stream of CADUs or of space packets, found 4000"
+    ):
         ingest(ground, np.random.default_rng(3).bytes(4000), tmp_path, "noise.bin")
     with ground.database.reading() as connection:
         record = repository.page(connection, repository.INGESTS).rows[0]

@@ -1,0 +1,58 @@
+"""The application: `create_app` joins the service, its dispatcher and the routes."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from fastapi import FastAPI
+
+from ground_service.api import problems
+from ground_service.api.limits import BodyLimit, HeadersAndTags
+from ground_service.api.routes import API_PREFIX, UPLOAD_PATHS, operations, router
+from ground_service.services.ground import ground_from_settings
+from ground_service.settings import Settings
+from ground_service.worker.dispatch import dispatcher_for
+
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+
+
+def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
+    """The HTTP application of a deployment.
+
+    Parameters
+    ----------
+    inline_jobs
+        Do jobs before the answer is sent (without a broker only), for tests and scripts.
+    """
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        ground = ground_from_settings(settings)
+        app.state.ground = ground
+        app.state.dispatcher = dispatcher_for(ground, settings, inline=inline_jobs)
+        try:
+            yield
+        finally:
+            app.state.dispatcher.close()
+            ground.close()
+
+    app = FastAPI(
+        title="LINNA ground service",
+        version="1",
+        summary="Ingest, archive and evaluation of crater-based navigation",
+        openapi_url=f"{API_PREFIX}/openapi.json",
+        docs_url=None,
+        redoc_url=None,
+        lifespan=lifespan,
+    )
+    app.state.open_without_users = settings.host in LOOPBACK
+    app.state.upload_limit_octets = settings.upload_limit_mib << 20
+    app.include_router(router)
+    app.include_router(operations)
+    problems.install(app)
+    app.add_middleware(
+        BodyLimit, upload_paths=UPLOAD_PATHS, upload_limit_octets=settings.upload_limit_mib << 20
+    )
+    app.add_middleware(HeadersAndTags)
+    return app

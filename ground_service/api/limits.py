@@ -1,0 +1,126 @@
+"""Guards around the application: size of bodies, secure headers, entity tags."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from ground_service.api.problems import problem
+
+JSON_LIMIT_OCTETS = 1 << 20
+TAGGED_LIMIT_OCTETS = 4 << 20
+
+SECURE_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-cache",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Content-Security-Policy": (
+        "default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline'; font-src data:; "
+        "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+    ),
+}
+
+
+class BodyLimit:
+    """Refuses bodies over a limit, announced or not; paths of uploads have their own, larger one."""
+
+    def __init__(self, app: ASGIApp, upload_paths: tuple[str, ...], upload_limit_octets: int) -> None:
+        self._app = app
+        self._uploads = upload_paths
+        self._upload_limit = upload_limit_octets
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        limit = self._upload_limit if scope["path"] in self._uploads else JSON_LIMIT_OCTETS
+        announced = Headers(scope=scope).get("content-length", "")
+        if announced and (not announced.isdigit() or int(announced) > limit):
+            response = problem(
+                413, "too large", f"body: expected at most {limit} octets, found {announced[:20]}"
+            )
+            await response(scope, receive, send)
+            return
+        taken = 0
+        over = False
+
+        async def counted() -> Message:
+            nonlocal taken, over
+            message = await receive()
+            taken += len(message.get("body", b""))
+            if taken > limit:
+                over = True
+                return {"type": "http.disconnect"}
+            return message
+
+        started = False
+
+        async def watched(message: Message) -> None:
+            nonlocal started
+            started = started or message["type"] == "http.response.start"
+            if not over:
+                await send(message)
+
+        try:
+            await self._app(scope, counted, watched)
+        except Exception:
+            if not over:
+                raise
+        if over and not started:
+            response = problem(413, "too large", f"body: expected at most {limit} octets")
+            await response(scope, receive, send)
+
+
+class HeadersAndTags:
+    """Adds secure headers to every answer, and an entity tag to whole JSON answers of GET; 304 where it matches."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        wanted = Headers(scope=scope).get("if-none-match", "")
+        held: dict[str, Any] = {"start": None, "body": []}
+
+        async def dressed(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in SECURE_HEADERS.items():
+                    headers.setdefault(name, value)
+                length = int(headers.get("content-length", TAGGED_LIMIT_OCTETS + 1))
+                taggable = (
+                    scope["method"] == "GET"
+                    and message["status"] == 200
+                    and headers.get("content-type", "").startswith("application/json")
+                    and length <= TAGGED_LIMIT_OCTETS
+                )
+                if taggable:
+                    held["start"] = message
+                    return
+                await send(message)
+                return
+            if held["start"] is None:
+                await send(message)
+                return
+            held["body"].append(message.get("body", b""))
+            if message.get("more_body"):
+                return
+            start, body = held["start"], b"".join(held["body"])
+            headers = MutableHeaders(scope=start)
+            tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
+            headers["ETag"] = tag
+            if tag in wanted or wanted.strip() == "*":
+                start["status"] = 304
+                del headers["content-length"]
+                body = b""
+            await send(start)
+            await send({"type": "http.response.body", "body": body})
+
+        await self._app(scope, receive, dressed)

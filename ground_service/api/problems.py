@@ -1,0 +1,113 @@
+"""Errors as RFC 9457 problem details: one handler turns every error of the packages into a status and a document."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from ground_service.errors import (
+    Conflict,
+    EvaluationError,
+    GroundError,
+    InvalidInput,
+    NotAuthorised,
+    NotFound,
+    StorageFull,
+    StorageReadOnly,
+    StoreError,
+)
+from lunar.errors import LunarError
+from reports.errors import ReportError
+from tmtc.errors import TmtcError
+
+log = logging.getLogger(__name__)
+
+MEDIA_TYPE = "application/problem+json"
+
+STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
+    (NotFound, 404, "not found"),
+    (Conflict, 409, "conflict"),
+    (InvalidInput, 422, "invalid input"),
+    (EvaluationError, 422, "cannot be evaluated"),
+    (NotAuthorised, 401, "not authorised"),
+    (StorageFull, 507, "no space left"),
+    (StorageReadOnly, 503, "read-only"),
+    (StoreError, 503, "store unavailable"),
+    (TmtcError, 422, "invalid telemetry"),
+    (LunarError, 422, "invalid input"),
+    (ReportError, 500, "report failed"),
+    (GroundError, 400, "bad request"),
+)
+
+
+class Forbidden(GroundError):
+    """The caller is known, but may not do this."""
+
+
+class TooLarge(GroundError):
+    """More octets than the service takes."""
+
+
+class PreconditionFailed(GroundError):
+    """What is stored is no longer what the caller saw."""
+
+
+def problem(
+    status: int, title: str, detail: str, request: Request | None = None, **extra: Any
+) -> JSONResponse:
+    """A problem document."""
+    body: dict[str, Any] = {
+        "type": "about:blank",
+        "title": title,
+        "status": status,
+        "detail": detail,
+        **extra,
+    }
+    if request is not None:
+        body["instance"] = request.url.path
+    headers = {"WWW-Authenticate": "Bearer"} if status == 401 else None
+    return JSONResponse(body, status_code=status, media_type=MEDIA_TYPE, headers=headers)
+
+
+def install(app: FastAPI) -> None:
+    """Make the application answer every error with a problem document."""
+
+    async def known(request: Request, error: Exception) -> JSONResponse:
+        if isinstance(error, Forbidden):
+            return problem(403, "forbidden", str(error), request)
+        if isinstance(error, TooLarge):
+            return problem(413, "too large", str(error), request)
+        if isinstance(error, PreconditionFailed):
+            return problem(412, "precondition failed", str(error), request)
+        status, title = next((s, t) for kind, s, t in STATUSES if isinstance(error, kind))
+        if status >= 500:
+            log.error("%s %s: %s", request.method, request.url.path, error)
+        return problem(status, title, str(error), request)
+
+    async def http(request: Request, error: Exception) -> JSONResponse:
+        assert isinstance(error, HTTPException)
+        return problem(error.status_code, str(error.detail).lower(), str(error.detail), request)
+
+    async def invalid(request: Request, error: Exception) -> JSONResponse:
+        assert isinstance(error, RequestValidationError)
+        found = [
+            {"where": ".".join(str(part) for part in item["loc"]), "expected": item["msg"]}
+            for item in error.errors()
+        ]
+        detail = "; ".join(f"{item['where']}: {item['expected']}" for item in found[:5])
+        return problem(422, "invalid request", detail, request, errors=found)
+
+    async def unexpected(request: Request, error: Exception) -> JSONResponse:
+        log.exception("%s %s", request.method, request.url.path, exc_info=error)
+        return problem(500, "internal error", "the service met an error that it has logged", request)
+
+    for kind in (GroundError, TmtcError, LunarError, ReportError):
+        app.add_exception_handler(kind, known)
+    app.add_exception_handler(HTTPException, http)
+    app.add_exception_handler(RequestValidationError, invalid)
+    app.add_exception_handler(Exception, unexpected)

@@ -1,0 +1,217 @@
+"""What goes over the wire: pydantic models with examples. Times are RFC 3339 UTC with nanoseconds kept."""
+
+from __future__ import annotations
+
+from typing import Any, Generic, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from lunar.timescales import format_utc
+
+Item = TypeVar("Item")
+
+
+class Schema(BaseModel):
+    """Base of everything sent."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class Problem(BaseModel):
+    """An RFC 9457 problem document."""
+
+    type: str = Field(examples=["about:blank"])
+    title: str = Field(examples=["not found"])
+    status: int = Field(examples=[404])
+    detail: str = Field(examples=["pass 7: not found"])
+    instance: str | None = Field(default=None, examples=["/api/v1/passes/7"])
+    errors: list[dict[str, str]] | None = None
+
+
+class PageOf(Schema, Generic[Item]):
+    """A page of a list."""
+
+    items: list[Item]
+    total: int = Field(description="Number of items in all pages", examples=[1])
+    limit: int = Field(examples=[100])
+    offset: int = Field(examples=[0])
+
+
+class Ephemeris(Schema):
+    """A reference ephemeris."""
+
+    id: int = Field(examples=[1])
+    name: str = Field(examples=["reference of pass 12"])
+    object_name: str = Field(examples=["SELENITA"])
+    frame: str = Field(examples=["ICRF"])
+    start: str = Field(examples=["2029-08-07T00:00:00.000000000Z"])
+    stop: str = Field(examples=["2029-08-07T01:00:00.000000000Z"])
+    states: int = Field(examples=[241])
+    precedence: int = Field(examples=[0])
+    sha256: str
+
+
+class IngestAccepted(Schema):
+    """An upload that was taken and will be ingested."""
+
+    ingest_id: int = Field(examples=[1])
+    job_id: str
+    sha256: str
+    octets: int
+
+
+class Ingest(Schema):
+    """One ingest of one file."""
+
+    id: int = Field(examples=[1])
+    state: str = Field(examples=["done"], description="queued, running, done or failed")
+    sha256: str
+    received: str
+    finished: str | None
+    error: str | None
+    dictionary_version: int = Field(examples=[1])
+    accounting: dict[str, Any]
+
+
+class PassSummary(Schema):
+    """A pass in a list."""
+
+    id: int = Field(examples=[1])
+    name: str = Field(examples=["selenita pass 1"])
+    start: str
+    stop: str
+
+
+class PassDetail(PassSummary):
+    """A pass."""
+
+    spacecraft_id: int = Field(examples=[76])
+    instance: str = Field(examples=["flight"])
+    archive_sha256: str | None
+    manifest: dict[str, Any]
+    reports: list[str]
+
+
+class PassDefinition(Schema):
+    """An interval of a spacecraft's time to be kept as a pass."""
+
+    name: str = Field(min_length=1, max_length=200, examples=["evening pass"])
+    start: str = Field(examples=["2029-08-07T06:00:00Z"], max_length=40)
+    stop: str = Field(examples=["2029-08-07T06:37:00Z"], max_length=40)
+    spacecraft_id: int = Field(ge=0, le=1023, examples=[76])
+    instance: str = Field(default="flight", min_length=1, max_length=96, examples=["flight"])
+
+
+class ApidCompleteness(Schema):
+    """Packets of one APID."""
+
+    apid: int = Field(examples=[161])
+    name: str = Field(examples=["detections"])
+    packets: int
+    lost: int
+    conflicts: int
+
+
+class Completeness(Schema):
+    """Packets of a pass that came and that did not."""
+
+    packets: int
+    lost: int
+    duplicates: int
+    conflicts: int
+    crc_errors: int
+    octets_skipped: int
+    frames_bad: int
+    symbols_corrected: int
+    by_apid: list[ApidCompleteness]
+
+
+class DetectionItem(Schema):
+    """One detection of one frame; pixel centres are at whole numbers."""
+
+    frame_number: int
+    time: str
+    u_px: float
+    v_px: float
+    diameter_px: float
+    score: float
+    size_class: int = Field(description="0: 5-10 km, 1: 10-15 km, 2: 15-30 km, 3: 3-5 km, -1: none")
+
+
+class Bucket(Schema):
+    """A stretch of a series: least, greatest and mean value of the samples in it."""
+
+    start: str
+    stop: str
+    count: int
+    min: float
+    max: float
+    mean: float
+    after_gap: bool = Field(description="A silence lies before it: draw no line to it")
+
+
+class SeriesOut(Schema):
+    """A series made short."""
+
+    name: str = Field(examples=["altitude_m"])
+    unit: str = Field(examples=["m"])
+    samples: int
+    correlation_id: int = Field(description="Time correlation used; 0 is an ideal clock")
+    buckets: list[Bucket]
+
+
+class States(Schema):
+    """Series of one estimator's states."""
+
+    estimator: str = Field(examples=["spherical"])
+    series: list[SeriesOut]
+
+
+class EventItem(Schema):
+    """An event report."""
+
+    time: str
+    severity: str = Field(examples=["info"])
+    name: str = Field(examples=["observation_stopped"])
+    detail: str
+
+
+class Job(Schema):
+    """A piece of background work."""
+
+    id: str
+    kind: str = Field(examples=["report"])
+    state: str = Field(examples=["done"], description="queued, running, done or failed")
+    progress: float = Field(ge=0.0, le=1.0)
+    attempts: int
+    arguments: dict[str, Any]
+    result: dict[str, Any] | None
+    error: str | None
+    created: str
+    started: str | None
+    finished: str | None
+
+
+class ReportItem(Schema):
+    """A report that was made."""
+
+    id: str
+    pass_id: int
+    created: str
+    summary: dict[str, Any]
+
+
+class Health(Schema):
+    """Whether the service lives."""
+
+    status: str = Field(examples=["ok"])
+
+
+def rfc3339(utc_ns: int | None) -> str | None:
+    """A time as text, to the nanosecond."""
+    return None if utc_ns is None else format_utc(int(utc_ns), 9)
+
+
+def time_text(utc_ns: int) -> str:
+    """A time that is there, as text."""
+    return format_utc(int(utc_ns), 9)

@@ -1,0 +1,38 @@
+"""Who calls, and what they may do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated
+
+from fastapi import Depends, Request
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+
+from ground_service.api.problems import Forbidden
+from ground_service.errors import NotAuthorised
+from ground_service.services.users import LOCAL_CALLER, Caller, authenticate, has_users
+
+_bearer = HTTPBearer(auto_error=False, description="Token given out by 'linna user add'")
+
+
+def caller_of(
+    request: Request, given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
+) -> Caller:
+    """The caller of a request: the owner of its token, or the local user of a service without users."""
+    ground = request.app.state.ground
+    if given is None:
+        if request.app.state.open_without_users and not has_users(ground):
+            return LOCAL_CALLER
+        raise NotAuthorised("expected a bearer token in the Authorization header, found none")
+    return authenticate(ground, given.credentials)
+
+
+def requires(role: str) -> Callable[..., Caller]:
+    """A dependency that lets only callers of this role or a higher one pass."""
+
+    def check(caller: Annotated[Caller, Depends(caller_of)]) -> Caller:
+        if not caller.may(role):
+            raise Forbidden(f"{caller.name}: expected the role {role} or higher, found {caller.role}")
+        return caller
+
+    return check

@@ -1,0 +1,228 @@
+"""Passes as a caller sees them: lists, completeness, detections, series of states and of housekeeping parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ground_service.clock import utc_now_ns
+from ground_service.errors import InvalidInput, NotFound
+from ground_service.processing.correlation import IDEAL_CLOCK, utc_ns_of_ticks
+from ground_service.processing.downsampling import Buckets, downsample
+from ground_service.services.ground import Ground
+from ground_service.services.ingest import FLOWN
+from ground_service.services.pass_data import (
+    PassSpan,
+    detection_samples,
+    event_list,
+    packet_accounting,
+    pass_span,
+)
+from ground_service.store import repository
+from reports.values import PacketAccounting, PassEvent
+from tmtc.dictionary import DICTIONARY
+
+STATE_VALUES = (
+    "latitude_deg", "longitude_deg", "altitude_m", "velocity_x_m_s", "velocity_y_m_s", "velocity_z_m_s",
+    "sigma_r_m", "sigma_t_m", "sigma_n_m", "nis", "matched",
+)  # fmt: skip
+"""Values of a navigation state that can be asked for as a series."""
+
+PARAMETERS = tuple(
+    field.name for field in DICTIONARY.packet("housekeeping").fields if field.name != "structure_id"
+)
+"""Housekeeping parameters that can be asked for as a series."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Series:
+    """A series of one value, made short, with the id of the time correlation used."""
+
+    name: str
+    unit: str
+    samples: int
+    correlation_id: int
+    buckets: Buckets
+
+
+@dataclass(frozen=True, slots=True)
+class Detection:
+    """One detection of one frame."""
+
+    frame_number: int
+    utc_ns: int
+    u_px: float
+    v_px: float
+    diameter_px: float
+    score: float
+    size_class: int
+
+
+def list_passes(ground: Ground, *, limit: int = 100, offset: int = 0) -> repository.Page:
+    """Passes, the latest entered first."""
+    with ground.database.reading() as connection:
+        return repository.page(connection, repository.PASSES, limit=limit, offset=offset)
+
+
+def get_pass(ground: Ground, pass_id: int) -> dict[str, Any]:
+    """A pass with the spacecraft it is of and its packets counted."""
+    with ground.database.reading() as connection:
+        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        vehicle = repository.get(connection, repository.VEHICLES, record["vehicle_id"], "vehicle")
+        reports = repository.page(connection, repository.REPORTS, limit=20, pass_id=pass_id)
+    return {
+        **record,
+        "spacecraft_id": vehicle["ccsds_id"],
+        "instance": vehicle["instance"],
+        "reports": [row["id"] for row in reports.rows],
+    }
+
+
+def define_pass(
+    ground: Ground,
+    *,
+    name: str,
+    start_utc_ns: int,
+    stop_utc_ns: int,
+    spacecraft_id: int,
+    instance: str = FLOWN,
+    manifest: Mapping[str, Any] | None = None,
+) -> int:
+    """Enter an interval of a spacecraft's time as a pass; its id."""
+    if stop_utc_ns <= start_utc_ns:
+        raise InvalidInput("pass", "stop", "a time after the start", str(stop_utc_ns))
+    with ground.database.writing() as connection:
+        return int(
+            repository.add(
+                connection,
+                repository.PASSES,
+                vehicle_id=repository.vehicle_id(connection, spacecraft_id, instance),
+                name=name,
+                start_utc_ns=start_utc_ns,
+                stop_utc_ns=stop_utc_ns,
+                archive_digest=None,
+                manifest=dict(manifest or {}),
+                ephemeris_id=None,
+                catalogue_sha256=None,
+                created_utc_ns=utc_now_ns(),
+            )
+        )
+
+
+def completeness(ground: Ground, pass_id: int) -> PacketAccounting:
+    """Packets of a pass that came and that did not."""
+    with ground.database.reading() as connection:
+        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        return packet_accounting(connection, record, pass_span(connection, record))
+
+
+def events(ground: Ground, pass_id: int) -> tuple[PassEvent, ...]:
+    """Event reports of a pass, in time order."""
+    with ground.database.reading() as connection:
+        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        return event_list(connection, pass_span(connection, record))
+
+
+def detections(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tuple[list[Detection], int]:
+    """Detections of a pass, a page of them in time order, and how many there are."""
+    with ground.database.reading() as connection:
+        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        samples = detection_samples(connection, pass_span(connection, record))
+    total = len(samples.u_px)
+    rows = np.arange(min(offset, total), min(offset + limit, total))
+    frames = np.searchsorted(samples.offsets, rows, side="right") - 1
+    return [
+        Detection(
+            frame_number=int(samples.frame_number[frame]),
+            utc_ns=int(samples.utc_ns[frame]),
+            u_px=float(samples.u_px[row]),
+            v_px=float(samples.v_px[row]),
+            diameter_px=float(samples.diameter_px[row]),
+            score=float(samples.score[row]),
+            size_class=int(samples.size_class[row]),
+        )
+        for row, frame in zip(rows.tolist(), frames.tolist(), strict=True)
+    ], total
+
+
+def state_series(
+    ground: Ground, pass_id: int, estimator: str, values: tuple[str, ...], max_points: int
+) -> list[Series]:
+    """Series of values of one estimator's states.
+
+    Raises
+    ------
+    InvalidInput
+        If a value cannot be asked for.
+    NotFound
+        If there is no such pass or no such estimator.
+    """
+    unknown = [value for value in values if value not in STATE_VALUES]
+    if unknown:
+        raise InvalidInput("states", "value", ", ".join(STATE_VALUES), unknown[0][:80])
+    codes = {name: code for code, name in DICTIONARY.labels("navigation_state", "estimator").items()}
+    if estimator not in codes:
+        raise NotFound("estimator", estimator[:80])
+    with ground.database.reading() as connection:
+        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        span = pass_span(connection, record)
+        columns = repository.sample_arrays(
+            connection,
+            "navigation_states",
+            span.vehicle,
+            span.start_ticks,
+            span.stop_ticks,
+            DICTIONARY.version,
+            ("ticks", *values),
+            estimator=codes[estimator],
+        )
+    definition = DICTIONARY.packet("navigation_state")
+    units = {field.name: field.unit for field in definition.fields}
+    return [
+        _series(
+            value,
+            units.get(value, "m/s" if "_m_s" in value else "m" if value.endswith("_m") else ""),
+            columns,
+            span,
+            max_points,
+        )
+        for value in values
+    ]
+
+
+def parameter_series(ground: Ground, pass_id: int, parameter: str, max_points: int) -> Series:
+    """The series of one housekeeping parameter of a pass."""
+    if parameter not in PARAMETERS:
+        raise NotFound("parameter", parameter[:80])
+    with ground.database.reading() as connection:
+        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        span = pass_span(connection, record)
+        columns = repository.sample_arrays(
+            connection,
+            "housekeeping",
+            span.vehicle,
+            span.start_ticks,
+            span.stop_ticks,
+            DICTIONARY.version,
+            ("ticks", parameter),
+        )
+    return _series(
+        parameter, DICTIONARY.packet("housekeeping").field(parameter).unit, columns, span, max_points
+    )
+
+
+def _series(
+    name: str, unit: str, columns: dict[str, NDArray[Any]], span: PassSpan, max_points: int
+) -> Series:
+    utc_ns, used = utc_ns_of_ticks(columns["ticks"], span.correlations)
+    return Series(
+        name=name,
+        unit=unit,
+        samples=len(utc_ns),
+        correlation_id=int(used[-1]) if len(used) else IDEAL_CLOCK,
+        buckets=downsample(utc_ns, columns[name].astype(np.float64), max_points),
+    )

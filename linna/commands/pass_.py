@@ -1,0 +1,78 @@
+"""`linna pass list | show`: passes of the ground database."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from linna.commands._ground import add_service_options, open_service
+from linna.output import add_json_flag, emit
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    actions = parser.add_subparsers(metavar="ACTION", required=True)
+    listing = actions.add_parser("list", help="all passes, the newest first")
+    listing.add_argument("--limit", type=int, default=50, help="how many (default: 50)")
+    listing.set_defaults(handler=list_passes)
+    showing = actions.add_parser("show", help="the figures of one pass")
+    showing.add_argument("pass_id", type=int, metavar="ID")
+    showing.set_defaults(handler=show_pass)
+    for action in (listing, showing):
+        add_service_options(action)
+        add_json_flag(action)
+
+
+def list_passes(arguments: argparse.Namespace) -> int:
+    from ground_service.services import passes
+    from lunar.timescales import format_utc
+
+    with open_service(arguments) as ground:
+        page = passes.list_passes(ground, limit=max(arguments.limit, 1))
+    rows = [
+        {
+            "pass_id": row["id"],
+            "name": row["name"],
+            "start": format_utc(row["start_utc_ns"]),
+            "stop": format_utc(row["stop_utc_ns"]),
+        }
+        for row in page.rows
+    ]
+    lines = [f"{row['pass_id']:>6}  {row['start']}  {row['stop']}  {row['name']}" for row in rows]
+    emit(arguments, {"passes": rows, "total": page.total}, text="\n".join(lines) or "no passes")
+    return 0
+
+
+def show_pass(arguments: argparse.Namespace) -> int:
+    from ground_service.services.reports import pass_summary
+
+    with open_service(arguments) as ground:
+        figures = pass_summary(ground, arguments.pass_id)
+    emit(arguments, figures, text=describe(figures))
+    return 0
+
+
+def describe(figures: dict[str, Any]) -> str:
+    """The figures of a pass as lines of text."""
+    lines = [
+        f"pass {figures['pass_id']}: {figures['frames']} frames, {figures['packets']} packets, "
+        f"{figures['packets_lost']} lost",
+        figures["verdict"],
+    ]
+    for kind in ("navigation", "baselines"):
+        for name, row in figures[kind].items():
+            drift = row["drift_percent"]
+            lines.append(
+                f"  {name:<16} median {_metres(row['median_3d_m'])}, 95 % {_metres(row['p95_3d_m'])}, "
+                f"largest {_metres(row['max_3d_m'])}, drift {'-' if drift is None else f'{drift:.3f} %'}"
+            )
+    detector = figures["detector"]
+    if detector["recall"] is not None:
+        lines.append(
+            f"  detector         precision {detector['precision']:.2f}, recall {detector['recall']:.2f}, "
+            f"localisation {detector['loc_px']:.2f} px"
+        )
+    return "\n".join(lines)
+
+
+def _metres(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0f} m"

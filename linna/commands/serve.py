@@ -1,0 +1,22 @@
+"""`linna serve`: the HTTP interface of the ground service."""
+
+from __future__ import annotations
+
+import argparse
+
+from linna.commands._ground import add_service_options, settings_of
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--host", help="address to bind to (default: 127.0.0.1)")
+    parser.add_argument("--port", type=int, help="port (default: 8042)")
+    add_service_options(parser)
+    parser.set_defaults(handler=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from ground_service.api.server import serve
+    from linna.data import data_folder
+
+    serve(settings_of(arguments, host=arguments.host, port=arguments.port, data=data_folder().root))
+    return 0
