@@ -345,10 +345,16 @@ def integrate_arc(
 
 
 def join(epoch_tdb_s: float, arcs: list[Arc]) -> Trajectory:
-    """Return arcs that follow on each other as one trajectory, in ascending time."""
-    elapsed = np.concatenate([arc.elapsed_s for arc in arcs])
-    states = np.concatenate([arc.states for arc in arcs])
-    rates = np.concatenate([arc.accelerations for arc in arcs])
+    """Return arcs that follow on each other as one trajectory, in ascending time.
+
+    The first knot of an arc that goes on from the very state in which the one before ended is left out.
+    """
+    skips = [0] + [
+        int(np.array_equal(after.states[0], before.states[-1])) for before, after in zip(arcs[:-1], arcs[1:], strict=True)
+    ]
+    elapsed = np.concatenate([arc.elapsed_s[skip:] for arc, skip in zip(arcs, skips, strict=True)])
+    states = np.concatenate([arc.states[skip:] for arc, skip in zip(arcs, skips, strict=True)])
+    rates = np.concatenate([arc.accelerations[skip:] for arc, skip in zip(arcs, skips, strict=True)])
     if len(elapsed) == 1:  # a propagation over no time at all
         elapsed, states, rates = np.repeat(elapsed, 2), np.repeat(states, 2, axis=0), np.repeat(rates, 2, axis=0)
         elapsed[1] += 1e-6
