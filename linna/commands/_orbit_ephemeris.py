@@ -1,0 +1,215 @@
+"""`linna orbit compare`, `interpolate` and `stats`: what is done with ephemeris files."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from linna.output import add_json_flag, emit
+
+
+def configure_compare(commands: Any) -> None:
+    """Add `compare` to the subparsers of `linna orbit`."""
+    compare = commands.add_parser("compare", help="difference of two ephemerides on common epochs")
+    compare.add_argument("a", type=Path, metavar="A", help="OEM or STK .e file; its orbit gives the axes")
+    compare.add_argument("b", type=Path, metavar="B", help="OEM or STK .e file")
+    compare.add_argument(
+        "--step", type=float, metavar="S", help="seconds between epochs (default: the states of A)"
+    )
+    compare.add_argument(
+        "--plot", type=Path, metavar="FILE", help="differences as a picture (png, svg or pdf)"
+    )
+    add_json_flag(compare)
+    compare.set_defaults(handler=run_compare)
+
+
+def configure_interpolate(commands: Any) -> None:
+    """Add `interpolate` to the subparsers of `linna orbit`."""
+    interpolate = commands.add_parser("interpolate", help="states of an ephemeris at given UTC epochs")
+    interpolate.add_argument("ephemeris", type=Path, metavar="F", help="OEM or STK .e file")
+    interpolate.add_argument(
+        "--epochs", required=True, metavar="FILE", help="UTC epochs, one a line (- reads standard input)"
+    )
+    add_json_flag(interpolate)
+    interpolate.set_defaults(handler=run_interpolate)
+
+
+def configure_stats(commands: Any) -> None:
+    """Add `stats` to the subparsers of `linna orbit`."""
+    stats = commands.add_parser("stats", help="altitudes, passes and period of an ephemeris")
+    stats.add_argument("ephemeris", type=Path, metavar="F", help="OEM or STK .e file")
+    stats.add_argument(
+        "--step", type=float, metavar="S", help="seconds between epochs (default: the states of the file)"
+    )
+    stats.add_argument("--plot", type=Path, metavar="FILE", help="altitudes as a picture (png, svg or pdf)")
+    add_json_flag(stats)
+    stats.set_defaults(handler=run_stats)
+
+
+def run_compare(arguments: argparse.Namespace) -> int:
+    from lunar.comparison import compare
+    from lunar.ephemeris import load_ephemeris
+    from lunar.timescales import format_utc
+
+    first, second = load_ephemeris(arguments.a), load_ephemeris(arguments.b)
+    epochs = _epochs(arguments.step, first)
+    if epochs is not None:
+        epochs = epochs[second.covers(epochs)]
+    difference = compare(first, second, epochs if epochs is not None and len(epochs) else None)
+    figures = {
+        "max_m": difference.max_m,
+        "rms_m": difference.rms_m,
+        "rms_rtn_m": list(difference.rms_rtn_m),
+        "samples": difference.samples,
+        "start": format_utc(int(difference.utc_ns[0])),
+        "stop": format_utc(int(difference.utc_ns[-1])),
+    }
+    if arguments.plot is not None:
+        from reports.studies import save_difference_plot
+
+        names = (arguments.a.name, arguments.b.name)
+        caption = f"{difference.samples} epochs, greatest distance {difference.max_m:.6g} m"
+        save_difference_plot(arguments.plot, difference.utc_ns, difference.position_rtn_m, names, caption)
+        figures["plot"] = str(arguments.plot)
+    radial, transverse, normal = difference.rms_rtn_m
+    text = (
+        f"{difference.samples} epochs from {figures['start']} to {figures['stop']}\n"
+        f"distance: max {difference.max_m:.6g} m, rms {difference.rms_m:.6g} m\n"
+        f"rms radial {radial:.6g} m, transverse {transverse:.6g} m, normal {normal:.6g} m"
+    )
+    emit(arguments, figures, text=text)
+    return 0
+
+
+def run_interpolate(arguments: argparse.Namespace) -> int:
+    import numpy as np
+
+    from linna.data import data_folder
+    from lunar.datafolder import default_orientation
+    from lunar.ephemeris import load_ephemeris
+    from lunar.ground_track import ground_track
+    from lunar.timescales import format_utc
+
+    ephemeris = load_ephemeris(arguments.ephemeris)
+    epochs = np.array(_read_epochs(arguments.epochs), dtype=np.int64)
+    orientation = default_orientation(data_folder())
+    position_m, velocity_m_s = ephemeris.at(epochs)
+    track = ground_track(ephemeris, orientation, epochs)
+    states = [
+        {
+            "epoch": format_utc(int(epoch), 9 if epoch % 1_000_000 else 3),
+            "position_km": (position_m[k] / 1e3).tolist(),
+            "velocity_km_s": (velocity_m_s[k] / 1e3).tolist(),
+            "latitude_deg": float(np.degrees(track.latitude_rad[k])),
+            "longitude_deg": float(np.degrees(track.longitude_rad[k])),
+            "altitude_km": float(track.altitude_m[k]) / 1e3,
+        }
+        for k, epoch in enumerate(epochs)
+    ]
+    lines = ["epoch,x_km,y_km,z_km,vx_km_s,vy_km_s,vz_km_s,latitude_deg,longitude_deg,altitude_km"]
+    lines += [
+        ",".join(
+            [
+                state["epoch"],
+                *(f"{v:.9f}" for v in state["position_km"]),
+                *(f"{v:.12f}" for v in state["velocity_km_s"]),
+                f"{state['latitude_deg']:.8f},{state['longitude_deg']:.8f},{state['altitude_km']:.6f}",
+            ]
+        )
+        for state in states
+    ]
+    emit(
+        arguments,
+        {"states": states, "frame": "ICRF, Moon-centred", "orientation": orientation.name},
+        text="\n".join(lines),
+    )
+    return 0
+
+
+def run_stats(arguments: argparse.Namespace) -> int:
+    import numpy as np
+
+    from linna.data import data_folder
+    from lunar.datafolder import default_orientation
+    from lunar.ephemeris import load_ephemeris
+    from lunar.ground_track import ground_track, track_statistics
+    from lunar.timescales import format_utc
+
+    ephemeris = load_ephemeris(arguments.ephemeris)
+    orientation = default_orientation(data_folder())
+    track = ground_track(ephemeris, orientation, _epochs(arguments.step, ephemeris))
+    numbers = track_statistics(ephemeris, track)
+    figures = {
+        "states": numbers.states,
+        "start": format_utc(int(track.utc_ns[0])),
+        "stop": format_utc(int(track.utc_ns[-1])),
+        "segments": len(ephemeris.segments),
+        "altitude_km": {
+            "mean": numbers.altitude_mean_m / 1e3,
+            "min": numbers.altitude_min_m / 1e3,
+            "max": numbers.altitude_max_m / 1e3,
+        },
+        "speed_km_s": numbers.speed_mean_m_s / 1e3,
+        "ground_speed_km_s": numbers.ground_speed_mean_m_s / 1e3,
+        "period_min": numbers.period_s / 60.0,
+        "passes_within_60_deg": numbers.passes,
+        "share_within_60_deg": numbers.share_inside,
+        "orientation": orientation.name,
+    }
+    if arguments.plot is not None:
+        from reports.studies import save_altitude_plot
+
+        save_altitude_plot(
+            arguments.plot,
+            track.utc_ns,
+            track.altitude_m / 1e3,
+            np.degrees(track.latitude_rad),
+            f"{arguments.ephemeris.name}: {numbers.states} states; orientation {orientation.name}",
+            [segment.start_utc_ns for segment in ephemeris.segments[1:]],
+        )
+        figures["plot"] = str(arguments.plot)
+    altitude = figures["altitude_km"]
+    text = (
+        f"{numbers.states} states from {figures['start']} to {figures['stop']}, {len(ephemeris.segments)} segments\n"
+        f"altitude: mean {altitude['mean']:.2f}, min {altitude['min']:.2f}, max {altitude['max']:.2f} km\n"
+        f"speed {figures['speed_km_s']:.3f} km/s, over ground {figures['ground_speed_km_s']:.3f} km/s, "
+        f"period {figures['period_min']:.2f} min\n"
+        f"within 60 deg of the equator: {numbers.share_inside:.1%} of the time in {numbers.passes} passes"
+    )
+    emit(arguments, figures, text=text)
+    return 0
+
+
+def _epochs(step_s: float | None, ephemeris: Any) -> Any:
+    from linna.errors import UsageError
+    from lunar.ground_track import even_epochs
+
+    if step_s is None:
+        return None
+    if not step_s > 0.0:
+        raise UsageError(f"--step: expected seconds above 0, found {step_s:g}")
+    return even_epochs(ephemeris, step_s)
+
+
+def _read_epochs(name: str) -> list[int]:
+    """UTC epochs of a file, one a line; blank lines and what follows a # are left out."""
+    from lunar.ephemeris import read_text
+    from lunar.errors import DataFileError, TimeFormatError
+    from lunar.timescales import parse_utc
+
+    text = sys.stdin.read() if name == "-" else read_text(name, "a list of UTC epochs")
+    epochs = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        wanted = line.partition("#")[0].strip()
+        if not wanted:
+            continue
+        try:
+            epochs.append(parse_utc(wanted))
+        except TimeFormatError:
+            expected = "a UTC epoch like 2029-08-07T00:00:00.000Z"
+            raise DataFileError(name, f"line {number}", expected, repr(wanted)) from None
+    if not epochs:
+        raise DataFileError(name, "", "at least one UTC epoch", "none")
+    return epochs
