@@ -126,7 +126,7 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             select(repository.PASS_FRAMES.c.frame_number, repository.PASS_FRAMES.c.file_sha256)
             .where(repository.PASS_FRAMES.c.pass_id == pass_id)
             .order_by(repository.PASS_FRAMES.c.frame_number)
-        ).tuples()
+        )
         return PassInputs(
             pass_id=str(pass_id),
             title=record["name"],
@@ -380,8 +380,8 @@ def _ingest_totals(connection: Connection, vehicle: int) -> dict[str, int]:
         select(table.c.file_sha256, table.c.accounting).where(
             table.c.vehicle_id == vehicle, table.c.state == "done"
         )
-    ).tuples()
-    by_file = dict(rows.all())
+    )
+    by_file = {row[0]: row[1] for row in rows}
     totals = {key: sum(int(accounting.get(key, 0)) for accounting in by_file.values()) for key in keys}
     seen = sum(int(accounting.get("packets", 0)) for accounting in by_file.values())
     stored = connection.execute(

@@ -169,7 +169,7 @@ def packet_headers(
     if stop_ticks is not None:
         query = query.where(PACKETS.c.ticks <= stop_ticks)
     query = query.order_by(PACKETS.c.apid, PACKETS.c.ticks, PACKETS.c.sequence_count, PACKETS.c.digest)
-    rows = np.array(connection.execute(query).tuples().all(), dtype=np.int64).reshape(-1, 3)
+    rows = np.array([tuple(row) for row in connection.execute(query)], dtype=np.int64).reshape(-1, 3)
     return {"apid": rows[:, 0], "ticks": rows[:, 1], "sequence_count": rows[:, 2]}
 
 
@@ -199,7 +199,7 @@ def samples(
         )
         .order_by(table.c.ticks, table.c.packet_id)
     )
-    rows = connection.execute(query).tuples().all()
+    rows = connection.execute(query).all()
     return {name: [row[i] for row in rows] for i, name in enumerate(columns)}
 
 
