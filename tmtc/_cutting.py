@@ -28,8 +28,6 @@ _PUS_TM_LENGTH = 22
 _PUS_TC_LENGTH = 13
 _CUC_P_FIELD = 0x2E
 _PACKET_MAX = 65_542
-# farthest that one decision looks ahead: a window of search, one packet begun in it, and its successor
-LOOK_AHEAD = 3 * _PACKET_MAX + 6
 
 
 def crc_tables() -> Array:

@@ -189,12 +189,7 @@ def idle_data(length: int) -> bytes:
     ----------
     CCSDS 132.0-B-3 section 4.1.4.6 and its note on the recommended generator.
     """
-    register, value, result = 0xFFFF_FFFF, 0, bytearray()
-    for bit in range(8 * length):
-        out = register >> 31
-        value = (value << 1 | out) & 0xFF
-        feedback = out ^ register >> 30 ^ register >> 9 ^ register
-        register = (register << 1 | (feedback & 1)) & 0xFFFF_FFFF
-        if bit & 7 == 7:
-            result.append(value)
-    return bytes(result)
+    bits = [1] * 32
+    for n in range(32, 8 * length):
+        bits.append(bits[n - 1] ^ bits[n - 2] ^ bits[n - 22] ^ bits[n - 32])
+    return np.packbits(np.array(bits[: 8 * length], dtype=np.uint8)).tobytes()

@@ -80,7 +80,7 @@ def parquet_octets(columns: Mapping[str, Sequence[object]]) -> bytes:
 def _plain(values: Sequence[object]) -> tuple[int, bytes]:
     """(physical type, plain encoding) of the values that are there."""
     present = [value for value in values if value is not None]
-    if all(isinstance(value, (int, np.integer)) for value in present):
+    if present and all(isinstance(value, (int, np.integer)) for value in present):
         return _INT64, np.array(present, dtype="<i8").tobytes()
     if all(isinstance(value, (int, float, np.integer, np.floating)) for value in present):
         return _DOUBLE, np.array(present, dtype="<f8").tobytes()

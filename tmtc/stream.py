@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from tmtc.crc import crc16
-from tmtc.packets import PACKET_MAX_LENGTH, TYPE_TELEMETRY
+from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, TYPE_TELEMETRY
 from tmtc.schema import as_octets
 
 Octets = bytes | bytearray | memoryview | npt.NDArray[np.uint8]
@@ -28,7 +28,7 @@ _GOOD, _BAD, _SKIPPED, _IDLE = 0, 1, 2, 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PacketCut:
-    """Where packets stand in a buffer.
+    """Where packets stand in a buffer, or in the segments of it that were cut.
 
     `offsets`, `lengths` (n,) and `crc_ok` (n,) hold the packets in the buffer's order, the damaged ones
     included; `idle` (m, 2) and `skipped` (k, 2) are ranges [start, stop) of idle packets and of octets that
@@ -164,9 +164,12 @@ class _Cutter:
                 continue
             if p == stop:
                 break
-            if not final and stop - p < self.kernels.LOOK_AHEAD:
+            if q := self.idle_end(p, stop):
+                kind = _IDLE
+            elif not final and stop - p < look_ahead(self.longest):
                 return p
-            kind, q = self.decide(p, stop)
+            else:
+                kind, q = self.decide(p, stop)
             last = self.rows[self.count - 1]
             if kind == _SKIPPED and self.count > begin and last[0] == _SKIPPED:
                 last[2] = q
@@ -184,18 +187,24 @@ class _Cutter:
         length = self.length_at(p, stop)
         e = p + length
         if length and (e == stop or self.stands(e, stop)):
-            if self.is_idle(p) and np.all(self.octets[p + 6 : e] == self.octets[p + 6]):
-                return _IDLE, e
             # the damage is inside [p, e), unless the length is wrong and right packets fill the end of that range
             q = self.kernels.chain_start(self.octets, p + 1, e, self.packet_type, self.longest, *state)
             return (self.kind_of(p), e) if q < 0 else (_SKIPPED, q)
-        limit = min(stop, p + PACKET_MAX_LENGTH)
+        limit = min(stop, p + self.longest)
         q = self.kernels.search(self.octets, p + 1, limit, stop, self.packet_type, self.longest, *state)
         # several damaged packets in a row, whose lengths still lead to the next right one
         r = p
         while r < q and (length := self.length_at(r, q)):
             r += length
         return (self.kind_of(p), e) if r == q else (_SKIPPED, q)
+
+    def idle_end(self, p: int, stop: int) -> int:
+        """End of an evenly filled idle packet at `p` with a packet behind it, else 0: needs no search."""
+        length = self.length_at(p, stop)
+        if not length or not self.is_idle(p):
+            return 0
+        fill = self.octets[p + PRIMARY_HEADER_LENGTH : p + length]
+        return p + length if np.all(fill == fill[0]) and self.stands(p + length, stop) else 0
 
     def kind_of(self, p: int) -> int:
         return _IDLE if self.is_idle(p) else _BAD
@@ -210,6 +219,64 @@ class _Cutter:
         """Whether a whole packet with a right checksum, or the header of an idle packet, stands at `p`."""
         length = self.length_at(p, stop)
         return bool(length) and (self.is_idle(p) or crc16(self.octets[p : p + length].data) == 0)
+
+
+@dataclass(slots=True)
+class PacketStream:
+    """Packets cut out of octets that arrive piece by piece; the same packets however the pieces are cut.
+
+    Right packets are given as soon as they are whole. After damage the stream waits until enough octets are there
+    to decide as over the whole stream (`look_ahead(longest)`), which also bounds what it keeps.
+    """
+
+    longest: int = PACKET_MAX_LENGTH
+    packet_type: int = TYPE_TELEMETRY
+    packets: int = 0
+    crc_errors: int = 0
+    octets_skipped: int = 0
+    octets_idle: int = 0
+    _pending: bytearray = field(default_factory=bytearray)
+    _needed: int = 1
+
+    def feed(self, octets: Octets) -> list[bytes]:
+        """Packets that have become whole with these octets."""
+        self._pending += as_octets(octets).data
+        if len(self._pending) < self._needed:
+            return []
+        return self._cut(final=False)
+
+    def close(self) -> list[bytes]:
+        """Packets that are still to be had now that nothing more will come."""
+        return self._cut(final=True)
+
+    @property
+    def octets_pending(self) -> int:
+        """Octets kept back for now."""
+        return len(self._pending)
+
+    def _cut(self, final: bool) -> list[bytes]:
+        octets = bytes(self._pending)
+        cut = cut_packets(octets, packet_type=self.packet_type, longest=self.longest, final=final)
+        found = list(cut.packets(octets))
+        self.packets += len(found)
+        self.crc_errors += cut.crc_errors
+        self.octets_skipped += cut.octets_skipped
+        self.octets_idle += cut.octets_idle
+        del self._pending[: cut.consumed]
+        # nothing changes before the packet that begins here is whole, or the damage here can be judged
+        self._needed = 1
+        rest = len(self._pending)
+        if rest >= PRIMARY_HEADER_LENGTH:
+            length = int.from_bytes(self._pending[4:6], "big") + PRIMARY_HEADER_LENGTH + 1
+            plausible = self._pending[0] >> 4 == self.packet_type and rest < length <= self.longest
+            idle = self._pending[0] & 0x0F == 0x07 and self._pending[1] == 0xFF
+            self._needed = length if plausible else rest + 1 if idle else look_ahead(self.longest)
+        return found
+
+
+def look_ahead(longest: int) -> int:
+    """Octets that one decision after damage can need: a window of search, a packet begun in it, its successor."""
+    return 3 * longest + PRIMARY_HEADER_LENGTH
 
 
 @functools.cache

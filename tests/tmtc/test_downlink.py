@@ -1,0 +1,397 @@
+"""The whole chain, packets to CADUs and back, under every setting and every injury."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from spacepackets.ccsds.tm_frame import TmTransferFrame
+
+from tmtc.cadu import ASM
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import (
+    FRAME_BAD_CHECKSUM,
+    FRAME_FOREIGN,
+    FRAME_UNCORRECTABLE,
+    DownlinkEncoder,
+    LinkSettings,
+    decode,
+    encode_cadus,
+)
+from tmtc.errors import LinkFormatError, ValueRefused
+from tmtc.frames import Clcw, pack_clcw, unpack_clcw
+from tmtc.packets import PacketSequencer, pack_packet
+from tmtc.randomiser import randomise
+
+
+def make_packets(count: int, seed: int = 0, boot: int = 1, start_s: int = 0) -> list[bytes]:
+    rng = np.random.default_rng(seed)
+    sequencer = PacketSequencer()
+    packets = []
+    for k in range(count):
+        ticks = start_s + k << 16
+        n = int(rng.integers(0, 30))
+        items = {
+            "u_px": rng.uniform(0, 511, n),
+            "v_px": rng.uniform(0, 511, n),
+            "diameter_px": rng.uniform(5, 80, n),
+            "score": rng.uniform(0, 1, n),
+            "size_class": rng.integers(-1, 4, n),
+            "sigma_px": np.full(n, np.nan),
+        }
+        values = {"frame_number": k, "image_ticks": ticks, "image_quality": 0, "items": items}
+        packets.append(
+            DICTIONARY.pack("detections", values, ticks=ticks, sequence_count=sequencer.next(0xA1))
+        )
+        event = {"event_id": "fix_refused", "frame_number": k, "value_1": 1.0, "value_2": 2.0}
+        packets.append(DICTIONARY.pack("event_low", event, ticks=ticks, sequence_count=sequencer.next(0xA4)))
+        if k % 10 == 0:
+            zeros = {f.name: 0 for f in DICTIONARY.packet("housekeeping").fields}
+            values = {**zeros, "structure_id": 1, "boot_count": boot}
+            packets.append(
+                DICTIONARY.pack("housekeeping", values, ticks=ticks, sequence_count=sequencer.next(0xA0))
+            )
+    return packets
+
+
+PACKETS = make_packets(200)
+
+
+def assert_all_octets_are_accounted_for(octets, decoded) -> None:
+    assert sum(decoded.octets.values()) == len(octets)
+    assert min(decoded.octets.values()) >= 0
+
+
+@pytest.mark.parametrize("randomiser", ["none", "legacy", "long"])
+@pytest.mark.parametrize("coding", ["rs", "none"])
+@pytest.mark.parametrize("checksum", [True, False])
+@pytest.mark.parametrize("frame_length", [223, 892, 1000, 1115])
+def test_what_is_sent_comes_back_and_the_settings_are_found_out(randomiser, coding, checksum, frame_length):
+    octets = encode_cadus(
+        PACKETS,
+        spacecraft_id=76,
+        frame_length=frame_length,
+        coding=coding,
+        randomiser=randomiser,
+        checksum=checksum,
+    )
+    decoded = decode(octets)
+    assert list(decoded.cut.packets(decoded.buffer)) == PACKETS
+    assert decoded.spacecraft_id == 76 and decoded.complete
+    assert decoded.settings.coding == coding and decoded.settings.frame_length == frame_length
+    assert decoded.settings.randomiser == randomiser
+    assert_all_octets_are_accounted_for(octets, decoded)
+
+
+@pytest.mark.parametrize("errors", [8, 16])
+@pytest.mark.parametrize("dual_basis", [True, False])
+@pytest.mark.parametrize("interleave", [1, 2, 3, 4, 5, 8])
+def test_every_reed_solomon_setting_is_found_out(errors, dual_basis, interleave):
+    frame_length = (255 - 2 * errors - 3) * interleave
+    wanted = LinkSettings(
+        frame_length=frame_length,
+        rs_errors=errors,
+        interleave=interleave,
+        dual_basis=dual_basis,
+        randomiser="long",
+    )
+    octets = DownlinkEncoder(5, wanted).encode(PACKETS)
+    decoded = decode(octets)
+    assert decoded.settings == wanted
+    assert list(decoded.cut.packets(decoded.buffer)) == PACKETS
+
+
+def test_a_cadu_of_the_default_link_is_1279_octets():
+    octets = encode_cadus(PACKETS[:1], spacecraft_id=76)
+    assert len(octets) == 1279 and octets[:4] == ASM
+
+
+def test_frames_are_what_spacepackets_reads():
+    octets = encode_cadus(
+        PACKETS[:40], spacecraft_id=76, virtual_channel=2, coding="none", randomiser="none", frame_length=512
+    )
+    frames = [octets[at + 4 : at + 516] for at in range(0, len(octets), 516)]
+    theirs = [TmTransferFrame.unpack(frame, 512, has_error_control_field=True) for frame in frames]
+    assert [f.primary_header.vc_frame_count for f in theirs] == list(range(len(frames)))
+    assert {f.primary_header.vc_id for f in theirs} == {2}
+    stream = b"".join(bytes(f.data_field) for f in theirs)
+    assert stream.startswith(b"".join(PACKETS[:40]))
+
+
+def test_a_file_of_bare_packets_is_recognised():
+    octets = b"".join(PACKETS)
+    decoded = decode(octets)
+    assert decoded.settings is None and decoded.frames is None
+    assert decoded.packets == len(PACKETS) and decoded.complete
+    assert decoded.by_apid == {0xA0: 20, 0xA1: 200, 0xA4: 200}
+    assert_all_octets_are_accounted_for(octets, decoded)
+
+
+def test_an_empty_file_is_empty():
+    decoded = decode(b"")
+    assert (decoded.packets, decoded.octets_skipped, decoded.frame_count) == (0, 0, 0)
+    assert encode_cadus([], spacecraft_id=1) == b""
+
+
+def test_packets_longer_than_frames_span_them():
+    long = [pack_packet(0x7A, bytes(5000) + b"\0\0", sequence_count=0)]
+    from tmtc.crc import append_crc
+
+    packets = [append_crc(p[:-2]) for p in long] + PACKETS[:3]
+    decoded = decode(encode_cadus(packets, spacecraft_id=1, frame_length=223))
+    assert list(decoded.cut.packets(decoded.buffer)) == packets
+
+
+@pytest.mark.parametrize("spare", range(9))
+def test_the_last_frame_is_filled_exactly_however_little_is_left(spare):
+    # zone of 215 octets: the packet leaves 0..8, fewer than the seven of the least idle packet among them
+    from tmtc.crc import append_crc
+
+    packet = append_crc(pack_packet(0x11, bytes(215 - spare - 6), sequence_count=0)[:-2])
+    octets = encode_cadus([packet], spacecraft_id=1, frame_length=223, coding="none")
+    decoded = decode(octets)
+    assert list(decoded.cut.packets(decoded.buffer)) == [packet]
+    assert decoded.octets_skipped == 0 and decoded.octets["idle_packets"] in (0, spare, spare + 215)
+
+
+def test_counts_go_on_from_one_dump_to_the_next_and_past_255():
+    encoder = DownlinkEncoder(76, LinkSettings(frame_length=64, coding="none"))
+    octets = b"".join(encoder.encode(PACKETS[k : k + 7]) for k in range(0, len(PACKETS), 7))
+    decoded = decode(octets)
+    assert decoded.frame_count > 256 and decoded.frames_lost == 0
+    assert list(decoded.cut.packets(decoded.buffer)) == PACKETS
+
+
+def test_virtual_channels_are_rebuilt_apart_and_idle_frames_are_counted():
+    encoder = DownlinkEncoder(76)
+    octets = b""
+    for k in range(0, len(PACKETS), 20):
+        octets += encoder.encode(PACKETS[k : k + 10], virtual_channel=0)
+        octets += encoder.idle(2)
+        octets += encoder.encode(PACKETS[k + 10 : k + 20], virtual_channel=1)
+    decoded = decode(octets)
+    assert sorted(decoded.cut.packets(decoded.buffer)) == sorted(PACKETS)
+    assert decoded.complete and decoded.octets["idle_frames"] == 2 * 21 * 1107
+    assert_all_octets_are_accounted_for(octets, decoded)
+
+
+def test_the_command_link_control_word_comes_down_with_each_frame():
+    clcw = Clcw(3, 9, retransmit=True)
+    encoder = DownlinkEncoder(76)
+    octets = encoder.encode(PACKETS, clcw=pack_clcw(clcw)) + encoder.idle(1, clcw=pack_clcw(clcw))
+    decoded = decode(octets)
+    assert list(decoded.cut.packets(decoded.buffer)) == PACKETS
+    assert {unpack_clcw(int(word).to_bytes(4, "big")) for word in decoded.frames.clcw} == {clcw}
+
+
+# injuries of the link
+
+
+def frame_of(octets: bytes, settings: LinkSettings, k: int) -> slice:
+    return slice(k * settings.cadu_length, (k + 1) * settings.cadu_length)
+
+
+def test_a_lost_frame_costs_the_packets_that_touch_it_and_no_other():
+    settings = LinkSettings()
+    octets = encode_cadus(PACKETS, spacecraft_id=76)
+    spans, at = [], 0
+    for packet in PACKETS:
+        spans.append((at // 1107, (at + len(packet) - 1) // 1107))
+        at += len(packet)
+    lost = 5
+    hit = [k for k, (first, last) in enumerate(spans) if first <= lost <= last]
+    damaged = (
+        octets[: frame_of(octets, settings, lost).start] + octets[frame_of(octets, settings, lost).stop :]
+    )
+    decoded = decode(damaged)
+    assert list(decoded.cut.packets(decoded.buffer)) == [p for k, p in enumerate(PACKETS) if k not in hit]
+    assert decoded.frames_lost == 1 and decoded.frames_bad == 0
+    assert decoded.packets_missing == len(hit)
+    assert_all_octets_are_accounted_for(damaged, decoded)
+
+
+def test_an_uncorrectable_frame_is_counted_and_its_damage_located():
+    octets = bytearray(encode_cadus(PACKETS, spacecraft_id=76))
+    octets[5 * 1279 + 10 : 5 * 1279 + 10 + 17 * 5 : 5] = bytes(17)
+    decoded = decode(bytes(octets))
+    assert decoded.frames_bad == 1 and decoded.frames.verdict[5] == FRAME_UNCORRECTABLE
+    assert (decoded.frames.corrected[5] < 0).sum() == 1
+    assert_all_octets_are_accounted_for(octets, decoded)
+
+
+def test_correctable_errors_cost_nothing_and_are_counted():
+    octets = bytearray(encode_cadus(PACKETS, spacecraft_id=76))
+    for frame in (1, 3):
+        for k in range(16 * 5):  # sixteen errors in each of the five codewords
+            octets[frame * 1279 + 4 + 200 + k] ^= 0x5A
+    decoded = decode(bytes(octets))
+    assert list(decoded.cut.packets(decoded.buffer)) == PACKETS
+    assert decoded.symbols_corrected == 160 and decoded.complete
+    assert decoded.frames.corrected[[1, 3]].tolist() == [[16] * 5] * 2
+
+
+def test_a_stream_whose_every_codeword_has_errors_is_still_recognised():
+    octets = bytearray(encode_cadus(PACKETS[:60], spacecraft_id=76, randomiser="long"))
+    for frame in range(len(octets) // 1279):
+        octets[frame * 1279 + 300 : frame * 1279 + 305] = bytes(5)
+        octets[frame * 1279 + 400 : frame * 1279 + 405] = bytes(5)
+    decoded = decode(bytes(octets))
+    assert list(decoded.cut.packets(decoded.buffer)) == PACKETS[:60]
+    assert decoded.settings.randomiser == "long"
+
+
+def test_a_bad_frame_checksum_discards_the_frame_of_an_uncoded_link():
+    octets = bytearray(encode_cadus(PACKETS, spacecraft_id=76, coding="none"))
+    octets[3 * 1119 + 500] ^= 1
+    decoded = decode(bytes(octets))
+    assert decoded.frames_bad == 1 and decoded.frames.verdict[3] == FRAME_BAD_CHECKSUM
+    assert decoded.crc_errors == 0 and decoded.packets_missing > 0
+
+
+def test_frames_of_another_spacecraft_are_not_used():
+    other = encode_cadus(make_packets(3, seed=9), spacecraft_id=77)
+    octets = encode_cadus(PACKETS, spacecraft_id=76) + other
+    decoded = decode(octets)
+    assert list(decoded.cut.packets(decoded.buffer)) == PACKETS
+    assert decoded.frames_bad == len(other) // 1279
+    assert (decoded.frames.verdict == FRAME_FOREIGN).sum() == len(other) // 1279
+    assert decode(octets, spacecraft_id=77).packets == len(make_packets(3, seed=9))
+
+
+def test_attaching_in_mid_stream_gives_no_bogus_packet_and_loses_no_whole_one():
+    # the first frames begin with the rest of a packet whose head was never received
+    octets = encode_cadus(PACKETS, spacecraft_id=76)[3 * 1279 :]
+    decoded = decode(octets)
+    found = list(decoded.cut.packets(decoded.buffer))
+    assert found == PACKETS[len(PACKETS) - len(found) :]
+    starts = np.cumsum([0] + [len(p) for p in PACKETS])
+    assert len(found) == int(np.count_nonzero(starts[:-1] >= 3 * 1107))
+    assert decoded.octets["orphaned"] == starts[len(PACKETS) - len(found)] - 3 * 1107
+    assert decoded.crc_errors == 0
+
+
+def test_attaching_in_mid_frame_costs_only_that_frame():
+    octets = encode_cadus(PACKETS, spacecraft_id=76)
+    decoded = decode(octets[777:])
+    assert decoded.octets["unsynchronised"] == 1279 - 777
+    assert_all_octets_are_accounted_for(octets[777:], decoded)
+
+
+def test_a_truncated_downlink_gives_all_whole_frames():
+    octets = encode_cadus(PACKETS, spacecraft_id=76)[: 7 * 1279 + 600]
+    decoded = decode(octets)
+    assert decoded.frame_count == 7 and decoded.octets["unsynchronised"] == 600
+    found = list(decoded.cut.packets(decoded.buffer))
+    assert found == PACKETS[: len(found)] and decoded.crc_errors == 0
+    assert_all_octets_are_accounted_for(octets, decoded)
+
+
+def test_a_dump_that_comes_twice_is_duplicates():
+    octets = encode_cadus(PACKETS, spacecraft_id=76)
+    decoded = decode(octets + octets)
+    assert decoded.duplicates == len(PACKETS) and decoded.gaps == 0 and decoded.conflicts == 0
+
+
+def test_late_playback_out_of_order_leaves_no_gap():
+    encoder = DownlinkEncoder(76)
+    half = len(PACKETS) // 2
+    octets = encoder.encode(PACKETS[half:]) + encoder.encode(PACKETS[:half])
+    decoded = decode(octets)
+    assert (decoded.gaps, decoded.duplicates, decoded.packets) == (0, 0, len(PACKETS))
+
+
+def test_a_reboot_starts_new_counts_and_is_no_loss():
+    first, second = make_packets(40, boot=1), make_packets(40, seed=1, boot=2, start_s=5000)
+    decoded = decode(encode_cadus(first + second, spacecraft_id=76))
+    assert (decoded.gaps, decoded.duplicates, decoded.conflicts) == (0, 0, 0)
+    assert {account.boot for account in decoded.sequence.accounts} == {1, 2}
+
+
+def test_packets_outside_the_dictionary_are_counted_as_unknown():
+    from tmtc.crc import append_crc
+
+    stranger = append_crc(pack_packet(0x55, bytes(30), sequence_count=0)[:-2])
+    decoded = decode(b"".join([*PACKETS[:5], stranger, *PACKETS[5:]]))
+    assert decoded.unknown == 1 and not decoded.complete
+    assert decoded.by_apid[0x55] == 1
+
+
+def test_markers_without_frames_between_them_are_an_error_that_says_so():
+    noise = np.random.default_rng(3).integers(0, 256, (30, 700), dtype=np.uint8)
+    noise[:, :4] = np.frombuffer(ASM, dtype=np.uint8)
+    with pytest.raises(LinkFormatError, match="markers stand every 700 octets"):
+        decode(noise.tobytes())
+
+
+def test_settings_that_are_given_are_used():
+    octets = encode_cadus(PACKETS, spacecraft_id=76)
+    wrong = decode(octets, settings=LinkSettings(randomiser="none", dual_basis=False))
+    assert wrong.packets == 0 and wrong.frames_bad == wrong.frame_count
+    assert_all_octets_are_accounted_for(octets, wrong)
+
+
+def test_the_legacy_sequence_is_a_codeword_so_that_the_code_alone_cannot_tell_it_from_none():
+    # the reason why the settings are found out by headers and packets as well
+    from tmtc.reed_solomon import ReedSolomon, clean
+
+    assert clean(randomise(np.zeros((1, 255), dtype=np.uint8), "legacy"), ReedSolomon(interleave=1)).all()
+
+
+def test_impossible_settings_are_refused():
+    with pytest.raises(ValueRefused, match="spacecraft_id"):
+        encode_cadus(PACKETS, spacecraft_id=1024)
+    with pytest.raises(ValueRefused, match="frame_length"):
+        encode_cadus(PACKETS, spacecraft_id=1, frame_length=2049, coding="none")
+    with pytest.raises(ValueRefused, match="virtual_channel"):
+        encode_cadus(PACKETS, spacecraft_id=1, virtual_channel=8)
+    with pytest.raises(LinkFormatError, match="found 1117"):
+        encode_cadus(PACKETS, spacecraft_id=1, frame_length=1117)
+
+
+def test_the_largest_frame_of_the_standard_is_a_frame():
+    decoded = decode(encode_cadus(PACKETS, spacecraft_id=1, frame_length=2048, coding="none"))
+    assert list(decoded.cut.packets(decoded.buffer)) == PACKETS
+
+
+SENT = make_packets(30, seed=7)
+STREAMS = {
+    coding: encode_cadus(SENT, spacecraft_id=76, frame_length=223, coding=coding) for coding in ("rs", "none")
+}
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.sampled_from(["rs", "none"]),
+    st.lists(
+        st.tuples(st.sampled_from(["flip", "insert", "delete"]), st.integers(0, 10**9), st.integers(0, 300)),
+        max_size=6,
+    ),
+)
+def test_whatever_the_link_does_no_packet_is_invented_and_every_octet_is_accounted_for(coding, injuries):
+    octets = bytearray(STREAMS[coding])
+    for kind, position, size in injuries:
+        at = position % len(octets)
+        if kind == "flip":
+            octets[at] ^= 1 << size % 8
+        elif kind == "insert":
+            octets[at:at] = bytes(size)
+        else:
+            del octets[at : at + size]
+    decoded = decode(bytes(octets), settings=LinkSettings(frame_length=223, coding=coding))
+    assert set(decoded.cut.packets(decoded.buffer)) <= set(SENT)
+    assert decoded.conflicts == 0 and decoded.duplicates == 0
+    assert_all_octets_are_accounted_for(octets, decoded)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.binary(max_size=3000))
+def test_any_octets_at_all_are_decoded_or_refused(octets):
+    for given_settings in (
+        None,
+        LinkSettings(frame_length=223, coding="rs"),
+        LinkSettings(frame_length=64, coding="none"),
+    ):
+        try:
+            decoded = decode(octets, settings=given_settings)
+        except LinkFormatError:
+            continue
+        assert_all_octets_are_accounted_for(octets, decoded)

@@ -1,0 +1,102 @@
+import csv
+import io
+import json
+import struct
+
+import numpy as np
+import pytest
+
+from tmtc.dictionary import DICTIONARY
+from tmtc.errors import UnknownPacket
+from tmtc.export import format_onboard_time, format_records, packet_records
+from tmtc.parquet import parquet_octets
+from tmtc.stream import cut_packets
+
+
+def tables():
+    items = {
+        "u_px": [1.5, 2.0], "v_px": [3.0, 4.0], "diameter_px": [10.0, 20.0], "score": [1.0, 0.0],
+        "size_class": [0, -1], "sigma_px": [0.5, np.nan],
+    }  # fmt: skip
+    detections = {"frame_number": 1, "image_ticks": 7, "image_quality": "dark"}
+    event = {"event_id": "boot", "frame_number": 0, "value_1": 0.25, "value_2": np.nan}
+    state = {
+        "frame_number": 1, "image_ticks": 7, "estimator": "anchored", "outcome": "fixed", "latitude_deg": -1.5,
+        "longitude_deg": 300.0, "altitude_m": 30e3, "velocity_icrf_m_s": [1.0, 2.0, 3.0],
+        "sigma_rtn_m": [4.0, 5.0, np.nan], "nis": 0.5, "matched": 9,
+    }  # fmt: skip
+    octets = b"".join(
+        (
+            DICTIONARY.pack("event_info", event, ticks=0, sequence_count=0),
+            DICTIONARY.pack("detections", {**detections, "items": items}, ticks=3 << 15, sequence_count=0),
+            DICTIONARY.pack("detections", {**detections, "items": []}, ticks=2 << 16, sequence_count=1),
+            DICTIONARY.pack("navigation_state", state, ticks=2 << 16, sequence_count=0),
+        )
+    )
+    return DICTIONARY.unpack_many(octets, cut_packets(octets))
+
+
+def test_on_board_time_is_told_in_tai():
+    assert format_onboard_time(0) == "2000-01-01T00:00:00.000000"
+    # 2029-08-07T00:00:00 TAI is 10811 days after the epoch
+    assert format_onboard_time(10811 * 86400 << 16 | 0x8000) == "2029-08-07T00:00:00.500000"
+    assert format_onboard_time((1 << 48) - 1).startswith("2136-02-07T06:28:15.99998")
+
+
+def test_records_stand_in_the_order_of_the_stream_with_names_for_codes():
+    records = packet_records(tables())
+    assert [r["packet"] for r in records] == ["event_info", "detections", "detections", "navigation_state"]
+    assert records[0]["event_id"] == "boot" and records[0]["value_2"] is None
+    assert records[1]["image_quality"] == "dark" and records[1]["onboard_tai"].endswith("00:00:01.500000")
+    assert records[1]["items"] == [
+        {
+            "u_px": 1.5,
+            "v_px": 3.0,
+            "diameter_px": 10.0,
+            "score": 1.0,
+            "size_class": "5-10 km",
+            "sigma_px": 0.5,
+        },
+        {"u_px": 2.0, "v_px": 4.0, "diameter_px": 20.0, "score": 0.0, "size_class": "none", "sigma_px": None},
+    ]
+    assert records[2]["items"] == []
+    assert records[3]["sigma_rtn_m"] == [4.0, 5.0, None]
+
+
+def test_json_and_csv_hold_the_records():
+    records = packet_records(tables())
+    assert json.loads(format_records(records, "json")) == records
+    rows = list(csv.DictReader(io.StringIO(format_records(records, "csv").decode())))
+    assert [row["frame_number"] for row in rows] == ["0", "1", "1", "1"]
+    assert rows[3]["velocity_icrf_m_s_2"] == "2.0" and rows[3]["sigma_rtn_m_3"] == ""
+    assert json.loads(rows[1]["items"]) == records[1]["items"]
+
+
+def test_no_packets_are_empty_files():
+    assert json.loads(format_records([], "json")) == []
+    assert format_records([], "csv") == b"\n"
+
+
+def test_an_unknown_format_is_refused():
+    with pytest.raises(UnknownPacket, match="expected one of json, csv, parquet, found 'xml'"):
+        format_records([], "xml")
+
+
+def test_parquet_is_the_octets_that_pyarrow_reads():
+    octets = parquet_octets({"n": [1, None, -3], "x": [0.5, 1, None], "t": ["a", None, "\u00b5"]})
+    # read with pyarrow 26.0.1: {'n': [1, None, -3], 'x': [0.5, 1.0, None], 't': ['a', None, '\u00b5']}
+    assert octets.hex() == (
+        "504152311500152c152c2c150615001506150600000200000003050100000000000000fdffffffffffffff1500152c15"
+        "2c2c15061500150615060000020000000303000000000000e03f000000000000f03f1500152215222c15061500150615"
+        "060000020000000305010000006102000000c2b51502194c4806736368656d611506001504250218016e00150a250218"
+        "017800150c25021801742500001606191c193c26081c1504192500061918016e15001606164e164e2608000026561c15"
+        "0a192500061918017815001606164e164e2656000026a4011c150c1925000619180174150016061644164426a4010000"
+        "16e001160600280a6c696e6e6120746d7463008f00000050415231"
+    )
+
+
+def test_parquet_begins_and_ends_as_its_format_says():
+    octets = format_records(packet_records(tables()), "parquet")
+    assert octets[:4] == octets[-4:] == b"PAR1"
+    (footer,) = struct.unpack("<I", octets[-8:-4])
+    assert 0 < footer < len(octets) - 12

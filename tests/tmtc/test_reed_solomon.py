@@ -1,0 +1,153 @@
+import numpy as np
+import pytest
+import reedsolo
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tmtc.errors import LinkFormatError, UncorrectableCodeword
+from tmtc.reed_solomon import (
+    UNCORRECTABLE,
+    ReedSolomon,
+    clean,
+    code_for,
+    decode,
+    dual_basis_tables,
+    encode,
+    generator,
+    repair,
+)
+
+
+def frames_for(code: ReedSolomon, count: int = 3, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (count, code.frame_length), dtype=np.uint8)
+
+
+def test_the_generator_polynomial_is_that_of_the_standard():
+    # CCSDS 131.0-B annex: palindromic, E = 16; coefficients as published with libfec
+    half = "015B7F56101E0DEB61A5082A3656AB20"
+    assert bytes(generator(16)).hex().upper() == half + "71" + "".join(
+        half[k : k + 2] for k in range(len(half) - 2, -1, -2)
+    )
+    assert len(generator(8)) == 17 and generator(8) == generator(8)[::-1]
+
+
+def test_the_dual_basis_table_is_that_of_the_standard():
+    to_dual, from_dual = dual_basis_tables()
+    assert to_dual[:8].tobytes().hex().upper() == "007BAFD499E2364D"
+    assert [int(to_dual[1 << bit]) for bit in range(8)] == [0x7B, 0xAF, 0x99, 0xFA, 0x86, 0xEC, 0xEF, 0x8D]
+    assert np.array_equal(from_dual[to_dual], np.arange(256))
+
+
+@pytest.mark.parametrize("errors", [8, 16])
+def test_conventional_codewords_are_those_of_an_independent_encoder(errors):
+    code = ReedSolomon(errors=errors, interleave=1, dual_basis=False)
+    frame = frames_for(code, 1)
+    theirs = reedsolo.RSCodec(nsym=2 * errors, nsize=255, fcr=128 - errors, prim=0x187, generator=173).encode(
+        frame.tobytes()
+    )
+    assert encode(frame, code).tobytes() == bytes(theirs)
+
+
+def test_dual_codewords_are_conventional_ones_symbol_by_symbol():
+    to_dual, from_dual = dual_basis_tables()
+    dual, conventional = ReedSolomon(interleave=1), ReedSolomon(interleave=1, dual_basis=False)
+    frames = frames_for(dual)
+    assert np.array_equal(encode(frames, dual), to_dual[encode(from_dual[frames], conventional)])
+
+
+def test_symbol_k_of_a_codeblock_belongs_to_codeword_k_modulo_the_depth():
+    code, single = ReedSolomon(interleave=5), ReedSolomon(interleave=1)
+    blocks = encode(frames_for(code), code)
+    for k in range(5):
+        assert clean(np.ascontiguousarray(blocks[:, k::5]), single).all()
+
+
+def test_virtual_fill_is_leading_zeros_that_are_not_sent():
+    short, full = ReedSolomon(interleave=1, virtual_fill=23), ReedSolomon(interleave=1)
+    frames = frames_for(short)
+    padded = np.concatenate((np.zeros((3, 23), dtype=np.uint8), frames), axis=1)
+    assert np.array_equal(encode(frames, short), encode(padded, full)[:, 23:])
+
+
+@pytest.mark.parametrize(
+    ("frame_length", "interleave", "block_length"),
+    [(1115, 5, 1275), (892, 4, 1020), (223, 1, 255), (446, 2, 510), (1784, 8, 2040), (1000, 5, 1160)],
+)
+def test_the_code_is_found_from_the_frame_length(frame_length, interleave, block_length):
+    code = code_for(frame_length)
+    assert (code.interleave, code.frame_length, code.block_length) == (interleave, frame_length, block_length)
+
+
+def test_frames_that_no_code_carries_are_refused():
+    with pytest.raises(LinkFormatError, match="found 1117"):
+        code_for(1117)
+    with pytest.raises(LinkFormatError, match="expected interleave 1, 2, 3, 4, 5 or 8, found 6"):
+        ReedSolomon(interleave=6)
+    with pytest.raises(LinkFormatError, match="8 or 16"):
+        ReedSolomon(errors=4)
+    with pytest.raises(LinkFormatError, match="expected frames of 1115 octets"):
+        encode(np.zeros((1, 10), dtype=np.uint8), ReedSolomon())
+
+
+@pytest.mark.parametrize(
+    "code", [ReedSolomon(), ReedSolomon(8, 2, 5), ReedSolomon(16, 1, 40, False)], ids=str
+)
+def test_as_many_wrong_symbols_as_promised_are_repaired_and_counted_in_each_codeword(code):
+    rng = np.random.default_rng(1)
+    frames = frames_for(code, code.errors + 2)
+    blocks = encode(frames, code)
+    words = blocks.reshape(frames.shape[0], -1, code.interleave)
+    for n in range(frames.shape[0]):  # n errors in codeword 0 of block n, none elsewhere
+        where = rng.choice(words.shape[1], n, replace=False)
+        words[n, where, 0] ^= rng.integers(1, 256, n, dtype=np.uint8)
+    result = decode(blocks, code)
+    expected = [*range(code.errors + 1), UNCORRECTABLE]
+    assert result.corrected[:, 0].tolist() == expected
+    assert not result.corrected[:, 1:].any()
+    assert np.array_equal(result.frames[:-1], frames[:-1])
+
+
+def test_one_lost_codeword_does_not_hide_the_others():
+    code = ReedSolomon()
+    frames = frames_for(code, 1)
+    blocks = encode(frames, code)
+    blocks[0, 2 : 2 + 17 * 5 : 5] ^= 0x55  # seventeen errors in codeword 2
+    blocks[0, 4] ^= 1  # one in codeword 4
+    result = decode(blocks, code)
+    assert result.corrected.tolist() == [[0, 0, UNCORRECTABLE, 0, 1]]
+
+
+def test_errors_found_in_the_virtual_fill_mean_that_too_many_others_were_there():
+    code = ReedSolomon(interleave=1, virtual_fill=10)
+    # a full codeword with nonzero symbols where the fill would be, those cut off: few "errors", all in the fill
+    full = ReedSolomon(interleave=1)
+    frame = frames_for(full, 1)
+    word = encode(frame, full)[0, 10:]
+    with pytest.raises(UncorrectableCodeword):
+        repair(word, code)
+
+
+def test_no_blocks_are_no_frames():
+    code = ReedSolomon()
+    assert decode(np.empty((0, 1275), dtype=np.uint8), code).frames.shape == (0, 1115)
+    assert encode(np.empty((0, 1115), dtype=np.uint8), code).shape == (0, 1275)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.sampled_from([8, 16]),
+    st.sampled_from([1, 2, 3, 4, 5, 8]),
+    st.integers(0, 200),
+    st.booleans(),
+    st.integers(0, 99),
+)
+def test_every_setting_encodes_to_clean_codewords_that_a_flipped_bit_spoils(errors, depth, fill, dual, seed):
+    code = ReedSolomon(errors, depth, fill, dual)
+    frames = frames_for(code, 2, seed)
+    blocks = encode(frames, code)
+    assert clean(blocks, code).all()
+    at = seed % blocks.shape[1]
+    blocks[1, at] ^= 1 << (seed % 8)
+    assert clean(blocks, code).sum() == 2 * depth - 1
+    result = decode(blocks, code)
+    assert np.array_equal(result.frames, frames) and result.corrected.sum() == 1

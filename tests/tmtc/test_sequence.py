@@ -1,0 +1,169 @@
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tmtc.sequence import CONFLICT, DUPLICATE, FIRST, account, extend_counts
+
+
+def never_same(a: int, b: int) -> bool:
+    return False
+
+
+def always_same(a: int, b: int) -> bool:
+    return True
+
+
+def report(counts, ticks=None, apid=None, same=always_same, boot=None):
+    counts = np.asarray(counts, dtype=np.int64)
+    ticks = (
+        np.arange(counts.size, dtype=np.int64) << 16 if ticks is None else np.asarray(ticks, dtype=np.int64)
+    )
+    apid = np.full(counts.size, 5, dtype=np.int64) if apid is None else np.asarray(apid, dtype=np.int64)
+    return account(apid, counts % 16384, ticks, same, boot)
+
+
+def test_an_unbroken_count_has_no_gap():
+    result = report(range(100))
+    assert (result.gaps, result.missing, result.duplicates, result.conflicts) == (0, 0, 0, 0)
+    assert result.accounts[0].received == 100
+
+
+def test_nothing_has_no_account():
+    assert report([]).accounts == ()
+
+
+def test_a_wrap_is_no_gap():
+    result = report(range(16380, 16390))
+    assert result.gaps == 0
+    assert result.extended_count.tolist() == list(range(16380, 16390))
+
+
+def test_many_wraps_are_counted_on():
+    counts = np.arange(50_000)
+    result = report(counts)
+    assert result.gaps == 0 and result.extended_count.tolist() == counts.tolist()
+
+
+def test_a_missing_packet_is_one_gap_of_one():
+    result = report([0, 1, 2, 4, 5])
+    assert (result.gaps, result.missing) == (1, 1)
+    assert result.accounts[0].missing_ranges.tolist() == [[3, 3]]
+
+
+def test_a_gap_across_the_wrap_is_found():
+    result = report([16382, 16383, 16386, 16387])
+    assert result.accounts[0].missing_ranges.tolist() == [[16384, 16385]]
+
+
+def test_order_of_arrival_does_not_matter():
+    rng = np.random.default_rng(4)
+    counts = np.delete(np.arange(16000, 17000), [3, 500, 501, 999 - 1])
+    ticks = counts << 16
+    order = rng.permutation(counts.size)
+    shuffled = report(counts[order], ticks[order])
+    assert (
+        shuffled.accounts[0].missing_ranges.tolist()
+        == report(counts, ticks).accounts[0].missing_ranges.tolist()
+    )
+    assert shuffled.missing == 4 and shuffled.gaps == 3
+    assert shuffled.extended_count.tolist() == counts[order].tolist()
+
+
+def test_packets_of_equal_time_are_ordered_by_their_count():
+    # four estimators report in one instant, arriving in any order, across the wrap
+    result = report([16381, 16382, 0, 16383, 2, 1], ticks=[0, 0, 1, 1, 1, 1])
+    assert result.gaps == 0
+
+
+def test_a_packet_that_comes_twice_is_a_duplicate_and_other_octets_are_a_conflict():
+    assert report([0, 1, 1, 2], ticks=[0, 1, 1, 2]).verdict.tolist() == [FIRST, FIRST, DUPLICATE, FIRST]
+    conflict = report([0, 1, 1, 2], ticks=[0, 1, 1, 2], same=never_same)
+    assert conflict.verdict.tolist() == [FIRST, FIRST, CONFLICT, FIRST]
+    assert (conflict.duplicates, conflict.conflicts) == (0, 1)
+
+
+def test_a_whole_dump_that_comes_twice_is_duplicates_and_no_gap():
+    counts = np.concatenate((np.arange(500), np.arange(500)))
+    result = report(counts, ticks=counts << 16)
+    assert (result.duplicates, result.gaps, result.accounts[0].received) == (500, 0, 500)
+    assert np.all(result.verdict[:500] == FIRST)
+
+
+def test_the_same_count_a_wrap_later_is_no_duplicate():
+    result = report(np.arange(20_000))
+    assert result.duplicates == 0
+
+
+def test_a_burst_from_yesterday_in_the_middle_of_today_is_told_apart():
+    day = 86_400 << 16
+    today = np.arange(9000, 9100)
+    yesterday = np.arange(8900, 9000)
+    counts = np.concatenate((today[:50], yesterday, today[50:]))
+    ticks = np.concatenate(
+        (2 * day + (today[:50] << 16), day + (yesterday << 16), 2 * day + (today[50:] << 16))
+    )
+    result = report(counts, ticks)
+    assert (result.gaps, result.duplicates) == (0, 0)
+
+
+def test_a_burst_from_the_future_leaves_no_gap_behind():
+    # the clock jumped ahead for ten packets and came back
+    counts = np.arange(100)
+    ticks = counts << 16
+    ticks[40:50] += 86_400 << 16
+    assert report(counts, ticks).gaps == 0
+
+
+def test_interleaved_senders_are_accounted_apart():
+    apid = np.tile([1, 2], 50)
+    counts = np.repeat(np.arange(50), 2)
+    result = report(counts, apid=apid)
+    assert result.gaps == 0 and [a.received for a in result.accounts] == [50, 50]
+
+
+def test_boots_are_accounted_apart():
+    counts = np.concatenate((np.arange(100), np.arange(100)))
+    boot = np.repeat([7, 8], 100)
+    result = report(counts, boot=boot, same=never_same)
+    assert [(a.boot, a.received, a.gaps, a.conflicts) for a in result.accounts] == [
+        (7, 100, 0, 0),
+        (8, 100, 0, 0),
+    ]
+
+
+def test_a_counter_that_begins_anew_is_a_restart_and_no_gap():
+    counts = np.concatenate((np.arange(3000, 3100), np.arange(0, 50)))
+    result = report(counts)
+    assert (result.accounts[0].restarts, result.gaps, result.conflicts, result.duplicates) == (1, 0, 0, 0)
+
+
+def test_a_loss_of_more_than_half_a_wrap_is_found_by_the_expected_rate():
+    counts = np.concatenate((np.arange(100), np.arange(12_100, 12_200)))
+    ticks = counts << 16  # one packet a second
+    extended, _ = extend_counts(counts % 16384, ticks, expected_rate=1.0)
+    assert extended.tolist() == counts.tolist()
+    beyond = np.concatenate((np.arange(100), np.arange(40_000, 40_100)))
+    extended, _ = extend_counts(beyond % 16384, beyond << 16, expected_rate=1.0)
+    assert extended.tolist() == beyond.tolist()
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    st.integers(0, 16383),
+    st.lists(st.integers(1, 400), min_size=1, max_size=60),
+    st.lists(st.integers(0, 59), max_size=20),
+    st.randoms(use_true_random=False),
+)
+def test_any_losses_copies_and_orders_are_accounted_for(start, steps, copies, random):
+    sent = start + np.cumsum(np.array(steps)) - steps[0]
+    rows = list(range(sent.size)) + [c % sent.size for c in copies]
+    random.shuffle(rows)
+    counts = sent[rows]
+    result = account(
+        np.full(counts.size, 3), counts % 16384, counts * 100, lambda a, b: bool(counts[a] == counts[b])
+    )
+    assert result.accounts[0].received == sent.size
+    assert result.missing == int(sent[-1] - sent[0] + 1 - sent.size)
+    assert result.gaps == int(np.count_nonzero(np.diff(sent) > 1))
+    assert result.duplicates == len(copies) and result.conflicts == 0
+    np.testing.assert_array_equal(result.extended_count - result.extended_count.min(), counts - counts.min())
