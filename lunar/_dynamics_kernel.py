@@ -1,8 +1,8 @@
 """Compiled right-hand sides and integrators for orbits about the Moon, ICRF axes, SI units.
 
-Time inside is seconds after the start of the propagation.  What changes with time but not with the orbit comes from one
-table of Chebyshev series, ``table[segment, term, column]``: nine elements of pa_from_icrf (row by row), then Earth and Sun
-positions.  ``force`` holds the scalars, at the places named below.
+Time inside is seconds after the start of the propagation.  What changes with time but not with the orbit comes
+from one table of Chebyshev series, ``table[segment, term, column]``: nine elements of pa_from_icrf (row by row),
+then Earth and Sun positions.  ``force`` holds the scalars, at the places named below.
 """
 
 from __future__ import annotations
@@ -10,9 +10,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lunar._compile import njit
 from lunar._gravity_kernel import acceleration, acceleration_gradient
+
+FloatArray = NDArray[np.float64]
 
 COLUMNS = 16
 FORCES = 8
@@ -26,7 +29,7 @@ NO_EVENT, PERISELENE, APOSELENE = range(3)
 
 
 @njit(error_model="numpy", boundscheck=False, fastmath={"contract", "nsz"})
-def look_up(table, force, t, out):  # type: ignore[no-untyped-def]
+def look_up(table: FloatArray, force: FloatArray, t: float, out: FloatArray) -> None:
     """Write the table's 15 columns at time ``t`` to ``out``, by Clenshaw's rule."""
     place = (t - force[TABLE_START_S]) / force[TABLE_STEP_S]
     segment = min(max(int(place), 0), len(table) - 1)
@@ -43,7 +46,9 @@ def look_up(table, force, t, out):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy", boundscheck=False, fastmath={"contract", "nsz"})
-def _tide(gm, sx, sy, sz, x, y, z):  # type: ignore[no-untyped-def]
+def _tide(
+    gm: float, sx: float, sy: float, sz: float, x: float, y: float, z: float
+) -> tuple[float, float, float]:
     """Acceleration by a distant body at s, less that of the Moon's centre, without cancellation (Battin 1999, 8.62)."""
     s2 = sx * sx + sy * sy + sz * sz
     dx, dy, dz = x - sx, y - sy, z - sz
@@ -55,7 +60,9 @@ def _tide(gm, sx, sy, sz, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy", boundscheck=False)
-def _visible_share(sun_x, sun_y, sun_z, sun_radius, x, y, z, radius):  # type: ignore[no-untyped-def]
+def _visible_share(
+    sun_x: float, sun_y: float, sun_z: float, sun_radius: float, x: float, y: float, z: float, radius: float
+) -> float:
     """Share of the Sun's disc left uncovered by a sphere: vectors from the spacecraft to the Sun and to its centre."""
     sun = math.sqrt(sun_x * sun_x + sun_y * sun_y + sun_z * sun_z)
     body = math.sqrt(x * x + y * y + z * z)
@@ -74,12 +81,26 @@ def _visible_share(sun_x, sun_y, sun_z, sun_radius, x, y, z, radius):  # type: i
     # Two discs that overlap (Montenbruck and Gill, section 3.4.2).
     u = (c * c + a * a - b * b) / (2.0 * c)
     v = math.sqrt(max(0.0, a * a - u * u))
-    area = a * a * math.acos(min(1.0, max(-1.0, u / a))) + b * b * math.acos(min(1.0, max(-1.0, (c - u) / b))) - c * v
+    area = (
+        a * a * math.acos(min(1.0, max(-1.0, u / a)))
+        + b * b * math.acos(min(1.0, max(-1.0, (c - u) / b)))
+        - c * v
+    )
     return 1.0 - area / (math.pi * a * a)
 
 
 @njit(error_model="numpy", boundscheck=False)
-def force_acceleration(t, x, y, z, gravity, force, table, scratch, frame):  # type: ignore[no-untyped-def]
+def force_acceleration(
+    t: float,
+    x: float,
+    y: float,
+    z: float,
+    gravity: FloatArray,
+    force: FloatArray,
+    table: FloatArray,
+    scratch: FloatArray,
+    frame: FloatArray,
+) -> tuple[float, float, float]:
     """Return the acceleration in ICRF; ``frame`` receives the table's columns at ``t``."""
     look_up(table, force, t, frame)
     px = frame[0] * x + frame[1] * y + frame[2] * z
@@ -102,8 +123,9 @@ def force_acceleration(t, x, y, z, gravity, force, table, scratch, frame):  # ty
     if force[PRESSURE] > 0.0:
         sx, sy, sz = frame[12] - x, frame[13] - y, frame[14] - z
         light = _visible_share(sx, sy, sz, force[SUN_RADIUS], -x, -y, -z, force[MOON_RADIUS])
-        light *= _visible_share(sx, sy, sz, force[SUN_RADIUS], frame[9] - x, frame[10] - y, frame[11] - z,
-                                force[EARTH_RADIUS])
+        light *= _visible_share(
+            sx, sy, sz, force[SUN_RADIUS], frame[9] - x, frame[10] - y, frame[11] - z, force[EARTH_RADIUS]
+        )
         d2 = sx * sx + sy * sy + sz * sz
         push = -light * force[PRESSURE] / (d2 * math.sqrt(d2))
         ax += push * sx
@@ -113,7 +135,9 @@ def force_acceleration(t, x, y, z, gravity, force, table, scratch, frame):  # ty
 
 
 @njit(error_model="numpy", boundscheck=False)
-def interpolate(times, states, rates, k, s, out):  # type: ignore[no-untyped-def]
+def interpolate(
+    times: FloatArray, states: FloatArray, rates: FloatArray, k: int, s: float, out: FloatArray
+) -> None:
     """Write the state at the fraction ``s`` of the step from knot ``k``: the quintic through both ends (r, v, a)."""
     h = times[k + 1] - times[k]
     for d in range(3):
@@ -130,7 +154,9 @@ def interpolate(times, states, rates, k, s, out):  # type: ignore[no-untyped-def
 
 
 @njit(error_model="numpy", boundscheck=False)
-def evaluate(times, states, rates, wanted, out):  # type: ignore[no-untyped-def]
+def evaluate(
+    times: FloatArray, states: FloatArray, rates: FloatArray, wanted: FloatArray, out: FloatArray
+) -> None:
     """Write the states at ``wanted`` times; where two knots share a time (a burn) the later one rules from there on."""
     for i in range(len(wanted)):
         low = 0
@@ -143,17 +169,29 @@ def evaluate(times, states, rates, wanted, out):  # type: ignore[no-untyped-def]
                 high = middle
         while low > 0 and times[low + 1] == times[low]:
             low -= 1
-        interpolate(times, states, rates, low, (wanted[i] - times[low]) / (times[low + 1] - times[low]), out[i])
+        interpolate(
+            times, states, rates, low, (wanted[i] - times[low]) / (times[low + 1] - times[low]), out[i]
+        )
 
 
 @njit(error_model="numpy", boundscheck=False)
-def _radial(state):  # type: ignore[no-untyped-def]
-    return state[0] * state[3] + state[1] * state[4] + state[2] * state[5]
+def _radial(state: FloatArray) -> float:
+    return float(state[0] * state[3] + state[1] * state[4] + state[2] * state[5])
 
 
 @njit(error_model="numpy", boundscheck=False)
-def _events(times, states, rates, k, sign, ground_m, event, event_radius_m, out):  # type: ignore[no-untyped-def]
-    """Return what happened in the step from knot ``k`` and at which fraction of it; for EVENT the state is in ``out``."""
+def _events(
+    times: FloatArray,
+    states: FloatArray,
+    rates: FloatArray,
+    k: int,
+    sign: float,
+    ground_m: float,
+    event: int,
+    event_radius_m: float,
+    out: FloatArray,
+) -> tuple[int, float]:
+    """Return what happened in the step from knot ``k``, and at which fraction; for EVENT ``out`` has the state."""
     end = states[k + 1]
     if end[0] * end[0] + end[1] * end[1] + end[2] * end[2] < ground_m * ground_m:
         return GROUND, 1.0
@@ -192,20 +230,49 @@ def _events(times, states, rates, k, sign, ground_m, event, event_radius_m, out)
 
 
 @njit(error_model="numpy", boundscheck=False, nogil=True)
-def integrate(start_s, y0, stop_s, gravity, force, table, scratch_size, a, b, c, error, second_error, error_order, rtol,
-              max_step_s, first_step_s, ground_m, event, event_radius_m, times, states, rates):  # type: ignore[no-untyped-def]
+def integrate(
+    start_s: float,
+    y0: FloatArray,
+    stop_s: float,
+    gravity: FloatArray,
+    force: FloatArray,
+    table: FloatArray,
+    scratch_size: int,
+    a: FloatArray,
+    b: FloatArray,
+    c: FloatArray,
+    error: FloatArray,
+    second_error: FloatArray,
+    error_order: int,
+    rtol: float,
+    max_step_s: float,
+    first_step_s: float,
+    ground_m: float,
+    event: int,
+    event_radius_m: float,
+    times: FloatArray,
+    states: FloatArray,
+    rates: FloatArray,
+) -> tuple[int, int, int, float]:
     """Integrate adaptively from ``start_s`` to ``stop_s`` (either may be the later), keeping every accepted step.
 
-    Returns (number of knots, why it ended, evaluations, next step).  Knots go to ``times``, ``states`` (n, 6) and ``rates``
-    (n, 3), the accelerations, until these are full (STEP_LIMIT).  EVENT: the last knot is a periselene below
-    ``event_radius_m``, or an aposelene above it, whichever ``event`` asks for.  GROUND: the last step met radius
-    ``ground_m``, at its end or at a periselene in it.
+    Returns (number of knots, why it ended, evaluations, next step).  Knots go to ``times``, ``states`` (n, 6) and
+    ``rates`` (n, 3), the accelerations, until these are full (STEP_LIMIT).  EVENT: the last knot is a periselene
+    below ``event_radius_m``, or an aposelene above it, whichever ``event`` asks for.  GROUND: the last step met
+    radius ``ground_m``, at its end or at a periselene in it.
 
-    One loop over stages, with the forces evaluated in one place (each further one would be compiled anew).  Stage 0 is at a
-    new knot; only there is the step that led to it searched for events, as its quintic needs the acceleration at both ends.
+    One loop over stages, with the forces evaluated in one place (each further one would be compiled anew).  Stage 0
+    is at a new knot; only there is the step that led to it searched for events, as its quintic needs the
+    acceleration at both ends.
     """
     stages = len(c)
-    scratch, frame, work, y, new = np.empty(scratch_size), np.empty(COLUMNS), np.empty(6), np.empty(6), np.empty(6)
+    scratch, frame, work, y, new = (
+        np.empty(scratch_size),
+        np.empty(COLUMNS),
+        np.empty(6),
+        np.empty(6),
+        np.empty(6),
+    )
     k = np.empty((stages, 6))
     for d in range(6):
         y[d] = y0[d]
@@ -225,8 +292,9 @@ def integrate(start_s, y0, stop_s, gravity, force, table, scratch_size, a, b, c,
             for j in range(stage):
                 total += a[stage, j] * k[j, d]
             work[d] = y[d] + signed * total
-        ax, ay, az = force_acceleration(t + c[stage] * signed, work[0], work[1], work[2], gravity, force, table, scratch,
-                                        frame)
+        ax, ay, az = force_acceleration(
+            t + c[stage] * signed, work[0], work[1], work[2], gravity, force, table, scratch, frame
+        )
         evaluations += 1
         for d in range(3):
             k[stage, d] = work[d + 3]
@@ -238,7 +306,9 @@ def integrate(start_s, y0, stop_s, gravity, force, table, scratch_size, a, b, c,
             for d in range(3):
                 rates[count, d] = k[0, d + 3]
             if count > 0 and status == REACHED:
-                status, fraction = _events(times, states, rates, count - 1, sign, ground_m, event, event_radius_m, work)
+                status, fraction = _events(
+                    times, states, rates, count - 1, sign, ground_m, event, event_radius_m, work
+                )
                 if status == EVENT:  # the knot moves to the event
                     t = times[count - 1] + fraction * (t - times[count - 1])
                     for d in range(6):
@@ -297,7 +367,9 @@ def integrate(start_s, y0, stop_s, gravity, force, table, scratch_size, a, b, c,
 
 
 @njit(error_model="numpy", boundscheck=False)
-def _tide_gradient(gm, sx, sy, sz, x, y, z, g):  # type: ignore[no-untyped-def]
+def _tide_gradient(
+    gm: float, sx: float, sy: float, sz: float, x: float, y: float, z: float, g: FloatArray
+) -> None:
     dx, dy, dz = x - sx, y - sy, z - sz
     d2 = dx * dx + dy * dy + dz * dz
     f = gm / (d2 * math.sqrt(d2))
@@ -311,7 +383,9 @@ def _tide_gradient(gm, sx, sy, sz, x, y, z, g):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy", boundscheck=False)
-def _force_gradient(low, force, frame, x, y, z, g):  # type: ignore[no-untyped-def]
+def _force_gradient(
+    low: FloatArray, force: FloatArray, frame: FloatArray, x: float, y: float, z: float, g: FloatArray
+) -> None:
     """Write the derivative of the acceleration by position, ICRF, of the field ``low`` with Earth and Sun."""
     xx, xy, xz, yy, yz, zz = acceleration_gradient(
         low,
@@ -332,7 +406,19 @@ def _force_gradient(low, force, frame, x, y, z, g):  # type: ignore[no-untyped-d
 
 
 @njit(error_model="numpy", boundscheck=False, nogil=True)
-def transition(y0, duration_s, steps, gravity, low, force, table, scratch_size, a, b, c):  # type: ignore[no-untyped-def]
+def transition(
+    y0: FloatArray,
+    duration_s: float,
+    steps: int,
+    gravity: FloatArray,
+    low: FloatArray,
+    force: FloatArray,
+    table: FloatArray,
+    scratch_size: int,
+    a: FloatArray,
+    b: FloatArray,
+    c: FloatArray,
+) -> FloatArray:
     """Return state and transition matrix (42 numbers, the matrix row by row) after ``steps`` equal steps."""
     scratch, frame, work, y = np.empty(scratch_size), np.empty(COLUMNS), np.empty(42), np.zeros(42)
     g = np.empty((3, 3))
@@ -351,7 +437,9 @@ def transition(y0, duration_s, steps, gravity, low, force, table, scratch_size, 
                 for d in range(42):
                     work[d] += factor * k[j, d]
             t = (number + c[stage]) * h
-            ax, ay, az = force_acceleration(t, work[0], work[1], work[2], gravity, force, table, scratch, frame)
+            ax, ay, az = force_acceleration(
+                t, work[0], work[1], work[2], gravity, force, table, scratch, frame
+            )
             _force_gradient(low, force, frame, work[0], work[1], work[2], g)
             for d in range(3):
                 k[stage, d] = work[d + 3]

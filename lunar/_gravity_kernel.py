@@ -1,8 +1,8 @@
 """The compiled spherical-harmonic sum: acceleration of a field to degree N in the body-fixed frame of its coefficients.
 
-Each Cartesian component of the gradient of a harmonic function is harmonic itself, so the acceleration is three sums over
-the same irregular solid harmonics one degree up.  With I(n,m) = (n-m)! P(n,m)(sin lat) exp(i m lon) / r^(n+1), P without
-the Condon-Shortley phase,
+Each Cartesian component of the gradient of a harmonic function is harmonic itself, so the acceleration is three sums
+over the same irregular solid harmonics one degree up.  With I(n,m) = (n-m)! P(n,m)(sin lat) exp(i m lon) / r^(n+1),
+P without the Condon-Shortley phase,
 
     d/dz I(n,m) = -I(n+1,m)    (d/dx + i d/dy) I(n,m) = -I(n+1,m+1)    (d/dx - i d/dy) I(n,m) = +I(n+1,m-1)
 
@@ -11,11 +11,11 @@ cosine of latitude: nothing happens at the poles.  Per degree and order that is 
 
     w(n) = (2n-1) zeta w(n-1) - ((n-1)^2 - m^2) rho^2 w(n-2)
 
-and six for the sums.  ``LANES`` adjacent orders go through it side by side as one vector of the processor, with degree
-running inside; each lane is scaled so that its sectorial term w(m) is 1, and lengths are scaled so that no factorial leaves
-the range of a double (used to degree 900).  The vector code is written as LLVM instructions, because no loop that numba
-compiles is vectorised across an outer index.  Coefficients lie block by block in the order of use; the sums at order m need
-the coefficients of orders m-1, m and m+1, which are overlapping loads from the same row.
+and six for the sums.  ``LANES`` adjacent orders go through it side by side as one vector of the processor, with
+degree running inside; each lane is scaled so that its sectorial term w(m) is 1, and lengths are scaled so that no
+factorial leaves the range of a double.  The vector code is written as LLVM instructions, because no loop that numba
+compiles is vectorised across an outer index.  Coefficients lie block by block in the order of use; the sums at order m
+need the coefficients of orders m-1, m and m+1, which are overlapping loads from the same row.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def pack(c_bar: FloatArray, s_bar: FloatArray, gm_m3_s2: float, radius_m: float)
 
 
 def _scales(degree: int, alpha: float) -> FloatArray:
-    """Return normalisation times scale, [n, m]: k(n,m) (2m-1)!! / ((n-m)! alpha^(n-m)), the factors of the docstring."""
+    """Return normalisation times scale, [n, m]: k(n,m) (2m-1)!! / ((n-m)! alpha^(n-m))."""
     scale = np.zeros((degree + 1, degree + 1), dtype=np.longdouble)
     sectorial = np.longdouble(1.0)
     for m in range(degree + 1):
@@ -91,12 +91,21 @@ def _scales(degree: int, alpha: float) -> FloatArray:
     return scale.astype(np.float64)
 
 
-def _emit(builder: ir.IRBuilder, coefficients: ir.Value, scratch: ir.Value, blocks: ir.Value, degrees: ir.Value,
-          step_re: ir.Value, step_im: ir.Value, zeta: ir.Value, rho2: ir.Value) -> None:
+def _emit(
+    builder: ir.IRBuilder,
+    coefficients: ir.Value,
+    scratch: ir.Value,
+    blocks: ir.Value,
+    degrees: ir.Value,
+    step_re: ir.Value,
+    step_im: ir.Value,
+    zeta: ir.Value,
+    rho2: ir.Value,
+) -> None:
     """Write the double loop over blocks of orders and over degrees.
 
-    The products of a degree are added two degrees after its solid harmonics are made: in program order the recursion, which
-    is what everything waits for, then comes before work that can wait.
+    The products of a degree are added two degrees after its solid harmonics are made: in program order the
+    recursion, which is what everything waits for, then comes before work that can wait.
     """
     real, integer = ir.DoubleType(), ir.IntType(64)
     vector = ir.VectorType(real, LANES)
@@ -121,7 +130,9 @@ def _emit(builder: ir.IRBuilder, coefficients: ir.Value, scratch: ir.Value, bloc
         builder.store(value, builder.bitcast(place(pointer, offset), vector.as_pointer()), align=8)
 
     def spread(value: ir.Value) -> ir.Value:
-        single = builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
+        single = builder.insert_element(
+            ir.Constant(vector, ir.Undefined), value, ir.Constant(ir.IntType(32), 0)
+        )
         mask = ir.Constant(ir.VectorType(ir.IntType(32), LANES), None)
         return builder.shuffle_vector(single, ir.Constant(vector, ir.Undefined), mask)
 
@@ -141,7 +152,9 @@ def _emit(builder: ir.IRBuilder, coefficients: ir.Value, scratch: ir.Value, bloc
     def add(sums: list[ir.Value], pointer: ir.Value, offset: int, harmonic: ir.Value) -> list[ir.Value]:
         """The six sums with one degree added: C at m-1, m, m+1, then S."""
         places = [0, 1, 2, LANES + 2, LANES + 3, LANES + 4]
-        return [fma(load(pointer, offset + k), harmonic, total) for k, total in zip(places, sums, strict=True)]
+        return [
+            fma(load(pointer, offset + k), harmonic, total) for k, total in zip(places, sums, strict=True)
+        ]
 
     def join(phis: list[ir.PhiInstr], values: list[ir.Value], origin: ir.Block) -> None:
         for phi, value in zip(phis, values, strict=True):
@@ -149,7 +162,8 @@ def _emit(builder: ir.IRBuilder, coefficients: ir.Value, scratch: ir.Value, bloc
 
     entry = builder.block
     block_loop, degree_test, degree_loop, block_end, done = (
-        builder.append_basic_block(f"gravity.{name}") for name in ("block", "test", "degree", "block_end", "done")
+        builder.append_basic_block(f"gravity.{name}")
+        for name in ("block", "test", "degree", "block_end", "done")
     )
     power_re_0, power_im_0 = load(scratch, _POWER_RE), load(scratch, _POWER_IM)
     step_re_v, step_im_v, rho2_v = spread(step_re), spread(step_im), spread(rho2)
@@ -194,7 +208,11 @@ def _emit(builder: ir.IRBuilder, coefficients: ir.Value, scratch: ir.Value, bloc
     new = fma(inner[0], last, builder.fmul(builder.fsub(m2rho2, inner[1]), before))
     hold(new)
     next_sums = add(inner[5:], at, 0, before)
-    join([n, at, *inner], [builder.add(n, index(1)), place(at, _ROW), *climb(inner[:3]), new, last, *next_sums], degree_loop)
+    join(
+        [n, at, *inner],
+        [builder.add(n, index(1)), place(at, _ROW), *climb(inner[:3]), new, last, *next_sums],
+        degree_loop,
+    )
     builder.branch(degree_test)
 
     builder.position_at_end(block_end)
@@ -212,7 +230,11 @@ def _emit(builder: ir.IRBuilder, coefficients: ir.Value, scratch: ir.Value, bloc
     next_re = builder.fsub(builder.fmul(power_re, step_re_v), builder.fmul(power_im, step_im_v))
     next_im = fma(power_re, step_im_v, builder.fmul(power_im, step_re_v))
     following = builder.add(first, index(LANES))
-    join([first, head, *outer], [following, place(at, 2 * _ROW), next_re, next_im, new_x, new_y, new_z], block_end)
+    join(
+        [first, head, *outer],
+        [following, place(at, 2 * _ROW), next_re, next_im, new_x, new_y, new_z],
+        block_end,
+    )
     builder.cbranch(builder.icmp_signed("<", following, builder.mul(blocks, index(LANES))), block_loop, done)
 
     builder.position_at_end(done)
@@ -220,10 +242,20 @@ def _emit(builder: ir.IRBuilder, coefficients: ir.Value, scratch: ir.Value, bloc
         store(value, scratch, offset)
 
 
-@intrinsic
-def _sums(typing_context: Any, coefficients: Any, start: Any, scratch: Any, blocks: Any, degrees: Any, step_re: Any,
-          step_im: Any, zeta: Any, rho2: Any) -> Any:
-    """Typing of the vector code: (packed coefficients, first block, scratch, blocks, degrees, step re, im, zeta, rho^2)."""
+@intrinsic  # type: ignore[untyped-decorator]
+def _sums(
+    typing_context: Any,
+    coefficients: Any,
+    start: Any,
+    scratch: Any,
+    blocks: Any,
+    degrees: Any,
+    step_re: Any,
+    step_im: Any,
+    zeta: Any,
+    rho2: Any,
+) -> Any:
+    """Typing of the vector code; ``start`` is where the first block lies in ``coefficients``."""
     signature = types.void(coefficients, types.intp, scratch, types.intp, types.intp, *[types.float64] * 4)
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
@@ -239,7 +271,9 @@ def _sums(typing_context: Any, coefficients: Any, start: Any, scratch: Any, bloc
 
 
 @njit(error_model="numpy", boundscheck=False)
-def acceleration(packed, scratch, x, y, z):  # type: ignore[no-untyped-def]
+def acceleration(
+    packed: FloatArray, scratch: FloatArray, x: float, y: float, z: float
+) -> tuple[float, float, float]:
     """Return the acceleration (m/s^2) at a body-fixed position (m), central term included, as three floats.
 
     ``packed`` comes from `pack`; ``scratch`` is a float64 array of at least `scratch_size` that the caller keeps.
@@ -276,17 +310,19 @@ def acceleration(packed, scratch, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy", boundscheck=False)
-def accelerations(packed, positions):  # type: ignore[no-untyped-def]
+def accelerations(packed: FloatArray, positions: FloatArray) -> FloatArray:
     """Return the accelerations at positions of shape (n, 3)."""
     scratch = np.empty(_SCRATCH)
     out = np.empty_like(positions)
     for i in range(len(positions)):
-        out[i, 0], out[i, 1], out[i, 2] = acceleration(packed, scratch, positions[i, 0], positions[i, 1], positions[i, 2])
+        out[i, 0], out[i, 1], out[i, 2] = acceleration(
+            packed, scratch, positions[i, 0], positions[i, 1], positions[i, 2]
+        )
     return out
 
 
 def pack_gradient(c_bar: FloatArray, s_bar: FloatArray, gm_m3_s2: float, radius_m: float) -> FloatArray:
-    """Return what `acceleration_gradient` reads: degree, GM / (R^3 alpha^2), R, alpha, then C and S for every n, m <= n."""
+    """Return what `acceleration_gradient` reads: degree, GM / (R alpha)^3, R, alpha, then C and S of all n, m <= n."""
     degree = len(c_bar) - 1
     alpha = 2.0 / max(degree, 2)
     scale = _scales(degree, alpha)
@@ -300,7 +336,9 @@ def pack_gradient(c_bar: FloatArray, s_bar: FloatArray, gm_m3_s2: float, radius_
 
 
 @njit(error_model="numpy", boundscheck=False)
-def acceleration_gradient(packed, x, y, z):  # type: ignore[no-untyped-def]
+def acceleration_gradient(
+    packed: FloatArray, x: float, y: float, z: float
+) -> tuple[float, float, float, float, float, float]:
     """Return (xx, xy, xz, yy, yz, zz) of the gradient of the acceleration, 1/s^2; meant for low degrees.
 
     From the same derivatives of solid harmonics as the acceleration, applied twice, with I(n,-m) = (-1)^m conj I(n,m).
@@ -323,7 +361,9 @@ def acceleration_gradient(packed, x, y, z):  # type: ignore[no-untyped-def]
         harmonic[m, m + 2] = sectorial
         for n in range(m + 1, size):
             older = harmonic[n - 2, m + 2] if n >= 2 else 0.0j
-            harmonic[n, m + 2] = (2 * n - 1) * zeta * harmonic[n - 1, m + 2] - ((n - 1) ** 2 - m * m) * rho2 * older
+            harmonic[n, m + 2] = (2 * n - 1) * zeta * harmonic[n - 1, m + 2] - (
+                (n - 1) ** 2 - m * m
+            ) * rho2 * older
     for n in range(size):
         harmonic[n, 1] = -harmonic[n, 3].conjugate()
         harmonic[n, 0] = harmonic[n, 4].conjugate() if size > 2 else 0.0j
@@ -351,11 +391,13 @@ def acceleration_gradient(packed, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy", boundscheck=False)
-def gradients(packed, positions):  # type: ignore[no-untyped-def]
+def gradients(packed: FloatArray, positions: FloatArray) -> FloatArray:
     """Return the gradients at positions of shape (n, 3), shape (n, 3, 3)."""
     out = np.empty((len(positions), 3, 3))
     for i in range(len(positions)):
-        xx, xy, xz, yy, yz, zz = acceleration_gradient(packed, positions[i, 0], positions[i, 1], positions[i, 2])
+        xx, xy, xz, yy, yz, zz = acceleration_gradient(
+            packed, positions[i, 0], positions[i, 1], positions[i, 2]
+        )
         out[i, 0, 0] = xx
         out[i, 1, 1] = yy
         out[i, 2, 2] = zz

@@ -1,7 +1,7 @@
 """Keplerian elements and states, in whatever inertial frame the caller uses for both.
 
-Scenarios give elements in the MCI frame (IAU Moon equator and node of date); `icrf_state_from_elements` reads them there.
-Elements are osculating: those of the two-body orbit with the same position and velocity.
+Scenarios give elements in the MCI frame (IAU Moon equator and node of date); `icrf_state_from_elements` reads them
+there.  Elements are osculating: those of the two-body orbit with the same position and velocity.
 
 References
 ----------
@@ -52,17 +52,19 @@ def state_from_elements(elements: Elements, gm_m3_s2: float) -> tuple[FloatArray
     a, e = elements.semi_major_axis_m, elements.eccentricity
     if not (math.isfinite(a) and a > 0.0 and 0.0 <= e < 1.0 and 0.0 <= elements.inclination_rad <= math.pi):
         raise OrbitError(
-            "elements: expected a semi-major axis over 0, an eccentricity from 0 to below 1 and an inclination from 0 to "
-            f"180 deg, found {a / 1e3:g} km, {e:g}, {math.degrees(elements.inclination_rad):g} deg"
+            "elements: expected a semi-major axis over 0, an eccentricity from 0 to below 1 and an inclination from 0 "
+            f"to 180 deg, found {a / 1e3:g} km, {e:g}, {math.degrees(elements.inclination_rad):g} deg"
         )
     p = a * (1.0 - e * e)
     u = elements.argument_of_perilune_rad + elements.true_anomaly_rad
     node = np.array([math.cos(elements.raan_rad), math.sin(elements.raan_rad), 0.0])
-    across = np.array([
-        -math.sin(elements.raan_rad) * math.cos(elements.inclination_rad),
-        math.cos(elements.raan_rad) * math.cos(elements.inclination_rad),
-        math.sin(elements.inclination_rad),
-    ])
+    across = np.array(
+        [
+            -math.sin(elements.raan_rad) * math.cos(elements.inclination_rad),
+            math.cos(elements.raan_rad) * math.cos(elements.inclination_rad),
+            math.sin(elements.inclination_rad),
+        ]
+    )
     radius = p / (1.0 + e * math.cos(elements.true_anomaly_rad))
     speed = math.sqrt(gm_m3_s2 / p)
     omega = elements.argument_of_perilune_rad
@@ -89,7 +91,9 @@ def elements_from_state(position_m: ArrayLike, velocity_m_s: ArrayLike, gm_m3_s2
     energy = 0.5 * float(v @ v) - gm_m3_s2 / radius
     momentum = float(np.linalg.norm(h))
     if not (energy < 0.0 and momentum > 0.0):
-        raise OrbitError(f"state: expected a bound orbit, found an energy of {energy:g} m2/s2, momentum {momentum:g} m2/s")
+        raise OrbitError(
+            f"state: expected a bound orbit, found an energy of {energy:g} m2/s2, momentum {momentum:g} m2/s"
+        )
     a = -0.5 * gm_m3_s2 / energy
     eccentricity_vector = np.cross(v, h) / gm_m3_s2 - r / radius
     e = float(np.linalg.norm(eccentricity_vector))
@@ -98,13 +102,19 @@ def elements_from_state(position_m: ArrayLike, velocity_m_s: ArrayLike, gm_m3_s2
     node = np.array([math.cos(raan), math.sin(raan), 0.0])
     across = np.cross(h / momentum, node)
     u = math.atan2(float(r @ across), float(r @ node))
-    omega = math.atan2(float(eccentricity_vector @ across), float(eccentricity_vector @ node)) if e > 1e-12 else 0.0
+    omega = (
+        math.atan2(float(eccentricity_vector @ across), float(eccentricity_vector @ node))
+        if e > 1e-12
+        else 0.0
+    )
     turn = 2.0 * math.pi
     return Elements(a, e, inclination, raan % turn, omega % turn, (u - omega) % turn)
 
 
-def icrf_state_from_elements(elements: Elements, tdb_s: float, gm_m3_s2: float) -> tuple[FloatArray, FloatArray]:
-    """Return position and velocity along ICRF axes from elements in MCI (Moon's equator and node of date) at ``tdb_s``."""
+def icrf_state_from_elements(
+    elements: Elements, tdb_s: float, gm_m3_s2: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return position and velocity along ICRF axes from elements in MCI at ``tdb_s``."""
     from lunar.frames import mci_from_icrf
 
     icrf_from_mci = np.asarray(mci_from_icrf(tdb_s)).T
@@ -112,10 +122,13 @@ def icrf_state_from_elements(elements: Elements, tdb_s: float, gm_m3_s2: float) 
     return icrf_from_mci @ position, icrf_from_mci @ velocity
 
 
-def elements_from_icrf_state(position_icrf_m: ArrayLike, velocity_icrf_m_s: ArrayLike, tdb_s: float,
-                             gm_m3_s2: float) -> Elements:
+def elements_from_icrf_state(
+    position_icrf_m: ArrayLike, velocity_icrf_m_s: ArrayLike, tdb_s: float, gm_m3_s2: float
+) -> Elements:
     """Return osculating elements in MCI (Moon's equator and node of date) at ``tdb_s`` of a state along ICRF axes."""
     from lunar.frames import mci_from_icrf
 
     rotation = np.asarray(mci_from_icrf(tdb_s))
-    return elements_from_state(rotation @ np.asarray(position_icrf_m), rotation @ np.asarray(velocity_icrf_m_s), gm_m3_s2)
+    return elements_from_state(
+        rotation @ np.asarray(position_icrf_m), rotation @ np.asarray(velocity_icrf_m_s), gm_m3_s2
+    )

@@ -50,11 +50,15 @@ class GravityField:
     def truncated(self, degree: int) -> GravityField:
         """Return the field without its terms above ``degree``."""
         if not 0 <= degree <= self.degree:
-            raise OrbitError(f"gravity field {self.name}: expected a degree from 0 to {self.degree}, found {degree}")
+            raise OrbitError(
+                f"gravity field {self.name}: expected a degree from 0 to {self.degree}, found {degree}"
+            )
         if degree == self.degree:
             return self
         keep = slice(0, degree + 1)
-        return GravityField(self.name, self.gm_m3_s2, self.radius_m, self.c_bar[keep, keep], self.s_bar[keep, keep])
+        return GravityField(
+            self.name, self.gm_m3_s2, self.radius_m, self.c_bar[keep, keep], self.s_bar[keep, keep]
+        )
 
 
 def acceleration(gravity: GravityField, position_pa_m: ArrayLike, degree: int | None = None) -> FloatArray:
@@ -67,7 +71,7 @@ def acceleration(gravity: GravityField, position_pa_m: ArrayLike, degree: int | 
 
 
 def gradient(gravity: GravityField, position_pa_m: ArrayLike, degree: int | None = None) -> FloatArray:
-    """Return the derivative of the acceleration by position in 1/s^2, shape ``(..., 3, 3)``: symmetric, without trace."""
+    """Return the derivative of the acceleration by position, 1/s^2, shape ``(..., 3, 3)``: symmetric, no trace."""
     from lunar import _gravity_kernel as kernel
 
     positions = np.asarray(position_pa_m, dtype=np.float64)
@@ -75,7 +79,9 @@ def gradient(gravity: GravityField, position_pa_m: ArrayLike, degree: int | None
     return np.asarray(kernel.gradients(packed_gradient(gravity, degree), flat)).reshape(*positions.shape, 3)
 
 
-_PACKED: weakref.WeakKeyDictionary[GravityField, dict[tuple[str, int], FloatArray]] = weakref.WeakKeyDictionary()
+_PACKED: weakref.WeakKeyDictionary[GravityField, dict[tuple[str, int], FloatArray]] = (
+    weakref.WeakKeyDictionary()
+)
 
 
 def packed(gravity: GravityField, degree: int | None = None) -> FloatArray:
@@ -113,9 +119,13 @@ def load_gravity(path: Path | str, max_degree: int | None = None) -> GravityFiel
     elif lines and lines[0].count(",") >= 5:
         name, gm, radius, degree, records = _parse_shadr(file, lines)
     else:
-        raise DataFileError(file, "", "an ICGEM, GMAT .cof or PDS SHADR gravity field", "none of their headers")
+        raise DataFileError(
+            file, "", "an ICGEM, GMAT .cof or PDS SHADR gravity field", "none of their headers"
+        )
     if not (1e11 < gm < 1e15 and 1e6 < radius < 1e8):
-        raise DataFileError(file, "header", "GM in m3/s2 and a radius in m of a moon or planet", f"{gm:g} and {radius:g}")
+        raise DataFileError(
+            file, "header", "GM in m3/s2 and a radius in m of a moon or planet", f"{gm:g} and {radius:g}"
+        )
     return _assembled(file, name, gm, radius, degree, records, max_degree)
 
 
@@ -142,7 +152,6 @@ def _kept(gravity: GravityField, purpose: str, degree: int, pack: object) -> Flo
     if key not in kept:
         cut = gravity.truncated(degree)
         kept[key] = pack(cut.c_bar, cut.s_bar, cut.gm_m3_s2, cut.radius_m)  # type: ignore[operator]
-        kept[key].flags.writeable = False
     return kept[key]
 
 
@@ -164,7 +173,9 @@ def _parse_icgem(file: Path, lines: list[str]) -> Parsed:
     normalisation = header.get("norm", "fully_normalized")
     if normalisation != "fully_normalized":
         raise DataFileError(file, "header, norm", "fully_normalized", normalisation)
-    gm = _real(file, "header, gravity_constant", header.get("gravity_constant", header.get("earth_gravity_constant")))
+    gm = _real(
+        file, "header, gravity_constant", header.get("gravity_constant", header.get("earth_gravity_constant"))
+    )
     radius = _real(file, "header, radius", header.get("radius"))
     degree = int(_real(file, "header, max_degree", header.get("max_degree")))
 
@@ -174,7 +185,9 @@ def _parse_icgem(file: Path, lines: list[str]) -> Parsed:
             if not words or words[0] == "key":
                 continue
             if words[0] not in ("gfc", "gfct"):
-                raise DataFileError(file, f"line {number}", "a line that begins with gfc", repr(line.strip()[:40]))
+                raise DataFileError(
+                    file, f"line {number}", "a line that begins with gfc", repr(line.strip()[:40])
+                )
             yield _record(file, number, words[1:5])
 
     return header.get("modelname", file.stem), gm, radius, degree, records()
@@ -185,7 +198,9 @@ def _parse_cof(file: Path, lines: list[str]) -> Parsed:
     head = lines[at]
     words = head[15:].split()
     if not head[8:14].strip().replace(" ", "").isdigit() or len(words) < 3:
-        raise DataFileError(file, f"line {at + 1}", "POTFIELD with degree, order, GM and radius", repr(head[:60]))
+        raise DataFileError(
+            file, f"line {at + 1}", "POTFIELD with degree, order, GM and radius", repr(head[:60])
+        )
     degree = int(head[8:11])
     gm, radius = (_real(file, f"line {at + 1}", word) for word in words[1:3])
     if len(words) > 3 and _real(file, f"line {at + 1}", words[3]) != 1.0:
@@ -232,8 +247,12 @@ def _parse_shadr(file: Path, lines: list[str]) -> Parsed:
 def _record(file: Path, number: int, words: list[str]) -> Record:
     try:
         n, m, c, s = words
-        return number, int(n), int(m), float(c.replace("D", "E").replace("d", "e")), float(
-            s.replace("D", "E").replace("d", "e")
+        return (
+            number,
+            int(n),
+            int(m),
+            float(c.replace("D", "E").replace("d", "e")),
+            float(s.replace("D", "E").replace("d", "e")),
         )
     except ValueError:
         found = repr(" ".join(words))
@@ -247,19 +266,30 @@ def _real(file: Path, where: str, text: str | None) -> float:
         raise DataFileError(file, where, "a number", repr(text or "")) from None
 
 
-def _assembled(file: Path, name: str, gm: float, radius: float, degree: int, records: Iterator[Record],
-               max_degree: int | None) -> GravityField:
+def _assembled(
+    file: Path,
+    name: str,
+    gm: float,
+    radius: float,
+    degree: int,
+    records: Iterator[Record],
+    max_degree: int | None,
+) -> GravityField:
     wanted = degree if max_degree is None else min(degree, max_degree)
     c_bar = np.zeros((wanted + 1, wanted + 1))
     s_bar = np.zeros_like(c_bar)
     seen = np.zeros_like(c_bar, dtype=bool)
     for number, n, m, c, s in records:
         if not (0 <= m <= n <= degree):
-            raise DataFileError(file, f"line {number}", f"order <= degree <= {degree}", f"degree {n}, order {m}")
+            raise DataFileError(
+                file, f"line {number}", f"order <= degree <= {degree}", f"degree {n}, order {m}"
+            )
         if n > wanted:
             continue
         if seen[n, m]:
-            raise DataFileError(file, f"line {number}", "every coefficient once", f"degree {n}, order {m} again")
+            raise DataFileError(
+                file, f"line {number}", "every coefficient once", f"degree {n}, order {m} again"
+            )
         if not (np.isfinite(c) and np.isfinite(s)):
             raise DataFileError(file, f"line {number}", "finite coefficients", f"{c:g} {s:g}")
         c_bar[n, m], s_bar[n, m], seen[n, m] = c, s, True
@@ -267,8 +297,12 @@ def _assembled(file: Path, name: str, gm: float, radius: float, degree: int, rec
     missing = missing[missing[:, 0] >= 2]
     if len(missing):
         n, m = missing[0]
-        raise DataFileError(file, f"degree {n}, order {m}", f"all coefficients to degree {wanted}",
-                            f"{len(missing)} missing, this one first")
+        raise DataFileError(
+            file,
+            f"degree {n}, order {m}",
+            f"all coefficients to degree {wanted}",
+            f"{len(missing)} missing, this one first",
+        )
     if seen[0, 0] and abs(c_bar[0, 0] - 1.0) > 1e-12:
         raise DataFileError(file, "degree 0, order 0", "1", f"{c_bar[0, 0]!r}")
     c_bar[0, 0] = 1.0

@@ -1,9 +1,9 @@
 """Orbit maintenance by impulsive burns, the rule of the LINNA paper (section V-B.1).
 
-Whenever the altitude of a periselene has fallen below the limit, a pair of burns follows, as in a Hohmann transfer: at the
-next aposelene one along track that lifts the following periselene to a (1 - e) of the wanted orbit, at that periselene one
-along track that brings the aposelene to a (1 + e).  Each burn leaves the velocity horizontal.  Apsides are the zeros of
-radial speed on the dense output of the propagation, so that burns lie at apsides of the perturbed orbit.
+Whenever the altitude of a periselene has fallen below the limit, a pair of burns follows, as in a Hohmann transfer:
+at the next aposelene one along track that lifts the following periselene to a (1 - e) of the wanted orbit, at that
+periselene one along track that brings the aposelene to a (1 + e).  Each burn leaves the velocity horizontal.  Apsides
+are the zeros of radial speed on the dense output of the propagation: burns lie at apsides of the perturbed orbit.
 """
 
 from __future__ import annotations
@@ -78,13 +78,26 @@ def propagate_with_maneuvers(
         raise OrbitError(f"propagation with manoeuvres: expected a span of 0 s or more, found {duration_s} s")
     if not (0.0 <= rule.eccentricity < 1.0 and wanted_periselene > limit):
         raise OrbitError(
-            f"manoeuvre rule: expected an orbit whose periselene is above the limit of {rule.periselene_altitude_m / 1e3:g} "
-            f"km, found {(wanted_periselene - constants.MOON_RADIUS_M) / 1e3:.3f} km"
+            "manoeuvre rule: expected an orbit whose periselene is above the limit of "
+            f"{rule.periselene_altitude_m / 1e3:g} km, found one at "
+            f"{(wanted_periselene - constants.MOON_RADIUS_M) / 1e3:.3f} km"
         )
 
     def arc_to(time_s: float, state: FloatArray, event: int, radius_m: float, step_s: float) -> Arc:
-        return integrate_arc(epoch_tdb_s, time_s, state, float(duration_s), model, integrator, rtol, max_step_s,
-                             constants.MOON_RADIUS_M, event=event, event_radius_m=radius_m, first_step_s=step_s)
+        return integrate_arc(
+            epoch_tdb_s,
+            time_s,
+            state,
+            float(duration_s),
+            model,
+            integrator,
+            rtol,
+            max_step_s,
+            constants.MOON_RADIUS_M,
+            event=event,
+            event_radius_m=radius_m,
+            first_step_s=step_s,
+        )
 
     arcs: list[Arc] = []
     burns: list[Maneuver] = []
@@ -100,14 +113,17 @@ def propagate_with_maneuvers(
             break
         if phase:
             target = wanted_periselene if phase == 1 else wanted_aposelene
-            state, burn = _burn(epoch_tdb_s + time, "aposelene" if phase == 1 else "periselene", state, target, model)
+            state, burn = _burn(
+                epoch_tdb_s + time, "aposelene" if phase == 1 else "periselene", state, target, model
+            )
             burns.append(burn)
         phase = (phase + 1) % 3
     return join(epoch_tdb_s, arcs), tuple(burns)
 
 
-def _burn(tdb_s: float, place: str, state: FloatArray, opposite_radius_m: float,
-          model: ForceModel) -> tuple[FloatArray, Maneuver]:
+def _burn(
+    tdb_s: float, place: str, state: FloatArray, opposite_radius_m: float, model: ForceModel
+) -> tuple[FloatArray, Maneuver]:
     """Return the state after a burn that sets the radius of the opposite apsis, and the burn."""
     position, velocity = state[:3], state[3:]
     gm = model.gm_m3_s2
@@ -118,7 +134,11 @@ def _burn(tdb_s: float, place: str, state: FloatArray, opposite_radius_m: float,
     speed = math.sqrt(2.0 * gm * opposite_radius_m / (radius * (radius + opposite_radius_m)))
     after = np.concatenate([position, speed * along])
     burn = Maneuver(
-        utc_ns_from_tdb_s(tdb_s), tdb_s, place, after[3:] - velocity,
-        elements_from_icrf_state(position, velocity, tdb_s, gm), elements_from_icrf_state(position, after[3:], tdb_s, gm),
+        utc_ns_from_tdb_s(tdb_s),
+        tdb_s,
+        place,
+        after[3:] - velocity,
+        elements_from_icrf_state(position, velocity, tdb_s, gm),
+        elements_from_icrf_state(position, after[3:], tdb_s, gm),
     )
     return after, burn

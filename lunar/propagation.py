@@ -1,12 +1,12 @@
 """Orbits about the Moon: force model, adaptive propagation with dense output, many states at once, transition matrix.
 
-States are position and velocity (m, m/s) from the Moon's centre along ICRF axes; time is TDB seconds past J2000.  Forces:
-gravity field to any degree in principal axes, tides of Earth and Sun, optionally the pressure of sunlight with the shadows
-of Moon and Earth.
+States are position and velocity (m, m/s) from the Moon's centre along ICRF axes; time is TDB seconds past J2000.
+Forces: gravity field to any degree in principal axes, tides of Earth and Sun, optionally the pressure of sunlight with
+the shadows of Moon and Earth.
 
-An adaptive Runge-Kutta method takes the steps (DOP853 of Hairer et al., or Fehlberg's 7(8)); every accepted step is kept, and
-between steps a quintic through position, velocity and acceleration at both ends is read.  Steps are kept to 60 s, at which
-that quintic is within 0.1 mm and 1e-6 m/s of the orbit.
+An adaptive Runge-Kutta method takes the steps (DOP853 of Hairer et al., or Fehlberg's 7(8)); every accepted step is
+kept, and between steps a quintic through position, velocity and acceleration at both ends is read.  Steps are kept to
+60 s, at which that quintic is within 0.1 mm and 1e-5 m/s of the orbit.
 
 References
 ----------
@@ -16,6 +16,7 @@ Fehlberg, NASA TR R-287 (1968).
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -87,8 +88,8 @@ class ForceModel:
 class Trajectory:
     """An orbit known at all times from ``start_tdb_s`` to ``stop_tdb_s``.
 
-    ``elapsed_s`` (n,) are the times of the steps after ``epoch_tdb_s``, ``states`` (n, 6) and ``accelerations`` (n, 3) what
-    was there, ICRF.  A burn appears as two steps at the same time; from that time on the later one holds.
+    ``elapsed_s`` (n,) are the times of the steps after ``epoch_tdb_s``, ``states`` (n, 6) and ``accelerations``
+    (n, 3) what was there, ICRF.  A burn appears as two steps at the same time; from that time on the later one holds.
     """
 
     epoch_tdb_s: float
@@ -138,12 +139,12 @@ class Trajectory:
         edges = [0, *burns.tolist(), len(self.elapsed_s)]
         return tuple(
             Trajectory(self.epoch_tdb_s, self.elapsed_s[a:b], self.states[a:b], self.accelerations[a:b])
-            for a, b in zip(edges[:-1], edges[1:], strict=True)
+            for a, b in itertools.pairwise(edges)
             if b - a > 1
         )
 
     def apsides(self) -> tuple[FloatArray, FloatArray]:
-        """Return the elapsed times (k,) at which radial speed vanishes, and the radii (k,) there, m, in order of time."""
+        """Return the elapsed times (k,) at which radial speed vanishes, in order, and the radii (k,) there in m."""
         radial = np.einsum("ij,ij->i", self.states[:, :3], self.states[:, 3:])
         spans = np.nonzero((radial[:-1] * radial[1:] < 0.0) & (np.diff(self.elapsed_s) > 0.0))[0]
         low, high = self.elapsed_s[spans].copy(), self.elapsed_s[spans + 1].copy()
@@ -177,8 +178,17 @@ def propagate(
     OrbitError
         Where the start is below ground, not finite, or no step size meets the tolerance.
     """
-    arc = integrate_arc(epoch_tdb_s, 0.0, state_vector(position_icrf_m, velocity_icrf_m_s), float(duration_s), model,
-                        integrator, rtol, max_step_s, ground_radius_m)
+    arc = integrate_arc(
+        epoch_tdb_s,
+        0.0,
+        state_vector(position_icrf_m, velocity_icrf_m_s),
+        float(duration_s),
+        model,
+        integrator,
+        rtol,
+        max_step_s,
+        ground_radius_m,
+    )
     return join(epoch_tdb_s, [arc])
 
 
@@ -191,9 +201,9 @@ def propagate_many(
     rtol: float = 1e-11,
     threads: int = 1,
 ) -> FloatArray:
-    """Return the states of many orbits, shape ``(n, k, 6)``, from ``(n, 6)`` states at one epoch, at ``(k,)`` times after it.
+    """Return states of many orbits, shape ``(n, k, 6)``, from ``(n, 6)`` states at one epoch, at ``(k,)`` later times.
 
-    Times ascend from 0 on.  An orbit that meets the ground has NaN from there on.
+    Times are seconds after the epoch; they ascend from 0 on.  An orbit that meets the ground has NaN from there on.
     """
     from concurrent.futures import ThreadPoolExecutor
 
@@ -213,12 +223,24 @@ def propagate_many(
             out[number] = starts[number]
             return
         try:
-            arc = integrate_arc(epoch_tdb_s, 0.0, starts[number], duration, model, integrator, rtol, MAX_STEP_S,
-                                constants.MOON_RADIUS_M, stop_at_ground=True)
+            arc = integrate_arc(
+                epoch_tdb_s,
+                0.0,
+                starts[number],
+                duration,
+                model,
+                integrator,
+                rtol,
+                MAX_STEP_S,
+                constants.MOON_RADIUS_M,
+                stop_at_ground=True,
+            )
         except OrbitError:
             return
         inside = times <= arc.elapsed_s[-1] if arc.status != kernel.GROUND else times < arc.ground_s
-        kernel.evaluate(arc.elapsed_s, arc.states, arc.accelerations, times[inside], out[number, : inside.sum()])
+        kernel.evaluate(
+            arc.elapsed_s, arc.states, arc.accelerations, times[inside], out[number, : inside.sum()]
+        )
 
     force_arrays(model, epoch_tdb_s, 0.0, duration)  # fills the tables once, before threads share them
     if threads > 1:
@@ -241,8 +263,8 @@ def propagate_with_stm(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return position (3,), velocity (3,) and transition matrix (6, 6) after ``duration_s`` (either sign).
 
-    The state moves under the whole model, the matrix under its field to ``stm_degree`` with Earth and Sun.  Equal steps of
-    the eighth-order method, none longer than ``step_s``: within 0.1 mm per orbit at 15 s and degree 100.
+    The state moves under the whole model, the matrix under its field to ``stm_degree`` with Earth and Sun.  Equal
+    steps of the eighth-order method, none longer than ``step_s``: within 0.1 mm per orbit at 15 s and degree 100.
     """
     from lunar import _dynamics_kernel as kernel
     from lunar._tableaux import DOP853
@@ -253,8 +275,9 @@ def propagate_with_stm(
     gravity, force, table, scratch = force_arrays(model, epoch_tdb_s, 0.0, duration_s)
     low = packed_gradient(model.gravity, min(stm_degree, _degree(model)))
     steps = max(1, int(np.ceil(abs(duration_s) / step_s - 1e-9)))
-    y = kernel.transition(start, float(duration_s), steps, gravity, low, force, table, scratch, DOP853.a, DOP853.b,
-                          DOP853.c)
+    y = kernel.transition(
+        start, float(duration_s), steps, gravity, low, force, table, scratch, DOP853.a, DOP853.b, DOP853.c
+    )
     return y[:3], y[3:6], y[6:].reshape(6, 6)
 
 
@@ -265,7 +288,9 @@ def acceleration_icrf(model: ForceModel, tdb_s: float, position_icrf_m: ArrayLik
     gravity, force, table, scratch = force_arrays(model, tdb_s, 0.0, 0.0)
     x, y, z = np.asarray(position_icrf_m, dtype=np.float64)
     return np.array(
-        kernel.force_acceleration(0.0, x, y, z, gravity, force, table, np.empty(scratch), np.empty(kernel.COLUMNS))
+        kernel.force_acceleration(
+            0.0, x, y, z, gravity, force, table, np.empty(scratch), np.empty(kernel.COLUMNS)
+        )
     )
 
 
@@ -323,19 +348,43 @@ def integrate_arc(
     while status == kernel.STEP_LIMIT:
         times, states, rates = np.empty(_KNOTS), np.empty((_KNOTS, 6)), np.empty((_KNOTS, 3))
         count, status, cost, step = kernel.integrate(
-            time, y, float(stop_s), gravity, force, table, scratch, method.a, method.b, method.c, method.error,
-            method.second_error, method.error_order, rtol, max_step_s, step, ground_radius_m, event, event_radius_m,
-            times, states, rates,
+            time,
+            y,
+            float(stop_s),
+            gravity,
+            force,
+            table,
+            scratch,
+            method.a,
+            method.b,
+            method.c,
+            method.error,
+            method.second_error,
+            method.error_order,
+            rtol,
+            max_step_s,
+            step,
+            ground_radius_m,
+            event,
+            event_radius_m,
+            times,
+            states,
+            rates,
         )
-        parts.append((times[:count], states[:count], rates[:count]) if not parts else
-                     (times[1:count], states[1:count], rates[1:count]))
+        parts.append(
+            (times[:count], states[:count], rates[:count])
+            if not parts
+            else (times[1:count], states[1:count], rates[1:count])
+        )
         time, y = times[count - 1], states[count - 1].copy()
         evaluations += cost
     elapsed = np.concatenate([part[0] for part in parts])
     kept_states = np.concatenate([part[1] for part in parts])
     kept_rates = np.concatenate([part[2] for part in parts])
     if status == kernel.TOO_SMALL:
-        raise OrbitError(f"propagation: expected steps over 1 us to meet a tolerance of {rtol:g}, found none at {time:.3f} s")
+        raise OrbitError(
+            f"propagation: expected steps over 1 us to meet a tolerance of {rtol:g}, found none at {time:.3f} s"
+        )
     ground_s = np.nan
     if status == kernel.GROUND:
         ground_s = _ground_time(elapsed[-2:], kept_states[-2:], kept_rates[-2:], ground_radius_m)
@@ -350,13 +399,17 @@ def join(epoch_tdb_s: float, arcs: list[Arc]) -> Trajectory:
     The first knot of an arc that goes on from the very state in which the one before ended is left out.
     """
     skips = [0] + [
-        int(np.array_equal(after.states[0], before.states[-1])) for before, after in zip(arcs[:-1], arcs[1:], strict=True)
+        int(np.array_equal(after.states[0], before.states[-1])) for before, after in itertools.pairwise(arcs)
     ]
     elapsed = np.concatenate([arc.elapsed_s[skip:] for arc, skip in zip(arcs, skips, strict=True)])
     states = np.concatenate([arc.states[skip:] for arc, skip in zip(arcs, skips, strict=True)])
     rates = np.concatenate([arc.accelerations[skip:] for arc, skip in zip(arcs, skips, strict=True)])
     if len(elapsed) == 1:  # a propagation over no time at all
-        elapsed, states, rates = np.repeat(elapsed, 2), np.repeat(states, 2, axis=0), np.repeat(rates, 2, axis=0)
+        elapsed, states, rates = (
+            np.repeat(elapsed, 2),
+            np.repeat(states, 2, axis=0),
+            np.repeat(rates, 2, axis=0),
+        )
         elapsed[1] += 1e-6
         states[1, :3] += 1e-6 * states[0, 3:]
     if elapsed[-1] < elapsed[0]:
@@ -366,17 +419,20 @@ def join(epoch_tdb_s: float, arcs: list[Arc]) -> Trajectory:
 
 def state_vector(position_icrf_m: ArrayLike, velocity_icrf_m_s: ArrayLike) -> FloatArray:
     """Return position and velocity as one array (6,)."""
-    state = np.concatenate([
-        np.asarray(position_icrf_m, dtype=np.float64).reshape(3), np.asarray(velocity_icrf_m_s, dtype=np.float64).reshape(3)
-    ])
+    state = np.concatenate(
+        [
+            np.asarray(position_icrf_m, dtype=np.float64).reshape(3),
+            np.asarray(velocity_icrf_m_s, dtype=np.float64).reshape(3),
+        ]
+    )
     if not np.all(np.isfinite(state)):
         raise OrbitError(f"start of the orbit: expected six finite numbers, found {state.tolist()}")
     return state
 
 
-def force_arrays(model: ForceModel, epoch_tdb_s: float, start_s: float, stop_s: float) -> tuple[
-    FloatArray, FloatArray, FloatArray, int
-]:
+def force_arrays(
+    model: ForceModel, epoch_tdb_s: float, start_s: float, stop_s: float
+) -> tuple[FloatArray, FloatArray, FloatArray, int]:
     """Return what the compiled right-hand side reads: packed field, scalars, table over the span, scratch length."""
     from lunar import _dynamics_kernel as kernel
     from lunar._gravity_kernel import scratch_size
@@ -391,7 +447,9 @@ def force_arrays(model: ForceModel, epoch_tdb_s: float, start_s: float, stop_s: 
     force[kernel.GM_SUN] = constants.GM_SUN_M3_S2 if model.sun else 0.0
     if model.solar_pressure is not None:
         pressure = constants.SOLAR_PRESSURE_1AU_N_M2 * constants.ASTRONOMICAL_UNIT_M**2
-        force[kernel.PRESSURE] = pressure * model.solar_pressure.area_to_mass_m2_kg * model.solar_pressure.reflection
+        force[kernel.PRESSURE] = (
+            pressure * model.solar_pressure.area_to_mass_m2_kg * model.solar_pressure.reflection
+        )
     force[kernel.MOON_RADIUS] = constants.MOON_RADIUS_M
     force[kernel.EARTH_RADIUS] = constants.EARTH_RADIUS_M
     force[kernel.SUN_RADIUS] = constants.SUN_RADIUS_M
@@ -436,21 +494,27 @@ def _ground_time(elapsed: FloatArray, states: FloatArray, rates: FloatArray, gro
 
     # Two knots in ascending order, so that the evaluation can search them.
     order = slice(None) if elapsed[1] > elapsed[0] else slice(None, None, -1)
-    knots = tuple(np.ascontiguousarray(array[order]) for array in (elapsed, states, rates))
+    times_of, states_at, rates_at = (np.ascontiguousarray(array[order]) for array in (elapsed, states, rates))
     fractions = np.linspace(0.0, 1.0, 257)
     low, high = elapsed[0], elapsed[1]
     out = np.empty((len(fractions), 6))
     for _ in range(3):
         times = low + (high - low) * fractions
-        kernel.evaluate(*knots, times, out)
+        kernel.evaluate(times_of, states_at, rates_at, times, out)
         below = np.nonzero(np.linalg.norm(out[:, :3], axis=-1) <= ground_radius_m)[0]
         at = int(below[0]) if len(below) else len(times) - 1
         low, high = times[max(at - 1, 0)], times[at]
     return float(high)
 
 
-def _impact(epoch_tdb_s: float, ground_s: float, elapsed: FloatArray, states: FloatArray, rates: FloatArray,
-            model: ForceModel) -> ImpactError:
+def _impact(
+    epoch_tdb_s: float,
+    ground_s: float,
+    elapsed: FloatArray,
+    states: FloatArray,
+    rates: FloatArray,
+    model: ForceModel,
+) -> ImpactError:
     from lunar.frames import spherical_from_mcmf
     from lunar.timescales import utc_ns_from_tdb_s
 

@@ -1,7 +1,7 @@
 """Positions of the Earth and the Sun seen from the Moon, ICRF axes, metres, without any ephemeris file.
 
-The Moon's place is the truncated ELP2000-82 of Meeus, the Earth's the VSOP2000 fit of ERFA (``moon98``, ``epv00``): some
-km in the Moon's distance and arcseconds in direction, far below what the tide on a low orbit can feel.
+The Moon's place is the truncated ELP2000-82 of Meeus, the Earth's the VSOP2000 fit of ERFA (``moon98``, ``epv00``):
+some km in the Moon's distance and arcseconds in direction, far below what the tide on a low orbit can feel.
 
 References
 ----------
@@ -21,7 +21,7 @@ _J2000_JD = 2_451_545.0
 
 
 def earth_position_icrf_m(tdb_s: ArrayLike) -> FloatArray:
-    """Return the Earth's position from the Moon's centre, shape ``(..., 3)``, at TDB seconds past J2000, shape ``(...)``."""
+    """Return the Earth's position from the Moon's centre, shape ``(..., 3)``, at TDB seconds past J2000 ``(...)``."""
     import erfa
 
     # TT would be asked for; the Moon moves 2 m in the 2 ms between TT and TDB.
@@ -30,7 +30,7 @@ def earth_position_icrf_m(tdb_s: ArrayLike) -> FloatArray:
 
 
 def sun_position_icrf_m(tdb_s: ArrayLike) -> FloatArray:
-    """Return the Sun's position from the Moon's centre, shape ``(..., 3)``, at TDB seconds past J2000, shape ``(...)``."""
+    """Return the Sun's position from the Moon's centre, shape ``(..., 3)``, at TDB seconds past J2000 ``(...)``."""
     import erfa
 
     days = np.asarray(tdb_s, dtype=np.float64) / SECONDS_PER_DAY

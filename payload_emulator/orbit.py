@@ -93,7 +93,8 @@ def propagate_scenario(scenario: Scenario, model: ForceModel, duration_s: float)
     """
     if scenario.orbit.oem:
         raise ScenarioError(
-            f"scenario {scenario.name}: expected orbital elements to propagate, found the ephemeris {scenario.orbit.oem}"
+            f"scenario {scenario.name}: expected orbital elements to propagate, "
+            f"found the ephemeris {scenario.orbit.oem}"
         )
     epoch_tdb_s = tdb_s_from_utc_ns(scenario.epoch_utc_ns)
     state = initial_state_icrf(scenario, model.gm_m3_s2)
@@ -124,8 +125,10 @@ def free_impact(scenario: Scenario, model: ForceModel, duration_s: float) -> Imp
     return None
 
 
-def sample(orbit: ScenarioOrbit, step_s: float, object_name: str = "SELENITA") -> tuple[Ephemeris, FloatArray]:
-    """The ephemeris on a regular grid, one segment between burns with a state at each end, and the grid's states (n, 6)."""
+def sample(
+    orbit: ScenarioOrbit, step_s: float, object_name: str = "SELENITA"
+) -> tuple[Ephemeris, FloatArray]:
+    """The ephemeris on a regular grid, a segment between burns with a state at each end; the grid's states (n, 6)."""
     last_s = float(orbit.trajectory.elapsed_s[-1])
     steps = int(np.floor(last_s / step_s + 1e-9))
     grid = orbit.epoch_utc_ns + np.rint(np.arange(steps + 1) * (step_s * _NS)).astype(np.int64)
@@ -139,7 +142,11 @@ def sample(orbit: ScenarioOrbit, step_s: float, object_name: str = "SELENITA") -
         states = arc.state_after(at)
         segments.append(
             EphemerisSegment(
-                utc_ns, states[:, :3], states[:, 3:], object_name=object_name, object_id=object_name,
+                utc_ns,
+                states[:, :3],
+                states[:, 3:],
+                object_name=object_name,
+                object_id=object_name,
                 degree=min(7, 2 * len(utc_ns) - 1),
             )
         )

@@ -17,17 +17,23 @@ def configure(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     propagate = commands.add_parser("propagate", help="propagate a scenario's orbit, write it as OEM")
     propagate.add_argument("scenario", help="scenario file, or the name of a shipped one")
-    propagate.add_argument("--days", type=_positive, default=30.0, metavar="D", help="span in days (default 30)")
+    propagate.add_argument(
+        "--days", type=_positive, default=30.0, metavar="D", help="span in days (default 30)"
+    )
     propagate.add_argument(
         "--step", type=_positive, default=30.0, metavar="S", help="seconds between states (default 30)"
     )
     propagate.add_argument("--out", type=Path, required=True, metavar="F.oem", help="ephemeris to write")
     propagate.add_argument("--gravity", metavar="FILE", help="coefficient file, or 'builtin'")
     propagate.add_argument("--degree", type=int, metavar="N", help="degree of the gravity field")
-    propagate.add_argument("--integrator", choices=("dop853", "rkf78"), help="another one than the scenario's")
+    propagate.add_argument(
+        "--integrator", choices=("dop853", "rkf78"), help="another one than the scenario's"
+    )
     propagate.add_argument("--no-maneuvers", action="store_true", help="let the orbit drift freely")
     propagate.add_argument(
-        "--free-drift", action="store_true", help="report also when the orbit would hit the ground without burns"
+        "--free-drift",
+        action="store_true",
+        help="report also when the orbit would hit the ground without burns",
     )
     add_json_flag(propagate)
     propagate.set_defaults(handler=run_propagate)
@@ -60,7 +66,9 @@ def run_propagate(arguments: argparse.Namespace) -> int:
     finally:
         part.unlink(missing_ok=True)
     wall_s = time.perf_counter() - started
-    log(f"propagated in {propagated - started:.2f} s, sampled and written in {wall_s - (propagated - started):.2f} s")
+    log(
+        f"propagated in {propagated - started:.2f} s, sampled and written in {wall_s - (propagated - started):.2f} s"
+    )
     figures = _figures(orbit, states, wall_s)
     figures["data"] = list(data.names()) or ["built-in gravity and IAU orientation only"]
     if arguments.free_drift:
@@ -80,11 +88,13 @@ def _positive(text: str) -> float:
 def _with_choices(scenario: Any, arguments: argparse.Namespace) -> Any:
     import dataclasses
 
-    changes = {
-        "gravity": arguments.gravity, "degree": arguments.degree, "integrator": arguments.integrator
-    }
-    dynamics = dataclasses.replace(scenario.dynamics, **{key: value for key, value in changes.items() if value is not None})
-    maneuvers = dataclasses.replace(scenario.maneuvers, enabled=scenario.maneuvers.enabled and not arguments.no_maneuvers)
+    changes = {"gravity": arguments.gravity, "degree": arguments.degree, "integrator": arguments.integrator}
+    dynamics = dataclasses.replace(
+        scenario.dynamics, **{key: value for key, value in changes.items() if value is not None}
+    )
+    maneuvers = dataclasses.replace(
+        scenario.maneuvers, enabled=scenario.maneuvers.enabled and not arguments.no_maneuvers
+    )
     return dataclasses.replace(scenario, dynamics=dynamics, maneuvers=maneuvers)
 
 
@@ -97,7 +107,9 @@ def _figures(orbit: Any, states: Any, wall_s: float) -> dict[str, Any]:
     altitude_km = (np.linalg.norm(states[:, :3], axis=1) - MOON_RADIUS_M) / 1e3
     return {
         "altitude_km": {
-            "mean": float(altitude_km.mean()), "min": float(altitude_km.min()), "max": float(altitude_km.max())
+            "mean": float(altitude_km.mean()),
+            "min": float(altitude_km.min()),
+            "max": float(altitude_km.max()),
         },
         "maneuvers": [
             {
@@ -149,8 +161,9 @@ def _text(figures: dict[str, Any]) -> str:
         f"{len(burns)} burns, {figures['delta_v_total_m_s']:.2f} m/s",
     ]
     lines += [
-        f"  {burn['epoch']}  {burn['delta_v_m_s']:.3f} m/s at {burn['place']}: a {burn['before']['semi_major_axis_km']:.3f} -> "
-        f"{burn['after']['semi_major_axis_km']:.3f} km, e {burn['before']['eccentricity']:.6f} -> "
+        f"  {burn['epoch']}  {burn['delta_v_m_s']:.3f} m/s at {burn['place']}: "
+        f"a {burn['before']['semi_major_axis_km']:.3f} -> {burn['after']['semi_major_axis_km']:.3f} km, "
+        f"e {burn['before']['eccentricity']:.6f} -> "
         f"{burn['after']['eccentricity']:.6f}"
         for burn in burns
     ]
@@ -158,7 +171,9 @@ def _text(figures: dict[str, Any]) -> str:
         drift = figures["free_drift"]
         lines.append(
             f"without burns it hits the Moon at {drift['impact']}, latitude {drift['latitude_deg']:.2f} deg, longitude "
-            f"{drift['longitude_deg']:.2f} deg E" if drift["impact"] else "without burns it stays above ground"
+            f"{drift['longitude_deg']:.2f} deg E"
+            if drift["impact"]
+            else "without burns it stays above ground"
         )
     lines.append(f"{figures['states']} states in {figures['wall_s']:.2f} s -> {figures['out']}")
     return "\n".join(lines)
