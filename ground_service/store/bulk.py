@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import BigInteger, Connection, Double, Float, Integer, LargeBinary, SmallInteger, Table, Text
+from sqlalchemy import BigInteger, Connection, Float, Integer, LargeBinary, SmallInteger, Table, Text
 
 Column = Sequence[Any] | NDArray[Any]
 
@@ -15,8 +15,7 @@ _COPY_TYPES = (
     (SmallInteger, "int2"),
     (BigInteger, "int8"),
     (Integer, "int4"),
-    (Double, "float8"),
-    (Float, "float4"),
+    (Float, "float8"),
     (LargeBinary, "bytea"),
     (Text, "text"),
 )

@@ -109,14 +109,18 @@ def prepare_database(url: str, *, upgrade: bool | None = None) -> Database:
         If it cannot be used.
     """
     database = open_database(url)
-    found, head, known = schema_revisions(database)
-    if found == head:
-        return database
-    if found is not None and found not in known:
-        raise DatabaseTooNew(database.label, head, found)
-    if upgrade is False or (upgrade is None and database.dialect != "sqlite"):
-        raise DatabaseNotMigrated(database.label, head, found or "none")
-    upgrade_database(database)
+    try:
+        found, head, known = schema_revisions(database)
+        if found == head:
+            return database
+        if found is not None and found not in known:
+            raise DatabaseTooNew(database.label, head, found)
+        if upgrade is False or (upgrade is None and database.dialect != "sqlite"):
+            raise DatabaseNotMigrated(database.label, head, found or "none")
+        upgrade_database(database)
+    except BaseException:
+        database.engine.dispose()
+        raise
     return database
 
 

@@ -1,0 +1,230 @@
+"""The HTTP interface: operations, problem documents, authorisation, limits."""
+
+import json
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ground_service.api.app import create_app
+from ground_service.services.archive_import import import_archive
+from ground_service.services.users import add_user
+from ground_service.settings import Settings
+
+with warnings.catch_warnings():
+    # It recommends another HTTP library than the installed one; both serve it.
+    warnings.simplefilter("ignore")
+    from fastapi.testclient import TestClient
+
+V1 = "/api/v1"
+
+
+@pytest.fixture(scope="module")
+def client(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    """A service without users, with the synthetic pass in it; not to be given users."""
+    settings = Settings(home=tmp_path_factory.mktemp("api"), upload_limit_mib=2)
+    with TestClient(create_app(settings, inline_jobs=True)) as opened:
+        import_archive(opened.app.state.ground, synthetic_pass.folder)  # type: ignore[attr-defined]
+        yield opened
+
+
+@pytest.fixture
+def guarded(tmp_path: Path) -> Iterator[tuple[TestClient, dict[str, str]]]:
+    """An empty service with one user of each role, and their tokens."""
+    with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as opened:
+        ground = opened.app.state.ground  # type: ignore[attr-defined]
+        yield opened, {role: add_user(ground, role, role) for role in ("viewer", "operator", "admin")}
+
+
+def is_problem(response: Any, status: int) -> bool:
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == "application/problem+json"
+    body = response.json()
+    assert body["status"] == status
+    assert body["title"] and body["detail"]
+    return True
+
+
+def test_an_upload_is_ingested_and_doubles_nothing(client: TestClient, make_pass: Callable[..., Any]) -> None:
+    stream = (make_pass(frames=3, seed=9).folder / "downlink.cadu").read_bytes()
+    first = client.post(f"{V1}/telemetry", content=stream, headers={"Idempotency-Key": "a"})
+    assert first.status_code == 202, first.text
+    ingest = client.get(first.headers["location"]).json()
+    assert ingest["state"] == "done"
+    assert ingest["accounting"]["packets_new"] == ingest["accounting"]["packets"] > 0
+    again = client.post(f"{V1}/telemetry", content=stream, headers={"Idempotency-Key": "a"}).json()
+    assert again == first.json()
+    third = client.post(f"{V1}/telemetry", content=stream).json()
+    assert third["ingest_id"] != first.json()["ingest_id"]
+    assert client.get(f"{V1}/ingests/{third['ingest_id']}").json()["accounting"]["packets_new"] == 0
+
+
+def test_an_upload_that_is_no_downlink_becomes_a_failed_ingest(client: TestClient) -> None:
+    accepted = client.post(f"{V1}/telemetry", content=b"hello world" * 100).json()
+    ingest = client.get(f"{V1}/ingests/{accepted['ingest_id']}").json()
+    assert ingest["state"] == "failed"
+    assert "expected a stream of CADUs or of space packets" in ingest["error"]
+    assert is_problem(client.post(f"{V1}/telemetry", content=b""), 422)
+
+
+def test_an_upload_over_the_limit_is_refused_announced_or_not(client: TestClient) -> None:
+    assert is_problem(client.post(f"{V1}/telemetry", content=b"\0" * (3 << 20)), 413)
+    blocks = (b"\0" * (1 << 18) for _ in range(12))
+    assert is_problem(client.post(f"{V1}/telemetry", content=blocks), 413)
+    assert is_problem(client.post(f"{V1}/passes", content=b"[" * (2 << 20)), 413)
+
+
+def test_passes_are_listed_in_pages_and_shown(client: TestClient) -> None:
+    page = client.get(f"{V1}/passes", params={"limit": 1}).json()
+    assert page["total"] >= 1
+    assert len(page["items"]) == 1
+    shown = client.get(f"{V1}/passes/1").json()
+    assert shown["name"] == "synthetic pass"
+    assert shown["start"] == "2029-08-07T06:00:00.000000000Z"
+    assert is_problem(client.get(f"{V1}/passes/999"), 404)
+    assert is_problem(client.get(f"{V1}/passes/x"), 422)
+    assert is_problem(client.get(f"{V1}/passes", params={"limit": 0}), 422)
+
+
+def test_a_pass_can_be_defined(client: TestClient) -> None:
+    given = {"name": "p", "start": "2029-08-07T06:00:00Z", "stop": "2029-08-07T07:00:00Z", "spacecraft_id": 76}
+    assert client.post(f"{V1}/passes", json=given).status_code == 201
+    assert is_problem(client.post(f"{V1}/passes", json={**given, "stop": "2029-08-07T05:00:00Z"}), 422)
+    assert is_problem(client.post(f"{V1}/passes", json={**given, "start": "noon"}), 422)
+    assert is_problem(client.post(f"{V1}/passes", json={**given, "colour": "red"}), 422)
+
+
+def test_what_is_in_a_pass_can_be_read(client: TestClient, synthetic_pass: Any) -> None:
+    complete = client.get(f"{V1}/passes/1/completeness").json()
+    assert (complete["packets"], complete["lost"]) == (len(synthetic_pass.packets), 0)
+    found = client.get(f"{V1}/passes/1/detections", params={"limit": 5, "offset": 3}).json()
+    assert len(found["items"]) == 5
+    assert found["total"] > 1000
+    assert client.get(f"{V1}/passes/1/events").json()["items"][0]["name"] == "observation_stopped"
+
+
+def test_series_are_made_short_with_their_extremes(client: TestClient) -> None:
+    states = client.get(
+        f"{V1}/passes/1/states", params={"estimator": "spherical", "value": "altitude_m", "max_points": 7}
+    ).json()
+    buckets = states["series"][0]["buckets"]
+    assert len(buckets) <= 7
+    assert sum(bucket["count"] for bucket in buckets) == 40
+    assert all(b["min"] <= b["mean"] <= b["max"] for b in buckets)
+    temperature = client.get(f"{V1}/passes/1/telemetry/temperature_c").json()
+    assert (temperature["unit"], temperature["samples"]) == ("degC", 40)
+    assert temperature["buckets"][-1]["max"] == pytest.approx(23.9)
+    assert is_problem(client.get(f"{V1}/passes/1/telemetry/salary"), 404)
+    assert is_problem(client.get(f"{V1}/passes/1/states", params={"estimator": "nobody"}), 404)
+    assert is_problem(client.get(f"{V1}/passes/1/states", params={"value": "salary"}), 422)
+
+
+def test_a_report_is_made_and_read_as_html_and_json(client: TestClient) -> None:
+    asked = client.post(f"{V1}/passes/1/reports")
+    assert asked.status_code == 202
+    job = client.get(asked.headers["location"]).json()
+    assert job["state"] == "done", job
+    report = f"{V1}/reports/{job['result']['report_id']}"
+    page = client.get(report, headers={"accept": "text/html"})
+    assert page.headers["content-type"].startswith("text/html")
+    assert "synthetic pass" in page.text
+    assert client.get(report, params={"format": "json"}).json()
+    assert is_problem(client.get(report, params={"format": "exe"}), 422)
+    assert is_problem(client.get(f"{V1}/reports/{'0' * 32}"), 404)
+    assert is_problem(client.post(f"{V1}/passes/77/reports"), 404)
+
+
+def test_an_ephemeris_is_uploaded_once(client: TestClient, synthetic_pass: Any) -> None:
+    octets = (synthetic_pass.folder / "reference.oem").read_bytes()
+    first = client.post(f"{V1}/ephemerides", content=octets, params={"name": "reference"})
+    assert first.status_code == 201, first.text
+    assert first.json()["frame"] == "ICRF"
+    assert client.post(f"{V1}/ephemerides", content=octets, params={"name": "reference"}).json() == first.json()
+    refused = client.post(f"{V1}/ephemerides", content=b"not an ephemeris")
+    assert is_problem(refused, 422)
+    assert "/files/" not in refused.text
+
+
+def test_answers_carry_a_tag_and_are_not_sent_twice(client: TestClient) -> None:
+    first = client.get(f"{V1}/passes/1")
+    again = client.get(f"{V1}/passes/1", headers={"If-None-Match": first.headers["etag"]})
+    assert again.status_code == 304
+    assert again.content == b""
+
+
+def test_answers_carry_secure_headers_and_no_cors(client: TestClient) -> None:
+    answer = client.get(f"{V1}/passes", headers={"Origin": "https://elsewhere.example"})
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    assert "default-src 'none'" in answer.headers["content-security-policy"]
+    assert "access-control-allow-origin" not in answer.headers
+
+
+def test_the_service_can_be_watched(client: TestClient) -> None:
+    assert client.get("/healthz").json() == {"status": "ok"}
+    assert client.get("/readyz").json() == {"status": "ok"}
+
+
+def test_the_description_is_complete(client: TestClient) -> None:
+    document = client.get(f"{V1}/openapi.json").json()
+    for path, operations in document["paths"].items():
+        assert path.startswith(V1)
+        for operation in operations.values():
+            assert operation["security"]
+            assert "application/problem+json" in json.dumps(operation["responses"]["422"])
+
+
+# Every operation, and the lowest role that may do it.
+MATRIX = [
+    ("GET", "/ephemerides", "viewer"),
+    ("POST", "/ephemerides", "operator"),
+    ("POST", "/telemetry", "operator"),
+    ("GET", "/ingests", "viewer"),
+    ("GET", "/ingests/1", "viewer"),
+    ("GET", "/passes", "viewer"),
+    ("POST", "/passes", "operator"),
+    ("GET", "/passes/1", "viewer"),
+    ("GET", "/passes/1/completeness", "viewer"),
+    ("GET", "/passes/1/detections", "viewer"),
+    ("GET", "/passes/1/states", "viewer"),
+    ("GET", "/passes/1/events", "viewer"),
+    ("GET", "/passes/1/telemetry/power_w", "viewer"),
+    ("POST", "/passes/1/reports", "operator"),
+    ("GET", "/jobs", "viewer"),
+    ("GET", f"/jobs/{'0' * 32}", "viewer"),
+    ("GET", f"/reports/{'0' * 32}", "viewer"),
+]
+
+
+def test_every_operation_asks_for_its_role(guarded: tuple[TestClient, dict[str, str]]) -> None:
+    client, tokens = guarded
+    ranks = ["viewer", "operator", "admin"]
+    for method, path, lowest in MATRIX:
+        assert is_problem(client.request(method, V1 + path), 401), path
+        assert is_problem(client.request(method, V1 + path, headers={"Authorization": "Bearer x"}), 401), path
+        for role in ranks:
+            status = client.request(
+                method, V1 + path, headers={"Authorization": f"Bearer {tokens[role]}"}
+            ).status_code
+            if ranks.index(role) < ranks.index(lowest):
+                assert status == 403, (path, role)
+            else:
+                assert status not in (401, 403), (path, role)
+
+
+def test_the_matrix_above_names_every_operation(client: TestClient) -> None:
+    document = client.get(f"{V1}/openapi.json").json()
+    described = {(m.upper(), p.removeprefix(V1)) for p, operations in document["paths"].items() for m in operations}
+
+    def matches(method: str, path: str) -> bool:
+        parts = path.split("/")
+        return any(
+            m == method
+            and len(p.split("/")) == len(parts)
+            and all(a == b or a.startswith("{") for a, b in zip(p.split("/"), parts, strict=True))
+            for m, p in described
+        )
+
+    assert len(MATRIX) == len(described)
+    assert all(matches(method, path) for method, path, _ in MATRIX)

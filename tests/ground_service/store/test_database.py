@@ -1,0 +1,185 @@
+"""The database: migrations, versions, and what goes wrong with disks, each in one clear line."""
+
+import errno
+import os
+import sqlite3
+from pathlib import Path
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from sqlalchemy import inspect, text
+
+from ground_service.errors import (
+    DatabaseNotMigrated,
+    DatabaseTooNew,
+    DatabaseUnavailable,
+    FileDamaged,
+    NotFound,
+    StorageFull,
+    StorageReadOnly,
+    storage_error,
+)
+from ground_service.store.database import (
+    downgrade_database,
+    open_database,
+    prepare_database,
+    schema_revisions,
+    upgrade_database,
+)
+from ground_service.store.files import FileArchive
+from ground_service.store.models import Base
+
+
+def url(path: Path) -> str:
+    return f"sqlite:///{path / 'linna.db'}"
+
+
+def test_a_new_database_is_made_with_the_newest_schema(tmp_path: Path) -> None:
+    database = prepare_database(url(tmp_path / "deep" / "folder"))
+    found, head, _ = schema_revisions(database)
+    assert found == head
+    with database.reading() as connection:
+        assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
+    database.engine.dispose()
+
+
+def test_every_migration_can_be_undone_and_done_again(tmp_path: Path) -> None:
+    database = prepare_database(url(tmp_path))
+    revisions = schema_revisions(database)[2]
+    for revision in (*revisions[1:], "base"):
+        downgrade_database(database, revision)
+    with database.reading() as connection:
+        assert set(inspect(connection).get_table_names()) <= {"alembic_version"}
+    for revision in reversed(revisions):
+        upgrade_database(database, revision)
+    with database.reading() as connection:
+        assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
+    database.engine.dispose()
+
+
+def test_samples_are_clustered_by_time(tmp_path: Path) -> None:
+    """The primary key leads with vehicle, dictionary and time: a time range is one contiguous read."""
+    database = prepare_database(url(tmp_path))
+    with database.reading() as connection:
+        made = connection.execute(text("SELECT sql FROM sqlite_master WHERE name = 'navigation_states'")).scalar_one()
+        key = inspect(connection).get_pk_constraint("navigation_states")["constrained_columns"]
+    assert "WITHOUT ROWID" in made
+    assert key == ["vehicle_id", "dictionary_version", "ticks", "packet_id"]
+    database.engine.dispose()
+
+
+def test_a_database_of_a_newer_version_is_left_alone(tmp_path: Path) -> None:
+    database = prepare_database(url(tmp_path))
+    with database.writing() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
+    database.engine.dispose()
+    with pytest.raises(DatabaseTooNew, match=r"linna\.db: expected schema revision \d+ or older, found 9999"):
+        prepare_database(url(tmp_path))
+
+
+def test_an_older_database_is_upgraded_or_says_what_to_do(tmp_path: Path) -> None:
+    database = prepare_database(url(tmp_path))
+    downgrade_database(database, "0001")
+    database.engine.dispose()
+    with pytest.raises(DatabaseNotMigrated, match="found 0001; run 'linna db upgrade'"):
+        prepare_database(url(tmp_path), upgrade=False)
+    upgraded = prepare_database(url(tmp_path))
+    found, head, _ = schema_revisions(upgraded)
+    assert found == head
+    upgraded.engine.dispose()
+
+
+def test_a_file_that_is_no_database_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "linna.db").write_bytes(b"not a database, but long enough to be looked at " * 40)
+    with pytest.raises(DatabaseUnavailable, match="file is not a database; expected a SQLite database"):
+        prepare_database(url(tmp_path))
+
+
+@pytest.mark.parametrize("wrong", ["nonsense", "oracle+what://x", "postgresql+psycopg://nobody:secret@127.0.0.1:1/x"])
+def test_a_database_that_cannot_be_reached_is_named_without_its_password(wrong: str) -> None:
+    with pytest.raises(DatabaseUnavailable) as caught:
+        prepare_database(wrong)
+    assert "secret" not in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_write_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
+    database = prepare_database(url(tmp_path))
+    with pytest.raises(RuntimeError), database.writing() as connection:
+        connection.execute(text("INSERT INTO vehicles (ccsds_id, instance) VALUES (1, 'x')"))
+        raise RuntimeError
+    with database.reading() as connection:
+        assert connection.execute(text("SELECT count(*) FROM vehicles")).scalar_one() == 0
+    database.engine.dispose()
+
+
+def test_a_full_database_is_one_clear_line(tmp_path: Path) -> None:
+    """SQLite itself says that it is full when it may take no more pages."""
+    database = prepare_database(url(tmp_path))
+    with pytest.raises(StorageFull, match="no space left"), database.writing() as connection:
+        pages = connection.execute(text("PRAGMA page_count")).scalar_one()
+        connection.execute(text(f"PRAGMA max_page_count = {pages}"))
+        for number in range(200):
+            connection.execute(
+                text("INSERT INTO vehicles (ccsds_id, instance) VALUES (:n, :i)"), {"n": number, "i": "x" * 90}
+            )
+    database.engine.dispose()
+
+
+def test_a_read_only_database_is_one_clear_line(tmp_path: Path) -> None:
+    prepare_database(url(tmp_path)).engine.dispose()
+    database = open_database(f"sqlite:///file:{tmp_path / 'linna.db'}?mode=ro&uri=true")
+    with pytest.raises(StorageReadOnly), database.writing() as connection:
+        connection.execute(text("INSERT INTO vehicles (ccsds_id, instance) VALUES (1, 'x')"))
+    database.engine.dispose()
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"),
+    [(errno.ENOSPC, StorageFull), (errno.EROFS, StorageReadOnly), (errno.EACCES, StorageReadOnly)],
+)
+def test_errors_of_the_disk_are_named(number: int, kind: type[Exception]) -> None:
+    error = storage_error(OSError(number, os.strerror(number)), "/archive")
+    assert isinstance(error, kind)
+    assert str(error).startswith("/archive: ")
+
+
+def test_a_file_is_stored_once_and_cannot_be_changed(tmp_path: Path) -> None:
+    archive = FileArchive(tmp_path / "files")
+    first = archive.put([b"abc", b"def"])
+    assert archive.put_octets(b"abcdef") == first
+    assert archive.get(first.sha256) == b"abcdef"
+    assert [p.name for p in archive.root.rglob("*") if p.is_file()] == [first.sha256]
+    assert first.path.stat().st_mode & 0o222 == 0
+
+
+def test_a_file_cut_off_while_stored_leaves_nothing(tmp_path: Path) -> None:
+    archive = FileArchive(tmp_path / "files")
+
+    def broken() -> object:
+        yield b"abc"
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(StorageFull):
+        archive.put(broken())  # type: ignore[arg-type]
+    assert not [p for p in archive.root.rglob("*") if p.is_file()]
+
+
+def test_a_damaged_file_is_noticed(tmp_path: Path) -> None:
+    archive = FileArchive(tmp_path / "files")
+    stored = archive.put_octets(b"abcdef")
+    stored.path.chmod(0o644)
+    stored.path.write_bytes(b"abcdeg")
+    with pytest.raises(FileDamaged, match="expected octets with SHA-256"):
+        archive.get(stored.sha256)
+    with pytest.raises(NotFound):
+        archive.get("0" * 64)
+
+
+def test_sqlite_can_be_opened_by_anything_else(tmp_path: Path) -> None:
+    """No lock is held and no transaction left open after use."""
+    prepare_database(url(tmp_path)).engine.dispose()
+    with sqlite3.connect(tmp_path / "linna.db") as connection:
+        connection.execute("INSERT INTO vehicles (ccsds_id, instance) VALUES (1, 'x')")
+    connection.close()

@@ -1,0 +1,56 @@
+"""Settings: from the environment, from files, and refused in one line."""
+
+from pathlib import Path
+
+import pytest
+
+from ground_service.errors import SettingsError
+from ground_service.settings import load_settings, normalised_url
+
+
+@pytest.fixture(autouse=True)
+def bare(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name in ("HOME", "DATABASE_URL", "BROKER_URL", "HOST", "PORT", "DATABASE_URL_FILE", "BROKER_URL_FILE"):
+        monkeypatch.delenv(f"LINNA_{name}", raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+
+
+def test_nothing_set_means_sqlite_and_jobs_in_process(tmp_path: Path) -> None:
+    settings = load_settings()
+    assert settings.resolved_database_url() == f"sqlite:///{tmp_path / 'linna' / 'linna.db'}"
+    assert settings.resolved_broker_url() is None
+    assert settings.host == "127.0.0.1"
+
+
+def test_what_is_given_goes_before_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LINNA_PORT", "9000")
+    assert load_settings().port == 9000
+    assert load_settings(port=None).port == 9000
+    assert load_settings(port=9001).port == 9001
+
+
+def test_secrets_can_come_from_files_and_are_not_printed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "url").write_text("postgres://linna:geheim@db/linna\n")
+    monkeypatch.setenv("LINNA_DATABASE_URL_FILE", str(tmp_path / "url"))
+    settings = load_settings()
+    assert settings.resolved_database_url() == "postgresql+psycopg://linna:geheim@db/linna"
+    assert "geheim" not in repr(settings)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("LINNA_PORT", "seventy", "LINNA_PORT: expected input should be a valid integer"),
+        ("LINNA_PORT", "70000", "LINNA_PORT: expected input should be less than or equal to 65535"),
+        ("LINNA_DATABASE_URL_FILE", "/does/not/exist", "LINNA_DATABASE_URL_FILE: expected a readable file"),
+    ],
+)
+def test_a_wrong_setting_is_named(monkeypatch: pytest.MonkeyPatch, name: str, value: str, message: str) -> None:
+    monkeypatch.setenv(name, value)
+    with pytest.raises(SettingsError, match=message):
+        load_settings()
+
+
+@pytest.mark.parametrize("spelling", ["postgres://h/d", "postgresql://h/d", "postgresql+psycopg://h/d"])
+def test_the_installed_driver_is_used_whatever_the_spelling(spelling: str) -> None:
+    assert normalised_url(spelling) == "postgresql+psycopg://h/d"

@@ -1,0 +1,135 @@
+"""The same service on PostgreSQL, Redis and real workers."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ground_service.errors import DatabaseNotMigrated, SettingsError
+from ground_service.services.archive_import import import_archive
+from ground_service.services.ground import Ground, open_ground
+from ground_service.services.ingest import ingest_file
+from ground_service.services.jobs import enter_job
+from ground_service.services.reports import pass_summary
+from ground_service.settings import Settings
+from ground_service.store import repository
+from ground_service.store.canonical import archive_hash
+from ground_service.store.database import downgrade_database, open_database, prepare_database, schema_revisions
+from ground_service.worker.app import run_worker
+from ground_service.worker.dispatch import dispatcher_for
+
+SPACECRAFT = 76
+
+
+def job_row(ground: Ground, job_id: str) -> dict[str, Any]:
+    with ground.database.reading() as connection:
+        return repository.get(connection, repository.JOBS, job_id, "job")
+
+
+def finished(ground: Ground, job_id: str, seconds: float = 180.0) -> dict[str, Any]:
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        row = job_row(ground, job_id)
+        if row["state"] in ("done", "failed"):
+            return row
+        time.sleep(0.2)
+    raise AssertionError(f"job {job_id} did not end: {job_row(ground, job_id)}")
+
+
+@pytest.fixture(scope="module")
+def upgraded(postgres_url: str) -> str:
+    with pytest.raises(DatabaseNotMigrated, match="run 'linna db upgrade'"):
+        prepare_database(postgres_url)
+    prepare_database(postgres_url, upgrade=True).engine.dispose()
+    return postgres_url
+
+
+@pytest.fixture(scope="module")
+def ground_on_postgres(upgraded: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ground]:
+    with open_ground(tmp_path_factory.mktemp("pg") / "home", database_url=upgraded) as ground:
+        yield ground
+
+
+def test_the_schema_goes_forward_and_back(upgraded: str, ground_on_postgres: Ground) -> None:
+    from alembic.autogenerate import compare_metadata
+    from alembic.migration import MigrationContext
+
+    from ground_service.store.models import Base
+
+    database = open_database(upgraded)
+    with database.reading() as connection:
+        assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
+    downgrade_database(database, "base")
+    assert schema_revisions(database)[0] is None
+    prepare_database(upgraded, upgrade=True).engine.dispose()
+    database.engine.dispose()
+
+
+def test_the_archive_is_the_same_as_on_sqlite(
+    ground_on_postgres: Ground, ground: Ground, synthetic_pass: Any
+) -> None:
+    stream = synthetic_pass.folder / "downlink.cadu"
+    hashes = []
+    for one in (ground, ground_on_postgres):
+        first = ingest_file(one, stream)
+        again = ingest_file(one, stream)
+        assert first.packets_new == first.packets == len(synthetic_pass.packets)
+        assert again.packets_new == 0
+        with one.database.reading() as connection:
+            vehicle = repository.vehicle_id(connection, SPACECRAFT, "flight")
+            hashes.append(archive_hash(connection, vehicle))
+    assert hashes[0] == hashes[1]
+
+
+def test_a_worker_makes_the_report(
+    ground_on_postgres: Ground, redis_url: str, upgraded: str, synthetic_pass: Any, tmp_path: Path
+) -> None:
+    """The worker is another process; a job entered while it is away is done when it comes; a killed one is done again."""
+    ground = ground_on_postgres
+    settings = Settings(home=ground.home, database_url=upgraded, broker_url=redis_url)
+    pass_id = import_archive(ground, synthetic_pass.folder)
+    dispatcher = dispatcher_for(ground, settings)
+    waiting = dispatcher.submit("report", {"pass_id": pass_id})
+    assert job_row(ground, waiting)["state"] == "queued"
+    hopeless = dispatcher.submit("report", {"pass_id": 4711})
+    environment = {
+        **os.environ,
+        "LINNA_HOME": str(ground.home),
+        "LINNA_DATABASE_URL": upgraded,
+        "LINNA_BROKER_URL": redis_url,
+        "LINNA_DATA": "",
+    }
+    environment.pop("LINNA_DATA")
+    with (tmp_path / "worker.log").open("wb") as log:
+        worker = subprocess.Popen(
+            [sys.executable, "-m", "linna", "worker"], env=environment, stdout=log, stderr=log
+        )
+        try:
+            row = finished(ground, waiting)
+            assert row["state"] == "done", row
+            assert row["attempts"] == 1
+            failed = finished(ground, hopeless)
+            assert (failed["state"], failed["error"]) == ("failed", "pass 4711: not found")
+        finally:
+            worker.terminate()
+            worker.wait(60)
+    with ground.database.reading() as connection:
+        report = repository.get(connection, repository.REPORTS, row["result"]["report_id"], "report")
+    assert report["summary"]["packets"] == pass_summary(ground, pass_id)["packets"]
+
+
+def test_a_job_entered_twice_is_one_job(ground: Ground) -> None:
+    first = enter_job(ground, "report", {"pass_id": 1}, job_id="0" * 32)
+    assert enter_job(ground, "report", {"pass_id": 1}, job_id="0" * 32) == first
+    with ground.database.reading() as connection:
+        assert repository.page(connection, repository.JOBS).total == 1
+
+
+def test_a_worker_without_a_broker_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="LINNA_BROKER_URL: expected a broker"):
+        run_worker(Settings(home=tmp_path))
