@@ -79,8 +79,9 @@ def save_class_histogram(path: Path, diameter_km: FloatArray, caption: str, bin_
                 edges[:-1][mine], counts[mine], bin_km * 0.92, align="edge", color=color(role),
                 label=f"{name}: {total:,}".replace(",", " "),
             )  # fmt: skip
-        axes.set_yscale("log")
-        axes.set_ylim(bottom=max(0.8, 0.5 * float(counts.min())))
+        if counts.any():
+            axes.set_yscale("log")
+            axes.set_ylim(bottom=max(0.8, 0.5 * float(counts.min())))
         axes.set_xlim(CLASS_EDGES_KM[0], CLASS_EDGES_KM[-1])
         axes.set_xticks([5, 10, 15, 20, 25, 30])
         axes.set_xlabel("diameter, km")
@@ -117,7 +118,7 @@ def save_altitude_plot(
         time_axis(over_time, time)
         over_time.set_ylabel("altitude, km")
         title = "Altitude over the sphere of 1737.4 km: minimum, mean, maximum"
-        over_time.set_title(title + ("; manoeuvres in red" if len(event_utc_ns) else ""))
+        over_time.set_title(title + ("; upright lines: manoeuvres" if len(event_utc_ns) else ""))
         share = figure.add_axes((0.07, 0.17, 0.36, 0.27))
         weights = np.full(len(altitude_km), 100.0 / len(altitude_km))
         share.hist(altitude_km, bins=40, weights=weights, color=color("blue"))
@@ -125,6 +126,10 @@ def save_altitude_plot(
         share.set_ylabel("share of states, %")
         share.set_title("Distribution")
         by_latitude = figure.add_axes((0.53, 0.17, 0.44, 0.27))
+        low, high = (
+            min(low, mean - 0.5),
+            max(high, mean + 0.5),
+        )  # an orbit without relief still needs a height
         cells, _, _ = np.histogram2d(
             latitude_deg, altitude_km, bins=(90, 48), range=((-90, 90), (low, high + 1e-6))
         )
@@ -172,12 +177,14 @@ def _sheet(path: Path, width_in: float, height_in: float) -> Iterator[Figure]:
         raise ReportError(
             f"{path}: expected a picture name ending in {', '.join(FORMATS)}, found {path.suffix!r}"
         )
-    with drawing():
-        from matplotlib.figure import Figure
+    import matplotlib
+    from matplotlib.figure import Figure
 
+    # Names inside an SVG are made from the salt: the same figures give the same octets.
+    with drawing(), matplotlib.rc_context({"svg.hashsalt": path.stem}):
         figure = Figure(figsize=(width_in, height_in), facecolor="white")
         yield figure
-        # No creation date: the same figures give the same octets.
+        # No creation date, for the same reason.
         metadata = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}.get(path.suffix.lower(), {})
         figure.savefig(path, dpi=150, facecolor="white", metadata=metadata)
 

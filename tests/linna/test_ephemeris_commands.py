@@ -1,0 +1,173 @@
+"""The commands on ephemerides, catalogues and the field of view as users run them."""
+
+import json
+
+import numpy as np
+import pytest
+
+from linna import cli
+from lunar.catalogue import PAPER_CLASS_COUNTS
+from lunar.ephemeris import ephemeris_from_states
+from lunar.frames import IauOrientation
+from lunar.oem import save_oem
+from lunar.stk import save_stk
+from lunar.timescales import NS, parse_utc
+
+START = parse_utc("2029-08-07T00:00:00")
+
+
+@pytest.fixture(autouse=True)
+def no_data(monkeypatch, tmp_path):
+    """These commands must work on a machine without the data products."""
+    monkeypatch.delenv("LINNA_DATA", raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "nothing"))
+
+
+def orbit(hours=48.0, step_s=60.0, radius_m=1_768_180.0):
+    pole = IauOrientation().mcmf_from_icrf(9.34e8)[2]
+    node = np.cross([0.0, 0.0, 1.0], pole) / np.linalg.norm(np.cross([0.0, 0.0, 1.0], pole))
+    elapsed = np.arange(0.0, hours * 3600.0 + 1.0, step_s)
+    angle = (elapsed * 2 * np.pi / 6672.0)[:, None]
+    position = radius_m * (np.cos(angle) * node + np.sin(angle) * pole)
+    velocity = radius_m * 2 * np.pi / 6672.0 * (np.cos(angle) * pole - np.sin(angle) * node)
+    return ephemeris_from_states(START + np.rint(elapsed * NS).astype(np.int64), position, velocity)
+
+
+@pytest.fixture
+def oem_path(tmp_path):
+    path = tmp_path / "orbit.oem"
+    save_oem(orbit(), path)
+    return path
+
+
+def run_json(capsys, *arguments):
+    assert cli.run([*map(str, arguments), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def error_line(capsys, *arguments):
+    assert cli.run([*map(str, arguments)]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    (line,) = [line for line in captured.err.strip().splitlines() if line.startswith("linna: error: ")]
+    return line
+
+
+def test_compare_tells_the_difference_of_an_oem_and_an_stk_file(oem_path, tmp_path, capsys):
+    other = tmp_path / "orbit.e"
+    save_stk(orbit(radius_m=1_768_190.0), other)
+    plot = tmp_path / "difference.png"
+    figures = run_json(capsys, "orbit", "compare", oem_path, other, "--plot", plot)
+    assert figures["samples"] == 48 * 60 + 1
+    assert figures["max_m"] == pytest.approx(10.0, abs=1e-5)
+    assert figures["rms_rtn_m"] == pytest.approx([10.0, 0.0, 0.0], abs=1e-5)
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    assert cli.run(["orbit", "compare", str(oem_path), str(other), "--step", "3600"]) == 0
+    assert capsys.readouterr().out.startswith("49 epochs from 2029-08-07T00:00:00.000Z")
+
+
+def test_interpolate_gives_states_at_the_epochs_of_a_file(oem_path, tmp_path, capsys):
+    epochs = tmp_path / "epochs.txt"
+    epochs.write_text("# two epochs\n2029-08-07T00:00:00Z\n\n2029-08-07T12:34:56.789123Z  # odd\n")
+    figures = run_json(capsys, "orbit", "interpolate", oem_path, "--epochs", epochs)
+    first, second = figures["states"]
+    assert set(first) == {
+        *("epoch", "position_km", "velocity_km_s", "latitude_deg", "longitude_deg", "altitude_km"),
+    }
+    assert second["epoch"] == "2029-08-07T12:34:56.789123000Z"
+    assert np.linalg.norm(second["position_km"]) == pytest.approx(1768.18, abs=1e-6)
+    assert first["altitude_km"] == pytest.approx(30.78, abs=1e-6)
+    assert abs(first["latitude_deg"]) < 0.1
+    assert cli.run(["orbit", "interpolate", str(oem_path), "--epochs", str(epochs)]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 3
+
+
+def test_interpolate_names_the_epoch_that_is_not_covered_and_the_line_that_is_no_epoch(
+    oem_path, tmp_path, capsys
+):
+    epochs = tmp_path / "epochs.txt"
+    epochs.write_text("2029-09-07T00:00:00Z\n")
+    line = error_line(capsys, "orbit", "interpolate", oem_path, "--epochs", epochs)
+    assert "found 2029-09-07T00:00:00.000Z; nothing is extrapolated" in line
+    epochs.write_text("2029-08-07T00:00:00Z\nnoon\n")
+    line = error_line(capsys, "orbit", "interpolate", oem_path, "--epochs", epochs)
+    assert "epochs.txt: line 2: expected a UTC epoch" in line and line.endswith("found 'noon'")
+    epochs.write_text("# none\n")
+    assert "at least one UTC epoch" in error_line(
+        capsys, "orbit", "interpolate", oem_path, "--epochs", epochs
+    )
+
+
+def test_stats_summarise_an_ephemeris_and_draw_it(oem_path, tmp_path, capsys):
+    plot = tmp_path / "altitude.svg"
+    figures = run_json(capsys, "orbit", "stats", oem_path, "--plot", plot)
+    assert figures["altitude_km"] == pytest.approx({"mean": 30.78, "min": 30.78, "max": 30.78}, abs=1e-6)
+    assert figures["period_min"] == pytest.approx(111.2, abs=0.01)
+    assert figures["orientation"] == "IAU WGCCRE 2009"
+    assert "<svg" in plot.read_text()
+
+
+@pytest.mark.parametrize("command", [("orbit", "stats"), ("orbit", "compare")])
+def test_a_file_cut_short_is_one_line(oem_path, tmp_path, capsys, command):
+    cut = tmp_path / "cut.oem"
+    cut.write_text(oem_path.read_text()[:2000])
+    files = [cut] if command[1] == "stats" else [cut, oem_path]
+    assert "cut.oem: line" in error_line(capsys, *command, *files)
+
+
+def test_a_plot_of_an_unknown_kind_is_one_line(oem_path, tmp_path, capsys):
+    line = error_line(capsys, "orbit", "stats", oem_path, "--plot", tmp_path / "altitude.bmp")
+    assert "expected a picture name ending in .png, .svg, .pdf" in line
+    assert not (tmp_path / "altitude.bmp").exists()
+
+
+def test_catalogue_stats_counts_the_classes_of_the_papers_density(tmp_path, capsys):
+    plot = tmp_path / "classes.pdf"
+    figures = run_json(capsys, "catalogue", "stats", "paper-density", "--plot", plot)
+    assert figures["class_counts"] == list(PAPER_CLASS_COUNTS)
+    assert figures["total"] == sum(PAPER_CLASS_COUNTS)
+    assert figures["source"].startswith("synthetic")
+    assert plot.read_bytes().startswith(b"%PDF")
+
+
+def test_catalogue_stats_of_a_faulty_file_is_one_line(tmp_path, capsys):
+    path = tmp_path / "faulty.csv"
+    path.write_text("lat,lon,diam\n1,2,three\n")
+    assert "faulty.csv: line 2, column diam: expected a number" in error_line(
+        capsys, "catalogue", "stats", path
+    )
+
+
+@pytest.mark.real_data
+def test_catalogue_stats_of_the_real_catalogue(data_path, capsys):
+    figures = run_json(capsys, "catalogue", "stats", data_path / "craters/lu1319381_ge2km.csv.gz")
+    assert figures["class_counts"] == [30_494, 6_677, 3_983]
+
+
+def test_the_fov_study_draws_its_curves_and_gives_the_keys(oem_path, tmp_path, capsys):
+    plot = tmp_path / "fov.png"
+    figures = run_json(
+        capsys, "camera", "fov-study", "--ephemeris", oem_path, "--catalogue", "paper-density", "--plot", plot
+    )
+    assert figures["fov_deg"] == list(range(10, 161, 10))
+    assert set(figures["probability_at_least"]) == {"1", "3", "5"}
+    assert all(len(values) == 16 for values in figures["probability_at_least"].values())
+    enough = [p > 0.9 for p in figures["probability_at_least"]["3"]]
+    assert figures["selected_fov_deg"] == figures["fov_deg"][enough.index(True)]
+    assert plot.stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        (("--fov-step", "0"), "--fov-step: expected"),
+        (("--threshold", "1.5"), "--threshold: expected"),
+        (("--needed", "0"), "--needed: expected"),
+        (("--step", "-1"), "--step: expected"),
+    ],
+)
+def test_the_fov_study_refuses_what_makes_no_sense(oem_path, capsys, option, message):
+    line = error_line(
+        capsys, "camera", "fov-study", "--ephemeris", oem_path, "--catalogue", "paper-density", *option
+    )
+    assert message in line
