@@ -19,6 +19,7 @@ ROLES = ("viewer", "operator", "admin")
 """Each may do what those before it may: look; plan, upload and command; manage users."""
 
 TOKEN_OCTETS = 32
+TOKEN_MINIMUM = 24
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
 
 
@@ -48,10 +49,7 @@ def add_user(ground: Ground, name: str, role: str, *, days_valid: float | None =
     Conflict
         If there is such a user already.
     """
-    if not _NAME.fullmatch(name):
-        raise InvalidInput("user", "name", "1 to 64 letters, digits and . _ @ -", repr(name)[:80])
-    if role not in ROLES:
-        raise InvalidInput("user", "role", ", ".join(ROLES), repr(role)[:80])
+    _check(name, role)
     now = utc_now_ns()
     with ground.database.writing() as connection:
         if repository.find(connection, repository.USERS, name=name) is not None:
@@ -73,6 +71,37 @@ def renew_token(ground: Ground, name: str, *, days_valid: float | None = None) -
         token = _add_token(connection, user["id"], now, days_valid)
         audit(connection, "local", "renew token", name, {})
     return token
+
+
+def ensure_user(ground: Ground, name: str, role: str, token: str) -> bool:
+    """See to it that a user exists with this role and token, as a deployment is set up; whether anything changed.
+
+    Raises
+    ------
+    InvalidInput
+        If the token is too short to be safe.
+    """
+    if len(token) < TOKEN_MINIMUM:
+        raise InvalidInput("token", "", f"{TOKEN_MINIMUM} characters or more", f"{len(token)}")
+    _check(name, role)
+    now = utc_now_ns()
+    hashed = hashlib.sha256(token.encode()).hexdigest()
+    with ground.database.writing() as connection:
+        user = repository.find(connection, repository.USERS, name=name)
+        if user is not None:
+            valid = repository.find(
+                connection, repository.TOKENS, user_id=user["id"], token_sha256=hashed, revoked_utc_ns=None
+            )
+            if valid is not None and user["role"] == role:
+                return False
+            repository.change(connection, repository.USERS, user["id"], role=role)
+            _revoke(connection, user["id"], now)
+            key = user["id"]
+        else:
+            key = repository.add(connection, repository.USERS, name=name, role=role, created_utc_ns=now)
+        _keep_token(connection, key, token, now, None)
+        audit(connection, "local", "ensure user", name, {"role": role})
+    return True
 
 
 def list_users(ground: Ground) -> list[dict[str, Any]]:
@@ -131,8 +160,20 @@ def audit(connection: Connection, actor: str, action: str, target: str, detail: 
     )
 
 
+def _check(name: str, role: str) -> None:
+    if not _NAME.fullmatch(name):
+        raise InvalidInput("user", "name", "1 to 64 letters, digits and . _ @ -", repr(name)[:80])
+    if role not in ROLES:
+        raise InvalidInput("user", "role", ", ".join(ROLES), repr(role)[:80])
+
+
 def _add_token(connection: Connection, user_id: int, now: int, days_valid: float | None) -> str:
     token = "linna_" + secrets.token_urlsafe(TOKEN_OCTETS)
+    _keep_token(connection, user_id, token, now, days_valid)
+    return token
+
+
+def _keep_token(connection: Connection, user_id: int, token: str, now: int, days_valid: float | None) -> None:
     repository.add(
         connection,
         repository.TOKENS,
@@ -141,7 +182,6 @@ def _add_token(connection: Connection, user_id: int, now: int, days_valid: float
         created_utc_ns=now,
         expires_utc_ns=None if days_valid is None else now + int(days_valid * 86_400e9),
     )
-    return token
 
 
 def _revoke(connection: Connection, user_id: int, now: int) -> None:

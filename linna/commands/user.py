@@ -21,9 +21,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
         action.add_argument(
             "--days", type=float, metavar="D", help="days that the token is valid (default: for good)"
         )
+    ensuring = actions.add_parser("ensure", help="see to it that a user exists with the token of a variable")
+    ensuring.add_argument("name")
+    ensuring.add_argument("--role", choices=("viewer", "operator", "admin"), required=True)
+    ensuring.add_argument(
+        "--token-variable", default="LINNA_ADMIN_TOKEN", metavar="NAME", help="default: LINNA_ADMIN_TOKEN"
+    )
+    ensuring.set_defaults(handler=ensure)
     listing = actions.add_parser("list", help="all users")
     listing.set_defaults(handler=list_all)
-    for action in (adding, renewing, listing):
+    for action in (adding, renewing, ensuring, listing):
         add_service_options(action)
         add_json_flag(action)
 
@@ -43,6 +50,22 @@ def renew(arguments: argparse.Namespace) -> int:
     with open_service(arguments) as ground:
         token = renew_token(ground, arguments.name, days_valid=arguments.days)
     emit(arguments, {"name": arguments.name, "token": token}, text=token)
+    return 0
+
+
+def ensure(arguments: argparse.Namespace) -> int:
+    import os
+
+    from ground_service.services.users import ensure_user
+    from linna.errors import UsageError
+
+    token = os.environ.get(arguments.token_variable, "")
+    if not token:
+        raise UsageError(f"{arguments.token_variable}: expected the token of {arguments.name}, found nothing")
+    with open_service(arguments) as ground:
+        changed = ensure_user(ground, arguments.name, arguments.role, token)
+    state = "set" if changed else "unchanged"
+    emit(arguments, {"name": arguments.name, "changed": changed}, text=f"{arguments.name}: {state}")
     return 0
 
 

@@ -1,0 +1,34 @@
+# The ground service and the command line; the same image serves, works and migrates.
+FROM python:3.11-slim AS build
+ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
+RUN python -m venv /opt/linna
+WORKDIR /src
+COPY requirements/runtime.txt requirements/postgres.txt requirements/
+RUN /opt/linna/bin/pip install -r requirements/runtime.txt -r requirements/postgres.txt
+COPY pyproject.toml README.md LICENSE ./
+COPY lunar lunar
+COPY tmtc tmtc
+COPY reports reports
+COPY payload_emulator payload_emulator
+COPY ground_service ground_service
+COPY linna linna
+COPY db db
+COPY scenarios scenarios
+RUN /opt/linna/bin/pip install --no-deps .
+
+FROM python:3.11-slim
+LABEL org.opencontainers.image.title="linna" org.opencontainers.image.licenses="Apache-2.0"
+RUN groupadd --gid 10001 linna && useradd --uid 10001 --gid linna --create-home linna \
+    && mkdir /var/lib/linna && chown linna:linna /var/lib/linna
+COPY --from=build /opt/linna /opt/linna
+ENV PATH=/opt/linna/bin:$PATH \
+    PYTHONUNBUFFERED=1 \
+    MPLBACKEND=Agg \
+    NUMBA_CACHE_DIR=/var/lib/linna/.numba \
+    LINNA_HOME=/var/lib/linna
+USER linna
+WORKDIR /var/lib/linna
+VOLUME /var/lib/linna
+EXPOSE 8042
+ENTRYPOINT ["linna"]
+CMD ["--help"]
