@@ -101,6 +101,7 @@ def load_payload(
     start, stop = reference.start_utc_ns, reference.stop_utc_ns
     flight_orientation = IauOrientation()
     position, velocity = reference.at(np.array([first_frame_utc_ns]))
+    start_state = _initial_state(scenario, first_frame_utc_ns, position[0], velocity[0])
     tables = FlightTables(
         anchor_ephemeris=_anchor_table(reference, orientation),
         catalogue=pack_catalogue_table(_catalogue_table(scenario, catalogue)),
@@ -108,9 +109,7 @@ def load_payload(
             GravityTable(field.name, field.gm_m3_s2, field.radius_m, field.c_bar, field.s_bar)
         ),
         orientation=_orientation_table(flight_orientation, start, stop),
-        initial_state=pack_initial_state(
-            _initial_state(scenario, first_frame_utc_ns, position[0], velocity[0])
-        ),
+        initial_state=pack_initial_state(start_state),
     )
     payload = Payload(
         detector, parameters, tables, model_hash=detector.model_hash, model_octets=len(model_octets)
@@ -125,8 +124,8 @@ def load_payload(
         },
         start_state={
             "utc": format_utc(first_frame_utc_ns, 9),
-            "position_icrf_m": position[0].tolist(),
-            "velocity_icrf_m_s": velocity[0].tolist(),
+            "position_icrf_m": start_state.position_icrf_m.tolist(),
+            "velocity_icrf_m_s": start_state.velocity_icrf_m_s.tolist(),
         },
         table_hashes={
             item.name: hashlib.sha256(getattr(tables, item.name)).hexdigest() for item in fields(tables)
