@@ -17,7 +17,7 @@ CLOSE_TEXELS = 0.04
 """A clearance that ends the search for a hit: a hundredth of a pixel at the corners of a 120 degree picture."""
 
 
-@njit(fastmath=True, error_model="numpy")
+@njit(fastmath=True, error_model="numpy", nogil=True)
 def fill_grid(
     heights: Any,
     node_row: Any,
@@ -70,8 +70,9 @@ def fill_grid(
                     fr = r - np.float32(a)
                     fc = c - np.float32(b)
                     slot = table[a >> shift, b >> shift]
-                    a &= mask
-                    b &= mask
+                    # A tile's own pixels start at (1, 1).
+                    a = (a & mask) + 1
+                    b = (b & mask) + 1
                     top = pool[slot, a, b] + fc * (pool[slot, a, b + 1] - pool[slot, a, b])
                     low = pool[slot, a + 1, b] + fc * (pool[slot, a + 1, b + 1] - pool[slot, a + 1, b])
                     ground[j] = top + fr * (low - top)
@@ -90,7 +91,7 @@ def fill_grid(
             heights[i, j] = h - drop
 
 
-@njit(fastmath=True, error_model="numpy")
+@njit(fastmath=True, error_model="numpy", nogil=True)
 def sweep_shadows(
     heights: Any, shadow: Any, distance: Any, texel: Any, tangent: Any, penumbra: Any, depth: Any
 ) -> Any:
@@ -117,7 +118,7 @@ def sweep_shadows(
             distance[j] = zero if free else away
 
 
-@njit(fastmath=True, error_model="numpy")
+@njit(fastmath=True, error_model="numpy", nogil=True)
 def block_peaks(heights: Any) -> Any:
     """Highest z of every block of 8 x 8 grid cells (their borders included)."""
     rows, columns = heights.shape
@@ -140,40 +141,6 @@ def block_peaks(heights: Any) -> Any:
     return peaks
 
 
-@njit(fastmath=True, error_model="numpy")
-def fill_albedo(
-    out: Any, step: Any, node_row: Any, node_column: Any, pool: Any, table: Any, shift: Any, pixel_step: Any
-) -> Any:
-    """Fill ``out`` with the albedo at every ``step``-th grid point.
-
-    An albedo pixel spans ``pixel_step`` height pixels.
-    """
-    mask = (1 << shift) - 1
-    scale = 1.0 / pixel_step
-    for i in range(out.shape[0]):
-        ni = min(i * step // NODE_STEP, node_row.shape[0] - 2)
-        fi = (i * step - ni * NODE_STEP) / NODE_STEP
-        for j in range(out.shape[1]):
-            nj = min(j * step // NODE_STEP, node_row.shape[1] - 2)
-            fj = (j * step - nj * NODE_STEP) / NODE_STEP
-            top = node_row[ni, nj] + fj * (node_row[ni, nj + 1] - node_row[ni, nj])
-            low = node_row[ni + 1, nj] + fj * (node_row[ni + 1, nj + 1] - node_row[ni + 1, nj])
-            r = (top + fi * (low - top)) * scale
-            top = node_column[ni, nj] + fj * (node_column[ni, nj + 1] - node_column[ni, nj])
-            low = node_column[ni + 1, nj] + fj * (node_column[ni + 1, nj + 1] - node_column[ni + 1, nj])
-            c = (top + fi * (low - top)) * scale
-            a = int(r)
-            b = int(c)
-            slot = table[a >> shift, b >> shift]
-            fr = r - a
-            fc = c - b
-            a &= mask
-            b &= mask
-            top = pool[slot, a, b] + fc * (pool[slot, a, b + 1] - pool[slot, a, b])
-            low = pool[slot, a + 1, b] + fc * (pool[slot, a + 1, b + 1] - pool[slot, a + 1, b])
-            out[i, j] = top + fr * (low - top)
-
-
 @njit(fastmath=True, error_model="numpy", inline="always")
 def _clearance(heights: Any, i: Any, j: Any, z: Any) -> Any:
     """How far a point lies above the ground, bilinear."""
@@ -187,7 +154,7 @@ def _clearance(heights: Any, i: Any, j: Any, z: Any) -> Any:
     return z - (top + fi * (low - top))
 
 
-@njit(fastmath=True, error_model="numpy")
+@njit(fastmath=True, error_model="numpy", nogil=True)
 def find_hit(
     heights: Any, peaks: Any, i0: Any, j0: Any, z0: Any, di: Any, dj: Any, dz: Any, start: Any, stop: Any
 ) -> Any:
@@ -253,7 +220,7 @@ def find_hit(
     return -1.0
 
 
-@njit(fastmath=True, error_model="numpy")
+@njit(fastmath=True, error_model="numpy", nogil=True)
 def trace_pixels(
     heights: Any,
     peaks: Any,
@@ -411,7 +378,7 @@ def trace_pixels(
                 inner[k] = t * np.float32(math.sqrt(di * di + dj * dj)) if t > zero else zero
 
 
-@njit(fastmath=True, error_model="numpy")
+@njit(fastmath=True, error_model="numpy", nogil=True)
 def _search(
     heights: Any,
     peaks: Any,
@@ -449,13 +416,13 @@ def _search(
     return t if t > 0.0 else -1.0
 
 
-@njit(fastmath=True, error_model="numpy")
+@njit(fastmath=True, error_model="numpy", nogil=True)
 def shade_pixels(
-    heights: Any,
     depth: Any,
     x0: Any,
     y0: Any,
     texel: Any,
+    altitude: Any,
     tangent_from_camera: Any,
     focal: Any,
     centre_u: Any,
@@ -464,7 +431,14 @@ def shade_pixels(
     sun_flat: Any,
     law: Any,
     hapke: Any,
+    node_row: Any,
+    node_column: Any,
+    slope_row: Any,
+    slope_column: Any,
+    pool: Any,
     albedo: Any,
+    table: Any,
+    shift: Any,
     albedo_step: Any,
     mean_albedo: Any,
     contrast: Any,
@@ -474,7 +448,8 @@ def shade_pixels(
 ) -> Any:
     """Fill the pictures from ``range_m``, which comes as the depth along the boresight.
 
-    The Sun stands at -x: its vector is (-sun_flat, 0, sun_up).
+    The Sun stands at -x: its vector is (-sun_flat, 0, sun_up).  Slopes come from the terrain's own pixels: the tangent
+    grid would blur them once more.
     """
     inverse = 1.0 / texel
     i0 = -x0 * inverse
@@ -486,10 +461,16 @@ def shade_pixels(
     next_two = np.uint64(2)
     up = np.float32(sun_up)
     flat = np.float32(sun_flat)
-    half_inverse = np.float32(0.5 * inverse)
     many = np.float32(law.shape[1] - 2)
     gamma = np.float32(math.sqrt(1.0 - 0.21))
-    albedo_scale = 1.0 / albedo_step
+    mask = np.uint64((1 << shift) - 1)
+    tile_shift = np.uint64(shift)
+    albedo_mask = np.uint64((1 << (shift - albedo_step)) - 1)
+    albedo_scale = np.float32(1.0 / (1 << albedo_step))
+    share = 1.0 / NODE_STEP
+    per_texel = np.float32(inverse / NODE_STEP)
+    last_ni = node_row.shape[0] - 2
+    last_nj = node_row.shape[1] - 2
     for v in range(radiance.shape[0]):
         b = (v - centre_v) / focal
         for u in range(radiance.shape[1]):
@@ -503,8 +484,11 @@ def shade_pixels(
             dx = tangent_from_camera[0, 0] * a + tangent_from_camera[0, 1] * b + tangent_from_camera[0, 2]
             dy = tangent_from_camera[1, 0] * a + tangent_from_camera[1, 1] * b + tangent_from_camera[1, 2]
             dz = tangent_from_camera[2, 0] * a + tangent_from_camera[2, 1] * b + tangent_from_camera[2, 2]
-            i = i0 + t * dx * inverse
-            j = j0 + t * dy * inverse
+            x = t * dx
+            y = t * dy
+            z = altitude + t * dz
+            i = i0 + x * inverse
+            j = j0 + y * inverse
             length = np.float32(math.sqrt(a * a + b * b + 1.0))
             range_m[v, u] = np.float32(t) * length
             p = np.uint64(i)
@@ -513,34 +497,87 @@ def shade_pixels(
             fj = np.float32(j - q)
             p1 = p + next_one
             q1 = q + next_one
+            top = depth[p, q] + fj * (depth[p, q1] - depth[p, q])
+            low = depth[p1, q] + fj * (depth[p1, q1] - depth[p1, q])
+            rise = top + fi * (low - top)
+            if rise <= -one:
+                lit[v, u] = zero
+                radiance[v, u] = zero
+                continue
+            # Place on the terrain's grid and how it changes along x and y.
+            ni = np.uint64(min(int(i) // NODE_STEP, last_ni))
+            nj = np.uint64(min(int(j) // NODE_STEP, last_nj))
+            ni1 = ni + next_one
+            nj1 = nj + next_one
+            ti = np.float32(i * share - ni)
+            tj = np.float32(j * share - nj)
+            base = math.sqrt(x * x + y * y + (MOON_RADIUS_M + z) * (MOON_RADIUS_M + z))
+            h = np.float32(base - MOON_RADIUS_M)
+            r00 = node_row[ni, nj] + h * slope_row[ni, nj]
+            r01 = node_row[ni, nj1] + h * slope_row[ni, nj1]
+            r10 = node_row[ni1, nj] + h * slope_row[ni1, nj]
+            r11 = node_row[ni1, nj1] + h * slope_row[ni1, nj1]
+            c00 = node_column[ni, nj] + h * slope_column[ni, nj]
+            c01 = node_column[ni, nj1] + h * slope_column[ni, nj1]
+            c10 = node_column[ni1, nj] + h * slope_column[ni1, nj]
+            c11 = node_column[ni1, nj1] + h * slope_column[ni1, nj1]
+            ra = r00 + tj * (r01 - r00)
+            rb = r10 + tj * (r11 - r10)
+            ca = c00 + tj * (c01 - c00)
+            cb = c10 + tj * (c11 - c10)
+            r = ra + ti * (rb - ra)
+            c = ca + ti * (cb - ca)
+            rx = (rb - ra) * per_texel
+            cx = (cb - ca) * per_texel
+            ry = (r01 - r00 + ti * (r11 - r10 - r01 + r00)) * per_texel
+            cy = (c01 - c00 + ti * (c11 - c10 - c01 + c00)) * per_texel
+            p = np.uint64(r)
+            q = np.uint64(c)
+            fi = r - np.float32(p)
+            fj = c - np.float32(q)
+            slot = table[p >> tile_shift, q >> tile_shift]
+            tile = pool[slot]
+            p = p & mask
+            q = q & mask
+            p1 = p + next_one
+            q1 = q + next_one
+            p2 = p + next_two
+            q2 = q + next_two
+            p3 = p2 + next_one
+            q3 = q2 + next_one
+            h11 = tile[p1, q1]
+            h12 = tile[p1, q2]
+            h21 = tile[p2, q1]
+            h22 = tile[p2, q2]
             w11 = fi * fj
             w01 = fj - w11
             w10 = fi - w11
             w00 = one - fi - w01
-            rise = w00 * depth[p, q] + w01 * depth[p, q1] + w10 * depth[p1, q] + w11 * depth[p1, q1]
-            h00 = heights[p, q]
-            h01 = heights[p, q1]
-            h10 = heights[p1, q]
-            h11 = heights[p1, q1]
-            p0 = p - next_one
-            q0 = q - next_one
-            p2 = p + next_two
-            q2 = q + next_two
-            gx = half_inverse * (
-                w00 * (h10 - heights[p0, q])
-                + w01 * (h11 - heights[p0, q1])
-                + w10 * (heights[p2, q] - h00)
-                + w11 * (heights[p2, q1] - h01)
+            along_row = half * (
+                w00 * (h21 - tile[p, q1])
+                + w01 * (h22 - tile[p, q2])
+                + w10 * (tile[p3, q1] - h11)
+                + w11 * (tile[p3, q2] - h12)
             )
-            gy = half_inverse * (
-                w00 * (h01 - heights[p, q0])
-                + w01 * (heights[p, q2] - h00)
-                + w10 * (h11 - heights[p1, q0])
-                + w11 * (heights[p1, q2] - h10)
+            along_column = half * (
+                w00 * (h12 - tile[p1, q])
+                + w01 * (tile[p1, q3] - h11)
+                + w10 * (h22 - tile[p2, q])
+                + w11 * (tile[p2, q3] - h21)
             )
+            gx = along_row * rx + along_column * cx
+            gy = along_row * ry + along_column * cy
+            # The nodes hold places at fixed height; the ground's own rise moves the place a little.
+            sx = np.float32(x)
+            sy = np.float32(y)
+            inverse_base = np.float32(1.0 / base)
+            lean = one / (one + (gx * sx + gy * sy) * inverse_base)
+            steep = np.float32(1.0 / (MOON_RADIUS_M + z))
+            gx = (np.float32(base) * gx * lean - sx) * steep
+            gy = (np.float32(base) * gy * lean - sy) * steep
             norm = one / np.float32(math.sqrt(gx * gx + gy * gy + one))
             mu0 = (gx * flat + up) * norm
-            if rise <= -one or mu0 <= zero:
+            if mu0 <= zero:
                 lit[v, u] = zero
                 radiance[v, u] = zero
                 continue
@@ -563,21 +600,26 @@ def shade_pixels(
                 h0 = (one + np.float32(2.0) * mu0) / (one + np.float32(2.0) * mu0 * gamma)
                 h1 = (one + np.float32(2.0) * mu) / (one + np.float32(2.0) * mu * gamma)
                 value += law[2, k] * h0 * h1 * both
-            i *= albedo_scale
-            j *= albedo_scale
-            p = np.uint64(i)
-            q = np.uint64(j)
-            fi = np.float32(i - p)
-            fj = np.float32(j - q)
-            a0 = albedo[p, q] + fj * (albedo[p, q + next_one] - albedo[p, q])
-            a1 = albedo[p + next_one, q] + fj * (albedo[p + next_one, q + next_one] - albedo[p + next_one, q])
+            r *= albedo_scale
+            c *= albedo_scale
+            p = np.uint64(r)
+            q = np.uint64(c)
+            fi = r - np.float32(p)
+            fj = c - np.float32(q)
+            p = p & albedo_mask
+            q = q & albedo_mask
+            p1 = p + next_one
+            q1 = q + next_one
+            paint = albedo[slot]
+            a0 = paint[p, q] + fj * (paint[p, q1] - paint[p, q])
+            a1 = paint[p1, q] + fj * (paint[p1, q1] - paint[p1, q])
             shade = np.float32(mean_albedo) + np.float32(contrast) * (
                 a0 + fi * (a1 - a0) - np.float32(mean_albedo)
             )
             radiance[v, u] = shade * value * sun
 
 
-@njit(fastmath=True, error_model="numpy")
+@njit(fastmath=True, error_model="numpy", nogil=True)
 def read_out(
     signal: Any,
     noise: Any,

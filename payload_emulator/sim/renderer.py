@@ -36,7 +36,7 @@ NODE_STEP = 32
 """Latitude and longitude are exact at every 32nd grid point and bilinear between: about 2 m off at most."""
 
 TEXEL_PER_PIXEL = 0.8
-ALBEDO_TEXELS = 4
+SMALLEST_TEXEL_M = 60.0
 COARSE_TEXELS = 4
 """Texel of the grid toward the Sun that only casts, in texels of the picture's."""
 
@@ -103,8 +103,6 @@ def render(
     TerrainError
         The camera is in the ground, sees no ground, or sees ground the terrain does not hold.
     """
-    from payload_emulator.sim import kernels
-
     photometry = photometry or Photometry()
     view = tangent_view(position_mcmf_m, camera_from_mcmf, sun_direction_mcmf)
     ground_m = float(terrain.height_m(*_below(position_mcmf_m)))
@@ -113,10 +111,24 @@ def render(
             f"render: expected a camera above the ground, found it {view.altitude_m - ground_m:.0f} m above terrain "
             f"of {ground_m:.0f} m"
         )
-    grid = _fit_grid(terrain, camera, view)
+    level = terrain.level_for((view.altitude_m - ground_m) / camera.focal_px)
+    likely, surely = _fit_grid(terrain, camera, view, level)
+    rendering = _render_grid(terrain, camera, view, likely, level, photometry)
+    if np.isnan(rendering.range_m).any():
+        # Ground deeper than what the border showed, or sky: look at everything that could be there.
+        rendering = _render_grid(terrain, camera, view, surely, level, photometry)
+    return rendering
+
+
+def _render_grid(
+    terrain: Terrain, camera: PinholeCamera, view: View, grid: TangentGrid, level: int, photometry: Photometry
+) -> Rendering:
+    from payload_emulator.sim import kernels
+
     sunward = _sunward_grid(grid, view)
     # One patch for both grids: a second call could evict tiles of the first.
-    patch = terrain.patch(*_outline(view, grid) if sunward is None else _outline(view, grid, sunward))
+    grids = (grid,) if sunward is None else (grid, sunward)
+    patch = terrain.patch(*_outline(view, *grids), level)
     nodes = _grid_nodes(grid, view, patch)
     heights = _heights(grid, nodes, patch)
     shadow = np.full(grid.columns, NO_SHADOW_M, np.float32)
@@ -132,19 +144,6 @@ def render(
         math.tan(view.sun_elevation_rad),
         _penumbra(view.sun_elevation_rad),
         lit,
-    )
-    albedo = np.empty(
-        ((grid.rows - 1) // ALBEDO_TEXELS + 1, (grid.columns - 1) // ALBEDO_TEXELS + 1), np.float32
-    )
-    kernels.fill_albedo(
-        albedo,
-        ALBEDO_TEXELS,
-        nodes[0],
-        nodes[1],
-        patch.albedo,
-        patch.table,
-        ALBEDO_SHIFT,
-        1 << (TILE_SHIFT - ALBEDO_SHIFT),
     )
     shape = (camera.height_px, camera.width_px)
     radiance, mask, range_m = (
@@ -166,19 +165,23 @@ def render(
         range_m,
     )
     kernels.shade_pixels(
-        heights,
         lit,
         grid.x0_m,
         grid.y0_m,
         grid.texel_m,
+        view.altitude_m,
         eye,
         *lens,
         math.sin(view.sun_elevation_rad),
         math.cos(view.sun_elevation_rad),
         photometry.tables(),
         photometry.law == "hapke",
-        albedo,
-        float(ALBEDO_TEXELS),
+        *nodes,
+        patch.heights,
+        patch.albedo,
+        patch.table,
+        TILE_SHIFT,
+        TILE_SHIFT - ALBEDO_SHIFT,
         MEAN_ALBEDO,
         photometry.albedo_contrast,
         radiance,
@@ -238,47 +241,69 @@ def _penumbra(elevation_rad: float) -> float:
     return 0.5 * (high - math.tan(min(elevation_rad, 1.5) - SUN_ANGULAR_RADIUS_RAD))
 
 
-def _fit_grid(terrain: Terrain, camera: PinholeCamera, view: View) -> TangentGrid:
-    """The smallest Sun-turned rectangle that holds all ground in the picture, whatever its height."""
+def _fit_grid(
+    terrain: Terrain, camera: PinholeCamera, view: View, level: int
+) -> tuple[TangentGrid, TangentGrid]:
+    """The rectangle that holds the ground in the picture as far as its border shows, and one that holds it surely."""
     low, high = -500.0, 500.0
-    texel = 100.0
+    rays = _border_rays(camera, view)
     for _ in range(4):
-        grid = _rectangle(camera, view, low, high, texel, terrain.pixel_m)
-        patch = terrain.patch(*_outline(view, grid))
+        # Rays that pass the limb end where they are closest to the Moon: the horizon.
+        reach = [_reach(rays, view.altitude_m, bound) for bound in (low, min(high, view.altitude_m - 1.0))]
+        hits = np.concatenate([np.zeros((1, 2)), *(rays[:, :2] * r[:, None] for r in reach)])
+        ground = view.altitude_m - 0.5 * (low + high)
+        surely = _rectangle(hits, camera, ground, 3.0)
+        patch = terrain.patch(*_outline(view, surely), level)
         if patch.low_m >= low and patch.high_m <= high:
             break
         low, high = min(low, patch.low_m), max(high, patch.high_m)
-    return grid
+    hits = np.concatenate([np.zeros((1, 2)), *_border_hits(rays, view, patch)])
+    return _rectangle(hits, camera, ground, 10.0), surely
 
 
-def _rectangle(
-    camera: PinholeCamera, view: View, low_m: float, high_m: float, texel_m: float, pixel_m: float
-) -> TangentGrid:
-    width, height = camera.width_px, camera.height_px
-    u = np.linspace(-0.5, width - 0.5, 17)
-    v = np.linspace(-0.5, height - 0.5, 17)
+def _border_rays(camera: PinholeCamera, view: View) -> Floats:
+    """Unit directions (n, 3) in the tangent frame along the border of the picture."""
+    u = np.linspace(-0.5, camera.width_px - 0.5, 33)
+    v = np.linspace(-0.5, camera.height_px - 0.5, 33)
     edge = np.concatenate(
         [
-            np.stack([u, np.full(17, -0.5)], axis=-1),
-            np.stack([u, np.full(17, height - 0.5)], axis=-1),
-            np.stack([np.full(17, -0.5), v], axis=-1),
-            np.stack([np.full(17, width - 0.5), v], axis=-1),
+            np.stack([u, np.full(33, -0.5)], axis=-1),
+            np.stack([u, np.full(33, camera.height_px - 0.5)], axis=-1),
+            np.stack([np.full(33, -0.5), v], axis=-1),
+            np.stack([np.full(33, camera.width_px - 0.5), v], axis=-1),
         ]
     )
-    rays = camera.rays(edge) @ view.tangent_from_camera.T
-    points = [np.zeros((1, 2))]
-    for level in (low_m, min(high_m, view.altitude_m - 1.0)):
-        radius = MOON_RADIUS_M + level
-        above = view.altitude_m - level
-        descent = -rays[:, 2] * (MOON_RADIUS_M + view.altitude_m)
-        # Rays that pass the limb end where they are closest to the Moon: the horizon.
-        root = np.sqrt(np.maximum(descent**2 - above * (above + 2.0 * radius), 0.0))
-        reach = np.maximum(descent - root, 0.0)
-        points.append(rays[:, :2] * reach[:, None])
-    hits = np.concatenate(points)
-    ground = max(view.altitude_m - 0.5 * (low_m + high_m), 100.0)
-    texel = max(TEXEL_PER_PIXEL * ground / camera.focal_px, 0.7 * pixel_m)
-    spare = 3.0 * texel
+    return np.asarray(camera.rays(edge) @ view.tangent_from_camera.T)
+
+
+def _reach(rays: Floats, altitude_m: float, height_m: npt.ArrayLike) -> Floats:
+    """Range along rays to the sphere at a height; to the point closest to it for rays that miss."""
+    radius = MOON_RADIUS_M + np.asarray(height_m, dtype=np.float64)
+    above = altitude_m - np.asarray(height_m, dtype=np.float64)
+    descent = -rays[:, 2] * (MOON_RADIUS_M + altitude_m)
+    root = np.sqrt(np.maximum(descent**2 - above * (above + 2.0 * radius), 0.0))
+    return np.asarray(np.maximum(descent - root, 0.0))
+
+
+def _border_hits(rays: Floats, view: View, patch: TerrainPatch) -> list[Floats]:
+    """Where the rays meet the ground, (n, 2) per round of a fixed-point search, the settled rounds only."""
+    from payload_emulator.sim.terrain import kernels
+
+    height = np.zeros(rays.shape[0])
+    hits = []
+    for number in range(7):
+        reach = _reach(rays, view.altitude_m, np.minimum(height, view.altitude_m - 1.0))
+        place = rays[:, :2] * reach[:, None]
+        if number >= 4:
+            hits.append(place)
+        rows, columns = patch.coordinates(*places_of_tangent(view, place[:, 0], place[:, 1], height))
+        kernels.sample_pool(patch.heights, patch.table, TILE_SHIFT, rows, columns, height)
+    return hits
+
+
+def _rectangle(hits: Floats, camera: PinholeCamera, ground_m: float, spare_texels: float) -> TangentGrid:
+    texel = max(TEXEL_PER_PIXEL * ground_m / camera.focal_px, SMALLEST_TEXEL_M)
+    spare = spare_texels * texel
     (x_low, y_low), (x_high, y_high) = hits.min(axis=0) - spare, hits.max(axis=0) + spare
     rows = _whole_nodes((x_high - x_low) / texel)
     columns = _whole_nodes((y_high - y_low) / texel)

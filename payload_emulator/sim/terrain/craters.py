@@ -70,6 +70,11 @@ class CraterShapes:
             self.wobble[indices],
         )
 
+    def above(self, radius_rad: float) -> CraterShapes:
+        """The craters larger than this."""
+        large = self.radius_rad > radius_rad
+        return self if large.all() else self.select(np.flatnonzero(large))
+
 
 def crater_profiles() -> npt.NDArray[np.float32]:
     """Radial profiles of unit depth (rim to mean inner floor), (40, 258), sampled from the centre to 2.6 radii."""

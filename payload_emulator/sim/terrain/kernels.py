@@ -20,7 +20,7 @@ LATTICE_SHIFT = 32768.37
 """Keeps lattice coordinates positive down to waves of 53 m, and the planes of the lattice off the axes."""
 
 
-@njit(fastmath=True, error_model="numpy")
+@njit(fastmath=True, error_model="numpy", nogil=True)
 def add_noise(
     out: Any,
     cos_lat: Any,
@@ -90,7 +90,7 @@ def _corner(h: Any, dx: Any, dy: Any, dz: Any) -> Any:
     return k * (gx * dx + gy * dy + gz * dz)
 
 
-@njit(fastmath=True, error_model="numpy")
+@njit(fastmath=True, error_model="numpy", nogil=True)
 def resample_cubic(
     source: Any, first_row: Any, row_step: Any, first_column: Any, column_step: Any, out: Any
 ) -> Any:
@@ -124,7 +124,7 @@ def resample_cubic(
             out[i, j] = w0 * line[m - 1] + w1 * line[m] + w2 * line[m + 1] + w3 * line[m + 2]
 
 
-@njit(fastmath=True, error_model="numpy")
+@njit(fastmath=True, error_model="numpy", nogil=True)
 def stamp_craters(
     out: Any,
     latitude_rad: Any,
@@ -204,7 +204,7 @@ def stamp_craters(
                     out[i, j] += depth * (row[k] + f * (row[k + 1] - row[k]))
 
 
-@njit(fastmath=True, error_model="numpy")
+@njit(fastmath=True, error_model="numpy", nogil=True)
 def sample_pool(pool: Any, table: Any, shift: Any, rows: Any, columns: Any, out: Any) -> Any:
     """Fill ``out`` (n) with bilinear values at pool rows and columns (pixel coordinates within the patch)."""
     mask = (1 << shift) - 1
@@ -216,8 +216,9 @@ def sample_pool(pool: Any, table: Any, shift: Any, rows: Any, columns: Any, out:
         fr = r - i
         fc = c - j
         slot = table[i >> shift, j >> shift]
-        i &= mask
-        j &= mask
+        # A tile's own pixels start at (1, 1).
+        i = (i & mask) + 1
+        j = (j & mask) + 1
         top = pool[slot, i, j] + fc * (pool[slot, i, j + 1] - pool[slot, i, j])
         low = pool[slot, i + 1, j] + fc * (pool[slot, i + 1, j + 1] - pool[slot, i + 1, j])
         out[n] = top + fr * (low - top)

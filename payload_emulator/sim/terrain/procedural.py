@@ -21,31 +21,37 @@ from payload_emulator.sim.terrain.craters import (
     shape_craters,
 )
 from payload_emulator.sim.terrain.tiles import (
-    ALBEDO_SHIFT,
     MEAN_ALBEDO,
-    TILE_PIXELS,
     Floats,
     Heights,
     TiledTerrain,
-    tile_angles,
+    coarse_nodes,
 )
 
 COARSE_STEP = 8
 """Long waves are computed at every eighth pixel and resampled."""
 
-LONG_WAVES_KM = (
+WAVES_KM = (
     (1600.0, 900.0),
     (800.0, 600.0),
     (400.0, 420.0),
     (200.0, 260.0),
     (100.0, 170.0),
     (50.0, 105.0),
-    (25.0, 62.0),
-    (12.0, 36.0),
-    (6.5, 22.0),
+    (25.0, 66.0),
+    (12.0, 42.0),
+    (6.5, 27.0),
+    (3.1, 17.0),
+    (1.5, 10.0),
+    (0.7, 5.4),
+    (0.33, 2.6),
 )
-SHORT_WAVES_KM = ((3.1, 11.5), (1.5, 6.3), (0.7, 3.2), (0.33, 1.6))
 """Wavelength in km and rms in m of every octave of the uplands."""
+
+COARSE_WAVE_PIXELS = 48.0
+SHORTEST_WAVE_PIXELS = 3.0
+SMALLEST_CRATER_PIXELS = 3.2
+"""Longer waves are computed on every eighth pixel; shorter waves and smaller craters than these are left out."""
 
 PLAIN_SHARE = 0.22
 PLAIN_DROP_M = 1500.0
@@ -107,47 +113,47 @@ class ProceduralTerrain(TiledTerrain):
         )
         return np.asarray(np.abs(latitude) < math.radians(83.0))
 
-    def make_heights(self, tile_row: int, tile_column: int) -> Heights:
-        """One tile of heights (513, 513) in metres."""
-        latitude, longitude = tile_angles(tile_row, tile_column, self.pixels_per_degree)
-        size = TILE_PIXELS + 1
-        nodes = TILE_PIXELS // COARSE_STEP + 4
-        index = (np.arange(nodes) - 1) * COARSE_STEP
-        step = 1.0 / self.pixels_per_degree
-        node_latitude = latitude[0] - np.radians(index * step)
-        node_longitude = longitude[0] + np.radians(index * step)
+    def make_heights(self, latitude_rad: Floats, longitude_rad: Floats) -> Heights:
+        """Heights on an even grid of places (rows, columns) in metres."""
+        step = float(latitude_rad[0] - latitude_rad[1])
+        pixel_km = step * MOON_RADIUS_M / 1000.0
+        node_latitude, node_longitude, top, left = coarse_nodes(latitude_rad, longitude_rad, COARSE_STEP, 1)
         plain = self._plain(node_latitude, node_longitude)
         roughness = (1.0 - (1.0 - PLAIN_ROUGHNESS) * plain).astype(np.float32)
         coarse = (-PLAIN_DROP_M * plain).astype(np.float32)
         even = np.ones_like(coarse)
+        waves = [(km, rms, salt) for (km, rms), salt in zip(WAVES_KM, self._salts, strict=False)]
+        long = [wave for wave in waves if wave[0] > COARSE_WAVE_PIXELS * pixel_km]
+        short = [wave for wave in waves[len(long) :] if wave[0] > SHORTEST_WAVE_PIXELS * pixel_km]
         angles = (
             np.cos(node_latitude),
             np.sin(node_latitude),
             np.cos(node_longitude),
             np.sin(node_longitude),
         )
-        for n, (wavelength, rms) in enumerate(LONG_WAVES_KM):
+        for wavelength, rms, salt in long:
             gain = even if wavelength > 300.0 else roughness
-            kernels.add_noise(coarse, *angles, MOON_RADIUS_M / 1000.0 / wavelength, rms, self._salts[n], gain)
-        out = np.empty((size, size), np.float32)
-        kernels.resample_cubic(coarse, 1.0, 1.0 / COARSE_STEP, 1.0, 1.0 / COARSE_STEP, out)
-        gain = np.empty((size, size), np.float32)
-        kernels.resample_cubic(roughness, 1.0, 1.0 / COARSE_STEP, 1.0, 1.0 / COARSE_STEP, gain)
-        angles = (np.cos(latitude), np.sin(latitude), np.cos(longitude), np.sin(longitude))
-        for n, (wavelength, rms) in enumerate(SHORT_WAVES_KM):
-            frequency = MOON_RADIUS_M / 1000.0 / wavelength
-            kernels.add_noise(out, *angles, frequency, rms, self._salts[20 + n], gain)
-        stamp(out, latitude, longitude, self._craters_about(latitude, longitude), self._profiles)
-        stamp(out, latitude, longitude, self._small.around(latitude, longitude), self._profiles)
+            kernels.add_noise(coarse, *angles, MOON_RADIUS_M / 1000.0 / wavelength, rms, salt, gain)
+        out = np.empty((latitude_rad.size, longitude_rad.size), np.float32)
+        gain = np.empty_like(out)
+        for source, target in ((coarse, out), (roughness, gain)):
+            kernels.resample_cubic(source, top, 1.0 / COARSE_STEP, left, 1.0 / COARSE_STEP, target)
+        angles = (np.cos(latitude_rad), np.sin(latitude_rad), np.cos(longitude_rad), np.sin(longitude_rad))
+        for wavelength, rms, salt in short:
+            kernels.add_noise(out, *angles, MOON_RADIUS_M / 1000.0 / wavelength, rms, salt, gain)
+        stamp(
+            out, latitude_rad, longitude_rad, self._craters_about(latitude_rad, longitude_rad), self._profiles
+        )
+        small = self._small.around(latitude_rad, longitude_rad)
+        stamp(
+            out, latitude_rad, longitude_rad, small.above(SMALLEST_CRATER_PIXELS * 0.5 * step), self._profiles
+        )
         return out
 
-    def make_albedo(self, tile_row: int, tile_column: int) -> Heights:
-        """One tile of normal albedo (65, 65): dark plains, bright uplands, mottled."""
-        latitude, longitude = tile_angles(tile_row, tile_column, self.pixels_per_degree)
-        step = TILE_PIXELS >> ALBEDO_SHIFT
-        latitude, longitude = latitude[::step], longitude[::step]
-        plain = self._plain(latitude, longitude)
-        return mottled_albedo(1.12 - 0.5 * plain, latitude, longitude, self._salts[40:46])
+    def make_albedo(self, latitude_rad: Floats, longitude_rad: Floats) -> Heights:
+        """Normal albedo on a grid of places: dark plains, bright uplands, mottled."""
+        plain = self._plain(latitude_rad, longitude_rad)
+        return mottled_albedo(1.12 - 0.5 * plain, latitude_rad, longitude_rad, self._salts[40:46])
 
     def _plain(self, latitude: Floats, longitude: Floats) -> Floats:
         """How much of a plain (0..1) a grid of places is, (rows, columns), cubic in a half-degree map."""

@@ -22,14 +22,17 @@ from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import TerrainError
 from payload_emulator.sim.terrain import kernels
 from payload_emulator.sim.terrain.craters import SmallCraters, crater_profiles
-from payload_emulator.sim.terrain.procedural import mottled_albedo, stamp
+from payload_emulator.sim.terrain.procedural import (
+    SHORTEST_WAVE_PIXELS,
+    SMALLEST_CRATER_PIXELS,
+    mottled_albedo,
+    stamp,
+)
 from payload_emulator.sim.terrain.tiles import (
-    ALBEDO_SHIFT,
-    TILE_PIXELS,
     Floats,
     Heights,
     TiledTerrain,
-    tile_angles,
+    coarse_nodes,
 )
 
 SMOOTHING_PIXELS = 1.0
@@ -49,7 +52,7 @@ ROUGHNESS_WAVES_KM = ((1.7, 3.6), (0.85, 2.3), (0.42, 1.4), (0.26, 0.8))
 REFERENCE_SLOPE = 0.10
 """Rms slope of the smoothed raster over 1 km on which the roughness above is added as it stands."""
 
-SLOPE_STEP = 8
+SLOPE_SPACING_M = 950.0
 SMALL_LOW_M = 350.0
 SMALL_HIGH_M = 1_800.0
 SMALL_EXPONENT = 2.2
@@ -223,29 +226,31 @@ class RasterTerrain(TiledTerrain):
             held |= layer.holds(latitude, longitude)
         return held
 
-    def make_heights(self, tile_row: int, tile_column: int) -> Heights:
-        """One tile of heights (513, 513) in metres."""
-        latitude, longitude = tile_angles(tile_row, tile_column, self.pixels_per_degree)
-        out = self._resampled(latitude, longitude)
+    def make_heights(self, latitude_rad: Floats, longitude_rad: Floats) -> Heights:
+        """Heights on an even grid of places (rows, columns) in metres."""
+        out = self._resampled(latitude_rad, longitude_rad)
         if not self._sharpen:
             return out
-        gain = self._slope_gain(latitude, longitude)
-        angles = (np.cos(latitude), np.sin(latitude), np.cos(longitude), np.sin(longitude))
-        for n, (wavelength, rms) in enumerate(ROUGHNESS_WAVES_KM):
-            kernels.add_noise(out, *angles, MOON_RADIUS_M / 1000.0 / wavelength, rms, self._salts[n], gain)
-        stamp(out, latitude, longitude, self._small.around(latitude, longitude), self._profiles)
+        step = float(latitude_rad[0] - latitude_rad[1])
+        shortest = SHORTEST_WAVE_PIXELS * step * MOON_RADIUS_M / 1000.0
+        gain = self._slope_gain(latitude_rad, longitude_rad)
+        angles = (np.cos(latitude_rad), np.sin(latitude_rad), np.cos(longitude_rad), np.sin(longitude_rad))
+        for (wavelength, rms), salt in zip(ROUGHNESS_WAVES_KM, self._salts, strict=False):
+            if wavelength > shortest:
+                kernels.add_noise(out, *angles, MOON_RADIUS_M / 1000.0 / wavelength, rms, salt, gain)
+        small = self._small.around(latitude_rad, longitude_rad)
+        stamp(
+            out, latitude_rad, longitude_rad, small.above(SMALLEST_CRATER_PIXELS * 0.5 * step), self._profiles
+        )
         return out
 
-    def make_albedo(self, tile_row: int, tile_column: int) -> Heights:
-        """One tile of normal albedo (65, 65): the map where there is one, mottled."""
-        latitude, longitude = tile_angles(tile_row, tile_column, self.pixels_per_degree)
-        step = TILE_PIXELS >> ALBEDO_SHIFT
-        latitude, longitude = latitude[::step], longitude[::step]
+    def make_albedo(self, latitude_rad: Floats, longitude_rad: Floats) -> Heights:
+        """Normal albedo on a grid of places: the map where there is one, mottled."""
         if self._albedo_map is None:
-            base = np.ones((latitude.size, longitude.size))
+            base = np.ones((latitude_rad.size, longitude_rad.size))
         else:
-            base = _sample_map(self._albedo_map, latitude, longitude)
-        return mottled_albedo(base, latitude, longitude, self._salts[10:15])
+            base = _sample_map(self._albedo_map, latitude_rad, longitude_rad)
+        return mottled_albedo(base, latitude_rad, longitude_rad, self._salts[10:15])
 
     def _resampled(self, latitude: Floats, longitude: Floats) -> Heights:
         """Heights on a grid of places from the finest layers, cubic."""
@@ -277,7 +282,9 @@ class RasterTerrain(TiledTerrain):
         rows = (90.0 - (np.degrees(latitude) - self._shift_north_deg)) * ppd - 0.5 - layer.north_offset
         columns = (np.degrees(longitude) - east_deg) * ppd - 0.5 - layer.west_offset
         feather = math.ceil(FEATHER_DEG * ppd)
-        reach = math.ceil(4.0 * self._smoothing)
+        # Steps wider than the source's pixels need a wider mean.
+        sigma = max(self._smoothing, 0.45 * float(rows[1] - rows[0]))
+        reach = math.ceil(3.5 * sigma)
         margin = max(reach, feather) + 3
         top, left = math.floor(rows[0]) - margin, math.floor(columns[0]) - margin
         height, width = math.ceil(rows[-1]) + margin + 1 - top, math.ceil(columns[-1]) + margin + 1 - left
@@ -302,18 +309,19 @@ class RasterTerrain(TiledTerrain):
             smooth = np.asarray(edge * edge * (3.0 - 2.0 * edge), dtype=np.float32)
             kernels.resample_cubic(smooth, *_span(rows, top), *_span(columns, left), weight)
             weight = np.clip(weight, 0.0, 1.0)
-        if self._smoothing > 0.0:
-            source = _smoothed(source, self._smoothing, reach)
+        if sigma > 0.0:
+            source = _smoothed(source, sigma, reach)
         kernels.resample_cubic(source, *_span(rows, top), *_span(columns, left), out)
         return out, weight
 
     def _slope_gain(self, latitude: Floats, longitude: Floats) -> Heights:
         """How rough the ground about each pixel is beside average ground, (rows, columns)."""
-        index = (np.arange(TILE_PIXELS // SLOPE_STEP + 8) - 3.0) * SLOPE_STEP
         step = float(latitude[0] - latitude[1])
-        nodes_latitude, nodes_longitude = latitude[0] - index * step, longitude[0] + index * step
+        # About 1 km between nodes whatever the level, on pixels all tiles share.
+        stride = max(1, round(SLOPE_SPACING_M / (step * MOON_RADIUS_M)))
+        nodes_latitude, nodes_longitude, top, left = coarse_nodes(latitude, longitude, stride, 3)
         heights = self._resampled(nodes_latitude, nodes_longitude)
-        spacing = SLOPE_STEP * self.pixel_m
+        spacing = stride * step * MOON_RADIUS_M
         north = np.diff(heights, axis=0)[:, :-1] / spacing
         east = np.diff(heights, axis=1)[:-1] / (spacing * np.cos(nodes_latitude[:-1])[:, None])
         square = north * north + east * east
@@ -322,13 +330,12 @@ class RasterTerrain(TiledTerrain):
         gain = np.clip(np.sqrt(blurred) / REFERENCE_SLOPE, 0.25, 1.6)
         # Cell (k, l) of the blur is centred half a step after node k + 1.
         out = np.empty((latitude.size, longitude.size), np.float32)
-        first = 3.0 - 1.5
         kernels.resample_cubic(
             np.ascontiguousarray(gain, dtype=np.float32),
-            first,
-            1.0 / SLOPE_STEP,
-            first,
-            1.0 / SLOPE_STEP,
+            top - 1.5,
+            1.0 / stride,
+            left - 1.5,
+            1.0 / stride,
             out,
         )
         return out

@@ -25,6 +25,15 @@ Heights = npt.NDArray[np.float32]
 
 TILE_SHIFT = 9
 TILE_PIXELS = 1 << TILE_SHIFT
+APRON = 1
+"""Rows and columns of the neighbours that a tile repeats before its own; there are two more after: slopes need them."""
+
+LEVELS = 6
+"""Each level has pixels about 1.41 times as large, made from the source without what is too small for them."""
+
+MEASURE_LEVEL = 2
+"""Rims are measured on pixels of 237 m: enough for craters of 2 km and up, and four times quicker to make."""
+
 ALBEDO_SHIFT = 6
 """An albedo tile has 64 x 64 pixels over the same ground."""
 
@@ -43,7 +52,8 @@ class TerrainPatch:
     Attributes
     ----------
     heights, albedo
-        Pools of tiles, float32 (slots, n + 1, n + 1): metres above the map sphere; normal albedo.
+        Pools of tiles, float32: heights (slots, 515, 515) in metres above the map sphere, a tile's own pixels
+        starting at (1, 1); normal albedo (slots, 65, 65).
     table
         Slot of every tile of the window, int32 (rows, columns); -1 for tiles that were not asked for.
     first_row, first_column
@@ -88,8 +98,14 @@ class Terrain(Protocol):
         """Height above the map sphere, bilinear on the grid."""
         ...
 
-    def patch(self, latitude_rad: Floats, longitude_rad: Floats, spacing_m: float = 0.0) -> TerrainPatch:
-        """Tiles within ``spacing_m`` of the given places (which must lie within half a turn of each other)."""
+    def level_for(self, sample_m: float) -> int:
+        """The level of detail that suits a picture with this sample on the ground."""
+        ...
+
+    def patch(
+        self, latitude_rad: Floats, longitude_rad: Floats, spacing_m: float = 0.0, level: int = 0
+    ) -> TerrainPatch:
+        """Tiles of a level within ``spacing_m`` of the given places (which must lie within half a turn of each other)."""
         ...
 
     def craters_near(self, latitude_rad: float, longitude_rad: float, radius_m: float) -> CraterCatalogue:
@@ -123,31 +139,36 @@ class TiledTerrain(ABC):
         self.pixels_per_degree = pixels_per_degree
         self.pixels_per_radian = math.degrees(pixels_per_degree)
         self.pixel_m = MOON_RADIUS_M / self.pixels_per_radian
-        self.tile_rows = 180 * pixels_per_degree // TILE_PIXELS
-        self.tile_columns = 2 * self.tile_rows
+        finest = 180 * pixels_per_degree // TILE_PIXELS
+        self._level_rows = tuple(round(finest / 2 ** (level / 2)) for level in range(LEVELS))
         self.cache_tiles = cache_tiles
         self._pool: Heights | None = None
         self._albedo: Heights | None = None
         self._bounds = np.zeros((cache_tiles, 2))
-        self._slots: OrderedDict[tuple[int, int], int] = OrderedDict()
+        self._slots: OrderedDict[tuple[int, int, int], int] = OrderedDict()
         self._rim_m = np.array(catalogue.rim_height_m, dtype=np.float64)
         self._depth_m = np.array(catalogue.depth_m, dtype=np.float64)
         self._measured = np.zeros(len(catalogue), dtype=bool)
 
     @abstractmethod
-    def make_heights(self, tile_row: int, tile_column: int) -> Heights:
-        """One tile of heights (513, 513): the last row and column repeat the neighbours' first."""
+    def make_heights(self, latitude_rad: Floats, longitude_rad: Floats) -> Heights:
+        """Heights on a grid of places (rows, columns) at even steps of latitude, north first, and longitude.
+
+        What is too small for the steps is left out.  The value at a place must not depend on the rest of the grid.
+        """
 
     @abstractmethod
-    def make_albedo(self, tile_row: int, tile_column: int) -> Heights:
-        """One tile of normal albedo (65, 65), likewise."""
+    def make_albedo(self, latitude_rad: Floats, longitude_rad: Floats) -> Heights:
+        """Normal albedo on a grid of places (rows, columns)."""
 
     @abstractmethod
     def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Whether the source itself holds each place."""
 
-    def patch(self, latitude_rad: Floats, longitude_rad: Floats, spacing_m: float = 0.0) -> TerrainPatch:
-        """Tiles within ``spacing_m`` (and two pixels) of the given places.
+    def patch(
+        self, latitude_rad: Floats, longitude_rad: Floats, spacing_m: float = 0.0, level: int = 0
+    ) -> TerrainPatch:
+        """Tiles of a level within ``spacing_m`` (and two pixels) of the given places.
 
         Raises
         ------
@@ -164,9 +185,10 @@ class TiledTerrain(ABC):
             )
         turn = 2.0 * math.pi
         longitude = longitude + turn * np.round((longitude[0] - longitude) / turn)
-        scale = self.pixels_per_radian
-        spare = 2.5 + spacing_m / self.pixel_m
-        wide = 2.5 + spacing_m / self.pixel_m / np.cos(latitude)
+        scale = self._level_rows[level] * TILE_PIXELS / math.pi
+        spare = 2.5 + spacing_m * scale / MOON_RADIUS_M
+        wide = 2.5 + spacing_m * scale / MOON_RADIUS_M / np.cos(latitude)
+        tile_columns = 2 * self._level_rows[level]
         rows = (0.5 * math.pi - latitude) * scale - 0.5
         columns = longitude * scale - 0.5
         above = np.floor((rows - spare) / TILE_PIXELS).astype(np.int64)
@@ -182,14 +204,14 @@ class TiledTerrain(ABC):
                     True
                 )
         count = int(np.count_nonzero(wanted))
-        if count > self.cache_tiles or wanted.shape[1] > self.tile_columns:
+        if count > self.cache_tiles or wanted.shape[1] > tile_columns:
             raise TerrainError(
                 f"terrain {self.name}: expected a window of at most {self.cache_tiles} tiles, found {count}: "
                 "the view is too wide or too near a pole"
             )
         table = np.full(wanted.shape, -1, np.int32)
         places = [(int(row), int(column)) for row, column in np.argwhere(wanted)]
-        keys = [(top + row, (left + column) % self.tile_columns) for row, column in places]
+        keys = [(level, top + row, (left + column) % tile_columns) for row, column in places]
         for key in keys:
             if key in self._slots:
                 self._slots.move_to_end(key)
@@ -208,8 +230,16 @@ class TiledTerrain(ABC):
             high_m=float(bounds[:, 1].max()),
         )
 
+    def level_for(self, sample_m: float) -> int:
+        """The finest level whose pixels are no smaller than three quarters of a picture's sample on the ground."""
+        sizes = [math.pi * MOON_RADIUS_M / (rows * TILE_PIXELS) for rows in self._level_rows]
+        return next((level for level, size in enumerate(sizes) if size >= 0.75 * sample_m), LEVELS - 1)
+
     def height_m(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> Floats:
         """Height above the map sphere (...) in metres, bilinear on the grid; places may lie anywhere apart."""
+        return self._sample(latitude_rad, longitude_rad, 0)
+
+    def _sample(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike, level: int) -> Floats:
         from payload_emulator.sim.terrain import kernels
 
         latitude, longitude = np.broadcast_arrays(
@@ -218,12 +248,14 @@ class TiledTerrain(ABC):
         out = np.empty(latitude.size)
         flat_latitude, flat_longitude = latitude.ravel(), longitude.ravel()
         # Blocks of 4 x 4 tiles: few calls, and no window wider than the cache.
-        block_row = np.floor((0.5 * math.pi - flat_latitude) * self.pixels_per_radian / (4 * TILE_PIXELS))
-        block_column = np.floor(flat_longitude * self.pixels_per_radian / (4 * TILE_PIXELS))
+        block_row = np.floor(
+            (0.5 * math.pi - flat_latitude) * self.pixels_per_radian / (4 * TILE_PIXELS << level)
+        )
+        block_column = np.floor(flat_longitude * self.pixels_per_radian / (4 * TILE_PIXELS << level))
         blocks, block = np.unique(block_row * 1.0e6 + block_column, return_inverse=True)
         for number in range(blocks.size):
             chosen = np.flatnonzero(block == number)
-            patch = self.patch(flat_latitude[chosen], flat_longitude[chosen])
+            patch = self.patch(flat_latitude[chosen], flat_longitude[chosen], level=level)
             rows, columns = patch.coordinates(flat_latitude[chosen], flat_longitude[chosen])
             values = np.empty(chosen.size)
             kernels.sample_pool(patch.heights, patch.table, TILE_SHIFT, rows, columns, values)
@@ -265,9 +297,13 @@ class TiledTerrain(ABC):
             latitude = self.catalogue.latitude_rad[part][:, None]
             longitude = self.catalogue.longitude_rad[part][:, None]
             radius = 0.5 * self.catalogue.diameter_m[part][:, None] / MOON_RADIUS_M
-            rim = self.height_m(*_circle(latitude, longitude, radius, RIM_AZIMUTHS)).mean(axis=1)
+            rim = self._sample(*_circle(latitude, longitude, radius, RIM_AZIMUTHS), MEASURE_LEVEL).mean(
+                axis=1
+            )
             rings = [
-                self.height_m(*_circle(latitude, longitude, fraction * radius, FLOOR_AZIMUTHS)).mean(axis=1)
+                self._sample(
+                    *_circle(latitude, longitude, fraction * radius, FLOOR_AZIMUTHS), MEASURE_LEVEL
+                ).mean(axis=1)
                 for fraction in (0.1, 0.22, 0.34)
             ]
             # Rings stand for equal-width annuli of the inner 0.4 radius: weights are their areas.
@@ -276,18 +312,20 @@ class TiledTerrain(ABC):
             self._depth_m[part] = rim - floor
             self._measured[part] = True
 
-    def _slot(self, key: tuple[int, int]) -> int:
+    def _slot(self, key: tuple[int, int, int]) -> int:
         slot = self._slots.get(key)
         if slot is not None:
             self._slots.move_to_end(key)
             return slot
         if self._pool is None:
-            size = TILE_PIXELS + 1
+            size = TILE_PIXELS + 3
             self._pool = np.empty((self.cache_tiles, size, size), np.float32)
             small = (1 << ALBEDO_SHIFT) + 1
             self._albedo = np.empty((self.cache_tiles, small, small), np.float32)
-        heights = self.make_heights(*key)
-        albedo = self.make_albedo(*key)
+        latitude, longitude = tile_angles(key[1], key[2], self._level_rows[key[0]] * TILE_PIXELS / 180.0)
+        heights = self.make_heights(latitude, longitude)
+        step = TILE_PIXELS >> ALBEDO_SHIFT
+        albedo = self.make_albedo(latitude[APRON::step], longitude[APRON::step])
         assert self._pool is not None and self._albedo is not None
         slot = (
             self._slots.popitem(last=False)[1] if len(self._slots) == self.cache_tiles else len(self._slots)
@@ -299,12 +337,33 @@ class TiledTerrain(ABC):
         return slot
 
 
-def tile_angles(tile_row: int, tile_column: int, pixels_per_degree: int) -> tuple[Floats, Floats]:
-    """Latitudes and longitudes (513,) in radians of a tile's pixel centres, the neighbours' first pixel included."""
-    index = np.arange(TILE_PIXELS + 1)
+def tile_angles(tile_row: int, tile_column: int, pixels_per_degree: float) -> tuple[Floats, Floats]:
+    """Latitudes and longitudes (515,) in radians of a tile's pixel centres, some of the neighbours' included."""
+    index = np.arange(-APRON, TILE_PIXELS + 2)
     latitude = np.radians(90.0 - (tile_row * TILE_PIXELS + index + 0.5) / pixels_per_degree)
     longitude = np.radians((tile_column * TILE_PIXELS + index + 0.5) / pixels_per_degree)
     return latitude, longitude
+
+
+def coarse_nodes(
+    latitude: Floats, longitude: Floats, stride: int, spare: int
+) -> tuple[Floats, Floats, float, float]:
+    """Every ``stride``-th place of the global grid about a part of it, and where the part begins among them.
+
+    All tiles pick the same nodes, so what is interpolated between them agrees at tile edges.  ``spare`` nodes are added on
+    all sides; the returned starts are in nodes.
+    """
+    step = float(latitude[0] - latitude[1])
+    starts, nodes = [], []
+    for first, count in (
+        (round((0.5 * math.pi - float(latitude[0])) / step - 0.5), latitude.size),
+        (round(float(longitude[0]) / step - 0.5), longitude.size),
+    ):
+        low = first // stride - spare
+        high = (first + count - 1) // stride + 2 + spare
+        starts.append(first / stride - low)
+        nodes.append((np.arange(low, high) * stride + 0.5) * step)
+    return 0.5 * math.pi - nodes[0], nodes[1], starts[0], starts[1]
 
 
 def _circle(latitude: Floats, longitude: Floats, radius: Floats, azimuths: int) -> tuple[Floats, Floats]:
