@@ -259,8 +259,8 @@ def completed_to_paper(catalogue: CraterCatalogue, seed: int) -> CraterCatalogue
     empty = tiles == 0
     if np.any(missing < 0) or not np.any(empty):
         raise LunarError(
-            f"{catalogue.source}: expected a catalogue with empty tiles and at most {PAPER_CLASS_COUNTS} craters of the "
-            f"three classes, found {np.count_nonzero(empty)} and {tuple(class_counts(known).tolist())}"
+            f"{catalogue.source}: expected a catalogue with empty tiles and at most {PAPER_CLASS_COUNTS} craters "
+            f"of the three classes, found {np.count_nonzero(empty)} and {tuple(class_counts(known).tolist())}"
         )
     rng = np.random.Generator(np.random.PCG64(seed))
     diameter_m = _class_diameters_m(rng, missing.tolist())

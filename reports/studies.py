@@ -186,7 +186,12 @@ def _sheet(path: Path, width_in: float, height_in: float) -> Iterator[Figure]:
         yield figure
         # No creation date, for the same reason.
         metadata = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}.get(path.suffix.lower(), {})
-        figure.savefig(path, dpi=150, facecolor="white", metadata=metadata)
+        part = path.with_name(f"{path.stem}.part{path.suffix}")
+        try:
+            figure.savefig(part, dpi=150, facecolor="white", metadata=metadata)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
 
 
 def _caption(figure: Figure, text: str) -> None:

@@ -48,6 +48,20 @@ def configure_stats(commands: Any) -> None:
     stats.set_defaults(handler=run_stats)
 
 
+def configure_convert(commands: Any) -> None:
+    """Add `convert` to the subparsers of `linna orbit`."""
+    convert = commands.add_parser("convert", help="an ephemeris as OEM, STK .e, CSV or TUM")
+    convert.add_argument("ephemeris", type=Path, metavar="F", help="OEM or STK .e file")
+    convert.add_argument(
+        "--out", required=True, type=Path, metavar="FILE", help="ending in .oem, .e, .csv or .tum"
+    )
+    convert.add_argument(
+        "--step", type=float, metavar="S", help="seconds between states (default: the states of the file)"
+    )
+    add_json_flag(convert)
+    convert.set_defaults(handler=run_convert)
+
+
 def run_compare(arguments: argparse.Namespace) -> int:
     from lunar.comparison import compare
     from lunar.ephemeris import load_ephemeris
@@ -122,7 +136,12 @@ def run_interpolate(arguments: argparse.Namespace) -> int:
     ]
     emit(
         arguments,
-        {"states": states, "frame": "ICRF, Moon-centred", "orientation": orientation.name},
+        {
+            "states": states,
+            "frame": "ICRF, Moon-centred",
+            "orientation": orientation.name,
+            "data": [f"lunar orientation {orientation.name}"],
+        },
         text="\n".join(lines),
     )
     return 0
@@ -157,6 +176,7 @@ def run_stats(arguments: argparse.Namespace) -> int:
         "passes_within_60_deg": numbers.passes,
         "share_within_60_deg": numbers.share_inside,
         "orientation": orientation.name,
+        "data": [f"lunar orientation {orientation.name}"],
     }
     if arguments.plot is not None:
         from reports.studies import save_altitude_plot
@@ -179,6 +199,43 @@ def run_stats(arguments: argparse.Namespace) -> int:
         f"within 60 deg of the equator: {numbers.share_inside:.1%} of the time in {numbers.passes} passes"
     )
     emit(arguments, figures, text=text)
+    return 0
+
+
+def run_convert(arguments: argparse.Namespace) -> int:
+    import os
+
+    from linna.data import data_folder
+    from linna.errors import UsageError
+    from lunar.datafolder import default_orientation
+    from lunar.ephemeris import ephemeris_from_states, load_ephemeris
+    from lunar.oem import format_oem
+    from lunar.stk import format_stk
+    from lunar.tabular import format_csv, format_tum
+
+    writers = {
+        ".oem": format_oem,
+        ".e": format_stk,
+        ".csv": lambda states: format_csv(states, default_orientation(data_folder())),
+        ".tum": format_tum,
+    }
+    out: Path = arguments.out
+    if out.suffix.lower() not in writers:
+        raise UsageError(f"--out: expected a name ending in {', '.join(writers)}, found {out.name!r}")
+    ephemeris = load_ephemeris(arguments.ephemeris)
+    epochs = _epochs(arguments.step, ephemeris)
+    if epochs is not None:
+        name = ephemeris.segments[0].object_name
+        ephemeris = ephemeris_from_states(epochs, *ephemeris.at(epochs), object_name=name)
+    text = writers[out.suffix.lower()](ephemeris)
+    part = out.with_name(out.name + ".part")
+    try:
+        part.write_text(text, encoding="utf-8", newline="\n")
+        os.replace(part, out)
+    finally:
+        part.unlink(missing_ok=True)
+    figures = {"out": str(out), "states": len(ephemeris.utc_ns), "segments": len(ephemeris.segments)}
+    emit(arguments, figures, text=f"{figures['states']} states -> {out}")
     return 0
 
 

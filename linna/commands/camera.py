@@ -84,6 +84,7 @@ def run_fov_study(arguments: argparse.Namespace) -> int:
         },
         "source": study.source,
         "orientation": orientation.name,
+        "data": [f"crater catalogue {study.source}", f"lunar orientation {orientation.name}"],
     }
     covered = f"{study.positions_covered} of {study.positions} positions lie where the catalogue is complete"
     if arguments.plot is not None:

@@ -48,6 +48,7 @@ def run_stats(arguments: argparse.Namespace) -> int:
         "total": len(catalogue),
         "diameter_km": _range(catalogue.diameter_m / 1e3),
         "source": catalogue.source,
+        "data": [f"crater catalogue {catalogue.source}"],
     }
     if arguments.plot is not None:
         from reports.studies import save_class_histogram

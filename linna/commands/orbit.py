@@ -9,7 +9,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-from linna.commands._orbit_ephemeris import configure_compare, configure_interpolate, configure_stats
+from linna.commands._orbit_ephemeris import (
+    configure_compare,
+    configure_convert,
+    configure_interpolate,
+    configure_stats,
+)
 from linna.output import add_json_flag, emit, log
 
 
@@ -40,6 +45,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     configure_compare(commands)
     configure_interpolate(commands)
     configure_stats(commands)
+    configure_convert(commands)
 
 
 def run_propagate(arguments: argparse.Namespace) -> int:

@@ -107,6 +107,22 @@ def test_stats_summarise_an_ephemeris_and_draw_it(oem_path, tmp_path, capsys):
     assert "<svg" in plot.read_text()
 
 
+@pytest.mark.parametrize("ending", [".oem", ".e", ".csv", ".tum"])
+def test_an_ephemeris_converts_to_every_format(oem_path, tmp_path, capsys, ending):
+    out = tmp_path / f"converted{ending}"
+    assert run_json(capsys, "orbit", "convert", oem_path, "--out", out)["states"] == 2881
+    if ending in (".oem", ".e"):
+        assert run_json(capsys, "orbit", "compare", oem_path, out)["max_m"] < 1e-5
+    else:
+        assert len(out.read_text().splitlines()) == 2881 + (ending == ".csv")
+    assert [path.name for path in tmp_path.glob("*.part")] == []
+
+
+def test_a_conversion_to_an_unknown_format_is_one_line(oem_path, tmp_path, capsys):
+    line = error_line(capsys, "orbit", "convert", oem_path, "--out", tmp_path / "orbit.xml")
+    assert "expected a name ending in .oem, .e, .csv, .tum, found 'orbit.xml'" in line
+
+
 @pytest.mark.parametrize("command", [("orbit", "stats"), ("orbit", "compare")])
 def test_a_file_cut_short_is_one_line(oem_path, tmp_path, capsys, command):
     cut = tmp_path / "cut.oem"
