@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any, TypeVar, overload
 
 os.environ.setdefault("NUMBA_SLP_VECTORIZE", "1")
 
 import numba
 from numba.core import cgutils, types
+from numba.core.dispatcher import Dispatcher
 from numba.extending import intrinsic
 
 __all__ = ["cgutils", "intrinsic", "njit", "prange", "types"]
@@ -34,4 +36,27 @@ def njit(function: Function | None = None, /, **options: Any) -> Any:
     """Return ``function`` compiled on first call and cached on disk; options as for ``numba.njit``."""
     options.setdefault("cache", True)
     compiler = numba.njit(**options)
-    return compiler if function is None else compiler(function)
+
+    def compiled(source: Function) -> Any:
+        kernel = compiler(source)
+        _stamp_with_callees(kernel, source)
+        return kernel
+
+    return compiled if function is None else compiled(function)
+
+
+def _stamp_with_callees(kernel: Any, source: Callable[..., Any]) -> None:
+    """Make a cached kernel depend on the files of the kernels it may call, not on its own file alone.
+
+    Numba judges a cached kernel by the age of its own file. A kernel compiled in from another file would go on living
+    in it after that file has changed, with arrays laid out for the new one.
+    """
+    file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
+    if file is None:  # not cached, or another layout of numba's private parts
+        return
+    files = {source.__code__.co_filename}
+    for value in source.__globals__.values():
+        members = vars(value).values() if isinstance(value, ModuleType) else (value,)
+        files |= {member.py_func.__code__.co_filename for member in members if isinstance(member, Dispatcher)}
+    stamps = [os.stat(name) for name in sorted(files)]
+    file._source_stamp = tuple((stamp.st_mtime_ns, stamp.st_size) for stamp in stamps)
