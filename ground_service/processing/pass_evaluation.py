@@ -90,6 +90,7 @@ class PassInputs:
     outcomes: tuple[OutcomeSamples, ...] = ()
     start_state: StartState | None = None
     gravity: GravityField | None = None
+    other_gravity: GravityField | None = None
     frames_expected: int | None = None
     cadence_s: float | None = None
     housekeeping: tuple[HousekeepingParameter, ...] = ()
@@ -112,7 +113,8 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
     missing: dict[str, str] = {}
     remarks: list[str] = []
     provenance = dict(inputs.provenance)
-    reference, navigation = None, ()
+    reference: TrackSeries | None = None
+    navigation: tuple[NavigationSeries, ...] = ()
     if inputs.reference is None:
         missing["navigation"] = missing["reference"] = "no reference ephemeris covers this pass"
     else:
@@ -317,23 +319,23 @@ def _time_since_fix_s(samples: NavigationSamples) -> FloatArray | None:
 def _baselines(
     inputs: PassInputs, start: StartState, gravity: GravityField, track: ReferenceStates, path_m: FloatArray
 ) -> list[NavigationSeries]:
-    degree = min(BASELINE_DEGREE, gravity.degree)
     rows = np.flatnonzero(track.covered & (track.utc_ns >= start.utc_ns))
     if len(rows) == 0:
         return []
     here = _at(track, rows)
     series = []
-    for name, n, third, text in (
-        (
-            "propagate-only",
-            degree,
-            True,
-            f"start state propagated, gravity to degree {degree}, Earth and Sun",
-        ),
-        ("Kepler", 0, False, "start state on its two-body orbit"),
-    ):
+    models = [("propagate-only", gravity, min(BASELINE_DEGREE, gravity.degree))]
+    if inputs.other_gravity is not None:
+        other = inputs.other_gravity
+        models.append((f"propagate-only, {other.name}", other, min(BASELINE_DEGREE, other.degree)))
+    for name, field_used, degree in (*models, ("Kepler", gravity, 0)):
         position = propagated_positions(
-            start, here.utc_ns, gravity, n, inputs.orientation, third_bodies=third
+            start, here.utc_ns, field_used, degree, inputs.orientation, third_bodies=degree > 0
+        )
+        text = (
+            f"start state propagated with {field_used.name} to degree {degree}, Earth and Sun"
+            if degree
+            else "start state on its two-body orbit"
         )
         error = error_of_positions_rtn_m(here, position)
         latitude, longitude, altitude = places_of_positions(here, position)

@@ -37,6 +37,11 @@ class Ground:
         """The gravity field of the data at hand."""
         return _gravity(self.data)
 
+    @property
+    def other_gravity(self) -> GravityField | None:
+        """An independent gravity field, where the data at hand hold one."""
+        return _other_gravity(self.data)
+
     def __enter__(self) -> Ground:
         return self
 
@@ -78,6 +83,13 @@ def ground_from_settings(settings: Settings) -> Ground:
 @functools.lru_cache(maxsize=4)
 def _orientation(data: DataFolder) -> Orientation:
     return default_orientation(data)
+
+
+@functools.lru_cache(maxsize=4)
+def _other_gravity(data: DataFolder) -> GravityField | None:
+    from lunar.gravity import load_gravity
+
+    return load_gravity(data.gravity_alternative) if data.gravity_alternative is not None else None
 
 
 @functools.lru_cache(maxsize=4)

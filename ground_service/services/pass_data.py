@@ -84,6 +84,9 @@ class ImageShelf(Mapping[int, NDArray[np.uint8]]):
     def __getitem__(self, frame_number: int) -> NDArray[np.uint8]:
         return read_image(self._files.get(self._sha256[frame_number]), f"frame {frame_number}")
 
+    def __contains__(self, frame_number: object) -> bool:
+        return frame_number in self._sha256
+
     def __iter__(self) -> Iterator[int]:
         return iter(self._sha256)
 
@@ -142,6 +145,7 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             outcomes=outcome_samples(connection, span),
             start_state=start_state_of(manifest),
             gravity=ground.gravity,
+            other_gravity=ground.other_gravity,
             frames_expected=manifest.get("frames_expected"),
             cadence_s=manifest.get("cadence_s"),
             housekeeping=_housekeeping(connection, span),
