@@ -11,7 +11,7 @@ from reports.values import PassReport
 if TYPE_CHECKING:
     from reports.document import Document
 
-__all__ = ["render_html", "to_json"]
+__all__ = ["render_html", "render_pdf", "to_json"]
 
 
 def render_html(report: Any) -> str:
@@ -27,6 +27,21 @@ def render_html(report: Any) -> str:
     from reports.html_page import html_page
 
     return html_page(_document(report))
+
+
+def render_pdf(report: Any) -> bytes:
+    """The same report as the octets of an A4 PDF; the same value gives the same octets.
+
+    Raises
+    ------
+    UnknownReportKind
+        when the value is none of those of `reports.values`
+    InconsistentReport
+        when parts of the value do not fit together
+    """
+    from reports.pdf_pages import pdf_pages
+
+    return pdf_pages(_document(report))
 
 
 def _document(report: Any) -> Document:

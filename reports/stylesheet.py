@@ -106,7 +106,7 @@ pre{margin:.6rem 0;padding:.9rem 1rem;overflow:auto;background:var(--panel);font
  .contents a{display:grid;grid-template-columns:1.6em 1fr;color:var(--f-muted);text-decoration:none}
  .contents a:hover{color:var(--accent);text-decoration:underline}
 }
-@media (max-width:52rem){.headline{grid-template-columns:repeat(2,minmax(0,1fr))}
+@media screen and (max-width:52rem){.headline{grid-template-columns:repeat(2,minmax(0,1fr))}
  .headline>div,.headline>div:first-child{border-left:0;padding-left:0;border-top:1px solid var(--f-grid)}
  .headline dt{min-height:0}h1{font-size:1.7rem}.kicker{flex-direction:column;gap:.2rem}
  .pairs{grid-template-columns:1fr}.pairs dt{border-bottom:0;padding-bottom:0}figure{overflow-x:auto}
@@ -121,7 +121,8 @@ pre{margin:.6rem 0;padding:.9rem 1rem;overflow:auto;background:var(--panel);font
  .tablewrap{margin:.9rem 0 1.2rem;overflow:visible}thead{display:table-header-group}
  .newpage{break-before:page}h2.newpage{margin-top:0}
  .headline{grid-template-columns:repeat(5,minmax(0,1fr))}
- details>summary{list-style:none}
+ details>summary{list-style:none}details::details-content{content-visibility:visible;block-size:auto}
+ body{background:#fff}
  pre{font-size:.75rem}
  a{color:inherit;text-decoration:none}
 }

@@ -72,11 +72,10 @@ def significant_text(value: float | int | str | None, digits: int = 3) -> str:
         return NOT_A_VALUE
     if value == 0:
         return "0"
-    exponent = math.floor(math.log10(abs(value)))
+    exponent = int(f"{value:.{digits - 1}e}".partition("e")[2])
     if exponent < -3 or exponent > 6:
         return f"{value:.{digits - 1}e}".replace("-", "−")
-    rounded = round(value, digits - 1 - exponent)
-    return number_text(rounded, max(0, digits - 1 - exponent))
+    return number_text(round(value, digits - 1 - exponent), max(0, digits - 1 - exponent))
 
 
 def percent_text(part: float | None, whole: float | None, decimals: int = 1) -> str:

@@ -8,6 +8,7 @@ well.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from threading import RLock
@@ -27,8 +28,8 @@ LIGHT = {
     "orange": "#e69f00",
     "sky": "#56b4e9",
     "gray1": "#3d4856",
-    "gray2": "#7b8694",
-    "gray3": "#9aa4b0",
+    "gray2": "#6b7786",
+    "gray3": "#8792a0",
     "silver": "#c9cfd7",
 }
 DARK = {
@@ -108,7 +109,9 @@ def drawing(scale: float = 1.0, more: Mapping[str, Any] | None = None) -> Iterat
     """Matplotlib set up for one drawing, type and lines scaled; drawings of one process take turns."""
     import matplotlib
 
-    with _LOCK, matplotlib.rc_context({**_settings(scale), **(more or {})}):
+    with _LOCK, matplotlib.rc_context({**_settings(scale), **(more or {})}), warnings.catch_warnings():
+        # A name in letters that the type does not have is still text on the page.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
         yield
 
 

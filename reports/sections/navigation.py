@@ -199,15 +199,19 @@ def altitude(view: PassView) -> list[Block]:
     zoom = navigation.zoom_span(view.time, report.imaging_arcs)
     if zoom is not None:
         spans.append(("altitude-hour", zoom, " One hour of it."))
-    low, high = float(np.nanmin(track.altitude_m)), float(np.nanmax(track.altitude_m))
+    low, high = quantiles(track.altitude_m, (0.0, 1.0))
+    runs_from = (
+        f"The reference runs from {low / 1e3:.1f} to {high / 1e3:.1f} km."
+        if math.isfinite(low)
+        else "The reference has no altitude."
+    )
     for key, time, extra in spans:
         blocks.append(
             Picture(
                 key,
                 "Estimated altitude over the reference (wide green line), and the magnitude of its error "
-                f"(form of the paper's Fig. 10).{extra} "
-                f"The reference runs from {low / 1e3:.1f} to {high / 1e3:.1f} km.",
-                f"Altitude over time; the reference runs from {low / 1e3:.1f} to {high / 1e3:.1f} km.",
+                f"(form of the paper's Fig. 10).{extra} {runs_from}",
+                f"Altitude over time. {runs_from}",
                 3.9,
                 lambda c, time=time: navigation.draw_altitude(  # type: ignore[misc]
                     c, series, track, view.styles, time, report.imaging_arcs
@@ -243,7 +247,7 @@ def consistency_section(view: PassView) -> list[Block]:
                 "divided by its degrees of "
                 "freedom, so that one is right. Dots: samples; line: running mean; band: where 95 % of the "
                 "samples of a consistent filter "
-                "lie. NIS alone cannot see an error common to all craters of a view.",
+                "lie. NIS alone cannot see an error common to all craters of a frame.",
                 f"NEES and NIS of {one.name} over time.",
                 3.4 if both else 2.1,
                 lambda c, one=one: consistency.draw_consistency(
@@ -281,8 +285,8 @@ def consistency_section(view: PassView) -> list[Block]:
                     Column("solution", numeric=False),
                     Column("quantity", numeric=False),
                     Column("samples"),
-                    Column("mean per degree of freedom"),
-                    Column("inside the 95 % bounds", unit="%"),
+                    Column("mean", unit="per degree of freedom"),
+                    Column("inside 95 % bounds", unit="% of samples"),
                 ),
                 tuple(rows),
             )

@@ -10,7 +10,6 @@ from reports.document import (
     Facts,
     Heading,
     Listing,
-    NewPage,
     Paragraph,
     Table,
     rung_number,
@@ -25,7 +24,7 @@ _MOST_READS = 30
 
 def provenance(view: PassView) -> list[Block]:
     report = view.report
-    blocks: list[Block] = [NewPage(), Heading("Provenance and data")]
+    blocks: list[Block] = [Heading("Provenance and data")]
     number = rung_number(report.evidence_rung)
     if number is not None:
         blocks.append(

@@ -1,0 +1,129 @@
+"""The page in a real browser: silent, self-contained, legible in both themes, whole on paper."""
+
+import base64
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.reports.browser import CHROMIUM, Tab, tab
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
+]
+
+# WCAG 2.1 contrast of text against the ground of the page, for the page and its figures.
+_CONTRAST = """
+(() => {
+  const parse = c => (c.match(/[\\d.]+/g) || []).map(Number);
+  const light = ([r, g, b]) => [r, g, b].map(v => v / 255)
+    .map(v => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
+    .reduce((s, v, i) => s + v * [0.2126, 0.7152, 0.0722][i], 0);
+  const ground = light(parse(getComputedStyle(document.body).backgroundColor));
+  const weak = [];
+  for (const e of document.querySelectorAll('h1,h2,h3,p,dt,dd,th,td,figcaption,caption,li,summary,svg text')) {
+    if (!e.textContent.trim()) continue;
+    const style = getComputedStyle(e);
+    const ink = light(parse(e instanceof SVGElement ? style.fill : style.color));
+    const ratio = (Math.max(ink, ground) + 0.05) / (Math.min(ink, ground) + 0.05);
+    if (ratio < LIMIT) weak.push(e.textContent.trim().slice(0, 30) + ' ' + ratio.toFixed(2));
+  }
+  return weak;
+})()
+"""
+
+
+@pytest.fixture(scope="module")
+def path(whole_page: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("page") / "report.html"
+    file.write_text(whole_page, encoding="utf-8")
+    return file
+
+
+@pytest.fixture(scope="module")
+def browser(path: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
+    with tab(tmp_path_factory.mktemp("profile")) as page:
+        page.size(1280, 900)
+        page.open(path)
+        yield page
+
+
+def test_the_page_loads_without_a_word_on_the_console_and_without_a_request(browser: Tab, path: Path) -> None:
+    assert browser.complaints == []
+    assert [r for r in browser.requests if not r.startswith("data:")] == [path.as_uri()]
+
+
+def test_every_figure_is_drawn(browser: Tab) -> None:
+    sizes = browser.value(
+        "[...document.querySelectorAll('figure svg')].map(s => s.getBoundingClientRect().height)"
+    )
+    assert len(sizes) > 15
+    assert min(sizes) > 60
+    assert browser.value(
+        "[...document.querySelectorAll('svg image')].every(i => i.getBoundingClientRect().width > 50)"
+    )
+
+
+@pytest.mark.parametrize("width", [1280, 1000, 800])
+def test_nothing_runs_out_of_the_window(browser: Tab, width: int) -> None:
+    browser.size(width, 900)
+    assert browser.value("document.documentElement.scrollWidth") <= width
+    browser.size(1280, 900)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_text_and_figures_are_legible_in_both_themes(browser: Tab, scheme: str) -> None:
+    browser.theme(scheme)
+    # 4.5 is WCAG AA for text; labels in the colour of their line are held to the 3 of graphics.
+    weak = browser.value(_CONTRAST.replace("LIMIT", "3.0"))
+    assert weak == []
+    assert browser.value(_CONTRAST.replace("LIMIT", "4.5").replace(",svg text", "")) == []
+    browser.theme("light")
+
+
+def test_dark_and_light_differ_in_ground_and_ink(browser: Tab) -> None:
+    colours = []
+    for scheme in ("light", "dark"):
+        browser.theme(scheme)
+        colours.append(browser.value("getComputedStyle(document.body).backgroundColor"))
+    browser.theme("light")
+    assert colours == ["rgb(254, 254, 254)", "rgb(20, 24, 30)"]
+
+
+def test_the_contents_lead_to_the_sections(browser: Tab) -> None:
+    broken = browser.value(
+        "[...document.querySelectorAll('.contents a')].filter(a => !document.querySelector(a.hash)).length"
+    )
+    assert broken == 0
+    assert browser.value("document.querySelectorAll('.contents a').length") == browser.value(
+        "document.querySelectorAll('h2').length"
+    )
+
+
+def test_figures_have_words_for_those_who_cannot_see_them(browser: Tab) -> None:
+    assert browser.value(
+        "[...document.querySelectorAll('figure svg')].every(s => s.getAttribute('aria-label'))"
+    )
+    assert browser.value("[...document.querySelectorAll('table')].every(t => t.caption && t.tHead)")
+
+
+def test_on_paper_no_figure_is_taller_than_a_page_and_paper_is_white(browser: Tab) -> None:
+    browser.theme("dark", media="print")
+    # A4 less the margins of the sheet is 265 mm or 1001 CSS pixels high, 178 mm or 673 wide.
+    browser.size(673, 1001)
+    heights = browser.value(
+        "[...document.querySelectorAll('figure')].map(f => f.getBoundingClientRect().height)"
+    )
+    ground = browser.value("getComputedStyle(document.body).backgroundColor")
+    browser.size(1280, 900)
+    browser.theme("light")
+    assert max(heights) < 1001
+    assert ground == "rgb(255, 255, 255)"
+
+
+def test_it_prints_to_a4(browser: Tab) -> None:
+    pdf = base64.b64decode(browser.call("Page.printToPDF", preferCSSPageSize=True)["data"])
+    assert pdf.startswith(b"%PDF-")
+    # 594.96 by 841.92 points are A4 in whole CSS pixels.
+    assert b"594.9" in pdf or b"595" in pdf

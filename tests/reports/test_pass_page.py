@@ -1,0 +1,229 @@
+"""The page of a pass: complete, self-contained, the same bytes every time."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from reports.errors import InconsistentReport, UnknownReportKind
+from reports.render import render_html
+from reports.values import (
+    FrameAccounting,
+    HeadlineFigure,
+    NavigationSeries,
+    PassReport,
+    TrackSeries,
+)
+from tests.reports import example
+from tests.reports.page import Page
+
+
+@pytest.fixture(scope="module")
+def page(whole_page: str) -> Page:
+    return Page(whole_page)
+
+
+def _series(n: int, **more: object) -> NavigationSeries:
+    """A navigation series of n samples at ten seconds, every value finite unless replaced."""
+    fields: dict[str, object] = {
+        "name": "anchored",
+        "kind": "estimate",
+        "utc_ns": example.START_UTC_NS + np.arange(n, dtype=np.int64) * 10_000_000_000,
+        "latitude_deg": np.linspace(-10.0, 10.0, n),
+        "longitude_deg": np.full(n, 300.0),
+        "altitude_m": np.full(n, 30_000.0),
+        "error_rtn_m": np.full((n, 3), 20.0),
+        **more,
+    }
+    return NavigationSeries(**fields)  # type: ignore[arg-type]
+
+
+def test_every_tag_of_the_page_is_closed(page: Page) -> None:
+    assert page.left_open == []
+
+
+def test_the_page_asks_for_nothing_outside_itself(page: Page, whole_page: str) -> None:
+    assert all(a.startswith("data:") for a in page.addresses)
+    assert not any("http" in s or "@import" in s for s in page.styles)
+    assert "script" not in page.tags
+    assert "default-src 'none'" in whole_page
+
+
+def test_ids_are_unique_and_every_reference_has_its_target(page: Page) -> None:
+    assert len(page.ids) == len(set(page.ids))
+    assert page.references <= set(page.ids)
+    assert any(r.startswith("glance-") for r in page.references), "figures must keep their clipping paths"
+
+
+def test_the_same_value_gives_the_same_bytes(whole_pass: PassReport, whole_page: str) -> None:
+    assert render_html(example.pass_report(gallery=3, worst=5)) == whole_page
+
+
+def test_colours_of_figures_are_roles_so_that_they_follow_the_theme(whole_page: str) -> None:
+    from reports.figures.theme import DARK, LIGHT
+
+    assert LIGHT.keys() == DARK.keys()
+    assert len(set(LIGHT.values())) == len(LIGHT), "a shared light colour would merge two roles"
+    figures = whole_page[whole_page.index("<main") :]
+    assert not any(tint in figures for tint in LIGHT.values())
+    for role, tint in DARK.items():
+        assert f"--f-{role}:{tint};" in whole_page
+
+
+def test_the_first_page_has_the_verdict_the_five_figures_and_their_rung(page: Page) -> None:
+    start = page.text[: page.text.index("At a glance", page.text.index("Verdict"))]
+    assert "Verdict: good" in start and "without reading the anchor ephemeris" in start
+    for text in ("51.2 m", "148 m", "1.71 % of path", "0.704", "9 of 1 204"):
+        assert text in start
+    assert start.count("rung 3") == 5 + 1
+    assert "3 real terrain" in start
+
+
+def test_the_detector_stands_beside_the_figures_printed_in_the_paper(page: Page) -> None:
+    # LINNA paper, Table II.
+    for figure in ("0.7021", "0.7362", "0.8131", "0.3248", "0.3586", "0.4659", "3.50", "4.11", "4.75"):
+        assert figure in page.text
+
+
+def test_all_six_outcomes_and_all_triggers_have_their_names(page: Page) -> None:
+    for name in ("Anchored match", "Multi-pair match", "Singleton match", "Prediction only", "Missed"):
+        assert name in page.text
+    for trigger in ("initialization", "time gap", "manual step", "safety timeout"):
+        assert trigger in page.text
+
+
+def test_times_are_utc_and_the_axis_names_the_day(page: Page) -> None:
+    # 1,880,964,872.5 s after 1970-01-01 is 2029-08-09 10:14:32 UTC (GNU date -u -d @1880964872).
+    assert "2029-08-09 10:14:32 UTC" in page.text
+    assert "UTC, 9 August 2029" in page.text
+
+
+def test_the_ledger_counts_every_read_of_the_anchor_ephemeris(page: Page) -> None:
+    ledger = page.text[page.text.rindex("Truth-use ledger") :]
+    assert "Never read the anchor ephemeris: anchored." in ledger
+    assert "Read it: paper, spherical." in ledger
+
+
+def test_a_title_with_markup_is_text(whole_pass: PassReport) -> None:
+    text = render_html(
+        PassReport(
+            title='<script>alert("x")</script> $\\alpha$ 月',
+            pass_id='";} body{display:none}</style>',
+            navigation=(_series(3, name="<b>&</b> $x^2$ 月"),),
+        )
+    )
+    page = Page(text)
+    assert page.left_open == []
+    assert "script" not in page.tags and "b" in page.tags
+    assert '<script>alert("x")</script> $\\alpha$ 月' in page.text
+
+
+def test_an_empty_pass_says_what_is_missing_and_why() -> None:
+    page = Page(render_html(PassReport(title="Nothing", pass_id="p0")))
+    assert page.left_open == []
+    for what, why in (
+        ("Verdict", "nobody has judged this pass"),
+        ("Navigation", "no navigation telemetry was received"),
+        ("Frame accounting", "the frames of the pass were not counted"),
+        ("Packet accounting", "no account of the downlink came with the pass"),
+        ("Matcher outcomes", "no estimator reported what its matcher did"),
+        ("Altitude against the reference", "no reference ephemeris covers the pass"),
+        ("Ground track", "no reference ephemeris covers the pass"),
+        ("Gallery of detections", "the pass has no images on the ground"),
+        ("Housekeeping", "no housekeeping packet was received"),
+        ("Configuration", "none was archived with the pass"),
+    ):
+        assert f"{what} not available: {why}" in page.text
+
+
+def test_a_reason_given_with_the_value_replaces_the_usual_one() -> None:
+    report = PassReport(
+        title="No images", pass_id="p1", not_available={"gallery": "images were not asked for in this window"}
+    )
+    text = Page(render_html(report)).text
+    assert "Gallery of detections not available: images were not asked for in this window" in text
+    assert "gallery: images were not asked for in this window" in text
+
+
+def test_a_pass_without_a_reference_shows_what_the_estimators_said() -> None:
+    nothing = np.full((40, 3), np.nan)
+    one = _series(40, error_rtn_m=nothing, outcome=("fixed",) * 30 + ("coasted",) * 10)
+    text = Page(render_html(PassReport(title="No reference", pass_id="p2", navigation=(one,)))).text
+    assert "Position error not available: no reference ephemeris covers the pass" in text
+    assert "Fixed on the catalogue" in text and "75.0 %" in text
+
+
+def test_a_pass_of_one_frame_is_reported() -> None:
+    report = example.pass_report(hours=15.0 / 3600.0, gallery=1, worst=0)
+    assert len(report.navigation[0].utc_ns) == 1
+    page = Page(render_html(report))
+    assert page.left_open == []
+    assert "Of 1 expected" in page.text
+
+
+def test_series_of_nothing_but_nan_are_dashes_not_numbers() -> None:
+    n = 25
+    one = _series(
+        n,
+        latitude_deg=np.full(n, np.nan),
+        longitude_deg=np.full(n, np.nan),
+        altitude_m=np.full(n, np.nan),
+        error_rtn_m=np.full((n, 3), np.nan),
+        sigma_rtn_m=np.full((n, 3), np.nan),
+        nees=np.full(n, np.nan),
+        nis=np.full(n, np.nan),
+        nis_dof=np.zeros(n, np.int64),
+    )
+    track = TrackSeries(one.utc_ns, np.linspace(-5, 5, n), np.full(n, 10.0), np.full(n, np.nan))
+    headline = (HeadlineFigure("Error", float("nan"), "m"), HeadlineFigure("Recall", None))
+    text = Page(
+        render_html(PassReport("NaN", "p3", navigation=(one,), reference=track, headline=headline))
+    ).text
+    assert text.count("not available") >= 4
+    assert "nan" not in text.lower().replace("nan ", "", 1).split("pass report")[-1]
+
+
+def test_single_wild_values_do_not_break_a_page() -> None:
+    n = 60
+    error = np.full((n, 3), 12.0)
+    error[7] = 1e12
+    error[9] = np.inf
+    error[11] = 0.0
+    one = _series(n, error_rtn_m=error, sigma_rtn_m=np.full((n, 3), 1e-9))
+    assert Page(render_html(PassReport("Wild", "p4", navigation=(one,)))).left_open == []
+
+
+def test_half_a_downlink_shows_the_share_that_came() -> None:
+    report = dataclasses.replace(
+        example.pass_report(gallery=0, worst=0), accounting=FrameAccounting(expected=148, processed=74)
+    )
+    text = Page(render_html(report)).text
+    assert "Of 148 expected, 74 (50.0 %) are processed." in text
+
+
+def test_arrays_of_different_lengths_are_refused_with_place_expected_and_found() -> None:
+    with pytest.raises(InconsistentReport) as caught:
+        render_html(PassReport("Bad", "p5", navigation=(_series(4, altitude_m=np.zeros(3)),)))
+    message = str(caught.value)
+    assert "'anchored', altitude_m" in message and "(4,)" in message and "(3,)" in message
+
+
+def test_too_few_outcome_labels_are_refused() -> None:
+    with pytest.raises(InconsistentReport, match="4 labels"):
+        render_html(PassReport("Bad", "p6", navigation=(_series(4, outcome=("fixed",)),)))
+
+
+def test_a_value_that_is_no_report_is_refused_by_name() -> None:
+    with pytest.raises(UnknownReportKind, match="dict"):
+        render_html({"title": "not a report"})
+
+
+@pytest.mark.slow
+def test_a_day_of_passes_stays_under_eight_megabytes() -> None:
+    report = example.pass_report(hours=24.0)
+    assert sum(len(s.utc_ns) for s in report.navigation if s.kind == "estimate") == 3 * 5_760
+    text = render_html(report)
+    assert len(text.encode()) < 8_000_000
+    page = Page(text)
+    assert page.left_open == [] and page.references <= set(page.ids)
+    assert "One hour of it" in page.text

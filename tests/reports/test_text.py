@@ -1,0 +1,97 @@
+"""Numbers, times and names as they are printed."""
+
+import math
+
+import pytest
+
+from reports.document import rung_number, rung_text
+from reports.text import (
+    count_text,
+    duration_text,
+    hash_text,
+    length_text,
+    number_text,
+    percent_text,
+    significant_text,
+    utc_text,
+)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (51.23, "51.2"),
+        (0.70444, "0.704"),
+        (0.0996, "0.0996"),
+        (0.9996, "1.00"),
+        (148.4, "148"),
+        (59_012.0, "59\u202f000"),
+        (9, "9"),
+        (12_345, "12\u202f345"),
+        (-3.14159, "−3.14"),
+        (0.0, "0"),
+        (math.nan, "–"),
+        (None, "–"),
+        ("words", "words"),
+        (1e-9, "1.00e−09"),
+    ],
+)
+def test_three_significant_digits(value: float | int | str | None, text: str) -> None:
+    assert significant_text(value) == text
+
+
+@pytest.mark.parametrize(
+    ("metres", "text"),
+    [(84.0, "84.0 m"), (999.4, "999 m"), (1_310.0, "1.31 km"), (58_960.0, "59.0 km"), (math.nan, "–")],
+)
+def test_lengths_carry_the_unit_that_fits(metres: float, text: str) -> None:
+    assert length_text(metres) == text
+
+
+def test_shares_of_nothing_are_no_number() -> None:
+    assert percent_text(3, 0) == "–"
+    assert percent_text(1, 3) == "33.3\u202f%"
+
+
+def test_counts_and_numbers_are_grouped_by_thousands() -> None:
+    assert count_text(1_234_567) == "1\u202f234\u202f567"
+    assert number_text(-1234.5, 1) == "−1\u202f234.5"
+    assert count_text(None) == "–"
+
+
+def test_times_are_cut_to_the_second_and_named() -> None:
+    # The leap day and the last second before 1970 are the edges of the calendar arithmetic.
+    assert utc_text(951_782_400_000_000_000) == "2000-02-29 00:00:00 UTC"
+    assert utc_text(-1) == "1969-12-31 23:59:59 UTC"
+    assert utc_text(None) == "–"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(42.0, "42 s"), (2_220.0, "37.0 min"), (86_400.0, "24.0 h"), (864_000.0, "10.0 d")]
+)
+def test_durations_fit_their_size(seconds: float, text: str) -> None:
+    assert duration_text(seconds) == text
+
+
+def test_hashes_can_break_over_lines() -> None:
+    assert hash_text("0123456789abcdef0") == "01234567 89abcdef 0"
+
+
+@pytest.mark.parametrize(
+    ("rung", "number"),
+    [
+        ("3", 3),
+        ("rung 2", 2),
+        ("(4) another renderer", 4),
+        ("real terrain", 3),
+        ("", None),
+        ("9", None),
+        ("?", None),
+    ],
+)
+def test_rungs_of_evidence_are_read_from_their_number_or_name(rung: str, number: int | None) -> None:
+    assert rung_number(rung) == number
+
+
+def test_an_unstated_rung_is_said_to_be_unstated() -> None:
+    assert rung_text("") == "evidence not stated"
