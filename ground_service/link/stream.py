@@ -39,6 +39,22 @@ class LinkAccounting:
     symbols_corrected: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class StreamEdges:
+    """How a stream begins and ends: what does not belong to a whole unit there, and the counts of the frames there.
+
+    `settings` is None for bare packets. Counts are those of the master channel, None where the frame at the edge is
+    not good.
+    """
+
+    settings: LinkSettings | None
+    octets: int
+    head_loose: int
+    tail_loose: int
+    head_count: int | None = None
+    tail_count: int | None = None
+
+
 class DownlinkReader:
     """Reads one stream: CADUs or bare space packets, told apart by content.
 
@@ -56,6 +72,7 @@ class DownlinkReader:
         window_octets: int = WINDOW_OCTETS,
     ) -> None:
         self.accounting = LinkAccounting()
+        self.edges: StreamEdges | None = None
         self._spacecraft_id = spacecraft_id
         self._dictionary = dictionary
         self._window_octets = window_octets
@@ -80,6 +97,7 @@ class DownlinkReader:
                 bare = settings is None
             if settings is None:
                 cut = cut_packets(window, final=final)
+                self._packet_edges(cut, len(window), final)
                 self.accounting.octets_skipped += cut.octets_skipped
                 self._count(cut)
                 rest = b"" if final else bytes(memoryview(window)[cut.consumed :])
@@ -110,11 +128,41 @@ class DownlinkReader:
         self.accounting.frames_bad += sign * (frames - own + truncated)
         self.accounting.symbols_corrected += sign * first.symbols_corrected
         self.accounting.octets_skipped += sign * first.octets["unsynchronised"]
+        if sign > 0:
+            self._frame_edges(first, settings, len(window))
         for one in found:
             self.accounting.octets_skipped += sign * (one.octets["orphaned"] + one.octets["skipped"])
             self._count(one.cut, sign)
             if sign > 0:
                 yield batch_of_cut(one.buffer, one.cut, self._dictionary, one.spacecraft_id)
+
+    def _packet_edges(self, cut: PacketCut, octets: int, final: bool) -> None:
+        first = self.edges
+        head = int(cut.skipped[0, 1]) if len(cut.skipped) and cut.skipped[0, 0] == 0 else 0
+        tail = (
+            octets - int(cut.skipped[-1, 0])
+            if final and len(cut.skipped) and cut.skipped[-1, 1] == octets
+            else 0
+        )
+        self.edges = StreamEdges(
+            None, self.accounting.octets, head if first is None else first.head_loose, tail
+        )
+
+    def _frame_edges(self, found: DownlinkDecode, settings: LinkSettings, octets: int) -> None:
+        frames = found.frames
+        if frames is None or len(frames) == 0:
+            return
+        first = self.edges
+        counts = [int(frames.master_count[i]) if frames.verdict[i] == 0 else None for i in (0, -1)]
+        tail = octets - int(frames.offset[-1]) - settings.cadu_length
+        if first is None:
+            self.edges = StreamEdges(
+                settings, self.accounting.octets, int(frames.offset[0]), tail, counts[0], counts[1]
+            )
+        else:
+            self.edges = StreamEdges(
+                settings, self.accounting.octets, first.head_loose, tail, first.head_count, counts[1]
+            )
 
     def _count(self, cut: PacketCut, sign: int = 1) -> None:
         self.accounting.packets += sign * int(np.count_nonzero(cut.crc_ok))
@@ -139,9 +187,16 @@ def _other_spacecraft(result: DownlinkDecode) -> list[int]:
 
 def _overlap(window: bytes, settings: LinkSettings) -> bytes:
     """The end of a window that the next one has to begin with: the longest packet may begin anywhere in it."""
-    frames = PACKET_MAX_LENGTH // max(settings.frame_length - 16, 1) + 2
-    length = min((frames + 1) * settings.cadu_length, len(window) // 2)
+    length = min(reach_octets(settings), len(window) // 2)
     return window[len(window) - length :]
+
+
+def reach_octets(settings: LinkSettings | None) -> int:
+    """Octets of a stream over which one packet can stretch; of bare packets when there are no settings."""
+    if settings is None:
+        return PACKET_MAX_LENGTH
+    frames = PACKET_MAX_LENGTH // max(settings.frame_length - 16, 1) + 3
+    return frames * settings.cadu_length
 
 
 def _rebuffered(blocks: Iterable[bytes], octets: int) -> Iterator[bytes]:

@@ -14,6 +14,7 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, InvalidInput
 from ground_service.link.stream import DownlinkReader
 from ground_service.services.ground import Ground
+from ground_service.services.joining import join_with_others
 from ground_service.store import repository
 from ground_service.store.files import StoredFile, read_blocks
 from ground_service.store.packets import store_batch
@@ -26,13 +27,17 @@ FLOWN = "flight"
 
 @dataclass(frozen=True, slots=True)
 class IngestResult:
-    """What one ingest found in its file, and what of it was new."""
+    """What one ingest found in its file, and what of it was new.
+
+    `packets_joined` came about only together with files that were ingested before.
+    """
 
     ingest_id: int
     vehicle_id: int | None
     octets: int
     packets: int
     packets_new: int
+    packets_joined: int
     packets_repeated: int
     samples: int
     crc_errors: int
@@ -110,8 +115,9 @@ def run_ingest(
         repository.change(connection, repository.INGESTS, ingest_id, state="running")
     path = ground.files.path(record["file_sha256"])
     try:
-        result = _store_stream(ground, ingest_id, DownlinkReader(spacecraft_id), instance, read_blocks(path))
-        if result.packets == 0 and result.octets > 0:
+        reader = DownlinkReader(spacecraft_id)
+        result = _store_stream(ground, ingest_id, reader, instance, record["file_sha256"], read_blocks(path))
+        if result.packets == 0 and result.frames == result.frames_bad:
             raise InvalidInput(
                 _name(ground, record["file_sha256"]),
                 "",
@@ -144,12 +150,17 @@ def run_ingest(
 
 
 def _store_stream(
-    ground: Ground, ingest_id: int, reader: DownlinkReader, instance: str, blocks: Iterable[bytes]
+    ground: Ground,
+    ingest_id: int,
+    reader: DownlinkReader,
+    instance: str,
+    sha256: str,
+    blocks: Iterable[bytes],
 ) -> IngestResult:
     vehicles: dict[int, int] = {}
     new = samples = unknown = 0
     for batch in reader.batches(blocks):
-        if len(batch) == 0:
+        if len(batch) == 0 and (reader.edges is None or reader.edges.settings is None):
             continue
         if batch.spacecraft_id is None:
             raise InvalidInput("downlink of bare packets", "", "the id of their spacecraft", "none given")
@@ -162,13 +173,21 @@ def _store_stream(
         new += stored.new
         samples += stored.samples
         unknown += batch.unknown
+    joined = 0
+    if reader.edges is not None:
+        for spacecraft_id, vehicle in vehicles.items():
+            with ground.database.writing() as connection:
+                joined += join_with_others(
+                    connection, ground.files, vehicle, spacecraft_id, sha256, reader.edges
+                )
     found = reader.accounting
     return IngestResult(
         ingest_id=ingest_id,
         vehicle_id=next(iter(vehicles.values()), None),
         octets=found.octets,
         packets=found.packets,
-        packets_new=new,
+        packets_new=new + joined,
+        packets_joined=joined,
         packets_repeated=found.packets - new,
         samples=samples,
         crc_errors=found.crc_errors,

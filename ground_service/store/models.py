@@ -101,14 +101,22 @@ class Packet(Base):
     octets: Mapped[bytes] = mapped_column(LargeBinary)
 
 
-class Fragment(Base):
-    """Octets at the edge of an ingested file that no whole packet could be made of, kept until the rest comes."""
+class StreamEdge(Base):
+    """How an ingested file begins and ends, so that what was cut apart between two files can be put together.
 
-    __tablename__ = "fragments"
+    `head_loose` and `tail_loose` are octets before the first and behind the last whole unit (CADU or packet);
+    `head_count` and `tail_count` the master channel counts of the first and last frame, NULL where not known.
+    """
+
+    __tablename__ = "stream_edges"
     vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"), primary_key=True)
-    digest: Mapped[bytes] = mapped_column(LargeBinary(16), primary_key=True)
-    place: Mapped[str] = mapped_column(String(8))
-    octets: Mapped[bytes] = mapped_column(LargeBinary)
+    file_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"), primary_key=True)
+    link: Mapped[dict[str, Any] | None] = mapped_column(JSON)
+    octets: Mapped[int] = mapped_column(BigInteger)
+    head_loose: Mapped[int] = mapped_column(Integer)
+    tail_loose: Mapped[int] = mapped_column(Integer)
+    head_count: Mapped[int | None] = mapped_column(SmallInteger)
+    tail_count: Mapped[int | None] = mapped_column(SmallInteger)
 
 
 class Sample:

@@ -10,7 +10,15 @@ from ground_service.settings import load_settings, normalised_url
 
 @pytest.fixture(autouse=True)
 def bare(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    for name in ("HOME", "DATABASE_URL", "BROKER_URL", "HOST", "PORT", "DATABASE_URL_FILE", "BROKER_URL_FILE"):
+    for name in (
+        "HOME",
+        "DATABASE_URL",
+        "BROKER_URL",
+        "HOST",
+        "PORT",
+        "DATABASE_URL_FILE",
+        "BROKER_URL_FILE",
+    ):
         monkeypatch.delenv(f"LINNA_{name}", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
 
@@ -29,7 +37,9 @@ def test_what_is_given_goes_before_the_environment(monkeypatch: pytest.MonkeyPat
     assert load_settings(port=9001).port == 9001
 
 
-def test_secrets_can_come_from_files_and_are_not_printed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_secrets_can_come_from_files_and_are_not_printed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     (tmp_path / "url").write_text("postgres://linna:geheim@db/linna\n")
     monkeypatch.setenv("LINNA_DATABASE_URL_FILE", str(tmp_path / "url"))
     settings = load_settings()
@@ -45,7 +55,9 @@ def test_secrets_can_come_from_files_and_are_not_printed(monkeypatch: pytest.Mon
         ("LINNA_DATABASE_URL_FILE", "/does/not/exist", "LINNA_DATABASE_URL_FILE: expected a readable file"),
     ],
 )
-def test_a_wrong_setting_is_named(monkeypatch: pytest.MonkeyPatch, name: str, value: str, message: str) -> None:
+def test_a_wrong_setting_is_named(
+    monkeypatch: pytest.MonkeyPatch, name: str, value: str, message: str
+) -> None:
     monkeypatch.setenv(name, value)
     with pytest.raises(SettingsError, match=message):
         load_settings()

@@ -89,7 +89,12 @@ def test_passes_are_listed_in_pages_and_shown(client: TestClient) -> None:
 
 
 def test_a_pass_can_be_defined(client: TestClient) -> None:
-    given = {"name": "p", "start": "2029-08-07T06:00:00Z", "stop": "2029-08-07T07:00:00Z", "spacecraft_id": 76}
+    given = {
+        "name": "p",
+        "start": "2029-08-07T06:00:00Z",
+        "stop": "2029-08-07T07:00:00Z",
+        "spacecraft_id": 76,
+    }
     assert client.post(f"{V1}/passes", json=given).status_code == 201
     assert is_problem(client.post(f"{V1}/passes", json={**given, "stop": "2029-08-07T05:00:00Z"}), 422)
     assert is_problem(client.post(f"{V1}/passes", json={**given, "start": "noon"}), 422)
@@ -141,7 +146,9 @@ def test_an_ephemeris_is_uploaded_once(client: TestClient, synthetic_pass: Any) 
     first = client.post(f"{V1}/ephemerides", content=octets, params={"name": "reference"})
     assert first.status_code == 201, first.text
     assert first.json()["frame"] == "ICRF"
-    assert client.post(f"{V1}/ephemerides", content=octets, params={"name": "reference"}).json() == first.json()
+    assert (
+        client.post(f"{V1}/ephemerides", content=octets, params={"name": "reference"}).json() == first.json()
+    )
     refused = client.post(f"{V1}/ephemerides", content=b"not an ephemeris")
     assert is_problem(refused, 422)
     assert "/files/" not in refused.text
@@ -215,7 +222,9 @@ def test_every_operation_asks_for_its_role(guarded: tuple[TestClient, dict[str, 
 
 def test_the_matrix_above_names_every_operation(client: TestClient) -> None:
     document = client.get(f"{V1}/openapi.json").json()
-    described = {(m.upper(), p.removeprefix(V1)) for p, operations in document["paths"].items() for m in operations}
+    described = {
+        (m.upper(), p.removeprefix(V1)) for p, operations in document["paths"].items() for m in operations
+    }
 
     def matches(method: str, path: str) -> bool:
         parts = path.split("/")

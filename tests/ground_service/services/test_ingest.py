@@ -1,5 +1,6 @@
 """Ingest: any order, any split, any repetition of the same octets gives the same archive."""
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from ground_service.services.ground import Ground, open_ground
 from ground_service.services.ingest import ingest_file
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
+from tmtc.downlink import encode_cadus
 
 SPACECRAFT = 76
 
@@ -128,3 +130,42 @@ def test_noise_is_refused_in_one_line_and_remembered(ground: Ground, tmp_path: P
 def test_a_missing_file_is_refused(ground: Ground, tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match="expected a downlink file, found nothing there"):
         ingest_file(ground, tmp_path / "no.bin", spacecraft_id=SPACECRAFT)
+
+
+def split_anywhere(octets: bytes, data: st.DataObject, smallest: int) -> list[bytes]:
+    """Pieces of at least `smallest` octets, cut at any octet, in any order."""
+    cuts = [0]
+    for _ in range(data.draw(st.integers(1, 5))):
+        low, high = cuts[-1] + smallest, len(octets) - smallest
+        if low <= high:
+            cuts.append(data.draw(st.integers(low, high)))
+    pieces = [octets[a:b] for a, b in itertools.pairwise([*cuts, len(octets)])]
+    return [pieces[i] for i in data.draw(st.permutations(range(len(pieces))))]
+
+
+@settings(max_examples=15, deadline=None)
+@given(data=st.data())
+def test_a_stream_of_frames_may_be_cut_at_any_octet(
+    data: st.DataObject, packets: list[bytes], expected: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Pieces hold two whole CADUs or more (259 octets each here), so that each has a frame to be placed by."""
+    folder = tmp_path_factory.mktemp("cut")
+    stream = encode_cadus(packets, spacecraft_id=SPACECRAFT, frame_length=223)
+    with open_ground(folder / "home") as ground:
+        for piece in split_anywhere(stream, data, 3 * 259):
+            ingest(ground, piece, folder)
+        assert archive(ground) == expected
+
+
+@settings(max_examples=10, deadline=None)
+@given(data=st.data())
+def test_bare_packets_may_be_cut_at_any_octet(
+    data: st.DataObject, packets: list[bytes], expected: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Pieces hold a whole packet or more; the longest here has about 600 octets."""
+    folder = tmp_path_factory.mktemp("cut")
+    smallest = 2 * max(len(packet) for packet in packets)
+    with open_ground(folder / "home") as ground:
+        for piece in split_anywhere(b"".join(packets), data, smallest):
+            ingest(ground, piece, folder)
+        assert archive(ground) == expected

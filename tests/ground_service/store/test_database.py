@@ -62,7 +62,9 @@ def test_samples_are_clustered_by_time(tmp_path: Path) -> None:
     """The primary key leads with vehicle, dictionary and time: a time range is one contiguous read."""
     database = prepare_database(url(tmp_path))
     with database.reading() as connection:
-        made = connection.execute(text("SELECT sql FROM sqlite_master WHERE name = 'navigation_states'")).scalar_one()
+        made = connection.execute(
+            text("SELECT sql FROM sqlite_master WHERE name = 'navigation_states'")
+        ).scalar_one()
         key = inspect(connection).get_pk_constraint("navigation_states")["constrained_columns"]
     assert "WITHOUT ROWID" in made
     assert key == ["vehicle_id", "dictionary_version", "ticks", "packet_id"]
@@ -96,7 +98,9 @@ def test_a_file_that_is_no_database_is_refused_in_one_line(tmp_path: Path) -> No
         prepare_database(url(tmp_path))
 
 
-@pytest.mark.parametrize("wrong", ["nonsense", "oracle+what://x", "postgresql+psycopg://nobody:secret@127.0.0.1:1/x"])
+@pytest.mark.parametrize(
+    "wrong", ["nonsense", "oracle+what://x", "postgresql+psycopg://nobody:secret@127.0.0.1:1/x"]
+)
 def test_a_database_that_cannot_be_reached_is_named_without_its_password(wrong: str) -> None:
     with pytest.raises(DatabaseUnavailable) as caught:
         prepare_database(wrong)
@@ -122,7 +126,8 @@ def test_a_full_database_is_one_clear_line(tmp_path: Path) -> None:
         connection.execute(text(f"PRAGMA max_page_count = {pages}"))
         for number in range(200):
             connection.execute(
-                text("INSERT INTO vehicles (ccsds_id, instance) VALUES (:n, :i)"), {"n": number, "i": "x" * 90}
+                text("INSERT INTO vehicles (ccsds_id, instance) VALUES (:n, :i)"),
+                {"n": number, "i": "x" * 90},
             )
     database.engine.dispose()
 

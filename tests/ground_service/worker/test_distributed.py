@@ -19,7 +19,12 @@ from ground_service.services.reports import pass_summary
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
-from ground_service.store.database import downgrade_database, open_database, prepare_database, schema_revisions
+from ground_service.store.database import (
+    downgrade_database,
+    open_database,
+    prepare_database,
+    schema_revisions,
+)
 from ground_service.worker.app import run_worker
 from ground_service.worker.dispatch import dispatcher_for
 
@@ -89,7 +94,7 @@ def test_the_archive_is_the_same_as_on_sqlite(
 def test_a_worker_makes_the_report(
     ground_on_postgres: Ground, redis_url: str, upgraded: str, synthetic_pass: Any, tmp_path: Path
 ) -> None:
-    """The worker is another process; a job entered while it is away is done when it comes; a killed one is done again."""
+    """The worker is another process; a job entered while it is away is done when it comes."""
     ground = ground_on_postgres
     settings = Settings(home=ground.home, database_url=upgraded, broker_url=redis_url)
     pass_id = import_archive(ground, synthetic_pass.folder)
