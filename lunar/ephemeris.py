@@ -348,22 +348,27 @@ def _interpolate(
     else:
         table = _lagrange_polynomials(node, states)
     # One row per step, so that a request out of order touches one stretch of memory per epoch.
-    rows = np.ascontiguousarray(table.transpose(2, 0, 1))
+    terms, parts, _ = table.shape
+    rows = np.ascontiguousarray(table.transpose(2, 0, 1)).reshape(-1, terms * parts)
     for start in range(0, len(flat), _BLOCK):
         part = slice(start, start + _BLOCK)
         which = row[part]
         x = (epochs[part] - origin_ns[which]) / NS / half_s[which] - 1.0
-        coefficients = np.ascontiguousarray(rows[which].transpose(1, 2, 0))
+        coefficients = np.ascontiguousarray(rows.take(which, axis=0).T).reshape(terms, parts, -1)
         value = coefficients[-1]
         if hermite:
             rate = np.zeros_like(value)
             for c in coefficients[-2::-1]:
-                rate = rate * x + value
-                value = value * x + c
-            position[part], velocity[part] = value.T, (rate / half_s[which]).T
+                rate *= x
+                rate += value
+                value *= x
+                value += c
+            rate /= half_s[which]
+            position[part], velocity[part] = value.T, rate.T
         else:
             for c in coefficients[-2::-1]:
-                value = value * x + c
+                value *= x
+                value += c
             position[part], velocity[part] = value[:3].T, value[3:].T
 
 

@@ -22,7 +22,9 @@ def circle(elapsed_s, radius_m=1_768_180.0):
 
 def ephemeris(elapsed_s=ELAPSED_S, radius_m=1_768_180.0, late_s=0.0, shift_m=(0.0, 0.0, 0.0)):
     position, velocity = circle(elapsed_s - late_s, radius_m)
-    return ephemeris_from_states(START + np.rint(elapsed_s * NS).astype(np.int64), position + shift_m, velocity)
+    return ephemeris_from_states(
+        START + np.rint(elapsed_s * NS).astype(np.int64), position + shift_m, velocity
+    )
 
 
 def test_an_ephemeris_does_not_differ_from_itself():

@@ -20,7 +20,9 @@ def circle(elapsed_s):
     """Position and velocity on a circular orbit, tilted."""
     angle = RATE_RAD_S * np.asarray(elapsed_s)
     position = RADIUS_M * np.stack([np.cos(angle), 0.6 * np.sin(angle), 0.8 * np.sin(angle)], -1)
-    velocity = RADIUS_M * RATE_RAD_S * np.stack([-np.sin(angle), 0.6 * np.cos(angle), 0.8 * np.cos(angle)], -1)
+    velocity = (
+        RADIUS_M * RATE_RAD_S * np.stack([-np.sin(angle), 0.6 * np.cos(angle), 0.8 * np.cos(angle)], -1)
+    )
     return position, velocity
 
 
@@ -150,7 +152,12 @@ def test_nothing_is_interpolated_across_the_edge_of_a_segment():
 
 def test_epochs_between_segments_are_refused():
     ephemeris = two_arcs(second_start_s=900.0)
-    assert ephemeris.covers(START + np.array([600, 601, 899, 900]) * NS).tolist() == [True, False, False, True]
+    assert ephemeris.covers(START + np.array([600, 601, 899, 900]) * NS).tolist() == [
+        True,
+        False,
+        False,
+        True,
+    ]
     with pytest.raises(EphemerisCoverageError, match=r"00:10:00.000Z, 2029-08-07T00:15:00.000Z"):
         at_s(ephemeris, 700.0)
 
@@ -158,9 +165,16 @@ def test_epochs_between_segments_are_refused():
 def test_a_hole_in_the_states_of_a_segment_is_a_gap():
     elapsed = np.concatenate([np.arange(0.0, 601.0, 30.0), np.arange(3600.0, 4201.0, 30.0)])
     ephemeris = arc(elapsed)
-    assert ephemeris.covers(START + np.array([600, 601, 3599, 3600]) * NS).tolist() == [True, False, False, True]
+    assert ephemeris.covers(START + np.array([600, 601, 3599, 3600]) * NS).tolist() == [
+        True,
+        False,
+        False,
+        True,
+    ]
     at_s(ephemeris, [600.0, 3600.0])
-    with pytest.raises(EphemerisCoverageError, match=r"with a gap 2029-08-07T00:10:00.000Z..2029-08-07T01:00:00.000Z"):
+    with pytest.raises(
+        EphemerisCoverageError, match=r"with a gap 2029-08-07T00:10:00.000Z..2029-08-07T01:00:00.000Z"
+    ):
         at_s(ephemeris, [30.0, 2000.0])
 
 

@@ -27,13 +27,17 @@ from lunar.frames import (
     spherical_from_mcmf,
 )
 
-SPICE = json.loads(Path(__file__).parents[1].joinpath("references/lunar/spice_moon_rotations.json").read_text())
+SPICE = json.loads(
+    Path(__file__).parents[1].joinpath("references/lunar/spice_moon_rotations.json").read_text()
+)
 SPICE_EPOCHS_TDB_S = np.array(SPICE["epochs_tdb_s"])
 
 # The same model in the same arithmetic: 1e-9 rad is 1.7 mm on the ground.
 SAME_MODEL_RAD = 1e-9
 
-unit_quaternions = st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1)
+unit_quaternions = st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4).filter(
+    lambda q: np.linalg.norm(q) > 0.1
+)
 latitudes = st.floats(-np.pi / 2, np.pi / 2)
 longitudes = st.floats(-2 * np.pi, 2 * np.pi)
 
@@ -75,7 +79,9 @@ def test_the_iau_series_is_that_of_spice_at_stored_epochs():
 @pytest.mark.parametrize("frame", ["IAU_MOON", "MOON_PA", "MOON_ME"])
 def test_rotations_are_those_of_spice_with_the_same_kernels(frame, de421, spice_kernels):
     # From 1905 to 2049, both sides of every record edge that falls in between.
-    epochs = np.concatenate([np.linspace(-3.0e9, 1.55e9, 301), de421.start_tdb_s + de421.record_s * np.arange(5000, 5010)])
+    epochs = np.concatenate(
+        [np.linspace(-3.0e9, 1.55e9, 301), de421.start_tdb_s + de421.record_s * np.arange(5000, 5010)]
+    )
     ours = {
         "IAU_MOON": IauOrientation().mcmf_from_icrf,
         "MOON_PA": de421.pa_from_icrf,
