@@ -72,6 +72,10 @@ WORST_MINIMUM_EXPECTED = 3
 RESETS = ("initialization", "time_gap", "manual_step", "safety_timeout")
 
 
+PERFECT_START_M = 1.0
+"""A start state this close to the reference is as good as the reference: no baseline of its own."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PassInputs:
     """Everything that the evaluation of a pass needs; None or empty where it is not known."""
@@ -324,18 +328,22 @@ def _baselines(
         return []
     here = _at(track, rows)
     series = []
-    models = [("propagate-only", gravity, min(BASELINE_DEGREE, gravity.degree))]
+    runs = [("propagate-only", start, gravity, min(BASELINE_DEGREE, gravity.degree))]
     if inputs.other_gravity is not None:
         other = inputs.other_gravity
-        models.append((f"propagate-only, {other.name}", other, min(BASELINE_DEGREE, other.degree)))
-    for name, field_used, degree in (*models, ("Kepler", gravity, 0)):
+        runs.append((f"propagate-only, {other.name}", start, other, min(BASELINE_DEGREE, other.degree)))
+    perfect = StartState(int(here.utc_ns[0]), here.position_icrf_m[0], here.velocity_icrf_m_s[0])
+    if _apart_m(start, perfect) > PERFECT_START_M:
+        runs.append(("propagate-only, perfect start", perfect, gravity, runs[0][3]))
+    for name, begin, field_used, degree in (*runs, ("Kepler", start, gravity, 0)):
         position = propagated_positions(
-            start, here.utc_ns, field_used, degree, inputs.orientation, third_bodies=degree > 0
+            begin, here.utc_ns, field_used, degree, inputs.orientation, third_bodies=degree > 0
         )
+        origin = "state of the reference" if begin is perfect else "start state of the filter"
         text = (
-            f"start state propagated with {field_used.name} to degree {degree}, Earth and Sun"
+            f"{origin} propagated with {field_used.name} to degree {degree}, Earth and Sun"
             if degree
-            else "start state on its two-body orbit"
+            else f"{origin} on its two-body orbit"
         )
         error = error_of_positions_rtn_m(here, position)
         latitude, longitude, altitude = places_of_positions(here, position)
@@ -355,6 +363,13 @@ def _baselines(
             )
         )
     return series
+
+
+def _apart_m(start: StartState, other: StartState) -> float:
+    """Distance of two states of the same instant; not a number (never "apart") for states of different instants."""
+    if start.utc_ns != other.utc_ns:
+        return float("nan")
+    return float(np.linalg.norm(np.asarray(start.position_icrf_m) - other.position_icrf_m))
 
 
 def _detector(
