@@ -115,7 +115,7 @@ def walk(
 
 
 @njit
-def _is_pus(buffer: Array, p: int, length: int, packet_type: int) -> bool:
+def is_pus(buffer: Array, p: int, length: int, packet_type: int) -> bool:
     """Whether a PUS-C secondary header stands where it should."""
     if not buffer[p] & 0x08:
         return False
@@ -205,7 +205,7 @@ def search(
         if _prefix_holds(buffer, q, length, prefix, known, tables, powers):
             e = q + length
             if (
-                _is_pus(buffer, q, length, packet_type)
+                is_pus(buffer, q, length, packet_type)
                 or e == stop
                 or _stands(buffer, e, stop, packet_type, longest, prefix, known, tables, powers)
             ):

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from tmtc import cadu, reed_solomon
 from tmtc.crc import CRC_LENGTH
 from tmtc.dictionary import DICTIONARY
-from tmtc.errors import LinkFormatError, UncorrectableCodeword, ValueRefused
+from tmtc.errors import LinkFormatError, ValueRefused
 from tmtc.frames import (
     FRAME_HEADER_LENGTH,
     FRAME_MAX_LENGTH,
@@ -678,13 +678,8 @@ def _can_repair(blocks: OctetArray, settings: LinkSettings) -> bool:
     """Whether the first codeword of some block can be repaired."""
     code = settings.code
     assert code is not None
-    for block in blocks[:8]:
-        try:
-            reed_solomon.repair(block[:: code.interleave], code)
-        except UncorrectableCodeword:
-            continue
-        return True
-    return False
+    _, corrected = reed_solomon.repair(blocks[:8, :: code.interleave], code)
+    return bool((corrected >= 0).any())
 
 
 def _candidates(block_length: int) -> tuple[list[LinkSettings], list[LinkSettings]]:

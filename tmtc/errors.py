@@ -7,7 +7,6 @@ TmtcError
 ├── UnknownPacket         no such name or (APID, service, subtype) in the dictionary
 ├── ValueRefused          a value that its field cannot hold or its range forbids
 ├── FrameError            a transfer frame that cannot be built or read
-├── UncorrectableCodeword more symbol errors than the Reed-Solomon code can repair
 └── LinkFormatError       a stream whose framing cannot be told, or settings that contradict each other
 """
 
@@ -56,10 +55,6 @@ class ValueRefused(TmtcError):
 
 class FrameError(TmtcError):
     """A transfer frame that cannot be built or read."""
-
-
-class UncorrectableCodeword(TmtcError):
-    """A Reed-Solomon codeword with more symbol errors than the code repairs."""
 
 
 class LinkFormatError(TmtcError):

@@ -2,8 +2,8 @@
 
 Encoding and the check whether codewords are clean are linear over bits, so both are sums (exclusive or) of
 one table row per symbol, done for all codewords at once; the tables are made for the basis at hand and no
-symbol is converted. Only codewords with errors go to the scalar decoder of `reedsolo`, in the conventional
-basis.
+symbol is converted. Only codewords with errors go through the decoder proper, in the conventional basis, again
+many at once, so that a stream of nothing but noise does not hold up its reader.
 
 References
 ----------
@@ -15,12 +15,11 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from tmtc.errors import LinkFormatError, UncorrectableCodeword
+from tmtc.errors import LinkFormatError
 
 OctetArray = npt.NDArray[np.uint8]
 
@@ -121,16 +120,14 @@ def decode(blocks: OctetArray, code: ReedSolomon) -> RsDecode:
         )
     corrected = np.zeros((blocks.shape[0], code.interleave), dtype=np.int16)
     frames = blocks[:, : code.frame_length]
-    dirty = ~clean(blocks, code)
-    if dirty.any():
+    dirty = np.argwhere(~clean(blocks, code))
+    if dirty.size:
         frames = frames.copy()
         words = blocks.reshape(blocks.shape[0], CODEWORD - code.virtual_fill, code.interleave)
         data = frames.reshape(-1, code.symbols, code.interleave)
-        for n, k in np.argwhere(dirty):
-            try:
-                data[n, :, k], corrected[n, k] = repair(words[n, :, k], code)
-            except UncorrectableCodeword:
-                corrected[n, k] = UNCORRECTABLE
+        for start in range(0, dirty.shape[0], _BLOCK):
+            block, column = dirty[start : start + _BLOCK].T
+            data[block, :, column], corrected[block, column] = repair(words[block, :, column], code)
     return RsDecode(frames, corrected)
 
 
@@ -145,31 +142,95 @@ def clean(blocks: OctetArray, code: ReedSolomon) -> npt.NDArray[np.bool_]:
     return result
 
 
-def repair(word: OctetArray, code: ReedSolomon) -> tuple[OctetArray, int]:
-    """(data symbols, corrected symbols) of one codeword with errors, as sent (without its virtual fill).
+def repair(words: OctetArray, code: ReedSolomon) -> tuple[OctetArray, npt.NDArray[np.int16]]:
+    """Data symbols (n, symbols) and corrected symbols (n,) of codewords (n, 255 - virtual fill) as sent.
 
-    Raises
-    ------
-    UncorrectableCodeword
-        More than `code.errors` symbols are wrong.
+    Where a codeword has more wrong symbols than the code repairs, its data stay as they are and the count is
+    `UNCORRECTABLE`.
+
+    References
+    ----------
+    Berlekamp and Massey's algorithm without inversions, Chien's search, Forney's formula (for example Blahut,
+    Algebraic Codes for Data Transmission, chapter 7), each step for all codewords at once.
     """
-    import reedsolo
-
     to_dual, from_dual = dual_basis_tables()
-    conventional = from_dual[word] if code.dual_basis else word
-    full = bytes(code.virtual_fill) + conventional.tobytes()
-    try:
-        message, _, positions = _scalar_codec(code.errors).decode(full)
-    except reedsolo.ReedSolomonError:
-        raise UncorrectableCodeword(
-            f"Reed-Solomon: more than {code.errors} symbol errors in a codeword"
-        ) from None
-    data = np.frombuffer(bytes(message), dtype=np.uint8)
-    # errors "found" in symbols that were never sent are not errors: too many others were
-    if any(position < code.virtual_fill for position in positions):
-        raise UncorrectableCodeword(f"Reed-Solomon: more than {code.errors} symbol errors in a codeword")
-    data = data[code.virtual_fill :]
-    return (to_dual[data] if code.dual_basis else data), len(positions)
+    received = np.zeros((words.shape[0], CODEWORD), dtype=np.uint8)
+    received[:, code.virtual_fill :] = from_dual[words] if code.dual_basis else words
+    syndromes = _syndromes(received, code.errors)
+    locator = _error_locator(syndromes, code.errors)
+    values = _error_values(syndromes, locator, code.errors)
+    count = np.count_nonzero(values, axis=1)
+    degree = locator.shape[1] - 1 - np.argmax(locator[:, ::-1] != 0, axis=1)
+    # as many roots as the locator promises, none where zeros were never sent, and a codeword afterwards
+    good = (degree == count) & (count <= code.errors) & ~values[:, : code.virtual_fill].any(axis=1)
+    mended = received ^ values
+    good &= ~_syndromes(mended, code.errors).any(axis=1)
+    mended = np.where(good[:, None], mended, received)[:, code.virtual_fill : CODEWORD - code.parity]
+    counts = np.where(good, count, UNCORRECTABLE).astype(np.int16)
+    return (to_dual[mended] if code.dual_basis else mended), counts
+
+
+def _syndromes(received: OctetArray, errors: int) -> OctetArray:
+    """Values (n, parity) of codewords (n, 255) in the conventional basis at the generator's roots."""
+    whole = ReedSolomon(errors, 1, 0, dual_basis=False)
+    parity = _parity(received[:, : whole.symbols, None], whole)[:, :, 0]
+    # a codeword plus the difference of check symbols: its value at a root is that of the difference alone
+    difference = parity ^ received[:, whole.symbols :]
+    times, roots = _multiplication_table(), _roots(errors)
+    value = np.zeros((received.shape[0], 2 * errors), dtype=np.uint8)
+    for k in range(2 * errors):
+        value = times[roots, value] ^ difference[:, k : k + 1]
+    return value
+
+
+def _error_locator(syndromes: OctetArray, errors: int) -> OctetArray:
+    """Coefficients (n, parity + 1), lowest power first, of the polynomial whose roots locate the errors."""
+    times = _multiplication_table()
+    n, parity = syndromes.shape
+    locator = np.zeros((n, parity + 1), dtype=np.uint8)
+    locator[:, 0] = 1
+    before = locator.copy()
+    scale = np.ones(n, dtype=np.uint8)
+    length = np.zeros(n, dtype=np.int64)
+    for step in range(parity):
+        terms = times[locator[:, : step + 1], syndromes[:, step::-1][:, : step + 1]]
+        discrepancy = np.bitwise_xor.reduce(terms, axis=1)
+        shifted = np.zeros_like(before)
+        shifted[:, 1:] = before[:, :-1]
+        after = times[scale[:, None], locator] ^ times[discrepancy[:, None], shifted]
+        longer = (discrepancy != 0) & (2 * length <= step)
+        before = np.where(longer[:, None], locator, shifted)
+        scale = np.where(longer, discrepancy, scale)
+        length = np.where(longer, step + 1 - length, length)
+        locator = after
+    return locator
+
+
+def _error_values(syndromes: OctetArray, locator: OctetArray, errors: int) -> OctetArray:
+    """What was added (n, 255) to each symbol, by the roots of the locator."""
+    times, inverse = _multiplication_table(), _inverses()
+    n, parity = syndromes.shape
+    locator = locator[:, : errors + 1]
+    # evaluator: the product with the syndromes, powers below the parity
+    evaluator = np.zeros((n, parity), dtype=np.uint8)
+    for k in range(errors + 1):
+        evaluator[:, k:] ^= times[locator[:, k : k + 1], syndromes[:, : parity - k]]
+    powers = _inverse_powers(parity)
+    total, odd = np.zeros((n, CODEWORD), dtype=np.uint8), np.zeros((n, CODEWORD), dtype=np.uint8)
+    for k in range(errors + 1):
+        term = times[locator[:, k : k + 1], powers[k]]
+        total ^= term
+        if k % 2:
+            odd ^= term
+    values = np.zeros((n, CODEWORD), dtype=np.uint8)
+    word, place = np.nonzero((total == 0) & (odd != 0))
+    numerator = np.zeros(word.size, dtype=np.uint8)
+    for k in range(errors):
+        numerator ^= times[evaluator[word, k], powers[k, place]]
+    # the odd terms of the locator are its derivative divided by the place
+    value = times[times[numerator, inverse[odd[word, place]]], _offsets(errors)[place]]
+    values[word, place] = value
+    return values
 
 
 @functools.cache
@@ -253,15 +314,38 @@ def _multiplication_table() -> OctetArray:
     return table
 
 
-def _times(a: int, b: int) -> int:
-    return int(_multiplication_table()[a, b])
+@functools.cache
+def _roots(errors: int) -> npt.NDArray[np.intp]:
+    """The generator's roots."""
+    exponent, _ = _field_tables()
+    roots: npt.NDArray[np.intp] = exponent[11 * np.arange(128 - errors, 128 + errors) % 255].astype(np.intp)
+    return roots
 
 
 @functools.cache
-def _scalar_codec(errors: int) -> Any:
-    import reedsolo
-
+def _inverse_powers(count: int) -> OctetArray:
+    """(count, 255): powers 0, 1, ... of the inverse of every symbol's place b^(254 - index), b = a^11."""
     exponent, _ = _field_tables()
-    return reedsolo.RSCodec(
-        nsym=2 * errors, nsize=CODEWORD, fcr=128 - errors, prim=_FIELD, generator=int(exponent[11])
-    )
+    places = 11 * (254 - np.arange(CODEWORD))
+    powers: OctetArray = exponent[-np.arange(count)[:, None] * places % 255].astype(np.uint8)
+    return powers
+
+
+@functools.cache
+def _offsets(errors: int) -> OctetArray:
+    """(255,): the place of every symbol to the power -(128 - E)."""
+    exponent, _ = _field_tables()
+    places = 11 * (254 - np.arange(CODEWORD))
+    return exponent[-(128 - errors) * places % 255].astype(np.uint8)
+
+
+@functools.cache
+def _inverses() -> OctetArray:
+    exponent, logarithm = _field_tables()
+    inverse = np.zeros(256, dtype=np.uint8)
+    inverse[1:] = exponent[-logarithm[1:] % 255]
+    return inverse
+
+
+def _times(a: int, b: int) -> int:
+    return int(_multiplication_table()[a, b])

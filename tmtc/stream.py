@@ -186,8 +186,12 @@ class _Cutter:
         state = (self.prefix, self.known, self.tables, self.powers)
         length = self.length_at(p, stop)
         e = p + length
-        if length and (e == stop or self.stands(e, stop)):
-            # the damage is inside [p, e), unless the length is wrong and right packets fill the end of that range
+        trusted = length and (
+            self.is_idle(p) or self.kernels.is_pus(self.octets, p, length, self.packet_type)
+        )
+        if trusted and (e == stop or self.stands(e, stop)):
+            # the header is one and a packet follows where it says, so the damage is inside [p, e), whatever else may
+            # be found in there, unless the length is wrong and right packets fill the end of that range
             q = self.kernels.chain_start(self.octets, p + 1, e, self.packet_type, self.longest, *state)
             return (self.kind_of(p), e) if q < 0 else (_SKIPPED, q)
         limit = min(stop, p + self.longest)

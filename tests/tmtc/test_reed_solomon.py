@@ -4,7 +4,7 @@ import reedsolo
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tmtc.errors import LinkFormatError, UncorrectableCodeword
+from tmtc.errors import LinkFormatError
 from tmtc.reed_solomon import (
     UNCORRECTABLE,
     ReedSolomon,
@@ -118,13 +118,39 @@ def test_one_lost_codeword_does_not_hide_the_others():
 
 
 def test_errors_found_in_the_virtual_fill_mean_that_too_many_others_were_there():
-    code = ReedSolomon(interleave=1, virtual_fill=10)
-    # a full codeword with nonzero symbols where the fill would be, those cut off: few "errors", all in the fill
-    full = ReedSolomon(interleave=1)
-    frame = frames_for(full, 1)
-    word = encode(frame, full)[0, 10:]
-    with pytest.raises(UncorrectableCodeword):
-        repair(word, code)
+    code, full = ReedSolomon(interleave=1, virtual_fill=10), ReedSolomon(interleave=1)
+    # a codeword with nonzero symbols where the fill would be, those cut off: few "errors", all in the fill
+    word = encode(frames_for(full, 1), full)[:, 10:]
+    data, corrected = repair(word, code)
+    assert corrected.tolist() == [UNCORRECTABLE]
+    assert np.array_equal(data, word[:, :213])
+
+
+@pytest.mark.parametrize("errors", [8, 16])
+def test_repair_agrees_with_an_independent_decoder_up_to_and_beyond_its_power(errors):
+    theirs = reedsolo.RSCodec(nsym=2 * errors, nsize=255, fcr=128 - errors, prim=0x187, generator=173)
+    code = ReedSolomon(errors=errors, interleave=1, dual_basis=False)
+    rng = np.random.default_rng(errors)
+    frames = frames_for(code, 60)
+    words = encode(frames, code)
+    for n in range(60):
+        where = rng.choice(255, n % (errors + 4), replace=False)
+        words[n, where] ^= rng.integers(1, 256, where.size, dtype=np.uint8)
+    data, corrected = repair(words, code)
+    for n in range(60):
+        try:
+            message, _, positions = theirs.decode(words[n].tobytes())
+        except reedsolo.ReedSolomonError:
+            assert corrected[n] == UNCORRECTABLE
+            continue
+        assert bytes(message) == data[n].tobytes() and len(positions) == corrected[n]
+    assert np.array_equal(data[corrected >= 0], frames[corrected >= 0])
+
+
+def test_noise_is_uncorrectable():
+    noise = np.random.default_rng(8).integers(0, 256, (300, 255), dtype=np.uint8)
+    # by the count of codewords within reach, 1 word of noise in 16! = 2e13 decodes with E = 16
+    assert (repair(noise, ReedSolomon(interleave=1))[1] == UNCORRECTABLE).all()
 
 
 def test_no_blocks_are_no_frames():

@@ -1,0 +1,309 @@
+"""Telemetry decoding beside other libraries, checksums included in ours: python -m benchmarks.tmtc.
+
+Rates are by processor time of one thread, best of a few rounds: on a quiet machine that is the time that passes, and
+a busy one changes it little. Slow rivals decode fewer packets of the same kind. Every decoder's values are compared
+with ours.
+"""
+
+from __future__ import annotations
+
+import binascii
+import io
+import json
+import logging
+import struct
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tmtc import reed_solomon
+from tmtc.downlink import LinkSettings, decode, encode_cadus
+from tmtc.schema import Dictionary, Field, Group, PacketDefinition
+from tmtc.stream import cut_packets
+from tmtc.xtce import format_xtce
+
+PACKETS = 200_000
+TYPES = ("u8", "i8", "u8", "u8", "i16", "u16", "u8", "f32", "u16", "u8", "u16", "u16") * 2
+FIXED = PacketDefinition(
+    "fixed", 0x111, 3, 25, "24 fields in 40 octets", tuple(Field(f"f{k}", t, "") for k, t in enumerate(TYPES))
+)
+VARIABLE = PacketDefinition(
+    "variable",
+    0x112,
+    129,
+    1,
+    "Records of 8 octets",
+    (Field("count", "u8", ""),),
+    Group("count", (Field("record", "u64", ""),)),
+)
+DICTIONARY = Dictionary(1, (FIXED, VARIABLE))
+
+
+def fixed_packets(count: int) -> bytes:
+    """`count` packets of 62 octets."""
+    rng = np.random.default_rng(1)
+    dtype = np.dtype([("head", "V20"), *((f.name, f.dtype) for f in FIXED.fields)])
+    first = DICTIONARY.pack("fixed", {f.name: 0 for f in FIXED.fields}, ticks=0, sequence_count=0)
+    records = np.frombuffer(rng.bytes(count * dtype.itemsize), dtype=dtype).copy()
+    records["head"] = np.frombuffer(first[:20], dtype="V20")[0]
+    for f in FIXED.fields:
+        if f.is_float:
+            records[f.name] = rng.normal(size=count)
+    octets = records.view(np.uint8).reshape(count, -1)
+    octets[:, 2] = 0xC0 | (np.arange(count) >> 8 & 0x3F)
+    octets[:, 3] = np.arange(count) & 0xFF
+    return _with_checksums([row.tobytes() for row in octets])
+
+
+def variable_packets(count: int) -> bytes:
+    """`count` packets of 23 to 511 octets, 267 on average."""
+    rng = np.random.default_rng(2)
+    first = DICTIONARY.pack("variable", {"items": []}, ticks=0, sequence_count=0)
+    parts = []
+    for k, n in enumerate(rng.integers(0, 62, count).tolist()):
+        head = struct.pack(">HHH", 0x0800 | VARIABLE.apid, 0xC000 | k & 0x3FFF, 16 + 8 * n)
+        parts.append(head + first[6:20] + bytes((n,)) + rng.bytes(8 * n))
+    return _with_checksums(parts)
+
+
+def bench(packets: int = PACKETS) -> dict[str, Any]:
+    """Packets and megabytes per second of ours and of the rivals."""
+    import ccsdspy
+
+    ccsdspy.log.setLevel(logging.ERROR)
+    fixed, variable = fixed_packets(packets), variable_packets(packets)
+    figures: dict[str, Any] = {"packets": packets, "clock": "processor time, best of rounds"}
+    ours = _ours(fixed), _ours(variable)  # also compiles
+    figures["fixed_62_octets"] = _rates(
+        fixed,
+        packets,
+        {
+            "linna, checksum": (lambda: _ours(fixed), packets),
+            "spacepackets PusTm + struct": (lambda: _spacepackets_pus(fixed, packets // 20), packets // 20),
+            "spacepackets cut + header + struct + fastcrc": (
+                lambda: _spacepackets_cut(fixed, packets // 10),
+                packets // 10,
+            ),
+            "ccsdspy FixedLength, no checksum": (lambda: _ccsdspy_fixed(fixed), packets),
+            "space_packet_parser XTCE, no checksum": (lambda: _xtce(fixed, packets // 400), packets // 400),
+            "struct loop + crc_hqx": (lambda: _struct_loop(fixed), packets),
+        },
+    )
+    figures["variable_mean_267_octets"] = _rates(
+        variable,
+        packets,
+        {
+            "linna, checksum": (lambda: _ours(variable), packets),
+            "ccsdspy VariableLength, no checksum": (
+                lambda: _ccsdspy_variable(variable, packets // 20),
+                packets // 20,
+            ),
+            "struct loop + frombuffer + crc_hqx": (lambda: _struct_loop_variable(variable), packets),
+        },
+    )
+    figures["values_equal"] = _compare(fixed, variable, *ours, packets)
+    figures["reed_solomon_mb_per_s"] = _reed_solomon()
+    figures["downlink_mb_per_s"] = _downlink(variable)
+    fixed_rates, variable_rates = figures["fixed_62_octets"], figures["variable_mean_267_octets"]
+    figures["ratios"] = {
+        "fixed, to spacepackets": _ratio(fixed_rates, "spacepackets PusTm + struct"),
+        "fixed, to spacepackets cut": _ratio(fixed_rates, "spacepackets cut + header + struct + fastcrc"),
+        "fixed, to the XTCE interpreter": _ratio(fixed_rates, "space_packet_parser XTCE, no checksum"),
+        "variable, to ccsdspy": _ratio(variable_rates, "ccsdspy VariableLength, no checksum"),
+    }
+    return figures
+
+
+def _ours(octets: bytes) -> Any:
+    return DICTIONARY.unpack_many(octets, cut_packets(octets))
+
+
+def _spacepackets_pus(octets: bytes, count: int) -> list[tuple[Any, ...]]:
+    from spacepackets.ecss import PusTm
+
+    body = _struct_of(FIXED)
+    rows = []
+    for k in range(count):
+        packet = PusTm.unpack(octets[62 * k : 62 * (k + 1)], timestamp_len=7)
+        rows.append(body.unpack(packet.tm_data))
+    return rows
+
+
+def _spacepackets_cut(octets: bytes, count: int) -> list[tuple[Any, ...]]:
+    from fastcrc import crc16
+    from spacepackets.ccsds import PacketId, PacketType, SpacePacketHeader
+    from spacepackets.ccsds.spacepacket import parse_space_packets
+
+    body = _struct_of(FIXED)
+    wanted = [PacketId(PacketType.TM, True, FIXED.apid)]
+    rows = []
+    for packet in parse_space_packets(octets[: 62 * count], wanted).tm_list:
+        SpacePacketHeader.unpack(packet[:6])
+        if crc16.ibm_3740(bytes(packet)) == 0:
+            rows.append(body.unpack_from(packet, 20))
+    return rows
+
+
+def _ccsdspy_fixed(octets: bytes) -> Any:
+    import ccsdspy
+
+    kinds = {"u": "uint", "i": "int", "f": "float"}
+    fields = [
+        ccsdspy.PacketArray(name="head", data_type="uint", bit_length=8, array_shape=14, array_order="C"),
+        *(
+            ccsdspy.PacketField(name=f.name, data_type=kinds[f.type[0]], bit_length=int(f.type[1:]))
+            for f in FIXED.fields
+        ),
+        ccsdspy.PacketField(name="crc", data_type="uint", bit_length=16),
+    ]
+    return ccsdspy.FixedLength(fields).load(io.BytesIO(octets))
+
+
+def _ccsdspy_variable(octets: bytes, count: int) -> Any:
+    import ccsdspy
+
+    cut = cut_packets(octets)
+    stop = int(cut.offsets[count]) if count < len(cut) else len(octets)
+    fields = [
+        ccsdspy.PacketArray(name="head", data_type="uint", bit_length=8, array_shape=14, array_order="C"),
+        ccsdspy.PacketField(name="count", data_type="uint", bit_length=8),
+        ccsdspy.PacketArray(name="record", data_type="uint", bit_length=64, array_shape="expand"),
+        ccsdspy.PacketField(name="crc", data_type="uint", bit_length=16),
+    ]
+    return ccsdspy.VariableLength(fields).load(io.BytesIO(octets[:stop]))
+
+
+def _xtce(octets: bytes, count: int) -> list[Any]:
+    import space_packet_parser
+
+    global _XTCE
+    if _XTCE is None:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "bench.xml")
+            path.write_text(format_xtce(DICTIONARY), encoding="utf-8")
+            _XTCE = space_packet_parser.load_xtce(path)
+    return [_XTCE.parse_bytes(octets[62 * k : 62 * (k + 1)]) for k in range(count)]
+
+
+_XTCE: Any = None
+
+
+def _struct_loop(octets: bytes) -> list[tuple[Any, ...]]:
+    body, view, at, rows = _struct_of(FIXED), memoryview(octets), 0, []
+    while at < len(octets):
+        stop = at + 7 + (octets[at + 4] << 8 | octets[at + 5])
+        if binascii.crc_hqx(view[at:stop], 0xFFFF) == 0:
+            rows.append(body.unpack_from(octets, at + 20))
+        at = stop
+    return rows
+
+
+def _struct_loop_variable(octets: bytes) -> list[Any]:
+    view, at, rows = memoryview(octets), 0, []
+    while at < len(octets):
+        stop = at + 7 + (octets[at + 4] << 8 | octets[at + 5])
+        if binascii.crc_hqx(view[at:stop], 0xFFFF) == 0:
+            rows.append(np.frombuffer(octets, dtype=">u8", count=octets[at + 20], offset=at + 21))
+        at = stop
+    return rows
+
+
+def _compare(fixed: bytes, variable: bytes, ours_fixed: Any, ours_variable: Any, packets: int) -> bool:
+    """Whether all decoders read the same values."""
+    columns = ours_fixed["fixed"].columns
+    theirs = _ccsdspy_fixed(fixed)
+    same = all(np.array_equal(columns[f.name], theirs[f.name]) for f in FIXED.fields)
+    row = tuple(columns[f.name][7] for f in FIXED.fields)
+    same &= row == _spacepackets_pus(fixed, 8)[7] == _struct_loop(fixed)[7] == _spacepackets_cut(fixed, 8)[7]
+    parsed = _xtce(fixed, 8)[7]
+    same &= row == tuple(parsed[f"fixed_{f.name}"] for f in FIXED.fields)
+    records = ours_variable["variable"].items_raw["record"]
+    same &= np.array_equal(records, np.concatenate(_struct_loop_variable(variable)))
+    some = _ccsdspy_variable(variable, packets // 20)["record"]
+    expected = np.concatenate([np.asarray(r, dtype=np.uint64) for r in some])
+    return bool(same and np.array_equal(records[: expected.size], expected))
+
+
+def _reed_solomon() -> dict[str, float]:
+    """Megabytes of codeblocks a second: clean check, encoding, repair of 16 errors in every codeword."""
+    code = reed_solomon.ReedSolomon()
+    frames = np.random.default_rng(3).integers(0, 256, (4000, code.frame_length), dtype=np.uint8)
+    blocks = reed_solomon.encode(frames, code)
+    dirty = blocks[:100].copy()
+    dirty[:, : 16 * code.interleave] ^= 0x5A
+    assert reed_solomon.clean(blocks, code).all()
+    assert np.array_equal(reed_solomon.decode(dirty, code).frames, frames[:100])
+    return {
+        "clean check": blocks.size / 1e6 / _best(lambda: reed_solomon.clean(blocks, code)),
+        "encode": frames.size / 1e6 / _best(lambda: reed_solomon.encode(frames, code)),
+        "repair of 16 errors a codeword": dirty.size / 1e6 / _best(lambda: reed_solomon.decode(dirty, code)),
+    }
+
+
+def _downlink(octets: bytes) -> dict[str, float]:
+    """Megabytes of CADUs a second, from the file to packets, accounted for; settings known and found out."""
+    packets = list(cut_packets(octets).packets(octets))
+    figures = {}
+    for name, settings in (
+        ("uncoded", LinkSettings(coding="none")),
+        ("coded, clean", LinkSettings(coding="rs")),
+    ):
+        stream = encode_cadus(packets, spacecraft_id=76, coding=settings.coding)
+        for how, given in (("settings known", settings), ("settings found out", None)):
+            seconds = _best(
+                lambda stream=stream, given=given: decode(stream, settings=given, dictionary=DICTIONARY)
+            )
+            figures[f"{name}, {how}"] = len(stream) / 1e6 / seconds
+        assert decode(stream).packets == len(packets)
+    return figures
+
+
+def _rates(
+    octets: bytes, packets: int, runs: dict[str, tuple[Callable[[], Any], int]]
+) -> dict[str, dict[str, float]]:
+    rates = {}
+    for name, (run, count) in runs.items():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            seconds = _best(run)
+        rates[name] = {
+            "packets_per_s": round(count / seconds),
+            "mb_per_s": round(len(octets) / packets * count / 1e6 / seconds, 1),
+        }
+    return rates
+
+
+def _ratio(rates: dict[str, dict[str, float]], rival: str) -> float:
+    return round(rates["linna, checksum"]["packets_per_s"] / rates[rival]["packets_per_s"], 1)
+
+
+def _best(run: Callable[[], Any], rounds: int = 5) -> float:
+    seconds = []
+    for _ in range(rounds):
+        started = time.process_time()
+        run()
+        seconds.append(time.process_time() - started)
+    return min(seconds)
+
+
+def _struct_of(definition: PacketDefinition) -> struct.Struct:
+    codes = {"u8": "B", "i8": "b", "u16": "H", "i16": "h", "u32": "I", "f32": "f"}
+    return struct.Struct(">" + "".join(codes[f.type] for f in definition.fields))
+
+
+def _with_checksums(packets: list[bytes]) -> bytes:
+    parts = []
+    for packet in packets:
+        length = len(packet) + 2 - 7
+        whole = packet[:4] + length.to_bytes(2, "big") + packet[6:]
+        parts += [whole, binascii.crc_hqx(whole, 0xFFFF).to_bytes(2, "big")]
+    return b"".join(parts)
+
+
+if __name__ == "__main__":
+    print(json.dumps({"tmtc": bench()}, indent=1))
