@@ -9,6 +9,8 @@ from fastapi import FastAPI
 
 from ground_service.api import problems
 from ground_service.api.limits import BodyLimit, HeadersAndTags
+from ground_service.api.live import live
+from ground_service.api.metrics import Metrics, Watch
 from ground_service.api.routes import API_PREFIX, UPLOAD_PATHS, operations, router
 from ground_service.services.ground import ground_from_settings
 from ground_service.settings import Settings
@@ -31,6 +33,7 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         ground = ground_from_settings(settings)
         app.state.ground = ground
         app.state.dispatcher = dispatcher_for(ground, settings, inline=inline_jobs)
+        app.state.dispatcher.resume()
         try:
             yield
         finally:
@@ -50,9 +53,12 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
     app.state.upload_limit_octets = settings.upload_limit_mib << 20
     app.include_router(router)
     app.include_router(operations)
+    app.include_router(live)
+    app.state.metrics = Metrics()
     problems.install(app)
     app.add_middleware(
         BodyLimit, upload_paths=UPLOAD_PATHS, upload_limit_octets=settings.upload_limit_mib << 20
     )
     app.add_middleware(HeadersAndTags)
+    app.add_middleware(Watch, metrics=app.state.metrics)
     return app

@@ -375,6 +375,12 @@ def readyz(ground: GroundOf) -> schemas.Health:
     return schemas.Health(status="ok")
 
 
+@operations.get("/metrics")
+def metrics(request: Request, ground: GroundOf) -> Response:
+    """Figures for Prometheus."""
+    return request.app.state.metrics.answer(ground)
+
+
 async def _stored_body(request: Request) -> StoredFile:
     """The body, streamed into the archive of files with bounded memory."""
     ground = ground_of(request)

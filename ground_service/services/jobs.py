@@ -11,8 +11,11 @@ import uuid
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from sqlalchemy import select
+
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, InvalidInput
+from ground_service.services.feed import publish
 from ground_service.services.ground import Ground
 from ground_service.services.ingest import run_ingest
 from ground_service.services.reports import make_report
@@ -65,6 +68,7 @@ def enter_job(ground: Ground, kind: str, arguments: Mapping[str, Any], *, job_id
                 attempts=0,
                 created_utc_ns=utc_now_ns(),
             )
+            publish(connection, "job", {"id": identity, "kind": kind, "state": "queued"})
     return identity
 
 
@@ -82,6 +86,7 @@ def run_job(ground: Ground, job_id: str) -> dict[str, Any]:
             attempts=job["attempts"] + 1,
             started_utc_ns=utc_now_ns(),
         )
+        publish(connection, "job", {"id": job_id, "kind": job["kind"], "state": "running"})
     try:
         result = WORK[job["kind"]](ground, job["arguments"], job_id)
     except (GroundError, TmtcError, LunarError, ReportError) as error:
@@ -93,4 +98,20 @@ def run_job(ground: Ground, job_id: str) -> dict[str, Any]:
 def _finish(ground: Ground, job_id: str, **values: Any) -> dict[str, Any]:
     with ground.database.writing() as connection:
         repository.change(connection, repository.JOBS, job_id, finished_utc_ns=utc_now_ns(), **values)
-        return repository.get(connection, repository.JOBS, job_id, "job")
+        job = repository.get(connection, repository.JOBS, job_id, "job")
+        publish(
+            connection,
+            "job",
+            {"id": job_id, "kind": job["kind"], "state": job["state"], "result": job["result"]},
+        )
+        return job
+
+
+def unfinished_jobs(ground: Ground) -> list[str]:
+    """Jobs that were entered and have not come to an end, the oldest first."""
+    table = repository.JOBS
+    with ground.database.reading() as connection:
+        rows = connection.execute(
+            select(table.c.id).where(table.c.state.not_in(FINISHED)).order_by(table.c.created_utc_ns)
+        )
+        return [str(row[0]) for row in rows]

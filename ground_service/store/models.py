@@ -387,3 +387,13 @@ class AuditEntry(Base):
     action: Mapped[str] = mapped_column(String(48))
     target: Mapped[str] = mapped_column(Text)
     detail: Mapped[dict[str, Any]] = mapped_column(JSON)
+
+
+class FeedItem(Base):
+    """Something that happened, for those who watch; `id` is the sequence number that they see."""
+
+    __tablename__ = "feed"
+    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
+    utc_ns: Mapped[int] = mapped_column(BigInteger)
+    kind: Mapped[str] = mapped_column(String(32))
+    payload: Mapped[dict[str, Any]] = mapped_column(JSON)

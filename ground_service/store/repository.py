@@ -51,6 +51,7 @@ REPORTS = _table(models.Report)
 USERS = _table(models.User)
 TOKENS = _table(models.Token)
 AUDIT = _table(models.AuditEntry)
+FEED = _table(models.FeedItem)
 SAMPLES: dict[str, Table] = {model.__tablename__: _table(model) for model in models.SAMPLE_TABLES}
 
 

@@ -7,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Protocol
 
 from ground_service.services.ground import Ground
-from ground_service.services.jobs import enter_job, run_job
+from ground_service.services.jobs import enter_job, run_job, unfinished_jobs
 from ground_service.settings import Settings
 
 
@@ -16,6 +16,9 @@ class Dispatcher(Protocol):
 
     def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
         """Enter a job and have it done; its id."""
+
+    def resume(self) -> None:
+        """Take up jobs that an earlier process left unfinished."""
 
     def close(self) -> None:
         """Let jobs that run here come to their end."""
@@ -32,6 +35,10 @@ class InlineDispatcher:
         run_job(self._ground, identity)
         return identity
 
+    def resume(self) -> None:
+        for identity in unfinished_jobs(self._ground):
+            run_job(self._ground, identity)
+
     def close(self) -> None:
         pass
 
@@ -46,10 +53,17 @@ class ThreadDispatcher:
 
     def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
         identity = enter_job(self._ground, kind, arguments, job_id=job_id)
+        self._start(identity)
+        return identity
+
+    def resume(self) -> None:
+        for identity in unfinished_jobs(self._ground):
+            self._start(identity)
+
+    def _start(self, identity: str) -> None:
         future = self._pool.submit(run_job, self._ground, identity)
         self.pending.add(future)
         future.add_done_callback(self.pending.discard)
-        return identity
 
     def close(self) -> None:
         self._pool.shutdown(wait=True)
@@ -68,6 +82,9 @@ class CeleryDispatcher:
         identity = enter_job(self._ground, kind, arguments, job_id=job_id)
         send_job(self._settings, identity)
         return identity
+
+    def resume(self) -> None:
+        """The broker keeps what was sent to it; nothing is to be done here."""
 
     def close(self) -> None:
         pass

@@ -237,3 +237,46 @@ def test_the_matrix_above_names_every_operation(client: TestClient) -> None:
 
     assert len(MATRIX) == len(described)
     assert all(matches(method, path) for method, path, _ in MATRIX)
+
+
+def test_what_happens_is_sent_live_and_can_be_caught_up_with(client: TestClient) -> None:
+    with client.websocket_connect(f"{V1}/live") as socket:
+        job = client.post(f"{V1}/passes/1/reports").json()["id"]
+        messages = [socket.receive_json() for _ in range(3)]
+    assert [m["payload"]["state"] for m in messages] == ["queued", "running", "done"]
+    assert {m["payload"]["id"] for m in messages} == {job}
+    numbers = [m["sequence"] for m in messages]
+    assert numbers == list(range(numbers[0], numbers[0] + 3))
+    with client.websocket_connect(f"{V1}/live?after={numbers[0]}") as socket:
+        assert [socket.receive_json() for _ in range(2)] == messages[1:]
+
+
+def test_watching_needs_a_token_where_there_are_users(guarded: tuple[TestClient, dict[str, str]]) -> None:
+    from starlette.websockets import WebSocketDisconnect
+
+    client, tokens = guarded
+    for headers in ({}, {"Authorization": "Bearer wrong"}):
+        with pytest.raises(WebSocketDisconnect), client.websocket_connect(f"{V1}/live", headers=headers):
+            pass
+    with client.websocket_connect(f"{V1}/live", headers={"Authorization": f"Bearer {tokens['viewer']}"}):
+        pass
+    with client.websocket_connect(f"{V1}/live", subprotocols=["bearer", tokens["viewer"]]) as socket:
+        assert socket.accepted_subprotocol == "bearer"
+
+
+def test_figures_are_kept_by_route(client: TestClient) -> None:
+    client.get(f"{V1}/passes/1")
+    figures = client.get("/metrics").text
+    assert 'linna_http_requests_total{method="GET",route="/api/v1/passes/{pass_id}",status="200"}' in figures
+    assert "linna_passes 1.0" in figures or "linna_passes 2.0" in figures
+
+
+def test_jobs_left_unfinished_are_taken_up_again(synthetic_pass: Any, tmp_path: Path) -> None:
+    from ground_service.services.ground import open_ground
+    from ground_service.services.jobs import enter_job
+
+    with open_ground(tmp_path) as ground:
+        import_archive(ground, synthetic_pass.folder)
+        left = enter_job(ground, "report", {"pass_id": 1})
+    with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as opened:
+        assert opened.get(f"{V1}/jobs/{left}").json()["state"] == "done"
