@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ground_service.link.packets import PacketBatch, batch_of_cut
+from tmtc.cadu import ASM
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import FRAME_FOREIGN, DownlinkDecode, LinkSettings, decode
 from tmtc.packets import PACKET_MAX_LENGTH
@@ -21,6 +22,9 @@ from tmtc.stream import PacketCut, cut_packets
 
 WINDOW_OCTETS = 8 << 20
 """Octets decoded and stored at a time: large enough to spread the cost of a transaction, small against memory."""
+
+PROBE_OCTETS = 256 << 10
+"""Octets from which the settings of a link are told; the whole window where the stream begins with noise."""
 
 FOREIGN_FRAMES = 2
 """A spacecraft is believed to be in a stream from this many good frames on."""
@@ -93,7 +97,7 @@ class DownlinkReader:
             self.accounting.octets += len(block)
             window = rest + block
             if bare is None:
-                settings = decode(window[: 4 * self._window_octets], dictionary=self._dictionary).settings
+                settings = self._settings_of(window)
                 bare = settings is None
             if settings is None:
                 cut = cut_packets(window, final=final)
@@ -109,6 +113,13 @@ class DownlinkReader:
                 rest = _overlap(window, settings)
                 for _ in self._frames(rest, settings, sign=-1):
                     pass
+
+    def _settings_of(self, window: bytes) -> LinkSettings | None:
+        """How frames travel in the stream that begins like this; None for bare packets."""
+        probe = decode(window[:PROBE_OCTETS], dictionary=self._dictionary)
+        if probe.settings is None and len(window) > PROBE_OCTETS and ASM in window:
+            probe = decode(window, dictionary=self._dictionary)
+        return probe.settings
 
     def _frames(self, window: bytes, settings: LinkSettings, sign: int) -> Iterator[PacketBatch]:
         """Batches of every spacecraft in a window; `sign` -1 takes the window off the accounting again."""
