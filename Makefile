@@ -1,9 +1,13 @@
 # Two commands for a new user: `make demo` and `make test`. On a bare machine: Python 3.11 and nothing else.
 
-PYTHON ?= python3.11
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   := .venv
 BIN    := $(VENV)/bin
-PIP     = $(PYTHON) -m pip --python $(BIN)/python install --quiet --disable-pip-version-check
+
+# The base interpreter's pip installs into the environment, which then need not hold a copy of it.
+BASE_PIP := $(shell $(PYTHON) -m pip --version >/dev/null 2>&1 && echo yes)
+PIP       = $(if $(BASE_PIP),$(PYTHON) -m pip --python $(BIN)/python,$(BIN)/python -m pip) \
+            install --quiet --disable-pip-version-check --root-user-action=ignore
 
 # Real terrain needs a raster library; it is installed only where real data are at hand.
 DEMO_STAMPS := $(VENV)/.runtime $(if $(LINNA_DATA),$(VENV)/.terrain)
@@ -19,7 +23,6 @@ test: $(VENV)/.dev
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .
-	$(BIN)/ruff format --check --diff . >/dev/null || true
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
@@ -33,7 +36,7 @@ install: $(DEMO_STAMPS)
 install-dev: $(VENV)/.dev
 
 $(BIN)/python:
-	$(PYTHON) -m venv --without-pip $(VENV)
+	$(PYTHON) -m venv $(if $(BASE_PIP),--without-pip) $(VENV)
 
 $(VENV)/.runtime: requirements/runtime.txt pyproject.toml | $(BIN)/python
 	$(PIP) --no-compile -r requirements/runtime.txt
