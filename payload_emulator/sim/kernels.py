@@ -13,6 +13,9 @@ from lunar.constants import MOON_RADIUS_M
 NODE_STEP = 32
 BLOCK_SHIFT = 3
 SHARP = 4.0
+LINE = 4096
+"""Longest side of a picture."""
+
 CLOSE_TEXELS = 0.04
 """A clearance that ends the search for a hit: a hundredth of a pixel at the corners of a 120 degree picture."""
 
@@ -37,19 +40,29 @@ def fill_grid(
     to start from (it is off by one texel's relief, which moves the place by a few metres).
     """
     rows, columns = heights.shape
-    mask = (1 << shift) - 1
-    ground = np.zeros(columns, np.float32)
+    mask = np.int32((1 << shift) - 1)
+    size = np.int32(pool.shape[2])
+    flat = pool.ravel()
+    tile_size = np.uint64(pool.shape[1] * pool.shape[2])
+    next_one = np.uint64(1)
+    next_row = np.uint64(pool.shape[2])
+    one = np.float32(1.0)
+    half = np.float32(0.5)
     inverse_radius = np.float32(1.0 / MOON_RADIUS_M)
     share = np.float32(1.0 / NODE_STEP)
-    passes = 2
+    step = np.float32(texel)
+    left = np.float32(y0)
+    # Rows of the buffer: height of the ground, fractions of row and column, the four corners.
+    work = np.zeros(7 * LINE, np.float32)
+    places = np.empty(3 * LINE, np.int32)
     for i in range(rows):
         ni = min(i // NODE_STEP, node_row.shape[0] - 2)
         fi = np.float32(i - ni * NODE_STEP) * share
-        x = np.float32(x0 + i * texel)
-        for _ in range(passes):
+        x2 = np.float32((x0 + i * texel) * (x0 + i * texel))
+        for _ in range(2 if i == 0 else 1):
             for nj in range(node_row.shape[1] - 1):
                 first = nj * NODE_STEP
-                last = min(first + NODE_STEP, columns) if nj < node_row.shape[1] - 2 else columns
+                count = min(NODE_STEP, columns - first) if nj < node_row.shape[1] - 2 else columns - first
                 r0 = node_row[ni, nj] + fi * (node_row[ni + 1, nj] - node_row[ni, nj])
                 r1 = node_row[ni, nj + 1] + fi * (node_row[ni + 1, nj + 1] - node_row[ni, nj + 1])
                 c0 = node_column[ni, nj] + fi * (node_column[ni + 1, nj] - node_column[ni, nj])
@@ -60,35 +73,41 @@ def fill_grid(
                 dsc = (slope_column[ni, nj + 1] - sc) * share
                 r1 = (r1 - r0) * share
                 c1 = (c1 - c0) * share
-                for j in range(first, last):
-                    k = np.float32(j - first)
-                    h = ground[j]
-                    r = r0 + k * r1 + h * (sr + k * dsr)
-                    c = c0 + k * c1 + h * (sc + k * dsc)
-                    a = int(r)
-                    b = int(c)
-                    fr = r - np.float32(a)
-                    fc = c - np.float32(b)
-                    slot = table[a >> shift, b >> shift]
+                for k in range(count):
+                    j = first + k
+                    f = np.float32(k)
+                    h = work[j]
+                    r = r0 + f * r1 + h * (sr + f * dsr)
+                    c = c0 + f * c1 + h * (sc + f * dsc)
+                    a = np.int32(r)
+                    b = np.int32(c)
+                    work[j + LINE] = r - np.float32(a)
+                    work[j + 2 * LINE] = c - np.float32(b)
+                    places[j] = a >> shift
+                    places[j + LINE] = b >> shift
                     # A tile's own pixels start at (1, 1).
-                    a = (a & mask) + 1
-                    b = (b & mask) + 1
-                    top = pool[slot, a, b] + fc * (pool[slot, a, b + 1] - pool[slot, a, b])
-                    low = pool[slot, a + 1, b] + fc * (pool[slot, a + 1, b + 1] - pool[slot, a + 1, b])
-                    ground[j] = top + fr * (low - top)
-        passes = 1
+                    places[j + 2 * LINE] = ((a & mask) + 1) * size + (b & mask) + 1
+            for j in range(columns):
+                slot = np.uint64(table[np.uint64(places[j]), np.uint64(places[j + LINE])])
+                m = slot * tile_size + np.uint64(places[j + 2 * LINE])
+                work[j + 3 * LINE] = flat[m]
+                work[j + 4 * LINE] = flat[m + next_one]
+                m += next_row
+                work[j + 5 * LINE] = flat[m]
+                work[j + 6 * LINE] = flat[m + next_one]
+            for j in range(columns):
+                fr = work[j + LINE]
+                fc = work[j + 2 * LINE]
+                top = work[j + 3 * LINE] + fc * (work[j + 4 * LINE] - work[j + 3 * LINE])
+                low = work[j + 5 * LINE] + fc * (work[j + 6 * LINE] - work[j + 5 * LINE])
+                work[j] = top + fr * (low - top)
         for j in range(columns):
-            h = ground[j]
-            y = np.float32(y0) + np.float32(j) * np.float32(texel)
-            inverse = inverse_radius * (np.float32(1.0) - h * inverse_radius)
-            u = (x * x + y * y) * inverse
+            h = work[j]
+            y = left + np.float32(j) * step
+            inverse = inverse_radius * (one - h * inverse_radius)
+            u = (x2 + y * y) * inverse
             v = u * inverse
-            drop = (
-                np.float32(0.5)
-                * u
-                * (np.float32(1.0) + np.float32(0.25) * v * (np.float32(1.0) + np.float32(0.5) * v))
-            )
-            heights[i, j] = h - drop
+            heights[i, j] = h - half * u * (one + half * half * v * (one + half * v))
 
 
 @njit(fastmath=True, error_model="numpy", nogil=True)
@@ -255,13 +274,13 @@ def trace_pixels(
     if down > 0.05:
         nadir_u = min(max(int(centre_u - focal * tangent_from_camera[2, 0] / down), 0), wide - 1)
         nadir_v = min(max(int(centre_v - focal * tangent_from_camera[2, 1] / down), 0), high - 1)
-    longest = high + wide
-    clear = np.empty(longest, np.float32)
-    inner = np.empty(longest, np.float32)
-    first = np.empty(longest, np.float32)
-    found = np.empty(longest, np.float32)
-    doubt = np.empty(longest, np.bool_)
+    inner = np.empty(high + wide, np.float32)
+    inner_z = np.empty(high + wide, np.float32)
+    work = np.empty(9 * LINE, np.float32)
+    places = np.empty(LINE, np.int32)
     z0 = np.float32(altitude)
+    high_z = np.float32(top)
+    quarter = np.float32(0.25)
     last_i = np.float32(rows - 2.01)
     last_j = np.float32(columns - 2.01)
     near = np.float32(1.01)
@@ -269,6 +288,7 @@ def trace_pixels(
     close = np.float32(CLOSE_TEXELS * texel)
     tiny = np.float32(1.0e-9)
     zero = np.float32(0.0)
+    one = np.float32(1.0)
     next_one = np.uint64(1)
     next_row = np.uint64(columns)
     for sector in range(4):
@@ -287,10 +307,13 @@ def trace_pixels(
                 continue
             begin = max(cross0 - half, 0)
             end = min(cross0 + half, cross_size - 1) + 1
-            for k in range(begin, end):
+            count = end - begin
+            for n_k in range(count):
+                k = begin + n_k
                 # Where the inner line was shorter its end stands in.
                 if n == 0 or (not upright and n == 1):
-                    clear[k] = zero
+                    work[n_k] = zero
+                    work[n_k + LINE] = high_z
                 else:
                     short = half - 1
                     left = max(cross0 - short, 0)
@@ -298,7 +321,9 @@ def trace_pixels(
                     same = min(max(k, left), right)
                     toward = k - 1 if k > cross0 else (k + 1 if k < cross0 else k)
                     toward = min(max(toward, left), right)
-                    clear[k] = min(inner[same], inner[toward])
+                    nearer = same if inner[same] < inner[toward] else toward
+                    work[n_k] = inner[nearer]
+                    work[n_k + LINE] = inner_z[nearer]
             if upright:
                 ax = tangent_from_camera[0, 0] / focal
                 ay = tangent_from_camera[1, 0] / focal
@@ -318,64 +343,76 @@ def trace_pixels(
             fax = np.float32(ax * inverse)
             fay = np.float32(ay * inverse)
             faz = np.float32(az)
-            fbx = np.float32(bx * inverse)
-            fby = np.float32(by * inverse)
-            fbz = np.float32(bz)
-            for k in range(begin, end):
+            fbx = np.float32(bx * inverse + ax * inverse * begin)
+            fby = np.float32(by * inverse + ay * inverse * begin)
+            fbz = np.float32(bz + az * begin)
+            # Newton steps on the bilinear ground, from where the ray passes the neighbour's height.  The loops are
+            # split so that all but the look-ups run in vector registers; one buffer with rows a constant apart tells
+            # the compiler that nothing overlaps.
+            for k in range(count):
                 c = np.float32(k)
                 di = fax * c + fbx
                 dj = fay * c + fby
                 fall = max(-(faz * c + fbz), np.float32(1.0e-3))
-                out = np.float32(math.sqrt(di * di + dj * dj)) + tiny
-                pace = np.float32(1.0) / out
-                # Without inner neighbours the start is the height of the highest ground: wrong, and settled below.
-                t0 = clear[k] * pace
-                i = min(max(i0 + t0 * di, near), last_i)
-                j = min(max(j0 + t0 * dj, near), last_j)
-                p = np.int32(i)
-                q = np.int32(j)
-                m = np.uint64(p * stride + q)
-                fj = j - np.float32(q)
-                h0 = flat[m] + fj * (flat[m + next_one] - flat[m])
-                h1 = flat[m + next_row] + fj * (flat[m + next_row + next_one] - flat[m + next_row])
-                f0 = z0 - t0 * fall - (h0 + (i - np.float32(p)) * (h1 - h0))
-                t1 = t0 + min(f0 / fall, pace)
-                i = min(max(i0 + t1 * di, near), last_i)
-                j = min(max(j0 + t1 * dj, near), last_j)
-                p = np.int32(i)
-                q = np.int32(j)
-                m = np.uint64(p * stride + q)
-                fj = j - np.float32(q)
-                h0 = flat[m] + fj * (flat[m + next_one] - flat[m])
-                h1 = flat[m + next_row] + fj * (flat[m + next_row + next_one] - flat[m + next_row])
-                f1 = z0 - t1 * fall - (h0 + (i - np.float32(p)) * (h1 - h0))
-                rate = max((f0 - f1) / max(t1 - t0, tiny), np.float32(0.25) * fall)
-                t2 = t1 + min(max(f1 / rate, t0 - t1), pace)
-                i = min(max(i0 + t2 * di, near), last_i)
-                j = min(max(j0 + t2 * dj, near), last_j)
-                p = np.int32(i)
-                q = np.int32(j)
-                m = np.uint64(p * stride + q)
-                fj = j - np.float32(q)
-                h0 = flat[m] + fj * (flat[m + next_one] - flat[m])
-                h1 = flat[m + next_row] + fj * (flat[m + next_row + next_one] - flat[m + next_row])
-                f2 = z0 - t2 * fall - (h0 + (i - np.float32(p)) * (h1 - h0))
-                inside = i > near and i < last_i and j > near and j < last_j
-                doubt[k] = not (f0 > zero and abs(f2) < close and inside)
-                first[k] = t0 if f0 > zero else zero
-                found[k] = t2 + f2 / rate
-            for k in range(begin, end):
+                pace = one / (np.float32(math.sqrt(di * di + dj * dj)) + tiny)
+                t0 = work[k] * pace
+                work[k + 2 * LINE] = min(max((z0 - work[k + LINE]) / fall, t0), t0 + pace)
+            for step in range(3):
+                for k in range(count):
+                    c = np.float32(k)
+                    t = work[k + 2 * LINE]
+                    i = min(max(i0 + t * (fax * c + fbx), near), last_i)
+                    j = min(max(j0 + t * (fay * c + fby), near), last_j)
+                    p = np.int32(i)
+                    q = np.int32(j)
+                    places[k] = p * stride + q
+                    work[k + 3 * LINE] = i - np.float32(p)
+                    work[k + 4 * LINE] = j - np.float32(q)
+                for k in range(count):
+                    m = np.uint64(places[k])
+                    work[k + 5 * LINE] = flat[m]
+                    work[k + 6 * LINE] = flat[m + next_one]
+                    work[k + 7 * LINE] = flat[m + next_row]
+                    work[k + 8 * LINE] = flat[m + next_row + next_one]
+                for k in range(count):
+                    c = np.float32(k)
+                    di = fax * c + fbx
+                    dj = fay * c + fby
+                    fall = max(-(faz * c + fbz), np.float32(1.0e-3))
+                    t = work[k + 2 * LINE]
+                    fi = work[k + 3 * LINE]
+                    fj = work[k + 4 * LINE]
+                    h0 = work[k + 5 * LINE]
+                    h1 = work[k + 6 * LINE] - h0
+                    h2 = work[k + 7 * LINE] - h0
+                    h3 = work[k + 8 * LINE] - h0 - h1 - h2
+                    value = z0 - t * fall - (h0 + fi * h2 + fj * (h1 + fi * h3))
+                    rate = max(fall + (h2 + fj * h3) * di + (h1 + fi * h3) * dj, quarter * fall)
+                    pace = one / (np.float32(math.sqrt(di * di + dj * dj)) + tiny)
+                    move = value / rate
+                    if step < 2:
+                        t0 = work[k] * pace
+                        move = min(max(move, t0 - t), pace)
+                    work[k + LINE] = value
+                    work[k + 2 * LINE] = t + move
+            for k in range(count):
                 c = np.float32(k)
                 di = fax * c + fbx
                 dj = fay * c + fby
-                t = found[k]
-                if doubt[k]:
-                    t = _search(heights, peaks, i0, j0, altitude, di, dj, faz * c + fbz, first[k], top, low)
+                t = work[k + 2 * LINE]
+                i = i0 + t * di
+                j = j0 + t * dj
+                out = np.float32(math.sqrt(di * di + dj * dj)) + tiny
+                if not (abs(work[k + LINE]) < close and i > near and i < last_i and j > near and j < last_j):
+                    t = _search(
+                        heights, peaks, i0, j0, altitude, di, dj, faz * c + fbz, work[k] / out, top, low
+                    )
                 if upright:
-                    depth_along[main, k] = t
+                    depth_along[main, begin + k] = t
                 else:
-                    depth_along[k, main] = t
-                inner[k] = t * np.float32(math.sqrt(di * di + dj * dj)) if t > zero else zero
+                    depth_along[begin + k, main] = t
+                inner[begin + k] = t * out if t > zero else zero
+                inner_z[begin + k] = z0 + t * (faz * c + fbz) if t > zero else high_z
 
 
 @njit(fastmath=True, error_model="numpy", nogil=True)
@@ -451,14 +488,17 @@ def shade_pixels(
     The Sun stands at -x: its vector is (-sun_flat, 0, sun_up).  Slopes come from the terrain's own pixels: the tangent
     grid would blur them once more.
     """
-    inverse = 1.0 / texel
-    i0 = -x0 * inverse
-    j0 = -y0 * inverse
+    wide = radiance.shape[1]
+    inverse = np.float32(1.0 / texel)
+    i0 = np.float32(-x0 / texel)
+    j0 = np.float32(-y0 / texel)
     one = np.float32(1.0)
     half = np.float32(0.5)
     zero = np.float32(0.0)
+    two = np.float32(2.0)
     next_one = np.uint64(1)
     next_two = np.uint64(2)
+    next_row = np.uint64(depth.shape[1])
     up = np.float32(sun_up)
     flat = np.float32(sun_flat)
     many = np.float32(law.shape[1] - 2)
@@ -467,76 +507,110 @@ def shade_pixels(
     tile_shift = np.uint64(shift)
     albedo_mask = np.uint64((1 << (shift - albedo_step)) - 1)
     albedo_scale = np.float32(1.0 / (1 << albedo_step))
-    share = 1.0 / NODE_STEP
-    per_texel = np.float32(inverse / NODE_STEP)
-    last_ni = node_row.shape[0] - 2
-    last_nj = node_row.shape[1] - 2
+    mean = np.float32(mean_albedo)
+    spread = np.float32(contrast)
+    share = np.float32(1.0 / NODE_STEP)
+    per_texel = share * inverse
+    last_ni = np.int32(node_row.shape[0] - 2)
+    last_nj = np.int32(node_row.shape[1] - 2)
+    stride = np.int32(depth.shape[1])
+    node_stride = np.int32(node_row.shape[1])
+    next_node_row = np.uint64(node_row.shape[1])
+    rises = depth.ravel()
+    node_r = node_row.ravel()
+    node_c = node_column.ravel()
+    slope_r = slope_row.ravel()
+    slope_c = slope_column.ravel()
+    radius = np.float32(1.0 / MOON_RADIUS_M)
+    high = np.float32(altitude)
+    ax = np.float32(tangent_from_camera[0, 0] / focal)
+    ay = np.float32(tangent_from_camera[1, 0] / focal)
+    az = np.float32(tangent_from_camera[2, 0] / focal)
+    per_pixel = np.float32(1.0 / focal)
+    work = np.empty(13 * LINE, np.float32)
+    places = np.empty(2 * LINE, np.int32)
     for v in range(radiance.shape[0]):
         b = (v - centre_v) / focal
-        for u in range(radiance.shape[1]):
-            a = (u - centre_u) / focal
-            t = np.float64(range_m[v, u])
-            if t < 0.0:
-                radiance[v, u] = zero
-                lit[v, u] = zero
-                range_m[v, u] = np.float32(np.nan)
+        a = -centre_u / focal
+        bx = np.float32(
+            tangent_from_camera[0, 0] * a + tangent_from_camera[0, 1] * b + tangent_from_camera[0, 2]
+        )
+        by = np.float32(
+            tangent_from_camera[1, 0] * a + tangent_from_camera[1, 1] * b + tangent_from_camera[1, 2]
+        )
+        bz = np.float32(
+            tangent_from_camera[2, 0] * a + tangent_from_camera[2, 1] * b + tangent_from_camera[2, 2]
+        )
+        left = np.float32(a)
+        square = np.float32(b * b + 1.0)
+        # As in `trace_pixels`: look-ups apart from arithmetic, one buffer with rows a constant apart.
+        for k in range(wide):
+            work[k] = range_m[v, k]
+        for k in range(wide):
+            c = np.float32(k)
+            t = max(work[k], zero)
+            x = t * (ax * c + bx)
+            y = t * (ay * c + by)
+            z = high + t * (az * c + bz)
+            i = max(i0 + x * inverse, zero)
+            j = max(j0 + y * inverse, zero)
+            whole_i = np.int32(i)
+            whole_j = np.int32(j)
+            ni = min(np.int32(i * share), last_ni)
+            nj = min(np.int32(j * share), last_nj)
+            lean = z * radius
+            bend = (x * x + y * y) * radius * (one - lean + lean * lean)
+            places[k] = whole_i * stride + whole_j
+            places[k + LINE] = ni * node_stride + nj
+            work[k + LINE] = x
+            work[k + 2 * LINE] = y
+            work[k + 3 * LINE] = z
+            work[k + 4 * LINE] = i - np.float32(whole_i)
+            work[k + 5 * LINE] = j - np.float32(whole_j)
+            work[k + 6 * LINE] = i * share - np.float32(ni)
+            work[k + 7 * LINE] = j * share - np.float32(nj)
+            work[k + 8 * LINE] = z + half * bend * (one - half * half * bend * radius)
+        for k in range(wide):
+            if work[k] < zero:
+                work[k + 9 * LINE] = -two
                 continue
-            dx = tangent_from_camera[0, 0] * a + tangent_from_camera[0, 1] * b + tangent_from_camera[0, 2]
-            dy = tangent_from_camera[1, 0] * a + tangent_from_camera[1, 1] * b + tangent_from_camera[1, 2]
-            dz = tangent_from_camera[2, 0] * a + tangent_from_camera[2, 1] * b + tangent_from_camera[2, 2]
-            x = t * dx
-            y = t * dy
-            z = altitude + t * dz
-            i = i0 + x * inverse
-            j = j0 + y * inverse
-            length = np.float32(math.sqrt(a * a + b * b + 1.0))
-            range_m[v, u] = np.float32(t) * length
-            p = np.uint64(i)
-            q = np.uint64(j)
-            fi = np.float32(i - p)
-            fj = np.float32(j - q)
-            p1 = p + next_one
-            q1 = q + next_one
-            top = depth[p, q] + fj * (depth[p, q1] - depth[p, q])
-            low = depth[p1, q] + fj * (depth[p1, q1] - depth[p1, q])
+            m = np.uint64(places[k])
+            fi = work[k + 4 * LINE]
+            fj = work[k + 5 * LINE]
+            top = rises[m] + fj * (rises[m + next_one] - rises[m])
+            m += next_row
+            low = rises[m] + fj * (rises[m + next_one] - rises[m])
             rise = top + fi * (low - top)
+            work[k + 9 * LINE] = rise
             if rise <= -one:
-                lit[v, u] = zero
-                radiance[v, u] = zero
                 continue
             # Place on the terrain's grid and how it changes along x and y.
-            ni = np.uint64(min(int(i) // NODE_STEP, last_ni))
-            nj = np.uint64(min(int(j) // NODE_STEP, last_nj))
-            ni1 = ni + next_one
-            nj1 = nj + next_one
-            ti = np.float32(i * share - ni)
-            tj = np.float32(j * share - nj)
-            base = math.sqrt(x * x + y * y + (MOON_RADIUS_M + z) * (MOON_RADIUS_M + z))
-            h = np.float32(base - MOON_RADIUS_M)
-            r00 = node_row[ni, nj] + h * slope_row[ni, nj]
-            r01 = node_row[ni, nj1] + h * slope_row[ni, nj1]
-            r10 = node_row[ni1, nj] + h * slope_row[ni1, nj]
-            r11 = node_row[ni1, nj1] + h * slope_row[ni1, nj1]
-            c00 = node_column[ni, nj] + h * slope_column[ni, nj]
-            c01 = node_column[ni, nj1] + h * slope_column[ni, nj1]
-            c10 = node_column[ni1, nj] + h * slope_column[ni1, nj]
-            c11 = node_column[ni1, nj1] + h * slope_column[ni1, nj1]
+            m = np.uint64(places[k + LINE])
+            m1 = m + next_one
+            m2 = m + next_node_row
+            m3 = m2 + next_one
+            ti = work[k + 6 * LINE]
+            tj = work[k + 7 * LINE]
+            h = work[k + 8 * LINE]
+            r00 = node_r[m] + h * slope_r[m]
+            r01 = node_r[m1] + h * slope_r[m1]
+            r10 = node_r[m2] + h * slope_r[m2]
+            r11 = node_r[m3] + h * slope_r[m3]
+            c00 = node_c[m] + h * slope_c[m]
+            c01 = node_c[m1] + h * slope_c[m1]
+            c10 = node_c[m2] + h * slope_c[m2]
+            c11 = node_c[m3] + h * slope_c[m3]
             ra = r00 + tj * (r01 - r00)
             rb = r10 + tj * (r11 - r10)
             ca = c00 + tj * (c01 - c00)
             cb = c10 + tj * (c11 - c10)
             r = ra + ti * (rb - ra)
             c = ca + ti * (cb - ca)
-            rx = (rb - ra) * per_texel
-            cx = (cb - ca) * per_texel
-            ry = (r01 - r00 + ti * (r11 - r10 - r01 + r00)) * per_texel
-            cy = (c01 - c00 + ti * (c11 - c10 - c01 + c00)) * per_texel
             p = np.uint64(r)
             q = np.uint64(c)
             fi = r - np.float32(p)
             fj = c - np.float32(q)
-            slot = table[p >> tile_shift, q >> tile_shift]
-            tile = pool[slot]
+            slot = np.uint64(table[p >> tile_shift, q >> tile_shift])
             p = p & mask
             q = q & mask
             p1 = p + next_one
@@ -545,61 +619,24 @@ def shade_pixels(
             q2 = q + next_two
             p3 = p2 + next_one
             q3 = q2 + next_one
-            h11 = tile[p1, q1]
-            h12 = tile[p1, q2]
-            h21 = tile[p2, q1]
-            h22 = tile[p2, q2]
+            h11 = pool[slot, p1, q1]
+            h12 = pool[slot, p1, q2]
+            h21 = pool[slot, p2, q1]
+            h22 = pool[slot, p2, q2]
             w11 = fi * fj
             w01 = fj - w11
             w10 = fi - w11
             w00 = one - fi - w01
-            along_row = half * (
-                w00 * (h21 - tile[p, q1])
-                + w01 * (h22 - tile[p, q2])
-                + w10 * (tile[p3, q1] - h11)
-                + w11 * (tile[p3, q2] - h12)
+            along_row = w00 * (h21 - pool[slot, p, q1]) + w01 * (h22 - pool[slot, p, q2])
+            along_row += w10 * (pool[slot, p3, q1] - h11) + w11 * (pool[slot, p3, q2] - h12)
+            along_column = w00 * (h12 - pool[slot, p1, q]) + w01 * (pool[slot, p1, q3] - h11)
+            along_column += w10 * (h22 - pool[slot, p2, q]) + w11 * (pool[slot, p2, q3] - h21)
+            scale = half * per_texel
+            work[k + 4 * LINE] = scale * (along_row * (rb - ra) + along_column * (cb - ca))
+            work[k + 5 * LINE] = scale * (
+                along_row * (r01 - r00 + ti * (r11 - r10 - r01 + r00))
+                + along_column * (c01 - c00 + ti * (c11 - c10 - c01 + c00))
             )
-            along_column = half * (
-                w00 * (h12 - tile[p1, q])
-                + w01 * (tile[p1, q3] - h11)
-                + w10 * (h22 - tile[p2, q])
-                + w11 * (tile[p2, q3] - h21)
-            )
-            gx = along_row * rx + along_column * cx
-            gy = along_row * ry + along_column * cy
-            # The nodes hold places at fixed height; the ground's own rise moves the place a little.
-            sx = np.float32(x)
-            sy = np.float32(y)
-            inverse_base = np.float32(1.0 / base)
-            lean = one / (one + (gx * sx + gy * sy) * inverse_base)
-            steep = np.float32(1.0 / (MOON_RADIUS_M + z))
-            gx = (np.float32(base) * gx * lean - sx) * steep
-            gy = (np.float32(base) * gy * lean - sy) * steep
-            norm = one / np.float32(math.sqrt(gx * gx + gy * gy + one))
-            mu0 = (gx * flat + up) * norm
-            if mu0 <= zero:
-                lit[v, u] = zero
-                radiance[v, u] = zero
-                continue
-            s = min(rise, one)
-            sun = half + s * (np.float32(0.75) - np.float32(0.25) * s * s)
-            lit[v, u] = sun
-            reach = one / length
-            vx = np.float32(-dx) * reach
-            vy = np.float32(-dy) * reach
-            vz = np.float32(-dz) * reach
-            mu = max((vz - gx * vx - gy * vy) * norm, np.float32(0.02))
-            place = min(max((vz * up - vx * flat + one) * half, zero), one) * many
-            k = np.uint64(place)
-            f = place - np.float32(k)
-            seeliger = law[0, k] + f * (law[0, k + next_one] - law[0, k])
-            lambert = law[1, k] + f * (law[1, k + next_one] - law[1, k])
-            both = mu0 / (mu0 + mu)
-            value = seeliger * both + lambert * mu0
-            if hapke:
-                h0 = (one + np.float32(2.0) * mu0) / (one + np.float32(2.0) * mu0 * gamma)
-                h1 = (one + np.float32(2.0) * mu) / (one + np.float32(2.0) * mu * gamma)
-                value += law[2, k] * h0 * h1 * both
             r *= albedo_scale
             c *= albedo_scale
             p = np.uint64(r)
@@ -610,13 +647,60 @@ def shade_pixels(
             q = q & albedo_mask
             p1 = p + next_one
             q1 = q + next_one
-            paint = albedo[slot]
-            a0 = paint[p, q] + fj * (paint[p, q1] - paint[p, q])
-            a1 = paint[p1, q] + fj * (paint[p1, q1] - paint[p1, q])
-            shade = np.float32(mean_albedo) + np.float32(contrast) * (
-                a0 + fi * (a1 - a0) - np.float32(mean_albedo)
-            )
-            radiance[v, u] = shade * value * sun
+            a0 = albedo[slot, p, q] + fj * (albedo[slot, p, q1] - albedo[slot, p, q])
+            a1 = albedo[slot, p1, q] + fj * (albedo[slot, p1, q1] - albedo[slot, p1, q])
+            work[k + 6 * LINE] = mean + spread * (a0 + fi * (a1 - a0) - mean)
+        for k in range(wide):
+            c = np.float32(k)
+            x = work[k + LINE]
+            y = work[k + 2 * LINE]
+            z = work[k + 3 * LINE] * radius
+            gx = work[k + 4 * LINE]
+            gy = work[k + 5 * LINE]
+            # The nodes hold places at fixed height; the ground's own rise moves the place a little.
+            lean = one / (one + (gx * x + gy * y) * radius)
+            stretch = one + (work[k + 8 * LINE] * radius - z) * (one - z)
+            steep = radius * (one - z + z * z)
+            gx = gx * lean * stretch - x * steep
+            gy = gy * lean * stretch - y * steep
+            norm = one / np.float32(math.sqrt(gx * gx + gy * gy + one))
+            right = left + c * per_pixel
+            length = np.float32(math.sqrt(right * right + square))
+            reach = one / length
+            vx = -(ax * c + bx) * reach
+            vy = -(ay * c + by) * reach
+            vz = -(az * c + bz) * reach
+            mu0 = (gx * flat + up) * norm
+            mu = max((vz - gx * vx - gy * vy) * norm, np.float32(0.02))
+            s = min(work[k + 9 * LINE], one)
+            sun = half + s * (np.float32(0.75) - np.float32(0.25) * s * s)
+            sun = sun if (s > -one and mu0 > zero) else zero
+            mu0 = max(mu0, zero)
+            both = mu0 / (mu0 + mu)
+            h0 = (one + two * mu0) / (one + two * mu0 * gamma)
+            h1 = (one + two * mu) / (one + two * mu * gamma)
+            work[k + 9 * LINE] = sun
+            work[k + 10 * LINE] = min(max((vz * up - vx * flat + one) * half, zero), one) * many
+            work[k + LINE] = mu0
+            work[k + 2 * LINE] = both
+            work[k + 3 * LINE] = both * h0 * h1
+            work[k] = work[k] * length if work[k] >= zero else np.float32(np.nan)
+        for k in range(wide):
+            sun = work[k + 9 * LINE]
+            lit[v, k] = sun
+            range_m[v, k] = work[k]
+            value = zero
+            if sun > zero:
+                place = work[k + 10 * LINE]
+                m = np.uint64(place)
+                f = place - np.float32(m)
+                seeliger = law[0, m] + f * (law[0, m + next_one] - law[0, m])
+                lambert = law[1, m] + f * (law[1, m + next_one] - law[1, m])
+                value = seeliger * work[k + 2 * LINE] + lambert * work[k + LINE]
+                if hapke:
+                    value += law[2, m] * work[k + 3 * LINE]
+                value *= work[k + 6 * LINE] * sun
+            radiance[v, k] = value
 
 
 @njit(fastmath=True, error_model="numpy", nogil=True)

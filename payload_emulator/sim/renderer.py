@@ -35,7 +35,7 @@ Image = npt.NDArray[np.float32]
 NODE_STEP = 32
 """Latitude and longitude are exact at every 32nd grid point and bilinear between: about 2 m off at most."""
 
-TEXEL_PER_PIXEL = 0.8
+TEXEL_PER_PIXEL = 0.65
 SMALLEST_TEXEL_M = 60.0
 COARSE_TEXELS = 4
 """Texel of the grid toward the Sun that only casts, in texels of the picture's."""
@@ -44,7 +44,7 @@ CASTER_RELIEF_M = 4500.0
 """A caster is taken to rise at most this far above the ground it shades."""
 
 LONGEST_SHADOW_M = 75.0e3
-LARGEST_GRID = 4096
+LARGEST_GRID = 4095
 NO_SHADOW_M = -1.0e6
 
 

@@ -26,7 +26,7 @@ Heights = npt.NDArray[np.float32]
 TILE_SHIFT = 9
 TILE_PIXELS = 1 << TILE_SHIFT
 APRON = 1
-"""Rows and columns of the neighbours that a tile repeats before its own; there are two more after: slopes need them."""
+"""Rows and columns of the neighbours that a tile repeats before its own; two more come after.  Slopes need them."""
 
 LEVELS = 6
 """Each level has pixels about 1.41 times as large, made from the source without what is too small for them."""
@@ -105,7 +105,7 @@ class Terrain(Protocol):
     def patch(
         self, latitude_rad: Floats, longitude_rad: Floats, spacing_m: float = 0.0, level: int = 0
     ) -> TerrainPatch:
-        """Tiles of a level within ``spacing_m`` of the given places (which must lie within half a turn of each other)."""
+        """Tiles of a level within ``spacing_m`` of places that lie within half a turn of each other."""
         ...
 
     def craters_near(self, latitude_rad: float, longitude_rad: float, radius_m: float) -> CraterCatalogue:
@@ -350,8 +350,8 @@ def coarse_nodes(
 ) -> tuple[Floats, Floats, float, float]:
     """Every ``stride``-th place of the global grid about a part of it, and where the part begins among them.
 
-    All tiles pick the same nodes, so what is interpolated between them agrees at tile edges.  ``spare`` nodes are added on
-    all sides; the returned starts are in nodes.
+    All tiles pick the same nodes, so what is interpolated between them agrees at tile edges.  ``spare`` nodes are
+    added on all sides; the returned starts are in nodes.
     """
     step = float(latitude[0] - latitude[1])
     starts, nodes = [], []
@@ -362,8 +362,8 @@ def coarse_nodes(
         low = first // stride - spare
         high = (first + count - 1) // stride + 2 + spare
         starts.append(first / stride - low)
-        nodes.append((np.arange(low, high) * stride + 0.5) * step)
-    return 0.5 * math.pi - nodes[0], nodes[1], starts[0], starts[1]
+        nodes.append(np.asarray((np.arange(low, high) * stride + 0.5) * step, dtype=np.float64))
+    return np.asarray(0.5 * math.pi - nodes[0]), np.asarray(nodes[1]), starts[0], starts[1]
 
 
 def _circle(latitude: Floats, longitude: Floats, radius: Floats, azimuths: int) -> tuple[Floats, Floats]:
