@@ -65,6 +65,8 @@ _TM_HEADER_DTYPE = np.dtype(
 )  # fmt: skip
 assert _TM_HEADER_DTYPE.itemsize == TM_DATA_START
 
+WITHIN_LIMITS, WARNING, ALARM = 0, 1, 2
+
 NOT_A_TM_PACKET = -1
 WRONG_LENGTH = -2
 
@@ -118,6 +120,15 @@ class Field:
         """Least and greatest raw integer (integer types only)."""
         bits = int(self.type[1:])
         return (0, (1 << bits) - 1) if self.type[0] == "u" else (-(1 << bits - 1), (1 << bits - 1) - 1)
+
+    def limit_states(self, values: npt.ArrayLike) -> npt.NDArray[np.int8]:
+        """`WITHIN_LIMITS`, `WARNING` or `ALARM` for each engineering value; NaN breaks no limit."""
+        numbers = np.asarray(values, dtype=np.float64)
+        states = np.full(numbers.shape, WITHIN_LIMITS, dtype=np.int8)
+        for state, limits in ((WARNING, self.warning), (ALARM, self.alarm)):
+            if limits is not None:
+                states[(numbers < limits[0]) | (numbers > limits[1])] = state
+        return states
 
     def label(self, code: int) -> str:
         """The name of a raw code, or the number itself where it has none."""

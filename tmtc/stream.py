@@ -165,22 +165,29 @@ class _Cutter:
             if p == stop:
                 break
             if q := self.idle_end(p, stop):
-                kind = _IDLE
+                ends = [(_IDLE, q)]
             elif not final and stop - p < look_ahead(self.longest):
                 return p
             else:
-                kind, q = self.decide(p, stop)
-            last = self.rows[self.count - 1]
-            if kind == _SKIPPED and self.count > begin and last[0] == _SKIPPED:
-                last[2] = q
-            else:
-                self.rows[self.count] = kind, p, q
-                self.count += 1
-            p = q
+                ends = self.decide(p, stop)
+            for kind, q in ends:
+                self.note(kind, p, q, begin)
+                p = q
         return p
 
-    def decide(self, p: int, stop: int) -> tuple[int, int]:
-        """(kind, end) of what stands at `p`, where no packet with a right checksum stands."""
+    def note(self, kind: int, p: int, q: int, begin: int) -> None:
+        """Write a row; what is skipped right after something skipped prolongs that row."""
+        last = self.rows[self.count - 1]
+        if kind == _SKIPPED and self.count > begin and last[0] == _SKIPPED:
+            last[2] = q
+            return
+        if self.count == self.rows.shape[0]:
+            self.rows = np.concatenate((self.rows, np.empty_like(self.rows)))
+        self.rows[self.count] = kind, p, q
+        self.count += 1
+
+    def decide(self, p: int, stop: int) -> list[tuple[int, int]]:
+        """(kind, end) of what stands at `p` and right after it, where no packet with a right checksum stands."""
         if self.prefix is None:
             self.prefix = np.empty(self.octets.size + 1, dtype=np.uint16)
         state = (self.prefix, self.known, self.tables, self.powers)
@@ -193,14 +200,17 @@ class _Cutter:
             # the header is one and a packet follows where it says, so the damage is inside [p, e), whatever else may
             # be found in there, unless the length is wrong and right packets fill the end of that range
             q = self.kernels.chain_start(self.octets, p + 1, e, self.packet_type, self.longest, *state)
-            return (self.kind_of(p), e) if q < 0 else (_SKIPPED, q)
+            return [(self.kind_of(p), e)] if q < 0 else [(_SKIPPED, q)]
         limit = min(stop, p + self.longest)
         q = self.kernels.search(self.octets, p + 1, limit, stop, self.packet_type, self.longest, *state)
+        if q == limit < stop:
+            return [(_SKIPPED, q)]
         # several damaged packets in a row, whose lengths still lead to the next right one
-        r = p
+        ends, r = [], p
         while r < q and (length := self.length_at(r, q)):
+            ends.append((self.kind_of(r), r + length))
             r += length
-        return (self.kind_of(p), e) if r == q else (_SKIPPED, q)
+        return ends if r == q else [(_SKIPPED, q)]
 
     def idle_end(self, p: int, stop: int) -> int:
         """End of an evenly filled idle packet at `p` with a packet behind it, else 0: needs no search."""

@@ -8,7 +8,16 @@ from hypothesis import strategies as st
 
 from tmtc.dictionary import DICTIONARY, dictionary_version
 from tmtc.errors import ChecksumError, MalformedPacket, TruncatedPacket, UnknownPacket, ValueRefused
-from tmtc.schema import WRONG_LENGTH, Dictionary, Field, Group, PacketDefinition
+from tmtc.schema import (
+    ALARM,
+    WARNING,
+    WITHIN_LIMITS,
+    WRONG_LENGTH,
+    Dictionary,
+    Field,
+    Group,
+    PacketDefinition,
+)
 from tmtc.stream import cut_packets
 
 HOUSEKEEPING = {
@@ -334,3 +343,19 @@ def test_integer_columns_do_not_wrap_in_arithmetic():
     table = DICTIONARY.unpack_many(buffer, cut_packets(buffer))["housekeeping"]
     assert table.columns["frames_bad"].dtype == np.int64 and table.raw["frames_bad"].dtype == np.uint32
     assert table.columns["image_ticks" if "image_ticks" in table.columns else "mode"].dtype == np.int64
+
+
+def test_limits_tell_warning_from_alarm():
+    temperature = DICTIONARY.packet("housekeeping").field("temperature_c")
+    values = [-41.0, -30.0, -20.0, 20.0, 60.0, 61.0, 86.0, math.nan]
+    assert temperature.limit_states(values).tolist() == [
+        ALARM,
+        WARNING,
+        0,
+        0,
+        0,
+        WARNING,
+        ALARM,
+        WITHIN_LIMITS,
+    ]
+    assert DICTIONARY.packet("housekeeping").field("mode").limit_states([3]).tolist() == [WITHIN_LIMITS]

@@ -1,0 +1,113 @@
+"""Large data in parts (PUS service 13): a table, an image or a map cut up for packets, and put together again.
+
+References
+----------
+ECSS-E-ST-70-41C section 6.13. Downlink parts are TM[13,1..3], uplink parts TC[13,9..11]; part numbers count from 1.
+A transfer that fits into one part is sent as its last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from tmtc.errors import ValueRefused
+
+PART_LIMIT = 65_535
+
+
+@dataclass(frozen=True, slots=True)
+class LargeData:
+    """A transfer that is complete."""
+
+    transaction: int
+    table: int
+    octets: bytes
+
+
+def split(
+    octets: bytes, *, transaction: int, table: int | str, part_length: int, link: str = "large_data"
+) -> list[tuple[str, dict[str, object]]]:
+    """(packet name, values) of every part, to be packed in this order; `link` is `large_data` (down) or `uplink`."""
+    if not 1 <= part_length <= PART_LIMIT:
+        raise ValueRefused("large data", "part_length", part_length, f"1..{PART_LIMIT} octets")
+    count = max(1, -(-len(octets) // part_length))
+    if count > PART_LIMIT:
+        raise ValueRefused("large data", "octets", f"{len(octets)} octets", f"at most {PART_LIMIT} parts")
+    parts: list[tuple[str, dict[str, object]]] = []
+    for k in range(count):
+        name = "last" if k == count - 1 else "first" if k == 0 else "middle"
+        piece = np.frombuffer(octets[k * part_length : (k + 1) * part_length], dtype=np.uint8)
+        parts.append(
+            (
+                f"{link}_{name}",
+                {"transaction": transaction, "part": k + 1, "table": table, "items": {"octet": piece}},
+            )
+        )
+    return parts
+
+
+@dataclass(slots=True)
+class LargeDataReceiver:
+    """Puts parts together, whatever the order in which they come and however often.
+
+    Unfinished transfers are kept up to `most_octets` in all; beyond that the one begun first is given up.
+    """
+
+    most_octets: int = 64 << 20
+    _parts: dict[int, dict[int, bytes]] = field(default_factory=dict)
+    _tables: dict[int, int] = field(default_factory=dict)
+    _last: dict[int, int] = field(default_factory=dict)
+    _kept: int = 0
+
+    def accept(self, name: str, values: Mapping[str, Any]) -> LargeData | None:
+        """The transfer that this part completes, if it does; `name` and `values` as the dictionary unpacks them."""
+        transaction, number = int(values["transaction"]), int(values["part"])
+        if self._tables.get(transaction, values["table"]) != values["table"]:
+            # the number is in use again for something else: what was begun under it will not be completed
+            self.abort(transaction)
+        parts = self._parts.setdefault(transaction, {})
+        self._tables[transaction] = int(values["table"])
+        octets = np.asarray(values["items"]["octet"], dtype=np.uint8).tobytes()
+        self._kept += len(octets) - len(parts.get(number, b""))
+        parts[number] = octets
+        if name.endswith("_last"):
+            self._last[transaction] = number
+        last = self._last.get(transaction)
+        if last is not None and len(parts) >= last and all(k in parts for k in range(1, last + 1)):
+            whole = LargeData(
+                transaction, self._tables[transaction], b"".join(parts[k] for k in range(1, last + 1))
+            )
+            self.abort(transaction)
+            return whole
+        while len(self._parts) > 1 and self.octets_kept > self.most_octets:
+            self.abort(next(iter(self._parts)))
+        if self.octets_kept > self.most_octets:
+            self.abort(transaction)
+        return None
+
+    def missing(self, transaction: int) -> list[int]:
+        """Parts not yet there: below the last one, or below the highest so far while the last has not come."""
+        parts = self._parts.get(transaction, {})
+        highest = self._last.get(transaction, max(parts, default=0))
+        return [k for k in range(1, highest + 1) if k not in parts]
+
+    def abort(self, transaction: int) -> None:
+        """Forget an unfinished transfer."""
+        self._kept -= sum(map(len, self._parts.pop(transaction, {}).values()))
+        self._tables.pop(transaction, None)
+        self._last.pop(transaction, None)
+
+    @property
+    def octets_kept(self) -> int:
+        """Octets of unfinished transfers."""
+        return self._kept
+
+
+def receive(parts: Iterable[tuple[str, Mapping[str, Any]]]) -> list[LargeData]:
+    """All transfers that are complete in `parts`."""
+    receiver = LargeDataReceiver()
+    return [whole for name, values in parts if (whole := receiver.accept(name, values)) is not None]
