@@ -1,7 +1,7 @@
 """Compiled right-hand sides and integrators for orbits about the Moon, ICRF axes, SI units.
 
 Time inside is seconds after the start of the propagation.  What changes with time but not with the orbit comes
-from one table of Chebyshev series, ``table[segment, term, column]``: nine elements of pa_from_icrf (row by row),
+from one table of polynomials in -1..1, ``table[segment, term, column]``: nine elements of pa_from_icrf (row by row),
 then Earth and Sun positions.  ``force`` holds the scalars, at the places named below.
 """
 
@@ -30,19 +30,16 @@ NO_EVENT, PERISELENE, APOSELENE = range(3)
 
 @njit(error_model="numpy", boundscheck=False, fastmath={"contract", "nsz"})
 def look_up(table: FloatArray, force: FloatArray, t: float, out: FloatArray) -> None:
-    """Write the table's 15 columns at time ``t`` to ``out``, by Clenshaw's rule."""
+    """Write the table's columns at time ``t`` to ``out``, by Horner's rule."""
     place = (t - force[TABLE_START_S]) / force[TABLE_STEP_S]
     segment = min(max(int(place), 0), len(table) - 1)
-    x2 = 2.0 * (2.0 * (place - segment) - 1.0)
-    last = np.zeros(COLUMNS)
-    before = np.zeros(COLUMNS)
-    for term in range(table.shape[1] - 1, 0, -1):
-        for k in range(COLUMNS):
-            new = table[segment, term, k] + x2 * last[k] - before[k]
-            before[k] = last[k]
-            last[k] = new
+    x = 2.0 * (place - segment) - 1.0
+    terms = table.shape[1]
     for k in range(COLUMNS):
-        out[k] = table[segment, 0, k] + 0.5 * x2 * last[k] - before[k]
+        out[k] = table[segment, terms - 1, k]
+    for term in range(terms - 2, -1, -1):
+        for k in range(COLUMNS):
+            out[k] = out[k] * x + table[segment, term, k]
 
 
 @njit(error_model="numpy", boundscheck=False, fastmath={"contract", "nsz"})
@@ -54,7 +51,7 @@ def _tide(
     dx, dy, dz = x - sx, y - sy, z - sz
     d2 = dx * dx + dy * dy + dz * dz
     q = (x * (x - 2.0 * sx) + y * (y - 2.0 * sy) + z * (z - 2.0 * sz)) / s2
-    f = q * (3.0 + 3.0 * q + q * q) / (1.0 + (1.0 + q) ** 1.5)
+    f = q * (3.0 + 3.0 * q + q * q) / (1.0 + (1.0 + q) * math.sqrt(1.0 + q))
     g = -gm / (d2 * math.sqrt(d2))
     return g * (x + f * sx), g * (y + f * sy), g * (z + f * sz)
 
@@ -238,6 +235,7 @@ def integrate(
     force: FloatArray,
     table: FloatArray,
     scratch_size: int,
+    nystrom: bool,
     a: FloatArray,
     b: FloatArray,
     c: FloatArray,
@@ -273,7 +271,7 @@ def integrate(
         np.empty(6),
         np.empty(6),
     )
-    k = np.empty((stages, 6))
+    k, first, second = np.empty((stages, 6)), np.empty(6), np.empty(6)
     for d in range(6):
         y[d] = y0[d]
     two_estimates = False
@@ -283,37 +281,53 @@ def integrate(
     t = t_new = start_s
     h = min(abs(first_step_s), max_step_s)
     step = signed = 0.0
-    count = evaluations = stage = 0
+    count = evaluations = stage = tries = 0
     status = REACHED
-    rejected = False
+    rejected = known = False
     while True:
         for d in range(6):
-            total = 0.0
-            for j in range(stage):
-                total += a[stage, j] * k[j, d]
-            work[d] = y[d] + signed * total
-        ax, ay, az = force_acceleration(
-            t + c[stage] * signed, work[0], work[1], work[2], gravity, force, table, scratch, frame
-        )
-        evaluations += 1
+            work[d] = 0.0
+        for j in range(stage):
+            for d in range(6):
+                work[d] += a[stage, j] * k[j, d]
         for d in range(3):
-            k[stage, d] = work[d + 3]
-        k[stage, 3], k[stage, 4], k[stage, 5] = ax, ay, az
+            if nystrom:
+                work[d] = y[d] + signed * (c[stage] * y[d + 3] + signed * work[d + 3])
+            else:
+                work[d] = y[d] + signed * work[d]
+                k[stage, d] = y[d + 3] + signed * work[d + 3]
+        if not known:
+            k[stage, 3], k[stage, 4], k[stage, 5] = force_acceleration(
+                t + c[stage] * signed, work[0], work[1], work[2], gravity, force, table, scratch, frame
+            )
+            evaluations += 1
+        known = False
         if stage == 0:
             times[count] = t
             for d in range(6):
                 states[count, d] = y[d]
             for d in range(3):
                 rates[count, d] = k[0, d + 3]
-            if count > 0 and status == REACHED:
-                status, fraction = _events(
-                    times, states, rates, count - 1, sign, ground_m, event, event_radius_m, work
-                )
-                if status == EVENT:  # the knot moves to the event
-                    t = times[count - 1] + fraction * (t - times[count - 1])
-                    for d in range(6):
-                        y[d] = work[d]
-                    continue
+            wait = 0.0
+            if status == EVENT:  # the dense output gave the time to some ms: Newton's rule on radial speed
+                rate = y[3] * y[3] + y[4] * y[4] + y[5] * y[5] + y[0] * k[0, 3] + y[1] * k[0, 4] + y[2] * k[0, 5]
+                wait = -_radial(y) / rate
+            elif count > 0:
+                status, fraction = _events(times, states, rates, count - 1, sign, ground_m, event, event_radius_m, work)
+                if status == EVENT:
+                    wait = (fraction - 1.0) * (t - times[count - 1])
+            if abs(wait) > 1e-6 and tries < 5:  # take the step again, as far as the event
+                tries += 1
+                t_new = t + wait
+                t = times[count - 1]
+                signed = t_new - t
+                step = abs(signed)
+                for d in range(3):
+                    y[d] = states[count - 1, d]
+                    y[d + 3] = k[0, d] = states[count - 1, d + 3]
+                    k[0, d + 3] = rates[count - 1, d]
+                stage = 1
+                continue
             count += 1
             if status != REACHED or sign * (stop_s - t) <= 0.0:
                 return count, status, evaluations, h
@@ -323,26 +337,32 @@ def integrate(
             stage += 1
             continue
         else:
+            for d in range(6):
+                new[d] = first[d] = second[d] = 0.0
+            for i in range(stages):
+                for d in range(6):
+                    row = d // 3
+                    rate = k[i, d] if d > 2 or not nystrom else signed * k[i, d + 3]
+                    new[d] += b[row, i] * rate
+                    first[d] += error[row, i] * rate
+                    second[d] += second_error[i] * rate
             size_r = rtol * rtol * (y[0] * y[0] + y[1] * y[1] + y[2] * y[2])
             size_v = rtol * rtol * (y[3] * y[3] + y[4] * y[4] + y[5] * y[5])
             fine = coarse = 0.0
             for d in range(6):
-                total = first = second = 0.0
-                for i in range(stages):
-                    total += b[i] * k[i, d]
-                    first += error[i] * k[i, d]
-                    second += second_error[i] * k[i, d]
-                new[d] = y[d] + signed * total
+                if nystrom and d < 3:
+                    new[d] += y[d + 3]
+                new[d] = y[d] + signed * new[d]
                 size = size_r if d < 3 else size_v
-                fine += first * first / size
-                coarse += second * second / size
+                fine += first[d] * first[d] / size
+                coarse += second[d] * second[d] / size
             if not two_estimates:
                 estimate = step * math.sqrt(fine / 6.0)
             elif fine > 0.0:
                 estimate = step * fine / math.sqrt(6.0 * (fine + 0.01 * coarse))
             else:
                 estimate = 0.0
-            factor = 0.9 * estimate ** (-1.0 / (error_order + 1)) if estimate > 0.0 else 5.0
+            factor = 0.9 * estimate ** (-1.0 / error_order) if estimate > 0.0 else 5.0
             if estimate <= 1.0:
                 grown = step * min(1.0 if rejected else 5.0, max(0.2, factor))
                 # A step cut short at the end of the span says nothing against the size in use.
@@ -351,6 +371,10 @@ def integrate(
                 t = t_new
                 for d in range(6):
                     y[d] = new[d]
+                if nystrom:  # the last stage is the first of the next step
+                    known = True
+                    for d in range(3, 6):
+                        k[0, d] = k[stages - 1, d]
                 stage = 0
                 signed = 0.0
                 continue

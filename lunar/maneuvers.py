@@ -17,7 +17,15 @@ from numpy.typing import ArrayLike, NDArray
 from lunar import constants
 from lunar.elements import Elements, elements_from_icrf_state
 from lunar.errors import OrbitError
-from lunar.propagation import MAX_STEP_S, Arc, ForceModel, Trajectory, integrate_arc, join, state_vector
+from lunar.propagation import (
+    DEFAULT_INTEGRATOR,
+    Arc,
+    ForceModel,
+    Trajectory,
+    integrate_arc,
+    join,
+    state_vector,
+)
 from lunar.timescales import utc_ns_from_tdb_s
 
 FloatArray = NDArray[np.float64]
@@ -56,9 +64,9 @@ def propagate_with_maneuvers(
     duration_s: float,
     model: ForceModel,
     rule: ManeuverRule,
-    integrator: str = "dop853",
-    rtol: float = 1e-11,
-    max_step_s: float = MAX_STEP_S,
+    integrator: str = DEFAULT_INTEGRATOR,
+    rtol: float | None = None,
+    max_step_s: float | None = None,
 ) -> tuple[Trajectory, tuple[Maneuver, ...]]:
     """Return the maintained orbit over ``duration_s`` (forwards only), and its burns in order of time.
 

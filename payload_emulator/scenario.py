@@ -46,7 +46,7 @@ class DynamicsSection:
     orientation: Literal["auto", "iau", "de421"] = "auto"
     earth: bool = True
     sun: bool = True
-    integrator: Literal["dop853", "rkf78"] = "dop853"
+    integrator: Literal["rkn86", "dop853", "rkf78"] = "rkn86"
 
 
 @dataclass(frozen=True, slots=True)
