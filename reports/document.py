@@ -35,10 +35,10 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Headline:
-    """The numbers of the first page and the rung of evidence on which they stand."""
+    """The numbers of the first page and the rung of evidence on which they stand; None where they need no evidence."""
 
     figures: tuple[HeadlineFigure, ...]
-    evidence_rung: str
+    evidence_rung: str | None
 
 
 @dataclass(frozen=True, slots=True)

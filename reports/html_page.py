@@ -121,22 +121,22 @@ def _headline(block: Headline) -> str:
             value, words = "not available", True
         unit = f"<small>{escape(figure.unit)}</small>" if figure.unit and not words else ""
         note = f'<dd class="note">{escape(figure.note)}</dd>' if figure.note else ""
-        rung = _rung(figure.evidence_rung or block.evidence_rung)
+        rung = "" if block.evidence_rung is None else _rung(figure.evidence_rung or block.evidence_rung)
         items.append(
             f"<div><dt>{escape(figure.label)}</dt>"
             f'<dd class="number{" words" if words else ""}">{escape(value)}{unit}</dd>{note}{rung}</div>'
         )
-    number = rung_number(block.evidence_rung)
+    return f'\n<dl class="headline">{"".join(items)}</dl>{_ladder(block.evidence_rung)}'
+
+
+def _ladder(rung: str | None) -> str:
+    if rung is None:
+        return ""
     ladder = ", ".join(f"{i} {name}" for i, name in enumerate(EVIDENCE_RUNGS, 1))
-    stands = (
-        f"These figures stand on {rung_text(block.evidence_rung)}."
-        if number or block.evidence_rung
-        else "No rung of evidence was stated for these figures."
-    )
-    return (
-        f'\n<dl class="headline">{"".join(items)}</dl>'
-        f'<p class="ladder">{escape(stands)} Rungs of evidence: {escape(ladder)}.</p>'
-    )
+    stands = "No rung of evidence was stated for these figures."
+    if rung:
+        stands = f"These figures stand on {rung_text(rung)}."
+    return f'<p class="ladder">{escape(stands)} Rungs of evidence: {escape(ladder)}.</p>'
 
 
 def _rung(rung: str) -> str:

@@ -16,7 +16,8 @@ from reports.sections.common import PassView
 from reports.sections.detection import detector_section, galleries
 from reports.sections.matching import matching
 from reports.sections.navigation import altitude, consistency_section, dependence, drift, errors
-from reports.sections.records import configuration, ledger, provenance
+from reports.sections.opening import about, provenance_and_data
+from reports.sections.records import configuration, ledger
 from reports.sections.summary import summary
 from reports.sections.surroundings import ground_track, housekeeping_and_events
 from reports.text import duration_text, utc_text
@@ -34,7 +35,7 @@ def pass_document(report: PassReport) -> Document:
     check(report)
     view = PassView(report, _time_scale(report), series_styles([(s.name, s.kind) for s in report.navigation]))
     sections: tuple[Callable[[PassView], list[Block]], ...] = (
-        provenance,
+        lambda v: provenance_and_data(v.report),
         frames_and_packets,
         matching,
         errors,
@@ -105,14 +106,12 @@ def _time_scale(report: PassReport) -> TimeScale:
 
 
 def _about(view: PassView) -> tuple[tuple[str, str], ...]:
-    report, time = view.report, view.time
-    facts = []
-    if time.start_utc_ns > 0:
-        facts.append(("From", utc_text(time.start_utc_ns)))
-        facts.append(("to", utc_text(time.stop_utc_ns)))
-        facts.append(("length", duration_text(time.length_s)))
-    if report.generated_for:
-        facts.append(("for", report.generated_for))
-    if report.created_utc:
-        facts.append(("made", report.created_utc))
-    return tuple(facts)
+    time = view.time
+    if time.start_utc_ns <= 0:
+        return about(view.report)
+    return about(
+        view.report,
+        ("From", utc_text(time.start_utc_ns)),
+        ("to", utc_text(time.stop_utc_ns)),
+        ("length", duration_text(time.length_s)),
+    )

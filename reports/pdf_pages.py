@@ -396,13 +396,20 @@ def _headline(block: Headline) -> list[_Piece]:
             for k, line in enumerate(notes[i]):
                 top = y + 0.10 + above + 0.38 + k * 6.4 * 1.4 / 72
                 page.text(x, top, line, 6.4, color=color("muted"))
+            if block.evidence_rung is None:
+                continue
             rung = rung_number(figure.evidence_rung or block.evidence_rung)
             words = f"rung {rung}" if rung else "rung not stated"
-            page.text(x, y + height - 0.18, words, 6.4, color=color("muted"), style="italic")
+            page.text(x, y + height - 0.18, words, 6.4, color=color("muted"))
 
+    if block.evidence_rung is None:
+        return [_Piece(height + 0.1, draw)]
     ladder = ", ".join(f"{i} {name}" for i, name in enumerate(EVIDENCE_RUNGS, 1))
-    stands = f"These figures stand on {rung_text(block.evidence_rung)}. Rungs of evidence: {ladder}."
-    note = _lines(_wrapped(stands, _WIDTH, 6.8), 6.8, before=0.06, after=0.06, color=color("muted"))
+    stands = "No rung of evidence was stated for these figures."
+    if block.evidence_rung:
+        stands = f"These figures stand on {rung_text(block.evidence_rung)}."
+    text = f"{stands} Rungs of evidence: {ladder}."
+    note = _lines(_wrapped(text, _WIDTH, 6.8), 6.8, before=0.06, after=0.06, color=color("muted"))
     return [_Piece(height, draw, keep=True), *note]
 
 

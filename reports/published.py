@@ -2,7 +2,8 @@
 
 References
 ----------
-"AI-Based Navigation for Lunar Satellites in VLLO", Table II (detection on its test set).
+"AI-Based Navigation for Lunar Satellites in VLLO", Table II (detection on its test set) and Section V-B (labels of its
+data set).
 """
 
 from __future__ import annotations
@@ -25,4 +26,7 @@ TABLE_II = {
     1: PublishedScore("Class 1 (10–15 km)", 0.7362, 0.3586, 4.11),
     2: PublishedScore("Class 2 (15–30 km)", 0.8131, 0.4659, 4.75),
 }
+LABEL_SHARES = {0: 72.8, 1: 16.9, 2: 10.3}
+LABELS = {0: 956_110, 1: 221_860, 2: 135_098}
+FRAMES = 51_924
 SOURCE = "LINNA paper, Table II"

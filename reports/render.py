@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from reports.errors import UnknownReportKind
 from reports.json_form import to_json
-from reports.values import PassReport
+from reports.values import CampaignReport, DatasetReport, DetectorReport, PassReport, RegressionReport
 
 if TYPE_CHECKING:
     from reports.document import Document
@@ -45,8 +45,26 @@ def render_pdf(report: Any) -> bytes:
 
 
 def _document(report: Any) -> Document:
-    if isinstance(report, PassReport):
-        from reports.pass_report import pass_document
+    match report:
+        case PassReport():
+            from reports.pass_report import pass_document
 
-        return pass_document(report)
-    raise UnknownReportKind(type(report).__name__)
+            return pass_document(report)
+        case CampaignReport():
+            from reports.campaign_report import campaign_document
+
+            return campaign_document(report)
+        case RegressionReport():
+            from reports.regression_report import regression_document
+
+            return regression_document(report)
+        case DetectorReport():
+            from reports.detector_report import detector_document
+
+            return detector_document(report)
+        case DatasetReport():
+            from reports.dataset_report import dataset_document
+
+            return dataset_document(report)
+        case _:
+            raise UnknownReportKind(type(report).__name__)

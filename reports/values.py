@@ -385,3 +385,191 @@ class PassReport:
     scenario_text: str = ""
     remarks: tuple[str, ...] = ()
     not_available: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignPass:
+    """One pass of a campaign: what its own report found, by name of the estimator where there are several."""
+
+    pass_id: str
+    start_utc_ns: int
+    build: str = ""
+    light: str = ""
+    altitude_km: float = float("nan")
+    sun_elevation_deg: float = float("nan")
+    frames_expected: int | None = None
+    frames_processed: int | None = None
+    packets: int | None = None
+    packets_lost: int | None = None
+    precision: float = float("nan")
+    recall: float = float("nan")
+    localisation_px: float = float("nan")
+    navigation: Mapping[str, NavigationStatistics] = field(default_factory=dict)
+    anchor_reads_after_start: Mapping[str, int] = field(default_factory=dict)
+    baselines: tuple[str, ...] = ()
+    verdict_level: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignReport:
+    """Many passes beside one another: trend, by build, by altitude, by light."""
+
+    title: str
+    campaign_id: str
+    passes: tuple[CampaignPass, ...] = ()
+    verdict: str = ""
+    verdict_level: str = ""
+    generated_for: str = ""
+    created_utc: str = ""
+    evidence_rung: str = ""
+    headline: tuple[HeadlineFigure, ...] = ()
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    data_sources: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    not_available: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class NamedScore:
+    """Precision, recall and localisation of one named group, such as a state of degradation or a renderer."""
+
+    label: str
+    expected: int
+    precision: float
+    recall: float
+    localisation_px: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainingCurve:
+    """One quantity over the epochs of a training run, ``epoch`` and ``values`` (n,)."""
+
+    name: str
+    epoch: FloatArray
+    values: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DetectorReport:
+    """A detector judged on a data set: scores by class, curves, calibration, bias, what it costs."""
+
+    title: str
+    model_id: str
+    score: DetectorScore | None = None
+    by_degradation: tuple[NamedScore, ...] = ()
+    by_source: tuple[NamedScore, ...] = ()
+    training: tuple[TrainingCurve, ...] = ()
+    cost: Mapping[str, str] = field(default_factory=dict)
+    gallery: tuple[GalleryFrame, ...] = ()
+    worst_frames: tuple[GalleryFrame, ...] = ()
+    verdict: str = ""
+    verdict_level: str = ""
+    generated_for: str = ""
+    created_utc: str = ""
+    evidence_rung: str = ""
+    headline: tuple[HeadlineFigure, ...] = ()
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    data_sources: tuple[str, ...] = ()
+    configuration: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    not_available: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class ClassCount:
+    """Labels of one size class in a data set, by part ("train", "val", "test")."""
+
+    size_class: int
+    label: str
+    by_part: Mapping[str, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Histogram:
+    """Counts (n,) between edges (n+1,) of one quantity."""
+
+    name: str
+    unit: str
+    edges: FloatArray
+    counts: IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FramePlaces:
+    """Where the frames of a data set lie: arrays (n,) and the part of each."""
+
+    latitude_deg: FloatArray
+    longitude_deg: FloatArray
+    part: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class IntegrityCheck:
+    """One check of a data set: how many things were looked at, how many failed."""
+
+    name: str
+    looked_at: int
+    failed: int
+    detail: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DatasetReport:
+    """A data set: how much, of what, from where, in which light, and whether it is whole."""
+
+    title: str
+    dataset_id: str
+    frames_by_part: Mapping[str, int] = field(default_factory=dict)
+    classes: tuple[ClassCount, ...] = ()
+    histograms: tuple[Histogram, ...] = ()
+    places: FramePlaces | None = None
+    terrain: TerrainMap | None = None
+    integrity: tuple[IntegrityCheck, ...] = ()
+    gallery: tuple[GalleryFrame, ...] = ()
+    verdict: str = ""
+    verdict_level: str = ""
+    generated_for: str = ""
+    created_utc: str = ""
+    evidence_rung: str = ""
+    headline: tuple[HeadlineFigure, ...] = ()
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    data_sources: tuple[str, ...] = ()
+    configuration: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    not_available: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class RegressionGate:
+    """One requirement on a candidate build; ``limit`` is the value that must not be passed, in the same unit."""
+
+    name: str
+    baseline: float
+    candidate: float
+    limit: float
+    passed: bool
+    unit: str = ""
+    pass_id: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class RegressionReport:
+    """A candidate build against a baseline over archived passes."""
+
+    title: str
+    regression_id: str
+    candidate: str = ""
+    baseline: str = ""
+    gates: tuple[RegressionGate, ...] = ()
+    candidate_passes: tuple[CampaignPass, ...] = ()
+    baseline_passes: tuple[CampaignPass, ...] = ()
+    verdict: str = ""
+    verdict_level: str = ""
+    generated_for: str = ""
+    created_utc: str = ""
+    evidence_rung: str = ""
+    headline: tuple[HeadlineFigure, ...] = ()
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    data_sources: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    not_available: Mapping[str, str] = field(default_factory=dict)

@@ -270,7 +270,7 @@ def end_labels(
         return min(max((value - bottom) / (top - bottom), 0.0), 1.0)
 
     ordered = sorted(usable, key=lambda e: place(e[1]))
-    heights = _spread([place(value) for _, value, _ in ordered], line_height)
+    heights = spread([place(value) for _, value, _ in ordered], line_height)
     for (name, _, tint), height in zip(ordered, heights, strict=True):
         axes.plot(
             [1.0 + 0.08 / axes_width_in, 1.0 + 0.32 / axes_width_in],
@@ -293,7 +293,7 @@ def end_labels(
         )
 
 
-def _spread(wanted: list[float], gap: float) -> list[float]:
+def spread(wanted: list[float], gap: float) -> list[float]:
     """Sorted heights moved as little as possible so that neighbours are at least a gap apart."""
     groups: list[list[float]] = []  # [centre, count]
     for height in wanted:

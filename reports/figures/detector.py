@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 CLASS_ROLES = {0: "blue", 1: "orange", 2: "purple", 3: "gray2"}
-_OCTANTS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
+OCTANTS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
 
 
 def draw_class_scores(canvas: Canvas, scores: Sequence[ClassScore]) -> None:
@@ -168,7 +168,7 @@ def _octants(canvas: Canvas, axes: Axes, residuals: ResidualSeries) -> None:
         out = np.hypot(u, v)
         nudge = limit * 0.09 / max(out, 1e-9)
         axes.text(
-            u * (1 + nudge), v * (1 + nudge), _OCTANTS[k], ha="center", va="center", fontsize="small",
+            u * (1 + nudge), v * (1 + nudge), OCTANTS[k], ha="center", va="center", fontsize="small",
             color=color("ink"),
         )  # fmt: skip
     axes.set_title("mean residual by Sun azimuth")
@@ -235,16 +235,11 @@ def draw_curves(
         axes.grid(True, axis="both")
         for k, curve in enumerate(curves):
             role = CLASS_ROLES.get(k, "gray2")
-            axes.plot(
-                curve.recall,
-                curve.precision,
-                color=color(role),
-                linestyle=("-", (0, (5, 1.5)), (0, (2, 1)))[k % 3],
-            )
-            axes.text(
-                0.04, 0.06 + 0.085 * (len(curves) - 1 - k), curve.label, color=color(role), transform=axes.transAxes,
-                fontsize="small",
-            )  # fmt: skip
+            line = ("-", (0, (5, 1.5)), (0, (2, 1)))[k % 3]
+            axes.plot(curve.recall, curve.precision, color=color(role), linestyle=line)
+            height = 0.06 + 0.085 * (len(curves) - 1 - k)
+            axes.plot([0.04, 0.12], [height, height], color=color(role), linestyle=line)
+            axes.text(0.15, height, curve.label, va="center_baseline", fontsize="small")
         for row in TABLE_II.values():
             axes.plot(
                 [row.recall], [row.precision], "o", markerfacecolor=color("paper"), markeredgecolor=color("gray1"),

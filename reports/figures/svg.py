@@ -15,6 +15,8 @@ _NUMBER = re.compile(r"-?\d+\.\d{3,}")
 _ID = re.compile(r' id="([^"]+)"')
 _PATH = re.compile(r' d="([^"]*)"')
 _IMAGE = re.compile(r'xlink:href="data:image/png;base64,[^"]+"')
+_MARKERS = re.compile(r'<g((?: clip-path="[^"]*")?)>((?:<use [^>]*/>){2,})</g>')
+_MARKER_STYLE = re.compile(r' style="([^"]*)"')
 _STYLE_NOISE = re.compile(
     r"font-family: [^;\"]+; |image-rendering:[^;\"]+;?|stroke-linejoin: round;? ?|stroke-linecap: butt;? ?"
 )
@@ -62,8 +64,17 @@ def _for_page(svg: str, key: str, label: str, photos: Sequence[Photo]) -> str:
         body = body.replace(tint, f"var(--f-{role})")
     body = re.sub(r"<defs>\s*</defs>", "", body)
     body = re.sub(r">\s+<", "><", body).strip()
+    body = _MARKERS.sub(_with_one_style, body)
     text = label.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
     return f'<svg viewBox="{view}" role="img" aria-label="{text}">{body}</svg>'
+
+
+def _with_one_style(found: re.Match[str]) -> str:
+    """A group of markers of one look, with that look said once."""
+    styles = set(_MARKER_STYLE.findall(found.group(2)))
+    if len(styles) != 1:
+        return found.group(0)
+    return f'<g{found.group(1)} style="{styles.pop()}">{_MARKER_STYLE.sub("", found.group(2))}</g>'
 
 
 def _short(number: str) -> str:

@@ -42,8 +42,8 @@ def draw_globe(
     axes.set_xlim(0, 360)
     axes.set_ylim(-90, 90)
     axes.set_xticks(range(0, 361, 30), [f"{v}°" for v in range(0, 361, 30)])
-    axes.set_yticks(range(-90, 91, 30), [_latitude(v) for v in range(-90, 91, 30)])
-    _underlay(canvas, axes, terrain)
+    axes.set_yticks(range(-90, 91, 30), [latitude_label(v) for v in range(-90, 91, 30)])
+    draw_underlay(canvas, axes, terrain)
     axes.grid(True, axis="both")
     axes.set_xlabel("longitude, degrees east")
     axes.set_ylabel("latitude")
@@ -83,7 +83,7 @@ def draw_strips(
         half = tall * width / height / 2 / max(np.cos(np.radians((low + high) / 2)), 0.3)
         axes.set_ylim((low + high - tall) / 2, (low + high + tall) / 2)
         axes.set_xlim(middle - half, middle + half)
-        _underlay(canvas, axes, terrain, middle)
+        draw_underlay(canvas, axes, terrain, middle)
         axes.grid(False)
         step = _degree_step(2 * half, 3)
         ticks = np.arange(np.ceil((middle - half) / step), np.floor((middle + half) / step) + 1) * step
@@ -93,7 +93,7 @@ def draw_strips(
             np.arange(np.ceil((low + high - tall) / 2 / step), np.floor((low + high + tall) / 2 / step) + 1)
             * step
         )
-        axes.set_yticks(list(ticks), [_latitude(t) for t in ticks])
+        axes.set_yticks(list(ticks), [latitude_label(t) for t in ticks])
         if craters is not None:
             _craters(canvas, axes, craters, middle, width)
         for one in series:
@@ -156,7 +156,7 @@ def _line(canvas: Canvas, axes: Axes, track: TrackSeries, keep: BoolArray, tint:
     )  # fmt: skip
 
 
-def _underlay(canvas: Canvas, axes: Axes, terrain: TerrainMap | None, middle: float = 180.0) -> None:
+def draw_underlay(canvas: Canvas, axes: Axes, terrain: TerrainMap | None, middle: float = 180.0) -> None:
     """The shaded relief, faint, where it lies under the map."""
     if terrain is None or terrain.image.size == 0:
         return
@@ -198,7 +198,8 @@ def _degree_step(extent: float, most: int) -> float:
     return next((s for s in (0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0) if extent / s <= most), 60.0)
 
 
-def _latitude(value: float) -> str:
+def latitude_label(value: float) -> str:
+    """A latitude as a map prints it: 30° N."""
     if abs(value) < 1e-9:
         return "0°"
     return f"{abs(value):g}° {'N' if value > 0 else 'S'}"

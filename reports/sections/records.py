@@ -1,50 +1,22 @@
-"""Provenance and data, truth-use ledger, configuration."""
+"""Truth-use ledger and configuration."""
 
 from __future__ import annotations
 
 from reports.document import (
     Block,
-    Bullets,
     Cell,
     Column,
-    Facts,
     Heading,
     Listing,
     Paragraph,
     Table,
-    rung_number,
-    rung_text,
 )
 from reports.figures.theme import TRIGGERS
-from reports.sections.common import PassView, is_hash, role_of, setting_text
-from reports.text import count_text, hash_text, utc_text
+from reports.sections.common import PassView, role_of
+from reports.sections.opening import settings
+from reports.text import count_text, utc_text
 
 _MOST_READS = 30
-
-
-def provenance(view: PassView) -> list[Block]:
-    report = view.report
-    blocks: list[Block] = [Heading("Provenance and data")]
-    number = rung_number(report.evidence_rung)
-    if number is not None:
-        blocks.append(
-            Paragraph(
-                f"The accuracy figures stand on {rung_text(report.evidence_rung)}. A figure on a lower rung "
-                "says less about flight "
-                "than one on a higher rung, and is not to be quoted without its rung."
-            )
-        )
-    if report.provenance:
-        pairs = tuple((k, hash_text(v) if is_hash(v) else v) for k, v in report.provenance.items())
-        blocks.append(Facts(pairs))
-    else:
-        blocks.append(view.absent("provenance", "Build, hashes, seed"))
-    blocks.append(Heading("Data sources", 3))
-    if report.data_sources:
-        blocks.append(Bullets(report.data_sources))
-    else:
-        blocks.append(view.absent("data_sources", "Data sources"))
-    return blocks
 
 
 def ledger(view: PassView) -> list[Block]:
@@ -114,11 +86,9 @@ def ledger(view: PassView) -> list[Block]:
 
 
 def configuration(view: PassView) -> list[Block]:
+    """Settings of the pass and its scenario."""
     report = view.report
-    blocks: list[Block] = [Heading("Configuration")]
-    for group, settings in report.configuration.items():
-        blocks.append(Heading(str(group), 3))
-        blocks.append(Facts(tuple((str(k), setting_text(v)) for k, v in settings.items()), mono=True))
+    blocks: list[Block] = [Heading("Configuration"), *settings(report.configuration)]
     if not report.configuration and not report.scenario_text:
         blocks.append(view.absent("configuration", "Configuration"))
     if report.scenario_text:

@@ -4,39 +4,24 @@ from __future__ import annotations
 
 import math
 
-from reports.document import Block, Bullets, Cell, Column, Heading, Headline, Picture, Table, Verdict
+from reports.document import Block, Cell, Column, Heading, Picture, Table
 from reports.figures import navigation
 from reports.figures.canvas import TimeScale
 from reports.sections.common import PassView, arc_words, role_of
+from reports.sections.opening import judgement, missing_and_remarks
 from reports.statistics import completed, error_3d_m, quantiles
 from reports.text import NOT_A_VALUE, count_text, length_text, number_text
 
 
 def summary(view: PassView) -> list[Block]:
-    report = view.report
-    blocks: list[Block] = []
-    if report.verdict:
-        blocks.append(Verdict(report.verdict, report.verdict_level))
-    else:
-        blocks.append(view.absent("verdict", "Verdict"))
-    if report.headline:
-        blocks.append(Headline(report.headline, report.evidence_rung))
-    else:
-        blocks.append(view.absent("headline", "Five figures"))
-    blocks.append(Heading("At a glance"))
+    """Verdict and figures, errors at a glance, what is missing."""
+    blocks: list[Block] = [*judgement(view.report), Heading("At a glance")]
     if view.with_error:
         blocks.append(error_picture(view, "glance", 2.75, view.time))
         blocks.append(_statistics_table(view))
     else:
         blocks.append(view.absent("navigation", "Navigation"))
-    missing = sorted(set(report.not_available))
-    if missing:
-        blocks.append(Heading("What this report does not show", 3))
-        blocks.append(Bullets(tuple(f"{m.replace('_', ' ')}: {report.not_available[m]}" for m in missing)))
-    if report.remarks:
-        blocks.append(Heading("Remarks", 3))
-        blocks.append(Bullets(report.remarks))
-    return blocks
+    return [*blocks, *missing_and_remarks(view.report)]
 
 
 def _statistics_table(view: PassView) -> Table:

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from reports.render import render_html
+from tests.reports import example
 from tests.reports.browser import CHROMIUM, Tab, tab
 
 pytestmark = [
@@ -120,6 +122,22 @@ def test_on_paper_no_figure_is_taller_than_a_page_and_paper_is_white(browser: Ta
     browser.theme("light")
     assert max(heights) < 1001
     assert ground == "rgb(255, 255, 255)"
+
+
+@pytest.mark.parametrize("kind", ["campaign", "regression", "detector", "dataset"])
+def test_the_other_reports_are_as_silent_and_as_legible(browser: Tab, kind: str, path: Path) -> None:
+    other = path.with_name(f"{kind}.html")
+    other.write_text(render_html(getattr(example, f"{kind}_report")()), encoding="utf-8")
+    browser.requests.clear()
+    browser.open(other)
+    assert browser.complaints == []
+    assert [r for r in browser.requests if not r.startswith("data:")] == [other.as_uri()]
+    assert browser.value("document.documentElement.scrollWidth") <= 1280
+    for scheme in ("light", "dark"):
+        browser.theme(scheme)
+        assert browser.value(_CONTRAST.replace("LIMIT", "3.0")) == []
+    browser.theme("light")
+    browser.open(path)
 
 
 def test_it_prints_to_a4(browser: Tab) -> None:

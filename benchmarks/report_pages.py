@@ -1,0 +1,45 @@
+"""Time and size of reports: python benchmarks/report_pages.py.
+
+The day is 5,760 frames at 15 s, 26 imaging arcs, three estimators, three baselines, sixteen images.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+
+from reports.render import render_html, render_pdf, to_json
+from tests.reports import example
+
+
+def bench() -> dict[str, Any]:
+    """Seconds (wall and processor) and megabytes of each form, after one small report that loads everything."""
+    render_html(example.pass_report(hours=0.1, gallery=1, worst=0))
+    figures: dict[str, Any] = {}
+    for name, report in (
+        ("pass", example.pass_report()),
+        ("day", example.pass_report(hours=24.0)),
+        ("campaign_1000", example.campaign_report(count=1_000)),
+    ):
+        figures[name] = {
+            "html": _measured(lambda r=report: render_html(r).encode()),
+            "pdf": _measured(lambda r=report: render_pdf(r)),
+            "json": _measured(lambda r=report: to_json(r).encode()),
+        }
+    return figures
+
+
+def _measured(make: Callable[[], bytes]) -> dict[str, float]:
+    wall, cpu = time.perf_counter(), time.process_time()
+    octets = make()
+    return {
+        "wall_s": round(time.perf_counter() - wall, 2),
+        "cpu_s": round(time.process_time() - cpu, 2),
+        "mb": round(len(octets) / 1e6, 2),
+    }
+
+
+if __name__ == "__main__":
+    print(json.dumps({"reports": bench()}, indent=1))

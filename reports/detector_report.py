@@ -1,0 +1,134 @@
+"""The report of a detector: scores by class, curves, calibration, bias, cost, galleries."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from reports.document import Block, Column, Document, Facts, Heading, Picture, Table
+from reports.figures import dataset
+from reports.figures.detector import OCTANTS, octant_bias
+from reports.sections.detection import detector_blocks, gallery_picture
+from reports.sections.opening import (
+    about,
+    absent,
+    judgement,
+    missing_and_remarks,
+    provenance_and_data,
+    settings,
+)
+from reports.text import count_text, number_text
+from reports.values import DetectorReport, NamedScore, ResidualSeries
+
+
+def detector_document(report: DetectorReport) -> Document:
+    """The document of a detector."""
+    blocks: list[Block] = [*judgement(report), Heading("Scores")]
+    found = detector_blocks(report.score) if report.score is not None else []
+    blocks += found or [absent(report, "score", "Scores", "the detector was not evaluated")]
+    if report.score is not None and report.score.residuals is not None:
+        table = _bias_table(report.score.residuals)
+        blocks += [table] if table is not None else []
+    blocks += missing_and_remarks(report)
+    for heading, key, scores, caption in (
+        (
+            "By state of degradation",
+            "degradation",
+            report.by_degradation,
+            "Precision and recall by state of degradation.",
+        ),
+        (
+            "By source of the images",
+            "sources",
+            report.by_source,
+            "Precision and recall by where the images come from.",
+        ),
+    ):
+        if scores:
+            blocks += [Heading(heading), *_named(key, scores, caption)]
+    if report.training:
+        curves = report.training[:9]
+        rows = -(-len(curves) // 3)
+        blocks += [
+            Heading("Training"),
+            Picture(
+                "training",
+                "Quantities over the epochs of the training run.",
+                "Training curves: " + ", ".join(c.name for c in curves),
+                0.78 + rows * 1.25 + (rows - 1) * 0.75,
+                lambda c: dataset.draw_training(c, curves),
+            ),
+        ]
+    blocks.append(Heading("Cost on board"))
+    if report.cost:
+        blocks.append(Facts(tuple(report.cost.items())))
+    else:
+        blocks.append(absent(report, "cost", "Latency and memory", "they were not measured"))
+    blocks.append(Heading("Detections over the images"))
+    if report.gallery:
+        lead = "Frames of the test set (form of the paper's Fig. 6)."
+        blocks.append(gallery_picture("gallery", report.gallery[:9], 3, lead))
+    else:
+        blocks.append(absent(report, "gallery", "Gallery of detections", "no images were given"))
+    if report.worst_frames:
+        worst = report.worst_frames[:10]
+        blocks.append(
+            gallery_picture(
+                "worst", worst, 5, f"The worst {len(worst)} frames, chosen by number, not by hand."
+            )
+        )
+    blocks += provenance_and_data(report)
+    if report.configuration:
+        blocks += [Heading("Configuration"), *settings(report.configuration)]
+    return Document("Detector report", report.title, report.model_id, about(report), tuple(blocks))
+
+
+def _named(key: str, scores: Sequence[NamedScore], caption: str) -> list[Block]:
+    table = Table(
+        caption,
+        (
+            Column("group", numeric=False),
+            Column("expected", unit="craters"),
+            Column("precision"),
+            Column("recall"),
+            Column("localisation", unit="px"),
+        ),
+        tuple(
+            (s.label, count_text(s.expected), number_text(s.precision, 3), number_text(s.recall, 3),
+             number_text(s.localisation_px, 2))
+            for s in scores
+        ),
+    )  # fmt: skip
+    picture = Picture(
+        key, caption, caption, 0.85 + 0.3 * len(scores), lambda c: dataset.draw_named_scores(c, scores)
+    )
+    return [picture, table]
+
+
+def _bias_table(residuals: ResidualSeries) -> Table | None:
+    if residuals.sun_azimuth_deg is None:
+        return None
+    mean, count = octant_bias(residuals)
+    rows = tuple(
+        (
+            OCTANTS[k],
+            count_text(int(count[k])),
+            number_text(float(mean[k, 0]), 3),
+            number_text(float(mean[k, 1]), 3),
+            number_text(float(np.hypot(*mean[k])), 3),
+        )
+        for k in range(8)
+        if count[k]
+    )
+    return Table(
+        "Mean residual by octant of Sun azimuth, detected minus expected.",
+        (
+            Column("Sun from", numeric=False),
+            Column("craters"),
+            Column("du", unit="px, right"),
+            Column("dv", unit="px, down"),
+            Column("length", unit="px"),
+        ),
+        rows,
+    )

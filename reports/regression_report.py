@@ -1,0 +1,117 @@
+"""The report of a regression: a candidate build against a baseline over the same archived passes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from reports.campaign_report import solution_table, solutions
+from reports.document import Block, Cell, Column, Document, Heading, Picture, Table
+from reports.figures import campaign
+from reports.sections.opening import about, absent, judgement, missing_and_remarks, provenance_and_data
+from reports.statistics import quantiles
+from reports.text import count_text, significant_text
+from reports.values import CampaignPass, FloatArray, RegressionReport
+
+
+def regression_document(report: RegressionReport) -> Document:
+    """The document of a regression."""
+    failed = [g for g in report.gates if not g.passed]
+    blocks: list[Block] = [*judgement(report), Heading("Gates")]
+    if report.gates:
+        blocks.append(_gates(report))
+    else:
+        blocks.append(absent(report, "gates", "Gates", "none was set"))
+    blocks += missing_and_remarks(report)
+    before, after = _paired(report)
+    if before:
+        blocks += [Heading("Candidate against baseline"), *_comparison(before, after)]
+    else:
+        blocks += [
+            Heading("Candidate against baseline"),
+            absent(report, "candidate_passes", "Passes", "no pass was run with both builds"),
+        ]
+    blocks += provenance_and_data(report)
+    facts = about(
+        report,
+        ("Candidate", report.candidate),
+        ("baseline", report.baseline),
+        ("gates failed", f"{len(failed)} of {len(report.gates)}"),
+        ("passes", count_text(len(before))),
+    )
+    return Document("Regression report", report.title, report.regression_id, facts, tuple(blocks))
+
+
+def _gates(report: RegressionReport) -> Table:
+    ordered = sorted(report.gates, key=lambda g: g.passed)
+    rows = tuple(
+        (
+            Cell(g.name, swatch="green" if g.passed else "vermillion", strong=not g.passed),
+            g.pass_id or "all",
+            significant_text(g.baseline),
+            significant_text(g.candidate),
+            significant_text(g.limit),
+            g.unit,
+            Cell("passed" if g.passed else "failed", strong=not g.passed),
+        )
+        for g in ordered
+    )
+    return Table(
+        "Gates, those that failed first.",
+        (
+            Column("gate", numeric=False),
+            Column("pass", numeric=False),
+            Column("baseline"),
+            Column("candidate"),
+            Column("limit"),
+            Column("unit", numeric=False),
+            Column("verdict", numeric=False),
+        ),
+        rows,
+    )
+
+
+def _paired(report: RegressionReport) -> tuple[list[CampaignPass], list[CampaignPass]]:
+    """Passes run with both builds, in the same order."""
+    after = {p.pass_id: p for p in report.candidate_passes}
+    both = [p for p in sorted(report.baseline_passes, key=lambda p: p.start_utc_ns) if p.pass_id in after]
+    return both, [after[p.pass_id] for p in both]
+
+
+def _comparison(before: list[CampaignPass], after: list[CampaignPass]) -> list[Block]:
+    names, styles = solutions([*before, *after])
+    flown = sorted(
+        (n for n in names if not any(n in p.baselines for p in before)),
+        key=lambda n: quantiles(campaign.statistic(before, n, "median_3d_m"), (0.5,))[0],
+    )
+    pairs: list[tuple[str, FloatArray, FloatArray, bool]] = [
+        (
+            f"median error, {name}",
+            campaign.statistic(before, name, "median_3d_m"),
+            campaign.statistic(after, name, "median_3d_m"),
+            True,
+        )
+        for name in flown[:2]
+    ]
+    recall = [np.array([p.recall for p in passes], dtype=np.float64) for passes in (before, after)]
+    if np.isfinite(recall[0]).any() and np.isfinite(recall[1]).any():
+        pairs.append(("recall", recall[0], recall[1], False))
+    blocks: list[Block] = []
+    if pairs:
+        worse = [
+            f"{title}: {int(np.sum((b > a) if lengths else (b < a)))} of {len(before)}"
+            for title, a, b, lengths in pairs
+        ]
+        blocks.append(
+            Picture(
+                "paired",
+                "Each pass with both builds. On the dashed line nothing has changed; blue: the candidate is "
+                "not worse; vermillion: worse. "
+                f"Passes that became worse: {'; '.join(worse)}.",
+                "Candidate against baseline for each pass. Worse: " + "; ".join(worse),
+                3.3,
+                lambda c: campaign.draw_paired(c, pairs),
+            )
+        )
+    blocks.append(solution_table(before, names, styles, ", baseline"))
+    blocks.append(solution_table(after, names, styles, ", candidate"))
+    return blocks

@@ -1,0 +1,122 @@
+"""What every report begins and ends with: verdict, figures, provenance, data, configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+from reports.document import (
+    Absent,
+    Block,
+    Bullets,
+    Facts,
+    Heading,
+    Headline,
+    Paragraph,
+    Verdict,
+    rung_number,
+    rung_text,
+)
+from reports.sections.common import is_hash, setting_text
+from reports.text import hash_text
+from reports.values import HeadlineFigure
+
+
+class Judged(Protocol):
+    """What all report values share."""
+
+    @property
+    def verdict(self) -> str: ...
+    @property
+    def verdict_level(self) -> str: ...
+    @property
+    def generated_for(self) -> str: ...
+    @property
+    def created_utc(self) -> str: ...
+    @property
+    def evidence_rung(self) -> str: ...
+    @property
+    def headline(self) -> tuple[HeadlineFigure, ...]: ...
+    @property
+    def provenance(self) -> Mapping[str, str]: ...
+    @property
+    def data_sources(self) -> tuple[str, ...]: ...
+    @property
+    def remarks(self) -> tuple[str, ...]: ...
+    @property
+    def not_available(self) -> Mapping[str, str]: ...
+
+
+def about(report: Judged, *facts: tuple[str, str]) -> tuple[tuple[str, str], ...]:
+    """Facts under the title, those that are known."""
+    known = (*facts, ("for", report.generated_for), ("made", report.created_utc))
+    return tuple((name, value) for name, value in known if value)
+
+
+def judgement(report: Judged, *, counts_only: bool = False) -> list[Block]:
+    """Verdict and figures; figures that only count things stand on no rung of evidence unless one is given."""
+    blocks: list[Block] = []
+    if report.verdict:
+        blocks.append(Verdict(report.verdict, report.verdict_level))
+    else:
+        blocks.append(absent(report, "verdict", "Verdict", "nobody has judged this"))
+    if report.headline:
+        blocks.append(
+            Headline(
+                report.headline, None if counts_only and not report.evidence_rung else report.evidence_rung
+            )
+        )
+    else:
+        blocks.append(absent(report, "headline", "Five figures", "no figure was computed"))
+    return blocks
+
+
+def absent(report: Judged, field: str, what: str, usual: str) -> Absent:
+    """The block that says that something is not available."""
+    return Absent(what, report.not_available.get(field) or usual)
+
+
+def missing_and_remarks(report: Judged) -> list[Block]:
+    """What the report does not show, and what its makers add."""
+    blocks: list[Block] = []
+    if report.not_available:
+        blocks.append(Heading("What this report does not show", 3))
+        reasons = sorted(report.not_available.items())
+        blocks.append(Bullets(tuple(f"{name.replace('_', ' ')}: {why}" for name, why in reasons)))
+    if report.remarks:
+        blocks.append(Heading("Remarks", 3))
+        blocks.append(Bullets(report.remarks))
+    return blocks
+
+
+def provenance_and_data(report: Judged) -> list[Block]:
+    """Where the figures come from and what they rest on."""
+    blocks: list[Block] = [Heading("Provenance and data")]
+    if rung_number(report.evidence_rung) is not None:
+        blocks.append(
+            Paragraph(
+                f"The accuracy figures stand on {rung_text(report.evidence_rung)}. A figure on a lower rung says less "
+                "about flight than one on a higher rung, and is not to be quoted without its rung."
+            )
+        )
+    if report.provenance:
+        blocks.append(
+            Facts(tuple((k, hash_text(v) if is_hash(v) else v) for k, v in report.provenance.items()))
+        )
+    else:
+        blocks.append(absent(report, "provenance", "Build, hashes, seed", "none was archived"))
+    blocks.append(Heading("Data sources", 3))
+    if report.data_sources:
+        blocks.append(Bullets(report.data_sources))
+    else:
+        blocks.append(absent(report, "data_sources", "Data sources", "not given"))
+    return blocks
+
+
+def settings(configuration: Mapping[str, Mapping[str, Any]]) -> list[Block]:
+    """Groups of settings."""
+    blocks: list[Block] = []
+    for group, values in configuration.items():
+        blocks.append(Heading(str(group), 3))
+        blocks.append(Facts(tuple((str(k), setting_text(v)) for k, v in values.items()), mono=True))
+    return blocks
