@@ -23,7 +23,7 @@ def default_home() -> Path:
 class Settings(BaseSettings):
     """Everything that a deployment can set. The defaults need no server: SQLite and in-process jobs."""
 
-    model_config = SettingsConfigDict(env_prefix="LINNA_", extra="ignore", secrets_dir=None)
+    model_config = SettingsConfigDict(env_prefix="LINNA_", env_ignore_empty=True, extra="ignore")
 
     home: Path = Field(
         default_factory=default_home, description="Folder of the database, raw files and reports"

@@ -16,6 +16,8 @@ from ground_service.api import schemas
 from ground_service.api.problems import TooLarge
 from ground_service.api.security import requires
 from ground_service.errors import InvalidInput
+from ground_service.processing.verification import STAGES
+from ground_service.services import commanding
 from ground_service.services import ephemerides as ephemeris_service
 from ground_service.services import passes as pass_service
 from ground_service.services.ground import Ground
@@ -25,8 +27,10 @@ from ground_service.services.users import Caller
 from ground_service.store import repository
 from ground_service.store.files import StoredFile
 from lunar.timescales import parse_utc
+from tmtc.dictionary import FAILURES
 
 API_PREFIX = "/api/v1"
+FAILURE_NAMES = dict(FAILURES)
 UPLOAD_PATHS = (f"{API_PREFIX}/telemetry", f"{API_PREFIX}/ephemerides")
 
 _PROBLEMS: dict[int | str, dict[str, Any]] = {
@@ -299,6 +303,82 @@ def get_parameter(
     return _series(pass_service.parameter_series(ground, pass_id, parameter, max_points))
 
 
+# Telecommands
+
+
+@router.get("/telecommands", response_model=schemas.PageOf[schemas.Telecommand])
+def list_telecommands(
+    ground: GroundOf,
+    _: Viewer,
+    state: Annotated[str | None, Query(pattern="^(queued|released|rejected|sent)$")] = None,
+    limit: Limit = 100,
+    offset: Offset = 0,
+) -> Any:
+    """Telecommands with their verification, the newest first."""
+    views, total = commanding.list_commands(ground, state=state, limit=limit, offset=offset)
+    return {"items": [_telecommand(view) for view in views], "total": total, "limit": limit, "offset": offset}
+
+
+@router.post("/telecommands", status_code=201, response_model=schemas.Telecommand)
+def enter_telecommand(ground: GroundOf, caller: Operator, given: schemas.CommandEntry) -> schemas.Telecommand:
+    """Queue a telecommand; the dictionary has to accept it."""
+    command_id = commanding.enter_command(
+        ground,
+        given.name,
+        given.arguments,
+        spacecraft_id=given.spacecraft_id,
+        instance=given.instance,
+        timeout_s=given.timeout_s,
+        actor=caller.name,
+    )
+    return _telecommand(commanding.get_command(ground, command_id))
+
+
+@router.get("/telecommands/{command_id}", response_model=schemas.Telecommand)
+def get_telecommand(ground: GroundOf, _: Viewer, command_id: RowId) -> schemas.Telecommand:
+    """One telecommand with its verification."""
+    return _telecommand(commanding.get_command(ground, command_id))
+
+
+@router.post("/telecommands/{command_id}/release", response_model=schemas.Telecommand)
+def release_telecommand(ground: GroundOf, caller: Operator, command_id: RowId) -> schemas.Telecommand:
+    """Release a queued telecommand; a critical one by another person than who entered it."""
+    commanding.release_command(ground, command_id, actor=caller.name)
+    return _telecommand(commanding.get_command(ground, command_id))
+
+
+@router.post("/telecommands/{command_id}/reject", response_model=schemas.Telecommand)
+def reject_telecommand(
+    ground: GroundOf, caller: Operator, command_id: RowId, given: schemas.Rejection
+) -> schemas.Telecommand:
+    """Take a queued telecommand out of the queue."""
+    commanding.reject_command(ground, command_id, actor=caller.name, reason=given.reason)
+    return _telecommand(commanding.get_command(ground, command_id))
+
+
+@router.post(
+    "/uplink",
+    response_class=Response,
+    responses={200: {"content": {"application/octet-stream": {}}, "description": "What is to be sent now"}},
+)
+def take_uplink(
+    ground: GroundOf,
+    caller: Operator,
+    spacecraft_id: Annotated[int, Query(ge=0, le=1023)],
+    instance: Annotated[str, Query(min_length=1, max_length=96, pattern=r"^[A-Za-z0-9._@-]+$")] = FLOWN,
+    format: Annotated[str, Query(pattern="^(cltu|packets)$")] = "cltu",
+) -> Response:
+    """Take all released telecommands as octets to radiate; they count as sent from then on."""
+    stream, ids = commanding.take_uplink(
+        ground, spacecraft_id=spacecraft_id, instance=instance, framed=format == "cltu", actor=caller.name
+    )
+    return Response(
+        stream,
+        media_type="application/octet-stream",
+        headers={"X-Telecommands": ",".join(str(number) for number in ids)},
+    )
+
+
 # Reports and jobs
 
 
@@ -475,6 +555,39 @@ def _pass(row: repository.Row) -> schemas.PassSummary:
         name=row["name"],
         start=schemas.time_text(row["start_utc_ns"]),
         stop=schemas.time_text(row["stop_utc_ns"]),
+    )
+
+
+def _telecommand(view: commanding.CommandView) -> schemas.Telecommand:
+    row, fate = view.row, view.fate
+    failures = FAILURE_NAMES
+    return schemas.Telecommand(
+        id=row["id"],
+        name=row["name"],
+        arguments=row["arguments"],
+        spacecraft_id=view.spacecraft_id,
+        instance=view.instance,
+        state=view.state,
+        critical=bool(row["critical"]),
+        timed_out=fate is not None and fate.timed_out,
+        requested_by=row["requested_by"],
+        requested=schemas.time_text(row["created_utc_ns"]),
+        decided_by=row["decided_by"],
+        decided=schemas.rfc3339(row["decided_utc_ns"]),
+        reason=row["reason"],
+        sequence_count=row["sequence_count"],
+        sent=schemas.rfc3339(row["sent_utc_ns"]),
+        reports=[
+            schemas.CommandReport(
+                stage=STAGES.get(report.subtype, str(report.subtype)),
+                ticks=report.ticks,
+                step=report.step,
+                failure=None
+                if report.failure_code is None
+                else failures.get(report.failure_code, str(report.failure_code)),
+            )
+            for report in (fate.reports if fate is not None else ())
+        ],
     )
 
 

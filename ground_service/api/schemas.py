@@ -176,6 +176,58 @@ class EventItem(Schema):
     detail: str
 
 
+class CommandEntry(Schema):
+    """A telecommand to be queued."""
+
+    name: str = Field(max_length=64, examples=["perform_function"])
+    arguments: dict[str, Any] = Field(
+        default_factory=dict,
+        examples=[{"function_id": "start_observation", "argument_1": 0, "argument_2": 15}],
+    )
+    spacecraft_id: int = Field(ge=0, le=1023, examples=[76])
+    instance: str = Field(default="flight", min_length=1, max_length=96, pattern=r"^[A-Za-z0-9._@-]+$")
+    timeout_s: int = Field(default=600, ge=1, le=86_400 * 30)
+
+
+class Rejection(Schema):
+    """Why a telecommand is not to be sent."""
+
+    reason: str = Field(min_length=1, max_length=500, examples=["wrong cadence"])
+
+
+class CommandReport(Schema):
+    """A verification report about a telecommand."""
+
+    stage: str = Field(examples=["accepted"])
+    ticks: int = Field(description="On-board time of the report, 2^-16 s")
+    step: int | None
+    failure: str | None
+
+
+class Telecommand(Schema):
+    """A telecommand and what became of it."""
+
+    id: int
+    name: str
+    arguments: dict[str, Any]
+    spacecraft_id: int
+    instance: str
+    state: str = Field(
+        description="queued, released, rejected, sent, accepted, started, completed or failed",
+        examples=["queued"],
+    )
+    critical: bool
+    timed_out: bool
+    requested_by: str
+    requested: str
+    decided_by: str | None
+    decided: str | None
+    reason: str | None
+    sequence_count: int | None
+    sent: str | None
+    reports: list[CommandReport]
+
+
 class Job(Schema):
     """A piece of background work."""
 

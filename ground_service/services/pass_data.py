@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -463,7 +463,12 @@ def _reference(ground: Ground, row: repository.Row | None) -> Ephemeris | None:
 
 def _catalogue(ground: Ground, record: Mapping[str, Any]) -> CraterCatalogue | None:
     sha256 = record["catalogue_sha256"]
-    return load_catalogue(ground.files.path(sha256)) if sha256 is not None else None
+    if sha256 is None:
+        return None
+    sources = [name for name in record["manifest"].get("data_sources", ()) if "catalogue" in str(name)]
+    return replace(
+        load_catalogue(ground.files.path(sha256)), source="; ".join(sources) or "catalogue of the pass"
+    )
 
 
 def _rung(manifest: Mapping[str, Any]) -> str:

@@ -397,3 +397,27 @@ class FeedItem(Base):
     utc_ns: Mapped[int] = mapped_column(BigInteger)
     kind: Mapped[str] = mapped_column(String(32))
     payload: Mapped[dict[str, Any]] = mapped_column(JSON)
+
+
+class Telecommand(Base):
+    """A telecommand, from being entered to its end; its octets exist from its release on."""
+
+    __tablename__ = "telecommands"
+    __table_args__ = (Index("ix_telecommands_vehicle_id_request_id", "vehicle_id", "request_id"),)
+    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
+    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"))
+    name: Mapped[str] = mapped_column(String(64))
+    arguments: Mapped[dict[str, Any]] = mapped_column(JSON)
+    state: Mapped[str] = mapped_column(String(16), index=True)
+    critical: Mapped[int] = mapped_column(Flag)
+    timeout_s: Mapped[int] = mapped_column(Integer)
+    requested_by: Mapped[str] = mapped_column(String(64))
+    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    decided_by: Mapped[str | None] = mapped_column(String(64))
+    decided_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
+    reason: Mapped[str | None] = mapped_column(Text)
+    sequence_count: Mapped[int | None] = mapped_column(SmallInteger)
+    request_id: Mapped[int | None] = mapped_column(BigInteger)
+    octets: Mapped[bytes | None] = mapped_column(LargeBinary)
+    sent_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
+    sent_after_ticks: Mapped[int | None] = mapped_column(BigInteger)

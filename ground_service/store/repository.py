@@ -52,6 +52,7 @@ USERS = _table(models.User)
 TOKENS = _table(models.Token)
 AUDIT = _table(models.AuditEntry)
 FEED = _table(models.FeedItem)
+TELECOMMANDS = _table(models.Telecommand)
 SAMPLES: dict[str, Table] = {model.__tablename__: _table(model) for model in models.SAMPLE_TABLES}
 
 

@@ -1,0 +1,87 @@
+"""What became of a telecommand, from the verification reports that came down about it (PUS service 1).
+
+A report names its telecommand by the first four octets of the packet, and those return after 16384 commands. So a
+report counts for a command only when it was made after the command was sent and before the same octets were sent
+again. Reports that come late, even after a time-out was declared, still count; the time-out stays on record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+ACCEPTED, NOT_ACCEPTED, STARTED, NOT_STARTED = 1, 2, 3, 4
+PROGRESS, PROGRESS_FAILED, COMPLETED, NOT_COMPLETED, NOT_ROUTED = 5, 6, 7, 8, 10
+
+STAGES = {
+    ACCEPTED: "accepted",
+    NOT_ACCEPTED: "not accepted",
+    STARTED: "started",
+    NOT_STARTED: "not started",
+    PROGRESS: "progress",
+    PROGRESS_FAILED: "progress failed",
+    COMPLETED: "completed",
+    NOT_COMPLETED: "not completed",
+    NOT_ROUTED: "not routed",
+}
+FAILURES = (NOT_ACCEPTED, NOT_STARTED, PROGRESS_FAILED, NOT_COMPLETED, NOT_ROUTED)
+
+
+@dataclass(frozen=True, slots=True)
+class VerificationReport:
+    """One report as it came down."""
+
+    subtype: int
+    request_id: int
+    ticks: int
+    step: int | None
+    failure_code: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class SentCommand:
+    """A telecommand that was sent when the newest on-board time known was `sent_after_ticks`."""
+
+    request_id: int
+    sent_utc_ns: int
+    sent_after_ticks: int
+    repeated_after_ticks: int | None
+    timeout_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class CommandFate:
+    """How far a command is known to have come: sent, accepted, started, completed or failed, and its reports."""
+
+    state: str
+    timed_out: bool
+    reports: tuple[VerificationReport, ...]
+
+
+def fate_of(command: SentCommand, reports: Sequence[VerificationReport], now_utc_ns: int) -> CommandFate:
+    """What the reports say about a command; `timed_out` when its end is overdue at `now_utc_ns`."""
+    mine = tuple(
+        sorted(
+            (
+                report
+                for report in reports
+                if report.request_id == command.request_id
+                and report.ticks > command.sent_after_ticks
+                and (command.repeated_after_ticks is None or report.ticks <= command.repeated_after_ticks)
+            ),
+            key=lambda report: (report.ticks, report.subtype, report.step or 0),
+        )
+    )
+    seen = {report.subtype for report in mine}
+    if seen & set(FAILURES):
+        state = "failed"
+    elif COMPLETED in seen:
+        state = "completed"
+    elif seen & {STARTED, PROGRESS}:
+        state = "started"
+    elif ACCEPTED in seen:
+        state = "accepted"
+    else:
+        state = "sent"
+    ended = state in ("failed", "completed")
+    return CommandFate(state, not ended and now_utc_ns > command.sent_utc_ns + command.timeout_ns, mine)
