@@ -39,6 +39,14 @@ GROUPS: dict[str, tuple[str, str]] = {
 
 def run(arguments: Sequence[str]) -> int:
     """Run one command line; the exit status comes back."""
+    try:
+        return _run(arguments)
+    except BrokenPipeError:  # the reader of our output has left: nothing more to say
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _run(arguments: Sequence[str]) -> int:
     for name, value in _THREAD_POLICY.items():
         os.environ.setdefault(name, value)
     if not arguments or arguments[0] in ("-h", "--help"):
@@ -73,8 +81,7 @@ def _guarded(handler, namespace: argparse.Namespace) -> int:
         print("linna: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        raise
     except OSError as error:
         print(f"linna: error: {_one_line(_os_message(error))}", file=sys.stderr)
         return 2

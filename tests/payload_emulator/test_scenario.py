@@ -1,12 +1,17 @@
 """Scenario files: what is read comes back, what cannot be flown is refused with the key and the values."""
 
+import tomllib
+
 import pytest
 
 from payload_emulator.errors import ScenarioError
 from payload_emulator.scenario import SHIPPED, Scenario, format_scenario, load_scenario, parse_scenario
 
+# A file with a [dataset] table is a recipe of a data set, not a scenario to fly.
+FLOWN = [file for file in sorted(SHIPPED.glob("*.toml")) if "dataset" not in tomllib.loads(file.read_text())]
 
-@pytest.mark.parametrize("file", sorted(SHIPPED.glob("*.toml")), ids=lambda file: file.stem)
+
+@pytest.mark.parametrize("file", FLOWN, ids=lambda file: file.stem)
 def test_each_shipped_scenario_reads_and_survives_a_round_trip(file) -> None:
     scenario = load_scenario(file)
     assert parse_scenario(format_scenario(scenario)) == scenario
