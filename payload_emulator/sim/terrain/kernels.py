@@ -11,7 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from lunar._compile import njit
+from lunar._compile import njit  # before numba: it sets how numba compiles
+
+from numba import types  # isort: skip
+from numba.extending import intrinsic  # isort: skip
 
 PROFILE_REACH = 2.6
 """Distance from a crater's centre, in radii, at which its stamped profile ends."""
@@ -39,12 +42,21 @@ def add_noise(
     """
     rows, columns = out.shape
     salt = np.uint32(seed)
+    six = np.float32(6.0)
+    ten = np.float32(10.0)
+    fifteen = np.float32(15.0)
+    one = np.float32(1.0)
+    scale = np.float32(amplitude)
+    # Lattice coordinates need doubles; the noise itself is made in a loop without any, twice as many at a time.
+    fraction = np.empty(2 * columns, np.float32)
+    cell = np.empty(2 * columns, np.uint32)
     for i in range(rows):
         ring = frequency * cos_lat[i]
         z = frequency * sin_lat[i] + LATTICE_SHIFT
         z_floor = math.floor(z)
         fz = np.float32(z - z_floor)
-        wz = fz * fz * fz * (fz * (fz * np.float32(6.0) - np.float32(15.0)) + np.float32(10.0))
+        fz1 = fz - one
+        wz = fz * fz * fz * (fz * (fz * six - fifteen) + ten)
         hz0 = np.uint32(np.uint32(np.int32(z_floor)) * np.uint32(0xCB1AB31F)) ^ salt
         hz1 = np.uint32(np.uint32(np.int32(z_floor) + 1) * np.uint32(0xCB1AB31F)) ^ salt
         for j in range(columns):
@@ -52,42 +64,71 @@ def add_noise(
             y = ring * sin_lon[j] + LATTICE_SHIFT
             ix = np.int32(x)
             iy = np.int32(y)
-            fx = np.float32(x - ix)
-            fy = np.float32(y - iy)
-            wx = fx * fx * fx * (fx * (fx * np.float32(6.0) - np.float32(15.0)) + np.float32(10.0))
-            wy = fy * fy * fy * (fy * (fy * np.float32(6.0) - np.float32(15.0)) + np.float32(10.0))
-            hx0 = np.uint32(np.uint32(ix) * np.uint32(0x8DA6B343))
-            hx1 = np.uint32(np.uint32(ix + np.int32(1)) * np.uint32(0x8DA6B343))
-            hy0 = np.uint32(np.uint32(iy) * np.uint32(0xD8163841))
-            hy1 = np.uint32(np.uint32(iy + np.int32(1)) * np.uint32(0xD8163841))
+            fraction[j] = np.float32(x - np.float64(ix))
+            fraction[j + columns] = np.float32(y - np.float64(iy))
+            cell[j] = np.uint32(ix)
+            cell[j + columns] = np.uint32(iy)
+        for j in range(columns):
+            fx = fraction[j]
+            fy = fraction[j + columns]
+            wx = fx * fx * fx * (fx * (fx * six - fifteen) + ten)
+            wy = fy * fy * fy * (fy * (fy * six - fifteen) + ten)
+            hx0 = np.uint32(cell[j] * np.uint32(0x8DA6B343))
+            hx1 = np.uint32(hx0 + np.uint32(0x8DA6B343))
+            hy0 = np.uint32(cell[j + columns] * np.uint32(0xD8163841))
+            hy1 = np.uint32(hy0 + np.uint32(0xD8163841))
             a = _corner(hx0 ^ hy0 ^ hz0, fx, fy, fz)
-            b = _corner(hx1 ^ hy0 ^ hz0, fx - np.float32(1.0), fy, fz)
-            c = _corner(hx0 ^ hy1 ^ hz0, fx, fy - np.float32(1.0), fz)
-            d = _corner(hx1 ^ hy1 ^ hz0, fx - np.float32(1.0), fy - np.float32(1.0), fz)
+            b = _corner(hx1 ^ hy0 ^ hz0, fx - one, fy, fz)
+            c = _corner(hx0 ^ hy1 ^ hz0, fx, fy - one, fz)
+            d = _corner(hx1 ^ hy1 ^ hz0, fx - one, fy - one, fz)
             low = a + wx * (b - a) + wy * (c - a + wx * (a - b - c + d))
-            fz1 = fz - np.float32(1.0)
             a = _corner(hx0 ^ hy0 ^ hz1, fx, fy, fz1)
-            b = _corner(hx1 ^ hy0 ^ hz1, fx - np.float32(1.0), fy, fz1)
-            c = _corner(hx0 ^ hy1 ^ hz1, fx, fy - np.float32(1.0), fz1)
-            d = _corner(hx1 ^ hy1 ^ hz1, fx - np.float32(1.0), fy - np.float32(1.0), fz1)
+            b = _corner(hx1 ^ hy0 ^ hz1, fx - one, fy, fz1)
+            c = _corner(hx0 ^ hy1 ^ hz1, fx, fy - one, fz1)
+            d = _corner(hx1 ^ hy1 ^ hz1, fx - one, fy - one, fz1)
             high = a + wx * (b - a) + wy * (c - a + wx * (a - b - c + d))
-            out[i, j] += gain[i, j] * amplitude * (low + wz * (high - low))
+            out[i, j] += gain[i, j] * scale * (low + wz * (high - low))
 
 
 @njit(fastmath=True, inline="always")
 def _corner(h: Any, dx: Any, dy: Any, dz: Any) -> Any:
-    h = np.uint32(h)
-    h = np.uint32(h ^ (h >> np.uint32(15)))
-    h = np.uint32(h * np.uint32(0x2C1B3C6D))
-    h = np.uint32(h ^ (h >> np.uint32(12)))
-    h = np.uint32(h * np.uint32(0x297A2D39))
-    h = np.uint32(h ^ (h >> np.uint32(15)))
-    # 2.2 makes the rms of the noise about one.
+    """Dot product of a corner's hashed gradient with the way from it; 2.2 makes the rms of the noise about one."""
+    h = _mixed(h)
     k = np.float32(2.2 / 511.5)
-    gx = np.float32(np.int32(h & np.uint32(1023)) - np.int32(511))
-    gy = np.float32(np.int32((h >> np.uint32(10)) & np.uint32(1023)) - np.int32(511))
-    gz = np.float32(np.int32((h >> np.uint32(20)) & np.uint32(1023)) - np.int32(511))
-    return k * (gx * dx + gy * dy + gz * dz)
+    return k * (_component(h, 0) * dx + _component(h, 10) * dy + _component(h, 20) * dz)
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _mixed(context: Any, h: Any) -> Any:
+    """A well mixed hash of 32 bits.
+
+    Written for the compiler by hand: numba widens every operation on 32-bit integers to 64, which halves the lanes.
+    """
+
+    def build(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
+        (value,) = arguments
+        for shift, factor in ((15, 0x2C1B3C6D), (12, 0x297A2D39)):
+            value = builder.xor(value, builder.lshr(value, value.type(shift)))
+            value = builder.mul(value, value.type(factor))
+        return builder.xor(value, builder.lshr(value, value.type(15)))
+
+    return types.uint32(types.uint32), build
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _component(context: Any, h: Any, shift: Any) -> Any:
+    """Ten bits of a hash from ``shift`` up as a float from -511 to 512."""
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        value, _ = arguments
+        amount = signature.args[1].literal_value
+        bits = builder.and_(builder.lshr(value, value.type(amount)), value.type(1023))
+        real = context.get_value_type(types.float32)
+        return builder.fsub(builder.sitofp(bits, real), real(511.0))
+
+    if not isinstance(shift, types.IntegerLiteral):
+        return None
+    return types.float32(types.uint32, shift), build
 
 
 @njit(fastmath=True, error_model="numpy", nogil=True)
