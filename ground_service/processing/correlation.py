@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ground_service.errors import EvaluationError
 from lunar.timescales import (
     tai_ns_from_utc_ns,
     ticks_from_utc_ns,
@@ -27,6 +28,14 @@ IDEAL_CLOCK = 0
 # One tick is 10^9 / 2^16 ns = 1953125 / 128 ns.
 _NS_NUMERATOR = 1_953_125
 _NS_DENOMINATOR = 128
+
+REJECTION = 6.0
+"""Time reports this many usual deviations off are not believed."""
+
+RESOLUTION_NS = 2 * 15_259.0
+"""Two ticks: deviations below that are the clock's resolution, not outliers."""
+
+MAX_ROUNDS = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,3 +81,74 @@ def ticks_of_utc_ns(utc_ns: int, correlations: Sequence[TimeCorrelation]) -> int
         shown, _ = utc_ns_of_ticks(np.array([ticks], dtype=np.int64), correlations)
         ticks += int((utc_ns - int(shown[0])) * _NS_DENOMINATOR // _NS_NUMERATOR)
     return ticks
+
+
+@dataclass(frozen=True, slots=True)
+class CorrelationFit:
+    """A fitted line of one run of the clock, and how well it fits."""
+
+    start_ticks: int
+    stop_ticks: int
+    reference_ticks: int
+    reference_utc_ns: int
+    drift_ppb: float
+    residual_rms_ns: float
+    residual_max_ns: float
+    points: int
+    rejected: int
+
+
+def fit_correlation(
+    ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntArray, *, rejection: float = REJECTION
+) -> CorrelationFit:
+    """The line through time reports: on-board ticks (n,), UTC of reception on Earth, and light time to there.
+
+    Points further off than `rejection` times the usual deviation (by the median, which outliers do not move) are
+    left out. One point gives an offset without drift.
+
+    Raises
+    ------
+    EvaluationError
+        If there is no point at all.
+    """
+    ticks = np.asarray(ticks, dtype=np.int64)
+    if len(ticks) == 0:
+        raise EvaluationError("time correlation: expected at least one time report, found none")
+    sent_tai = np.asarray(tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - np.asarray(
+        light_time_ns
+    )
+    middle = int(np.argsort(ticks, kind="stable")[len(ticks) // 2])
+    nominal = (ticks - ticks[middle]) * _NS_NUMERATOR // _NS_DENOMINATOR
+    # Small numbers from here on: what the clock is off by, against the middle point.
+    deviation = (sent_tai - sent_tai[middle] - nominal).astype(np.float64)
+    kept = np.ones(len(ticks), dtype=np.bool_)
+    offset = slope = 0.0
+    for _ in range(MAX_ROUNDS):
+        offset, slope = _line(nominal[kept].astype(np.float64), deviation[kept])
+        residual = deviation - offset - slope * nominal
+        spread = 1.4826 * float(np.median(np.abs(residual[kept] - np.median(residual[kept]))))
+        still = np.abs(residual) <= max(rejection * spread, RESOLUTION_NS)
+        if (still == kept).all() or not still.any():
+            break
+        kept = still
+    residual = (deviation - offset - slope * nominal)[kept]
+    reference_tai = int(sent_tai[middle]) + round(offset)
+    return CorrelationFit(
+        start_ticks=int(ticks[kept].min()),
+        stop_ticks=int(ticks[kept].max()),
+        reference_ticks=int(ticks[middle]),
+        reference_utc_ns=int(utc_ns_from_tai_ns(reference_tai)),
+        drift_ppb=slope * 1e9,
+        residual_rms_ns=float(np.sqrt(np.mean(residual**2))),
+        residual_max_ns=float(np.abs(residual).max()),
+        points=int(kept.sum()),
+        rejected=int((~kept).sum()),
+    )
+
+
+def _line(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
+    """Offset and slope of least squares; no slope where all x are alike."""
+    centre = x - x.mean()
+    square = float(centre @ centre)
+    slope = float(centre @ y) / square if square > 0.0 else 0.0
+    return float(y.mean() - slope * x.mean()), slope

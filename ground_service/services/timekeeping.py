@@ -1,0 +1,88 @@
+"""Time correlations of a vehicle: fitted per run of its clock, versioned, in force at once for everything derived.
+
+Samples keep their on-board ticks and are given UTC when they are read, so a new correlation needs no rewriting, and
+late data are correlated like any others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from sqlalchemy import select, update
+
+from ground_service.clock import utc_now_ns
+from ground_service.errors import InvalidInput
+from ground_service.processing.correlation import CorrelationFit, fit_correlation
+from ground_service.services.ground import Ground
+from ground_service.services.users import audit
+from ground_service.store import repository
+
+
+@dataclass(frozen=True, slots=True)
+class TimePoint:
+    """A time report as received: what the clock showed, when that reached the Earth, the light time, the boot."""
+
+    ticks: int
+    earth_utc_ns: int
+    light_time_ns: int
+    boot_count: int = 0
+
+
+def correlate(
+    ground: Ground, vehicle: int, points: Sequence[TimePoint], *, actor: str = "local"
+) -> list[CorrelationFit]:
+    """Fit a correlation for every boot among the points; they replace those in force, which stay on record.
+
+    Raises
+    ------
+    InvalidInput
+        If there are no points.
+    """
+    if not points:
+        raise InvalidInput("time correlation", "points", "at least one time report", "none")
+    fits: dict[int, CorrelationFit] = {}
+    for boot in sorted({point.boot_count for point in points}):
+        mine = [point for point in points if point.boot_count == boot]
+        fits[boot] = fit_correlation(
+            np.array([point.ticks for point in mine], dtype=np.int64),
+            np.array([point.earth_utc_ns for point in mine], dtype=np.int64),
+            np.array([point.light_time_ns for point in mine], dtype=np.int64),
+        )
+    table = repository.CORRELATIONS
+    now = utc_now_ns()
+    with ground.database.writing() as connection:
+        repository.get(connection, repository.VEHICLES, vehicle, "vehicle")
+        connection.execute(
+            update(table).where(table.c.vehicle_id == vehicle, table.c.superseded == 0).values(superseded=1)
+        )
+        for boot, fit in fits.items():
+            repository.add(
+                connection,
+                table,
+                vehicle_id=vehicle,
+                method="least squares of time reports",
+                boot_count=boot,
+                start_ticks=fit.start_ticks,
+                stop_ticks=fit.stop_ticks,
+                reference_ticks=fit.reference_ticks,
+                reference_utc_ns=fit.reference_utc_ns,
+                drift_ppb=fit.drift_ppb,
+                residual_rms_ns=fit.residual_rms_ns,
+                points=fit.points,
+                superseded=0,
+                created_utc_ns=now,
+            )
+        audit(connection, actor, "correlate time", str(vehicle), {"boots": len(fits), "points": len(points)})
+    return list(fits.values())
+
+
+def correlations_on_record(ground: Ground, vehicle: int) -> list[repository.Row]:
+    """All correlations that a vehicle ever had, the newest first."""
+    table = repository.CORRELATIONS
+    with ground.database.reading() as connection:
+        rows = connection.execute(
+            select(table).where(table.c.vehicle_id == vehicle).order_by(table.c.id.desc())
+        ).mappings()
+        return [dict(row) for row in rows]
