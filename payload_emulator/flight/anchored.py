@@ -7,7 +7,7 @@ only grows less certain, and says so. If the map keeps disagreeing with what is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,15 @@ Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _NAN = float("nan")
-_UNKNOWN = (_NAN, _NAN, _NAN)
+_NO_CRATERS = np.empty(0, dtype=np.int64)
+# No detector repeats itself better than this: without a floor two sightings of a crater would be one equation twice.
+_SMALLEST_VARIANCE_PX2 = 0.04
+# Distances from the Moon's centre outside which no estimate is one.
+_RADIUS_LIMITS_M = (MOON_RADIUS_M - 10e3, MOON_RADIUS_M + 1_000e3)
+# A correction this many times larger than its uncertainty is no correction.
+_CORRECTION_SIGMAS = 7.0
+# A crater crosses the image in at most this time from the altitudes flown; afterwards it is not in view any more.
+_CRATER_MEMORY_S = 240.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,9 +66,6 @@ class AnchoredParameters:
         Sigma per axis of a detection where the detector gives none; smallest believed; factor on what it gives.
     detection_persistence
         Share of a detection's variance that stays with its crater from frame to frame.
-    frames_in_view_recall
-        Part of the frames in which a crater in view is detected: with the time in view it tells how often the
-        same crater's error is met, and its variance is raised by that number.
     tracking_limit_m
         Largest position sigma around which a linear prediction is searched; beyond, the search is by votes.
     search_radius_m
@@ -80,7 +85,6 @@ class AnchoredParameters:
     detection_sigma_floor_px: float = 0.5
     detection_sigma_scale: float = 1.0
     detection_persistence: float = 0.3
-    frames_in_view_recall: float = 0.6
     tracking_limit_m: float = 1_500.0
     search_radius_m: float = 25_000.0
     divergence_limit_m: float = 5_000.0
@@ -160,7 +164,6 @@ class AnchoredNavigator:
         )
         self.last_fix: Fix | None = None
         self._camera = camera
-        self._interval_s = 15.0
         self._disagreements = 0
 
     def step(self, ticks: int, found: Detections | None, camera_from_icrf: Float | None) -> AnchoredReport:
@@ -177,11 +180,11 @@ class AnchoredNavigator:
         elapsed_s = (ticks - self.state.ticks) / TICKS_PER_SECOND
         mcmf_from_icrf = self.model.mcmf_from_icrf(ticks)
         prior = kalman.predict(self.state, ticks, self.model, self.parameters.errors)
-        if prior is None or mcmf_from_icrf is None or not prior.finite:
+        if prior is None or mcmf_from_icrf is None or not _usable(prior):
             # Without the Moon's orientation neither dynamics nor catalogue can be used: the old state is all there is.
             return self._report(Outcome.refused, None, 0, 0)
-        if elapsed_s > 0.0:
-            self._interval_s = elapsed_s
+        if elapsed_s > _CRATER_MEMORY_S or elapsed_s <= 0.0:
+            prior = prior.only_craters(_NO_CRATERS)
         self.state = prior
         if found is None:
             return self._report(Outcome.no_image, mcmf_from_icrf, 0, 0)
@@ -199,6 +202,13 @@ class AnchoredNavigator:
         self.state, self.last_fix = fix.update.state, fix
         return self._report(Outcome.fixed, mcmf_from_icrf, candidates, expected, fix)
 
+    def loosen(self, sigma_position_m: float, sigma_velocity_m_s: float) -> None:
+        """Widen the estimate after something that the dynamics do not know of: a burn, a restart, an old state."""
+        widened = self.state.covariance.copy()
+        widened[:3, :3] += np.eye(3) * sigma_position_m**2
+        widened[3:6, 3:6] += np.eye(3) * sigma_velocity_m_s**2
+        self.state = replace(self.state, covariance=widened)
+
     @property
     def lost(self) -> bool:
         """Whether the estimate is too uncertain to be of use."""
@@ -214,6 +224,9 @@ class AnchoredNavigator:
         altitude_m = float(np.linalg.norm(prior.mean[:3])) - MOON_RADIUS_M
         margin_px = min(3.5 * sigma_m / max(altitude_m, 1_000.0) * self._camera.focal_px, 200.0)
         sighting = in_view(self.landmarks, pose, self._camera, margin_px)
+        prior = prior.only_craters(sighting.index)
+        self.state = prior
+        sighting = look(self.landmarks, sighting.index, pose, self._camera, prior.shifts(sighting.index))
         expected = int(np.count_nonzero(inside_image(sighting, self._camera)))
         if not len(sighting):
             return None, 0, 0
@@ -225,15 +238,19 @@ class AnchoredNavigator:
 
     def _identify(self, prior: FilterState, sighting: Sighting, found: Detections) -> Identification:
         count = len(sighting)
-        design = kalman.design_matrix(sighting).reshape(2 * count, kalman.SIZE)
+        design = kalman.design_matrix(sighting, prior).reshape(2 * count, prior.mean.size)
         tilt = sighting.by_attitude.reshape(2 * count, 3) * self.parameters.errors.attitude_noise_rad
         spread = (design @ prior.covariance @ design.T + tilt @ tilt.T).reshape(count, 2, count, 2)
+        # Craters among the states bring their own uncertainty with them, the others that of the catalogue.
+        scaled = sighting.by_offset * self._crater_sigma_m(sighting.index)[:, None, :]
+        own = scaled @ np.swapaxes(scaled, 1, 2)
+        own[prior.slots(sighting.index) >= 0] = 0.0
         return identify(
             found,
             sighting,
             spread,
-            self._crater_noise(sighting),
-            self._detection_variance(found),
+            own,
+            self._fresh_variance(found),
             float(self._camera.width_px * self._camera.height_px),
             self.parameters.identification,
         )
@@ -249,32 +266,28 @@ class AnchoredNavigator:
         reacquired: bool,
     ) -> Fix | None:
         """Return the fix of identified craters, None where it contradicts the prediction as a whole."""
-        chosen = sighting.select(identification.sighted)
-        variance = self._detection_variance(found)[identification.detection]
-        test_noise = self._crater_noise(chosen) + variance[:, None, None] * np.eye(2)
-        share = self.parameters.detection_persistence
-        times = self._sightings_per_crater()
-        lasting = variance * (1.0 - share + share * times)
-        noise = times * self._crater_noise(chosen) + lasting[:, None, None] * np.eye(2)
+        index = sighting.index[identification.sighted]
         uv = np.stack([found.u_px, found.v_px], axis=1)[identification.detection]
         update = kalman.update(
-            prior,
+            prior.with_craters(index, self._crater_sigma_m(index)),
             pose.camera_from_icrf,
             pose.mcmf_from_icrf,
             self.landmarks,
-            chosen.index,
+            index,
             uv,
-            noise,
-            test_noise,
+            self._fresh_variance(found)[identification.detection],
             self._camera,
             self.parameters.errors,
         )
         if update is None or update.nis > _frame_limit(2 * len(identification)):
             return None
-        return Fix(identification, chosen.index, update, reacquired)
+        if not _plausible(prior, update.state):
+            return None
+        return Fix(identification, index, update, reacquired)
 
     def _acquired(self, prior: FilterState, pose: Pose, found: Detections, radius_m: float) -> Fix | None:
         """Return a fix from a search by votes, None where none is safe."""
+        prior = prior.only_craters(_NO_CRATERS)
         pairs = acquire(
             found,
             self.landmarks,
@@ -299,7 +312,7 @@ class AnchoredNavigator:
         wide[:3, :3] += np.eye(3) * extra**2
         # A jump of position by Kepler motion comes with one of velocity: 1e-3 rad/s times the distance.
         wide[3:6, 3:6] += np.eye(3) * (1e-3 * extra) ** 2
-        return self._acquired(FilterState(prior.ticks, prior.mean, wide), pose, found, extra)
+        return self._acquired(replace(prior, covariance=wide), pose, found, extra)
 
     def _judge(self, fix: Fix | None, expected: int, detections: int) -> None:
         """Count frames in a row in which the map and the image disagree."""
@@ -309,11 +322,16 @@ class AnchoredNavigator:
         elif usable >= 4:
             self._disagreements += 1
 
-    def _crater_noise(self, sighting: Sighting) -> Float:
-        """Return the covariance of each crater's catalogued place in pixels."""
-        sigma = self.landmarks.sigma_m[sighting.index]
-        scaled = sighting.by_offset * sigma[:, None, :]
-        return np.asarray(scaled @ np.swapaxes(scaled, 1, 2), dtype=np.float64)
+    def _crater_sigma_m(self, index: Index) -> Float:
+        """Return the uncertainty of where each crater is detected, east, north, up.
+
+        That is the catalogue's, and the part of the detector's error that stays with the crater.
+        """
+        altitude_m = max(float(np.linalg.norm(self.state.mean[:3])) - MOON_RADIUS_M, 1_000.0)
+        lasting_px = self.parameters.detection_sigma_px * np.sqrt(self.parameters.detection_persistence)
+        sigma_m = self.landmarks.sigma_m[index].copy()
+        sigma_m[:, :2] = np.hypot(sigma_m[:, :2], lasting_px * altitude_m / self._camera.focal_px)
+        return sigma_m
 
     def _detection_variance(self, found: Detections) -> Float:
         """Return the variance of each detection, per axis."""
@@ -322,15 +340,10 @@ class AnchoredNavigator:
         sigma = np.maximum(sigma * parameters.detection_sigma_scale, parameters.detection_sigma_floor_px)
         return np.asarray(sigma**2, dtype=np.float64)
 
-    def _sightings_per_crater(self) -> float:
-        """Return how often the same crater is used on one pass: its error is not fresh each time."""
-        position, velocity = self.state.mean[:3], self.state.mean[3:6]
-        radius = float(np.linalg.norm(position))
-        altitude_m: float = max(radius - MOON_RADIUS_M, 1_000.0)
-        ground_speed = float(np.linalg.norm(velocity)) * MOON_RADIUS_M / radius
-        length = 2.0 * altitude_m * float(np.tan(0.5 * self._camera.fov_rad))
-        frames = length / (ground_speed * max(self._interval_s, 1.0))
-        return max(1.0, self.parameters.frames_in_view_recall * frames)
+    def _fresh_variance(self, found: Detections) -> Float:
+        """Return the part of each detection's variance that is new in every frame."""
+        fresh = self._detection_variance(found) * (1.0 - self.parameters.detection_persistence)
+        return np.maximum(fresh, _SMALLEST_VARIANCE_PX2)
 
     def _report(
         self,
@@ -363,6 +376,19 @@ class AnchoredNavigator:
             expected,
             fix is not None and fix.reacquired,
         )
+
+
+def _usable(state: FilterState) -> bool:
+    """Return whether a state is finite and somewhere near the Moon."""
+    low, high = _RADIUS_LIMITS_M
+    return state.finite and low < float(np.linalg.norm(state.mean[:3])) < high
+
+
+def _plausible(prior: FilterState, posterior: FilterState) -> bool:
+    """Return whether a correction is one that the prediction's uncertainty allows, to a place near the Moon."""
+    change = float(np.linalg.norm(posterior.mean[:3] - prior.mean[:3]))
+    positive = bool(np.all(np.diag(posterior.covariance) >= 0.0))
+    return _usable(posterior) and positive and change < _CORRECTION_SIGMAS * prior.position_sigma_m
 
 
 def _frame_limit(degrees: int) -> float:

@@ -1,8 +1,9 @@
-"""Extended Kalman filter of orbit and common errors, iterated, in Joseph form.
+"""Extended Kalman filter of orbit, common errors and the craters in view, iterated, in Joseph form.
 
-State of 17: position and velocity (ICRF), empirical acceleration (radial, transverse, normal), attitude bias
-(camera axes), pixel bias, catalogue offset (east, north, up). The last three groups are errors that many
-sightings share; they are estimated with their own memory instead of being taken for fresh noise each time.
+The first 17 states are position and velocity (ICRF), empirical acceleration (radial, transverse, normal), attitude
+bias (camera axes), pixel bias, catalogue offset (east, north, up). Behind them stand three for each crater that was
+used and is still in view: how far it lies from its catalogued place, east, north, up. A crater is seen several
+times on a pass and errs the same way each time; its error is a state, not fresh noise, and goes when it does.
 """
 
 from __future__ import annotations
@@ -52,11 +53,18 @@ class CommonErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilterState:
-    """Estimate (17,) and covariance (17, 17) at an on-board time."""
+    """Estimate (17 + 3 m,) and covariance at an on-board time, with the m craters among the states.
+
+    Attributes
+    ----------
+    craters
+        Indices into the map, shape (m,).
+    """
 
     ticks: int
     mean: Float
     covariance: Float
+    craters: Index
 
     @property
     def position_sigma_m(self) -> float:
@@ -67,6 +75,45 @@ class FilterState:
     def finite(self) -> bool:
         return bool(np.all(np.isfinite(self.mean)) and np.all(np.isfinite(self.covariance)))
 
+    def slots(self, index: Index) -> Index:
+        """Return the place of the first of the three states of each given crater, -1 where it has none."""
+        if not self.craters.size:
+            return np.full(index.size, -1, dtype=np.int64)
+        order = np.argsort(self.craters)
+        at = np.minimum(np.searchsorted(self.craters[order], index), order.size - 1)
+        found = self.craters[order[at]] == index
+        return np.where(found, SIZE + 3 * order[at], -1)
+
+    def shifts(self, index: Index) -> Float:
+        """Return how far each given crater lies from its catalogued place, shape (n, 3), zero where not estimated."""
+        slots = self.slots(index)
+        values = self.mean[np.maximum(slots, 0)[:, None] + np.arange(3)]
+        return np.where(slots[:, None] >= 0, values, 0.0)
+
+    def with_craters(self, index: Index, sigma_m: Float) -> FilterState:
+        """Return the state with the given craters among its states; new ones at their catalogued places."""
+        new = self.slots(index) < 0
+        count, size = int(np.count_nonzero(new)), self.mean.size
+        if not count:
+            return self
+        covariance = np.zeros((size + 3 * count, size + 3 * count))
+        covariance[:size, :size] = self.covariance
+        rest = np.arange(size, size + 3 * count)
+        covariance[rest, rest] = sigma_m[new].reshape(-1) ** 2
+        mean = np.concatenate([self.mean, np.zeros(3 * count)])
+        return FilterState(self.ticks, mean, covariance, np.concatenate([self.craters, index[new]]))
+
+    def only_craters(self, keep: Index) -> FilterState:
+        """Return the state without the craters that are not among the given ones."""
+        kept = np.isin(self.craters, keep)
+        if kept.all():
+            return self
+        slots = SIZE + 3 * np.flatnonzero(kept)
+        places = np.concatenate([np.arange(SIZE), (slots[:, None] + np.arange(3)).reshape(-1)])
+        return FilterState(
+            self.ticks, self.mean[places], self.covariance[np.ix_(places, places)], self.craters[kept]
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Update:
@@ -76,12 +123,15 @@ class Update:
     ----------
     nis
         Normalised innovation squared over all used sightings.
+    mean_innovation
+        Mean of detection minus prediction, right and down, over its standard deviation, shape (2,).
     residual_px
         Detection minus prediction after the update, shape (n, 2).
     """
 
     state: FilterState
     nis: float
+    mean_innovation: Float
     residual_px: Float
 
 
@@ -107,7 +157,7 @@ def initial_filter_state(
             np.array(errors.catalogue_offset_m),
         ]
     )
-    return FilterState(ticks, mean, np.diag(sigma**2))
+    return FilterState(ticks, mean, np.diag(sigma**2), np.empty(0, dtype=np.int64))
 
 
 def predict(state: FilterState, ticks: int, model: OrbitModel, errors: CommonErrors) -> FilterState | None:
@@ -115,14 +165,17 @@ def predict(state: FilterState, ticks: int, model: OrbitModel, errors: CommonErr
     transition, mean, noise = transition_to(state, ticks, model, errors)
     if transition is None:
         return None
-    covariance = transition @ state.covariance @ transition.T + noise
-    return FilterState(ticks, mean, 0.5 * (covariance + covariance.T))
+    covariance = state.covariance.copy()
+    covariance[:SIZE] = transition @ covariance[:SIZE]
+    covariance[:, :SIZE] = covariance[:, :SIZE] @ transition.T
+    covariance[:SIZE, :SIZE] += noise
+    return FilterState(ticks, mean, 0.5 * (covariance + covariance.T), state.craters)
 
 
 def transition_to(
     state: FilterState, ticks: int, model: OrbitModel, errors: CommonErrors
 ) -> tuple[Float | None, Float, Float]:
-    """Return transition matrix (None outside the orientation table), propagated mean and process noise."""
+    """Return transition (17, 17; None outside the orientation table), propagated mean and process noise (17, 17)."""
     orbit = model.propagate(state.mean[ORBIT], state.ticks, ticks)
     transition, noise, mean = np.eye(SIZE), np.zeros((SIZE, SIZE)), state.mean.copy()
     if orbit is None:
@@ -146,13 +199,17 @@ def pose_of(mean: Float, camera_from_icrf: Float, mcmf_from_icrf: Float) -> Pose
     return Pose(mean[POSITION], camera_from_icrf, mcmf_from_icrf, mean[ATTITUDE], mean[PIXEL], mean[OFFSET])
 
 
-def design_matrix(sighting: Sighting) -> Float:
-    """Return the derivatives of all predicted pixels by the state, shape (n, 2, 17)."""
-    matrix = np.zeros((len(sighting), 2, SIZE))
+def design_matrix(sighting: Sighting, state: FilterState) -> Float:
+    """Return the derivatives of all predicted pixels by all states, shape (n, 2, 17 + 3 m)."""
+    matrix = np.zeros((len(sighting), 2, state.mean.size))
     matrix[:, :, POSITION] = sighting.by_position
     matrix[:, :, ATTITUDE] = sighting.by_attitude
     matrix[:, 0, PIXEL.start] = matrix[:, 1, PIXEL.start + 1] = 1.0
     matrix[:, :, OFFSET] = sighting.by_offset
+    slots = state.slots(sighting.index)
+    known = np.flatnonzero(slots >= 0)
+    for axis in range(3):
+        matrix[known, :, slots[known] + axis] = sighting.by_offset[known, :, axis]
     return matrix
 
 
@@ -163,8 +220,7 @@ def update(
     landmarks: LandmarkMap,
     index: Index,
     uv_px: Float,
-    noise_px2: Float,
-    test_noise_px2: Float,
+    variance_px2: Float,
     camera: PinholeCamera,
     errors: CommonErrors,
     iterations: int = 3,
@@ -173,44 +229,38 @@ def update(
 
     Parameters
     ----------
+    prior
+        Must hold the craters among its states.
     index, uv_px
         Craters (into the map) and where they were detected, shapes (n,) and (n, 2).
-    noise_px2
-        Covariance of each detection against its catalogued place, shape (n, 2, 2), raised for errors that will
-        be met again with the same crater: what the estimate is weighed with. Independent between craters; the
-        attitude noise, common to the frame, is added here.
-    test_noise_px2
-        The same for one frame alone: what the innovations are tested with.
+    variance_px2
+        Variance of each detection, per axis, shape (n,). The attitude noise, common to the frame, is added here.
     """
-    count = 2 * index.size
+    count, size = 2 * index.size, prior.mean.size
     mean = prior.mean
     for step in range(iterations):
-        sighting = look(landmarks, index, pose_of(mean, camera_from_icrf, mcmf_from_icrf), camera)
-        design = design_matrix(sighting).reshape(count, SIZE)
+        current = FilterState(prior.ticks, mean, prior.covariance, prior.craters)
+        pose = pose_of(mean, camera_from_icrf, mcmf_from_icrf)
+        sighting = look(landmarks, index, pose, camera, current.shifts(index))
+        design = design_matrix(sighting, current).reshape(count, size)
         tilt = sighting.by_attitude.reshape(count, 3) * errors.attitude_noise_rad
-        noise = _block_diagonal(noise_px2) + tilt @ tilt.T
-        spread = design @ prior.covariance @ design.T + noise
+        noise = np.diag(np.repeat(variance_px2, 2)) + tilt @ tilt.T
+        crossed = design @ prior.covariance
+        spread = crossed @ design.T + noise
         innovation = (uv_px - sighting.uv_px).reshape(count) - design @ (prior.mean - mean)
         if not (np.all(np.isfinite(innovation)) and np.all(np.isfinite(spread))):
             return None
         if step == 0:
-            once = spread + _block_diagonal(test_noise_px2 - noise_px2)
-            nis = float(innovation @ np.linalg.solve(once, innovation))
-        gain = np.linalg.solve(spread, design @ prior.covariance).T
+            nis = float(innovation @ np.linalg.solve(spread, innovation))
+            spread_of_sum = spread.reshape(index.size, 2, index.size, 2).sum(axis=(0, 2))
+            mean_innovation = innovation.reshape(-1, 2).sum(axis=0) / np.sqrt(np.diag(spread_of_sum))
+        gain = np.linalg.solve(spread, crossed).T
         previous, mean = mean, prior.mean + gain @ innovation
         if np.linalg.norm(mean[POSITION] - previous[POSITION]) < 0.01:
             break
-    left = np.eye(SIZE) - gain @ design
+    left = np.eye(size) - gain @ design
     covariance = left @ prior.covariance @ left.T + gain @ noise @ gain.T
-    state = FilterState(prior.ticks, mean, 0.5 * (covariance + covariance.T))
-    after = look(landmarks, index, pose_of(mean, camera_from_icrf, mcmf_from_icrf), camera)
-    return Update(state, nis, uv_px - after.uv_px) if state.finite else None
-
-
-def _block_diagonal(blocks: Float) -> Float:
-    """Return blocks (n, 2, 2) on the diagonal of a matrix (2n, 2n)."""
-    n = blocks.shape[0]
-    matrix = np.zeros((n, 2, n, 2))
-    rows = np.arange(n)
-    matrix[rows, :, rows, :] = blocks
-    return matrix.reshape(2 * n, 2 * n)
+    state = FilterState(prior.ticks, mean, 0.5 * (covariance + covariance.T), prior.craters)
+    pose = pose_of(mean, camera_from_icrf, mcmf_from_icrf)
+    after = look(landmarks, index, pose, camera, state.shifts(index))
+    return Update(state, nis, mean_innovation, uv_px - after.uv_px) if state.finite else None

@@ -183,12 +183,24 @@ def _reach_rad(radius_m: float, pose: Pose, camera: PinholeCamera, margin_px: fl
     return min(1.1 * (float(np.arcsin(sine)) - angle), 1.1 * horizon)
 
 
-def look(landmarks: LandmarkMap, index: Index, pose: Pose, camera: PinholeCamera) -> Sighting:
-    """Return the given craters as a pose sees them; NaN behind the camera."""
+def look(
+    landmarks: LandmarkMap,
+    index: Index,
+    pose: Pose,
+    camera: PinholeCamera,
+    shift_enu_m: Float | None = None,
+) -> Sighting:
+    """Return the given craters as a pose sees them; NaN behind the camera.
+
+    `shift_enu_m`, shape (n, 3), moves each crater from its catalogued place.
+    """
     axes = landmarks.enu_from_mcmf[index]
     turned = pose.camera_from_icrf - _cross_matrix(pose.attitude_rad) @ pose.camera_from_icrf
     camera_from_mcmf = turned @ pose.mcmf_from_icrf.T
-    point = landmarks.position_mcmf_m[index] + pose.catalogue_offset_m @ axes
+    shift = pose.catalogue_offset_m if shift_enu_m is None else shift_enu_m + pose.catalogue_offset_m
+    point = landmarks.position_mcmf_m[index] + np.einsum(
+        "...i,...ij->...j", np.broadcast_to(shift, (index.size, 3)), axes
+    )
     seen = (point - pose.mcmf_from_icrf @ pose.position_icrf_m) @ camera_from_mcmf.T
     f, count = camera.focal_px, index.size
     depth = np.where(seen[:, 2] > 0.0, seen[:, 2], np.nan)
