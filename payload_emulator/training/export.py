@@ -7,7 +7,7 @@ import json
 import logging
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +19,27 @@ from payload_emulator.flight.detector import (
     HEATMAP_NAME,
     INPUT_NAME,
     INPUT_SIZE_PX,
+    STRIDE_PX,
     OnnxDetector,
 )
-from payload_emulator.training.dataset import Dataset, frame_truth
+from payload_emulator.flight.preprocess import sun_up_turns, turn_forward
+from payload_emulator.training.dataset import Dataset, Frame, frame_truth
+from payload_emulator.training.evaluate import detect_with_network
+from payload_emulator.training.scoring import (
+    FrameDetections,
+    FrameTruth,
+    Tally,
+    best_threshold,
+    tally,
+    threshold_for_precision,
+)
 
 PARITY_LIMIT = 2e-4
 """Greatest difference allowed between torch and ONNX Runtime: far under one count of a score in telemetry (1/255)."""
+
+ON_BOARD_BETA = 0.5
+"""The on-board threshold weighs precision twice as much as recall: a false crater costs a navigator more than a missed
+one, and plains have fewer craters than the validation blocks, so every threshold is less precise there."""
 
 NAVIGATION_PRECISION = 0.90
 INPUT_CONVENTION = (
@@ -37,8 +52,9 @@ class Calibration:
     """What is fixed on the validation split."""
 
     score_threshold: float
+    f1_threshold: float
     navigation_threshold: float
-    log_sigma_shift: float
+    geometry_shift: tuple[float, float, float, float]  # added to the network's geometry: cells, cells, ln, ln
     figures: dict[str, Any]
 
 
@@ -62,34 +78,65 @@ def load_network(path: Path) -> tuple[Any, dict[str, Any]]:
 
 
 def calibrate(network: Any, datasets: Sequence[Dataset], limit: int = 400) -> Calibration:
-    """Thresholds (greatest strict F1; navigation precision) and sigma scale from the validation split."""
-    from payload_emulator.training.evaluate import detect_with_network
-    from payload_emulator.training.scoring import best_threshold, tally, threshold_for_precision
+    """Thresholds and constant corrections from the validation split, on real terrain where there is any.
 
+    Thresholds: greatest strict F0.5 (on board) and F1, and the precision that navigation
+    may want. Corrections, each a median over matched craters: offset of the centre in the Sun-up image (walls in shadow draw it toward the Sun), logarithm of the
+    diameter, and the scale of sigma that puts 68.3 % of the errors within one.
+    """
     every = [(d, f) for d in datasets for f in d.frames("val")]
     if not every:
-        return Calibration(0.4, 0.6, 0.0, {})
+        return Calibration(0.4, 0.4, 0.6, (0.0, 0.0, 0.0, 0.0), {})
+    every = [(d, f) for d, f in every if not f.complete] or every
     chosen = [every[k] for k in np.unique(np.linspace(0, len(every) - 1, limit).astype(int))]
-    # Real terrain decides where there is any: it is where the detector is judged.
-    real = [(d, f) for d, f in chosen if not f.complete]
-    chosen = real or chosen
-    found = [detect_with_network(network, d, f) for d, f in chosen]
-    truths = [frame_truth(d, f) for d, f in chosen]
-    strict = tally(truths, found)
-    threshold, figures = best_threshold(strict)
-    fair = tally(truths, found, low_m=3_000.0, ignore_aware=True)
-    right = (fair.outcome == 1) & (fair.score >= threshold)
-    errors = np.concatenate([fair.error_u[right], fair.error_v[right]])
-    sigma = np.concatenate([fair.sigma_px[right]] * 2)
-    ratio = np.abs(errors) / sigma
-    # Between the core of the distribution and its tail: the 68.3 % point of |error| / sigma becomes 1.
-    shift = float(np.log(np.quantile(ratio, 0.683))) if ratio.size > 50 else 0.0
+    pairs = [_sun_up(frame_truth(d, f), detect_with_network(network, d, f), f) for d, f in chosen]
+    truths, found = [truth for truth, _ in pairs], [detections for _, detections in pairs]
+    provisional, _ = best_threshold(tally(truths, found))
+    shift = geometry_shift(tally(truths, found, low_m=3_000.0, ignore_aware=True), provisional)
+    strict = tally(truths, [_shifted(detections, shift) for detections in found])
+    balanced, _ = best_threshold(strict)
+    threshold, figures = best_threshold(strict, beta=ON_BOARD_BETA)
     return Calibration(
         round(threshold, 3),
+        round(balanced, 3),
         round(max(threshold, threshold_for_precision(strict, NAVIGATION_PRECISION)), 3),
         shift,
         figures.to_dict(),
     )
+
+
+def geometry_shift(tallied: Tally, threshold: float) -> tuple[float, float, float, float]:
+    """What to add to the network's geometry so that errors in the Sun-up image are centred and sigma is one sigma."""
+    right = (tallied.outcome == 1) & (tallied.score >= threshold)
+    if np.count_nonzero(right) < 50:
+        return (0.0, 0.0, 0.0, 0.0)
+    error_u, error_v = tallied.error_u[right], tallied.error_v[right]
+    bias_u, bias_v = float(np.median(error_u)), float(np.median(error_v))
+    ratio = np.abs(np.concatenate([error_u - bias_u, error_v - bias_v])) / np.tile(tallied.sigma_px[right], 2)
+    log_ratio = float(np.median(tallied.log_diameter_ratio[right]))
+    return (-bias_u / STRIDE_PX, -bias_v / STRIDE_PX, -log_ratio, float(np.log(np.quantile(ratio, 0.683))))
+
+
+def _shifted(found: FrameDetections, shift: tuple[float, float, float, float]) -> FrameDetections:
+    """Detections in a Sun-up image as the corrected network would give them."""
+    factor = float(np.exp(shift[2]))
+    return replace(
+        found,
+        u_px=found.u_px + STRIDE_PX * shift[0],
+        v_px=found.v_px + STRIDE_PX * shift[1],
+        diameter_px=factor * found.diameter_px,
+        diameter_m=factor * found.diameter_m,
+        sigma_px=float(np.exp(shift[3])) * found.sigma_px,
+    )
+
+
+def _sun_up(truth: FrameTruth, found: FrameDetections, frame: Frame) -> tuple[FrameTruth, FrameDetections]:
+    """Truth and detections of a frame in the coordinates of its Sun-up image."""
+    turns = sun_up_turns(frame.sun_camera)
+    shape = (truth.height_px, truth.width_px)
+    truth_u, truth_v = turn_forward(truth.u_px, truth.v_px, turns, *shape)
+    found_u, found_v = turn_forward(found.u_px, found.v_px, turns, *shape)
+    return replace(truth, u_px=truth_u, v_px=truth_v), replace(found, u_px=found_u, v_px=found_v)
 
 
 def export(
@@ -113,7 +160,7 @@ def export(
 
     network, stored = load_network(checkpoint)
     calibration = calibrate(network, datasets)
-    exported = ExportedCraterNet(network, calibration.log_sigma_shift).eval()
+    exported = ExportedCraterNet(network, calibration.geometry_shift).eval()
     example = torch.zeros(1, 1, INPUT_SIZE_PX, INPUT_SIZE_PX)
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
@@ -134,8 +181,9 @@ def export(
         "outputs": "heatmap probability (1, 1, 128, 128); geometry (1, 4, 128, 128): right, down in cells, "
         "ln(diameter / 16 px), ln(sigma / 1 px)",
         "score_threshold": str(calibration.score_threshold),
+        "f1_threshold": str(calibration.f1_threshold),
         "navigation_threshold": str(calibration.navigation_threshold),
-        "log_sigma_shift": f"{calibration.log_sigma_shift:.4f}",
+        "geometry_shift": json.dumps([round(value, 5) for value in calibration.geometry_shift]),
         "validation": json.dumps(calibration.figures),
         "training_steps": str(stored["progress"]["step"]),
         "training_minutes": f"{stored['progress']['seconds'] / 60:.1f}",
@@ -167,7 +215,9 @@ def export(
         "model": str(out),
         "model_bytes": len(octets),
         "parity_max_abs": difference,
+        "geometry_shift": list(calibration.geometry_shift),
         "score_threshold": calibration.score_threshold,
+        "f1_threshold": calibration.f1_threshold,
         "navigation_threshold": calibration.navigation_threshold,
         "validation": calibration.figures,
     }

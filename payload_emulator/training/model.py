@@ -109,14 +109,14 @@ class CraterNet(nn.Module):
 
 
 class ExportedCraterNet(nn.Module):
-    """The network as flight runs it: probabilities, and the calibrated logarithm of sigma."""
+    """The network as flight runs it: probabilities, and geometry with the corrections of `export.calibrate`."""
 
-    def __init__(self, network: CraterNet, log_sigma_shift: float = 0.0) -> None:
+    def __init__(
+        self, network: CraterNet, geometry_shift: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    ) -> None:
         super().__init__()
         self.network = network
-        shift = torch.zeros(1, 4, 1, 1)
-        shift[0, 3] = log_sigma_shift
-        self.register_buffer("shift", shift)
+        self.register_buffer("shift", torch.tensor(geometry_shift, dtype=torch.float32).reshape(1, 4, 1, 1))
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
         heat, geometry = self.network(image)

@@ -121,8 +121,8 @@ def match(
 class Tally:
     """Every detection and every wanted crater of a set of frames after matching, for one rule and one truth.
 
-    Detections: score, outcome (1 right, 0 wrong, -1 not counted), error_u, error_v (detection minus
-    crater) where right. Craters: score at which each was found (NaN: never).
+    Detections: score, outcome (1 right, 0 wrong, -1 not counted); where right error_u, error_v (detection minus
+    crater) and log_diameter_ratio (detection over crater). Craters: score at which each was found (NaN: never).
     """
 
     score: Floats
@@ -132,6 +132,7 @@ class Tally:
     sigma_px: Floats
     detection_block: NDArray[np.int64]
     detection_octant: NDArray[np.int64]
+    log_diameter_ratio: Floats
     crater_score: Floats
     crater_depth_ratio: Floats
     crater_diameter_px: Floats
@@ -230,6 +231,8 @@ def tally(
             outcome[(outcome == 0) & near] = -1
         error_u = np.where(hit >= 0, found.u_px[d] - truth.u_px[w][hit] if w.size else np.nan, np.nan)
         error_v = np.where(hit >= 0, found.v_px[d] - truth.v_px[w][hit] if w.size else np.nan, np.nan)
+        sizes = truth.diameter_px[w][hit] if w.size else np.ones(d.size)
+        log_ratio = np.where(hit >= 0, np.log(found.diameter_px[d] / sizes), np.nan)
         octant = int(np.floor(np.mod(truth.sun_azimuth_image_rad, 2.0 * np.pi) / (np.pi / 4.0))) % 8
         parts.append(
             (
@@ -240,6 +243,7 @@ def tally(
                 found.sigma_px[d],
                 np.full(d.size, truth.block),
                 np.full(d.size, octant),
+                log_ratio,
             )
         )
         score = np.full(w.size, np.nan)
@@ -254,7 +258,7 @@ def tally(
                 np.full(w.size, truth.block),
             )
         )
-    return Tally(*_columns(parts, 7), *_columns(craters, 6))
+    return Tally(*_columns(parts, 8), *_columns(craters, 6))
 
 
 def match_any(
@@ -274,13 +278,26 @@ def match_any(
     return near
 
 
-def best_threshold(tallied: Tally, candidates: Floats | None = None) -> tuple[float, Figures]:
-    """Threshold of the greatest F1 and its figures (choose it on a validation set only)."""
+def best_threshold(
+    tallied: Tally, candidates: Floats | None = None, beta: float = 1.0
+) -> tuple[float, Figures]:
+    """Threshold of the greatest F-beta and its figures (choose it on a validation set only).
+
+    `beta` below 1 gives precision more weight than recall.
+    """
     candidates = np.arange(0.10, 0.91, 0.01) if candidates is None else candidates
     every = [tallied.figures(float(threshold)) for threshold in candidates]
-    values = np.array([figures.f1 if np.isfinite(figures.f1) else -1.0 for figures in every])
+    values = np.array([_f_beta(figures, beta) for figures in every])
     best = int(np.argmax(values))
     return float(candidates[best]), every[best]
+
+
+def _f_beta(figures: Figures, beta: float) -> float:
+    """F-beta of the counts; -1 where nothing was expected or claimed."""
+    missed = figures.expected - figures.detected_true
+    right = (1.0 + beta * beta) * figures.detected_true
+    total = right + beta * beta * missed + figures.false_alarms
+    return right / total if total else -1.0
 
 
 def threshold_for_precision(tallied: Tally, precision: float) -> float:

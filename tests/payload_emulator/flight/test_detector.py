@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from payload_emulator.errors import ModelError
-from payload_emulator.flight.detections import detections_from_lists
+from payload_emulator.flight.detections import Detections
 from payload_emulator.flight.detector import DetectorParameters, OnnxDetector, decode, drop_duplicates
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.preprocess import ImageQuality
@@ -150,6 +150,7 @@ def test_a_flat_heatmap_gives_no_detections():
 
 
 def test_a_weaker_repetition_is_dropped_and_a_nested_crater_kept():
-    found = detections_from_lists([100, 104, 102], [100, 101, 100], [40, 44, 12], [0.9, 0.8, 0.7], [1, 1, 1])
+    columns = ([100, 104, 102], [100, 101, 100], [40, 44, 12], [0.9, 0.8, 0.7], [1, 1, 1])
+    found = Detections(*(np.array(column, float) for column in columns))
     kept = drop_duplicates(found, DetectorParameters())
     assert kept.diameter_px.tolist() == [40, 12]

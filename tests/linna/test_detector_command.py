@@ -1,0 +1,100 @@
+"""`linna detector` and `linna dataset` from the outside: keys of their JSON, words of their refusals."""
+
+import json
+
+import numpy as np
+import pytest
+
+from linna.cli import run
+
+
+def speckled(shape=(512, 512), dtype=np.uint8):
+    rng = np.random.default_rng(2)
+    return (rng.integers(30, 220, shape) * (np.iinfo(dtype).max // 255)).astype(dtype)
+
+
+@pytest.fixture
+def write_image(tmp_path):
+    import cv2
+
+    def write(name, image):
+        path = tmp_path / name
+        assert cv2.imwrite(str(path), image)
+        return path
+
+    return write
+
+
+def test_info_tells_the_hash_and_the_thresholds(capsys):
+    assert run(["detector", "info", "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert len(figures["sha256"]) == 64
+    assert 0.1 <= float(figures["score_threshold"]) <= float(figures["navigation_threshold"])
+
+
+@pytest.mark.parametrize(
+    ("name", "image"),
+    [
+        ("a.png", speckled()),
+        ("b.tiff", speckled(dtype=np.uint16)),
+        ("c.png", speckled((300, 700, 3))),
+        ("d.png", speckled((64, 48))),
+    ],
+)
+def test_detect_takes_any_size_and_depth(write_image, capsys, name, image):
+    path = write_image(name, image)
+    assert run(["detector", "detect", str(path), "--altitude-km", "30", "--threshold", "0.05", "--json"]) == 0
+    (item,) = json.loads(capsys.readouterr().out)["images"]
+    assert item["file"] == str(path)
+    assert item["quality"] == "ok"
+    for detection in item["detections"]:
+        assert set(detection) >= {"u_px", "v_px", "diameter_px", "score", "class"}
+        assert -1 <= detection["class"] <= 3
+
+
+def test_a_black_picture_is_a_verdict_not_an_error(write_image, capsys):
+    assert (
+        run(["detector", "detect", str(write_image("black.png", np.zeros((512, 512), np.uint8))), "--json"])
+        == 0
+    )
+    (item,) = json.loads(capsys.readouterr().out)["images"]
+    assert item["quality"] == "dark" and item["detections"] == []
+
+
+def test_what_is_no_image_is_refused_in_one_line(tmp_path, capsys):
+    path = tmp_path / "x.png"
+    path.write_text("no image")
+    assert run(["detector", "detect", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert str(path) in error and error.count("\n") == 1
+
+
+def test_what_is_no_model_is_refused_in_one_line(write_image, tmp_path, capsys):
+    (tmp_path / "m.onnx").write_bytes(b"no model")
+    image = write_image("a.png", speckled())
+    assert run(["detector", "detect", str(image), "--model", str(tmp_path / "m.onnx")]) == 2
+    error = capsys.readouterr().err
+    assert "expected an ONNX model" in error and error.count("\n") == 1
+
+
+def test_a_missing_model_file_is_named(tmp_path, capsys):
+    assert run(["detector", "info", "--model", str(tmp_path / "none.onnx")]) == 2
+    assert "none.onnx" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("verb", [["dataset", "stats"], ["dataset", "check"]])
+def test_a_folder_without_a_data_set_is_refused(verb, tmp_path, capsys):
+    assert run([*verb, str(tmp_path)]) == 2
+    assert "expected a data set" in capsys.readouterr().err
+
+
+def test_evaluating_on_no_data_set_is_refused(tmp_path, capsys):
+    assert run(["detector", "evaluate", "--dataset", str(tmp_path)]) == 2
+    assert "expected a data set" in capsys.readouterr().err
+
+
+def test_bench_reports_latency_memory_and_size(capsys):
+    assert run(["detector", "bench", "--frames", "5", "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert {"median_ms", "p99_ms", "peak_rss_mb", "model_bytes"} <= set(figures)
+    assert figures["model_bytes"] <= 6_000_000
