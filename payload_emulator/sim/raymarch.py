@@ -211,7 +211,8 @@ def _march(
             stop = along - math.sqrt(deep) if deep > 0.0 else along + math.sqrt(inside)
             before = t
             hit = False
-            while t <= stop:
+            # One step past the lowest ground, so that the last stretch is looked at too.
+            while t <= stop + stride:
                 x, y, z = px + t * dx, py + t * dy, pz + t * dz
                 ground = _height(heights, table, first_row, first_column, scale, x, y, z)
                 if math.sqrt(x * x + y * y + z * z) - MOON_RADIUS_M <= ground:

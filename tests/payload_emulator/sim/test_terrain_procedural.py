@@ -1,0 +1,70 @@
+import math
+
+import numpy as np
+import pytest
+
+from lunar.catalogue import class_counts
+from payload_emulator.sim.terrain.procedural import ProceduralTerrain
+from payload_emulator.sim.terrain.tiles import LEVELS, tile_angles
+
+
+def test_the_classes_hold_the_papers_counts(procedural):
+    # The paper, section V-B.2: 58,649 / 12,830 / 7,908 craters of 5-10, 10-15 and 15-30 km.
+    assert class_counts(procedural.catalogue).tolist() == [58_649, 12_830, 7_908]
+    assert np.count_nonzero(procedural.catalogue.diameter_m > 30e3) == 3_674
+
+
+@pytest.mark.parametrize("level", [0, 2])
+@pytest.mark.parametrize(("row", "column"), [(16, 7), (18, -1)])
+def test_neighbouring_tiles_repeat_each_others_edges(procedural, level, row, column):
+    columns = 2 * procedural._level_rows[level]
+    ppd = procedural._level_rows[level] * 512 / 180.0
+    west = procedural.make_heights(*tile_angles(row, column % columns, ppd))
+    east = procedural.make_heights(*tile_angles(row, (column + 1) % columns, ppd))
+    south = procedural.make_heights(*tile_angles(row + 1, column % columns, ppd))
+    # Craters are stamped in single precision from each tile's own corner: 1 cm.
+    np.testing.assert_allclose(west[:, 512:515], east[:, 0:3], atol=1e-2, rtol=0.0)
+    np.testing.assert_allclose(west[512:515, :], south[0:3, :], atol=1e-2, rtol=0.0)
+
+
+def test_heights_do_not_depend_on_what_was_asked_before():
+    latitude, longitude = np.radians(np.linspace(8.0, 12.0, 7)), np.radians(np.linspace(358.0, 362.0, 7))
+    first, second = ProceduralTerrain(5, cache_tiles=8), ProceduralTerrain(5, cache_tiles=8)
+    forward = [first.height_m(a, b) for a, b in zip(latitude, longitude, strict=True)]
+    backward = [second.height_m(a, b) for a, b in zip(latitude[::-1], longitude[::-1], strict=True)]
+    np.testing.assert_array_equal(forward, backward[::-1])
+
+
+def test_there_is_no_step_at_the_prime_meridian(procedural):
+    latitude = np.radians(np.linspace(9.0, 11.0, 200))
+    step = math.radians(0.5 / 256.0)
+    across = procedural.height_m(latitude, 2.0 * math.pi - step) - procedural.height_m(latitude, step)
+    beside = procedural.height_m(latitude, step) - procedural.height_m(latitude, 3.0 * step)
+    assert np.sqrt(np.mean(across**2)) < 2.0 * np.sqrt(np.mean(beside**2)) + 1.0
+
+
+def test_worlds_of_other_seeds_are_other_worlds(procedural):
+    other = ProceduralTerrain(4)
+    latitude, longitude = np.radians([10.0, 11.0]), np.radians([20.0, 21.0])
+    assert np.abs(procedural.height_m(latitude, longitude) - other.height_m(latitude, longitude)).min() > 0.1
+
+
+def test_craters_are_as_deep_as_they_were_drawn(procedural):
+    drawn = procedural._shapes
+    latitude, longitude = math.radians(10.0), math.radians(20.0)
+    near = procedural.catalogue.near(latitude, longitude, 90e3)
+    near = near[procedural.catalogue.diameter_m[near] > 4e3]
+    measured = procedural.measured(near)
+    assert near.size > 30
+    ratio = (measured.depth_m - drawn.depth_m[near]) / measured.diameter_m
+    # Others lie in and over most craters; the typical one keeps its depth to 3 % of its diameter.
+    assert np.median(np.abs(ratio)) < 0.03
+
+
+def test_levels_of_detail_show_the_same_ground(procedural):
+    latitude, longitude = np.radians(np.linspace(9.2, 10.8, 60)), np.radians(np.linspace(19.2, 20.8, 60))
+    fine = procedural._sample(latitude, longitude, 0)
+    for level in range(1, LEVELS):
+        coarse = procedural._sample(latitude, longitude, level)
+        # What is left out is small craters and waves: tens of metres where they lie.
+        assert np.median(np.abs(coarse - fine)) < 25.0
