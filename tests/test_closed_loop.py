@@ -1,0 +1,140 @@
+"""The main job end to end on the procedural Moon: orbit, images, payload, downlink, ingest, report, and its JSON."""
+
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from linna import cli
+
+SCENARIO = """
+name = "closed-loop"
+seed = 7
+[dynamics]
+gravity = "builtin"
+orientation = "iau"
+[window]
+search = "none"
+start = "2029-08-07T01:40:00Z"
+duration_s = 180.0
+[terrain]
+source = "procedural"
+[navigation]
+filter_gravity = "builtin"
+filter_degree = 8
+initial_position_error_m = 1000.0
+initial_velocity_error_m_s = 1.0
+"""
+FRAMES = 12
+
+
+def linna(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "linna", *arguments], capture_output=True, text=True, check=False
+    )
+
+
+@pytest.fixture(scope="module")
+def scenario_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("scenario") / "closed-loop.toml"
+    file.write_text(SCENARIO)
+    return file
+
+
+@pytest.fixture(scope="module")
+def demo(scenario_file: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, Path]:
+    out = tmp_path_factory.mktemp("demo")
+    result = linna("demo", "--scenario", str(scenario_file), "--out", str(out), "--json")
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout), out
+
+
+def test_the_demo_prints_one_json_object_with_the_agreed_keys(demo) -> None:
+    figures, _ = demo
+    assert set(figures) >= {
+        "report",
+        "pass_id",
+        "frames",
+        "packets",
+        "packets_lost",
+        "detector",
+        "navigation",
+        "wall_s",
+        "data",
+    }
+    assert figures["frames"] == FRAMES
+    assert figures["packets_lost"] == 0
+    assert set(figures["detector"]) >= {"precision", "recall", "loc_px"}
+    for mode in ("paper", "spherical", "anchored"):
+        assert set(figures["navigation"][mode]) >= {"median_3d_m", "p95_3d_m", "max_3d_m", "drift_percent"}
+    assert any("procedural" in source for source in figures["data"])
+
+
+def test_every_frame_comes_down_for_every_estimator(demo) -> None:
+    figures, out = demo
+    summary = json.loads((out / "pass" / "summary.json").read_text())
+    for mode in ("paper", "spherical", "anchored"):
+        assert sum(summary["estimators"][mode]["outcomes"].values()) == FRAMES
+    # Per frame: detections, and a state and an outcome of each of three estimators; housekeeping and events besides.
+    assert figures["packets"] >= FRAMES * 7
+
+
+def test_the_anchored_estimator_never_reads_the_anchor_ephemeris(demo) -> None:
+    _, out = demo
+    summary = json.loads((out / "pass" / "summary.json").read_text())
+    assert summary["truth_reads_after_start"] == 0
+    assert (
+        summary["estimators"]["paper"]["anchor_reads_after_start"] >= FRAMES - 1
+    )  # the altitude, each frame
+
+
+def test_the_report_is_one_file_that_asks_for_nothing_outside(demo) -> None:
+    figures, _ = demo
+    page = Path(figures["report"]).read_text()
+    assert "closed-loop" in page
+    assert "http://" not in page.replace("http://www.w3.org/", "")
+    assert "https://" not in page
+
+
+def test_the_manifest_hashes_what_lies_in_the_archive(demo) -> None:
+    _, out = demo
+    manifest = json.loads((out / "pass" / "manifest.json").read_text())
+    assert set(manifest["files"]) >= {
+        "downlink.cadu",
+        "reference.oem",
+        "truth.oem",
+        "catalogue.csv",
+        "summary.json",
+    }
+    for name, entry in manifest["files"].items():
+        octets = (out / "pass" / name).read_bytes()
+        assert (len(octets), hashlib.sha256(octets).hexdigest()) == (entry["bytes"], entry["sha256"])
+
+
+def test_importing_the_archive_again_changes_nothing(demo) -> None:
+    from ground_service.services.archive_import import import_archive
+    from ground_service.services.ground import open_ground
+    from ground_service.services.reports import pass_summary
+
+    figures, out = demo
+    with open_ground(out / "ground") as ground:
+        before = pass_summary(ground, int(figures["pass_id"]))
+        assert import_archive(ground, out / "pass") == figures["pass_id"]
+        assert pass_summary(ground, int(figures["pass_id"])) == before
+
+
+def test_the_same_scenario_gives_the_same_octets(demo, scenario_file: Path, tmp_path: Path) -> None:
+    _, out = demo
+    assert cli.run(["emulate", str(scenario_file), "--out", str(tmp_path / "again"), "--json"]) == 0
+    for name in ("downlink.cadu", "reference.oem", "catalogue.csv"):
+        assert (tmp_path / "again" / name).read_bytes() == (out / "pass" / name).read_bytes(), name
+
+
+def test_an_archive_is_not_written_over_something_else(scenario_file: Path, tmp_path: Path, capsys) -> None:
+    (tmp_path / "precious.txt").write_text("do not touch")
+    assert cli.run(["emulate", str(scenario_file), "--out", str(tmp_path)]) == 2
+    assert "expected a new folder or an earlier pass archive" in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["precious.txt"]
