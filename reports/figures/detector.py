@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from reports.figures.canvas import Canvas
+from reports.figures.canvas import Canvas, spread
 from reports.figures.theme import color
 from reports.published import TABLE_II
 from reports.values import (
@@ -105,16 +105,24 @@ def draw_bins(canvas: Canvas, parts: Sequence[tuple[str, Sequence[BinScore]]]) -
             ("precision", np.array([b.precision for b in bins]), "gray1", "s"),
             ("recall", np.array([b.recall for b in bins]), "blue", "o"),
         )
+        ends: list[tuple[float, str, str]] = []
         for name, value, role, marker in lines:
             axes.plot(centre, value, color=color(role), marker=marker, markersize=canvas.pt(4.5))
-            finite = np.flatnonzero(np.isfinite(value))
+            finite = value[np.isfinite(value)]
             if i == len(parts) - 1 and len(finite):
-                axes.annotate(
-                    name, (1.0, float(value[finite[-1]])), xycoords=("axes fraction", "data"),
-                    xytext=(canvas.pt(6), 0), textcoords="offset points", va="center_baseline", color=color(role),
-                    fontsize="small",
-                )  # fmt: skip
+                ends.append((float(finite[-1]), name, role))
         axes.set_ylim(0, 1.02)
+        ends.sort()
+        for place, (_, name, role) in zip(spread([e[0] for e in ends], 0.17 / height), ends, strict=True):
+            axes.text(
+                1.0 + 0.09 / width,
+                place,
+                name,
+                transform=axes.get_yaxis_transform(),
+                va="center_baseline",
+                color=color(role),
+                fontsize="small",
+            )
         axes.set_xlabel(label)
         axes.set_title("share of the expected craters" if i == 0 else "")
 

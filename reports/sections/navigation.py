@@ -65,7 +65,8 @@ def _arc_table(view: PassView) -> Table:
         error = error_3d_m(one.error_rtn_m)
         lit = inside(one.utc_ns, view.report.imaging_arcs)
         first = True
-        for name, mask in (("imaging", lit), ("between", ~lit)):
+        arcs = (("imaging", lit), ("between", ~lit)) if view.report.imaging_arcs else (("whole", ~lit),)
+        for name, mask in arcs:
             finite = mask & np.isfinite(error)
             if not finite.any():
                 continue
@@ -92,7 +93,8 @@ def _arc_table(view: PassView) -> Table:
             )
             first = False
     return Table(
-        "The same errors inside imaging arcs and between them.",
+        "The same errors by direction in the reference orbit"
+        f"{', inside imaging arcs and between them' if view.report.imaging_arcs else ''}.",
         (
             Column("solution", numeric=False),
             Column("arc", numeric=False),

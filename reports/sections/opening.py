@@ -57,7 +57,7 @@ def judgement(report: Judged, *, counts_only: bool = False) -> list[Block]:
     """Verdict and figures; figures that only count things stand on no rung of evidence unless one is given."""
     blocks: list[Block] = []
     if report.verdict:
-        blocks.append(Verdict(report.verdict, report.verdict_level))
+        blocks.append(Verdict(report.verdict[0].upper() + report.verdict[1:], report.verdict_level))
     else:
         blocks.append(absent(report, "verdict", "Verdict", "nobody has judged this"))
     if report.headline:

@@ -49,7 +49,7 @@ def ledger(view: PassView) -> list[Block]:
         )
     blocks.append(
         Table(
-            "Reads of the anchor ephemeris by each estimator, and the resets that caused them.",
+            "Reads of the anchor ephemeris by each estimator, and its resets by what triggered them.",
             (
                 Column("estimator", numeric=False),
                 Column("all", group="reads"),
@@ -75,7 +75,7 @@ def ledger(view: PassView) -> list[Block]:
                         utc_text(r.utc_ns).removesuffix(" UTC"),
                         r.estimator,
                         count_text(r.frame_number),
-                        TRIGGERS.get(r.trigger, r.trigger),
+                        TRIGGERS.get(r.trigger, "no reset" if r.trigger == "none" else r.trigger),
                     )
                     for r in report.truth_ledger[:_MOST_READS]
                 ),

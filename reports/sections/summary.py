@@ -69,8 +69,7 @@ def _statistics_table(view: PassView) -> Table:
 
 def error_picture(view: PassView, key: str, height_in: float, time: TimeScale) -> Picture:
     series, arcs = view.with_error, view.report.imaging_arcs
-    known = [(s.name, quantiles(error_3d_m(s.error_rtn_m)[time.inside(s.utc_ns)], (0.5,))[0]) for s in series]
-    best = min((k for k in known if math.isfinite(k[1])), key=lambda k: k[1], default=("none", math.nan))
+    smallest = _smallest_medians(view, time)
     resets = len(navigation.resets_of(view.estimates, time))
     marks = ""
     if resets == 1:
@@ -81,8 +80,24 @@ def error_picture(view: PassView, key: str, height_in: float, time: TimeScale) -
         key,
         f"{'' if time is view.time else 'One hour of it: '}3-D position error of every solution, flown (full "
         "lines) and computed for comparison (gray), on a logarithmic axis. "
-        f"Smallest median: {best[0]}, {length_text(best[1])}.{arc_words(time, arcs)}{marks}",
-        f"Error over time. Smallest median: {best[0]}, {length_text(best[1])}.",
+        f"{smallest}{arc_words(time, arcs)}{marks}",
+        f"Error over time. {smallest}",
         height_in,
         lambda c: navigation.draw_error_over_time(c, series, view.styles, time, arcs),
     )
+
+
+def _smallest_medians(view: PassView, time: TimeScale) -> str:
+    """Words for the best of the flown solutions and the best of the baselines."""
+    parts = []
+    for kind, words in (("estimate", "of those flown"), ("baseline", "of the baselines")):
+        known = [
+            (quantiles(error_3d_m(s.error_rtn_m)[time.inside(s.utc_ns)], (0.5,))[0], s.name)
+            for s in view.with_error
+            if (s.kind == "baseline") == (kind == "baseline")
+        ]
+        finite = [k for k in known if math.isfinite(k[0])]
+        if finite:
+            median, name = min(finite)
+            parts.append(f"{words} {name}, {length_text(median)}")
+    return f"Smallest median: {'; '.join(parts)}." if parts else ""

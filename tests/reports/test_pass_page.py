@@ -122,7 +122,7 @@ def test_an_empty_pass_says_what_is_missing_and_why() -> None:
     page = Page(render_html(PassReport(title="Nothing", pass_id="p0")))
     assert page.left_open == []
     for what, why in (
-        ("Verdict", "nobody has judged this pass"),
+        ("Verdict", "nobody has judged this"),
         ("Navigation", "no navigation telemetry was received"),
         ("Frame accounting", "the frames of the pass were not counted"),
         ("Packet accounting", "no account of the downlink came with the pass"),
@@ -134,6 +134,16 @@ def test_an_empty_pass_says_what_is_missing_and_why() -> None:
         ("Configuration", "none was archived with the pass"),
     ):
         assert f"{what} not available: {why}" in page.text
+
+
+def test_without_imaging_arcs_errors_are_those_of_the_whole_pass() -> None:
+    words = Page(render_html(PassReport("No arcs", "p7", navigation=(_series(30),)))).text
+    table = words[words.index("The same errors by direction in the reference orbit.") :]
+    assert "whole" in table and "imaging arcs and between them" not in words
+
+
+def test_the_caption_tells_the_best_flown_solution_from_the_best_baseline(page: Page) -> None:
+    assert "Smallest median: of those flown anchored, 30.6 m; of the baselines" in page.text
 
 
 def test_a_reason_given_with_the_value_replaces_the_usual_one() -> None:
