@@ -10,14 +10,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lunar._compile import njit
 from lunar._gravity_kernel import acceleration as field_acceleration
 from lunar._gravity_kernel import acceleration_gradient
 
+Float = NDArray[np.float64]
+
 
 @njit(error_model="numpy")
-def _rotation(start, turn, fraction, out):  # type: ignore[no-untyped-def]
+def _rotation(start: Float, turn: Float, fraction: float, out: Float) -> None:
     """Rotation to principal axes at a fraction of the arc: exp(fraction [turn]) start, to third order."""
     a, b, c = turn[0] * fraction, turn[1] * fraction, turn[2] * fraction
     square = a * a + b * b + c * c
@@ -34,7 +37,7 @@ def _rotation(start, turn, fraction, out):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def _tide(x, y, z, body, gm):  # type: ignore[no-untyped-def]
+def _tide(x: float, y: float, z: float, body: Float, gm: float) -> tuple[float, float, float]:
     """Acceleration by a distant body relative to that of the Moon's centre (third-body term)."""
     dx, dy, dz = body[0] - x, body[1] - y, body[2] - z
     near = gm / (dx * dx + dy * dy + dz * dz) ** 1.5
@@ -43,7 +46,9 @@ def _tide(x, y, z, body, gm):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def _field(packed, scratch, rotation, x, y, z):  # type: ignore[no-untyped-def]
+def _field(
+    packed: Float, scratch: Float, rotation: Float, x: float, y: float, z: float
+) -> tuple[float, float, float]:
     """Gravity of the Moon in inertial axes."""
     bx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
     by = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
@@ -57,7 +62,7 @@ def _field(packed, scratch, rotation, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def _axes(state, out):  # type: ignore[no-untyped-def]
+def _axes(state: Float, out: Float) -> None:
     """Columns radial, transverse, normal of the orbit, in inertial axes."""
     r = math.sqrt(state[0] ** 2 + state[1] ** 2 + state[2] ** 2)
     hx = state[1] * state[5] - state[2] * state[4]
@@ -72,10 +77,21 @@ def _axes(state, out):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def _rates(  # type: ignore[no-untyped-def]
-    state, transition, decay, rotation, field, scratch, coarse, bodies, gms,
-    axes, gradient, rate, transition_rate,
-):  # fmt: skip
+def _rates(
+    state: Float,
+    transition: Float,
+    decay: float,
+    rotation: Float,
+    field: Float,
+    scratch: Float,
+    coarse: Float,
+    bodies: Float,
+    gms: Float,
+    axes: Float,
+    gradient: Float,
+    rate: Float,
+    transition_rate: Float,
+) -> None:
     """Time derivatives of state (6) and transition matrix (6, 9); `decay` is that of the empirical acceleration."""
     x, y, z = state[0], state[1], state[2]
     ax, ay, az = _field(field, scratch, rotation, x, y, z)
@@ -107,7 +123,7 @@ def _rates(  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def _advance(step_matrix, matrix, both_sides, work):  # type: ignore[no-untyped-def]
+def _advance(step_matrix: Float, matrix: Float, both_sides: bool, work: Float) -> None:
     """Replace a matrix (9, 9) by step_matrix times it, and by that times the transpose where both sides are asked."""
     for i in range(9):
         for j in range(9):
@@ -126,10 +142,21 @@ def _advance(step_matrix, matrix, both_sides, work):  # type: ignore[no-untyped-
 
 
 @njit(error_model="numpy")
-def propagate_arc(  # type: ignore[no-untyped-def]
-    start, duration_s, steps, start_rotation, turn, field, scratch, coarse, bodies, gms,
-    correlation_s, white_psd, markov_sigma,
-):  # fmt: skip
+def propagate_arc(
+    start: Float,
+    duration_s: float,
+    steps: int,
+    start_rotation: Float,
+    turn: Float,
+    field: Float,
+    scratch: Float,
+    coarse: Float,
+    bodies: Float,
+    gms: Float,
+    correlation_s: float,
+    white_psd: Float,
+    markov_sigma: Float,
+) -> tuple[Float, Float, Float]:
     """Return state (9,), transition (9, 9) and process noise (9, 9) at the end of an arc, by fourth-order Runge-Kutta.
 
     Parameters

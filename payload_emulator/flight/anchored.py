@@ -18,7 +18,7 @@ from lunar.frames import rtn_from_inertial
 from payload_emulator.flight import navigation_filter as kalman
 from payload_emulator.flight.acquisition import AcquisitionParameters, acquire
 from payload_emulator.flight.detections import Detections
-from payload_emulator.flight.dynamics import OrbitModel, ProcessNoise
+from payload_emulator.flight.dynamics import OrbitModel, ProcessNoise, process_noise
 from payload_emulator.flight.identification import Identification, IdentificationParameters, identify
 from payload_emulator.flight.navigation_filter import CommonErrors, FilterState, Update
 from payload_emulator.flight.outcomes import Outcome
@@ -62,6 +62,8 @@ class AnchoredParameters:
     ----------
     gravity_degree
         Degree to which the gravity table is used.
+    noise
+        Process noise; None takes the one that goes with the degree.
     detection_sigma_px, detection_sigma_floor_px, detection_sigma_scale
         Sigma per axis of a detection where the detector gives none; smallest believed; factor on what it gives.
     detection_persistence
@@ -77,7 +79,7 @@ class AnchoredParameters:
     """
 
     gravity_degree: int = 100
-    noise: ProcessNoise = field(default_factory=ProcessNoise)
+    noise: ProcessNoise | None = None
     errors: CommonErrors = field(default_factory=CommonErrors)
     identification: IdentificationParameters = field(default_factory=IdentificationParameters)
     acquisition: AcquisitionParameters = field(default_factory=AcquisitionParameters)
@@ -152,14 +154,16 @@ class AnchoredNavigator:
     ) -> None:
         self.parameters = parameters
         self.landmarks: LandmarkMap = landmark_map(catalogue)
-        self.model = OrbitModel(gravity, orientation, parameters.gravity_degree, parameters.noise)
+        degree = min(parameters.gravity_degree, gravity.c_bar.shape[0] - 1)
+        noise = process_noise(degree) if parameters.noise is None else parameters.noise
+        self.model = OrbitModel(gravity, orientation, degree, noise)
         self.state: FilterState = kalman.initial_filter_state(
             initial_state.ticks,
             initial_state.position_icrf_m,
             initial_state.velocity_icrf_m_s,
             initial_state.sigma_position_m,
             initial_state.sigma_velocity_m_s,
-            parameters.noise.markov_sigma_m_s2,
+            noise.markov_sigma_m_s2,
             parameters.errors,
         )
         self.last_fix: Fix | None = None

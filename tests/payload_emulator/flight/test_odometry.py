@@ -94,7 +94,7 @@ def test_every_use_of_the_anchor_ephemeris_is_counted(moon: Any) -> None:
 def test_the_planar_system_recovers_an_exact_planar_motion() -> None:
     # Ten points of a plane seen from h = 30 km and, moved (0.3, 24.5, 0.2) km, from h + 0.2 km.
     rng = np.random.default_rng(4)
-    ground = rng.uniform(-25e3, 25e3, (10, 2)) + [0.0, 12e3]
+    ground = rng.uniform(-25e3, 25e3, (10, 2)) + np.array([0.0, 12e3])
     h, move = 30_000.0, np.array([300.0, 24_500.0, 200.0])
     features = []
     for shift, altitude in ((np.zeros(2), h), (move[:2], h + move[2])):
@@ -248,7 +248,7 @@ def test_a_manual_step_and_a_clock_that_runs_backwards_both_reset(moon: Any) -> 
     assert (manual.outcome, manual.reset_trigger) == (Outcome.anchored, ResetTrigger.manual_step)
     backwards = stream.frame(wait_s=-45.0)
     assert (backwards.outcome, backwards.reset_trigger) == (Outcome.anchored, ResetTrigger.time_gap)
-    latitude, longitude, altitude = moon.place(moon.orbit([stream.second])[0])
+    latitude, _, altitude = moon.place(moon.orbit([stream.second])[0])
     assert stream.state is not None
     # The anchor table interpolates 30 s nodes; one tick of time is 0.03 m of motion.
     assert stream.state.latitude_rad * moon.radius_m == pytest.approx(latitude * moon.radius_m, abs=0.05)

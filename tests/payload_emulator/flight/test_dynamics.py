@@ -1,0 +1,91 @@
+"""The on-board orbit model against the library's integrator, and its transition matrix against differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lunar.elements import Elements, icrf_state_from_elements
+from lunar.frames import IauOrientation
+from lunar.gravity import builtin_gravity
+from lunar.propagation import ForceModel, propagate
+from lunar.timescales import parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns, utc_ns_from_ticks
+from payload_emulator.flight.dynamics import OrbitModel, ProcessNoise, process_noise
+from payload_emulator.flight.tables import GravityTable, OrientationTable, pack_orientation_table
+from payload_emulator.flight.tables import unpack_orientation_table as unpack
+
+EPOCH = parse_utc("2029-08-07T00:00:00Z")
+START = int(ticks_from_utc_ns(EPOCH))
+MOON = IauOrientation()
+
+
+def orientation_table() -> OrientationTable:
+    ticks = START + np.arange(-5, 8) * 7_200 * 65_536
+    tdb_s = np.array([float(tdb_s_from_utc_ns(int(utc_ns_from_ticks(int(tick))))) for tick in ticks])
+    rotations = MOON.mcmf_from_icrf(tdb_s)
+    return unpack(pack_orientation_table(ticks, rotations, MOON.pa_from_icrf(tdb_s[0]) @ rotations[0].T))
+
+
+def model(noise: ProcessNoise | None = None) -> OrbitModel:
+    field = builtin_gravity()
+    table = GravityTable(field.name, field.gm_m3_s2, field.radius_m, field.c_bar, field.s_bar)
+    return OrbitModel(table, orientation_table(), 12, noise or ProcessNoise())
+
+
+def start_state() -> np.ndarray:
+    position, velocity = icrf_state_from_elements(
+        Elements(1_768_180.0, 0.006908, *np.radians([89.076, 3.164, 333.604, 8.882])),
+        float(tdb_s_from_utc_ns(EPOCH)),
+        builtin_gravity().gm_m3_s2,
+    )
+    return np.concatenate([position, velocity, np.zeros(3)])
+
+
+def test_an_orbit_on_board_is_that_of_the_library_to_a_centimetre_after_an_hour() -> None:
+    state, epoch_s = start_state(), float(tdb_s_from_utc_ns(EPOCH))
+    predicted = model().propagate(state, START, START + 3_600 * 65_536)
+    expected = propagate(epoch_s, state[:3], state[3:6], 3_700.0, ForceModel(builtin_gravity(), MOON)).state(
+        epoch_s + 3_600.0
+    )
+    assert predicted is not None
+    np.testing.assert_allclose(predicted.state[:3], expected[:3], atol=0.01)
+    np.testing.assert_allclose(predicted.state[3:6], expected[3:], atol=1e-5)
+
+
+def test_going_forth_and_back_ends_where_it_began() -> None:
+    orbit, state = model(), start_state()
+    there = orbit.propagate(state, START, START + 1_800 * 65_536)
+    assert there is not None
+    back = orbit.propagate(there.state, START + 1_800 * 65_536, START)
+    assert back is not None
+    np.testing.assert_allclose(back.state[:6], state[:6], atol=1e-3)
+
+
+@pytest.mark.parametrize("axis, step", [(0, 10.0), (2, 10.0), (4, 0.01), (6, 1e-6), (8, 1e-6)])
+def test_the_transition_matrix_is_the_derivative_of_the_motion(axis: int, step: float) -> None:
+    orbit, state, change = model(), start_state(), np.zeros(9)
+    change[axis] = step
+    until = START + 900 * 65_536
+    ahead, here, behind = (orbit.propagate(state + k * change, START, until) for k in (1.0, 0.0, -1.0))
+    assert ahead is not None and here is not None and behind is not None
+    difference = (ahead.state - behind.state) / (2.0 * step)
+    column = here.transition[:, axis]
+    np.testing.assert_allclose(column[:3], difference[:3], atol=2e-3 * np.linalg.norm(difference[:3]))
+    np.testing.assert_allclose(column[3:6], difference[3:6], atol=2e-3 * np.linalg.norm(difference[3:6]))
+
+
+def test_white_acceleration_grows_velocity_variance_with_time() -> None:
+    noise = ProcessNoise((1e-6, 1e-6, 1e-6), (1e-12, 1e-12, 1e-12), 900.0)
+    predicted = model(noise).propagate(start_state(), START, START + 60 * 65_536)
+    assert predicted is not None
+    # Over a minute gravity gradient changes this by (60 s x 0.9e-3 rad/s)^2, three parts in a thousand.
+    np.testing.assert_allclose(np.diag(predicted.noise)[3:6], 60.0 * 1e-6, rtol=0.01)
+
+
+def test_outside_the_orientation_table_there_is_no_prediction() -> None:
+    assert model().propagate(start_state(), START, START + 40 * 86_400 * 65_536) is None
+
+
+def test_less_gravity_on_board_means_more_process_noise() -> None:
+    densities = [process_noise(degree).white_psd_m2_s3[0] for degree in (8, 20, 50, 70, 100)]
+    assert densities == sorted(densities, reverse=True)

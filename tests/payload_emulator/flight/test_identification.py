@@ -1,0 +1,92 @@
+"""How many agreeing pairs a set needs, and what a set may hold."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from payload_emulator.flight.detections import Detections
+from payload_emulator.flight.identification import IdentificationParameters, identify, minimum_members
+from payload_emulator.flight.sighting import Sighting
+
+
+def poisson_at_least(mean: float, count: int) -> float:
+    return 1.0 - sum(math.exp(-mean) * mean**k / math.factorial(k) for k in range(count))
+
+
+@pytest.mark.parametrize("loose", [0.01, 0.5, 20.0, 1e4])
+@pytest.mark.parametrize("tight", [0.001, 0.05, 0.5])
+@pytest.mark.parametrize("limit", [0.03, 1e-5])
+def test_the_minimum_is_the_smallest_set_that_chance_makes_less_often_than_the_limit(
+    loose: float, tight: float, limit: float
+) -> None:
+    members = minimum_members(loose, tight, limit)
+    assert loose * poisson_at_least(tight, members - 1) < limit
+    if members > 1:
+        assert loose * poisson_at_least(tight, members - 2) >= limit
+
+
+def sighting(uv: np.ndarray) -> Sighting:
+    count = len(uv)
+    nothing = np.zeros((count, 2, 3))
+    return Sighting(np.arange(count), uv, np.full(count, 30.0), nothing, nothing, nothing)
+
+
+def found(uv: np.ndarray, diameter: float = 30.0) -> Detections:
+    count = len(uv)
+    return Detections(uv[:, 0], uv[:, 1], np.full(count, diameter), np.ones(count), np.ones(count))
+
+
+def common_shift(count: int, sigma_px: float) -> np.ndarray:
+    """Covariance of predicted places that all err by the same shift."""
+    return np.einsum("ab,jk->jakb", np.eye(2), np.full((count, count), sigma_px**2))
+
+
+def run(detected: Detections, craters: Sighting, sigma_px: float) -> list[tuple[int, int]]:
+    count = len(craters)
+    result = identify(
+        detected,
+        craters,
+        common_shift(count, sigma_px),
+        np.zeros((count, 2, 2)) + 0.25 * np.eye(2),
+        np.ones(len(detected)),
+        512.0 * 512.0,
+        IdentificationParameters(),
+    )
+    pairs = list(zip(result.detection.tolist(), result.sighted.tolist(), strict=True))
+    return sorted(pairs) if result.believed else []
+
+
+def test_a_shift_larger_than_the_spacing_of_craters_is_found_by_their_agreement() -> None:
+    rng = np.random.default_rng(2)
+    places = rng.uniform(60.0, 450.0, (15, 2))
+    shifted = places + np.array([22.0, -17.0]) + rng.normal(0.0, 0.8, (15, 2))
+    clutter = rng.uniform(0.0, 511.0, (4, 2))
+    pairs = run(found(np.concatenate([shifted, clutter])), sighting(places), sigma_px=15.0)
+    assert {(k, k) for k in range(15)} == {pair for pair in pairs if pair[0] < 15}
+
+
+def test_one_crater_is_enough_where_the_prediction_is_good_and_not_where_it_is_bad() -> None:
+    places = np.random.default_rng(3).uniform(20.0, 490.0, (30, 2))
+    lone = found(places[:1] + 0.5)
+    assert run(lone, sighting(places), sigma_px=0.5) == [(0, 0)]
+    assert run(lone, sighting(places), sigma_px=60.0) == []
+
+
+def test_a_crater_of_another_size_is_no_match() -> None:
+    places = np.array([[100.0, 100.0], [300.0, 200.0]])
+    assert run(found(places, diameter=60.0), sighting(places), sigma_px=1.0) == []
+
+
+def test_each_detection_and_each_crater_is_used_once() -> None:
+    places = np.array([[100.0, 100.0], [102.0, 101.0], [300.0, 300.0]])
+    pairs = run(found(np.concatenate([places, places[:1] + 0.4])), sighting(places), sigma_px=1.0)
+    assert len({i for i, _ in pairs}) == len(pairs) == len({j for _, j in pairs})
+
+
+def test_no_detections_and_no_craters_make_no_set() -> None:
+    nothing = np.empty((0, 2))
+    assert run(found(nothing), sighting(np.array([[5.0, 5.0]])), 1.0) == []
+    assert run(found(np.array([[5.0, 5.0]])), sighting(nothing), 1.0) == []
