@@ -80,9 +80,9 @@ def load_network(path: Path) -> tuple[Any, dict[str, Any]]:
 def calibrate(network: Any, datasets: Sequence[Dataset], limit: int = 400) -> Calibration:
     """Thresholds and constant corrections from the validation split, on real terrain where there is any.
 
-    Thresholds: greatest strict F0.5 (on board) and F1, and the precision that navigation
-    may want. Corrections, each a median over matched craters: offset of the centre in the Sun-up image (walls in shadow draw it toward the Sun), logarithm of the
-    diameter, and the scale of sigma that puts 68.3 % of the errors within one.
+    Thresholds: greatest strict F0.5 (on board) and F1, and the precision that navigation may want. Corrections, each a
+    median over matched craters: offset of the centre in the Sun-up image (walls in shadow draw it toward the Sun),
+    logarithm of the diameter, and the scale of sigma that puts 68.3 % of the errors within one.
     """
     every = [(d, f) for d in datasets for f in d.frames("val")]
     if not every:
