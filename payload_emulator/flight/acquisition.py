@@ -26,6 +26,9 @@ Index = NDArray[np.int64]
 # The ground falls away from a plane: towards the edges of the image depth exceeds altitude by up to a tenth.
 _SAG = 0.05
 
+SEARCHABLE_DETECTIONS = 3
+"""Fewer detections than this can fix no place and altitude beyond what chance gives."""
+
 
 @dataclass(frozen=True, slots=True)
 class AcquisitionParameters:
@@ -91,7 +94,7 @@ def acquire(
     sigma_px
         Standard deviation of each detection.
     """
-    if len(found) < 3:
+    if len(found) < SEARCHABLE_DETECTIONS:
         return None
     votes = _Votes.of(found, landmarks, pose, camera, sigma_m, parameters)
     if votes is None:

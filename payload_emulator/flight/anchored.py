@@ -16,7 +16,7 @@ from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import rtn_from_inertial
 from payload_emulator.flight import navigation_filter as kalman
-from payload_emulator.flight.acquisition import AcquisitionParameters, acquire
+from payload_emulator.flight.acquisition import SEARCHABLE_DETECTIONS, AcquisitionParameters, acquire
 from payload_emulator.flight.detections import Detections
 from payload_emulator.flight.dynamics import OrbitModel, ProcessNoise, process_noise
 from payload_emulator.flight.identification import Identification, IdentificationParameters, identify
@@ -224,7 +224,9 @@ class AnchoredNavigator:
         if sigma_m > self.parameters.tracking_limit_m:
             expected = len(in_view(self.landmarks, pose, self._camera, 0.0))
             fix = self._acquired(prior, pose, found, sigma_m)
-            return fix, 0 if fix is None else fix.identification.candidates, expected
+            # A search that found no safe place is a fix refused, and counts the detections it was tried with.
+            tried = len(found) if len(found) >= SEARCHABLE_DETECTIONS else 0
+            return fix, tried if fix is None else fix.identification.candidates, expected
         altitude_m = float(np.linalg.norm(prior.mean[:3])) - MOON_RADIUS_M
         margin_px = min(3.5 * sigma_m / max(altitude_m, 1_000.0) * self._camera.focal_px, 200.0)
         sighting = in_view(self.landmarks, pose, self._camera, margin_px)

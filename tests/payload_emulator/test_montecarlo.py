@@ -126,6 +126,9 @@ def test_false_detections_alone_give_no_fix(navigation_case: Any) -> None:
         )
         run = fly(case, 7)
         assert np.count_nonzero(run.fixed) <= 2
+        assert set(run.outcome.tolist()) <= {Outcome.fixed, Outcome.coasted, Outcome.refused}
+    # The wide search was tried, found nothing safe, and says so.
+    assert Outcome.refused in run.outcome.tolist()
 
 
 def test_the_same_seed_gives_the_same_run_on_any_number_of_processes(navigation_case: Any) -> None:
