@@ -562,7 +562,7 @@ def _verdict(
     loss = "All packets arrived." if inputs.packets.lost == 0 else f"{inputs.packets.lost} packets were lost."
     if best is None:
         return f"No position estimate could be compared with a reference. {loss}", "bad"
-    figure = f"{best.name} navigation held a median 3-D error of {_length(best.statistics.median_3d_m)}"
+    figure = f"{best.name.capitalize()} navigation held a median 3-D error of {_length(best.statistics.median_3d_m)}"
     if only is None:
         return f"{figure}; there is no propagate-only baseline to judge it by. {loss}", "caution"
     baseline = _length(only.statistics.median_3d_m)
