@@ -38,7 +38,8 @@ class CommonErrors:
     attitude_bias_rad, attitude_correlation_s
         Slow part: alignment, thermal bending.
     pixel_bias_px, pixel_correlation_s
-        Shift of all detections of a frame, as an uneven response to slanting light causes.
+        Shift of all detections of a frame, as an uneven response to slanting light causes: a few tenths of a
+        pixel, for as long as the light stays. Innovations cannot show it; left out, the filter claims too much.
     catalogue_offset_m
         Shift of the whole catalogue, east, north, up; it does not change.
     """
@@ -46,8 +47,8 @@ class CommonErrors:
     attitude_noise_rad: float = float(np.radians(0.01))
     attitude_bias_rad: float = float(np.radians(0.01))
     attitude_correlation_s: float = 3_600.0
-    pixel_bias_px: float = 0.1
-    pixel_correlation_s: float = 600.0
+    pixel_bias_px: float = 0.25
+    pixel_correlation_s: float = 3_600.0
     catalogue_offset_m: tuple[float, float, float] = (15.0, 15.0, 10.0)
 
 
