@@ -36,11 +36,12 @@ h1{margin:0 0 .5rem;font-size:2.15rem;line-height:1.15;font-weight:650;letter-sp
 .headline>div:first-child{border-left:0;padding-left:0}
 .headline dt{min-height:2.6em;font-size:.86rem;line-height:1.3;color:var(--f-muted)}
 .headline dd{margin:0}
-.headline .number{margin:.1rem 0 .1rem;font-size:2.05rem;line-height:1.2;font-weight:600;letter-spacing:-.02em;
+.headline .number{display:flex;flex-wrap:wrap;align-items:baseline;column-gap:.3rem;
+ margin:.1rem 0 .1rem;font-size:2.05rem;line-height:1.2;font-weight:600;letter-spacing:-.02em;
  font-variant-numeric:tabular-nums lining-nums}
 .headline .number.words{font-size:1.15rem;letter-spacing:0;white-space:normal;padding:.45rem 0 .4rem}
-.headline .number small{display:inline-block;margin-left:.3em;white-space:nowrap;
- font-size:.95rem;font-weight:450;letter-spacing:0;color:var(--f-muted)}
+.headline .number small{white-space:nowrap;line-height:1.3;font-size:.95rem;font-weight:450;
+ letter-spacing:0;color:var(--f-muted)}
 .headline .note{font-size:.8rem;line-height:1.35;color:var(--f-muted)}
 .headline .rung{margin-top:auto;padding-top:.5rem;font-size:.76rem;color:var(--f-muted)}
 .rung i{display:inline-block;width:.62em;height:.62em;margin-right:.16em;border:1px solid var(--f-gray2);

@@ -220,7 +220,7 @@ def log_length_axis(axes: Axes, which: str, values: Sequence[NDArray[np.float64]
     medians = [float(np.median(v)) for v in positive]
     low = max(min(float(np.quantile(v, 0.02)) for v in positive), min(medians) / 10.0)
     high = max(float(v.max()) for v in positive)
-    bottom = 10.0 ** math.floor(math.log10(max(low, 1e-2)) + 0.2)
+    bottom = 10.0 ** math.floor(math.log10(max(low, 1e-2)) + 0.05)
     top = 10.0 ** math.ceil(math.log10(max(high * 1.05, bottom * 10)))
     decades = np.arange(round(math.log10(bottom)), round(math.log10(top)) + 1)
     every = 1 if len(decades) <= 8 else 2

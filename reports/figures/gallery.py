@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 # On top of gray photographs in every theme, so these are not roles.
 CLASS_TINTS = {0: "#5cd6ff", 1: "#ffd23f", 2: "#ff8ad0", 3: "#d7dde4"}
 FALSE_TINT = "#ff5a36"
+SMALL_TINT = "#b9c1cb"
+SCORED_CLASSES = (0, 1, 2)
 _NO_CLASS_TINT = "#ffffff"
+_LETTER_IN = 0.052
 
 
 def draw_gallery(canvas: Canvas, frames: Sequence[GalleryFrame], columns: int) -> None:
@@ -38,9 +41,20 @@ def draw_gallery(canvas: Canvas, frames: Sequence[GalleryFrame], columns: int) -
             title += f" · {utc_text(frame.utc_ns, date=False)}"
         canvas.text(left, top - 0.15, title, va="center_baseline", fontsize="small", weight="bold")
         canvas.text(
-            left, top - 0.33, frame.caption, va="center_baseline", fontsize="x-small", color=color("muted")
+            left,
+            top - 0.33,
+            _fitted(frame.caption, size),
+            va="center_baseline",
+            fontsize="x-small",
+            color=color("muted"),
         )
         _draw_frame(canvas, sheet, left, top - head - size, size, frame)
+
+
+def _fitted(caption: str, width_in: float) -> str:
+    """A caption cut to the width of its frame."""
+    most = int(width_in / _LETTER_IN)
+    return caption if len(caption) <= most else f"{caption[: most - 1].rstrip()}…"
 
 
 def gallery_height_in(count: int, columns: int, width_in: float) -> float:
@@ -84,16 +98,28 @@ def _draw_frame(
                     *circles, color=tint_of(int(size_class)), linestyle=dashes[lost], linewidth=canvas.pt(1.3)
                 )
                 line.set_clip_path(border)
-    tints = np.where(
-        false, FALSE_TINT, np.array([tint_of(int(c)) for c in frame.detection_class], dtype=object)
-    )
-    crosses = _crosses(x(frame.detection_u_px), y(frame.detection_v_px), 0.045)
-    if len(tints):
-        sheet.plot(*_joined(crosses), color="#0b0e12", linewidth=canvas.pt(2.7), solid_capstyle="butt")
-    for tint in sorted(set(tints.tolist())):
-        sheet.plot(
-            *_joined(crosses[tints == tint]), color=tint, linewidth=canvas.pt(1.3), solid_capstyle="butt"
+    scored = np.isin(frame.detection_class, SCORED_CLASSES)
+    found = ~false | scored
+    tints = np.array([tint_of(int(c)) for c in frame.detection_class], dtype=object)
+    tints = np.where(false, FALSE_TINT, tints)
+    u, v = x(frame.detection_u_px), y(frame.detection_v_px)
+    crosses = _crosses(u, v, 0.045)
+
+    def strokes(chosen: BoolArray, tint: str, wide: float) -> None:
+        (line,) = sheet.plot(
+            *_joined(crosses[chosen]), color=tint, linewidth=canvas.pt(wide), solid_capstyle="butt"
         )
+        line.set_clip_path(border)
+
+    if (~found).any():
+        (dots,) = sheet.plot(
+            u[~found], v[~found], ".", color=SMALL_TINT, markersize=canvas.pt(2.6), markeredgewidth=0
+        )
+        dots.set_clip_path(border)
+    if found.any():
+        strokes(found, "#0b0e12", 2.7)
+    for tint in sorted(set(tints[found].tolist())):
+        strokes(found & (tints == tint), tint, 1.3)
 
 
 def tint_of(size_class: int) -> str:

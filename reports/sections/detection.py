@@ -52,8 +52,8 @@ def detector_table(score: DetectorScore) -> Table:
             Column("paper", group="localisation, px"),
         ),
         tuple(rows),
-        note=f"{score.method} The paper's figures are for its own synthetic test set: a mark to compare with, not the "
-        "same experiment.".strip(),
+        note=f"{_sentence(score.method)}The paper's figures are for its own synthetic test set: a mark to "
+        "compare with, not the same experiment.",
     )
 
 
@@ -154,14 +154,21 @@ def detector_section(view: PassView) -> list[Block]:
     )
 
 
+def _sentence(text: str) -> str:
+    """A text as a sentence before another, whether or not it was written as one."""
+    text = text.strip()
+    if not text:
+        return ""
+    return f"{text[0].upper()}{text[1:]}{'' if text.endswith('.') else '.'} "
+
+
 def gallery_picture(key: str, frames: tuple[GalleryFrame, ...], columns: int, lead: str) -> Picture:
     """A sheet of frames with the key to its marks in the caption."""
     return Picture(
         key,
-        f"{lead} Crosses: detections (colour of their class; vermillion: no crater of the catalogue). Dashed "
-        "circles: craters of the "
-        "catalogue at their own size; dotted: not detected. Cyan: 5–10 km, yellow: 10–15 km, pink: 15–30 km, "
-        "gray: smaller.",
+        f"{lead} Crosses: detections in the colour of their class; vermillion: of 5–30 km with no crater of the "
+        "catalogue; gray dots: other sizes, not matched and not scored. Dashed circles: craters of the catalogue at "
+        "their own size; dotted: not detected. Cyan: 5–10 km, yellow: 10–15 km, pink: 15–30 km, gray: smaller.",
         f"{len(frames)} image frames with detections and catalogue craters.",
         gallery.gallery_height_in(len(frames), columns, WIDTH_IN),
         lambda c: gallery.draw_gallery(c, frames, columns),
@@ -183,7 +190,10 @@ def galleries(view: PassView) -> list[Block]:
         worst = report.worst_frames[:10]
         blocks.append(
             gallery_picture(
-                "worst", worst, 5, f"The worst {len(worst)} frames, chosen by number, not by hand."
+                "worst",
+                worst,
+                5 if len(worst) > 4 else 4,
+                f"The worst {len(worst)} frames, chosen by number, not by hand.",
             )
         )
     return blocks

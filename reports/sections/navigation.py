@@ -240,6 +240,7 @@ def consistency_section(view: PassView) -> list[Block]:
             one.nees is not None
             and np.isfinite(one.nees).any()
             and one.nis is not None
+            and one.nis_dof is not None
             and np.isfinite(one.nis).any()
         )
         blocks.append(

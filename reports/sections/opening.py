@@ -95,7 +95,8 @@ def provenance_and_data(report: Judged) -> list[Block]:
     if rung_number(report.evidence_rung) is not None:
         blocks.append(
             Paragraph(
-                f"The accuracy figures stand on {rung_text(report.evidence_rung)}. A figure on a lower rung says less "
+                f"The accuracy figures stand on {rung_text(report.evidence_rung)}. A figure on a lower rung "
+                "says less "
                 "about flight than one on a higher rung, and is not to be quoted without its rung."
             )
         )

@@ -24,10 +24,13 @@ def ground_track(view: PassView) -> list[Block]:
     chosen = _middle_arc(view)
     several = len(arcs) > 1
     under = f" over {report.terrain.source}" if report.terrain is not None and report.terrain.source else ""
+    imaging = (
+        "Vermillion: imaging; thin: between imaging arcs" if arcs else "Vermillion: the track of the pass"
+    )
     blocks.append(
         Picture(
             "globe",
-            f"Ground track of the reference on the whole Moon{under}. Vermillion: imaging; thin: between imaging arcs"
+            f"Ground track of the reference on the whole Moon{under}. {imaging}"
             f"{'; blue: the arc of the next figure' if several else ''}.",
             "Map of the Moon with the ground track.",
             4.6 if several else 3.2,

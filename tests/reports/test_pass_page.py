@@ -146,6 +146,22 @@ def test_the_caption_tells_the_best_flown_solution_from_the_best_baseline(page: 
     assert "Smallest median: of those flown anchored, 30.6 m; of the baselines" in page.text
 
 
+def test_only_false_alarms_of_the_scored_classes_are_marked_as_false(whole_pass: PassReport) -> None:
+    from reports.figures.gallery import FALSE_TINT, draw_gallery
+    from reports.figures.svg import draw_svg
+
+    frame = whole_pass.gallery[0]
+    nothing = np.zeros(len(frame.detection_u_px), np.bool_)
+
+    def marks(size_class: int) -> int:
+        classes = np.full(len(nothing), size_class, np.int64)
+        shown = dataclasses.replace(frame, detection_matched=nothing, detection_class=classes)
+        return draw_svg("g", 3.0, 3.5, lambda c: draw_gallery(c, (shown,), 1), "one frame").count(FALSE_TINT)
+
+    assert marks(0) == 1, "one compound path holds all crosses of a colour"
+    assert marks(3) == 0
+
+
 def test_a_reason_given_with_the_value_replaces_the_usual_one() -> None:
     report = PassReport(
         title="No images", pass_id="p1", not_available={"gallery": "images were not asked for in this window"}
