@@ -160,7 +160,7 @@ def block_peaks(heights: Any) -> Any:
     return peaks
 
 
-@njit(fastmath=True, error_model="numpy", inline="always")
+@njit(fastmath=True, error_model="numpy", nogil=True)
 def _clearance(heights: Any, i: Any, j: Any, z: Any) -> Any:
     """How far a point lies above the ground, bilinear."""
     a = np.uint64(i)
@@ -324,22 +324,16 @@ def trace_pixels(
                     nearer = same if inner[same] < inner[toward] else toward
                     work[n_k] = inner[nearer]
                     work[n_k + LINE] = inner_z[nearer]
-            if upright:
-                ax = tangent_from_camera[0, 0] / focal
-                ay = tangent_from_camera[1, 0] / focal
-                az = tangent_from_camera[2, 0] / focal
-                b = (main - centre_v) / focal
-                bx = tangent_from_camera[0, 1] * b + tangent_from_camera[0, 2] - ax * centre_u
-                by = tangent_from_camera[1, 1] * b + tangent_from_camera[1, 2] - ay * centre_u
-                bz = tangent_from_camera[2, 1] * b + tangent_from_camera[2, 2] - az * centre_u
-            else:
-                ax = tangent_from_camera[0, 1] / focal
-                ay = tangent_from_camera[1, 1] / focal
-                az = tangent_from_camera[2, 1] / focal
-                b = (main - centre_u) / focal
-                bx = tangent_from_camera[0, 0] * b + tangent_from_camera[0, 2] - ax * centre_v
-                by = tangent_from_camera[1, 0] * b + tangent_from_camera[1, 2] - ay * centre_v
-                bz = tangent_from_camera[2, 0] * b + tangent_from_camera[2, 2] - az * centre_v
+            # The line runs along u in upright sectors, along v in the others.
+            run = 0 if upright else 1
+            ax = tangent_from_camera[0, run] / focal
+            ay = tangent_from_camera[1, run] / focal
+            az = tangent_from_camera[2, run] / focal
+            start = centre_u if upright else centre_v
+            b = (main - (centre_v if upright else centre_u)) / focal
+            bx = tangent_from_camera[0, 1 - run] * b + tangent_from_camera[0, 2] - ax * start
+            by = tangent_from_camera[1, 1 - run] * b + tangent_from_camera[1, 2] - ay * start
+            bz = tangent_from_camera[2, 1 - run] * b + tangent_from_camera[2, 2] - az * start
             fax = np.float32(ax * inverse)
             fay = np.float32(ay * inverse)
             faz = np.float32(az)
@@ -445,11 +439,15 @@ def _search(
         stop = min(stop, (columns - 2.001 - j0) / dj)
     elif dj < -1.0e-12:
         stop = min(stop, (1.001 - j0) / dj)
-    t = -2.0
-    if first > start and first < stop:
-        t = find_hit(heights, peaks, i0, j0, altitude, di, dj, dz, first, stop)
-    if t == -2.0 and start < stop:
-        t = find_hit(heights, peaks, i0, j0, altitude, di, dj, dz, start, stop)
+    t = -1.0
+    # From `first`; should that be under ground, from the top.
+    begin = first if start < first < stop else start
+    for _ in range(2):
+        if begin < stop:
+            t = find_hit(heights, peaks, i0, j0, altitude, di, dj, dz, begin, stop)
+        if t != -2.0:
+            break
+        begin = start
     return t if t > 0.0 else -1.0
 
 

@@ -90,7 +90,7 @@ def add_noise(
             out[i, j] += gain[i, j] * scale * (low + wz * (high - low))
 
 
-@njit(fastmath=True, inline="always")
+@njit(fastmath=True, nogil=True)
 def _corner(h: Any, dx: Any, dy: Any, dz: Any) -> Any:
     """Dot product of a corner's hashed gradient with the way from it; 2.2 makes the rms of the noise about one."""
     h = _mixed(h)
