@@ -72,6 +72,7 @@ WORST_MINIMUM_EXPECTED = 3
 RESETS = ("initialization", "time_gap", "manual_step", "safety_timeout")
 
 
+PERFECT_START = "propagate-only, perfect start"
 PERFECT_START_M = 1.0
 """A start state this close to the reference is as good as the reference: no baseline of its own."""
 
@@ -334,7 +335,7 @@ def _baselines(
         runs.append((f"propagate-only, {other.name}", start, other, min(BASELINE_DEGREE, other.degree)))
     perfect = StartState(int(here.utc_ns[0]), here.position_icrf_m[0], here.velocity_icrf_m_s[0])
     if _apart_m(start, perfect) > PERFECT_START_M:
-        runs.append(("propagate-only, perfect start", perfect, gravity, runs[0][3]))
+        runs.append((PERFECT_START, perfect, gravity, runs[0][3]))
     for name, begin, field_used, degree in (*runs, ("Kepler", start, gravity, 0)):
         position = propagated_positions(
             begin, here.utc_ns, field_used, degree, inputs.orientation, third_bodies=degree > 0
@@ -566,6 +567,9 @@ def _verdict(
     if only is None:
         return f"{figure}; there is no propagate-only baseline to judge it by. {loss}", "caution"
     baseline = _length(only.statistics.median_3d_m)
+    perfect = next((s for s in navigation if s.name == PERFECT_START), None)
+    if perfect is not None:
+        baseline += f"; {_length(perfect.statistics.median_3d_m)} from a perfect start"
     if best.statistics.median_3d_m < only.statistics.median_3d_m:
         level = "good" if inputs.packets.lost == 0 else "caution"
         return (
