@@ -166,6 +166,25 @@ def project_craters(
     )
 
 
+def project_as_the_paper(
+    catalogue: CraterCatalogue, camera: PinholeCamera, position_mcmf_m: npt.ArrayLike
+) -> tuple[Floats, Floats, Floats]:
+    """Pixel coordinates u, v and diameters (n) by the paper's local equirectangular map on a smooth sphere.
+
+    For a nadir camera with image up to the north: no relief, no curvature, one scale for the whole picture.  Kept to
+    measure what those simplifications cost; `project_craters` is the exact geometry.
+    """
+    latitude, longitude, altitude = (
+        float(value) for value in spherical_from_mcmf(np.asarray(position_mcmf_m))
+    )
+    turn = 2.0 * math.pi
+    east = (catalogue.longitude_rad - longitude + math.pi) % turn - math.pi
+    scale = camera.focal_px * MOON_RADIUS_M / altitude
+    u = camera.centre_px[0] + scale * math.cos(latitude) * east
+    v = camera.centre_px[1] - scale * (catalogue.latitude_rad - latitude)
+    return u, v, camera.focal_px * catalogue.diameter_m / altitude
+
+
 def _rim_points(catalogue: CraterCatalogue) -> tuple[Floats, Floats]:
     """Centres (n, 3) and rims (n, 24, 3) in MCMF, all points of a rim at rim height."""
     height = np.nan_to_num(catalogue.rim_height_m, nan=0.0)

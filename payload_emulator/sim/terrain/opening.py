@@ -10,16 +10,19 @@ if TYPE_CHECKING:
     from lunar.datafolder import DataFolder
     from payload_emulator.sim.terrain.tiles import TiledTerrain
 
-KINDS = ("auto", "raster", "procedural")
+KINDS = ("auto", "raster", "procedural", "catalogue")
 
 
 def open_terrain(kind: str, data: DataFolder, seed: int, **options: object) -> TiledTerrain:
-    """The terrain ``raster`` (real heights and catalogue of the data folder), ``procedural``, or the better (``auto``).
+    """The terrain of a kind.
+
+    ``raster``: real heights and catalogue of the data folder; ``procedural``: a seeded Moon; ``auto``: the first where
+    the data allow it, else the second; ``catalogue``: the craters of the data folder's catalogue on a procedural base.
 
     Raises
     ------
     TerrainError
-        An unknown kind, or rasters asked for where the data folder has none.
+        An unknown kind, or rasters or a catalogue asked for where the data folder has none.
     """
     if kind not in KINDS:
         raise TerrainError(f"terrain: expected one of {', '.join(KINDS)}, found {kind!r}")
@@ -29,6 +32,15 @@ def open_terrain(kind: str, data: DataFolder, seed: int, **options: object) -> T
             f"terrain: expected height rasters and a crater catalogue in {data.root or 'a data folder'}, found "
             f"{len(data.dem_tiles)} rasters and {'a' if catalogue_path else 'no'} catalogue"
         )
+    if kind == "catalogue":
+        if catalogue_path is None:
+            raise TerrainError(
+                f"terrain: expected a crater catalogue in {data.root or 'a data folder'}, found none"
+            )
+        from lunar.catalogue import load_catalogue
+        from payload_emulator.sim.terrain.procedural import ProceduralTerrain
+
+        return ProceduralTerrain(seed, catalogue=load_catalogue(catalogue_path), **options)  # type: ignore[arg-type]
     if kind == "procedural" or not (data.dem_tiles and catalogue_path):
         from payload_emulator.sim.terrain.procedural import ProceduralTerrain
 

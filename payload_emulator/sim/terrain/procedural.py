@@ -18,6 +18,7 @@ from payload_emulator.sim.terrain.craters import (
     crater_profiles,
     draw_depth_ratio,
     draw_power_law,
+    fresh_depth_ratio,
     shape_craters,
 )
 from payload_emulator.sim.terrain.tiles import (
@@ -74,14 +75,29 @@ SMALL_EXPONENT = 2.2
 class ProceduralTerrain(TiledTerrain):
     """The whole Moon from a seed, on 256 pixels per degree (118 m)."""
 
-    def __init__(self, seed: int, pixels_per_degree: int = 256, cache_tiles: int = 192) -> None:
+    def __init__(
+        self,
+        seed: int,
+        pixels_per_degree: int = 256,
+        cache_tiles: int = 192,
+        catalogue: CraterCatalogue | None = None,
+    ) -> None:
+        """``catalogue`` takes the place of the synthetic one: its craters are stamped where and as large as it says.
+
+        Depths it does not tell are drawn.
+        """
         self.seed = seed
         self._profiles = crater_profiles()
         rng = np.random.Generator(np.random.PCG64([seed, 0x4D4F4F4E]))
         salts = rng.integers(1, 2**31 - 1, 64)
         self._salts = [int(salt) for salt in salts]
         self._plains = _plains_map(self._salts[60:])
-        catalogue, self._shapes = _draw_catalogue(rng, self._plains, seed)
+        if catalogue is None:
+            name = f"procedural Moon, seed {seed}"
+            catalogue, self._shapes = _draw_catalogue(rng, self._plains, seed)
+        else:
+            name = f"craters of {catalogue.source} on a procedural base, seed {seed}"
+            self._shapes = _shape_catalogue(catalogue, rng)
         count_2km = np.count_nonzero(catalogue.diameter_m >= CATALOGUE_LOW_M)
         sphere_km2 = 4.0 * math.pi * (MOON_RADIUS_M / 1000.0) ** 2
         density = 1.0 - (1.0 - PLAIN_CRATERS) * self._plains[::2, ::2][:180, :360]
@@ -95,7 +111,6 @@ class ProceduralTerrain(TiledTerrain):
             SMALL_EXPONENT,
             density,
         )
-        name = f"procedural Moon, seed {seed}"
         super().__init__(name, (name,), catalogue, pixels_per_degree, cache_tiles)
         # Widest first: a tile asks for the craters of each size band within that band's reach.
         reach = kernels.PROFILE_REACH * 1.05 * self._shapes.radius_rad * MOON_RADIUS_M
@@ -236,6 +251,16 @@ def _plains_map(salts: list[int]) -> npt.NDArray[np.float32]:
     limit = float(field.ravel()[order[np.searchsorted(share, 1.0 - PLAIN_SHARE)]])
     edge = np.clip((field - limit) / 0.35 + 0.5, 0.0, 1.0)
     return np.asarray(edge * edge * (3.0 - 2.0 * edge), dtype=np.float32)
+
+
+def _shape_catalogue(catalogue: CraterCatalogue, rng: np.random.Generator) -> CraterShapes:
+    """Shapes of a given catalogue's craters, as deep as it says or else as drawn."""
+    drawn = draw_depth_ratio(rng, len(catalogue), DEPTH_QUANTILES)
+    known = catalogue.depth_m / catalogue.diameter_m
+    # Drawn ratios are of simple craters and shrink with the fresh depth of large ones; what a catalogue says does not.
+    shrink = np.minimum(1.0, fresh_depth_ratio(catalogue.diameter_m) / 0.2)
+    ratio = np.where(np.isfinite(known), np.maximum(known, 0.005) / shrink, drawn)
+    return shape_craters(catalogue.latitude_rad, catalogue.longitude_rad, catalogue.diameter_m, ratio, rng)
 
 
 def _draw_catalogue(

@@ -8,7 +8,7 @@ from lunar.catalogue import make_catalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import axis_rotation, mcmf_from_spherical
 from payload_emulator.sim import raymarch
-from payload_emulator.sim.labels import label_frame, project_craters
+from payload_emulator.sim.labels import label_frame, project_as_the_paper, project_craters
 from payload_emulator.sim.light import sun_direction_mcmf
 
 CAMERA = PinholeCamera()
@@ -136,3 +136,19 @@ def test_frame_labels_point_into_the_terrains_catalogue(procedural):
     np.testing.assert_array_equal(procedural.catalogue.diameter_m[labels.index], labels.diameter_m)
     measured = procedural.measured(labels.index)
     assert np.isfinite(measured.rim_height_m).all()
+
+
+def test_the_papers_labels_agree_below_the_camera_and_drift_off_toward_the_edge():
+    position = mcmf_from_spherical(0.0, 0.0, 40e3)
+    rotation = nadir_camera_from_mcmf(position)
+    offset = np.degrees(np.array([1e3, 60e3]) / MOON_RADIUS_M)
+    catalogue = make_catalogue(
+        [0.0, 0.0], np.radians(offset), [5000.0, 5000.0], source="t", rim_height_m=[0.0, 0.0]
+    )
+    exact = project_craters(catalogue, CAMERA, position, rotation)
+    u, v, _ = project_as_the_paper(catalogue, CAMERA, position)
+    assert u[0] == pytest.approx(exact.u_px[0], abs=0.01)
+    assert v == pytest.approx(exact.v_px, abs=0.01)
+    # At 60 km the Moon has fallen by 1036 m below the plane that the paper's map lies in: u is short by 1036 / 41036.
+    flat = CAMERA.focal_px * 60.0 / 40.0
+    assert u[1] - exact.u_px[1] == pytest.approx(flat * 1036.0 / 41036.0, rel=0.03)

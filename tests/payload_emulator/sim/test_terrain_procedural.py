@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from lunar.catalogue import class_counts
+from lunar.catalogue import class_counts, make_catalogue
 from payload_emulator.sim.terrain.procedural import ProceduralTerrain
 from payload_emulator.sim.terrain.tiles import LEVELS, tile_angles
 
@@ -68,3 +68,20 @@ def test_levels_of_detail_show_the_same_ground(procedural):
         coarse = procedural._sample(latitude, longitude, level)
         # What is left out is small craters and waves: tens of metres where they lie.
         assert np.median(np.abs(coarse - fine)) < 25.0
+
+
+def test_craters_of_a_given_catalogue_stand_where_it_says():
+    given = make_catalogue(
+        np.radians([10.0, 10.4]),
+        np.radians([20.0, 20.6]),
+        [8000.0, 12000.0],
+        source="two",
+        depth_m=[1500.0, np.nan],
+    )
+    terrain = ProceduralTerrain(3, catalogue=given)
+    assert terrain.catalogue is given
+    assert "two" in terrain.name
+    measured = terrain.measured(np.array([0, 1]))
+    # The base's own relief and the drawn craters below 2 km move it by some tens of metres.
+    assert measured.depth_m[0] == pytest.approx(1500.0, abs=200.0)
+    assert measured.depth_m[1] > 50.0

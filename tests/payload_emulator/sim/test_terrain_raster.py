@@ -138,7 +138,9 @@ def test_a_missing_or_damaged_raster_is_named(tmp_path):
 def test_opening_says_what_is_missing():
     with pytest.raises(TerrainError, match="0 rasters and no catalogue"):
         open_terrain("raster", DataFolder(), 1)
-    with pytest.raises(TerrainError, match="expected one of auto, raster, procedural, found 'flat'"):
+    with pytest.raises(
+        TerrainError, match="expected one of auto, raster, procedural, catalogue, found 'flat'"
+    ):
         open_terrain("flat", DataFolder(), 1)
     assert open_terrain("auto", DataFolder(), 1).name == "procedural Moon, seed 1"
 
