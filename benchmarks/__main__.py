@@ -20,7 +20,8 @@ def main(wanted: list[str]) -> int:
         if wanted and file.stem not in wanted:
             continue
         print(f"\n== {file.stem}", flush=True)
-        failed += subprocess.run([sys.executable, "-m", f"benchmarks.{file.stem}"], cwd=HERE.parent, check=False).returncode != 0
+        command = [sys.executable, "-m", f"benchmarks.{file.stem}"]
+        failed += subprocess.run(command, cwd=HERE.parent, check=False).returncode != 0
     return failed
 
 

@@ -106,7 +106,6 @@ class TerrainSection:
     """`auto`: the real terrain where its rasters are at hand, else the procedural Moon."""
 
     source: Literal["auto", "raster", "procedural"] = "auto"
-    sub_resolution_craters: bool = True
 
 
 @dataclass(frozen=True, slots=True)

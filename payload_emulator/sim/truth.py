@@ -57,7 +57,7 @@ class Truth:
         times = np.atleast_1d(utc_ns)
         position, _ = self.states(times)
         rotation = self.orientation.mcmf_from_icrf(np.asarray(tdb_s_from_utc_ns(times), dtype=np.float64))
-        return np.einsum("nij,nj->ni", rotation, position)
+        return np.asarray(np.einsum("nij,nj->ni", rotation, position), dtype=np.float64)
 
 
 def frame_times(
