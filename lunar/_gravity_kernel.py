@@ -145,9 +145,13 @@ def _emit(
         return [builder.fadd(a, two_zeta), builder.fadd(q, rise), builder.fadd(rise, two_rho2)]
 
     def hold(value: ir.Value) -> None:
-        """Keep the order of instructions at this place: LLVM would move the recursion behind the sums (20 % slower)."""
+        """Keep the order of instructions at this place: LLVM would move the recursion behind the sums (20 % slower).
+
+        An empty piece of assembler that reads the first lane, which is where a scalar lies: nothing is moved for it.
+        """
         if builder.module.triple.startswith("x86_64"):
-            builder.asm(ir.FunctionType(ir.VoidType(), [vector]), "", "x", [value], True)
+            lane = builder.extract_element(value, ir.Constant(ir.IntType(32), 0))
+            builder.asm(ir.FunctionType(ir.VoidType(), [real]), "", "x", [lane], True)
 
     def add(sums: list[ir.Value], pointer: ir.Value, offset: int, harmonic: ir.Value) -> list[ir.Value]:
         """The six sums with one degree added: C at m-1, m, m+1, then S."""

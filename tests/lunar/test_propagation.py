@@ -1,0 +1,128 @@
+"""Orbits against closed forms, against a tighter run, and where they end; elements and burns by their definitions."""
+
+import math
+
+import numpy as np
+import pytest
+
+from lunar.constants import MOON_RADIUS_M
+from lunar.elements import Elements, elements_from_state, state_from_elements
+from lunar.errors import ImpactError
+from lunar.frames import IauOrientation
+from lunar.gravity import builtin_gravity
+from lunar.maneuvers import ManeuverRule, propagate_with_maneuvers
+from lunar.propagation import ForceModel, propagate
+from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
+from lunar.timescales import parse_utc, tdb_s_from_utc_ns
+
+EPOCH_S = float(tdb_s_from_utc_ns(parse_utc("2029-08-07T00:00:00Z")))
+# Table I of the paper.
+TABLE_I = Elements(1_768_180.0, 0.006908, *np.radians([89.076, 3.164, 333.604, 8.882]))
+KEPLER = ForceModel(builtin_gravity(), IauOrientation(), 0, earth=False, sun=False)
+FULL = ForceModel(builtin_gravity(), IauOrientation())
+
+
+def kepler_place(elements: Elements, gm: float, elapsed_s: float) -> np.ndarray:
+    """Two-body position by Kepler's equation, solved by Newton's method."""
+    e = elements.eccentricity
+    start = 2.0 * math.atan(math.sqrt((1 - e) / (1 + e)) * math.tan(elements.true_anomaly_rad / 2.0))
+    mean = start - e * math.sin(start) + math.sqrt(gm / elements.semi_major_axis_m**3) * elapsed_s
+    anomaly = mean
+    for _ in range(20):
+        anomaly -= (anomaly - e * math.sin(anomaly) - mean) / (1 - e * math.cos(anomaly))
+    true = 2.0 * math.atan(math.sqrt((1 + e) / (1 - e)) * math.tan(anomaly / 2.0))
+    moved = Elements(
+        elements.semi_major_axis_m,
+        e,
+        elements.inclination_rad,
+        elements.raan_rad,
+        elements.argument_of_perilune_rad,
+        true,
+    )
+    return state_from_elements(moved, gm)[0]
+
+
+def test_elements_come_back_from_the_state_they_give() -> None:
+    gm = builtin_gravity().gm_m3_s2
+    back = elements_from_state(*state_from_elements(TABLE_I, gm), gm)
+    assert back.semi_major_axis_m == pytest.approx(TABLE_I.semi_major_axis_m, abs=1e-5)  # m
+    for name in (
+        "eccentricity",
+        "inclination_rad",
+        "raan_rad",
+        "argument_of_perilune_rad",
+        "true_anomaly_rad",
+    ):
+        assert getattr(back, name) == pytest.approx(getattr(TABLE_I, name), abs=1e-11), name
+
+
+@pytest.mark.parametrize("integrator", ["rkn86", "dop853", "rkf78"])
+def test_a_point_mass_gives_the_orbit_of_kepler(integrator: str) -> None:
+    gm = builtin_gravity().gm_m3_s2
+    trajectory = propagate(
+        EPOCH_S, *state_from_elements(TABLE_I, gm), 86_400.0, KEPLER, integrator=integrator
+    )
+    for elapsed_s in (0.0, 1_234.5, 40_000.0, 86_400.0):
+        error_m = np.linalg.norm(
+            trajectory.state(np.array([EPOCH_S + elapsed_s]))[0, :3] - kepler_place(TABLE_I, gm, elapsed_s)
+        )
+        assert error_m < 0.01, elapsed_s  # m, over 13 revolutions
+
+
+def test_integrators_of_different_families_agree_over_a_day() -> None:
+    gm = builtin_gravity().gm_m3_s2
+    runs = [
+        propagate(EPOCH_S, *state_from_elements(TABLE_I, gm), 86_400.0, FULL, integrator=name)
+        for name in ("rkn86", "dop853", "rkf78")
+    ]
+    times = EPOCH_S + np.linspace(0.0, 86_400.0, 97)
+    first, *others = (run.state(times)[:, :3] for run in runs)
+    for other in others:
+        assert np.linalg.norm(other - first, axis=1).max() < 0.05  # m
+
+
+def test_an_orbit_into_the_ground_stops_with_the_place_of_impact() -> None:
+    gm = builtin_gravity().gm_m3_s2
+    falling = Elements(MOON_RADIUS_M - 10_000.0, 0.03, math.radians(89.0), 0.0, 0.0, math.pi)
+    with pytest.raises(ImpactError) as end:
+        propagate(EPOCH_S, *state_from_elements(falling, gm), 7_200.0, KEPLER)
+    # Kepler: the radius meets the sphere where 1 + e cos(nu) = p / R.
+    p = falling.semi_major_axis_m * (1 - falling.eccentricity**2)
+    nu = 2.0 * math.pi - math.acos((p / MOON_RADIUS_M - 1.0) / falling.eccentricity)
+    anomaly = (
+        2.0
+        * math.atan2(math.sqrt(0.97) * math.sin(nu / 2), math.sqrt(1.03) * math.cos(nu / 2))
+        % (2 * math.pi)
+    )
+    mean = anomaly - 0.03 * math.sin(anomaly)
+    expected_s = (mean - math.pi) * math.sqrt(falling.semi_major_axis_m**3 / gm)
+    impact_s = float(tdb_s_from_utc_ns(end.value.utc_ns)) - EPOCH_S
+    assert impact_s == pytest.approx(expected_s, abs=0.01)  # s
+    assert "\n" not in str(end.value)
+
+
+def test_burns_bring_the_orbit_back_to_the_rule() -> None:
+    gm = builtin_gravity().gm_m3_s2
+    rule = ManeuverRule(15e3, 1_768_180.0, 0.006)
+    trajectory, burns = propagate_with_maneuvers(
+        EPOCH_S, *state_from_elements(TABLE_I, gm), 12 * 86_400.0, FULL, rule
+    )
+    times = np.arange(EPOCH_S, EPOCH_S + 12 * 86_400.0, 30.0)
+    altitude_m = np.linalg.norm(trajectory.state(times)[:, :3], axis=1) - MOON_RADIUS_M
+    assert burns, "the orbit of Table I sinks below 15 km within days"
+    assert len(burns) % 2 == 0
+    assert altitude_m.min() > 10e3  # m: one arc below 15 km calls for the pair of burns, none goes far below
+    after = burns[1].after
+    assert after.semi_major_axis_m == pytest.approx(rule.semi_major_axis_m, abs=200.0)  # m, osculating
+    assert after.eccentricity == pytest.approx(rule.eccentricity, abs=2e-4)
+
+
+def test_earth_and_sun_stand_where_the_eclipse_of_2018_had_them() -> None:
+    """Total lunar eclipse of 27 July 2018, greatest at 20:21:44 UTC, gamma 0.1168 (F. Espenak, NASA): the Moon's centre
+    passes 0.1168 Earth radii from the axis of the shadow. Light time and aberration move the axis by up to 40 km.
+    """
+    tdb_s = float(tdb_s_from_utc_ns(parse_utc("2018-07-27T20:21:44Z")))
+    earth, sun = earth_position_icrf_m(tdb_s), sun_position_icrf_m(tdb_s)
+    axis = (earth - sun) / np.linalg.norm(earth - sun)
+    off_axis_m = np.linalg.norm(earth - (earth @ axis) * axis)
+    assert off_axis_m == pytest.approx(0.1168 * 6_378_137.0, abs=50e3)
