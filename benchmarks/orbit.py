@@ -1,0 +1,162 @@
+"""Gravity kernel and propagation beside what one would pick instead: python -m benchmarks orbit.
+
+Rivals in the same run: the textbook recursion in numba, and SciPy's DOP853 over the same right-hand side.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from lunar import _dynamics_kernel, _gravity_kernel
+from lunar._compile import njit
+from lunar.datafolder import default_gravity, default_orientation, find_data
+from lunar.elements import Elements, icrf_state_from_elements
+from lunar.gravity import GravityField
+from lunar.maneuvers import ManeuverRule, propagate_with_maneuvers
+from lunar.propagation import ForceModel, force_arrays, propagate
+from lunar.timescales import parse_utc, tdb_s_from_utc_ns
+
+DEGREE = 100
+EVALUATIONS = 20_000
+SCIPY_DAYS = 0.25
+
+
+@njit
+def textbook(c, s, gm, radius, positions, out):  # type: ignore[no-untyped-def]
+    """Cunningham's recursion as in Montenbruck and Gill, section 3.2.4, order by order, unnormalised coefficients."""
+    degree = c.shape[0] - 1
+    v = np.zeros((degree + 2, degree + 2))
+    w = np.zeros((degree + 2, degree + 2))
+    for k in range(positions.shape[0]):
+        x, y, z = positions[k]
+        r2 = x * x + y * y + z * z
+        rho = radius * radius / r2
+        x0, y0, z0 = radius * x / r2, radius * y / r2, radius * z / r2
+        v[0, 0] = radius / math.sqrt(r2)
+        w[0, 0] = 0.0
+        for m in range(degree + 2):
+            if m > 0:
+                v[m, m] = (2 * m - 1) * (x0 * v[m - 1, m - 1] - y0 * w[m - 1, m - 1])
+                w[m, m] = (2 * m - 1) * (x0 * w[m - 1, m - 1] + y0 * v[m - 1, m - 1])
+            if m <= degree:
+                v[m + 1, m] = (2 * m + 1) * z0 * v[m, m]
+                w[m + 1, m] = (2 * m + 1) * z0 * w[m, m]
+            for n in range(m + 2, degree + 2):
+                a, b = (2 * n - 1) / (n - m), (n + m - 1) / (n - m)
+                v[n, m] = a * z0 * v[n - 1, m] - b * rho * v[n - 2, m]
+                w[n, m] = a * z0 * w[n - 1, m] - b * rho * w[n - 2, m]
+        ax = ay = az = 0.0
+        for n in range(degree + 1):
+            ax -= c[n, 0] * v[n + 1, 1]
+            ay -= c[n, 0] * w[n + 1, 1]
+            az -= (n + 1) * c[n, 0] * v[n + 1, 0]
+            for m in range(1, n + 1):
+                f = 0.5 * (n - m + 1) * (n - m + 2)
+                cc, ss = c[n, m], s[n, m]
+                ax += 0.5 * (-cc * v[n + 1, m + 1] - ss * w[n + 1, m + 1])
+                ax += f * (cc * v[n + 1, m - 1] + ss * w[n + 1, m - 1])
+                ay += 0.5 * (-cc * w[n + 1, m + 1] + ss * v[n + 1, m + 1])
+                ay += f * (-cc * w[n + 1, m - 1] + ss * v[n + 1, m - 1])
+                az += (n - m + 1) * (-cc * v[n + 1, m] - ss * w[n + 1, m])
+        scale = gm / (radius * radius)
+        out[k, 0], out[k, 1], out[k, 2] = scale * ax, scale * ay, scale * az
+
+
+def main() -> None:
+    """Print the table."""
+    named = os.environ.get("LINNA_DATA")
+    data = find_data(Path(named) if named else None)
+    field, orientation = default_gravity(data), default_orientation(data)
+    field = field.truncated(min(DEGREE, field.degree))
+    print(f"field {field.name} to degree {field.degree}; processor time, best of 5")
+    _kernels(field)
+    _propagations(ForceModel(field, orientation, field.degree))
+
+
+def _kernels(field: GravityField) -> None:
+    rng = np.random.default_rng(1)
+    positions = rng.standard_normal((EVALUATIONS, 3))
+    positions *= 1_768_000.0 / np.linalg.norm(positions, axis=1, keepdims=True)
+    packed = _gravity_kernel.pack(field.c_bar, field.s_bar, field.gm_m3_s2, field.radius_m)
+    c, s = _unnormalised(field)
+    theirs = np.empty_like(positions)
+    few = positions[: EVALUATIONS // 10]
+    ours = _gravity_kernel.accelerations(packed, positions)
+    textbook(c, s, field.gm_m3_s2, field.radius_m, positions, theirs)
+    difference = float(np.max(np.abs(ours - theirs)) / np.max(np.abs(ours)))
+    ours_us = _best(lambda: _gravity_kernel.accelerations(packed, positions)) / EVALUATIONS * 1e6
+    theirs_us = _best(lambda: textbook(c, s, field.gm_m3_s2, field.radius_m, few, theirs)) / len(few) * 1e6
+    print(f"{'acceleration, one thread':<44} {ours_us:8.2f} us")
+    print(f"{'  textbook recursion, numba':<44} {theirs_us:8.2f} us   {theirs_us / ours_us:5.1f} x ours")
+    print(f"{'  largest relative difference':<44} {difference:8.1e}")
+
+
+def _propagations(model: ForceModel) -> None:
+    epoch_s = float(tdb_s_from_utc_ns(parse_utc("2029-08-07T00:00:00Z")))
+    elements = Elements(1_768_180.0, 0.006908, *np.radians([89.076, 3.164, 333.604, 8.882]))
+    state = np.concatenate(icrf_state_from_elements(elements, epoch_s, model.gravity.gm_m3_s2))
+
+    def month() -> None:
+        trajectory, _ = propagate_with_maneuvers(
+            epoch_s, state[:3], state[3:], 30 * 86_400.0, model, ManeuverRule()
+        )
+        trajectory.state(epoch_s + np.arange(0.0, 30 * 86_400.0, 30.0))
+
+    propagate(epoch_s, state[:3], state[3:], 60.0, model)
+    print(f"{'30 days with burns, a state each 30 s':<44} {_best(month, 2):8.2f} s")
+    duration_s = SCIPY_DAYS * 86_400.0
+    gravity, force, table, scratch = force_arrays(model, epoch_s, 0.0, duration_s)
+    work, columns = np.empty(scratch), np.empty(_dynamics_kernel.COLUMNS)
+
+    def rates(t: float, y: np.ndarray) -> np.ndarray:
+        a = _dynamics_kernel.force_acceleration(t, y[0], y[1], y[2], gravity, force, table, work, columns)
+        return np.array([y[3], y[4], y[5], *a])
+
+    rates(0.0, state)
+    scipy_s = _best(
+        lambda: solve_ivp(
+            rates, (0.0, duration_s), state, method="DOP853", rtol=1e-11, atol=1e-6, dense_output=True
+        ),
+        2,
+    )
+    for name in ("rkn86", "dop853", "rkf78"):
+        propagate(epoch_s, state[:3], state[3:], 60.0, model, integrator=name)
+        ours_s = _best(
+            lambda name=name: propagate(epoch_s, state[:3], state[3:], duration_s, model, integrator=name), 3
+        )
+        print(f"{f'{SCIPY_DAYS * 24:.0f} h, {name}':<44} {ours_s:8.4f} s")
+        if name == "dop853":
+            print(
+                f"{'  SciPy DOP853, same right-hand side':<44} {scipy_s:8.4f} s   {scipy_s / ours_s:5.1f} x ours"
+            )
+
+
+def _unnormalised(field: GravityField) -> tuple[np.ndarray, np.ndarray]:
+    n, m = np.meshgrid(np.arange(field.degree + 1), np.arange(field.degree + 1), indexing="ij")
+    log_gamma = np.vectorize(math.lgamma)
+    with np.errstate(invalid="ignore"):
+        ratio = np.exp(0.5 * (log_gamma(np.abs(n - m) + 1.0) - log_gamma(n + m + 1.0)))
+    scale = np.where(m <= n, ratio * np.sqrt((2.0 - (m == 0)) * (2 * n + 1)), 0.0)
+    return field.c_bar * scale, field.s_bar * scale
+
+
+def _best(run: Callable[[], object], rounds: int = 5) -> float:
+    """Least processor time of several runs after one to warm up, seconds."""
+    run()
+    times = []
+    for _ in range(rounds):
+        begin = time.process_time()
+        run()
+        times.append(time.process_time() - begin)
+    return min(times)
+
+
+if __name__ == "__main__":
+    main()
