@@ -473,7 +473,6 @@ def _frame_accounting(inputs: PassInputs) -> FrameAccounting:
         with_detections=int(np.count_nonzero(np.diff(detections.offsets) > 0)),
         navigated=navigated,
         bad_image=len(detections) - processed,
-        downlinked=len(inputs.images) or None,
         quality=quality,
     )
 
