@@ -12,15 +12,14 @@ from numpy.typing import NDArray
 from lunar.camera import PinholeCamera, ground_point_sphere, nadir_camera_from_mcmf
 from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
-from lunar.third_bodies import sun_position_icrf_m
-from lunar.timescales import format_utc, tdb_s_from_utc_ns
-from payload_emulator.emulator import World, build_world
+from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.scenario import Scenario
 from payload_emulator.sim import raymarch, renderer
 from payload_emulator.sim.labels import Labels, label_frame
-from payload_emulator.sim.light import sun_angles, sun_direction_mcmf
+from payload_emulator.sim.light import sun_angles
 from payload_emulator.sim.sensor import SensorModel, expose
+from payload_emulator.world import World, build_world, true_sun_direction
 
 FloatArray = NDArray[np.float64]
 
@@ -66,7 +65,7 @@ def render_frame(scenario: Scenario, data: DataFolder, utc_ns: int, renderer_nam
     position = world.truth.positions_mcmf(utc_ns)[0]
     rotation = nadir_camera_from_mcmf(position)
     rng = np.random.default_rng((scenario.seed, utc_ns))
-    sun = _sun_direction(world, position, utc_ns, rng)
+    sun = true_sun_direction(world, position, utc_ns, rng)
     rendering = RENDERERS[renderer_name](world.terrain, world.camera, position, rotation, sun)
     labels = label_frame(world.terrain, world.camera, position, rotation, lit=rendering.lit)
     metadata = _metadata(world, utc_ns, position, rotation, sun)
@@ -77,18 +76,6 @@ def render_frame(scenario: Scenario, data: DataFolder, utc_ns: int, renderer_nam
         _label_rows(labels, world.terrain.catalogue.ids),
         world.data_names,
     )
-
-
-def _sun_direction(world: World, position: FloatArray, utc_ns: int, rng: np.random.Generator) -> FloatArray:
-    light = world.scenario.light
-    if light.mode == "paper":
-        elevation = math.radians(rng.uniform(light.elevation_min_deg, light.elevation_max_deg))
-        azimuth = math.radians(rng.uniform(light.azimuth_min_deg, light.azimuth_max_deg))
-        latitude, longitude, _ = (float(value) for value in spherical_from_mcmf(position))
-        return sun_direction_mcmf(elevation, azimuth, latitude, longitude)
-    tdb_s = float(tdb_s_from_utc_ns(utc_ns))
-    toward = sun_position_icrf_m(tdb_s) - world.truth.states(utc_ns)[0][0]
-    return np.asarray(world.truth.orientation.mcmf_from_icrf(tdb_s) @ (toward / np.linalg.norm(toward)))
 
 
 def _metadata(
