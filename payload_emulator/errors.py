@@ -3,6 +3,7 @@
 PayloadError
 ├── ScenarioError      a scenario file, or what it asks for, is not usable
 ├── TerrainError       a terrain source is missing, damaged or does not cover the place asked for
+├── RendererError      a renderer is not installed, or cannot render what is asked for
 ├── ModelError         a detector model is not the one that flight expects
 ├── TableError         an uploaded table (anchor ephemeris, catalogue, gravity) is damaged or of another kind
 └── DatasetError       a data set is missing, incomplete or of another camera
@@ -19,6 +20,10 @@ class ScenarioError(PayloadError):
 
 class TerrainError(PayloadError):
     """A terrain source is missing, damaged, or does not cover the place asked for."""
+
+
+class RendererError(PayloadError):
+    """A renderer is not installed, failed, or cannot render what is asked for."""
 
 
 class ModelError(PayloadError):
