@@ -26,7 +26,7 @@ check: $(VENV)/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(VENV)/.dev
+bench: $(VENV)/.bench
 	$(BIN)/python -m benchmarks
 
 up:
@@ -49,6 +49,10 @@ $(VENV)/.terrain: requirements/terrain.txt $(VENV)/.runtime
 
 $(VENV)/.dev: requirements/dev.txt requirements/train.txt requirements/postgres.txt $(VENV)/.runtime $(VENV)/.terrain
 	$(PIP) -r requirements/runtime.txt -r requirements/postgres.txt -r requirements/train.txt -r requirements/dev.txt
+	touch $@
+
+$(VENV)/.bench: requirements/bench.txt $(VENV)/.dev
+	$(PIP) -r requirements/bench.txt
 	touch $@
 
 clean:

@@ -1,12 +1,14 @@
 """Gravity kernel and propagation beside what one would pick instead: python -m benchmarks orbit.
 
-Rivals in the same run: the textbook recursion in numba, and SciPy's DOP853 over the same right-hand side.
+Rivals in the same run: the textbook recursion in numba, brahe (Rust) and heyoka's scalar compiled function on the same
+coefficients and places, and SciPy's DOP853 over the same right-hand side.
 """
 
 from __future__ import annotations
 
 import math
 import os
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -96,6 +98,67 @@ def _kernels(field: GravityField) -> None:
     print(f"{'acceleration, one thread':<44} {ours_us:8.2f} us")
     print(f"{'  textbook recursion, numba':<44} {theirs_us:8.2f} us   {theirs_us / ours_us:5.1f} x ours")
     print(f"{'  largest relative difference':<44} {difference:8.1e}")
+    for name, rival in (("brahe, Clenshaw", _brahe), ("heyoka, scalar cfunc", _heyoka)):
+        try:
+            evaluate = rival(field)
+        except ImportError as missing:
+            print(f"{f'  {name}':<44} not installed ({missing.name}): pip install -r requirements/bench.txt")
+            continue
+        theirs = np.array([evaluate(place) for place in few])
+        difference = float(np.max(np.abs(ours[: len(few)] - theirs)) / np.max(np.abs(ours)))
+        theirs_us = _best(lambda evaluate=evaluate: [evaluate(place) for place in few]) / len(few) * 1e6
+        print(f"{f'  {name}':<44} {theirs_us:8.2f} us   {theirs_us / ours_us:5.1f} x ours")
+        print(f"{'  largest relative difference':<44} {difference:8.1e}")
+
+
+def _brahe(field: GravityField) -> Callable[[np.ndarray], np.ndarray]:
+    """brahe reads coefficient files only: the field travels as one, to all digits."""
+    import brahe
+
+    degree = field.degree
+    rows = [
+        f"gfc {n} {m} {float(field.c_bar[n, m])!r} {float(field.s_bar[n, m])!r} 0 0"
+        for n in range(degree + 1)
+        for m in range(n + 1)
+    ]
+    head = (
+        "product_type gravity_field",
+        "modelname field",
+        f"earth_gravity_constant {field.gm_m3_s2!r}",
+        f"radius {field.radius_m!r}",
+        f"max_degree {degree}",
+        "errors formal",
+        "norm fully_normalized",
+        "tide_system zero_tide",
+        "key L M C S sigma_C sigma_S",
+        "end_of_head",
+    )
+    with tempfile.NamedTemporaryFile("w", suffix=".gfc") as file:
+        file.write("\n".join([*head, *rows, ""]))
+        file.flush()
+        model = brahe.GravityModel.from_file(file.name)
+    return lambda place: model.compute_spherical_harmonics_clenshaw(place, degree, degree)
+
+
+def _heyoka(field: GravityField) -> Callable[[np.ndarray], np.ndarray]:
+    """heyoka compiles the field into one function; half a minute at degree 100."""
+    import heyoka
+
+    place = heyoka.make_vars("x", "y", "z")
+    pairs = [
+        (float(field.c_bar[n, m]), float(field.s_bar[n, m]))
+        for n in range(field.degree + 1)
+        for m in range(n + 1)
+    ]
+    formula = heyoka.model.sh_gravity_acc(
+        list(place),
+        pairs,
+        field.gm_m3_s2,
+        field.radius_m,
+        max_degree=field.degree,
+        max_order=field.degree,
+    )
+    return heyoka.cfunc(formula, list(place), compact_mode=True, batch_size=1)
 
 
 def _propagations(model: ForceModel) -> None:

@@ -50,9 +50,13 @@ def exact_acceleration(field: GravityField, position: np.ndarray, degree: int) -
             for n in range(m, degree + 1):
                 if n > m:
                     a = mpmath.sqrt(mpmath.mpf((2 * n - 1) * (2 * n + 1)) / ((n - m) * (n + m)))
-                    b = mpmath.mpf((2 * n + 1) * (n + m - 1) * (n - m - 1)) / ((n - m) * (n + m) * (2 * n - 3))
+                    b = mpmath.mpf((2 * n + 1) * (n + m - 1) * (n - m - 1)) / (
+                        (n - m) * (n + m) * (2 * n - 3)
+                    )
                     before, now = now, a * u * now - mpmath.sqrt(b) * before
-                weight = mpmath.mpf(float(field.c_bar[n, m])) * cos + mpmath.mpf(float(field.s_bar[n, m])) * sin
+                weight = (
+                    mpmath.mpf(float(field.c_bar[n, m])) * cos + mpmath.mpf(float(field.s_bar[n, m])) * sin
+                )
                 total += (mpmath.mpf(field.radius_m) / r) ** n * now * weight
         return mpmath.mpf(field.gm_m3_s2) / r * total
 
@@ -160,7 +164,9 @@ def test_the_other_vector_width_gives_the_same_sums(tmp_path: Path) -> None:
         spec.loader.exec_module(other)
         field = kaula_field(51)
         places = np.array([at(-77.0, 3.0), at(5.0, 250.0)])
-        found = other.accelerations(other.pack(field.c_bar, field.s_bar, field.gm_m3_s2, field.radius_m), places)
+        found = other.accelerations(
+            other.pack(field.c_bar, field.s_bar, field.gm_m3_s2, field.radius_m), places
+        )
     finally:
         del sys.modules["other_width"]
     assert np.allclose(found, acceleration(field, places), rtol=1e-14)
@@ -251,7 +257,11 @@ def test_the_three_formats_hold_the_same_field(text: str, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("text", "where", "expected"),
     [
-        (ICGEM.replace("gfc 2 2 3.4e-05 -1.0e-10\n", ""), "degree 2, order 2", "all coefficients to degree 2"),
+        (
+            ICGEM.replace("gfc 2 2 3.4e-05 -1.0e-10\n", ""),
+            "degree 2, order 2",
+            "all coefficients to degree 2",
+        ),
         (ICGEM.replace("gfc 2 1", "gfc 1 2"), "line 10", "order <= degree <= 2"),
         (ICGEM.replace("gfc 2 1", "gfc 2 0"), "line 10", "every coefficient once"),
         (ICGEM.replace("fully_normalized", "unnormalized"), "header, norm", "fully_normalized"),
@@ -261,7 +271,11 @@ def test_the_three_formats_hold_the_same_field(text: str, tmp_path: Path) -> Non
         (ICGEM.replace("0.49D+13", "0.49"), "header", "GM in m3/s2"),
         (ICGEM.replace("-9.0D-05", "-9.0"), "degree 2, order 0", "normalised flattening"),
         (COF.replace("END\n", ""), "end of file", "END"),
-        (COF.replace("1.00000000000000e+00\n", "0.00000000000000e+00\n"), "line 3", "normalised coefficients"),
+        (
+            COF.replace("1.00000000000000e+00\n", "0.00000000000000e+00\n"),
+            "line 3",
+            "normalised coefficients",
+        ),
         (COF.replace("RECOEF    2  2", "RECOEF    3  2"), "line 6", "order <= degree <= 2"),
         (SHADR.replace("2, 2, 1,", "2, 2, 0,"), "line 1, normalisation state", "fully normalised"),
         (SHADR[:-30], "line 4", "degree, order and two coefficients"),

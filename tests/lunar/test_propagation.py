@@ -5,13 +5,20 @@ import math
 import numpy as np
 import pytest
 
-from lunar.constants import MOON_RADIUS_M
+from lunar.constants import MOON_RADIUS_M, SPEED_OF_LIGHT_M_S
 from lunar.elements import Elements, elements_from_state, state_from_elements
-from lunar.errors import ImpactError
+from lunar.errors import ImpactError, OrbitError
 from lunar.frames import IauOrientation
 from lunar.gravity import builtin_gravity
 from lunar.maneuvers import ManeuverRule, propagate_with_maneuvers
-from lunar.propagation import ForceModel, propagate
+from lunar.propagation import (
+    ForceModel,
+    SolarPressure,
+    acceleration_icrf,
+    propagate,
+    propagate_many,
+    propagate_with_stm,
+)
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 
@@ -126,3 +133,110 @@ def test_earth_and_sun_stand_where_the_eclipse_of_2018_had_them() -> None:
     axis = (earth - sun) / np.linalg.norm(earth - sun)
     off_axis_m = np.linalg.norm(earth - (earth @ axis) * axis)
     assert off_axis_m == pytest.approx(0.1168 * 6_378_137.0, abs=50e3)
+
+
+SUNLIT = ForceModel(builtin_gravity(), IauOrientation(), 0, solar_pressure=SolarPressure(0.02, 1.4))
+
+
+def sunward() -> np.ndarray:
+    sun = sun_position_icrf_m(EPOCH_S)
+    return sun / np.linalg.norm(sun)
+
+
+def pushed(position_m: np.ndarray) -> np.ndarray:
+    """What sunlight adds to the acceleration at a place, m/s^2."""
+    dark = ForceModel(builtin_gravity(), IauOrientation(), 0)
+    return acceleration_icrf(SUNLIT, EPOCH_S, position_m) - acceleration_icrf(dark, EPOCH_S, position_m)
+
+
+def test_sunlight_pushes_away_from_the_sun_with_the_pressure_of_its_flux() -> None:
+    place = 1_768_180.0 * sunward()
+    push = pushed(place)
+    distance_au = np.linalg.norm(sun_position_icrf_m(EPOCH_S) - place) / 149_597_870_700.0
+    # Total solar irradiance 1361 W/m^2 at 1 au (Kopp and Lean 2011) over the speed of light.
+    expected = 1361.0 / SPEED_OF_LIGHT_M_S / distance_au**2 * 0.02 * 1.4
+    assert np.linalg.norm(push) == pytest.approx(expected, rel=1e-6)
+    assert push @ sunward() == pytest.approx(-expected, rel=1e-6)
+
+
+def test_sunlight_ends_in_the_moons_shadow_and_is_halved_on_its_edge() -> None:
+    across = np.cross(sunward(), [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across)
+    lit = np.linalg.norm(pushed(1_768_180.0 * sunward()))
+    assert np.linalg.norm(pushed(-1_768_180.0 * sunward())) == 0.0
+    # Where the limb cuts the Sun's disc in two, the line to the Sun's centre touches the Moon.
+    depth_m = math.sqrt(1_768_180.0**2 - MOON_RADIUS_M**2)
+    edge = MOON_RADIUS_M * across - depth_m * sunward()
+    # The Sun is 390 times as far as the Moon is wide: the tangent leans by R / 1 au = 1.2e-5 rad, 0.3 % of the disc.
+    assert np.linalg.norm(pushed(edge)) == pytest.approx(0.5 * lit, rel=0.02)
+
+
+def test_sunlight_moves_a_low_orbit_by_what_its_push_does_in_ten_minutes() -> None:
+    place = 1_768_180.0 * sunward()
+    across = np.cross(sunward(), [0.0, 0.0, 1.0])
+    speed = math.sqrt(builtin_gravity().gm_m3_s2 / 1_768_180.0)
+    velocity = speed * across / np.linalg.norm(across)
+    lit, dark = (
+        propagate(EPOCH_S, place, velocity, 600.0, model).state_after(600.0)
+        for model in (SUNLIT, ForceModel(builtin_gravity(), IauOrientation(), 0))
+    )
+    # Clohessy and Wiltshire, constant radial push f: x = f (1 - cos nt) / n^2, y = -2 f (nt - sin nt) / n^2.
+    f, n = np.linalg.norm(pushed(place)), speed / 1_768_180.0
+    expected_m = f / n**2 * math.hypot(1 - math.cos(600 * n), 2 * (600 * n - math.sin(600 * n)))
+    # The push turns with the Sun, not with the orbit: 0.57 rad over the ten minutes.
+    assert np.linalg.norm(lit[:3] - dark[:3]) == pytest.approx(expected_m, rel=0.1)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_many_orbits_are_those_flown_one_by_one(threads: int) -> None:
+    gm = builtin_gravity().gm_m3_s2
+    nominal = np.concatenate(state_from_elements(TABLE_I, gm))
+    rng = np.random.default_rng(2)
+    starts = nominal + np.concatenate(
+        [1e3 * rng.standard_normal((5, 3)), rng.standard_normal((5, 3))], axis=1
+    )
+    times = np.array([0.0, 61.5, 3_600.0, 7_200.0])
+    together = propagate_many(EPOCH_S, starts, times, FULL, threads=threads)
+    assert together.shape == (5, 4, 6)
+    for start, states in zip(starts, together, strict=True):
+        alone = propagate(EPOCH_S, start[:3], start[3:], 7_200.0, FULL).state_after(times)
+        np.testing.assert_array_equal(states, alone)
+
+
+def test_an_orbit_of_many_that_hits_the_ground_ends_in_nan_and_leaves_the_others_alone() -> None:
+    gm = builtin_gravity().gm_m3_s2
+    falling = Elements(MOON_RADIUS_M - 10_000.0, 0.03, math.radians(89.0), 0.0, 0.0, math.pi)
+    starts = [np.concatenate(state_from_elements(elements, gm)) for elements in (falling, TABLE_I)]
+    times = np.arange(0.0, 7_201.0, 60.0)
+    falls, flies = propagate_many(EPOCH_S, starts, times, KEPLER)
+    with pytest.raises(ImpactError) as end:
+        propagate(EPOCH_S, starts[0][:3], starts[0][3:], 7_200.0, KEPLER)
+    impact_s = float(tdb_s_from_utc_ns(end.value.utc_ns)) - EPOCH_S
+    assert np.array_equal(np.isfinite(falls[:, 0]), times < impact_s)
+    assert np.isfinite(flies).all()
+
+
+def test_times_of_many_orbits_must_ascend() -> None:
+    start = np.concatenate(state_from_elements(TABLE_I, builtin_gravity().gm_m3_s2))
+    with pytest.raises(OrbitError, match="ascending"):
+        propagate_many(EPOCH_S, [start], [10.0, 5.0], KEPLER)
+
+
+@pytest.mark.parametrize("duration_s", [900.0, -900.0])
+def test_the_transition_matrix_is_the_change_of_the_end_with_the_start(duration_s: float) -> None:
+    start = np.concatenate(state_from_elements(TABLE_I, builtin_gravity().gm_m3_s2))
+    position, velocity, matrix = propagate_with_stm(
+        EPOCH_S, start[:3], start[3:], duration_s, FULL, stm_degree=FULL.gravity.degree
+    )
+    end = propagate(EPOCH_S, start[:3], start[3:], duration_s, FULL).state_after(duration_s)
+    np.testing.assert_allclose(np.concatenate([position, velocity]), end, atol=2e-3)  # m, m/s
+    steps = np.array([10.0] * 3 + [0.01] * 3)
+    for column, step in enumerate(steps):
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = start.copy()
+            moved[column] += sign * step
+            ends.append(propagate(EPOCH_S, moved[:3], moved[3:], duration_s, FULL).state_after(duration_s))
+        slope = (ends[0] - ends[1]) / (2.0 * step)
+        np.testing.assert_allclose(matrix[:3, column], slope[:3], atol=2e-4 * np.abs(slope[:3]).max())
+        np.testing.assert_allclose(matrix[3:, column], slope[3:], atol=2e-4 * np.abs(slope[3:]).max())
