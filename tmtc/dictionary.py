@@ -59,11 +59,11 @@ FAILURES: Labels = (
 FUNCTIONS: Labels = (
     (1, "set_mode"), (2, "start_observation"), (3, "stop_observation"), (4, "manual_step"),
     (5, "reset_estimators"), (6, "clear_store"), (7, "reboot"), (8, "check_tables"),
-    (9, "synchronise_clock"), (10, "abort_uplink"),
+    (9, "synchronise_clock"), (10, "abort_uplink"), (11, "widen_estimate"),
 )  # fmt: skip
 TABLES: Labels = (
     (1, "anchor_ephemeris"), (2, "catalogue"), (3, "gravity"), (4, "parameters"), (5, "model"),
-    (6, "thumbnail"), (7, "landmark_map"),
+    (6, "thumbnail"), (7, "landmark_map"), (8, "orientation"), (9, "initial_state"), (10, "burns"),
 )  # fmt: skip
 
 _FRAME = (
@@ -168,6 +168,29 @@ def _telemetry() -> tuple[PacketDefinition, ...]:
                 Field("anchor_reads", "u32", "Reads of the anchor ephemeris by this estimator so far"),
             ),
         ),
+        PacketDefinition(
+            "filter_state", APID_NAVIGATION_STATE, 129, 4, "Orbit of the navigation filter with its covariance",
+            (
+                *_FRAME,
+                Field("position_icrf_m", "f64", "Position, Moon-centred ICRF axes", "m", size=3),
+                Field("velocity_icrf_m_s", "f64", "Velocity, ICRF axes", "m/s", size=3),
+                Field("acceleration_rtn_m_s2", "f32", "Empirical acceleration, R, T, N", "m/s^2", size=3),
+                Field(
+                    "covariance", "f32", "Covariance of the nine numbers above, lower triangle by rows", size=45
+                ),
+            ),
+        ),
+        PacketDefinition(
+            "identifications", APID_FRAME_OUTCOME, 129, 5, "Which crater each used detection was taken for",
+            (*_FRAME, Field("count", "u8", "Number of pairs that follow")),
+            Group(
+                "count",
+                (
+                    Field("detection", "u8", "Place in the detections of the same frame, from 0"),
+                    Field("crater_id", "u32", "Identity in the on-board catalogue"),
+                ),
+            ),
+        ),
         *(
             PacketDefinition(
                 f"event_{severity}", APID_EVENTS, 5, subtype, f"Event report, {meaning}",
@@ -270,8 +293,8 @@ def _telecommands() -> tuple[PacketDefinition, ...]:
             "perform_function", 8, 1, "Perform a function of the payload",
             (
                 Field("function_id", "u16", "Function", labels=FUNCTIONS),
-                Field("argument_1", "f64", "First argument (mode, duration in s, table number), else 0"),
-                Field("argument_2", "f64", "Second argument (cadence in s), else 0"),
+                Field("argument_1", "f64", "First argument (mode, duration in s, table number, m), else 0"),
+                Field("argument_2", "f64", "Second argument (cadence in s, m/s), else 0"),
             ),
         ),
         command(
