@@ -1,4 +1,4 @@
-"""The packet dictionary of the payload, version 1.
+"""The packet dictionary of the payload: version 2, and version 1 before it.
 
 Everything that crosses the link is defined here and nowhere else; the ICD and the XTCE export are generated
 from it.
@@ -6,11 +6,31 @@ from it.
 
 from __future__ import annotations
 
+from tmtc.codes import (
+    ARGUMENTS,
+    ARGUMENTS_1,
+    CLOCK_STATES,
+    ESTIMATORS,
+    EVENTS,
+    EVENTS_1,
+    FAILURES,
+    FAILURES_1,
+    FUNCTIONS,
+    FUNCTIONS_1,
+    IMAGE_QUALITIES,
+    MODES,
+    OUTCOMES,
+    QUANTITIES,
+    RESET_TRIGGERS,
+    SIZE_CLASSES,
+    STORE_CLASSES,
+    TABLES,
+    TABLES_1,
+    Labels,
+)
 from tmtc.errors import UnknownPacket
 from tmtc.packets import TYPE_TELECOMMAND
 from tmtc.schema import Dictionary, Field, Group, PacketDefinition
-
-Labels = tuple[tuple[int, str], ...]
 
 APID_HOUSEKEEPING = 0x0A0
 APID_DETECTIONS = 0x0A1
@@ -22,49 +42,11 @@ APID_VERIFICATION = 0x0A6
 APID_TEST = 0x0A7
 APID_PARAMETERS = 0x0A8
 APID_LARGE_DATA = 0x0A9
+APID_PERFORMANCE = 0x0AA
+APID_REPORTS = 0x0AB
+APID_SCHEDULE = 0x0AC
+APID_STORE = 0x0AD
 APID_COMMAND = 0x0A0
-
-MODES: Labels = ((0, "safe"), (1, "standby"), (2, "observing"), (3, "downlinking"))
-IMAGE_QUALITIES: Labels = ((0, "ok"), (1, "dark"), (2, "saturated"), (3, "uniform"), (4, "invalid"))
-ESTIMATORS: Labels = ((0, "paper"), (1, "spherical"), (2, "anchored"))
-OUTCOMES: Labels = (
-    (0, "anchored"), (1, "multi"), (2, "single"), (3, "predicted"), (4, "missed"), (5, "rejected"),
-    (6, "fixed"), (7, "coasted"), (8, "refused"), (9, "no_image"),
-)  # fmt: skip
-RESET_TRIGGERS: Labels = (
-    (0, "none"), (1, "initialization"), (2, "time_gap"), (3, "manual_step"), (4, "safety_timeout"),
-)  # fmt: skip
-SIZE_CLASSES: Labels = ((-1, "none"), (0, "5-10 km"), (1, "10-15 km"), (2, "15-30 km"), (3, "3-5 km"))
-CLOCK_STATES: Labels = ((0, "free_running"), (1, "synchronised"), (2, "suspect"))
-EVENTS: Labels = (
-    (1, "boot"), (2, "mode_changed"), (3, "observation_started"), (4, "observation_stopped"),
-    (5, "activity_released"), (6, "table_loaded"), (7, "table_refused"), (8, "telecommand_rejected"),
-    (9, "parameter_changed"),
-    (16, "image_dark"), (17, "image_saturated"), (18, "image_uniform"), (19, "image_invalid"),
-    (20, "camera_fault"), (21, "attitude_missing"), (22, "frame_skipped"),
-    (32, "detector_timeout"), (33, "detector_error"), (34, "filter_reset"), (35, "filter_divergence"),
-    (36, "fix_refused"), (37, "anchor_read"), (38, "estimator_error"),
-    (48, "clock_jump"), (49, "clock_synchronised"), (50, "watchdog_reset"), (51, "model_hash_mismatch"),
-    (52, "parameters_hash_mismatch"), (53, "catalogue_hash_mismatch"), (54, "anchor_table_hash_mismatch"),
-    (55, "storage_full"), (56, "storage_corrupt"), (57, "state_recovered"), (58, "state_lost"),
-    (64, "power_low"), (65, "temperature_high"), (66, "temperature_low"), (67, "memory_high"),
-    (68, "queue_overflow"),
-)  # fmt: skip
-FAILURES: Labels = (
-    (1, "unknown_packet"), (2, "bad_checksum"), (3, "bad_length"), (4, "value_out_of_range"),
-    (5, "wrong_mode"), (6, "duplicate"), (7, "expired"), (8, "out_of_sequence"), (9, "unknown_function"),
-    (10, "unknown_parameter"), (11, "storage_full"), (12, "schedule_full"), (13, "busy"),
-    (14, "table_corrupt"), (15, "execution_error"), (16, "unknown_apid"), (17, "no_such_activity"),
-)  # fmt: skip
-FUNCTIONS: Labels = (
-    (1, "set_mode"), (2, "start_observation"), (3, "stop_observation"), (4, "manual_step"),
-    (5, "reset_estimators"), (6, "clear_store"), (7, "reboot"), (8, "check_tables"),
-    (9, "synchronise_clock"), (10, "abort_uplink"), (11, "widen_estimate"),
-)  # fmt: skip
-TABLES: Labels = (
-    (1, "anchor_ephemeris"), (2, "catalogue"), (3, "gravity"), (4, "parameters"), (5, "model"),
-    (6, "thumbnail"), (7, "landmark_map"), (8, "orientation"), (9, "initial_state"), (10, "burns"),
-)  # fmt: skip
 
 _FRAME = (
     Field("frame_number", "u32", "Count of frames since the start of the observation"),
@@ -73,7 +55,7 @@ _FRAME = (
 _OCTETS = (Field("octet", "u8", "One octet of the part"),)
 
 
-def _telemetry() -> tuple[PacketDefinition, ...]:
+def _telemetry(events: Labels, failures: Labels, tables: Labels) -> tuple[PacketDefinition, ...]:
     return (
         PacketDefinition(
             "housekeeping", APID_HOUSEKEEPING, 3, 25, "Periodic state of the payload",
@@ -168,6 +150,179 @@ def _telemetry() -> tuple[PacketDefinition, ...]:
                 Field("anchor_reads", "u32", "Reads of the anchor ephemeris by this estimator so far"),
             ),
         ),
+        *(
+            PacketDefinition(
+                f"event_{severity}", APID_EVENTS, 5, subtype, f"Event report, {meaning}",
+                (
+                    Field("event_id", "u16", "What happened", labels=events),
+                    Field("frame_number", "u32", "Frame during which it happened"),
+                    Field("value_1", "f64", "First value that goes with the event"),
+                    Field("value_2", "f64", "Second value that goes with the event"),
+                ),
+            )
+            for subtype, severity, meaning in (
+                (1, "info", "informative"),
+                (2, "low", "low severity"),
+                (3, "medium", "medium severity"),
+                (4, "high", "high severity"),
+            )
+        ),
+        PacketDefinition(
+            "time_report", APID_TIME_REPORT, 9, 2, "On-board time at a reference instant",
+            (
+                Field("reported_ticks", "u64", "On-board time at the reference instant", "2^-16 s"),
+                Field("rate_exponent", "u8", "One report every 2^n transfer frames", maximum=8),
+            ),
+        ),
+        *(_verification(*row, failures) for row in _VERIFICATION),
+        PacketDefinition("connection_report", APID_TEST, 17, 2, "Answer to a connection test", ()),
+        PacketDefinition(
+            "parameter_report", APID_PARAMETERS, 20, 2, "Value of one on-board parameter",
+            (
+                Field("parameter_id", "u16", "Number of the parameter"),
+                Field("value", "f64", "Its value"),
+            ),
+        ),
+        *(
+            PacketDefinition(
+                f"large_data_{part}", APID_LARGE_DATA, 13, subtype, f"Large data downlink, {part} part",
+                (
+                    Field("transaction", "u16", "Number of the transfer"),
+                    Field("part", "u16", "Number of the part, from 1"),
+                    Field("table", "u8", "What is transferred", labels=tables),
+                    Field("count", "u16", "Octets that follow"),
+                ),
+                Group("count", _OCTETS),
+            )
+            for subtype, part in ((1, "first"), (2, "middle"), (3, "last"))
+        ),
+    )  # fmt: skip
+
+
+_VERIFICATION = (
+    (1, "verification_accepted", "Telecommand accepted", False, False),
+    (2, "verification_not_accepted", "Telecommand failed acceptance", False, True),
+    (3, "verification_started", "Execution started", False, False),
+    (4, "verification_not_started", "Execution failed to start", False, True),
+    (5, "verification_progress", "Execution went a step further", True, False),
+    (6, "verification_progress_failed", "Execution failed in a step", True, True),
+    (7, "verification_completed", "Execution completed", False, False),
+    (8, "verification_not_completed", "Execution failed to complete", False, True),
+    (10, "verification_not_routed", "Telecommand could not be routed", False, True),
+)
+
+
+def _verification(
+    subtype: int, name: str, text: str, step: bool, failure: bool, failures: Labels
+) -> PacketDefinition:
+    fields = [Field("request_id", "u32", "First four octets of the telecommand packet")]
+    if step:
+        fields.append(Field("step", "u8", "Number of the step, from 1"))
+    if failure:
+        fields.append(Field("failure_code", "u16", "Why", labels=failures))
+    return PacketDefinition(name, APID_VERIFICATION, 1, subtype, text, tuple(fields))
+
+
+def _command(
+    name: str,
+    service: int,
+    subtype: int,
+    text: str,
+    fields: tuple[Field, ...] = (),
+    group: Group | None = None,
+) -> PacketDefinition:
+    return PacketDefinition(
+        name, APID_COMMAND, service, subtype, text, fields, group, packet_type=TYPE_TELECOMMAND
+    )
+
+
+def _telecommands(
+    events: Labels, functions: Labels, tables: Labels, arguments: tuple[str, str], structures: int
+) -> tuple[PacketDefinition, ...]:
+    structure = Field("structure_id", "u16", "Housekeeping structure", minimum=1, maximum=structures)
+    event = Field("event_id", "u16", "Event", labels=events)
+    parameter = Field("parameter_id", "u16", "Number of the parameter")
+
+    return (
+        _command("enable_housekeeping", 3, 5, "Send the structure periodically", (structure,)),
+        _command("disable_housekeeping", 3, 6, "Stop sending the structure", (structure,)),
+        _command("request_housekeeping", 3, 27, "Send the structure once", (structure,)),
+        _command(
+            "set_housekeeping_interval", 3, 31, "Change how often the structure is sent",
+            (structure, Field("interval_s", "u16", "Time between packets", "s", minimum=1, maximum=3600)),
+        ),
+        _command("enable_event", 5, 5, "Report this event", (event,)),
+        _command("disable_event", 5, 6, "Do not report this event", (event,)),
+        _command(
+            "perform_function", 8, 1, "Perform a function of the payload",
+            (
+                Field("function_id", "u16", "Function", labels=functions),
+                Field("argument_1", "f64", f"First argument ({arguments[0]}), else 0"),
+                Field("argument_2", "f64", f"Second argument ({arguments[1]}), else 0"),
+            ),
+        ),
+        _command(
+            "set_time_report_rate", 9, 1, "Change how often time is reported",
+            (Field("rate_exponent", "u8", "One report every 2^n transfer frames", maximum=8),),
+        ),
+        _command("enable_schedule", 11, 1, "Release the activities of the schedule"),
+        _command("disable_schedule", 11, 2, "Hold the activities of the schedule"),
+        _command("reset_schedule", 11, 3, "Delete all activities"),
+        _command(
+            "insert_activity", 11, 4, "Release a telecommand at an on-board time",
+            (
+                Field("release_ticks", "u64", "On-board time of release", "2^-16 s", maximum=2.0**48 - 1),
+                Field("count", "u16", "Octets of the telecommand packet that follows"),
+            ),
+            Group("count", _OCTETS),
+        ),
+        _command(
+            "delete_activity", 11, 5, "Delete an activity",
+            (Field("request_id", "u32", "First four octets of the scheduled telecommand packet"),),
+        ),
+        *(
+            _command(
+                f"uplink_{part}", 13, subtype, f"Large data uplink, {part} part",
+                (
+                    Field("transaction", "u16", "Number of the transfer"),
+                    Field("part", "u16", "Number of the part, from 1"),
+                    Field("table", "u8", "What is transferred", labels=tables),
+                    Field("count", "u16", "Octets that follow"),
+                ),
+                Group("count", _OCTETS),
+            )
+            for subtype, part in ((9, "first"), (10, "middle"), (11, "last"))
+        ),
+        _command(
+            "replay_store", 15, 9, "Send again what was stored between two on-board times",
+            (
+                Field("start_ticks", "u64", "From", "2^-16 s", maximum=2.0**48 - 1),
+                Field("stop_ticks", "u64", "To, excluded", "2^-16 s", maximum=2.0**48 - 1),
+            ),
+        ),
+        _command(
+            "delete_store", 15, 11, "Delete what was stored before an on-board time",
+            (Field("stop_ticks", "u64", "Up to, excluded", "2^-16 s", maximum=2.0**48 - 1),),
+        ),
+        _command("test_connection", 17, 1, "Answer with a connection report"),
+        _command("request_parameter", 20, 1, "Report the value of a parameter", (parameter,)),
+        _command(
+            "set_parameter", 20, 3, "Change a parameter",
+            (parameter, Field("value", "f64", "New value")),
+        ),
+    )  # fmt: skip
+
+
+_QUANTITY = Field("quantity", "u16", "Quantity of the data pool", labels=QUANTITIES)
+_STRUCTURE = Field(
+    "structure_id", "u16", "Housekeeping structure, defined by telecommand", minimum=16, maximum=31
+)
+_MILLISECONDS = "Processor time a step, mean since the last report"
+
+
+def _second_telemetry() -> tuple[PacketDefinition, ...]:
+    """What version 2 adds: the filter in full, and the payload as a machine."""
+    return (
         PacketDefinition(
             "filter_state", APID_NAVIGATION_STATE, 129, 4, "Orbit of the navigation filter with its covariance",
             (
@@ -191,167 +346,130 @@ def _telemetry() -> tuple[PacketDefinition, ...]:
                 ),
             ),
         ),
-        *(
-            PacketDefinition(
-                f"event_{severity}", APID_EVENTS, 5, subtype, f"Event report, {meaning}",
-                (
-                    Field("event_id", "u16", "What happened", labels=EVENTS),
-                    Field("frame_number", "u32", "Frame during which it happened"),
-                    Field("value_1", "f64", "First value that goes with the event"),
-                    Field("value_2", "f64", "Second value that goes with the event"),
-                ),
-            )
-            for subtype, severity, meaning in (
-                (1, "info", "informative"),
-                (2, "low", "low severity"),
-                (3, "medium", "medium severity"),
-                (4, "high", "high severity"),
-            )
-        ),
         PacketDefinition(
-            "time_report", APID_TIME_REPORT, 9, 2, "On-board time at a reference instant",
+            "performance", APID_PERFORMANCE, 3, 25, "Periodic state of the machine",
             (
-                Field("reported_ticks", "u64", "On-board time at the reference instant", "2^-16 s"),
-                Field("rate_exponent", "u8", "One report every 2^n transfer frames", maximum=8),
+                Field("structure_id", "u16", "Housekeeping structure, always 2", minimum=2, maximum=2),
+                *(
+                    Field(f"cpu_{stage}_ms", "f32", f"{_MILLISECONDS}: {meaning}", "ms")
+                    for stage, meaning in (
+                        ("commands", "telecommands and schedule"),
+                        ("detector", "image preparation and detector"),
+                        ("navigation", "estimators"),
+                        ("telemetry", "packets and store"),
+                        ("monitoring", "monitoring and memory scrubbing"),
+                    )
+                ),
+                Field("detector_latency_max_ms", "f32", "Longest run of the detector since the last report", "ms"),
+                Field("detector_timeouts", "u16", "Runs of the detector that took too long, since boot"),
+                Field(
+                    "camera_temperature_c", "i16", "Temperature of the camera", "degC", scale=0.01, saturate=True,
+                    warning=(-20.0, 50.0), alarm=(-30.0, 60.0),
+                ),
+                Field("bus_current_a", "u16", "Current drawn from the bus", "A", scale=0.001, saturate=True),
+                *(
+                    Field(f"queue_{name}", "u16", f"Packets of class {name} waiting for downlink", saturate=True)
+                    for _, name in STORE_CLASSES
+                ),
+                *(
+                    Field(f"store_{name}_permille", "u16", f"Store of class {name} in use", "1/1000", maximum=1000)
+                    for _, name in STORE_CLASSES
+                ),
+                Field("store_overwritten", "u32", "Packets lost from the store before they were sent, since boot"),
+                Field("storage_errors", "u16", "Damaged packets found in the store since boot", saturate=True),
+                Field("memory_repairs", "u16", "Regions of memory restored since boot", saturate=True),
+                Field("activities", "u8", "Activities in the schedule"),
+                Field("last_command_count", "u16", "Sequence count of the newest telecommand, 65535 if none"),
             ),
         ),
-        *(_verification(*row) for row in _VERIFICATION),
-        PacketDefinition("connection_report", APID_TEST, 17, 2, "Answer to a connection test", ()),
         PacketDefinition(
-            "parameter_report", APID_PARAMETERS, 20, 2, "Value of one on-board parameter",
+            "housekeeping_report", APID_REPORTS, 3, 25, "Values of a structure that was defined by telecommand",
+            (_STRUCTURE, Field("count", "u8", "Number of quantities that follow")),
+            Group("count", (_QUANTITY, Field("value", "f64", "Its value"))),
+        ),
+        PacketDefinition(
+            "housekeeping_definition", APID_REPORTS, 3, 10, "What a defined structure holds",
             (
-                Field("parameter_id", "u16", "Number of the parameter"),
-                Field("value", "f64", "Its value"),
+                _STRUCTURE,
+                Field("interval_s", "u16", "Time between packets, 0 if not sent periodically", "s"),
+                Field("count", "u8", "Number of quantities that follow"),
+            ),
+            Group("count", (_QUANTITY,)),
+        ),
+        PacketDefinition(
+            "disabled_events", APID_EVENTS, 5, 8, "Events that are not reported",
+            (Field("count", "u8", "Number of events that follow"),),
+            Group("count", (Field("event_id", "u16", "Event", labels=EVENTS),)),
+        ),
+        PacketDefinition(
+            "schedule_report", APID_SCHEDULE, 11, 13, "Activities of the schedule, by release time",
+            (
+                Field("enabled", "u8", "Whether activities are released", maximum=1),
+                Field("count", "u8", "Number of activities that follow"),
+            ),
+            Group(
+                "count",
+                (
+                    Field("release_ticks", "u64", "On-board time of release", "2^-16 s", maximum=2.0**48 - 1),
+                    Field("request_id", "u32", "First four octets of the scheduled telecommand packet"),
+                ),
             ),
         ),
-        *(
-            PacketDefinition(
-                f"large_data_{part}", APID_LARGE_DATA, 13, subtype, f"Large data downlink, {part} part",
+        PacketDefinition(
+            "store_report", APID_STORE, 15, 19, "Contents of the packet store",
+            (Field("count", "u8", "Number of classes that follow"),),
+            Group(
+                "count",
                 (
-                    Field("transaction", "u16", "Number of the transfer"),
-                    Field("part", "u16", "Number of the part, from 1"),
-                    Field("table", "u8", "What is transferred", labels=TABLES),
-                    Field("count", "u16", "Octets that follow"),
+                    Field("store_class", "u8", "Class", labels=STORE_CLASSES),
+                    Field("packets", "u32", "Packets kept"),
+                    Field("unsent", "u32", "Packets among them that wait for downlink"),
+                    Field("octets", "u32", "Octets in use"),
+                    Field(
+                        "oldest_ticks", "u64", "On-board time of the oldest packet, 0 if none", "2^-16 s",
+                        maximum=2.0**48 - 1,
+                    ),
+                    Field(
+                        "newest_ticks", "u64", "On-board time of the newest packet, 0 if none", "2^-16 s",
+                        maximum=2.0**48 - 1,
+                    ),
                 ),
-                Group("count", _OCTETS),
-            )
-            for subtype, part in ((1, "first"), (2, "middle"), (3, "last"))
+            ),
         ),
     )  # fmt: skip
 
 
-_VERIFICATION = (
-    (1, "verification_accepted", "Telecommand accepted", False, False),
-    (2, "verification_not_accepted", "Telecommand failed acceptance", False, True),
-    (3, "verification_started", "Execution started", False, False),
-    (4, "verification_not_started", "Execution failed to start", False, True),
-    (5, "verification_progress", "Execution went a step further", True, False),
-    (6, "verification_progress_failed", "Execution failed in a step", True, True),
-    (7, "verification_completed", "Execution completed", False, False),
-    (8, "verification_not_completed", "Execution failed to complete", False, True),
-    (10, "verification_not_routed", "Telecommand could not be routed", False, True),
+def _second_telecommands() -> tuple[PacketDefinition, ...]:
+    return (
+        _command(
+            "create_housekeeping", 3, 1, "Define a housekeeping structure",
+            (
+                _STRUCTURE,
+                Field("interval_s", "u16", "Time between packets, 0 for on request only", "s", maximum=3600),
+                Field("count", "u8", "Number of quantities that follow", minimum=1, maximum=32),
+            ),
+            Group("count", (_QUANTITY,)),
+        ),
+        _command("delete_housekeeping", 3, 3, "Delete a defined structure", (_STRUCTURE,)),
+        _command("report_housekeeping_definition", 3, 9, "Report what a defined structure holds", (_STRUCTURE,)),
+        _command("report_disabled_events", 5, 7, "Report which events are not reported"),
+        _command("report_schedule", 11, 17, "Report the activities of the schedule"),
+        _command("report_store", 15, 18, "Report the contents of the packet store"),
+    )  # fmt: skip
+
+
+DICTIONARY_1 = Dictionary(
+    version=1,
+    telemetry=_telemetry(EVENTS_1, FAILURES_1, TABLES_1),
+    telecommands=_telecommands(EVENTS_1, FUNCTIONS_1, TABLES_1, ARGUMENTS_1, 1),
+)
+DICTIONARY = Dictionary(
+    version=2,
+    telemetry=_telemetry(EVENTS, FAILURES, TABLES) + _second_telemetry(),
+    telecommands=_telecommands(EVENTS, FUNCTIONS, TABLES, ARGUMENTS, 31) + _second_telecommands(),
 )
 
-
-def _verification(subtype: int, name: str, text: str, step: bool, failure: bool) -> PacketDefinition:
-    fields = [Field("request_id", "u32", "First four octets of the telecommand packet")]
-    if step:
-        fields.append(Field("step", "u8", "Number of the step, from 1"))
-    if failure:
-        fields.append(Field("failure_code", "u16", "Why", labels=FAILURES))
-    return PacketDefinition(name, APID_VERIFICATION, 1, subtype, text, tuple(fields))
-
-
-def _telecommands() -> tuple[PacketDefinition, ...]:
-    structure = Field("structure_id", "u16", "Housekeeping structure", minimum=1, maximum=1)
-    event = Field("event_id", "u16", "Event", labels=EVENTS)
-    parameter = Field("parameter_id", "u16", "Number of the parameter")
-
-    def command(
-        name: str,
-        service: int,
-        subtype: int,
-        text: str,
-        fields: tuple[Field, ...] = (),
-        group: Group | None = None,
-    ) -> PacketDefinition:
-        return PacketDefinition(
-            name, APID_COMMAND, service, subtype, text, fields, group, packet_type=TYPE_TELECOMMAND
-        )
-
-    return (
-        command("enable_housekeeping", 3, 5, "Send the structure periodically", (structure,)),
-        command("disable_housekeeping", 3, 6, "Stop sending the structure", (structure,)),
-        command("request_housekeeping", 3, 27, "Send the structure once", (structure,)),
-        command(
-            "set_housekeeping_interval", 3, 31, "Change how often the structure is sent",
-            (structure, Field("interval_s", "u16", "Time between packets", "s", minimum=1, maximum=3600)),
-        ),
-        command("enable_event", 5, 5, "Report this event", (event,)),
-        command("disable_event", 5, 6, "Do not report this event", (event,)),
-        command(
-            "perform_function", 8, 1, "Perform a function of the payload",
-            (
-                Field("function_id", "u16", "Function", labels=FUNCTIONS),
-                Field("argument_1", "f64", "First argument (mode, duration in s, table number, m), else 0"),
-                Field("argument_2", "f64", "Second argument (cadence in s, m/s), else 0"),
-            ),
-        ),
-        command(
-            "set_time_report_rate", 9, 1, "Change how often time is reported",
-            (Field("rate_exponent", "u8", "One report every 2^n transfer frames", maximum=8),),
-        ),
-        command("enable_schedule", 11, 1, "Release the activities of the schedule"),
-        command("disable_schedule", 11, 2, "Hold the activities of the schedule"),
-        command("reset_schedule", 11, 3, "Delete all activities"),
-        command(
-            "insert_activity", 11, 4, "Release a telecommand at an on-board time",
-            (
-                Field("release_ticks", "u64", "On-board time of release", "2^-16 s", maximum=2.0**48 - 1),
-                Field("count", "u16", "Octets of the telecommand packet that follows"),
-            ),
-            Group("count", _OCTETS),
-        ),
-        command(
-            "delete_activity", 11, 5, "Delete an activity",
-            (Field("request_id", "u32", "First four octets of the scheduled telecommand packet"),),
-        ),
-        *(
-            command(
-                f"uplink_{part}", 13, subtype, f"Large data uplink, {part} part",
-                (
-                    Field("transaction", "u16", "Number of the transfer"),
-                    Field("part", "u16", "Number of the part, from 1"),
-                    Field("table", "u8", "What is transferred", labels=TABLES),
-                    Field("count", "u16", "Octets that follow"),
-                ),
-                Group("count", _OCTETS),
-            )
-            for subtype, part in ((9, "first"), (10, "middle"), (11, "last"))
-        ),
-        command(
-            "replay_store", 15, 9, "Send again what was stored between two on-board times",
-            (
-                Field("start_ticks", "u64", "From", "2^-16 s", maximum=2.0**48 - 1),
-                Field("stop_ticks", "u64", "To, excluded", "2^-16 s", maximum=2.0**48 - 1),
-            ),
-        ),
-        command(
-            "delete_store", 15, 11, "Delete what was stored before an on-board time",
-            (Field("stop_ticks", "u64", "Up to, excluded", "2^-16 s", maximum=2.0**48 - 1),),
-        ),
-        command("test_connection", 17, 1, "Answer with a connection report"),
-        command("request_parameter", 20, 1, "Report the value of a parameter", (parameter,)),
-        command(
-            "set_parameter", 20, 3, "Change a parameter",
-            (parameter, Field("value", "f64", "New value")),
-        ),
-    )  # fmt: skip
-
-
-DICTIONARY = Dictionary(version=1, telemetry=_telemetry(), telecommands=_telecommands())
-
-_VERSIONS = {DICTIONARY.version: DICTIONARY}
+_VERSIONS = {dictionary.version: dictionary for dictionary in (DICTIONARY_1, DICTIONARY)}
 
 
 def dictionary_version(version: int) -> Dictionary:

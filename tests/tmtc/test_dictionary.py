@@ -48,13 +48,27 @@ def test_the_layouts_have_the_lengths_of_the_interface():
     assert lengths["verification_not_completed"] == (0x0A6, 1, 8, 22 + 6, 0)
 
 
-def test_version_1_has_the_hash_under_which_it_was_released():
-    # a change here is a change of the interface: it needs a new version beside the old one, which stays decodable
-    assert DICTIONARY.version == 1
-    assert DICTIONARY.hash == "58920a1367873a6f038811b65adcf6d09ca9f95b41981403f87e191e37e635c7"
-    assert dictionary_version(1) is DICTIONARY
-    with pytest.raises(UnknownPacket, match="expected version 1, found 2"):
-        dictionary_version(2)
+def test_versions_have_the_hashes_under_which_they_were_released():
+    # a change here is a change of the interface: it needs a new version beside the old ones, which stay decodable
+    assert DICTIONARY.version == 2
+    assert DICTIONARY.hash == "bd7bd2128efb9310c1000dd578ddd33d4cd02813ae1a62ccd651d0e9d9e7db01"
+    first = dictionary_version(1)
+    assert first.hash == "bf94b11b68e9327bf0ca1d262ca2a69719c71215d16f98dbcd6be24d057661b9"
+    assert dictionary_version(2) is DICTIONARY
+    with pytest.raises(UnknownPacket, match="expected version 1, 2, found 3"):
+        dictionary_version(3)
+
+
+def test_packets_of_version_1_read_the_same_in_version_2():
+    octets = dictionary_version(1).pack("housekeeping", HOUSEKEEPING, ticks=5 << 16, sequence_count=1)
+    assert octets == pack("housekeeping", HOUSEKEEPING)
+    for definition in dictionary_version(1).telemetry + dictionary_version(1).telecommands:
+        later = DICTIONARY.packet(definition.name)
+        assert (later.key, later.base_length, later.item_length) == (
+            definition.key,
+            definition.base_length,
+            definition.item_length,
+        )
 
 
 def test_housekeeping_comes_back_within_its_quantisation():
