@@ -15,7 +15,7 @@ from lunar.errors import ImpactError
 from lunar.frames import IauOrientation, Orientation
 from lunar.gravity import GravityField, builtin_gravity, load_gravity
 from lunar.maneuvers import Maneuver, ManeuverRule, propagate_with_maneuvers
-from lunar.propagation import ForceModel, Trajectory, propagate
+from lunar.propagation import ForceModel, SolarPressure, Trajectory, propagate
 from lunar.timescales import tai_ns_from_utc_ns, tdb_minus_tt_s, tdb_s_from_utc_ns
 from payload_emulator.errors import ScenarioError
 from payload_emulator.scenario import Scenario
@@ -60,8 +60,14 @@ def force_model(scenario: Scenario, data: DataFolder) -> ForceModel:
     dynamics = scenario.dynamics
     gravity = open_gravity(dynamics.gravity, data)
     orientation = open_orientation(dynamics.orientation, data)
+    area_to_mass = dynamics.solar_area_to_mass_m2_kg
     return ForceModel(
-        gravity, orientation, min(dynamics.degree, gravity.degree), earth=dynamics.earth, sun=dynamics.sun
+        gravity,
+        orientation,
+        min(dynamics.degree, gravity.degree),
+        earth=dynamics.earth,
+        sun=dynamics.sun,
+        solar_pressure=SolarPressure(area_to_mass, dynamics.solar_reflection) if area_to_mass > 0.0 else None,
     )
 
 

@@ -39,7 +39,10 @@ class OrbitSection:
 
 @dataclass(frozen=True, slots=True)
 class DynamicsSection:
-    """Forces on the true spacecraft. `gravity`: "auto" (best field at hand), "builtin", or a coefficient file."""
+    """Forces on the true spacecraft. `gravity`: "auto" (best field at hand), "builtin", or a coefficient file.
+
+    Sunlight pushes where the cross-section over mass is positive; the reflection is 1 for black, 2 for a mirror.
+    """
 
     gravity: str = "auto"
     degree: int = 100
@@ -47,6 +50,8 @@ class DynamicsSection:
     earth: bool = True
     sun: bool = True
     integrator: Literal["rkn86", "dop853", "rkf78"] = "rkn86"
+    solar_area_to_mass_m2_kg: float = 0.0
+    solar_reflection: float = 1.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -334,6 +339,19 @@ def _check(scenario: Scenario, source: str) -> None:
         )
     require(
         2 <= scenario.dynamics.degree <= 1200, "dynamics.degree", "from 2 to 1200", scenario.dynamics.degree
+    )
+    dynamics = scenario.dynamics
+    require(
+        0.0 <= dynamics.solar_area_to_mass_m2_kg <= 1e3,
+        "dynamics.solar_area_to_mass_m2_kg",
+        "from 0 to 1000",
+        dynamics.solar_area_to_mass_m2_kg,
+    )
+    require(
+        0.0 <= dynamics.solar_reflection <= 2.0,
+        "dynamics.solar_reflection",
+        "from 0 to 2",
+        dynamics.solar_reflection,
     )
     require(16 <= camera.width_px <= 8192, "camera.width_px", "from 16 to 8192", camera.width_px)
     require(16 <= camera.height_px <= 8192, "camera.height_px", "from 16 to 8192", camera.height_px)

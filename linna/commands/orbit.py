@@ -15,6 +15,7 @@ from linna.commands._orbit_ephemeris import (
     configure_interpolate,
     configure_stats,
 )
+from linna.commands._orbit_visibility import configure_visibility
 from linna.output import add_json_flag, emit, log
 
 
@@ -46,6 +47,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     configure_interpolate(commands)
     configure_stats(commands)
     configure_convert(commands)
+    configure_visibility(commands)
 
 
 def run_propagate(arguments: argparse.Namespace) -> int:

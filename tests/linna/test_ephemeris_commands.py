@@ -187,3 +187,19 @@ def test_the_fov_study_refuses_what_makes_no_sense(oem_path, capsys, option, mes
         capsys, "camera", "fov-study", "--ephemeris", oem_path, "--catalogue", "paper-density", *option
     )
     assert message in line
+
+
+def test_visibility_lists_eclipses_and_the_contacts_of_a_station(oem_path, capsys):
+    figures = run_json(capsys, "orbit", "visibility", oem_path, "--station", "Madrid=40.43,-4.25,830")
+    assert len(figures["eclipses"]) in (25, 26, 27)  # a revolution of 111 min, 48 h
+    assert figures["contacts"]["Madrid"]
+    assert 1.1 < figures["light_time_s"]["min"] < figures["light_time_s"]["max"] < 1.4  # s
+    first, second, *_ = figures["eclipses"]
+    assert first["stop"] < second["start"]
+
+
+@pytest.mark.parametrize("station", ["Madrid", "Madrid=here", "Madrid=400,0", "=1,2", "Madrid=1"])
+def test_a_station_that_cannot_be_read_is_one_line(oem_path, capsys, station):
+    assert "expected NAME=LATITUDE,LONGITUDE" in error_line(
+        capsys, "orbit", "visibility", oem_path, "--station", station
+    )

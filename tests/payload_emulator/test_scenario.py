@@ -37,6 +37,10 @@ def test_an_empty_scenario_is_the_papers_orbit() -> None:
         ),
         ('name = "x"\n[orbit]\neccentricity = "round"', "orbit.eccentricity must be a number, found 'round'"),
         (
+            'name = "x"\n[dynamics]\nsolar_area_to_mass_m2_kg = -1.0',
+            "dynamics.solar_area_to_mass_m2_kg must be from 0 to 1000, found -1.0",
+        ),
+        (
             'name = "x"\n[orbit]\neccentricity = 1.2',
             "orbit.eccentricity must be from 0 to below 1, found 1.2",
         ),
