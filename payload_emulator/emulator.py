@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lunar.catalogue import save_catalogue
 from lunar.datafolder import DataFolder
@@ -25,6 +24,7 @@ from lunar.oem import save_oem
 from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.loading import LoadedPayload, load_payload
+from payload_emulator.recording import FrameInput, frame_input, save_frame_times, save_image, save_record
 from payload_emulator.scenario import Scenario, format_scenario
 from payload_emulator.world import (
     World,
@@ -34,17 +34,10 @@ from payload_emulator.world import (
     sample_truth,
     with_reference_error,
 )
+from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 SPACECRAFT_ID = 0x4C
-_NS = 1_000_000_000
-_EPHEMERIS_STEP_NS = 10 * _NS
-_EPHEMERIS_MARGIN_NS = 120 * _NS
-_SEARCH_CHUNK_DAYS = 15.0
-_CATALOGUE_MARGIN_M = 15_000.0
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Progress = Callable[[Iterable[Any], int], Iterator[Any]]
 
 
@@ -115,10 +108,14 @@ def _emulate_into(
     )
     frames = exposures(world)
     packets: list[bytes] = []
+    inputs: list[FrameInput] = []
     for number, frame in enumerate(progress(frames, total) if progress else frames):
+        inputs.append(frame_input(number, frame.image, frame.attitude, frame.clock_ticks))
         packets += loaded.payload.step(frame.image, frame.attitude, frame.clock_ticks, b"")
         if number in kept:
-            _save_png(folder / "frames" / f"{number:06d}.png", frame.image)
+            save_image(folder, number, frame.image)
+    save_record(folder, inputs, loaded.parameters, loaded.tables)
+    save_frame_times(folder, world.frame_utc_ns)
     save_oem(truth_ephemeris, folder / "truth.oem")
     save_oem(reference, folder / "reference.oem")
     save_catalogue(catalogue, folder / "catalogue.csv")
@@ -165,7 +162,6 @@ def _summary(
 def _manifest(world: World, loaded: LoadedPayload, folder: Path) -> dict[str, Any]:
     """What the ground needs to know of a pass, with the hash of every file of the archive but itself."""
     scenario, camera = world.scenario, world.scenario.camera
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "manifest.json")
     return {
         "schema_version": 1,
         "pass_name": f"{scenario.name}-{format_utc(int(world.frame_utc_ns[0]), 0)}",
@@ -174,6 +170,7 @@ def _manifest(world: World, loaded: LoadedPayload, folder: Path) -> dict[str, An
         "scenario_toml": format_scenario(scenario),
         "seed": scenario.seed,
         "build": loaded.build,
+        "dictionary": {"version": DICTIONARY.version, "hash": DICTIONARY.hash},
         "data_sources": list(world.data_names),
         "start_utc": format_utc(int(world.frame_utc_ns[0])),
         "stop_utc": format_utc(int(world.frame_utc_ns[-1])),
@@ -190,24 +187,20 @@ def _manifest(world: World, loaded: LoadedPayload, folder: Path) -> dict[str, An
             **loaded.gravity,
         },
         "tables": loaded.table_hashes,
-        "files": {
-            path.relative_to(folder).as_posix(): {
-                "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
-                "bytes": path.stat().st_size,
-            }
-            for path in files
-        },
+        "files": file_entries(folder),
     }
 
 
-def _save_png(path: Path, image: NDArray[np.uint8]) -> None:
-    import cv2
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    good, encoded = cv2.imencode(".png", image[..., ::-1])
-    if not good:
-        raise OSError(f"PNG encoder refused an image of shape {image.shape}")
-    path.write_bytes(encoded.tobytes())
+def file_entries(folder: Path) -> dict[str, dict[str, Any]]:
+    """Size and SHA-256 of every file of an archive but its manifest, by name."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / "manifest.json")
+    return {
+        path.relative_to(folder).as_posix(): {
+            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+            "bytes": path.stat().st_size,
+        }
+        for path in files
+    }
 
 
 def _require_replaceable(out: Path) -> None:

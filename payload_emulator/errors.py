@@ -6,6 +6,8 @@ PayloadError
 ├── RendererError      a renderer is not installed, or cannot render what is asked for
 ├── ModelError         a detector model is not the one that flight expects
 ├── TableError         an uploaded table (anchor ephemeris, catalogue, gravity) is damaged or of another kind
+├── ParameterError     a parameter file cannot be read
+├── RecordError        an archived pass cannot be flown again
 └── DatasetError       a data set is missing, incomplete or of another camera
 """
 
@@ -36,3 +38,11 @@ class TableError(PayloadError):
 
 class DatasetError(PayloadError):
     """A data set is missing, incomplete, or was made for another camera."""
+
+
+class ParameterError(PayloadError):
+    """A parameter file is no TOML, or names a parameter that flight does not have, or gives it another type."""
+
+
+class RecordError(PayloadError):
+    """An archived pass lacks what is needed to fly it again, or holds something else than was recorded."""

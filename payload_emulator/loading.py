@@ -39,6 +39,7 @@ from payload_emulator.flight.tables import (
     pack_initial_state,
     pack_orientation_table,
 )
+from payload_emulator.parameter_file import BuildParameters, format_parameters, parse_parameters
 from payload_emulator.scenario import Scenario
 
 _ANCHOR_STEP_NS = 15_000_000_000
@@ -63,6 +64,8 @@ class LoadedPayload:
     """A payload ready to observe, and what the archive records of how it was loaded."""
 
     payload: Payload
+    parameters: BuildParameters
+    tables: FlightTables
     build: dict[str, str]
     start_state: dict[str, Any]
     table_hashes: dict[str, str]
@@ -87,17 +90,21 @@ def load_payload(
         The detector model is missing or no network of this project.
     """
     model_octets = _model_octets(model)
-    detector = OnnxDetector(
-        model_octets, DetectorParameters(width_px=camera.width_px, height_px=camera.height_px)
-    )
     navigation = scenario.navigation
     field = _filter_field(navigation.filter_gravity, navigation.filter_degree, data)
-    parameters = FlightParameters(
-        camera=camera,
-        modes=tuple(Mode[name] for name in navigation.estimators),
-        odometry=OdometryParameters(safety_timeout_s=navigation.safety_timeout_s or None),
-        anchored=AnchoredParameters(gravity_degree=field.degree),
+    chosen = BuildParameters(
+        DetectorParameters(width_px=camera.width_px, height_px=camera.height_px),
+        FlightParameters(
+            camera=camera,
+            modes=tuple(Mode[name] for name in navigation.estimators),
+            odometry=OdometryParameters(safety_timeout_s=navigation.safety_timeout_s or None),
+            anchored=AnchoredParameters(gravity_degree=field.degree),
+        ),
     )
+    # Flight is given what the parameter file of the archive says, so that a replay is given the same.
+    loaded = parse_parameters(format_parameters(chosen))
+    parameters = loaded.flight
+    detector = OnnxDetector(model_octets, loaded.detector)
     start, stop = reference.start_utc_ns, reference.stop_utc_ns
     flight_orientation = IauOrientation()
     position, velocity = reference.at(np.array([first_frame_utc_ns]))
@@ -116,6 +123,8 @@ def load_payload(
     )
     return LoadedPayload(
         payload,
+        loaded,
+        tables,
         build={
             "name": "linna-flight",
             "version": "0.1.0",

@@ -1,0 +1,234 @@
+"""What a payload was given during a pass, kept so that another build can be given the same.
+
+In a pass archive this is the folder `payload/`: `inputs.jsonl` (one line per frame: on-board time, message of the ADCS,
+telecommands, hash of the image), `parameters.toml`, `tables/*.bin` as uploaded, and `dictionary.json` (the packet
+definitions the downlink was made with); images lie in `frames/`. Nothing of the truth is here.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from payload_emulator.errors import RecordError
+from payload_emulator.flight.payload import FlightTables
+from payload_emulator.parameter_file import BuildParameters, format_parameters, parse_parameters
+from tmtc.definitions import format_dictionary
+from tmtc.dictionary import DICTIONARY
+
+FOLDER = "payload"
+INPUTS = f"{FOLDER}/inputs.jsonl"
+PARAMETERS = f"{FOLDER}/parameters.toml"
+TABLES = f"{FOLDER}/tables"
+FRAME_TIMES = "frame_times.csv"
+DICTIONARY_FILE = f"{FOLDER}/dictionary.json"
+
+FloatArray = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameInput:
+    """What one call of `Payload.step` was given, the image by its hash.
+
+    Attributes
+    ----------
+    image_shape, image_sha256
+        Shape of the pixels and SHA-256 of their octets, row by row; an empty shape and hash for a camera that gave
+        none.
+    """
+
+    number: int
+    clock_ticks: int
+    attitude: FloatArray
+    telecommands: bytes
+    image_shape: tuple[int, ...]
+    image_sha256: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PassRecord:
+    """Everything but the images that a payload was given during a pass."""
+
+    inputs: tuple[FrameInput, ...]
+    parameters: BuildParameters
+    tables: FlightTables
+
+
+def frame_input(
+    number: int, image: NDArray[Any], attitude: FloatArray, clock_ticks: int, telecommands: bytes = b""
+) -> FrameInput:
+    """The record of one frame."""
+    return FrameInput(
+        number,
+        int(clock_ticks),
+        np.asarray(attitude, np.float64),
+        telecommands,
+        image.shape,
+        pixel_hash(image),
+    )
+
+
+def pixel_hash(image: NDArray[Any]) -> str:
+    """SHA-256 of the pixels, row by row; empty for an image without any."""
+    return hashlib.sha256(np.ascontiguousarray(image).data).hexdigest() if image.size else ""
+
+
+def save_record(
+    folder: Path, inputs: Iterable[FrameInput], parameters: BuildParameters, tables: FlightTables
+) -> None:
+    """Write the record of a pass into its archive `folder`."""
+    (folder / TABLES).mkdir(parents=True, exist_ok=True)
+    (folder / INPUTS).write_text("".join(_line(item) for item in inputs))
+    (folder / PARAMETERS).write_text(format_parameters(parameters))
+    (folder / DICTIONARY_FILE).write_text(format_dictionary(DICTIONARY))
+    for item in fields(tables):
+        octets: bytes = getattr(tables, item.name)
+        if octets:
+            (folder / TABLES / f"{item.name}.bin").write_bytes(octets)
+
+
+def save_frame_times(folder: Path, utc_ns: NDArray[np.int64]) -> None:
+    """Write the UTC (n,) of every frame, which is the ground's to know: a payload is given its own clock only."""
+    rows = [f"{number},{utc}\n" for number, utc in enumerate(utc_ns.tolist())]
+    (folder / FRAME_TIMES).write_text("frame_number,utc_ns\n" + "".join(rows))
+
+
+def load_record(folder: Path) -> PassRecord:
+    """The record in a pass archive.
+
+    Raises
+    ------
+    RecordError
+        The archive holds no record, or not all of it.
+    """
+    try:
+        lines = (folder / INPUTS).read_text().splitlines()
+        text = (folder / PARAMETERS).read_text()
+    except FileNotFoundError as error:
+        raise RecordError(
+            f"{folder}: expected {Path(error.filename).relative_to(folder)}, found none: this pass was archived "
+            "without what its payload was given and cannot be flown again"
+        ) from None
+    except UnicodeDecodeError:
+        raise RecordError(f"{folder / INPUTS}: expected UTF-8 text, found other octets") from None
+    known = {item.name for item in fields(FlightTables)}
+    tables = {
+        path.stem: path.read_bytes() for path in sorted((folder / TABLES).glob("*.bin")) if path.stem in known
+    }
+    return PassRecord(
+        tuple(_parse(line, folder / INPUTS, i) for i, line in enumerate(lines)),
+        parse_parameters(text, source=str(folder / PARAMETERS)),
+        FlightTables(**tables),
+    )
+
+
+def frame_path(number: int) -> str:
+    """Name of the image of a frame in an archive."""
+    return f"frames/{number:06d}.png"
+
+
+def missing_frames(folder: Path, inputs: Sequence[FrameInput]) -> list[int]:
+    """Frames that had an image which is not in the archive."""
+    return [
+        item.number
+        for item in inputs
+        if item.image_sha256 and not (folder / frame_path(item.number)).is_file()
+    ]
+
+
+def save_image(folder: Path, number: int, image: Image) -> None:
+    """Write one frame into an archive."""
+    import cv2
+
+    path = folder / frame_path(number)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    good, encoded = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
+    if not good:
+        raise OSError(f"PNG encoder refused an image of shape {image.shape}")
+    path.write_bytes(encoded.tobytes())
+
+
+def load_image(folder: Path, item: FrameInput) -> Image:
+    """The image of a frame as the payload was given it, checked against its hash; no pixels where it had none.
+
+    Raises
+    ------
+    RecordError
+        The image is missing, or is another one.
+    """
+    if not item.image_sha256:
+        return np.zeros(item.image_shape, np.uint8)
+    import cv2
+
+    path = folder / frame_path(item.number)
+    try:
+        octets = np.frombuffer(path.read_bytes(), np.uint8)
+    except FileNotFoundError:
+        raise RecordError(f"{path}: expected the image of frame {item.number}, found none") from None
+    pixels = cv2.imdecode(octets, cv2.IMREAD_UNCHANGED) if octets.size else None
+    if pixels is None:
+        raise RecordError(f"{path}: expected a PNG image, found something else")
+    image: Image = np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels)
+    check_image(item, image, str(path))
+    return image
+
+
+def check_image(item: FrameInput, image: Image, source: str) -> None:
+    """Refuse an image that is not the one that the payload was given."""
+    if image.shape != item.image_shape:
+        raise RecordError(
+            f"{source}: expected {_size(item.image_shape)} as recorded for frame {item.number}, "
+            f"found {_size(image.shape)}"
+        )
+    found = pixel_hash(image)
+    if found != item.image_sha256:
+        raise RecordError(
+            f"{source}: expected pixels with SHA-256 {item.image_sha256[:16]}… for frame {item.number}, "
+            f"found {found[:16]}…"
+        )
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return " x ".join(map(str, shape)) + " pixels"
+
+
+def _line(item: FrameInput) -> str:
+    attitude = [None if math.isnan(value) else value for value in item.attitude.tolist()]
+    row = {
+        "frame": item.number,
+        "ticks": item.clock_ticks,
+        "attitude": attitude,
+        "telecommands": base64.b64encode(item.telecommands).decode(),
+        "image": frame_path(item.number) if item.image_sha256 else None,
+        "shape": list(item.image_shape),
+        "pixels_sha256": item.image_sha256,
+    }
+    return json.dumps(row) + "\n"
+
+
+def _parse(line: str, path: Path, index: int) -> FrameInput:
+    try:
+        row = json.loads(line)
+        attitude = [math.nan if value is None else float(value) for value in row["attitude"]]
+        return FrameInput(
+            int(row["frame"]),
+            int(row["ticks"]),
+            np.array(attitude, dtype=np.float64),
+            base64.b64decode(row["telecommands"], validate=True),
+            tuple(int(value) for value in row["shape"]),
+            str(row["pixels_sha256"]),
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        raise RecordError(
+            f"{path}, line {index + 1}: expected a frame's inputs, found something else ({error})"
+        ) from None
