@@ -236,7 +236,7 @@ def fly(case: NavigationCase, seed: int) -> NavigationRun:
         found, truth = _detect(case, true_map, states[k, :3], camera_from_icrf, rotations[k], lasting, rng)
         told = _turned(camera_from_icrf, bias_rad + case.attitude_noise_rad * rng.standard_normal(3))
         if case.kidnap is not None and case.kidnap.told and k == case.kidnap.frame:
-            navigator.loosen(case.kidnap.distance_m, 1e-3 * case.kidnap.distance_m)
+            navigator.widen(case.kidnap.distance_m, 1e-3 * case.kidnap.distance_m)
         shown = bool(case.imaging[k])
         report = navigator.step(int(ticks[k]), found if shown else None, told)
         rows.append(_row(navigator, report.outcome, report.nis, states[k], truth if shown else truth[:0]))

@@ -33,10 +33,12 @@ from payload_emulator.flight.sighting import (
 )
 from payload_emulator.flight.tables import (
     TICKS_PER_SECOND,
+    BurnTable,
     CatalogueTable,
     GravityTable,
     InitialState,
     OrientationTable,
+    no_burns,
 )
 
 Float = NDArray[np.float64]
@@ -141,6 +143,8 @@ class AnchoredNavigator:
         Uploaded tables.
     camera
         The camera as calibrated.
+    burns
+        Planned burns; `burns` may be replaced at any time.
     """
 
     def __init__(
@@ -151,8 +155,10 @@ class AnchoredNavigator:
         initial_state: InitialState,
         camera: PinholeCamera,
         parameters: AnchoredParameters = AnchoredParameters(),
+        burns: BurnTable | None = None,
     ) -> None:
         self.parameters = parameters
+        self.burns = no_burns() if burns is None else burns
         self.landmarks: LandmarkMap = landmark_map(catalogue)
         degree = min(parameters.gravity_degree, gravity.c_bar.shape[0] - 1)
         noise = process_noise(degree) if parameters.noise is None else parameters.noise
@@ -183,7 +189,7 @@ class AnchoredNavigator:
         self.last_fix = None
         elapsed_s = (ticks - self.state.ticks) / TICKS_PER_SECOND
         mcmf_from_icrf = self.model.mcmf_from_icrf(ticks)
-        prior = kalman.predict(self.state, ticks, self.model, self.parameters.errors)
+        prior = self._predict(ticks)
         if prior is None or mcmf_from_icrf is None or not _usable(prior):
             # Without the Moon's orientation neither dynamics nor catalogue can be used: the old state is all there is.
             return self._report(Outcome.refused, None, 0, 0)
@@ -206,17 +212,26 @@ class AnchoredNavigator:
         self.state, self.last_fix = fix.update.state, fix
         return self._report(Outcome.fixed, mcmf_from_icrf, candidates, expected, fix)
 
-    def loosen(self, sigma_position_m: float, sigma_velocity_m_s: float) -> None:
-        """Widen the estimate after something that the dynamics do not know of: a burn, a restart, an old state."""
-        widened = self.state.covariance.copy()
-        widened[:3, :3] += np.eye(3) * sigma_position_m**2
-        widened[3:6, 3:6] += np.eye(3) * sigma_velocity_m_s**2
-        self.state = replace(self.state, covariance=widened)
+    def widen(self, sigma_position_m: float, sigma_velocity_m_s: float) -> None:
+        """Widen the estimate after something that neither dynamics nor burns know of: a restart, an old state."""
+        self.state = kalman.widened(self.state, sigma_position_m, sigma_velocity_m_s)
 
     @property
     def lost(self) -> bool:
         """Whether the estimate is too uncertain to be of use."""
         return self.state.position_sigma_m > self.parameters.divergence_limit_m
+
+    def _predict(self, ticks: int) -> FilterState | None:
+        """Return the state carried to a time over the burns on the way, undoing them on the way back."""
+        state, table, errors = self.state, self.burns, self.parameters.errors
+        sense = 1.0 if ticks >= state.ticks else -1.0
+        low, high = np.searchsorted(table.ticks, sorted((state.ticks, ticks)), side="right")
+        for k in range(low, high)[:: int(sense)]:
+            reached = kalman.predict(state, int(table.ticks[k]), self.model, errors)
+            if reached is None:
+                return None
+            state = kalman.burn(reached, sense * table.delta_v_icrf_m_s[k], float(table.sigma_m_s[k]))
+        return kalman.predict(state, ticks, self.model, errors)
 
     def _fix(self, prior: FilterState, pose: Pose, found: Detections) -> tuple[Fix | None, int, int]:
         """Return a fix around the prediction, the number of candidate pairs and of craters expected in view."""

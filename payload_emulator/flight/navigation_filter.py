@@ -1,7 +1,7 @@
 """Extended Kalman filter of orbit, common errors and the craters in view, iterated, in Joseph form.
 
-The first 17 states are position and velocity (ICRF), empirical acceleration (radial, transverse, normal), attitude
-bias (camera axes), pixel bias, catalogue offset (east, north, up). Behind them stand three for each crater that was
+The first 18 states are position and velocity (ICRF), empirical acceleration (radial, transverse, normal), attitude
+bias (camera axes), pixel bias, catalogue offset (east, north, up) and image scale. Behind them stand three for each crater that was
 used and is still in view: how far it lies from its catalogued place, east, north, up. A crater is seen several
 times on a pass and errs the same way each time; its error is a state, not fresh noise, and goes when it does.
 """
@@ -21,9 +21,9 @@ from payload_emulator.flight.tables import TICKS_PER_SECOND
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-SIZE = 17
+SIZE = 18
 POSITION, VELOCITY, ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)
-ATTITUDE, PIXEL, OFFSET = slice(9, 12), slice(12, 14), slice(14, 17)
+ATTITUDE, PIXEL, OFFSET, SCALE = slice(9, 12), slice(12, 14), slice(14, 17), 17
 ORBIT = slice(0, 9)
 
 
@@ -42,6 +42,9 @@ class CommonErrors:
         pixel, for as long as the light stays. Innovations cannot show it; left out, the filter claims too much.
     catalogue_offset_m
         Shift of the whole catalogue, east, north, up; it does not change.
+    scale, scale_sigma
+        Stretch of all detections about the image centre as calibrated, and how well it is known; it does not change.
+        A single pass cannot tell it from an error of altitude: the periods of several orbits can.
     """
 
     attitude_noise_rad: float = float(np.radians(0.01))
@@ -50,11 +53,13 @@ class CommonErrors:
     pixel_bias_px: float = 0.25
     pixel_correlation_s: float = 3_600.0
     catalogue_offset_m: tuple[float, float, float] = (15.0, 15.0, 10.0)
+    scale: float = 0.0
+    scale_sigma: float = 5e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilterState:
-    """Estimate (17 + 3 m,) and covariance at an on-board time, with the m craters among the states.
+    """Estimate (18 + 3 m,) and covariance at an on-board time, with the m craters among the states.
 
     Attributes
     ----------
@@ -145,9 +150,9 @@ def initial_filter_state(
     markov_sigma_m_s2: tuple[float, float, float],
     errors: CommonErrors,
 ) -> FilterState:
-    """Return the state that starts the filter: common errors zero, with their full uncertainty."""
+    """Return the state that starts the filter: common errors as calibrated, with their full uncertainty."""
     mean = np.zeros(SIZE)
-    mean[POSITION], mean[VELOCITY] = position_icrf_m, velocity_icrf_m_s
+    mean[POSITION], mean[VELOCITY], mean[SCALE] = position_icrf_m, velocity_icrf_m_s, errors.scale
     sigma = np.concatenate(
         [
             np.full(3, sigma_position_m),
@@ -156,6 +161,7 @@ def initial_filter_state(
             np.full(3, errors.attitude_bias_rad),
             np.full(2, errors.pixel_bias_px),
             np.array(errors.catalogue_offset_m),
+            np.array([errors.scale_sigma]),
         ]
     )
     return FilterState(ticks, mean, np.diag(sigma**2), np.empty(0, dtype=np.int64))
@@ -173,10 +179,26 @@ def predict(state: FilterState, ticks: int, model: OrbitModel, errors: CommonErr
     return FilterState(ticks, mean, 0.5 * (covariance + covariance.T), state.craters)
 
 
+def burn(state: FilterState, delta_v_icrf_m_s: Float, sigma_m_s: float) -> FilterState:
+    """Return the state after an impulsive burn (3,) that was carried out to a standard deviation per axis."""
+    mean, covariance = state.mean.copy(), state.covariance.copy()
+    mean[VELOCITY] += delta_v_icrf_m_s
+    covariance[VELOCITY, VELOCITY] += np.eye(3) * sigma_m_s**2
+    return FilterState(state.ticks, mean, covariance, state.craters)
+
+
+def widened(state: FilterState, sigma_position_m: float, sigma_velocity_m_s: float) -> FilterState:
+    """Return the state with more uncertainty per axis: after a restart, an old state, a burn of unknown size."""
+    covariance = state.covariance.copy()
+    covariance[POSITION, POSITION] += np.eye(3) * sigma_position_m**2
+    covariance[VELOCITY, VELOCITY] += np.eye(3) * sigma_velocity_m_s**2
+    return FilterState(state.ticks, state.mean, covariance, state.craters)
+
+
 def transition_to(
     state: FilterState, ticks: int, model: OrbitModel, errors: CommonErrors
 ) -> tuple[Float | None, Float, Float]:
-    """Return transition (17, 17; None outside the orientation table), propagated mean and process noise (17, 17)."""
+    """Return transition (18, 18; None outside the orientation table), propagated mean and process noise (18, 18)."""
     orbit = model.propagate(state.mean[ORBIT], state.ticks, ticks)
     transition, noise, mean = np.eye(SIZE), np.zeros((SIZE, SIZE)), state.mean.copy()
     if orbit is None:
@@ -197,16 +219,25 @@ def transition_to(
 
 def pose_of(mean: Float, camera_from_icrf: Float, mcmf_from_icrf: Float) -> Pose:
     """Return the camera pose that a filter state stands for."""
-    return Pose(mean[POSITION], camera_from_icrf, mcmf_from_icrf, mean[ATTITUDE], mean[PIXEL], mean[OFFSET])
+    return Pose(
+        mean[POSITION],
+        camera_from_icrf,
+        mcmf_from_icrf,
+        mean[ATTITUDE],
+        mean[PIXEL],
+        mean[OFFSET],
+        float(mean[SCALE]),
+    )
 
 
 def design_matrix(sighting: Sighting, state: FilterState) -> Float:
-    """Return the derivatives of all predicted pixels by all states, shape (n, 2, 17 + 3 m)."""
+    """Return the derivatives of all predicted pixels by all states, shape (n, 2, 18 + 3 m)."""
     matrix = np.zeros((len(sighting), 2, state.mean.size))
     matrix[:, :, POSITION] = sighting.by_position
     matrix[:, :, ATTITUDE] = sighting.by_attitude
     matrix[:, 0, PIXEL.start] = matrix[:, 1, PIXEL.start + 1] = 1.0
     matrix[:, :, OFFSET] = sighting.by_offset
+    matrix[:, :, SCALE] = sighting.by_scale
     slots = state.slots(sighting.index)
     known = np.flatnonzero(slots >= 0)
     for axis in range(3):

@@ -4,7 +4,9 @@ Errors that are common to a frame or last over many frames are parameters of the
 
 - attitude: a small rotation of the camera, axes of the camera, C_true = (1 - [theta x]) C_measured;
 - pixel bias: a shift of every detection, as an uneven response to slanting light would cause;
-- catalogue offset: a shift of the whole catalogue east, north and up.
+- catalogue offset: a shift of the whole catalogue east, north and up;
+- scale: all detections drawn towards the image centre or away from it, as a focal length in error or a detector that
+  leans towards the middle would; for a camera that looks straight down it is an error of altitude.
 """
 
 from __future__ import annotations
@@ -93,6 +95,8 @@ class Pose:
         Measured attitude and the Moon's orientation, shape (3, 3).
     attitude_rad, pixel_bias_px, catalogue_offset_m
         Common errors as estimated, shapes (3,), (2,), (3,).
+    scale
+        Relative stretch of the image about its centre.
     """
 
     position_icrf_m: Float
@@ -101,6 +105,7 @@ class Pose:
     attitude_rad: Float
     pixel_bias_px: Float
     catalogue_offset_m: Float
+    scale: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,6 +122,8 @@ class Sighting:
         Predicted diameters.
     by_position, by_attitude, by_offset
         Derivatives of `uv_px`, shape (n, 2, 3), by position (ICRF), attitude and catalogue offset (ENU).
+    by_scale
+        Derivatives by the scale, shape (n, 2).
     """
 
     index: Index
@@ -125,6 +132,7 @@ class Sighting:
     by_position: Float
     by_attitude: Float
     by_offset: Float
+    by_scale: Float
 
     def __len__(self) -> int:
         return int(self.index.shape[0])
@@ -137,6 +145,7 @@ class Sighting:
             self.by_position[which],
             self.by_attitude[which],
             self.by_offset[which],
+            self.by_scale[which],
         )
 
 
@@ -202,7 +211,7 @@ def look(
         "...i,...ij->...j", np.broadcast_to(shift, (index.size, 3)), axes
     )
     seen = (point - pose.mcmf_from_icrf @ pose.position_icrf_m) @ camera_from_mcmf.T
-    f, count = camera.focal_px, index.size
+    f, count = camera.focal_px * (1.0 + pose.scale), index.size
     depth = np.where(seen[:, 2] > 0.0, seen[:, 2], np.nan)
     x, y, scale = seen[:, 0] / depth, seen[:, 1] / depth, f / depth
     uv = np.empty((count, 2))
@@ -223,6 +232,7 @@ def look(
         -(by_point @ turned),
         by_attitude,
         by_mcmf @ np.swapaxes(axes, 1, 2),
+        camera.focal_px * np.stack([x, y], axis=1),
     )
 
 

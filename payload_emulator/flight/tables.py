@@ -4,7 +4,7 @@ Every table is one block: magic `LINNATBL`, kind (2 octets, ASCII), version (u16
 (u32), CRC-32 of the content (u32), then the content; all big-endian. The identity of a table in telemetry is
 the first 32 bits of the SHA-256 of the whole block.
 
-Kinds: `AE` anchor ephemeris, `CC` crater catalogue, `GR` gravity field, `OR` orientation, `IS` initial state.
+Kinds: `AE` anchor ephemeris, `CC` crater catalogue, `GR` gravity field, `OR` orientation, `IS` initial state, `BU` burns.
 Frames: MCMF is mean-Earth/polar-axis (ME), PA principal axes, ICRF the inertial axes centred on the Moon.
 """
 
@@ -190,6 +190,33 @@ class InitialState:
     sigma_velocity_m_s: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class BurnTable:
+    """Impulsive burns as planned, in order of time.
+
+    Attributes
+    ----------
+    ticks
+        On-board time of each burn, shape (n,).
+    delta_v_icrf_m_s
+        Planned change of velocity, shape (n, 3).
+    sigma_m_s
+        Standard deviation per axis of what is carried out against the plan, shape (n,).
+    """
+
+    ticks: Index
+    delta_v_icrf_m_s: Float
+    sigma_m_s: Float
+
+    def __len__(self) -> int:
+        return int(self.ticks.shape[0])
+
+
+def no_burns() -> BurnTable:
+    """Return a table without burns."""
+    return BurnTable(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty(0))
+
+
 def table_hash(octets: bytes) -> int:
     """Return the identity of a table as telemetry carries it, 32 bits."""
     return int.from_bytes(hashlib.sha256(octets).digest()[:4], "big")
@@ -352,6 +379,32 @@ def unpack_initial_state(octets: bytes) -> InitialState:
     return InitialState(ticks, numbers[:3], numbers[3:6], float(numbers[6]), float(numbers[7]))
 
 
+def pack_burn_table(table: BurnTable) -> bytes:
+    """Return planned burns as octets, 40 per burn, in order of time."""
+    order = np.argsort(table.ticks, kind="stable")
+    rows = np.concatenate([table.delta_v_icrf_m_s, table.sigma_m_s[:, None]], axis=1)[order]
+    content = struct.pack(">I", len(table)) + table.ticks[order].astype(">i8").tobytes()
+    return _wrap(b"BU", content + rows.astype(">f8").tobytes())
+
+
+def unpack_burn_table(octets: bytes) -> BurnTable:
+    """Return the planned burns in a block of octets.
+
+    Raises
+    ------
+    TableError
+        The block is damaged, holds another kind of table, values that are not finite, or times out of order.
+    """
+    content = _unwrap(b"BU", octets)
+    count = _count(content, 40, b"BU")
+    ticks = np.frombuffer(content, dtype=">i8", count=count, offset=4).astype(np.int64)
+    rows = np.frombuffer(content, dtype=">f8", count=4 * count, offset=4 + 8 * count)
+    rows = _finite(rows, "burn table").reshape(count, 4)
+    if np.any(np.diff(ticks) <= 0) or np.any(rows[:, 3] < 0.0):
+        raise TableError("burn table: expected increasing times and sigmas of zero or more, found others")
+    return BurnTable(ticks, rows[:, :3], rows[:, 3])
+
+
 def _wrap(kind: bytes, content: bytes) -> bytes:
     return _HEADER.pack(MAGIC, kind, VERSION, len(content), zlib.crc32(content)) + content
 
@@ -382,6 +435,7 @@ _NAMES = {
     b"GR": "gravity table",
     b"OR": "orientation table",
     b"IS": "initial state",
+    b"BU": "burn table",
 }
 
 
