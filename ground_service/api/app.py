@@ -8,10 +8,14 @@ from contextlib import asynccontextmanager
 from fastapi import FastAPI
 
 from ground_service.api import problems
+from ground_service.api.common import API_PREFIX
 from ground_service.api.limits import BodyLimit, HeadersAndTags
 from ground_service.api.live import live
 from ground_service.api.metrics import Metrics, Watch
-from ground_service.api.routes import API_PREFIX, UPLOAD_PATHS, operations, router
+from ground_service.api.operations import operations
+from ground_service.api.planning import planning
+from ground_service.api.routes import UPLOAD_PATHS, router
+from ground_service.api.telecommands import telecommands
 from ground_service.services.ground import ground_from_settings
 from ground_service.settings import Settings
 from ground_service.worker.dispatch import dispatcher_for
@@ -51,7 +55,8 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
     )
     app.state.open_without_users = settings.host in LOOPBACK
     app.state.upload_limit_octets = settings.upload_limit_mib << 20
-    app.include_router(router)
+    for one in (router, planning, telecommands):
+        app.include_router(one)
     app.include_router(operations)
     app.include_router(live)
     app.state.metrics = Metrics()

@@ -114,7 +114,7 @@ class HeadersAndTags:
                 return
             start, body = held["start"], b"".join(held["body"])
             headers = MutableHeaders(scope=start)
-            tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
+            tag = headers.get("etag") or f'"{hashlib.sha256(body).hexdigest()[:32]}"'
             headers["ETag"] = tag
             if tag in wanted or wanted.strip() == "*":
                 start["status"] = 304

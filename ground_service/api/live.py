@@ -12,12 +12,12 @@ from typing import Annotated
 from fastapi import APIRouter, Query, WebSocket, WebSocketDisconnect
 from starlette.concurrency import run_in_threadpool
 
-from ground_service.api.routes import API_PREFIX
-from ground_service.api.schemas import time_text
+from ground_service.api.common import API_PREFIX
 from ground_service.errors import NotAuthorised
 from ground_service.services.feed import last_number, read_feed
 from ground_service.services.ground import Ground
 from ground_service.services.users import authenticate, has_users
+from ground_service.services.views import time_text
 
 POLL_S = 0.5
 POLICY_VIOLATION = 1008

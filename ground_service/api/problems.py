@@ -21,6 +21,7 @@ from ground_service.errors import (
     StorageReadOnly,
     StoreError,
 )
+from ground_service.services.planning import PlanConflicts
 from lunar.errors import LunarError
 from reports.errors import ReportError
 from tmtc.errors import TmtcError
@@ -84,6 +85,12 @@ def install(app: FastAPI) -> None:
             return problem(413, "too large", str(error), request)
         if isinstance(error, PreconditionFailed):
             return problem(412, "precondition failed", str(error), request)
+        if isinstance(error, PlanConflicts):
+            found = [
+                {"where": f"window {one.window_id}" if one.window_id else one.kind, "detail": one.detail}
+                for one in error.conflicts
+            ]
+            return problem(409, "conflict", str(error), request, errors=found)
         status, title = next((s, t) for kind, s, t in STATUSES if isinstance(error, kind))
         if status >= 500:
             log.error("%s %s: %s", request.method, request.url.path, error)

@@ -6,8 +6,6 @@ from typing import Any, Generic, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from lunar.timescales import format_utc
-
 Item = TypeVar("Item")
 
 
@@ -25,7 +23,7 @@ class Problem(BaseModel):
     status: int = Field(examples=[404])
     detail: str = Field(examples=["pass 7: not found"])
     instance: str | None = Field(default=None, examples=["/api/v1/passes/7"])
-    errors: list[dict[str, str]] | None = None
+    errors: list[dict[str, str]] | None = Field(default=None, description="What is wrong, one by one")
 
 
 class PageOf(Schema, Generic[Item]):
@@ -213,7 +211,7 @@ class Telecommand(Schema):
     spacecraft_id: int
     instance: str
     state: str = Field(
-        description="queued, released, rejected, sent, accepted, started, completed or failed",
+        description="queued, carried, released, rejected, sent, accepted, started, completed or failed",
         examples=["queued"],
     )
     critical: bool
@@ -225,6 +223,8 @@ class Telecommand(Schema):
     reason: str | None
     sequence_count: int | None
     sent: str | None
+    window_id: int | None = Field(description="The planned window that it belongs to")
+    carrier_id: int | None = Field(description="The telecommand that carries it into the on-board schedule")
     reports: list[CommandReport]
 
 
@@ -257,13 +257,3 @@ class Health(Schema):
     """Whether the service lives."""
 
     status: str = Field(examples=["ok"])
-
-
-def rfc3339(utc_ns: int | None) -> str | None:
-    """A time as text, to the nanosecond."""
-    return None if utc_ns is None else format_utc(int(utc_ns), 9)
-
-
-def time_text(utc_ns: int) -> str:
-    """A time that is there, as text."""
-    return format_utc(int(utc_ns), 9)

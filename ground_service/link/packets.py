@@ -82,7 +82,7 @@ def decoded_rows(tables: Mapping[str, Table], place: IntArray) -> dict[str, Colu
     """Columns of each kind of sample; `place` maps the packet index of a table to the index in the batch."""
     rows: dict[str, Columns] = {}
     for kind, names, translate in _KINDS:
-        pieces = [translate(table, place) for name, table in tables.items() if name.startswith(names)]
+        pieces = [translate(table, place) for name, table in tables.items() if name in names]
         if pieces:
             rows[kind] = pieces[0] if len(pieces) == 1 else _joined(pieces)
     return rows
@@ -207,12 +207,15 @@ def _optional(column: NDArray[Any]) -> NDArray[np.object_]:
     return result
 
 
-_KINDS: tuple[tuple[str, str, Callable[[Table, IntArray], Columns]], ...] = (
-    ("housekeeping", "housekeeping", _housekeeping),
-    ("detections", "detections", _detections),
-    ("navigation_states", "navigation_state", _navigation),
-    ("frame_outcomes", "frame_outcome", _outcomes),
-    ("events", "event_", _events),
-    ("time_reports", "time_report", _time_reports),
-    ("verifications", "verification_", _verifications),
+_Translation = Callable[[Table, IntArray], Columns]
+
+_KINDS: tuple[tuple[str, frozenset[str], _Translation], ...] = (
+    ("housekeeping", frozenset({"housekeeping"}), _housekeeping),
+    ("detections", frozenset({"detections"}), _detections),
+    ("navigation_states", frozenset({"navigation_state"}), _navigation),
+    ("frame_outcomes", frozenset({"frame_outcome"}), _outcomes),
+    ("events", frozenset(_SEVERITIES), _events),
+    ("time_reports", frozenset({"time_report"}), _time_reports),
+    ("verifications", frozenset(_VERIFICATION_SUBTYPES), _verifications),
 )
+"""Kinds of samples, the packets they come from, and how."""

@@ -7,18 +7,19 @@ released by somebody other than who entered it. Every step goes into the audit l
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from sqlalchemy import Connection, func, select
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, InvalidInput
-from ground_service.processing.verification import CommandFate, SentCommand, VerificationReport, fate_of
+from ground_service.services.command_state import CommandView, command_view
 from ground_service.services.feed import publish
 from ground_service.services.ground import Ground
 from ground_service.services.ingest import FLOWN
 from ground_service.services.users import audit
+from ground_service.services.window_progress import advance_windows
 from ground_service.store import repository
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import TmtcError
@@ -32,21 +33,6 @@ CRITICAL_FUNCTIONS = ("clear_store", "reboot", "abort_uplink")
 """What destroys data or changes what the payload is: a second person has to agree."""
 
 COMMANDS = tuple(definition.name for definition in DICTIONARY.telecommands)
-
-
-@dataclass(frozen=True, slots=True)
-class CommandView:
-    """A telecommand as it stands now; `fate` is None before it is sent."""
-
-    row: dict[str, Any]
-    spacecraft_id: int
-    instance: str
-    fate: CommandFate | None
-
-    @property
-    def state(self) -> str:
-        """Where the command is on its way."""
-        return self.fate.state if self.fate is not None else str(self.row["state"])
 
 
 def enter_command(
@@ -66,25 +52,65 @@ def enter_command(
     InvalidInput
         If the dictionary has no such command, or refuses its arguments.
     """
-    _packed(name, arguments, 0)
-    critical = _is_critical(name, arguments)
     with ground.database.writing() as connection:
-        key = int(
-            repository.add(
-                connection,
-                repository.TELECOMMANDS,
-                vehicle_id=repository.vehicle_id(connection, spacecraft_id, instance),
-                name=name,
-                arguments=dict(arguments),
-                state="queued",
-                critical=int(critical),
-                timeout_s=timeout_s,
-                requested_by=actor,
-                created_utc_ns=utc_now_ns(),
-            )
-        )
-        _note(connection, actor, "enter", key, "queued", {"name": name, "arguments": dict(arguments)})
+        vehicle = repository.vehicle_id(connection, spacecraft_id, instance)
+        return _add(connection, vehicle, name, arguments, "queued", actor, timeout_s)
+
+
+def add_released(
+    connection: Connection,
+    vehicle: int,
+    name: str,
+    arguments: Mapping[str, Any],
+    *,
+    actor: str,
+    timeout_s: int = DEFAULT_TIMEOUT_S,
+    window_id: int | None = None,
+) -> int:
+    """Add a telecommand that is released already, within the caller's transaction; its id.
+
+    Raises
+    ------
+    Conflict
+        If it is critical: such a one has to be entered and then released by somebody else.
+    """
+    if _is_critical(name, arguments):
+        raise Conflict(f"telecommand {name}: is critical; it has to be released by a second person")
+    key = _add(connection, vehicle, name, arguments, "queued", actor, timeout_s, window_id)
+    _release(connection, key, actor)
     return key
+
+
+def add_scheduled(
+    connection: Connection,
+    vehicle: int,
+    name: str,
+    arguments: Mapping[str, Any],
+    *,
+    release_ticks: int,
+    actor: str,
+    timeout_s: int,
+    window_id: int | None = None,
+) -> int:
+    """Add a released `insert_activity` that carries a telecommand to be done at an on-board time; its id.
+
+    The telecommand inside has a sequence count and a row of its own, so that the reports about it are found.
+    """
+    if _is_critical(name, arguments):
+        raise Conflict(f"telecommand {name}: is critical; it has to be released by a second person")
+    inner = _add(connection, vehicle, name, arguments, "carried", actor, timeout_s, window_id)
+    octets = _commit(connection, inner, "carried", actor)
+    outer = add_released(
+        connection,
+        vehicle,
+        "insert_activity",
+        {"release_ticks": release_ticks, "items": [{"octet": octet} for octet in octets]},
+        actor=actor,
+        timeout_s=timeout_s,
+        window_id=window_id,
+    )
+    repository.change(connection, repository.TELECOMMANDS, inner, carrier_id=outer)
+    return outer
 
 
 def release_command(ground: Ground, command_id: int, *, actor: str) -> None:
@@ -102,20 +128,7 @@ def release_command(ground: Ground, command_id: int, *, actor: str) -> None:
                 f"telecommand {command_id} ({row['name']}): is critical; "
                 f"expected another person than {actor} to release it"
             )
-        count = _next_count(connection, row["vehicle_id"])
-        octets = _packed(row["name"], row["arguments"], count)
-        repository.change(
-            connection,
-            repository.TELECOMMANDS,
-            command_id,
-            state="released",
-            decided_by=actor,
-            decided_utc_ns=utc_now_ns(),
-            sequence_count=count,
-            request_id=int.from_bytes(octets[:4], "big"),
-            octets=octets,
-        )
-        _note(connection, actor, "release", command_id, "released", {"sequence_count": count})
+        _release(connection, command_id, actor)
 
 
 def reject_command(ground: Ground, command_id: int, *, actor: str, reason: str) -> None:
@@ -156,7 +169,13 @@ def take_uplink(
             repository.change(
                 connection, table, row[0], state="sent", sent_utc_ns=now, sent_after_ticks=newest
             )
+            connection.execute(
+                table.update()
+                .where(table.c.carrier_id == row[0], table.c.state == "carried")
+                .values(state="sent", sent_utc_ns=now, sent_after_ticks=newest)
+            )
             _note(connection, actor, "send", row[0], "sent", {})
+    advance_windows(ground, vehicle)
     packets = [bytes(row[1]) for row in rows]
     stream = UplinkEncoder(spacecraft_id).encode(packets) if framed else b"".join(packets)
     return stream, [int(row[0]) for row in rows]
@@ -166,7 +185,7 @@ def get_command(ground: Ground, command_id: int) -> CommandView:
     """A telecommand as it stands now."""
     with ground.database.reading() as connection:
         row = repository.get(connection, repository.TELECOMMANDS, command_id, "telecommand")
-        return _view(connection, row)
+        return command_view(connection, row)
 
 
 def list_commands(
@@ -176,7 +195,63 @@ def list_commands(
     equal = {"state": state} if state is not None else {}
     with ground.database.reading() as connection:
         page = repository.page(connection, repository.TELECOMMANDS, limit=limit, offset=offset, **equal)
-        return [_view(connection, row) for row in page.rows], page.total
+        return [command_view(connection, row) for row in page.rows], page.total
+
+
+def _add(
+    connection: Connection,
+    vehicle: int,
+    name: str,
+    arguments: Mapping[str, Any],
+    state: str,
+    actor: str,
+    timeout_s: int,
+    window_id: int | None = None,
+) -> int:
+    """Enter a telecommand that the dictionary accepts; its id."""
+    _packed(name, arguments, 0)
+    key = int(
+        repository.add(
+            connection,
+            repository.TELECOMMANDS,
+            vehicle_id=vehicle,
+            name=name,
+            arguments=dict(arguments),
+            state=state,
+            critical=int(_is_critical(name, arguments)),
+            timeout_s=timeout_s,
+            requested_by=actor,
+            created_utc_ns=utc_now_ns(),
+            window_id=window_id,
+        )
+    )
+    _note(connection, actor, "enter", key, state, {"name": name, "arguments": dict(arguments)})
+    return key
+
+
+def _release(connection: Connection, command_id: int, actor: str) -> None:
+    octets = _commit(connection, command_id, "released", actor)
+    count = int.from_bytes(octets[2:4], "big") % SEQUENCE_COUNT_LIMIT
+    _note(connection, actor, "release", command_id, "released", {"sequence_count": count})
+
+
+def _commit(connection: Connection, command_id: int, state: str, actor: str) -> bytes:
+    """Give a telecommand its sequence count and its octets, which never change again."""
+    row = repository.get(connection, repository.TELECOMMANDS, command_id, "telecommand")
+    count = _next_count(connection, row["vehicle_id"])
+    octets = _packed(row["name"], row["arguments"], count)
+    repository.change(
+        connection,
+        repository.TELECOMMANDS,
+        command_id,
+        state=state,
+        decided_by=actor,
+        decided_utc_ns=utc_now_ns(),
+        sequence_count=count,
+        request_id=int.from_bytes(octets[:4], "big"),
+        octets=octets,
+    )
+    return octets
 
 
 def _packed(name: str, arguments: Mapping[str, Any], count: int) -> bytes:
@@ -195,7 +270,20 @@ def _is_critical(name: str, arguments: Mapping[str, Any]) -> bool:
         labels = DICTIONARY.labels("perform_function", "function_id")
         function = arguments.get("function_id")
         return (labels.get(function) if isinstance(function, int) else function) in CRITICAL_FUNCTIONS
+    if name == "insert_activity":
+        return _carries_critical(name, arguments)
     return name in CRITICAL_COMMANDS
+
+
+def _carries_critical(name: str, arguments: Mapping[str, Any]) -> bool:
+    """Whether a telecommand is in a scheduled one that needs a second person, or one that cannot be read."""
+    carrier = DICTIONARY.unpack_command(_packed(name, arguments, 0))
+    octets = bytes(np.asarray(carrier.values["items"]["octet"], dtype=np.uint8))
+    try:
+        inner = DICTIONARY.unpack_command(octets)
+    except TmtcError:
+        return True
+    return _is_critical(inner.name, inner.values)
 
 
 def _queued(connection: Connection, command_id: int) -> repository.Row:
@@ -226,42 +314,6 @@ def _newest_ticks(connection: Connection, vehicle: int) -> int:
         )
     ).scalar()
     return int(newest) if newest is not None else -1
-
-
-def _view(connection: Connection, row: repository.Row) -> CommandView:
-    vehicle = repository.get(connection, repository.VEHICLES, row["vehicle_id"], "vehicle")
-    fate = None
-    if row["state"] == "sent":
-        table, commands = repository.SAMPLES["verifications"], repository.TELECOMMANDS
-        reports = connection.execute(
-            select(
-                table.c.subtype, table.c.request_id, table.c.ticks, table.c.step, table.c.failure_code
-            ).where(
-                table.c.vehicle_id == row["vehicle_id"],
-                table.c.dictionary_version == DICTIONARY.version,
-                table.c.ticks > row["sent_after_ticks"],
-                table.c.request_id == row["request_id"],
-            )
-        )
-        repeated = connection.execute(
-            select(func.min(commands.c.sent_after_ticks)).where(
-                commands.c.vehicle_id == row["vehicle_id"],
-                commands.c.request_id == row["request_id"],
-                commands.c.id > row["id"],
-            )
-        ).scalar()
-        fate = fate_of(
-            SentCommand(
-                request_id=row["request_id"],
-                sent_utc_ns=row["sent_utc_ns"],
-                sent_after_ticks=row["sent_after_ticks"],
-                repeated_after_ticks=repeated,
-                timeout_ns=row["timeout_s"] * 1_000_000_000,
-            ),
-            [VerificationReport(*report) for report in reports],
-            utc_now_ns(),
-        )
-    return CommandView(row, vehicle["ccsds_id"], vehicle["instance"], fate)
 
 
 def _note(

@@ -15,6 +15,7 @@ from ground_service.errors import GroundError, InvalidInput
 from ground_service.link.stream import DownlinkReader
 from ground_service.services.ground import Ground
 from ground_service.services.joining import join_with_others
+from ground_service.services.window_progress import advance_windows
 from ground_service.store import repository
 from ground_service.store.files import StoredFile, read_blocks
 from ground_service.store.packets import store_batch
@@ -180,6 +181,9 @@ def _store_stream(
                 joined += join_with_others(
                     connection, ground.files, vehicle, spacecraft_id, sha256, reader.edges
                 )
+    if new + joined:
+        for vehicle in vehicles.values():
+            advance_windows(ground, vehicle)
     found = reader.accounting
     return IngestResult(
         ingest_id=ingest_id,

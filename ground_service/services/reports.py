@@ -15,6 +15,7 @@ from ground_service.errors import storage_error
 from ground_service.processing.pass_evaluation import evaluate_pass, summary_of
 from ground_service.services.ground import Ground
 from ground_service.services.pass_data import load_pass_inputs
+from ground_service.services.window_progress import advance_windows
 from ground_service.store import repository
 from lunar.timescales import format_utc
 from reports.values import PassReport
@@ -75,6 +76,8 @@ def make_report(
                 summary=summary,
                 created_utc_ns=now,
             )
+        vehicle = int(repository.get(connection, repository.PASSES, pass_id, "pass")["vehicle_id"])
+    advance_windows(ground, vehicle)
     folder = out if out is not None else ground.home / "reports" / f"pass-{pass_id}"
     for kind, octets in documents.items():
         _write_whole(folder / f"report.{kind}", octets)

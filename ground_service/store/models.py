@@ -400,7 +400,10 @@ class FeedItem(Base):
 
 
 class Telecommand(Base):
-    """A telecommand, from being entered to its end; its octets exist from its release on."""
+    """A telecommand, from being entered to its end; its octets exist from its release on.
+
+    One that is inside another (an activity of the on-board schedule) names that one in `carrier_id`.
+    """
 
     __tablename__ = "telecommands"
     __table_args__ = (Index("ix_telecommands_vehicle_id_request_id", "vehicle_id", "request_id"),)
@@ -421,3 +424,34 @@ class Telecommand(Base):
     octets: Mapped[bytes | None] = mapped_column(LargeBinary)
     sent_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
     sent_after_ticks: Mapped[int | None] = mapped_column(BigInteger)
+    window_id: Mapped[int | None] = mapped_column(Integer, index=True)
+    carrier_id: Mapped[int | None] = mapped_column(BigInteger)
+
+
+class Window(Base):
+    """A planned observation.
+
+    `decision` is what people decided (draft, approved, failed), `state` where the window has come with what telemetry
+    says, kept up to date by `services.window_progress`; `version` counts changes by people.
+    """
+
+    __tablename__ = "windows"
+    __table_args__ = (Index("ix_windows_vehicle_id_start_utc_ns", "vehicle_id", "start_utc_ns"),)
+    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"))
+    name: Mapped[str] = mapped_column(Text)
+    start_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    stop_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    cadence_s: Mapped[float] = mapped_column(Double)
+    decision: Mapped[str] = mapped_column(String(16))
+    state: Mapped[str] = mapped_column(String(16))
+    reason: Mapped[str | None] = mapped_column(Text)
+    predecessor_id: Mapped[int | None] = mapped_column(ForeignKey("windows.id"))
+    ephemeris_id: Mapped[int | None] = mapped_column(ForeignKey("ephemerides.id"))
+    pass_id: Mapped[int | None] = mapped_column(ForeignKey("passes.id"))
+    data_octets: Mapped[int] = mapped_column(BigInteger)
+    predicted: Mapped[dict[str, Any]] = mapped_column(JSON)
+    version: Mapped[int] = mapped_column(Integer)
+    created_by: Mapped[str] = mapped_column(String(64))
+    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    changed_utc_ns: Mapped[int] = mapped_column(BigInteger)

@@ -53,6 +53,7 @@ TOKENS = _table(models.Token)
 AUDIT = _table(models.AuditEntry)
 FEED = _table(models.FeedItem)
 TELECOMMANDS = _table(models.Telecommand)
+WINDOWS = _table(models.Window)
 SAMPLES: dict[str, Table] = {model.__tablename__: _table(model) for model in models.SAMPLE_TABLES}
 
 

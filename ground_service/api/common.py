@@ -1,0 +1,129 @@
+"""What the operations share: who asks, which service answers, pages, uploads, idempotency keys."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import queue
+import threading
+from collections.abc import Iterator
+from typing import Annotated, Any
+
+from fastapi import Depends, Header, Path, Query, Request
+from starlette.concurrency import run_in_threadpool
+
+from ground_service.api import schemas
+from ground_service.api.problems import TooLarge
+from ground_service.api.security import requires
+from ground_service.services.ground import Ground
+from ground_service.services.users import Caller
+from ground_service.store.files import StoredFile
+
+API_PREFIX = "/api/v1"
+
+PROBLEMS: dict[int | str, dict[str, Any]] = {
+    status: {"model": schemas.Problem, "content": {"application/problem+json": {}}, "description": text_}
+    for status, text_ in (
+        (401, "No valid token"),
+        (403, "The role does not allow it"),
+        (404, "Not found"),
+        (409, "Conflict"),
+        (412, "Precondition failed"),
+        (413, "Too large"),
+        (422, "Invalid input"),
+        (429, "Too many requests"),
+        (503, "Store unavailable"),
+        (507, "No space left"),
+    )
+}
+
+
+Viewer = Annotated[Caller, Depends(requires("viewer"))]
+Operator = Annotated[Caller, Depends(requires("operator"))]
+Admin = Annotated[Caller, Depends(requires("admin"))]
+Limit = Annotated[int, Query(ge=1, le=1000, description="Items in a page")]
+Offset = Annotated[int, Query(ge=0, le=2**31 - 1, description="Items before the page")]
+PassId = Annotated[int, Path(ge=1, le=2**31 - 1)]
+RowId = Annotated[int, Path(ge=1, le=2**53)]
+Key = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
+IdempotencyKey = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key",
+        max_length=128,
+        description="The same key again gives the same job, not another",
+    ),
+]
+Instance = Annotated[str, Query(min_length=1, max_length=96, pattern=r"^[A-Za-z0-9._@-]+$")]
+Name = Annotated[str, Query(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+
+
+def ground_of(request: Request) -> Ground:
+    """The opened service."""
+    ground: Ground = request.app.state.ground
+    return ground
+
+
+GroundOf = Annotated[Ground, Depends(ground_of)]
+
+
+async def stored_body(request: Request) -> StoredFile:
+    """The body, streamed into the archive of files with bounded memory."""
+    ground = ground_of(request)
+    limit: int = request.app.state.upload_limit_octets
+    blocks: queue.Queue[bytes | BaseException | None] = queue.Queue(maxsize=8)
+    stopped = threading.Event()
+
+    def take() -> Iterator[bytes]:
+        while True:
+            block = blocks.get()
+            if block is None:
+                return
+            if isinstance(block, BaseException):
+                raise block
+            yield block
+
+    def store() -> StoredFile:
+        try:
+            return ground.files.put(take())
+        finally:
+            stopped.set()
+
+    def hand_over(block: bytes | BaseException | None) -> None:
+        while not stopped.is_set():
+            try:
+                blocks.put(block, timeout=0.2)
+                return
+            except queue.Full:
+                continue
+
+    task = asyncio.create_task(run_in_threadpool(store))
+    taken = 0
+    try:
+        async for block in request.stream():
+            taken += len(block)
+            if taken > limit:
+                raise TooLarge(f"body: expected at most {limit} octets")
+            if block:
+                try:
+                    blocks.put_nowait(block)
+                except queue.Full:
+                    await run_in_threadpool(hand_over, block)
+    except BaseException as error:
+        await run_in_threadpool(hand_over, error)
+        await asyncio.gather(task, return_exceptions=True)
+        raise
+    await run_in_threadpool(hand_over, None)
+    return await task
+
+
+def idempotent_id(what: str, caller: Caller, key: str | None) -> str | None:
+    """The id of the job that an idempotency key of this caller stands for."""
+    if key is None:
+        return None
+    return hashlib.sha256(f"{caller.name}\0{what}\0{key}".encode()).hexdigest()[:32]
+
+
+def page_of(items: list[Any], total: int, limit: int, offset: int) -> dict[str, Any]:
+    """A page of a list."""
+    return {"items": items, "total": total, "limit": limit, "offset": offset}

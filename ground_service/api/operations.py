@@ -1,0 +1,31 @@
+"""What a deployment watches the service with."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request, Response
+
+from ground_service.api import schemas
+from ground_service.api.common import GroundOf
+from ground_service.store import repository
+
+operations = APIRouter(include_in_schema=False)
+
+
+@operations.get("/healthz")
+def healthz() -> schemas.Health:
+    """The process lives."""
+    return schemas.Health(status="ok")
+
+
+@operations.get("/readyz")
+def readyz(ground: GroundOf) -> schemas.Health:
+    """The service can be used: its database answers."""
+    with ground.database.reading() as connection:
+        repository.page(connection, repository.JOBS, limit=1)
+    return schemas.Health(status="ok")
+
+
+@operations.get("/metrics")
+def metrics(request: Request, ground: GroundOf) -> Response:
+    """Figures for Prometheus."""
+    return request.app.state.metrics.answer(ground)

@@ -1,0 +1,183 @@
+"""Operations on planned windows."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Query, Response
+
+from ground_service.api import plan_schemas, schemas
+from ground_service.api.common import (
+    API_PREFIX,
+    PROBLEMS,
+    GroundOf,
+    Limit,
+    Offset,
+    Operator,
+    PassId,
+    Viewer,
+    page_of,
+)
+from ground_service.api.plan_schemas import time_of
+from ground_service.api.problems import PreconditionFailed
+from ground_service.services import commanding, plan_exchange
+from ground_service.services import planning as plan_service
+from ground_service.services.planning import WindowEntry
+from ground_service.services.views import search_view, telecommand_view, window_view
+from ground_service.store.repository import Row
+
+planning = APIRouter(prefix=API_PREFIX, responses=PROBLEMS, tags=["planning"])
+
+IfMatch = Annotated[
+    str | None, Header(alias="If-Match", max_length=200, description="Change only what was seen: its ETag")
+]
+
+
+@planning.post("/windows/search", response_model=plan_schemas.SearchOut)
+def search_windows(ground: GroundOf, _: Viewer, given: plan_schemas.WindowSearch) -> Any:
+    """Candidate windows by constraints over a reference ephemeris."""
+    found, row, names = plan_service.search_windows(
+        ground,
+        given.constraints(),
+        start_utc_ns=None if given.start is None else time_of(given.start, "start"),
+        stop_utc_ns=None if given.stop is None else time_of(given.stop, "stop"),
+        cadence_s=given.cadence_s,
+        step_s=given.step_s,
+        resources=given.resources.value(),
+        ephemeris_id=given.ephemeris_id,
+        catalogue_pass_id=given.catalogue_pass_id,
+        spacecraft_id=given.spacecraft_id,
+        instance=given.instance,
+    )
+    return search_view(found, row, names)
+
+
+@planning.get("/windows", response_model=schemas.PageOf[plan_schemas.WindowOut])
+def list_windows(
+    ground: GroundOf,
+    _: Viewer,
+    state: Annotated[plan_schemas.WindowState | None, Query()] = None,
+    limit: Limit = 100,
+    offset: Offset = 0,
+) -> Any:
+    """Planned windows, the newest first."""
+    rows, total = plan_service.list_windows(ground, state=state, limit=limit, offset=offset)
+    return page_of([window_view(row) for row in rows], total, limit, offset)
+
+
+@planning.post("/windows", status_code=201, response_model=plan_schemas.WindowOut)
+def add_window(response: Response, ground: GroundOf, caller: Operator, given: plan_schemas.WindowIn) -> Any:
+    """Enter a window as a draft; conflicts with committed windows or with resources are answered with 409."""
+    row = plan_service.add_window(
+        ground,
+        WindowEntry(
+            name=given.name,
+            start_utc_ns=time_of(given.start, "start"),
+            stop_utc_ns=time_of(given.stop, "stop"),
+            cadence_s=given.cadence_s,
+            spacecraft_id=given.spacecraft_id,
+            instance=given.instance,
+            predecessor_id=given.predecessor_id,
+            ephemeris_id=given.ephemeris_id,
+            resources=given.resources.value(),
+        ),
+        actor=caller.name,
+    )
+    response.headers["Location"] = f"{API_PREFIX}/windows/{row['id']}"
+    return _tagged(response, row)
+
+
+@planning.get("/windows/{window_id}", response_model=plan_schemas.WindowOut)
+def get_window(response: Response, ground: GroundOf, _: Viewer, window_id: PassId) -> Any:
+    """One planned window."""
+    return _tagged(response, plan_service.get_window(ground, window_id))
+
+
+@planning.patch("/windows/{window_id}", response_model=plan_schemas.WindowOut)
+def change_window(
+    response: Response,
+    ground: GroundOf,
+    caller: Operator,
+    window_id: PassId,
+    given: plan_schemas.WindowChange,
+    if_match: IfMatch = None,
+) -> Any:
+    """Change a draft, or approve a window, make it a draft again, or declare it failed."""
+    fields = given.model_dump(exclude_unset=True, exclude={"state", "reason"})
+    changes: dict[str, Any] = {}
+    for name, value in fields.items():
+        if name in ("start", "stop"):
+            if value is not None:
+                changes[f"{name}_utc_ns"] = time_of(value, name)
+        elif value is not None or name == "predecessor_id":
+            changes[name] = value
+    row = plan_service.change_window(
+        ground,
+        window_id,
+        actor=caller.name,
+        changes=changes,
+        decision=given.state,
+        reason=given.reason,
+        expected=lambda row: _expect(row, if_match),
+    )
+    return _tagged(response, row)
+
+
+@planning.delete("/windows/{window_id}", status_code=204)
+def delete_window(
+    ground: GroundOf, caller: Operator, window_id: PassId, if_match: IfMatch = None
+) -> Response:
+    """Take a window off the plan."""
+    if if_match is not None:
+        _expect(plan_service.get_window(ground, window_id), if_match)
+    plan_service.delete_window(ground, window_id, actor=caller.name)
+    return Response(status_code=204)
+
+
+@planning.post("/windows/{window_id}/uplink", response_model=schemas.PageOf[schemas.Telecommand])
+def uplink_window(ground: GroundOf, caller: Operator, window_id: PassId) -> Any:
+    """Release the time-tagged telecommands of an approved window; `POST uplink` then gives their octets."""
+    ids = plan_service.uplink_window(ground, window_id, actor=caller.name)
+    views = [telecommand_view(commanding.get_command(ground, key)) for key in ids]
+    return page_of(views, len(views), max(len(views), 1), 0)
+
+
+@planning.get("/plan", response_model=plan_schemas.Plan)
+def export_plan(ground: GroundOf, _: Viewer) -> Any:
+    """All windows that have not failed, as a plan that another service can take."""
+    return plan_exchange.export_plan(ground)
+
+
+@planning.post("/plan", status_code=201, response_model=plan_schemas.Imported)
+def import_plan(ground: GroundOf, caller: Operator, given: plan_schemas.Plan) -> Any:
+    """Enter all windows of a plan as drafts, or none of them; windows that are there already are left alone."""
+    entries = [
+        plan_exchange.PlanEntry(
+            key=one.key,
+            after=one.after,
+            window=WindowEntry(
+                name=one.name,
+                start_utc_ns=time_of(one.start, f"windows.{one.key}.start"),
+                stop_utc_ns=time_of(one.stop, f"windows.{one.key}.stop"),
+                cadence_s=one.cadence_s,
+                spacecraft_id=one.spacecraft_id,
+                instance=one.instance,
+            ),
+        )
+        for one in given.windows
+    ]
+    return {"windows": plan_exchange.import_plan(ground, entries, actor=caller.name)}
+
+
+def _tag(row: Row) -> str:
+    return f'"window-{row["id"]}-{row["version"]}-{row["state"]}"'
+
+
+def _tagged(response: Response, row: Row) -> Any:
+    response.headers["ETag"] = _tag(row)
+    return window_view(row)
+
+
+def _expect(row: Row, if_match: str | None) -> None:
+    if if_match is not None and if_match.strip() != "*" and _tag(row) not in if_match:
+        raise PreconditionFailed(f"window {row['id']}: expected {if_match[:80]}, found {_tag(row)}")

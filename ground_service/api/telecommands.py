@@ -1,0 +1,99 @@
+"""Operations on telecommands and the uplink."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Response
+
+from ground_service.api import schemas
+from ground_service.api.common import (
+    API_PREFIX,
+    PROBLEMS,
+    GroundOf,
+    Instance,
+    Limit,
+    Offset,
+    Operator,
+    RowId,
+    Viewer,
+    page_of,
+)
+from ground_service.services import commanding
+from ground_service.services.ingest import FLOWN
+from ground_service.services.views import telecommand_view
+
+telecommands = APIRouter(prefix=API_PREFIX, responses=PROBLEMS, tags=["telecommands"])
+
+
+@telecommands.get("/telecommands", response_model=schemas.PageOf[schemas.Telecommand])
+def list_telecommands(
+    ground: GroundOf,
+    _: Viewer,
+    state: Annotated[str | None, Query(pattern="^(queued|released|rejected|sent)$")] = None,
+    limit: Limit = 100,
+    offset: Offset = 0,
+) -> Any:
+    """Telecommands with their verification, the newest first."""
+    views, total = commanding.list_commands(ground, state=state, limit=limit, offset=offset)
+    return page_of([telecommand_view(view) for view in views], total, limit, offset)
+
+
+@telecommands.post("/telecommands", status_code=201, response_model=schemas.Telecommand)
+def entertelecommand_view(ground: GroundOf, caller: Operator, given: schemas.CommandEntry) -> Any:
+    """Queue a telecommand; the dictionary has to accept it."""
+    command_id = commanding.enter_command(
+        ground,
+        given.name,
+        given.arguments,
+        spacecraft_id=given.spacecraft_id,
+        instance=given.instance,
+        timeout_s=given.timeout_s,
+        actor=caller.name,
+    )
+    return telecommand_view(commanding.get_command(ground, command_id))
+
+
+@telecommands.get("/telecommands/{command_id}", response_model=schemas.Telecommand)
+def gettelecommand_view(ground: GroundOf, _: Viewer, command_id: RowId) -> Any:
+    """One telecommand with its verification."""
+    return telecommand_view(commanding.get_command(ground, command_id))
+
+
+@telecommands.post("/telecommands/{command_id}/release", response_model=schemas.Telecommand)
+def releasetelecommand_view(ground: GroundOf, caller: Operator, command_id: RowId) -> Any:
+    """Release a queued telecommand; a critical one by another person than who entered it."""
+    commanding.release_command(ground, command_id, actor=caller.name)
+    return telecommand_view(commanding.get_command(ground, command_id))
+
+
+@telecommands.post("/telecommands/{command_id}/reject", response_model=schemas.Telecommand)
+def rejecttelecommand_view(
+    ground: GroundOf, caller: Operator, command_id: RowId, given: schemas.Rejection
+) -> Any:
+    """Take a queued telecommand out of the queue."""
+    commanding.reject_command(ground, command_id, actor=caller.name, reason=given.reason)
+    return telecommand_view(commanding.get_command(ground, command_id))
+
+
+@telecommands.post(
+    "/uplink",
+    response_class=Response,
+    responses={200: {"content": {"application/octet-stream": {}}, "description": "What is to be sent now"}},
+)
+def take_uplink(
+    ground: GroundOf,
+    caller: Operator,
+    spacecraft_id: Annotated[int, Query(ge=0, le=1023)],
+    instance: Instance = FLOWN,
+    format: Annotated[str, Query(pattern="^(cltu|packets)$")] = "cltu",
+) -> Response:
+    """Take all released telecommands as octets to radiate; they count as sent from then on."""
+    stream, ids = commanding.take_uplink(
+        ground, spacecraft_id=spacecraft_id, instance=instance, framed=format == "cltu", actor=caller.name
+    )
+    return Response(
+        stream,
+        media_type="application/octet-stream",
+        headers={"X-Telecommands": ",".join(str(number) for number in ids)},
+    )

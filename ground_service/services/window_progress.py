@@ -1,0 +1,190 @@
+"""Windows brought up to date with what came down: called after every ingest, uplink and report.
+
+The state is worked out afresh from the archive each time (`processing.window_states`), so telemetry may come in any
+order. A window that has telemetry is given a pass, which its report is then made of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sqlalchemy import Connection, func, select
+
+from ground_service.clock import utc_now_ns
+from ground_service.processing.correlation import TimeCorrelation, ticks_of_utc_ns
+from ground_service.processing.sequence import account_sequence
+from ground_service.processing.window_states import WindowFacts, state_of
+from ground_service.services.command_state import command_view
+from ground_service.services.feed import publish
+from ground_service.services.ground import Ground
+from ground_service.services.pass_data import load_correlations
+from ground_service.store import repository
+from lunar.constants import NANOSECONDS_PER_SECOND
+from tmtc.dictionary import DICTIONARY, EVENTS
+
+MARGIN_NS = 60 * NANOSECONDS_PER_SECOND
+"""Reports of the start and the stop may be this far from the planned times."""
+
+_EVENT_CODES = {name: code for code, name in EVENTS}
+STARTED, STOPPED = _EVENT_CODES["observation_started"], _EVENT_CODES["observation_stopped"]
+HEARD_TICKS = 7 * 86_400 << 16
+_REPORTS = ("housekeeping", "events", "verifications")
+_SCIENCE = ("detections", "navigation_states", "frame_outcomes")
+
+
+def advance_windows(ground: Ground, vehicle: int) -> int:
+    """Bring the approved windows of a vehicle up to date; how many changed their state."""
+    table = repository.WINDOWS
+    with ground.database.reading() as connection:
+        pending = connection.execute(
+            select(func.count()).select_from(table).where(*_open(vehicle))
+        ).scalar_one()
+    if not pending:
+        return 0
+    changed = 0
+    with ground.database.writing() as connection:
+        connection.execute(
+            select(repository.VEHICLES.c.id).where(repository.VEHICLES.c.id == vehicle).with_for_update()
+        )
+        correlations = load_correlations(connection, vehicle)
+        rows = connection.execute(
+            select(table).where(*_open(vehicle)).order_by(table.c.start_utc_ns)
+        ).mappings()
+        for row in [dict(row) for row in rows]:
+            changed += _advance(connection, row, correlations)
+    return changed
+
+
+def _advance(
+    connection: Connection, row: Mapping[str, Any], correlations: tuple[TimeCorrelation, ...]
+) -> bool:
+    facts = _facts(connection, row, correlations)
+    state, reason = state_of(facts)
+    values: dict[str, Any] = {}
+    if facts.frames > 0 and row["pass_id"] is None:
+        values["pass_id"] = _pass_of(connection, row)
+    if state != row["state"]:
+        values |= {"state": state, "reason": reason, "changed_utc_ns": utc_now_ns()}
+    if values:
+        repository.change(connection, repository.WINDOWS, row["id"], **values)
+    if state == row["state"]:
+        return False
+    publish(connection, "window", {"id": row["id"], "state": state})
+    return True
+
+
+def _facts(
+    connection: Connection, row: Mapping[str, Any], correlations: tuple[TimeCorrelation, ...]
+) -> WindowFacts:
+    vehicle = row["vehicle_id"]
+    start = ticks_of_utc_ns(row["start_utc_ns"] - MARGIN_NS, correlations)
+    stop = ticks_of_utc_ns(row["stop_utc_ns"] + MARGIN_NS, correlations)
+    events = repository.samples(
+        connection, "events", vehicle, start, stop, DICTIONARY.version, ("event_id",)
+    )["event_id"]
+    commands = [
+        command_view(connection, dict(command))
+        for command in connection.execute(
+            select(repository.TELECOMMANDS).where(
+                repository.TELECOMMANDS.c.window_id == row["id"],
+                repository.TELECOMMANDS.c.state != "rejected",
+            )
+        ).mappings()
+    ]
+    frames = _frames(connection, vehicle, start, stop)
+    headers = repository.packet_headers(connection, vehicle, start, stop) if frames else None
+    reported = row["pass_id"] is not None and (
+        repository.find(connection, repository.REPORTS, pass_id=row["pass_id"]) is not None
+    )
+    predecessor = (
+        repository.get(connection, repository.WINDOWS, row["predecessor_id"], "window")
+        if row["predecessor_id"] is not None
+        else None
+    )
+    return WindowFacts(
+        decision=row["decision"],
+        predecessor_failed=predecessor is not None and predecessor["state"] == "failed",
+        command_states=tuple(view.state for view in commands),
+        frames=frames,
+        started=STARTED in events,
+        stopped=STOPPED in events,
+        heard_after=_heard(connection, vehicle, stop),
+        lost=None
+        if headers is None
+        else sum(
+            account_sequence(headers["ticks"][here], headers["sequence_count"][here]).lost
+            for here in (headers["apid"] == apid for apid in set(headers["apid"].tolist()))
+        ),
+        reported=reported,
+    )
+
+
+def _frames(connection: Connection, vehicle: int, start: int, stop: int) -> int:
+    """Images of the span that anything came down about."""
+    most = 0
+    for kind in _SCIENCE:
+        table = repository.SAMPLES[kind]
+        most = max(
+            most,
+            connection.execute(
+                select(func.count(func.distinct(table.c.ticks))).where(
+                    table.c.vehicle_id == vehicle,
+                    table.c.dictionary_version == DICTIONARY.version,
+                    table.c.ticks.between(start, stop),
+                )
+            ).scalar_one(),
+        )
+    return most
+
+
+def _heard(connection: Connection, vehicle: int, after_ticks: int) -> bool:
+    """Whether reports made in the days after an on-board time have come down (a wild clock does not count)."""
+    for kind in _REPORTS:
+        table = repository.SAMPLES[kind]
+        found = connection.execute(
+            select(table.c.ticks)
+            .where(
+                table.c.vehicle_id == vehicle,
+                table.c.dictionary_version == DICTIONARY.version,
+                table.c.ticks > after_ticks,
+                table.c.ticks <= after_ticks + HEARD_TICKS,
+            )
+            .limit(1)
+        ).first()
+        if found is not None:
+            return True
+    return False
+
+
+def _open(vehicle: int) -> tuple[Any, ...]:
+    """Which windows can still come further."""
+    table = repository.WINDOWS
+    return (
+        table.c.vehicle_id == vehicle,
+        table.c.decision == "approved",
+        table.c.state != "processed",
+    )
+
+
+def _pass_of(connection: Connection, row: Mapping[str, Any]) -> int:
+    """A pass over the span of the window."""
+    return int(
+        repository.add(
+            connection,
+            repository.PASSES,
+            vehicle_id=row["vehicle_id"],
+            name=row["name"],
+            start_utc_ns=row["start_utc_ns"],
+            stop_utc_ns=row["stop_utc_ns"],
+            archive_digest=None,
+            manifest={
+                "window_id": row["id"],
+                "cadence_s": row["cadence_s"],
+                "frames_expected": row["predicted"].get("frames"),
+            },
+            ephemeris_id=row["ephemeris_id"],
+            catalogue_sha256=None,
+            created_utc_ns=utc_now_ns(),
+        )
+    )

@@ -1,0 +1,240 @@
+"""Windows over the interface: searched, entered, decided on, uplinked, followed by telemetry, exchanged."""
+
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ground_service.api.app import create_app
+from ground_service.settings import Settings
+from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import encode_cadus
+from tmtc.packets import PacketSequencer
+from tmtc.uplink import UplinkDecoder
+
+with warnings.catch_warnings():
+    # It recommends another HTTP library than the installed one; both serve it.
+    warnings.simplefilter("ignore")
+    from fastapi.testclient import TestClient
+
+V1 = "/api/v1"
+NS = 1_000_000_000
+START = parse_utc("2029-08-07T06:00:00Z")
+
+
+def at(seconds: float) -> str:
+    return format_utc(START + int(seconds * NS), 0)
+
+
+@pytest.fixture
+def client(synthetic_pass: Any, tmp_path: Path) -> Iterator[TestClient]:
+    """A service with the reference ephemeris of the synthetic pass and nothing else."""
+    with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as opened:
+        octets = (synthetic_pass.folder / "reference.oem").read_bytes()
+        assert opened.post(f"{V1}/ephemerides", content=octets).status_code == 201
+        yield opened
+
+
+def window(client: TestClient, start_s: float, stop_s: float, **fields: Any) -> Any:
+    body = {"start": at(start_s), "stop": at(stop_s), "spacecraft_id": 76, **fields}
+    return client.post(f"{V1}/windows", json=body)
+
+
+def approved(client: TestClient, start_s: float, stop_s: float, **fields: Any) -> int:
+    made = window(client, start_s, stop_s, **fields)
+    assert made.status_code == 201, made.text
+    key = made.json()["id"]
+    answer = client.patch(f"{V1}/windows/{key}", json={"state": "approved"})
+    assert answer.status_code == 200, answer.text
+    return int(key)
+
+
+def test_windows_are_searched_over_the_uploaded_ephemeris(client: TestClient) -> None:
+    body = {
+        "altitude_km": {"min": 29, "max": 31},
+        "maximum_duration_s": 600,
+        "spacecraft_id": 76,
+        "minimum_battery": 0.1,
+    }
+    found = client.post(f"{V1}/windows/search", json=body)
+    assert found.status_code == 200, found.text
+    document = found.json()
+    assert document["candidates"]
+    first = document["candidates"][0]
+    assert 29.9 < first["altitude_km"]["min"] <= first["altitude_km"]["max"] < 30.1
+    assert document["contacts"]
+    none = client.post(f"{V1}/windows/search", json={"altitude_km": {"min": 50, "max": 60}}).json()
+    assert none["candidates"] == []
+    for refused in (
+        {"craters_per_frame": 5},  # no catalogue here
+        {"terrain": "mare"},  # no map here
+        {"start": at(0), "stop": at(-60)},
+        {"start": "2001-01-01T00:00:00Z", "stop": "2001-01-02T00:00:00Z", "ephemeris_id": 1},
+        {"altitude_km": {"min": 2, "max": 1}},
+        {"start": "yesterday"},
+    ):
+        answer = client.post(f"{V1}/windows/search", json=refused)
+        assert answer.status_code == 422, (refused, answer.text)
+
+
+def test_what_overlaps_a_committed_window_is_answered_with_409(client: TestClient) -> None:
+    first = approved(client, 0, 300)
+    overlapping = window(client, 299, 500)
+    assert overlapping.status_code == 409
+    assert overlapping.json()["errors"] == [
+        {"where": f"window {first}", "detail": f"window {first} (approved) covers part of the same time"}
+    ]
+    assert window(client, 300, 500).status_code == 201
+    assert window(client, 400, 600, predecessor_id=99).status_code == 404
+    assert window(client, 200, 600, instance="other", predecessor_id=first).status_code == 404
+    assert window(client, 310, 300).status_code == 422
+
+
+def test_drafts_may_overlap_but_only_one_can_be_approved(client: TestClient) -> None:
+    keys = [window(client, 0, 300).json()["id"] for _ in range(2)]
+    assert client.patch(f"{V1}/windows/{keys[0]}", json={"state": "approved"}).status_code == 200
+    assert client.patch(f"{V1}/windows/{keys[1]}", json={"state": "approved"}).status_code == 409
+    moved = client.patch(
+        f"{V1}/windows/{keys[1]}", json={"start": at(300), "stop": at(400), "state": "approved"}
+    )
+    assert moved.status_code == 200
+    assert client.patch(f"{V1}/windows/{keys[1]}", json={"cadence_s": 5}).status_code == 409
+
+
+def test_resources_that_do_not_suffice_are_a_conflict(client: TestClient) -> None:
+    little = window(client, 0, 300, resources={"storage_mib": 0.001})
+    assert little.status_code == 409
+    assert "octets would be stored on board" in little.json()["detail"]
+    weak = window(client, 0, 300, resources={"battery_wh": 1.0, "generation_w": 0.0})
+    assert weak.status_code == 409
+    assert "the battery would fall to" in weak.json()["detail"]
+
+
+def test_a_change_of_what_somebody_else_changed_is_refused(client: TestClient) -> None:
+    made = window(client, 0, 300)
+    tag = made.headers["etag"]
+    path = f"{V1}/windows/{made.json()['id']}"
+    assert client.patch(path, json={"name": "mine"}, headers={"If-Match": tag}).status_code == 200
+    assert client.patch(path, json={"name": "theirs"}, headers={"If-Match": tag}).status_code == 412
+    assert client.delete(path, headers={"If-Match": tag}).status_code == 412
+    assert client.delete(path).status_code == 204
+    assert client.get(path).status_code == 404
+
+
+def test_an_approved_window_becomes_time_tagged_telecommands(client: TestClient) -> None:
+    key = approved(client, 60, 360, cadence_s=10)
+    assert client.post(f"{V1}/windows/{key}/uplink").json()["total"] == 3
+    again = client.post(f"{V1}/windows/{key}/uplink").json()
+    assert [one["name"] for one in again["items"]] == [
+        "enable_schedule",
+        "insert_activity",
+        "insert_activity",
+    ]
+    stream = client.post(f"{V1}/uplink", params={"spacecraft_id": 76}).content
+    packets = [DICTIONARY.unpack_command(packet) for packet in UplinkDecoder(76).decode(stream).packets]
+    assert [packet.name for packet in packets] == ["enable_schedule", "insert_activity", "insert_activity"]
+    inner = []
+    for packet, seconds in zip(packets[1:], (60, 360), strict=True):
+        assert packet.values["release_ticks"] == int(ticks_from_utc_ns(START + seconds * NS))
+        inner.append(DICTIONARY.unpack_command(bytes(packet.values["items"]["octet"].astype("u1"))))
+    assert [one.values["function_id"] for one in inner] == [2, 3]
+    assert (inner[0].values["argument_1"], inner[0].values["argument_2"]) == (300.0, 10.0)
+    counts = [one.sequence_count for one in (*packets, *inner)]
+    assert len(set(counts)) == len(counts)
+    assert client.get(f"{V1}/windows/{key}").json()["state"] == "uplinked"
+    assert client.delete(f"{V1}/windows/{key}").status_code == 409
+    assert client.patch(f"{V1}/windows/{key}", json={"state": "draft"}).status_code == 409
+    failed = client.patch(
+        f"{V1}/windows/{key}", json={"state": "failed", "reason": "spacecraft in safe mode"}
+    )
+    assert failed.json()["reason"] == "spacecraft in safe mode"
+
+
+def test_a_draft_or_a_failed_window_is_not_uplinked(client: TestClient) -> None:
+    key = window(client, 0, 300).json()["id"]
+    assert client.post(f"{V1}/windows/{key}/uplink").status_code == 409
+    before = approved(client, 400, 500)
+    after = approved(client, 600, 700, predecessor_id=before)
+    client.patch(f"{V1}/windows/{before}", json={"state": "failed", "reason": "x"})
+    assert client.post(f"{V1}/windows/{after}/uplink").status_code == 409
+
+
+def telemetry(frames: int = 5) -> list[bytes]:
+    """What a payload sends about an observation that begins at START + 60 s and ends 60 s later."""
+    sequencer, packets = PacketSequencer(), []
+
+    def send(name: str, seconds: float, values: dict[str, Any]) -> None:
+        ticks = int(ticks_from_utc_ns(START + int(seconds * NS)))
+        apid = DICTIONARY.packet(name).apid
+        packets.append(DICTIONARY.pack(name, values, ticks=ticks, sequence_count=sequencer.next(apid)))
+
+    event = {"frame_number": 0, "value_1": 0.0, "value_2": 0.0}
+    send("event_info", 60, {"event_id": "observation_started", **event})
+    for k in range(frames):
+        image = int(ticks_from_utc_ns(START + (60 + 15 * k) * NS))
+        send(
+            "detections",
+            60 + 15 * k,
+            {"frame_number": k, "image_ticks": image, "image_quality": 0, "items": []},
+        )
+    send("event_info", 120, {"event_id": "observation_stopped", **event})
+    send("event_info", 600, {"event_id": "mode_changed", **event})
+    return packets
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (1, 2, 0)])
+def test_the_state_follows_telemetry_in_whatever_order_it_comes(
+    client: TestClient, order: tuple[int, ...]
+) -> None:
+    key = approved(client, 60, 120)
+    client.post(f"{V1}/windows/{key}/uplink")
+    client.post(f"{V1}/uplink", params={"spacecraft_id": 76})
+    packets = telemetry()
+    pieces = [packets[:3], packets[3:7], packets[7:]]
+    seen = []
+    for number in order:
+        stream = encode_cadus(pieces[number], spacecraft_id=76)
+        assert client.post(f"{V1}/telemetry", content=stream).status_code == 202
+        seen.append(client.get(f"{V1}/windows/{key}").json()["state"])
+    assert seen[-1] == "downlinked"
+    if order == (0, 1, 2):
+        assert seen[:2] == ["executing", "executed"]
+    shown = client.get(f"{V1}/windows/{key}").json()
+    assert client.get(f"{V1}/passes/{shown['pass_id']}").json()["manifest"]["window_id"] == key
+    assert client.post(f"{V1}/passes/{shown['pass_id']}/reports").status_code == 202
+    assert client.get(f"{V1}/windows/{key}").json()["state"] == "processed"
+
+
+def test_a_plan_goes_from_one_service_to_another(
+    client: TestClient, synthetic_pass: Any, tmp_path_factory: Callable[..., Any]
+) -> None:
+    first = approved(client, 0, 100)
+    approved(client, 100, 200, predecessor_id=first, name="second")
+    plan = client.get(f"{V1}/plan").json()
+    assert client.post(f"{V1}/plan", json=plan).json()["windows"] == {"w1": 1, "w2": 2}  # already there
+    home = tmp_path_factory.mktemp("other")  # type: ignore[attr-defined]
+    with TestClient(create_app(Settings(home=home), inline_jobs=True)) as other:
+        made = other.post(f"{V1}/plan", json=plan)
+        assert made.status_code == 201, made.text
+        second = other.get(f"{V1}/windows/{made.json()['windows']['w2']}").json()
+        assert (second["name"], second["state"]) == ("second", "draft")
+        assert second["predecessor_id"] == made.json()["windows"]["w1"]
+        # all or nothing: the last of these follows a window that ends after it begins
+        plan["windows"] = [
+            {**plan["windows"][0], "key": "a", "name": "new", "start": at(300), "stop": at(400)},
+            {
+                **plan["windows"][0],
+                "key": "b",
+                "name": "late",
+                "start": at(350),
+                "stop": at(450),
+                "after": "a",
+            },
+        ]
+        assert other.post(f"{V1}/plan", json=plan).status_code == 409
+        assert other.get(f"{V1}/windows").json()["total"] == 2
+        plan["windows"][0]["after"] = "b"
+        assert other.post(f"{V1}/plan", json=plan).status_code == 422

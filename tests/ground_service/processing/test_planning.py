@@ -1,0 +1,215 @@
+"""Candidate windows: every sample of a candidate fulfils the constraints, computed here a second time by hand."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ground_service.processing.planning import (
+    Commitment,
+    Constraints,
+    Contact,
+    Planner,
+    Resources,
+    data_octets,
+    storage_peak,
+)
+from ground_service.processing.window_states import (
+    PlannedSpan,
+    WindowFacts,
+    span_conflicts,
+    state_of,
+)
+from lunar.camera import PinholeCamera
+from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
+from lunar.ephemeris import Ephemeris, ephemeris_from_states
+from lunar.frames import IauOrientation
+from lunar.third_bodies import sun_position_icrf_m
+from lunar.timescales import parse_utc, tdb_s_from_utc_ns
+
+NS = 1_000_000_000
+START = parse_utc("2029-08-07T06:00:00Z")
+RADIUS_M = MOON_RADIUS_M + 40e3
+PERIOD_S = 2.0 * np.pi * np.sqrt(RADIUS_M**3 / GM_MOON_M3_S2)
+
+
+def circle(eccentric_m: float = 0.0) -> Ephemeris:
+    """Five hours on a polar circle of 40 km altitude; `eccentric_m` lets the altitude swing by so much."""
+    utc_ns = START + np.arange(0, 5 * 3600, 20, dtype=np.int64) * NS
+    rate = 2.0 * np.pi / PERIOD_S
+    angle = rate * (utc_ns - START) / NS
+    radius = RADIUS_M + eccentric_m * np.cos(angle)
+    along, up = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    position = radius[:, None] * (c * along + s * up)
+    slope = (-eccentric_m * rate * np.sin(angle))[:, None]
+    velocity = slope * (c * along + s * up) + (radius * rate)[:, None] * (-s * along + c * up)
+    return ephemeris_from_states(utc_ns, position, velocity)
+
+
+def planner(ephemeris: Ephemeris, **resources: Any) -> Planner:
+    return Planner(ephemeris, IauOrientation(), Resources(**resources), PinholeCamera())
+
+
+def search(plan: Planner, **constraints: Any) -> Any:
+    return plan.search(
+        Constraints(**constraints), plan.ephemeris.start_utc_ns, plan.ephemeris.stop_utc_ns, 15.0
+    )
+
+
+def test_altitude_is_kept_all_along_and_missed_just_outside() -> None:
+    plan = planner(circle(eccentric_m=20e3))
+    found = search(plan, altitude_m=(45e3, 100e3), maximum_duration_s=7200.0).candidates
+    assert len(found) >= 2
+    for candidate in found:
+        assert candidate.altitude_m[0] >= 45e3 - 20.0  # edges to 1 s, 20 m/s of climb at most
+        for edge, step in ((candidate.start_utc_ns, -5 * NS), (candidate.stop_utc_ns, 5 * NS)):
+            outside = edge + step
+            if plan.ephemeris.start_utc_ns <= outside <= plan.ephemeris.stop_utc_ns:
+                position, _ = plan.ephemeris.at(np.array([outside]))
+                assert np.linalg.norm(position) - MOON_RADIUS_M < 45e3
+
+
+def test_sunlight_on_the_ground_and_on_the_spacecraft() -> None:
+    plan = planner(circle())
+    found = search(plan, sun_elevation_rad=(np.radians(10.0), np.pi), sunlit=True).candidates
+    assert found
+    for candidate in found:
+        epochs = np.linspace(candidate.start_utc_ns, candidate.stop_utc_ns, 20).astype(np.int64)
+        position, _ = plan.ephemeris.at(epochs)
+        sun = np.asarray(sun_position_icrf_m(np.asarray(tdb_s_from_utc_ns(epochs))))
+        cosine = (
+            np.sum(position * sun, axis=1) / np.linalg.norm(position, axis=1) / np.linalg.norm(sun, axis=1)
+        )
+        # The Sun stands at 90 degrees less the angle between the zenith and it, parallax below 0.01 degrees.
+        assert np.all(np.degrees(np.arcsin(cosine)) > 9.98)
+        assert candidate.sunlit_share == 1.0
+
+
+def test_long_spans_are_cut_and_short_ones_left_out() -> None:
+    plan = planner(circle())
+    everything = search(plan, maximum_duration_s=1200.0)
+    assert len(everything.candidates) == 15  # 17980 s in pieces of 1200 s at most
+    assert everything.candidates[0].stop_utc_ns == everything.candidates[1].start_utc_ns
+    none = search(plan, minimum_duration_s=86_400.0)
+    assert none.candidates == ()
+    assert none.refused["too short"] > 0
+
+
+def test_craters_are_counted_in_the_camera(make_pass: Callable[..., Any]) -> None:
+    from lunar.catalogue import load_catalogue
+    from lunar.ephemeris import load_ephemeris
+
+    folder = make_pass(frames=6, seed=3).folder
+    ephemeris, catalogue = load_ephemeris(folder / "reference.oem"), load_catalogue(folder / "catalogue.csv")
+    plan = Planner(ephemeris, IauOrientation(), Resources(), PinholeCamera(), catalogue)
+    many = plan.search(
+        Constraints(craters_per_frame=30.0, minimum_duration_s=60.0),
+        ephemeris.start_utc_ns,
+        ephemeris.stop_utc_ns,
+        15.0,
+    ).candidates
+    assert len(many) == 1
+    assert many[0].craters_per_frame is not None
+    assert many[0].craters_per_frame[0] >= 30.0
+    # Craters were only placed around the six frames: the search has to find that stretch and no other.
+    middle = (many[0].start_utc_ns + many[0].stop_utc_ns) // 2
+    assert abs(middle - (START + 38 * NS)) < 60 * NS
+
+
+def test_terrain_is_asked_of_the_map() -> None:
+    north = Planner(
+        circle(), IauOrientation(), Resources(), PinholeCamera(), mare=lambda latitude, _: latitude > 0.0
+    )
+    for wanted, sign in ((True, 1.0), (False, -1.0)):
+        found = search(north, mare=wanted).candidates
+        assert found
+        assert all(sign * candidate.latitude_rad[0] > -1e-2 for candidate in found)
+        assert all(candidate.mare_share == float(wanted) for candidate in found)
+
+
+def test_the_battery_falls_with_the_load() -> None:
+    weak = planner(circle(), battery_wh=4.0, generation_w=13.0)
+    assert search(weak, minimum_battery=0.5).refused["battery too low"] > 0
+    strong = search(planner(circle(), generation_w=1000.0), maximum_duration_s=3600.0, sunlit=True)
+    assert all(candidate.battery_minimum > 0.85 for candidate in strong.candidates)
+    assert strong.candidates[0].energy_wh == pytest.approx(
+        8.0 * (strong.candidates[0].stop_utc_ns - strong.candidates[0].start_utc_ns) / NS / 3600.0
+    )
+
+
+def test_data_leave_the_store_in_the_order_they_came() -> None:
+    first, second = Commitment(0, 100 * NS, 1000), Commitment(200 * NS, 300 * NS, 500)
+    contacts = [
+        Contact("a", 400 * NS, 460 * NS),
+        Contact("b", 450 * NS, 500 * NS),
+        Contact("a", 900 * NS, 960 * NS),
+    ]
+    # 1000 octets at 80 bit/s take the 100 s of the two contacts that overlap; the next 50 s carry the other 500.
+    peak, by = storage_peak([first, second], contacts, 80.0, second)
+    assert (peak, by) == (1500, 950 * NS)
+    peak, by = storage_peak([first, second], [Contact("a", 100 * NS, 200 * NS)], 80.0, second)
+    assert (peak, by) == (1000, None)
+    assert storage_peak([first], contacts, 0.0, first) == (1000, None)
+
+
+def test_data_of_a_frame_are_as_long_as_its_packets() -> None:
+    # Packet lengths by the ICD: detections 35 + 9 n, navigation state 84, frame outcome 59, housekeeping 92 octets.
+    from tmtc.dictionary import DICTIONARY
+
+    lengths = {
+        n: DICTIONARY.packet(n).base_length for n in ("navigation_state", "frame_outcome", "housekeeping")
+    }
+    one = (
+        DICTIONARY.packet("detections").base_length
+        + 10 * 9
+        + 2 * sum(lengths[n] for n in ("navigation_state", "frame_outcome"))
+    )
+    assert data_octets(3, 10.0, 2) == 3 * (one + lengths["housekeeping"])
+
+
+def test_windows_conflict_where_they_overlap() -> None:
+    mine = PlannedSpan(1, 100, 200, "draft")
+    others = [
+        PlannedSpan(2, 50, 101, "approved"),
+        PlannedSpan(3, 200, 300, "approved"),
+        PlannedSpan(4, 120, 130, "draft"),
+        PlannedSpan(5, 120, 130, "failed"),
+        PlannedSpan(6, 199, 400, "executed"),
+    ]
+    assert [one.window_id for one in span_conflicts(mine, None, others)] == [2, 6]
+    assert span_conflicts(mine, PlannedSpan(7, 0, 100, "approved"), []) == []
+    late = span_conflicts(mine, PlannedSpan(7, 0, 101, "failed"), [])
+    assert [one.kind for one in late] == ["predecessor", "predecessor"]
+
+
+SENT = ("completed", "accepted")
+
+
+@pytest.mark.parametrize(
+    ("facts", "expected"),
+    [
+        (WindowFacts("draft", started=True), "draft"),
+        (WindowFacts("failed", frames=5), "failed"),
+        (WindowFacts("approved"), "approved"),
+        (WindowFacts("approved", command_states=("released", "carried")), "approved"),
+        (WindowFacts("approved", command_states=SENT), "uplinked"),
+        (WindowFacts("approved", command_states=("sent", "failed")), "failed"),
+        (WindowFacts("approved", predecessor_failed=True, command_states=SENT), "failed"),
+        (WindowFacts("approved", command_states=SENT, heard_after=True), "failed"),
+        (WindowFacts("approved", command_states=SENT, started=True), "executing"),
+        (WindowFacts("approved", command_states=SENT, frames=2), "executing"),
+        (WindowFacts("approved", command_states=SENT, started=True, stopped=True, lost=2), "executed"),
+        (WindowFacts("approved", command_states=SENT, frames=9, heard_after=True, lost=1), "executed"),
+        (WindowFacts("approved", command_states=SENT, frames=9, heard_after=True, lost=0), "downlinked"),
+        (
+            WindowFacts("approved", command_states=SENT, frames=9, heard_after=True, lost=0, reported=True),
+            "processed",
+        ),
+    ],
+)
+def test_the_state_follows_from_the_facts(facts: WindowFacts, expected: str) -> None:
+    state, reason = state_of(facts)
+    assert state == expected
+    assert (reason is not None) == (state == "failed" and facts.decision == "approved")
