@@ -62,7 +62,7 @@ def _build(arguments: argparse.Namespace) -> int:
 
 def _check(arguments: argparse.Namespace) -> int:
     from linna.output import emit, log
-    from payload_emulator.training.dataset import check
+    from payload_emulator.training.integrity import check
 
     problems = check(arguments.folder)
     for problem in problems:

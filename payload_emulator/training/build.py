@@ -1,6 +1,7 @@
 """Rendering of a data set, shard by shard: a pure function of recipe, data and shard number, whatever the workers.
 
-Resumable: a shard whose labels file exists is not made again. Memory: each worker keeps one terrain at a time.
+Resumable: a shard whose labels file exists is not made again, and that file is written after everything else of the
+shard, in one move. Memory: each worker keeps one terrain at a time, and of that the tiles last looked at.
 """
 
 from __future__ import annotations
@@ -9,37 +10,34 @@ import hashlib
 import json
 import math
 import multiprocessing
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lunar.camera import PinholeCamera, ground_point_sphere, nadir_camera_from_mcmf
-from lunar.constants import MOON_RADIUS_M
+from lunar.camera import PinholeCamera
 from lunar.datafolder import DataFolder, find_data
-from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.errors import DatasetError
 from payload_emulator.training import dataset as store
-from payload_emulator.training.recipe import Box, Recipe, Source
+from payload_emulator.training.finishing import write_index
+from payload_emulator.training.frames import describe, find_renderer, take_frame
+from payload_emulator.training.recipe import Recipe, Source
+from payload_emulator.training.shots import Place, draw_box, draw_pose, pose_at
+from payload_emulator.training.track import Track, lay_track
 
-Floats = NDArray[np.float64]
-
-_ATTEMPTS = 4000
-_LOWEST_FLIGHT_M = 9_000.0  # above the ground: lower, a 5 km crater fills more than a sixth of the frame
-_LABEL_MINIMUM_M = 2_000.0
-_LABEL_MINIMUM_PX = 5.0
-_STAMPED_MINIMUM_PX = 9.0
-_BLOCK_DEG = 8.0
-_SHARD_REACH_DEG = 2.5  # frames of a shard look at neighbouring ground, so that its terrain is made once
+_FOLDERS = ("images", "metadata", "shards")
+_TERRAIN_KINDS = {"real": "raster", "procedural": "procedural", "catalogue": "catalogue"}
 
 
 @dataclass(frozen=True, slots=True)
 class Shard:
-    """A run of frames of one source."""
+    """A run of frames of one source; along an ephemeris with their epochs, places in MCMF m and splits."""
 
     name: str
     source: Source
@@ -47,32 +45,26 @@ class Shard:
     number: int
     first_frame: int
     frames: int
+    utc_ns: tuple[int, ...] = ()
+    position_mcmf_m: tuple[tuple[float, float, float], ...] = ()
+    split: tuple[str, ...] = ()
 
 
-@dataclass(slots=True)
-class _Place:
-    """Where a shard draws its frames: the box of its source; after the first frame, the part about that frame."""
+def plan_shards(recipe: Recipe, frames: int, tracks: Mapping[str, Track] | None = None) -> list[Shard]:
+    """Shards of a data set of about `frames` frames; each source gets its share, rounded to whole frames.
 
-    box: Box
-    near: Box | None = None
-
-
-def plan_shards(recipe: Recipe, frames: int) -> list[Shard]:
-    """Shards of a data set of about `frames` frames; each source gets its share, rounded to whole frames."""
-    total = sum(source.share for source in recipe.sources)
-    if frames < len(recipe.sources) or total <= 0.0:
-        raise DatasetError(
-            f"data set: expected at least one frame per source ({len(recipe.sources)}), found {frames}"
-        )
+    `tracks` holds the places of the sources that follow an ephemeris, by name.
+    """
     shards: list[Shard] = []
     first = 0
-    for source in recipe.sources:
-        wanted = max(1, round(frames * source.share / total))
+    for source, wanted in _wanted(recipe, frames):
+        track = (tracks or {}).get(source.name)
         for done in range(0, wanted, recipe.frames_per_shard):
             count = min(wanted - done, recipe.frames_per_shard)
             # Runs of one seed, so that a worker seldom has to open another terrain.
             seed = source.seeds[done * len(source.seeds) // wanted]
-            shards.append(Shard(f"{len(shards):05d}", source, seed, len(shards), first, count))
+            along = _along(track, slice(done, done + count)) if track is not None else {}
+            shards.append(Shard(f"{len(shards):05d}", source, seed, len(shards), first, count, **along))
             first += count
     return shards
 
@@ -85,375 +77,159 @@ def build(
     Raises
     ------
     DatasetError
-        The folder holds another data set, or the recipe needs data that are not there.
+        The folder holds another data set or is being written, the recipe needs data that are not there, a file cannot
+        be written, or a worker died; what was finished before is kept.
     """
-    shards = plan_shards(recipe, frames)
+    find_renderer(recipe.renderer)
+    _check_data(recipe, data)
+    tracks = _lay_tracks(recipe, frames, data)
+    shards = plan_shards(recipe, frames, tracks)
     total = sum(shard.frames for shard in shards)
-    _claim(folder, recipe, frames)
-    if any(source.terrain == "real" for source in recipe.sources) and not data.dem_tiles:
-        raise DatasetError(f"data set {recipe.name}: expected terrain tiles in the data folder, found none")
-    todo = [shard for shard in shards if not (folder / "shards" / f"{shard.name}.npz").is_file()]
-    done = total - sum(shard.frames for shard in todo)
-    yield done, total
-    root = str(data.root) if data.root is not None else ""
-    if workers <= 1:
-        for shard in todo:
-            make_shard(recipe, shard, folder, root)
-            done += shard.frames
-            yield done, total
-    elif todo:
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(workers, mp_context=context) as pool:
-            running = {pool.submit(make_shard, recipe, shard, folder, root): shard for shard in todo}
-            for finished in as_completed(running):
-                finished.result()
-                done += running[finished].frames
+    _claim(folder, recipe, frames, tracks)
+    with _locked(folder):
+        _sweep(folder)
+        todo = [shard for shard in shards if not _shard_path(folder, shard).is_file()]
+        done = total - sum(shard.frames for shard in todo)
+        yield done, total
+        try:
+            for shard in _make(recipe, todo, folder, str(data.root or ""), workers):
+                done += shard.frames
                 yield done, total
-    hashes = {
-        shard.name: hashlib.sha256((folder / "shards" / f"{shard.name}.npz").read_bytes()).hexdigest()
-        for shard in shards
-    }
-    store.write_index(folder, recipe, total, hashes, _data_names(recipe, data))
+            hashes = {
+                shard.name: hashlib.sha256(_shard_path(folder, shard).read_bytes()).hexdigest()
+                for shard in shards
+            }
+            write_index(folder, recipe, total, hashes, _data_names(recipe, data))
+        except OSError as error:
+            where = f" ({error.filename})" if error.filename else ""
+            raise DatasetError(
+                f"{folder}: {error.strerror or error}{where}; {done} of {total} frames are kept, "
+                "the same command goes on from there"
+            ) from error
+        except BrokenProcessPool:
+            raise DatasetError(
+                f"{folder}: a worker process died (killed, or out of memory); {done} of {total} frames are kept, "
+                "the same command goes on from there"
+            ) from None
 
 
 def make_shard(recipe: Recipe, shard: Shard, folder: Path, data_root: str) -> None:
     """Render the frames of one shard and write them with their labels."""
-    terrain = _terrain(shard.source, shard.seed, data_root)
+    source = shard.source
+    terrain = _terrain(source, shard.seed, data_root)
     rng = np.random.Generator(np.random.Philox(key=[recipe.seed, shard.number]))
-    place = _Place(_draw_box(shard.source, rng))
-    camera = PinholeCamera(recipe.width_px, recipe.height_px, math.radians(recipe.fov_deg))
-    frame_rows: list[dict[str, float]] = []
-    crater_rows: list[dict[str, NDArray[Any]]] = []
-    poses: list[tuple[Floats, Floats, Floats]] = []
+    camera = _camera(recipe)
+    place = None if source.ephemeris else Place(draw_box(source, rng))
+    shots, hashes = [], []
     for k in range(shard.frames):
         number = shard.first_frame + k
-        image, row, craters, pose = _make_frame(terrain, camera, shard.source, place, number, rng)
-        store.write_gray(folder / "images" / f"{number:06d}.png", image)
-        store.write_json(
-            folder / "metadata" / f"{number:06d}.json", _metadata(camera, shard, row, pose, terrain)
+
+        def pose_of(generator: np.random.Generator, k: int = k, number: int = number) -> Any:
+            if place is not None:
+                return draw_pose(terrain, camera, source, place, generator)
+            position = np.array(shard.position_mcmf_m[k])
+            return pose_at(terrain, camera, source, position, f"frame {number}", generator)
+
+        shot = take_frame(terrain, camera, source, pose_of, number, recipe.bits, recipe.renderer, rng)
+        split = shard.split[k] if shard.split else source.split
+        utc_ns = shard.utc_ns[k] if shard.utc_ns else None
+        document = describe(camera, shot, source, split, terrain, utc_ns)
+        hashes.append(
+            (
+                store.write_gray(folder / "images" / f"{number:06d}.png", shot.image),
+                store.write_json(folder / "metadata" / f"{number:06d}.json", document),
+            )
         )
-        frame_rows.append(row)
-        crater_rows.append(craters)
-        poses.append(pose)
+        shots.append(shot)
     labels = store.ShardLabels(
-        source=shard.source.name,
-        split=shard.source.split,
-        complete=shard.source.terrain == "procedural",
-        frames={key: np.array([row[key] for row in frame_rows]) for key in store.FRAME_COLUMNS},
-        sun_camera=np.array([pose[2] for pose in poses]),
-        camera_from_mcmf=np.array([pose[1] for pose in poses]),
-        position_mcmf_m=np.array([pose[0] for pose in poses]),
-        craters={key: np.concatenate([part[key] for part in crater_rows]) for key in store.CRATER_COLUMNS},
-        first=np.concatenate([[0], np.cumsum([part["id"].size for part in crater_rows])]).astype(np.int64),
+        source=source.name,
+        split=source.split,
+        complete=source.terrain != "real",
+        frames={key: np.array([shot.row[key] for shot in shots]) for key in store.FRAME_COLUMNS},
+        sun_camera=np.array([shot.pose.camera_from_mcmf @ shot.sun_mcmf for shot in shots]),
+        camera_from_mcmf=np.array([shot.pose.camera_from_mcmf for shot in shots]),
+        position_mcmf_m=np.array([shot.pose.position_mcmf_m for shot in shots]),
+        craters={key: np.concatenate([shot.craters[key] for shot in shots]) for key in shots[0].craters},
+        first=np.concatenate([[0], np.cumsum([shot.craters["id"].size for shot in shots])]).astype(np.int64),
+        frame_split=shard.split,
+        image_sha256=tuple(image for image, _ in hashes),
+        metadata_sha256=tuple(metadata for _, metadata in hashes),
     )
     store.write_shard(folder, shard.name, labels)
 
 
-def _make_frame(
-    terrain: Any, camera: PinholeCamera, source: Source, place: _Place, number: int, rng: np.random.Generator
-) -> tuple[NDArray[np.uint8], dict[str, float], dict[str, NDArray[Any]], tuple[Floats, Floats, Floats]]:
-    from payload_emulator.flight.preprocess import ImageQuality, gray_levels, prepare_image
-    from payload_emulator.sim.light import sun_direction_mcmf
-    from payload_emulator.sim.renderer import render
-    from payload_emulator.sim.sensor import expose
+def _make(
+    recipe: Recipe, todo: Sequence[Shard], folder: Path, data_root: str, workers: int
+) -> Iterator[Shard]:
+    """Make shards; yields each when it is on disk."""
+    if workers <= 1:
+        for shard in todo:
+            make_shard(recipe, shard, folder, data_root)
+            yield shard
+        return
+    if not todo:
+        return
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(min(workers, len(todo)), mp_context=context, initializer=_follow_parent)
+    try:
+        running: dict[Future[None], Shard] = {
+            pool.submit(make_shard, recipe, shard, folder, data_root): shard for shard in todo
+        }
+        for finished in as_completed(running):
+            finished.result()
+            yield running.pop(finished)
+    finally:
+        # After an error nothing more is begun; shards under way are finished.
+        pool.shutdown(wait=True, cancel_futures=True)
 
-    for _ in range(20):
-        latitude, longitude, altitude_m, ground_m, position, rotation = _draw_pose(
-            terrain, camera, source, place, rng
+
+def _follow_parent() -> None:
+    """In a worker: leave interrupts to the parent, and end when it does, however it ends."""
+    import signal
+    import threading
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _wanted(recipe: Recipe, frames: int) -> list[tuple[Source, int]]:
+    """How many frames each source gives."""
+    total = sum(source.share for source in recipe.sources)
+    if frames < len(recipe.sources) or total <= 0.0:
+        raise DatasetError(
+            f"data set: expected at least one frame per source ({len(recipe.sources)}), found {frames}"
         )
-        elevation, azimuth = _draw_sun(source.light, rng)
-        sun = sun_direction_mcmf(elevation, azimuth, latitude, longitude)
-        rendering = render(terrain, camera, position, rotation, sun, _draw_photometry(source.vary, rng))
-        rgb = expose(rendering.radiance, _draw_sensor(source.vary, rng), rng)
-        image = gray_levels(rgb)
-        if prepare_image(image).quality is ImageQuality.OK:
-            break
-    craters = _label(terrain, camera, position, rotation, rendering)
-    small = stamped_craters(terrain, camera, position, rotation, image)
-    craters = {key: np.concatenate([craters[key], small[key]]) for key in craters}
-    block = int((math.degrees(latitude) + 90.0) // _BLOCK_DEG) * 100 + int(
-        math.degrees(longitude) % 360.0 // _BLOCK_DEG
-    )
-    row = {
-        "number": number,
-        "latitude_deg": math.degrees(latitude),
-        "longitude_deg": math.degrees(longitude) % 360.0,
-        "altitude_m": altitude_m,
-        "ground_m": ground_m,
-        "sun_elevation_deg": math.degrees(elevation),
-        "sun_azimuth_deg": math.degrees(azimuth),
-        "block": block,
-    }
-    return image, row, craters, (position, rotation, rotation @ sun)
+    return [(source, max(1, round(frames * source.share / total))) for source in recipe.sources]
 
 
-def _draw_pose(
-    terrain: Any, camera: PinholeCamera, source: Source, place: _Place, rng: np.random.Generator
-) -> tuple[float, float, float, float, Floats, Floats]:
-    edge = _edge_pixels(camera)
-    box = place.box
-    for attempt in range(_ATTEMPTS):
-        draw = place.near if place.near is not None and attempt < _ATTEMPTS // 4 else box
-        latitude = math.asin(
-            rng.uniform(math.sin(math.radians(draw.south_deg)), math.sin(math.radians(draw.north_deg)))
+def _lay_tracks(recipe: Recipe, frames: int, data: DataFolder) -> dict[str, Track]:
+    root = str(data.root or "")
+    return {
+        source.name: lay_track(
+            source, _camera(recipe), _terrain(source, source.seeds[0], root), data, wanted, recipe.seed
         )
-        longitude = math.radians(rng.uniform(draw.west_deg, draw.east_deg))
-        altitude_m = 1000.0 * rng.uniform(*source.altitude_km)
-        turn = _pointing(source.vary, rng)
-        position = np.asarray(mcmf_from_spherical(latitude, longitude, altitude_m))
-        rotation = turn @ nadir_camera_from_mcmf(position)
-        ground = ground_point_sphere(camera, rotation, position, edge)
-        if not np.isfinite(ground).all():
-            continue
-        edge_latitude, edge_longitude, _ = spherical_from_mcmf(ground)
-        if not _allowed(source, box, np.degrees(edge_latitude), np.degrees(edge_longitude)):
-            continue
-        if not np.all(terrain.covers(edge_latitude, edge_longitude)):
-            continue
-        inner = np.concatenate([0.5 * (ground + ground.mean(axis=0)), ground.mean(axis=0)[None]])
-        inner_latitude, inner_longitude, _ = spherical_from_mcmf(inner)
-        heights = terrain.height_m(inner_latitude, inner_longitude)
-        if not np.isfinite(heights).all() or altitude_m - heights.max() < _LOWEST_FLIGHT_M:
-            continue
-        if place.near is None:
-            place.near = _about(box, math.degrees(latitude), math.degrees(longitude))
-        return latitude, longitude, altitude_m, float(heights.mean()), position, rotation
-    raise DatasetError(
-        f"data set source {source.name!r}: expected room for a footprint in box {box.west_deg:g}..{box.east_deg:g} E, "
-        f"{box.south_deg:g}..{box.north_deg:g} N, found none in {_ATTEMPTS} draws"
-    )
-
-
-def _about(box: Box, latitude_deg: float, longitude_deg: float) -> Box:
-    """The part of a box within `_SHARD_REACH_DEG` of a place."""
-    wide = _SHARD_REACH_DEG / max(math.cos(math.radians(latitude_deg)), 0.2)
-    return Box(
-        max(box.west_deg, longitude_deg - wide),
-        min(box.east_deg, longitude_deg + wide),
-        max(box.south_deg, latitude_deg - _SHARD_REACH_DEG),
-        min(box.north_deg, latitude_deg + _SHARD_REACH_DEG),
-    )
-
-
-def _allowed(source: Source, box: Box, latitude_deg: Floats, longitude_deg: Floats) -> bool:
-    """Whether a footprint's edge lies in the box and clear of every box to avoid, buffer included."""
-    if not _inside(box, latitude_deg, longitude_deg, 0.0).all():
-        return False
-    return not any(
-        _inside(other, latitude_deg, longitude_deg, source.buffer_km).any() for other in source.avoid
-    )
-
-
-def _inside(box: Box, latitude_deg: Floats, longitude_deg: Floats, buffer_km: float) -> NDArray[np.bool_]:
-    margin = math.degrees(buffer_km * 1000.0 / MOON_RADIUS_M)
-    widen = margin / np.cos(np.radians(np.minimum(np.abs(latitude_deg) + margin, 85.0)))
-    middle = 0.5 * (box.west_deg + box.east_deg)
-    offset = np.mod(longitude_deg - middle + 180.0, 360.0) - 180.0
-    across = np.abs(offset) <= 0.5 * (box.east_deg - box.west_deg) + widen
-    inside: NDArray[np.bool_] = (
-        across & (latitude_deg >= box.south_deg - margin) & (latitude_deg <= box.north_deg + margin)
-    )
-    return inside
-
-
-def _edge_pixels(camera: PinholeCamera) -> Floats:
-    """Sixteen pixels along the edge of the image, (16, 2)."""
-    right, bottom = camera.width_px - 0.5, camera.height_px - 0.5
-    along_u, along_v = np.linspace(-0.5, right, 5), np.linspace(-0.5, bottom, 5)
-    top = [(u, -0.5) for u in along_u]
-    low = [(u, bottom) for u in along_u]
-    sides = [(u, v) for u in (-0.5, right) for v in along_v[1:-1]]
-    return np.array(top + low + sides)
-
-
-def _draw_box(source: Source, rng: np.random.Generator) -> Box:
-    areas = np.array(
-        [
-            (b.east_deg - b.west_deg)
-            * (math.sin(math.radians(b.north_deg)) - math.sin(math.radians(b.south_deg)))
-            for b in source.boxes
-        ]
-    )
-    return source.boxes[int(rng.choice(len(source.boxes), p=areas / areas.sum()))]
-
-
-def _draw_sun(light: str, rng: np.random.Generator) -> tuple[float, float]:
-    if light == "paper":
-        return math.radians(rng.uniform(5.0, 15.0)), math.radians(rng.uniform(-45.0, 45.0))
-    azimuth = math.radians(rng.uniform(-180.0, 180.0))
-    if light == "low":
-        return math.radians(rng.uniform(5.0, 15.0)), azimuth
-    limits = ((5.0, 15.0), (15.0, 35.0), (35.0, 60.0), (3.0, 5.0))[
-        int(rng.choice(4, p=(0.7, 0.17, 0.07, 0.06)))
-    ]
-    return math.radians(rng.uniform(*limits)), azimuth
-
-
-def _pointing(vary: bool, rng: np.random.Generator) -> Floats:
-    """Small rotation of the camera: yaw of 4 degrees, tilt of 0.7 degrees (one sigma, cut at three)."""
-    if not vary:
-        return np.eye(3)
-    x, y, z = np.clip(rng.normal(size=3), -3.0, 3.0) * np.radians([0.7, 0.7, 4.0])
-    cos_z, sin_z = math.cos(z), math.sin(z)
-    about_z = np.array([[cos_z, -sin_z, 0.0], [sin_z, cos_z, 0.0], [0.0, 0.0, 1.0]])
-    cos_x, sin_x = math.cos(x), math.sin(x)
-    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cos_x, -sin_x], [0.0, sin_x, cos_x]])
-    cos_y, sin_y = math.cos(y), math.sin(y)
-    about_y = np.array([[cos_y, 0.0, sin_y], [0.0, 1.0, 0.0], [-sin_y, 0.0, cos_y]])
-    return np.asarray(about_z @ about_y @ about_x)
-
-
-def _draw_photometry(vary: bool, rng: np.random.Generator) -> Any:
-    from payload_emulator.sim.photometry import LAWS, Photometry
-
-    if not vary:
-        return Photometry()
-    law = LAWS[int(rng.choice(len(LAWS), p=_law_shares(LAWS)))]
-    return Photometry(
-        law=law,
-        phase_slope_per_rad=float(rng.uniform(0.2, 1.0)),
-        albedo_contrast=float(rng.uniform(0.0, 1.6)),
-    )
-
-
-def _law_shares(laws: tuple[str, ...]) -> list[float]:
-    return [0.5 if law == "lunar-lambert" else 0.5 / (len(laws) - 1) for law in laws]
-
-
-def _draw_sensor(vary: bool, rng: np.random.Generator) -> Any:
-    from payload_emulator.sim.sensor import SensorModel, random_sensor
-
-    return random_sensor(rng) if vary else SensorModel()
-
-
-def _label(
-    terrain: Any, camera: PinholeCamera, position: Floats, rotation: Floats, rendering: Any
-) -> dict[str, NDArray[Any]]:
-    """Catalogued craters in view with what scoring and training need to know of each."""
-    from payload_emulator.sim.labels import label_frame
-
-    labels = label_frame(terrain, camera, position, rotation, _LABEL_MINIMUM_M, rendering.lit)
-    measured = terrain.measured(labels.index)
-    points = (measured.position_mcmf_m - position) @ rotation.T
-    diameter_px = camera.focal_px * measured.diameter_m / points[:, 2]
-    chosen = np.flatnonzero((diameter_px >= _LABEL_MINIMUM_PX) & measured.complete)
-    near = measured.select(chosen)
-    u, v = labels.u_px[chosen], labels.v_px[chosen]
-    distance = np.linalg.norm(points[chosen], axis=1)
-    row = np.clip(np.rint(v).astype(int), 0, camera.height_px - 1)
-    column = np.clip(np.rint(u).astype(int), 0, camera.width_px - 1)
-    seen = rendering.range_m[row, column]
-    hidden = np.isnan(seen) | (seen < 0.9 * distance)
-    return {
-        "id": near.ids.astype(np.int64),
-        "u_px": u.astype(np.float32),
-        "v_px": v.astype(np.float32),
-        "diameter_px": diameter_px[chosen].astype(np.float32),
-        "diameter_m": near.diameter_m.astype(np.float32),
-        "depth_ratio": (near.depth_m / near.diameter_m).astype(np.float32),
-        "lit": np.nan_to_num(labels.lit_fraction[chosen]).astype(np.float32),
-        "hidden": hidden.astype(np.uint8),
-        "latitude_deg": np.degrees(near.latitude_rad),
-        "longitude_deg": np.degrees(near.longitude_rad) % 360.0,
+        for source, wanted in _wanted(recipe, frames)
+        if source.ephemeris
     }
 
 
-def stamped_craters(
-    terrain: Any, camera: PinholeCamera, position: Floats, rotation: Floats, image: NDArray[np.uint8]
-) -> dict[str, NDArray[Any]]:
-    """Craters below the catalogue's limit that the terrain draws from its seed, where they are large in the image.
-
-    Their ids are negative: they teach what a crater looks like at any scale (from 12 km one of 1.5 km is 18 px wide),
-    and are no part of scoring. No shadow picture is kept for them, so "lit" is judged on the image.
-    """
-    latitude, longitude, altitude_m = (float(value) for value in spherical_from_mcmf(position))
-    reach = (altitude_m + 4_000.0) * math.tan(camera.fov_rad / 2.0) * 1.1 / MOON_RADIUS_M
-    wide = reach / max(math.cos(latitude), 0.2)
-    shapes = terrain._small.around(
-        np.array([latitude - reach, latitude + reach]), np.array([longitude - wide, longitude + wide])
-    )
-    diameter_m = 2.0 * shapes.radius_rad * MOON_RADIUS_M
-    flat = mcmf_from_spherical(shapes.latitude_rad, shapes.longitude_rad, 0.0) - position
-    rough = np.asarray(flat) @ rotation.T
-    uv = camera.project(rough)
-    with np.errstate(invalid="ignore"):
-        large = camera.focal_px * diameter_m / rough[:, 2] >= 0.75 * _STAMPED_MINIMUM_PX
-        chosen = np.flatnonzero(large & camera.contains(uv, -40.0))
-    place_latitude, place_longitude = shapes.latitude_rad[chosen], shapes.longitude_rad[chosen]
-    azimuth = np.arange(8) * (math.pi / 4.0)
-    arc = shapes.radius_rad[chosen][:, None]
-    rim_latitude = place_latitude[:, None] + arc * np.cos(azimuth)
-    rim_longitude = place_longitude[:, None] + arc * np.sin(azimuth) / np.cos(place_latitude)[:, None]
-    height = terrain.height_m(rim_latitude, rim_longitude).mean(axis=1) if chosen.size else np.zeros(0)
-    points = (
-        np.asarray(mcmf_from_spherical(place_latitude, place_longitude, height)) - position
-    ) @ rotation.T
-    uv = camera.project(points)
-    diameter_px = camera.focal_px * diameter_m[chosen] / points[:, 2]
-    keep = np.flatnonzero((diameter_px >= _STAMPED_MINIMUM_PX) & camera.contains(uv))
-    chosen, uv, diameter_px = chosen[keep], uv[keep], diameter_px[keep]
+def _along(track: Track, span: slice) -> dict[str, Any]:
     return {
-        "id": -1 - np.arange(chosen.size, dtype=np.int64),
-        "u_px": uv[:, 0].astype(np.float32),
-        "v_px": uv[:, 1].astype(np.float32),
-        "diameter_px": diameter_px.astype(np.float32),
-        "diameter_m": diameter_m[chosen].astype(np.float32),
-        "depth_ratio": (shapes.depth_m[chosen] / diameter_m[chosen]).astype(np.float32),
-        "lit": _bright_share(image, uv, diameter_px).astype(np.float32),
-        "hidden": np.zeros(chosen.size, np.uint8),
-        "latitude_deg": np.degrees(shapes.latitude_rad[chosen]),
-        "longitude_deg": np.degrees(shapes.longitude_rad[chosen]) % 360.0,
+        "utc_ns": tuple(int(value) for value in track.utc_ns[span]),
+        "position_mcmf_m": tuple((float(x), float(y), float(z)) for x, y, z in track.position_mcmf_m[span]),
+        "split": track.split[span],
     }
 
 
-def _bright_share(image: NDArray[np.uint8], uv: Floats, diameter_px: Floats) -> Floats:
-    """Share of 16 points around each centre that are brighter than a third of the frame's median bright pixel."""
-    bright = image[image > 8]
-    level = float(np.median(bright)) / 3.0 if bright.size else 255.0
-    radius = np.repeat([0.6, 1.25], 8)
-    angle = np.tile(np.arange(8) * (math.pi / 4.0), 2)
-    u = uv[:, :1] + 0.5 * diameter_px[:, None] * radius * np.cos(angle)
-    v = uv[:, 1:] + 0.5 * diameter_px[:, None] * radius * np.sin(angle)
-    rows = np.clip(np.rint(v).astype(int), 0, image.shape[0] - 1)
-    columns = np.clip(np.rint(u).astype(int), 0, image.shape[1] - 1)
-    share: Floats = (image[rows, columns] > level).mean(axis=1) if uv.shape[0] else np.zeros(0)
-    return share
-
-
-def _metadata(
-    camera: PinholeCamera,
-    shard: Shard,
-    row: dict[str, float],
-    pose: tuple[Floats, Floats, Floats],
-    terrain: Any,
-) -> dict[str, Any]:
-    position, rotation, sun_camera = pose
-    corners = ground_point_sphere(camera, rotation, position, camera.corners_px())
-    latitude, longitude, _ = spherical_from_mcmf(corners)
-    down = nadir_camera_from_mcmf(position)
-    relative = rotation @ np.asarray(down).T
-    return {
-        "frame": int(row["number"]),
-        "source": shard.source.name,
-        "split": shard.source.split,
-        "terrain": terrain.name,
-        "data": list(terrain.data_names),
-        "latitude_deg": row["latitude_deg"],
-        "longitude_deg": row["longitude_deg"],
-        "altitude_km": row["altitude_m"] / 1000.0,
-        "mean_ground_m": row["ground_m"],
-        "tilt_deg": math.degrees(math.acos(min(1.0, float(relative[2, 2])))),
-        "azimuth_deg": math.degrees(math.atan2(float(relative[1, 0]), float(relative[0, 0]))),
-        "sun_elevation_deg": row["sun_elevation_deg"],
-        "sun_azimuth_deg": row["sun_azimuth_deg"],
-        "sun_camera": [float(value) for value in sun_camera],
-        "corners_deg": [
-            {"latitude": float(a), "longitude": float(o) % 360.0}
-            for a, o in zip(np.degrees(latitude), np.degrees(longitude), strict=True)
-        ],
-        "position_mcmf_m": [float(value) for value in position],
-        "camera_from_mcmf": [[float(value) for value in line] for line in rotation],
-    }
+def _camera(recipe: Recipe) -> PinholeCamera:
+    return PinholeCamera(recipe.width_px, recipe.height_px, math.radians(recipe.fov_deg))
 
 
 _open_terrains: dict[tuple[str, int, str], Any] = {}
@@ -466,31 +242,69 @@ def _terrain(source: Source, seed: int, data_root: str) -> Any:
     key = (source.terrain, seed, data_root)
     if key not in _open_terrains:
         _open_terrains.clear()
-        kind = "raster" if source.terrain == "real" else "procedural"
-        _open_terrains[key] = open_terrain(kind, find_data(Path(data_root) if data_root else None), seed)
+        data = find_data(Path(data_root) if data_root else None)
+        _open_terrains[key] = open_terrain(_TERRAIN_KINDS[source.terrain], data, seed)
     return _open_terrains[key]
 
 
-def _claim(folder: Path, recipe: Recipe, frames: int) -> None:
+def _shard_path(folder: Path, shard: Shard) -> Path:
+    return folder / "shards" / f"{shard.name}.npz"
+
+
+def _check_data(recipe: Recipe, data: DataFolder) -> None:
+    kinds = {source.terrain for source in recipe.sources}
+    if "real" in kinds and not data.dem_tiles:
+        raise DatasetError(f"data set {recipe.name}: expected terrain tiles in the data folder, found none")
+
+
+def _claim(folder: Path, recipe: Recipe, frames: int, tracks: Mapping[str, Track]) -> None:
     """Make the folder for this recipe, or refuse one that holds another data set."""
     claim = folder / "recipe.json"
-    wanted = {"recipe_sha256": recipe.digest, "frames": frames}
+    wanted: dict[str, Any] = {"recipe_sha256": recipe.digest, "frames": frames}
+    if tracks:
+        wanted["places_sha256"] = {name: track.digest for name, track in sorted(tracks.items())}
     if claim.is_file():
         found = json.loads(claim.read_text(encoding="utf-8"))
         if found != wanted:
             raise DatasetError(
                 f"{folder}: expected an empty folder or the same data set (recipe {recipe.digest[:12]}, "
-                f"{frames} frames), "
+                f"{frames} frames{', the same places' if tracks else ''}), "
                 f"found one of recipe {str(found.get('recipe_sha256'))[:12]}, {found.get('frames')} frames"
             )
     elif folder.exists() and any(folder.iterdir()):
         raise DatasetError(f"{folder}: expected an empty folder or a data set, found other files")
-    for name in ("images", "metadata", "shards"):
+    for name in _FOLDERS:
         (folder / name).mkdir(parents=True, exist_ok=True)
-    store.write_json(claim, wanted)
+    if not claim.is_file():
+        store.write_json(claim, wanted)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the folder alone; the lock falls with the process, however it ends."""
+    import fcntl
+
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise DatasetError(
+                f"{folder}: expected a folder that nobody writes to, found another build under way"
+            ) from None
+        yield
+    finally:
+        os.close(handle)
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what a killed build left half-written."""
+    for place in (folder, *(folder / name for name in _FOLDERS)):
+        for path in place.glob(".*"):
+            path.unlink(missing_ok=True)
 
 
 def _data_names(recipe: Recipe, data: DataFolder) -> list[str]:
-    if any(source.terrain == "real" for source in recipe.sources):
+    if any(source.terrain != "procedural" for source in recipe.sources):
         return list(data.names())
     return ["procedural Moon (no data)"]

@@ -3,7 +3,7 @@
 Layout of the folder::
 
     dataset.json            recipe, camera, counts, data sources, hashes of the shards
-    images/000123.png       8-bit gray, the mean of the sensor's colour channels, as the camera saw it (not turned)
+    images/000123.png       gray, 8 or 16 bits, the mean of the colour channels, as the camera saw it (not turned)
     metadata/000123.json    pose, corner coordinates, Sun vector
     shards/0006.npz         labels and poses of the frames of one shard; written last, so that its presence means "done"
     coco_train.json ...     COCO annotations by split
@@ -19,7 +19,8 @@ import io
 import json
 import math
 import os
-from collections.abc import Iterable, Iterator, Sequence
+import zipfile
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,6 @@ from numpy.typing import NDArray
 
 from lunar.catalogue import size_class
 from payload_emulator.errors import DatasetError
-from payload_emulator.training.recipe import SPLITS, Recipe
 from payload_emulator.training.scoring import FrameTruth
 from payload_emulator.training.targets import Tier
 
@@ -39,7 +39,8 @@ CATEGORIES = ((0, "5-10 km"), (1, "10-15 km"), (2, "15-30 km"), (3, "3-5 km"))
 # Label tier: what a network can fairly be asked to find.
 LABEL_MINIMUM_DIAMETER_PX = 10.0
 LABEL_MINIMUM_DIAMETER_M = 2_500.0  # the real terrain resolves nothing smaller
-LABEL_MINIMUM_DEPTH_RATIO = 0.025
+LABEL_MINIMUM_DEPTH_RATIO = 0.02
+LABEL_LEAST_WEIGHT = 0.5  # at that depth: less, and worn craters are found too seldom
 FULL_WEIGHT_DEPTH_RATIO = 0.06
 LABEL_MINIMUM_LIT = 0.06
 LABEL_MAXIMUM_DIAMETER_PX = 380.0
@@ -56,6 +57,12 @@ CRATER_COLUMNS = (
     "latitude_deg",
     "longitude_deg",
 )
+ELLIPSE_COLUMNS = ("major_px", "minor_px", "angle_rad", "visible")
+"""Axes of the rim's ellipse, angle of the major one from +u toward +v, share of the rim within the picture.
+
+Data sets made before these were kept are read as if rims were round and whole.
+"""
+
 FRAME_COLUMNS = (
     "number",
     "latitude_deg",
@@ -71,7 +78,8 @@ FRAME_COLUMNS = (
 @dataclass(frozen=True, slots=True, eq=False)
 class ShardLabels:
     """Labels of one shard: frame columns (f,), sun_camera (f, 3), camera_from_mcmf (f, 3, 3), position_mcmf_m (f, 3),
-    crater columns (n,) in frame order with `first` (f + 1,) marking where each frame's craters begin."""
+    crater columns (n,) in frame order with `first` (f + 1,) marking where each frame's craters begin; where frames of
+    one shard belong to several splits, the split of each; SHA-256 of each frame's image and metadata file."""
 
     source: str
     split: str
@@ -82,11 +90,14 @@ class ShardLabels:
     position_mcmf_m: NDArray[np.float64]
     craters: dict[str, NDArray[Any]]
     first: NDArray[np.int64]
+    frame_split: tuple[str, ...] = ()
+    image_sha256: tuple[str, ...] = ()
+    metadata_sha256: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One frame of a data set with its labels; crater columns as `CRATER_COLUMNS`."""
+    """One frame of a data set with its labels; crater columns as `CRATER_COLUMNS` and `ELLIPSE_COLUMNS`."""
 
     number: int
     source: str
@@ -114,7 +125,8 @@ class Dataset:
         try:
             self.index: dict[str, Any] = json.loads(index.read_text(encoding="utf-8"))
         except FileNotFoundError:
-            raise DatasetError(f"{folder}: expected a data set (dataset.json), found none") from None
+            found = "an unfinished one: build it again to go on" if (folder / "recipe.json").is_file() else "none"
+            raise DatasetError(f"{folder}: expected a data set (dataset.json), found {found}") from None
         except (OSError, ValueError) as error:
             raise DatasetError(f"{index}: expected a JSON object, found: {error}") from error
         if self.index.get("schema_version") != SCHEMA_VERSION:
@@ -150,7 +162,7 @@ class Dataset:
         ]
 
     def image(self, frame: Frame) -> NDArray[np.uint8]:
-        """Gray image (H, W) of a frame."""
+        """Gray image (H, W) of a frame, the upper 8 bits where it has 16."""
         return read_gray(self.folder / "images" / f"{frame.number:06d}.png")
 
 
@@ -179,8 +191,11 @@ def choose_tiers(
         & ~craters["hidden"].astype(bool)
     )
     span = FULL_WEIGHT_DEPTH_RATIO - LABEL_MINIMUM_DEPTH_RATIO
-    weight = np.clip(0.3 + 0.7 * (craters["depth_ratio"] - LABEL_MINIMUM_DEPTH_RATIO) / span, 0.3, 1.0)
-    return np.where(label, Tier.LABEL, Tier.IGNORE).astype(np.int8), np.nan_to_num(weight, nan=0.3)
+    grown = (craters["depth_ratio"] - LABEL_MINIMUM_DEPTH_RATIO) / span
+    weight = np.clip(LABEL_LEAST_WEIGHT + (1.0 - LABEL_LEAST_WEIGHT) * grown, LABEL_LEAST_WEIGHT, 1.0)
+    return np.where(label, Tier.LABEL, Tier.IGNORE).astype(np.int8), np.nan_to_num(
+        weight, nan=LABEL_LEAST_WEIGHT
+    )
 
 
 def frame_truth(dataset: Dataset, frame: Frame) -> FrameTruth:
@@ -236,16 +251,28 @@ def write_shard(folder: Path, name: str, labels: ShardLabels) -> str:
     }
     arrays |= {f"frame_{key}": value for key, value in labels.frames.items()}
     arrays |= {f"crater_{key}": value for key, value in labels.craters.items()}
+    for key in ("frame_split", "image_sha256", "metadata_sha256"):
+        if getattr(labels, key):
+            arrays[key] = np.array(getattr(labels, key))
     np.savez(buffer, **arrays)
     octets = buffer.getvalue()
-    _write_whole(folder / "shards" / f"{name}.npz", octets)
-    return hashlib.sha256(octets).hexdigest()
+    return write_whole(folder / "shards" / f"{name}.npz", octets)
 
 
 def load_shard(path: Path) -> ShardLabels:
     """Labels of one shard."""
     try:
         with np.load(path) as stored:
+            craters = {key: stored[f"crater_{key}"] for key in CRATER_COLUMNS}
+            count = craters["id"].size
+            before = {"major_px": craters["diameter_px"], "minor_px": craters["diameter_px"]}
+            before |= {"angle_rad": np.zeros(count, np.float32), "visible": np.ones(count, np.float32)}
+            for key in ELLIPSE_COLUMNS:
+                craters[key] = stored[f"crater_{key}"] if f"crater_{key}" in stored else before[key]
+            texts = {
+                key: tuple(str(value) for value in stored[key]) if key in stored else ()
+                for key in ("frame_split", "image_sha256", "metadata_sha256")
+            }
             return ShardLabels(
                 source=str(stored["source"]),
                 split=str(stored["split"]),
@@ -254,12 +281,13 @@ def load_shard(path: Path) -> ShardLabels:
                 sun_camera=stored["sun_camera"],
                 camera_from_mcmf=stored["camera_from_mcmf"],
                 position_mcmf_m=stored["position_mcmf_m"],
-                craters={key: stored[f"crater_{key}"] for key in CRATER_COLUMNS},
+                craters=craters,
                 first=stored["first"],
+                **texts,
             )
     except FileNotFoundError:
         raise DatasetError(f"{path}: expected the labels of a shard, found no file") from None
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise DatasetError(f"{path}: expected the labels of a shard, found: {error}") from error
 
 
@@ -270,35 +298,14 @@ def shard_frames(labels: ShardLabels) -> Iterator[Frame]:
         yield Frame(
             number=int(labels.frames["number"][k]),
             source=labels.source,
-            split=labels.split,
+            split=labels.frame_split[k] if labels.frame_split else labels.split,
             complete=labels.complete,
             values={key: float(labels.frames[key][k]) for key in FRAME_COLUMNS},
             sun_camera=labels.sun_camera[k],
             camera_from_mcmf=labels.camera_from_mcmf[k],
             position_mcmf_m=labels.position_mcmf_m[k],
-            craters={key: labels.craters[key][span] for key in CRATER_COLUMNS},
+            craters={key: values[span] for key, values in labels.craters.items()},
         )
-
-
-def write_index(
-    folder: Path, recipe: Recipe, frames: int, shards: dict[str, str], data_names: Sequence[str]
-) -> None:
-    """Write dataset.json and the COCO files of a finished data set."""
-    index = {
-        "schema_version": SCHEMA_VERSION,
-        "name": recipe.name,
-        "recipe": recipe.to_dict(),
-        "recipe_sha256": recipe.digest,
-        "camera": {"width_px": recipe.width_px, "height_px": recipe.height_px, "fov_deg": recipe.fov_deg},
-        "frames": frames,
-        "data": list(data_names),
-        "shards": shards,
-    }
-    _write_whole(folder / "dataset.json", json.dumps(index, indent=1, sort_keys=True).encode())
-    dataset = Dataset(folder)
-    for split in SPLITS:
-        found = dataset.frames(split)
-        _write_whole(folder / f"coco_{split}.json", json.dumps(_coco(dataset, found)).encode())
 
 
 def count_instances(frames: Iterable[Frame], width_px: int, height_px: int) -> list[int]:
@@ -306,72 +313,51 @@ def count_instances(frames: Iterable[Frame], width_px: int, height_px: int) -> l
     counts = np.zeros(3, np.int64)
     for frame in frames:
         craters = frame.craters
-        inside = _inside(craters, width_px, height_px)
+        inside = in_picture(craters, width_px, height_px)
         classes = size_class(craters["diameter_m"].astype(np.float64))[inside]
         counts += np.array([np.count_nonzero(classes == k) for k in range(3)])
     return [int(count) for count in counts]
 
 
-def check(folder: Path) -> list[str]:
-    """What is wrong with a data set: missing or damaged files, one line each; empty when it is whole."""
-    dataset = Dataset(folder)
-    problems = []
-    for name, expected in sorted(dataset.index["shards"].items()):
-        path = folder / "shards" / f"{name}.npz"
-        found = hashlib.sha256(path.read_bytes()).hexdigest()
-        if found != expected:
-            problems.append(f"{path}: expected SHA-256 {expected}, found {found}")
-    for frame in dataset.frames():
-        path = folder / "images" / f"{frame.number:06d}.png"
-        try:
-            image = read_gray(path)
-        except DatasetError as error:
-            problems.append(str(error))
-            continue
-        if image.shape != (dataset.height_px, dataset.width_px):
-            problems.append(
-                f"{path}: expected {dataset.width_px} x {dataset.height_px} pixels, "
-                f"found {image.shape[1]} x {image.shape[0]}"
-            )
-        if not (folder / "metadata" / f"{frame.number:06d}.json").is_file():
-            problems.append(
-                f"{folder}/metadata/{frame.number:06d}.json: expected frame metadata, found no file"
-            )
-    return problems
-
-
 def read_gray(path: Path) -> NDArray[np.uint8]:
-    """An 8-bit gray PNG (H, W)."""
+    """A gray PNG (H, W) in 8 bits."""
     import cv2
 
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if image is None:
-        raise DatasetError(f"{path}: expected an 8-bit PNG image, found none that can be read")
+        raise DatasetError(f"{path}: expected a gray PNG image, found none that can be read")
     return np.asarray(image, dtype=np.uint8)
 
 
-def write_gray(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write an 8-bit gray PNG in one move."""
+def write_gray(path: Path, image: NDArray[Any]) -> str:
+    """Write a gray PNG of 8 or 16 bits in one move; its SHA-256 comes back."""
     import cv2
 
     done, octets = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not done:
-        raise DatasetError(f"{path}: expected an image of 8-bit gray, found {image.dtype} {image.shape}")
-    _write_whole(path, octets.tobytes())
+        raise DatasetError(f"{path}: expected an image of 8 or 16 bits, found {image.dtype} {image.shape}")
+    return write_whole(path, octets.tobytes())
 
 
-def write_json(path: Path, document: dict[str, Any]) -> None:
-    """Write a JSON object in one move."""
-    _write_whole(path, json.dumps(document, indent=1).encode())
+def write_json(path: Path, document: dict[str, Any]) -> str:
+    """Write a JSON object in one move; its SHA-256 comes back."""
+    return write_whole(path, json.dumps(document, indent=1).encode())
 
 
-def _write_whole(path: Path, octets: bytes) -> None:
+def write_whole(path: Path, octets: bytes) -> str:
+    """Write a file whole or not at all; its SHA-256 comes back."""
     unfinished = path.with_name(f".{path.name}.{os.getpid()}")
-    unfinished.write_bytes(octets)
-    unfinished.replace(path)
+    try:
+        unfinished.write_bytes(octets)
+        unfinished.replace(path)
+    except OSError:
+        unfinished.unlink(missing_ok=True)
+        raise
+    return hashlib.sha256(octets).hexdigest()
 
 
-def _inside(craters: dict[str, NDArray[Any]], width_px: int, height_px: int) -> NDArray[np.bool_]:
+def in_picture(craters: dict[str, NDArray[Any]], width_px: int, height_px: int) -> NDArray[np.bool_]:
+    """Which craters have their centre in the picture."""
     inside: NDArray[np.bool_] = (
         (craters["u_px"] >= -0.5)
         & (craters["u_px"] <= width_px - 0.5)
@@ -379,46 +365,3 @@ def _inside(craters: dict[str, NDArray[Any]], width_px: int, height_px: int) -> 
         & (craters["v_px"] <= height_px - 0.5)
     )
     return inside
-
-
-def _coco(dataset: Dataset, frames: Sequence[Frame]) -> dict[str, Any]:
-    annotations: list[dict[str, Any]] = []
-    for frame in frames:
-        craters = frame.craters
-        classes = size_class(craters["diameter_m"].astype(np.float64))
-        tiers, _ = choose_tiers(craters, dataset.width_px, dataset.height_px, frame.complete)
-        chosen = np.flatnonzero(_inside(craters, dataset.width_px, dataset.height_px) & (classes >= 0))
-        for k in chosen:
-            u, v, d = (float(craters[name][k]) for name in ("u_px", "v_px", "diameter_px"))
-            annotations.append(
-                {
-                    "id": len(annotations) + 1,
-                    "image_id": frame.number,
-                    "category_id": int(classes[k]),
-                    "bbox": [round(value, 2) for value in (u - d / 2 + 0.5, v - d / 2 + 0.5, d, d)],
-                    "area": round(math.pi * d * d / 4, 1),
-                    "iscrowd": 0,
-                    "centre": [round(u, 3), round(v, 3)],
-                    "diameter": round(d, 3),
-                    "ellipse": [round(u, 3), round(v, 3), round(d / 2, 3), round(d / 2, 3), 0.0],
-                    "crater_id": int(craters["id"][k]),
-                    "depth_ratio": round(float(np.nan_to_num(craters["depth_ratio"][k])), 4),
-                    "ignore": int(tiers[k] != Tier.LABEL),
-                }
-            )
-    return {
-        "info": {"description": str(dataset.index["name"]), "version": str(SCHEMA_VERSION)},
-        "categories": [
-            {"id": number, "name": name, "supercategory": "crater"} for number, name in CATEGORIES
-        ],
-        "images": [
-            {
-                "id": frame.number,
-                "file_name": f"images/{frame.number:06d}.png",
-                "width": dataset.width_px,
-                "height": dataset.height_px,
-            }
-            for frame in frames
-        ],
-        "annotations": annotations,
-    }

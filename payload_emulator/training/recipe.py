@@ -2,7 +2,8 @@
 
 A recipe is a TOML file with a `[dataset]` table and one `[[dataset.source]]` table per source. Angles are degrees and
 lengths kilometres in the file. Splits are separated by footprint: every pixel of a frame looks into one of its source's
-boxes and stays `buffer_km` away from every box it must avoid.
+boxes and stays `buffer_km` away from every box it must avoid. A source may follow an ephemeris instead of drawing its
+places, with the paper's own split: a contiguous test arc, the rest shuffled (section V-C).
 """
 
 from __future__ import annotations
@@ -19,8 +20,13 @@ from typing import Any
 from payload_emulator.errors import DatasetError
 
 SPLITS = ("train", "val", "test")
-TERRAINS = ("procedural", "real")
+PAPER_SPLIT = "80/15/5"
+"""Split of a source along an ephemeris: the last 5 % of its frames in time are the test arc, the rest is shuffled."""
+
+PAPER_SHARES = (0.80, 0.15, 0.05)
+TERRAINS = ("procedural", "real", "catalogue")
 LIGHTS = ("wide", "low", "paper")
+DEPTHS = (8, 16)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,11 +46,16 @@ EVERYWHERE = (Box(0.0, 360.0, -60.0, 60.0),)
 class Source:
     """One kind of frames.
 
-    terrain : "procedural" (one world per seed) or "real" (tiles of the data folder; seeds vary what is stamped).
+    split : "train", "val" or "test"; along an ephemeris also "80/15/5".
+    terrain : "procedural" (one world per seed), "real" (tiles of the data folder; seeds vary what is stamped) or
+        "catalogue" (the data folder's craters on a procedural base).
     share : of all frames of the data set.
     light : "wide" = 3..60 degrees of elevation, mostly 5..15, any azimuth; "low" = 5..15, any azimuth; "paper" = 5..15
         and -45..45 degrees from north.
     vary : photometry, sensor and pointing are randomised; else they are nominal and the camera looks straight down.
+    ephemeris : an OEM or STK file, or a scenario whose orbit is flown for `days`: frames are taken in turn at every
+        `step_s` where the sub-satellite latitude is within `latitude_limit_deg` (the paper, section V-B.4) and the
+        footprint is on the terrain. `altitude_km` does not apply.
     """
 
     name: str
@@ -58,11 +69,15 @@ class Source:
     light: str = "wide"
     vary: bool = True
     altitude_km: tuple[float, float] = (12.0, 50.0)
+    ephemeris: str = ""
+    step_s: float = 15.0
+    days: float = 1.0
+    latitude_limit_deg: float = 60.0
 
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """A data set up to its number of frames."""
+    """A data set up to its number of frames. `bits` is the depth of the images, 8 or 16."""
 
     name: str
     seed: int
@@ -71,14 +86,34 @@ class Recipe:
     height_px: int = 512
     fov_deg: float = 120.0
     frames_per_shard: int = 20
+    bits: int = 8
+    renderer: str = "fast"
 
     def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
+        """Plain values; what came later than the first data sets is left out where it is not used."""
+        document = _without_defaults(asdict(self), {"bits": 8, "renderer": "fast"})
+        document["sources"] = [_source_dict(source) for source in document["sources"]]
+        return document
 
     @property
     def digest(self) -> str:
         """Hash of everything that decides what the frames are."""
         return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
+
+
+def _source_dict(source: dict[str, Any]) -> dict[str, Any]:
+    """A source's values; of an ephemeris only the name, as its folder says nothing about the frames."""
+    if source["ephemeris"]:
+        return source | {"ephemeris": Path(source["ephemeris"]).name}
+    return {
+        key: value
+        for key, value in source.items()
+        if key not in ("ephemeris", "step_s", "days", "latitude_limit_deg")
+    }
+
+
+def _without_defaults(document: dict[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in document.items() if key not in defaults or value != defaults[key]}
 
 
 def procedural_recipe(seed: int = 1) -> Recipe:
@@ -122,6 +157,8 @@ def load_recipe(path: Path) -> Recipe:
     for key in ("name", "seed"):
         if key not in settings:
             raise DatasetError(f"{path}: dataset.{key}: expected a value, found none")
+    if settings.get("bits", 8) not in DEPTHS:
+        raise DatasetError(f"{path}: dataset.bits: expected 8 or 16, found {settings['bits']!r}")
     return Recipe(sources=tuple(_source(path, n, item) for n, item in enumerate(sources)), **settings)
 
 
@@ -132,7 +169,8 @@ def _source(path: Path, number: int, table: Mapping[str, Any]) -> Source:
     for key in ("name", "split", "terrain", "share"):
         if key not in values:
             raise DatasetError(f"{path}: {where}: {key}: expected a value, found none")
-    for key, allowed in (("split", SPLITS), ("terrain", TERRAINS), ("light", LIGHTS)):
+    splits = (*SPLITS, PAPER_SPLIT) if values.get("ephemeris") else SPLITS
+    for key, allowed in (("split", splits), ("terrain", TERRAINS), ("light", LIGHTS)):
         if key in values and values[key] not in allowed:
             raise DatasetError(
                 f"{path}: {where}: {key}: expected one of {', '.join(allowed)}, found {values[key]!r}"
@@ -144,6 +182,12 @@ def _source(path: Path, number: int, table: Mapping[str, Any]) -> Source:
         values["seeds"] = tuple(int(seed) for seed in values["seeds"])
     if "altitude_km" in values:
         values["altitude_km"] = tuple(float(value) for value in values["altitude_km"])
+    if values.get("ephemeris"):
+        beside = path.parent / values["ephemeris"]
+        values["ephemeris"] = str(beside) if beside.exists() else values["ephemeris"]
+        for key in ("step_s", "days"):
+            if not values.get(key, 1.0) > 0.0:
+                raise DatasetError(f"{path}: {where}: {key}: expected more than 0, found {values[key]!r}")
     return Source(**values)
 
 

@@ -76,6 +76,12 @@ class CraterShapes:
         return self if large.all() else self.select(np.flatnonzero(large))
 
 
+def no_craters() -> CraterShapes:
+    """Shapes of no crater at all."""
+    none = np.zeros(0)
+    return CraterShapes(none, none, none, none, np.zeros(0, np.int64), np.zeros((0, 4)))
+
+
 def crater_profiles() -> npt.NDArray[np.float32]:
     """Radial profiles of unit depth (rim to mean inner floor), (40, 258), sampled from the centre to 2.6 radii."""
     s = np.asarray(np.arange(PROFILE_SAMPLES + 2) * (PROFILE_REACH / PROFILE_SAMPLES), dtype=np.float64)

@@ -11,7 +11,7 @@ import math
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,9 @@ import numpy.typing as npt
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import TerrainError
+
+if TYPE_CHECKING:
+    from payload_emulator.sim.terrain.craters import CraterShapes, SmallCraters
 
 Floats = npt.NDArray[np.float64]
 Heights = npt.NDArray[np.float32]
@@ -116,9 +119,20 @@ class Terrain(Protocol):
         """Catalogue craters of these indices, likewise measured."""
         ...
 
+    def small_craters(self, latitude_rad: Floats, longitude_rad: Floats) -> CraterShapes:
+        """Seeded craters below the catalogue's limit that can touch a window of these latitudes and longitudes."""
+        ...
+
 
 class TiledTerrain(ABC):
-    """Cache of tiles and everything that follows from it; a source only has to make one tile."""
+    """Cache of tiles and everything that follows from it; a source only has to make one tile.
+
+    A terrain belongs to one thread: the tiles of a patch are overwritten by later ones.  Another thread that asks it
+    for heights while it is at work is refused.
+    """
+
+    _small: SmallCraters | None = None
+    """Craters below the catalogue's limit, where the source draws any."""
 
     def __init__(
         self,
@@ -164,6 +178,12 @@ class TiledTerrain(ABC):
     @abstractmethod
     def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Whether the source itself holds each place."""
+
+    def small_craters(self, latitude_rad: Floats, longitude_rad: Floats) -> CraterShapes:
+        """Seeded craters below the catalogue's limit that can touch a window of these latitudes and longitudes."""
+        from payload_emulator.sim.terrain.craters import no_craters
+
+        return no_craters() if self._small is None else self._small.around(latitude_rad, longitude_rad)
 
     def patch(
         self, latitude_rad: Floats, longitude_rad: Floats, spacing_m: float = 0.0, level: int = 0

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from payload_emulator.training import dataset as store
+from payload_emulator.training.finishing import write_index
 from payload_emulator.training.recipe import Recipe, Source
 
 SIZE = 512
@@ -87,7 +88,7 @@ def write_blob_dataset(folder: Path, frames_per_split: dict[str, int], seed: int
             first=np.array(first),
         )
         hashes[f"{shard:05d}"] = store.write_shard(folder, f"{shard:05d}", labels)
-    store.write_index(folder, recipe, number, hashes, ["blobs"])
+    write_index(folder, recipe, number, hashes, ["blobs"])
     return store.Dataset(folder)
 
 

@@ -11,6 +11,7 @@ from lunar.datafolder import find_data
 from payload_emulator.errors import DatasetError
 from payload_emulator.training import dataset as store
 from payload_emulator.training.build import build, make_shard, plan_shards
+from payload_emulator.training.integrity import check
 from payload_emulator.training.recipe import Recipe, Source, load_recipe
 
 ROOT = Path(__file__).parents[3]
@@ -37,7 +38,7 @@ def built(tmp_path_factory):
 def test_progress_ends_with_every_frame_and_the_folder_is_whole(built):
     folder, steps = built
     assert steps[0] == (0, 4) and steps[-1] == (4, 4)
-    assert store.check(folder) == []
+    assert check(folder) == []
 
 
 def test_a_shard_does_not_depend_on_what_was_made_before(built, tmp_path):

@@ -8,6 +8,7 @@ import pytest
 
 from payload_emulator.errors import DatasetError
 from payload_emulator.training import dataset as store
+from payload_emulator.training.integrity import check
 from payload_emulator.training.targets import Tier
 
 
@@ -29,14 +30,14 @@ def test_frames_come_back_by_split(blob_dataset):
 
 
 def test_a_whole_data_set_has_no_problems(blob_dataset):
-    assert store.check(blob_dataset.folder) == []
+    assert check(blob_dataset.folder) == []
 
 
 def test_every_missing_or_damaged_file_is_named(copy):
     (copy / "images" / "000003.png").unlink()
     (copy / "images" / "000004.png").write_bytes(b"\x89PNG broken")
     (copy / "metadata" / "000005.json").unlink()
-    problems = "\n".join(store.check(copy))
+    problems = "\n".join(check(copy))
     for name in ("000003.png", "000004.png", "000005.json"):
         assert name in problems
 
@@ -46,7 +47,7 @@ def test_changed_labels_are_found_by_their_hash(copy):
     labels = store.load_shard(path)
     labels.craters["u_px"][0] += 1.0
     store.write_shard(copy, "00000", labels)
-    assert any("SHA-256" in problem for problem in store.check(copy))
+    assert any("SHA-256" in problem for problem in check(copy))
 
 
 def test_a_folder_without_a_data_set_is_refused(tmp_path):

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from payload_emulator.errors import DatasetError
-from payload_emulator.training.build import _allowed, _inside, plan_shards
+from payload_emulator.training.build import plan_shards
 from payload_emulator.training.recipe import Box, Source, load_recipe, procedural_recipe
+from payload_emulator.training.shots import allowed, inside_box
 
 ROOT = Path(__file__).parents[3]
 
@@ -78,15 +79,15 @@ def test_a_footprint_within_the_buffer_of_a_forbidden_box_is_refused():
     source = Source("x", "train", "real", 1.0, avoid=(Box(285.0, 300.0, -60.0, 60.0),), buffer_km=60.0)
     world = Box(180.0, 330.0, -60.0, 60.0)
     # One degree of longitude is 30.3 km at the equator and half of that at 60 degrees.
-    assert not _allowed(source, world, np.array([0.0]), np.array([284.0]))
-    assert not _allowed(source, world, np.array([0.0]), np.array([283.1]))
-    assert _allowed(source, world, np.array([0.0]), np.array([282.9]))
-    assert not _allowed(source, world, np.array([58.0]), np.array([281.5]))
+    assert not allowed(source, world, np.array([0.0]), np.array([284.0]))
+    assert not allowed(source, world, np.array([0.0]), np.array([283.1]))
+    assert allowed(source, world, np.array([0.0]), np.array([282.9]))
+    assert not allowed(source, world, np.array([58.0]), np.array([281.5]))
 
 
 def test_boxes_join_over_the_zero_meridian():
     box = Box(350.0, 370.0, -10.0, 10.0)
-    inside = _inside(box, np.zeros(4), np.array([355.0, 5.0, 12.0, 349.0]), 0.0)
+    inside = inside_box(box, np.zeros(4), np.array([355.0, 5.0, 12.0, 349.0]), 0.0)
     assert inside.tolist() == [True, True, False, False]
 
 
