@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lunar.catalogue import save_catalogue
 from lunar.datafolder import DataFolder
@@ -26,11 +27,13 @@ from payload_emulator.errors import ScenarioError
 from payload_emulator.loading import LoadedPayload, load_payload
 from payload_emulator.recording import FrameInput, frame_input, save_frame_times, save_image, save_record
 from payload_emulator.scenario import Scenario, format_scenario
+from payload_emulator.scoring import score_navigation
 from payload_emulator.world import (
     World,
     build_world,
     catalogue_near_track,
     exposures,
+    orders_before,
     sample_truth,
     with_reference_error,
 )
@@ -99,6 +102,7 @@ def _emulate_into(
         world.truth.orientation,
         data,
         int(world.frame_utc_ns[0]),
+        world.burns,
     )
     total = int(world.frame_utc_ns.size)
     kept = (
@@ -109,9 +113,12 @@ def _emulate_into(
     frames = exposures(world)
     packets: list[bytes] = []
     inputs: list[FrameInput] = []
+    attitudes: list[NDArray[np.float64]] = []
     for number, frame in enumerate(progress(frames, total) if progress else frames):
-        inputs.append(frame_input(number, frame.image, frame.attitude, frame.clock_ticks))
-        packets += loaded.payload.step(frame.image, frame.attitude, frame.clock_ticks, b"")
+        orders = orders_before(world, number)
+        attitudes.append(frame.camera_from_mcmf)
+        inputs.append(frame_input(number, frame.image, frame.attitude, frame.clock_ticks, orders))
+        packets += loaded.payload.step(frame.image, frame.attitude, frame.clock_ticks, orders)
         if number in kept:
             save_image(folder, number, frame.image)
     save_record(folder, inputs, loaded.parameters, loaded.tables)
@@ -122,6 +129,7 @@ def _emulate_into(
     octets = encode_cadus(packets, spacecraft_id=SPACECRAFT_ID, coding=scenario.link.coding)
     (folder / "downlink.cadu").write_bytes(octets)
     summary = _summary(world, loaded, packets, len(octets), len(kept), time.monotonic() - started)
+    summary |= score_navigation(world, loaded, catalogue, np.array(attitudes), b"".join(packets))
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     (folder / "manifest.json").write_text(json.dumps(_manifest(world, loaded, folder), indent=2) + "\n")
     return summary
@@ -151,7 +159,7 @@ def _summary(
             "first": float(np.degrees(longitude[0])) % 360.0,
             "last": float(np.degrees(longitude[-1])) % 360.0,
         },
-        "maneuvers": len(world.maneuvers),
+        "maneuvers": len(world.burns),
         **loaded.payload.summary(),
         "data": list(world.data_names),
         "wall_s": round(wall_s, 3),

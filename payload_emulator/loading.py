@@ -7,6 +7,7 @@ simulated truth passes through here except what a scenario declares to be known.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -30,10 +31,12 @@ from payload_emulator.flight.odometry import OdometryParameters
 from payload_emulator.flight.outcomes import Mode
 from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload
 from payload_emulator.flight.tables import (
+    BurnTable,
     CatalogueTable,
     GravityTable,
     InitialState,
     pack_anchor_table,
+    pack_burn_table,
     pack_catalogue_table,
     pack_gravity_table,
     pack_initial_state,
@@ -41,6 +44,7 @@ from payload_emulator.flight.tables import (
 )
 from payload_emulator.parameter_file import BuildParameters, format_parameters, parse_parameters
 from payload_emulator.scenario import Scenario
+from payload_emulator.sim.disturbances import TrueBurn
 
 _ANCHOR_STEP_NS = 15_000_000_000
 _ORIENTATION_STEP_NS = 3_600_000_000_000
@@ -80,6 +84,7 @@ def load_payload(
     orientation: Orientation,
     data: DataFolder,
     first_frame_utc_ns: int,
+    burns: Sequence[TrueBurn] = (),
     model: Path | None = None,
 ) -> LoadedPayload:
     """Flight software with its tables, for a window that starts at `first_frame_utc_ns`.
@@ -117,6 +122,7 @@ def load_payload(
         ),
         orientation=_orientation_table(flight_orientation, start, stop),
         initial_state=pack_initial_state(start_state),
+        burns=_burn_table([burn for burn in burns if burn.declared and start <= burn.utc_ns <= stop]),
     )
     payload = Payload(
         detector, parameters, tables, model_hash=detector.model_hash, model_octets=len(model_octets)
@@ -184,6 +190,19 @@ def _initial_state(
         velocity_icrf_m_s + navigation.initial_velocity_error_m_s * directions[1],
         position_error_m,
         velocity_error_m_s,
+    )
+
+
+def _burn_table(burns: Sequence[TrueBurn]) -> bytes:
+    """The burns as planned; no octets where there is none."""
+    if not burns:
+        return b""
+    return pack_burn_table(
+        BurnTable(
+            np.array([int(ticks_from_utc_ns(burn.utc_ns)) for burn in burns], dtype=np.int64),
+            np.stack([burn.planned_m_s for burn in burns]),
+            np.array([burn.sigma_m_s for burn in burns]),
+        )
     )
 
 

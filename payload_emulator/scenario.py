@@ -56,12 +56,16 @@ class DynamicsSection:
 
 @dataclass(frozen=True, slots=True)
 class ManeuverSection:
-    """The paper's orbit maintenance (section V-B.1)."""
+    """The paper's orbit maintenance (section V-B.1).
+
+    The payload is told of planned burns; what is carried out differs from the plan by a share of it (1 sigma per axis).
+    """
 
     enabled: bool = True
     periselene_altitude_km: float = 15.0
     semi_major_axis_km: float = 1768.180
     eccentricity: float = 0.006
+    execution_error_fraction: float = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +75,8 @@ class WindowSection:
     `search`: "terrain" takes the first window of the wanted direction whose whole track lies over the terrain at hand,
     no earlier than `start` (the orbit's epoch when empty), between the two longitudes (east-positive; the second may
     exceed 360); "none" observes from `start` for `duration_s`.
-    Frames are taken where the sub-satellite latitude is within `latitude_limit_deg`.
+    Frames are taken where the sub-satellite latitude is within `latitude_limit_deg`, on one of so many arcs as
+    `arc_interval` says (1: on every one).
     """
 
     search: Literal["terrain", "none"] = "terrain"
@@ -80,6 +85,7 @@ class WindowSection:
     passes: int = 1
     direction: Literal["ascending", "descending", "any"] = "ascending"
     latitude_limit_deg: float = 60.0
+    arc_interval: int = 1
     longitude_min_deg: float = 0.0
     longitude_max_deg: float = 360.0
     search_days: float = 30.0
@@ -143,6 +149,26 @@ class AttitudeSection:
 
 
 @dataclass(frozen=True, slots=True)
+class DisturbancesSection:
+    """What happens on the way; times in seconds after the first frame, nothing happens where a size is zero.
+
+    - kidnap: the spacecraft is found elsewhere, turned about the Moon's centre by a distance on the ground; `told`: the
+      payload is told by telecommand that its estimate is worth no more than that distance;
+    - outage: the camera gives no image;
+    - burn: along the velocity; `declared`: the payload has it in its burn table. `maneuvers` gives its execution error.
+    """
+
+    kidnap_at_s: float = 0.0
+    kidnap_distance_km: float = 0.0
+    kidnap_told: bool = False
+    outage_at_s: float = 0.0
+    outage_duration_s: float = 0.0
+    burn_at_s: float = 0.0
+    burn_delta_v_m_s: float = 0.0
+    burn_declared: bool = True
+
+
+@dataclass(frozen=True, slots=True)
 class ClockSection:
     """The on-board clock: reading minus ideal = offset + drift x elapsed."""
 
@@ -182,6 +208,7 @@ class Scenario:
     terrain: TerrainSection = field(default_factory=TerrainSection)
     navigation: NavigationSection = field(default_factory=NavigationSection)
     attitude: AttitudeSection = field(default_factory=AttitudeSection)
+    disturbances: DisturbancesSection = field(default_factory=DisturbancesSection)
     clock: ClockSection = field(default_factory=ClockSection)
     link: LinkSection = field(default_factory=LinkSection)
     reference: ReferenceSection = field(default_factory=ReferenceSection)
@@ -370,6 +397,20 @@ def _check(scenario: Scenario, source: str) -> None:
         window.longitude_max_deg,
     )
     require(window.passes >= 1, "window.passes", "at least 1", window.passes)
+    require(window.arc_interval >= 1, "window.arc_interval", "at least 1", window.arc_interval)
+    moved = scenario.disturbances.kidnap_distance_km > 0.0 or scenario.disturbances.burn_delta_v_m_s != 0.0
+    require(
+        not (moved and (scenario.maneuvers.enabled or orbit.oem)),
+        "maneuvers.enabled",
+        "false, and orbit.oem empty, where [disturbances] change the orbit",
+        scenario.maneuvers.enabled,
+    )
+    require(
+        scenario.disturbances.kidnap_distance_km >= 0.0,
+        "disturbances.kidnap_distance_km",
+        "zero or more",
+        scenario.disturbances.kidnap_distance_km,
+    )
     require(
         window.search != "none" or window.duration_s > 0.0,
         "window.duration_s",

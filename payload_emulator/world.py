@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,9 @@ from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder
-from lunar.ephemeris import Ephemeris, ephemeris_from_states
+from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.frames import Orientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.gravity import GravityField
-from lunar.maneuvers import Maneuver
 from lunar.oem import load_oem
 from lunar.propagation import ForceModel
 from lunar.third_bodies import sun_position_icrf_m
@@ -25,6 +25,7 @@ from lunar.timescales import parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns, ut
 from payload_emulator.errors import ScenarioError
 from payload_emulator.orbit import force_model, propagate_scenario
 from payload_emulator.scenario import Scenario
+from payload_emulator.sim.disturbances import TrueBurn, changed, executed, turned_state
 from payload_emulator.sim.light import sun_direction_mcmf
 from payload_emulator.sim.renderer import render
 from payload_emulator.sim.sensor import SensorModel, expose
@@ -38,12 +39,16 @@ from payload_emulator.sim.truth import (
     perturbed,
     require_above_ground,
 )
+from tmtc.dictionary import DICTIONARY
 
 _NS = 1_000_000_000
 _EPHEMERIS_STEP_NS = 10 * _NS
 _EPHEMERIS_MARGIN_NS = 120 * _NS
+_BEFORE_JUMP_NS = 10_000
 _SEARCH_CHUNK_DAYS = 15.0
 _CATALOGUE_MARGIN_M = 15_000.0
+# With the Sun this far below the horizon of the sub-satellite point no ground in view is lit, mountains included.
+_NIGHT_RAD = np.radians(12.0)
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -57,7 +62,7 @@ class World:
     truth: Truth
     terrain: TiledTerrain
     gravity: GravityField
-    maneuvers: tuple[Maneuver, ...]
+    burns: tuple[TrueBurn, ...]
     frame_utc_ns: IntArray
     data_names: tuple[str, ...]
 
@@ -69,12 +74,19 @@ class World:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposure:
-    """One frame as the payload receives it, and the truth it was taken from (which stays here)."""
+    """One frame as the payload receives it, and the truth it was taken from (which stays here).
+
+    Attributes
+    ----------
+    camera_from_mcmf
+        True attitude, shape (3, 3).
+    """
 
     utc_ns: int
     image: NDArray[np.uint8]
     attitude: FloatArray
     clock_ticks: int
+    camera_from_mcmf: FloatArray
 
 
 def build_world(scenario: Scenario, data: DataFolder) -> World:
@@ -88,23 +100,54 @@ def build_world(scenario: Scenario, data: DataFolder) -> World:
     terrain = open_terrain(scenario.terrain.source, data, scenario.seed)
     model = force_model(scenario, data)
     gravity = model.gravity
-    truth, maneuvers, windows = _fly_to_windows(scenario, model, terrain)
+    truth, burns, windows = _fly_to_windows(scenario, model, terrain)
     interval_ns = round(scenario.camera.frame_interval_s * _NS)
     limit_rad = np.radians(scenario.window.latitude_limit_deg)
     frames = [frame_times(truth, start, stop, interval_ns, limit_rad) for start, stop in windows]
     frame_utc_ns = np.concatenate(frames) if frames else np.zeros(0, dtype=np.int64)
+    frame_utc_ns = _one_arc_of(scenario.window.arc_interval, frame_utc_ns, interval_ns)
     if frame_utc_ns.size == 0:
         raise ScenarioError(
             f"scenario {scenario.name}: the observation window holds no frame within "
             f"{scenario.window.latitude_limit_deg} deg of latitude"
         )
+    truth, burns = _disturbed(scenario, truth, burns, int(frame_utc_ns[0]), model)
     require_above_ground(truth, frame_utc_ns, terrain.height_m)
     names = (
         *terrain.data_names,
         f"gravity {gravity.name} to degree {model.degree}",
         f"orientation {model.orientation.name}",
     )
-    return World(scenario, truth, terrain, gravity, maneuvers, frame_utc_ns, names)
+    return World(scenario, truth, terrain, gravity, burns, frame_utc_ns, names)
+
+
+def _one_arc_of(interval: int, frame_utc_ns: IntArray, step_ns: int) -> IntArray:
+    """The frames of one arc out of so many; an arc ends where the latitude limit interrupts the frames."""
+    arc = np.cumsum(np.diff(frame_utc_ns, prepend=frame_utc_ns[:1]) > step_ns)
+    return frame_utc_ns[arc % interval == 0]
+
+
+def _disturbed(
+    scenario: Scenario, truth: Truth, burns: tuple[TrueBurn, ...], first_utc_ns: int, model: ForceModel
+) -> tuple[Truth, tuple[TrueBurn, ...]]:
+    """The flight with the disturbances of the scenario, and all its burns."""
+    section = scenario.disturbances
+    if section.burn_delta_v_m_s != 0.0:
+        utc_ns = first_utc_ns + round(section.burn_at_s * _NS)
+        velocity = truth.states(utc_ns)[1][0]
+        done = section.burn_delta_v_m_s * velocity / np.linalg.norm(velocity)
+        burn = executed(utc_ns, done, scenario.maneuvers.execution_error_fraction, (scenario.seed, 2**36))
+        truth = changed(truth, utc_ns, lambda state: state + np.concatenate([np.zeros(3), done]), model)
+        burns = (*burns, replace(burn, declared=section.burn_declared))
+    if section.kidnap_distance_km > 0.0:
+        heading = np.random.default_rng((scenario.seed, 2**37)).uniform(0.0, 2.0 * np.pi)
+        truth = changed(
+            truth,
+            first_utc_ns + round(section.kidnap_at_s * _NS),
+            lambda state: turned_state(state, 1e3 * section.kidnap_distance_km, heading),
+            model,
+        )
+    return truth, burns
 
 
 def exposures(world: World) -> Iterator[Exposure]:
@@ -115,6 +158,25 @@ def exposures(world: World) -> Iterator[Exposure]:
             if number + 1 < world.frame_utc_ns.size:
                 pending.append(renderer.submit(expose_frame, world, number + 1))
             yield pending.pop(0).result()
+
+
+def orders_before(world: World, number: int) -> bytes:
+    """Telecommands that reach the payload with a frame: after a told kidnap, to trust its estimate less."""
+    section = world.scenario.disturbances
+    if not (section.kidnap_told and section.kidnap_distance_km > 0.0):
+        return b""
+    moved_utc_ns = int(world.frame_utc_ns[0]) + round(section.kidnap_at_s * _NS)
+    if int(world.frame_utc_ns[number]) < moved_utc_ns or (
+        number and int(world.frame_utc_ns[number - 1]) >= moved_utc_ns
+    ):
+        return b""
+    distance_m = 1e3 * section.kidnap_distance_km
+    return DICTIONARY.pack_command(
+        "perform_function",
+        # A jump of place on an orbit comes with one of velocity: 1e-3 rad/s times the distance.
+        {"function_id": "widen_estimate", "argument_1": distance_m, "argument_2": 1e-3 * distance_m},
+        sequence_count=0,
+    )
 
 
 def expose_frame(world: World, number: int) -> Exposure:
@@ -129,8 +191,7 @@ def expose_frame(world: World, number: int) -> Exposure:
     pointing = np.radians(attitude.pointing_error_deg) * rng.standard_normal(3)
     camera_from_mcmf = perturbed(nadir_camera_from_mcmf(position), pointing)
     camera_from_icrf = camera_from_mcmf @ world.truth.orientation.mcmf_from_icrf(tdb_s)
-    rendering = render(world.terrain, world.camera, position, camera_from_mcmf, sun)
-    image = expose(rendering.radiance, SensorModel(), rng)
+    image = _image(world, utc_ns, position, camera_from_mcmf, sun, rng)
     bias = np.radians(attitude.knowledge_bias_deg) * np.random.default_rng(
         (scenario.seed, 2**32)
     ).standard_normal(3)
@@ -141,7 +202,28 @@ def expose_frame(world: World, number: int) -> Exposure:
         image,
         attitude_message(known, known @ camera_from_icrf.T @ camera_from_mcmf @ sun),
         _clock_ticks(world, utc_ns),
+        camera_from_mcmf,
     )
+
+
+def _image(
+    world: World,
+    utc_ns: int,
+    position_mcmf_m: FloatArray,
+    camera_from_mcmf: FloatArray,
+    sun_mcmf: FloatArray,
+    rng: np.random.Generator,
+) -> NDArray[np.uint8]:
+    """What the camera gives: nothing in an outage, noise in deep night."""
+    section, camera = world.scenario.disturbances, world.camera
+    elapsed_s = (utc_ns - int(world.frame_utc_ns[0])) / _NS
+    if section.outage_at_s <= elapsed_s < section.outage_at_s + section.outage_duration_s:
+        return np.empty((0, 0, 3), dtype=np.uint8)
+    if position_mcmf_m @ sun_mcmf < -np.sin(_NIGHT_RAD) * np.linalg.norm(position_mcmf_m):
+        radiance = np.zeros((camera.height_px, camera.width_px), dtype=np.float32)
+    else:
+        radiance = render(world.terrain, camera, position_mcmf_m, camera_from_mcmf, sun_mcmf).radiance
+    return expose(radiance, SensorModel(), rng)
 
 
 def true_sun_direction(
@@ -169,24 +251,24 @@ def _clock_ticks(world: World, utc_ns: int) -> int:
 
 def _fly_to_windows(
     scenario: Scenario, model: ForceModel, terrain: TiledTerrain
-) -> tuple[Truth, tuple[Maneuver, ...], list[tuple[int, int]]]:
+) -> tuple[Truth, tuple[TrueBurn, ...], list[tuple[int, int]]]:
     """Propagate in chunks until the wanted windows are found; truth, burns on the way, windows."""
     window = scenario.window
     not_before = parse_utc(window.start) if window.start else scenario.epoch_utc_ns
     if scenario.orbit.oem:
         ephemeris = load_oem(Path(scenario.orbit.oem))
-        truth, maneuvers = _truth_of_ephemeris(ephemeris, model.orientation), ()
-        return truth, maneuvers, _windows(scenario, truth, terrain, max(not_before, truth.start_utc_ns))
+        truth = _truth_of_ephemeris(ephemeris, model.orientation)
+        return truth, (), _windows(scenario, truth, terrain, max(not_before, truth.start_utc_ns))
     reach_days = min(_SEARCH_CHUNK_DAYS, window.search_days)
     if window.search == "none":
         reach_days = (
             (not_before - scenario.epoch_utc_ns) / _NS / 86_400.0 + window.duration_s / 86_400.0 + 0.01
         )
     while True:
-        truth, maneuvers = _propagate(scenario, model, reach_days)
+        truth, burns = _propagate(scenario, model, reach_days)
         found = _windows(scenario, truth, terrain, not_before)
         if len(found) >= (1 if window.search == "none" else window.passes):
-            return truth, maneuvers, found
+            return truth, burns, found
         if reach_days >= window.search_days:
             raise ScenarioError(
                 f"scenario {scenario.name}: window.search expected {window.passes} {window.direction} window(s) over "
@@ -221,13 +303,22 @@ def _windows(
     )
 
 
-def _propagate(scenario: Scenario, model: ForceModel, days: float) -> tuple[Truth, tuple[Maneuver, ...]]:
+def _propagate(scenario: Scenario, model: ForceModel, days: float) -> tuple[Truth, tuple[TrueBurn, ...]]:
     duration_s = days * 86_400.0
     orbit = propagate_scenario(scenario, model, duration_s)
     stop_utc_ns = scenario.epoch_utc_ns + round(duration_s * _NS)
-    return Truth(
-        orbit.trajectory.state, scenario.epoch_utc_ns, stop_utc_ns, model.orientation
-    ), orbit.maneuvers
+    share, seed = scenario.maneuvers.execution_error_fraction, (scenario.seed, 2**36)
+    burns = tuple(executed(burn.utc_ns, burn.delta_v_icrf_m_s, share, seed) for burn in orbit.maneuvers)
+    return (
+        Truth(
+            orbit.trajectory.state,
+            scenario.epoch_utc_ns,
+            stop_utc_ns,
+            model.orientation,
+            tuple(burn.utc_ns for burn in burns),
+        ),
+        burns,
+    )
 
 
 def _truth_of_ephemeris(ephemeris: Ephemeris, orientation: Orientation) -> Truth:
@@ -239,23 +330,43 @@ def _truth_of_ephemeris(ephemeris: Ephemeris, orientation: Orientation) -> Truth
 
 
 def sample_truth(truth: Truth, frame_utc_ns: IntArray) -> Ephemeris:
-    """The true trajectory over the frames and a margin, as an ephemeris with a state each ten seconds."""
+    """The true trajectory over the frames and a margin: a state each ten seconds, a segment between jumps."""
     start = max(int(frame_utc_ns[0]) - _EPHEMERIS_MARGIN_NS, truth.start_utc_ns)
     stop = min(int(frame_utc_ns[-1]) + _EPHEMERIS_MARGIN_NS, truth.stop_utc_ns)
-    times = np.append(np.arange(start, stop, _EPHEMERIS_STEP_NS, dtype=np.int64), stop)
-    position, velocity = truth.states(times)
-    return ephemeris_from_states(times, position, velocity)
+    grid = np.append(np.arange(start, stop, _EPHEMERIS_STEP_NS, dtype=np.int64), stop)
+    edges = [start, *(utc_ns for utc_ns in sorted(truth.breaks_utc_ns) if start < utc_ns < stop), stop]
+    segments = []
+    for first, last in itertools.pairwise(edges):
+        times = np.unique(np.concatenate([[first], grid[(grid > first) & (grid < last)], [last]]))
+        # The state at a jump is that after it; a segment that ends there takes the one before.
+        asked = times.copy()
+        asked[-1] -= _BEFORE_JUMP_NS if last != stop else 0
+        position, velocity = truth.states(asked)
+        position += velocity * ((times - asked) / _NS)[:, None]
+        segments.append(
+            EphemerisSegment(
+                times,
+                position,
+                velocity,
+                object_name="SELENITA",
+                object_id="SELENITA",
+                degree=min(7, 2 * times.size - 1),
+            )
+        )
+    return Ephemeris(tuple(segments))
 
 
 def with_reference_error(ephemeris: Ephemeris, sigma_m: float, seed: int) -> Ephemeris:
     """The ephemeris displaced by one constant offset in RTN: what orbit determination leaves to the ground."""
     if sigma_m == 0.0:
         return ephemeris
-    segment = ephemeris.segments[0]
     offset = sigma_m * np.random.default_rng((seed, 2**33)).standard_normal(3)
-    rtn_from_icrf = rtn_from_inertial(segment.position_m, segment.velocity_m_s)
-    displaced = segment.position_m + np.einsum("nji,j->ni", rtn_from_icrf, offset)
-    return ephemeris_from_states(segment.utc_ns, displaced, segment.velocity_m_s)
+
+    def displaced(segment: EphemerisSegment) -> EphemerisSegment:
+        rtn_from_icrf = rtn_from_inertial(segment.position_m, segment.velocity_m_s)
+        return replace(segment, position_m=segment.position_m + np.einsum("nji,j->ni", rtn_from_icrf, offset))
+
+    return Ephemeris(tuple(displaced(segment) for segment in ephemeris.segments))
 
 
 def catalogue_near_track(world: World) -> CraterCatalogue:

@@ -15,7 +15,7 @@ from lunar.constants import GM_EARTH_M3_S2, GM_SUN_M3_S2
 from lunar.gravity import GravityField, packed, packed_gradient
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns, utc_ns_from_ticks
-from payload_emulator.flight.tables import TICKS_PER_SECOND, GravityTable, OrientationTable
+from payload_emulator.flight.tables import TICKS_PER_SECOND, BurnTable, GravityTable, OrientationTable
 
 Float = NDArray[np.float64]
 
@@ -147,6 +147,20 @@ class OrbitModel:
             total = transition @ total
             noise = transition @ noise @ transition.T + added
         return Prediction(state, total, noise)
+
+
+def flown(model: OrbitModel, state: Float, from_ticks: int, to_ticks: int, burns: BurnTable) -> Float | None:
+    """Return the state (9,) carried forwards over the planned burns on the way; None outside the orientation table."""
+    low, high = np.searchsorted(burns.ticks, [from_ticks, to_ticks], side="right")
+    stops = [*burns.ticks[low:high].tolist(), to_ticks]
+    for number, stop in enumerate(stops):
+        reached = model.propagate(state, from_ticks, stop)
+        if reached is None:
+            return None
+        state, from_ticks = reached.state.copy(), stop
+        if number < len(stops) - 1:
+            state[3:6] += burns.delta_v_icrf_m_s[low + number]
+    return state
 
 
 _THIRD_BODY_GMS = np.array([GM_EARTH_M3_S2, GM_SUN_M3_S2])

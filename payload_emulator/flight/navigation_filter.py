@@ -1,9 +1,10 @@
 """Extended Kalman filter of orbit, common errors and the craters in view, iterated, in Joseph form.
 
 The first 18 states are position and velocity (ICRF), empirical acceleration (radial, transverse, normal), attitude
-bias (camera axes), pixel bias, catalogue offset (east, north, up) and image scale. Behind them stand three for each crater that was
-used and is still in view: how far it lies from its catalogued place, east, north, up. A crater is seen several
-times on a pass and errs the same way each time; its error is a state, not fresh noise, and goes when it does.
+bias (camera axes), pixel bias, catalogue offset (east, north, up) and image scale. Behind them stand three for each
+crater that was used and is still in view: how far it lies from its catalogued place, east, north, up. A crater is
+seen several times on a pass and errs the same way each time; its error is a state, not fresh noise, and goes when it
+does.
 """
 
 from __future__ import annotations

@@ -32,6 +32,7 @@ from payload_emulator.flight.tables import (
     AnchorTable,
     table_hash,
     unpack_anchor_table,
+    unpack_burn_table,
     unpack_catalogue_table,
     unpack_gravity_table,
     unpack_initial_state,
@@ -48,10 +49,19 @@ _NAN = float("nan")
 _UNKNOWN_VECTOR = (_NAN, _NAN, _NAN)
 _PIXEL_LIMIT = 65_535 / 64.0
 # Numbers of tables in events, as in the dictionary's table of tables; orientation and initial state follow it.
-_TABLE_NUMBERS = {"anchor_ephemeris": 1, "catalogue": 2, "gravity": 3, "orientation": 8, "initial_state": 9}
+_TABLE_NUMBERS = {
+    "anchor_ephemeris": 1,
+    "catalogue": 2,
+    "gravity": 3,
+    "orientation": 8,
+    "initial_state": 9,
+    "burns": 10,
+}
 _STAGES = ((ACK_ACCEPTANCE, "accepted"), (ACK_START, "started"), (ACK_COMPLETION, "completed"))
 # Codes of the dictionary's failure table.
 _UNKNOWN_FUNCTION, _OUT_OF_RANGE = 9, 4
+# No estimate is worth less than this (position in m, velocity in m/s).
+_WIDEST_M = 1e6
 
 
 class PayloadMode(IntEnum):
@@ -107,7 +117,8 @@ class FlightParameters:
 class FlightTables:
     """Tables as uploaded; empty octets where there is none.
 
-    `paper` and `spherical` need the anchor ephemeris; `anchored` needs all the others and never reads that one.
+    `paper` and `spherical` need the anchor ephemeris; `anchored` needs all the others but the burns, which are only
+    there where some are planned, and never reads that one.
     """
 
     anchor_ephemeris: bytes = b""
@@ -115,6 +126,7 @@ class FlightTables:
     gravity: bytes = b""
     orientation: bytes = b""
     initial_state: bytes = b""
+    burns: bytes = b""
 
 
 class Payload:
@@ -240,9 +252,16 @@ class Payload:
             gravity = self._load("gravity", unpack_gravity_table)
             orientation = self._load("orientation", unpack_orientation_table)
             state = self._load("initial_state", unpack_initial_state)
+            burns = self._load("burns", unpack_burn_table)
             if catalogue and gravity and orientation and state:
                 self._navigator = AnchoredNavigator(
-                    catalogue, gravity, orientation, state, self._parameters.camera, self._parameters.anchored
+                    catalogue,
+                    gravity,
+                    orientation,
+                    state,
+                    self._parameters.camera,
+                    self._parameters.anchored,
+                    burns,
                 )
 
     def _load(self, name: str, unpack: Callable[[bytes], Table]) -> Table | None:
@@ -331,7 +350,32 @@ class Payload:
                 "matched": report.matched,
             },
         )
+        self._send_filter(navigator, found)
         return report.altitude_m
+
+    def _send_filter(self, navigator: AnchoredNavigator, found: Detections | None) -> None:
+        """Send what the ground needs to judge and to smooth the filter: its orbit in full, the pairs of its fix."""
+        frame = {"frame_number": self._counts["frames"], "image_ticks": self._ticks}
+        mean, covariance = navigator.state.mean, navigator.state.covariance[:9, :9]
+        self._send(
+            "filter_state",
+            {
+                **frame,
+                "position_icrf_m": mean[:3],
+                "velocity_icrf_m_s": mean[3:6],
+                "acceleration_rtn_m_s2": mean[6:9],
+                "covariance": covariance[np.tril_indices(9)],
+            },
+        )
+        fix = navigator.last_fix
+        if fix is not None and found is not None:
+            reported = _reported(found)
+            sent = np.isin(fix.identification.detection, reported)
+            pairs = {
+                "detection": np.searchsorted(reported, fix.identification.detection[sent]),
+                "crater_id": navigator.landmarks.ids[fix.index[sent]],
+            }
+            self._send("identifications", {**frame, "items": pairs})
 
     def _trouble(self, event: str, present: bool, value_1: float, value_2: float) -> None:
         """Report the beginning of a lasting trouble, once."""
@@ -417,8 +461,7 @@ class Payload:
         )
 
     def _report_detections(self, found: Detections, altitude_m: float) -> None:
-        strongest = np.sort(np.argsort(-found.score, kind="stable")[:255])
-        kept = found.select(strongest)
+        kept = found.select(_reported(found))
         self._send(
             "detections",
             {
@@ -471,7 +514,7 @@ class Payload:
         if command.name == "perform_function":
             code = int(values["function_id"])
             function = DICTIONARY.labels("perform_function", "function_id").get(code, "")
-            return self._perform(function, float(values["argument_1"]))
+            return self._perform(function, float(values["argument_1"]), float(values["argument_2"]))
         if command.name in ("enable_housekeeping", "disable_housekeeping"):
             self._housekeeping_on = command.name == "enable_housekeeping"
         elif command.name == "set_housekeeping_interval":
@@ -485,7 +528,7 @@ class Payload:
             return _UNKNOWN_FUNCTION
         return 0
 
-    def _perform(self, function: str, argument: float) -> int:
+    def _perform(self, function: str, argument: float, second: float) -> int:
         if function == "set_mode" and argument not in (0.0, 1.0, 2.0, 3.0):
             return _OUT_OF_RANGE
         if function == "manual_step":
@@ -496,6 +539,11 @@ class Payload:
             self._enter(PayloadMode(int(argument)))
         elif function == "start_observation":
             self._enter(PayloadMode.observing)
+        elif function == "widen_estimate":
+            if not (0.0 <= argument <= _WIDEST_M and 0.0 <= second <= _WIDEST_M):
+                return _OUT_OF_RANGE
+            if self._navigator is not None:
+                self._navigator.widen(argument, second)
         elif function == "stop_observation":
             self._enter(PayloadMode.standby)
         else:
@@ -574,6 +622,11 @@ class Payload:
         )
         self._messages[kind] += 1
         self._counts["packets"] += 1
+
+
+def _reported(found: Detections) -> NDArray[np.int64]:
+    """Return the detections that fit into a packet, the strongest, in their order."""
+    return np.sort(np.argsort(-found.score, kind="stable")[:255])
 
 
 def _rotation(attitude: Float) -> Float | None:

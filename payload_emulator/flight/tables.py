@@ -4,7 +4,8 @@ Every table is one block: magic `LINNATBL`, kind (2 octets, ASCII), version (u16
 (u32), CRC-32 of the content (u32), then the content; all big-endian. The identity of a table in telemetry is
 the first 32 bits of the SHA-256 of the whole block.
 
-Kinds: `AE` anchor ephemeris, `CC` crater catalogue, `GR` gravity field, `OR` orientation, `IS` initial state, `BU` burns.
+Kinds: `AE` anchor ephemeris, `CC` crater catalogue, `GR` gravity field, `OR` orientation, `IS` initial state,
+`BU` burns.
 Frames: MCMF is mean-Earth/polar-axis (ME), PA principal axes, ICRF the inertial axes centred on the Moon.
 """
 

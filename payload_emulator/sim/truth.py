@@ -40,12 +40,15 @@ class Truth:
         Span that `state_icrf` covers.
     orientation
         Rotation of the Moon in the simulated world.
+    breaks_utc_ns
+        Instants at which the state jumps.
     """
 
     state_icrf: Callable[[FloatArray], FloatArray]
     start_utc_ns: int
     stop_utc_ns: int
     orientation: Orientation
+    breaks_utc_ns: tuple[int, ...] = ()
 
     def states(self, utc_ns: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Position (n, 3) in metres and velocity (n, 3) in m/s, Moon-centred ICRF axes, at UTC instants (n,)."""
