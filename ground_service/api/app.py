@@ -18,6 +18,7 @@ from ground_service.api.routes import UPLOAD_PATHS, router
 from ground_service.api.telecommands import telecommands
 from ground_service.services.ground import ground_from_settings
 from ground_service.settings import Settings
+from ground_service.web.pages import pages
 from ground_service.worker.dispatch import dispatcher_for
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
@@ -59,6 +60,7 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         app.include_router(one)
     app.include_router(operations)
     app.include_router(live)
+    app.include_router(pages)
     app.state.metrics = Metrics()
     problems.install(app)
     app.add_middleware(

@@ -1,0 +1,181 @@
+"""Pages and their files. A page is a frame of HTML; its script fills it from the API with the caller's token.
+
+Nothing here needs a token: pages hold no data but the telemetry dictionary, which is no secret.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+
+from ground_service.errors import NotFound
+from ground_service.services.commanding import CRITICAL_COMMANDS
+from ground_service.services.passes import PARAMETERS, STATE_VALUES
+from ground_service.web.basemap import basemap_jpeg
+from tmtc.dictionary import DICTIONARY
+from tmtc.schema import Field, PacketDefinition
+
+_HERE = Path(__file__).parent
+_STATIC = _HERE / "static"
+
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+    "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
+
+_MEDIA = {
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".svg": "image/svg+xml",
+    ".LICENSE": "text/plain; charset=utf-8",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A page: its address, its template and script, its name in the navigation ('' for none)."""
+
+    path: str
+    name: str
+    title: str
+    entry: str
+
+
+PAGES = (
+    Page("/", "overview", "Overview", "Overview"),
+    Page("/planner", "planner", "Planner", "Planner"),
+    Page("/passes", "passes", "Passes", "Passes"),
+    Page("/passes/{pass_id}", "pass", "Pass", ""),
+    Page("/telemetry", "telemetry", "Telemetry", "Telemetry"),
+    Page("/commands", "commands", "Commands", "Commands"),
+    Page("/regression", "regression", "Regression", "Regression"),
+    Page("/live", "live", "Live", "Live"),
+    Page("/licences", "licences", "Licences", ""),
+)
+
+pages = APIRouter(include_in_schema=False)
+
+
+def _page_answer(page: Page) -> Any:
+    def answer() -> Response:
+        return Response(
+            _rendered(page), media_type="text/html; charset=utf-8", headers={"Content-Security-Policy": POLICY}
+        )
+
+    return answer
+
+
+for _page in PAGES:
+    pages.add_api_route(_page.path, _page_answer(_page), methods=["GET", "HEAD"], name=f"page {_page.name}")
+
+
+@pages.get("/static/{path:path}")
+def static_file(path: str, v: str = "") -> Response:
+    """A file of the pages; kept by the browser for good where its version is asked for."""
+    body = _files().get(path)
+    if body is None:
+        raise NotFound("file", path[:80])
+    headers = {"Cache-Control": "public, max-age=31536000, immutable" if v else "no-cache"}
+    media = next(media for ending, media in _MEDIA.items() if path.endswith(ending))
+    return Response(body, media_type=media, headers=headers)
+
+
+@pages.get("/moon.jpg")
+def moon_map(request: Request) -> Response:
+    """The Moon's albedo as a background of maps, -180 to 180 degrees east, 90 to -90 north; 404 without the data."""
+    albedo = request.app.state.ground.data.albedo
+    if albedo is None:
+        raise NotFound("data product", "albedo map")
+    return Response(
+        basemap_jpeg(albedo), media_type="image/jpeg", headers={"Cache-Control": "private, max-age=86400"}
+    )
+
+
+@cache
+def _files() -> dict[str, bytes]:
+    """All files, read once: what is served is what was there at the start, and no path leads elsewhere."""
+    return {
+        file.relative_to(_STATIC).as_posix(): file.read_bytes()
+        for file in sorted(_STATIC.rglob("*"))
+        if file.is_file() and file.name.endswith(tuple(_MEDIA))
+    }
+
+
+@cache
+def _version() -> str:
+    """One version for all files, since scripts import each other by plain names."""
+    whole = hashlib.sha256()
+    for name, body in _files().items():
+        whole.update(name.encode() + b"\0" + body)
+    return whole.hexdigest()[:12]
+
+
+@lru_cache(maxsize=len(PAGES))
+def _rendered(page: Page) -> str:
+    environment = Environment(
+        loader=FileSystemLoader(_HERE / "templates"),
+        autoescape=select_autoescape(default=True, default_for_string=True),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(f"{page.name}.html").render(
+        page=page,
+        pages=[one for one in PAGES if one.entry],
+        version=_version(),
+        dictionary=_dictionary(),
+        state_values=STATE_VALUES,
+        licences={
+            name.removeprefix("vendor/").removesuffix(".LICENSE"): body.decode()
+            for name, body in _files().items()
+            if name.endswith(".LICENSE")
+        },
+    )
+
+
+@cache
+def _dictionary() -> dict[str, Any]:
+    """What pages need to know of the dictionary: telecommands to enter, parameters to look at."""
+    housekeeping = DICTIONARY.packet("housekeeping")
+    return {
+        "version": DICTIONARY.version,
+        "hash": DICTIONARY.hash,
+        "telecommands": [_telecommand(definition) for definition in DICTIONARY.telecommands],
+        "parameters": [_field(field) for field in housekeeping.fields if field.name in PARAMETERS],
+        "estimators": list(DICTIONARY.labels("navigation_state", "estimator").values()),
+    }
+
+
+def _telecommand(definition: PacketDefinition) -> dict[str, Any]:
+    return {
+        "name": definition.name,
+        "description": definition.description,
+        "service": definition.service,
+        "subtype": definition.subtype,
+        "critical": definition.name in CRITICAL_COMMANDS,
+        "fields": [_field(field) for field in definition.fields],
+        "repeats": [_field(field) for field in definition.group.fields] if definition.group else [],
+        "group": definition.group.name if definition.group else None,
+        "count": definition.group.count if definition.group else None,
+    }
+
+
+def _field(field: Field) -> dict[str, Any]:
+    return {
+        "name": field.name,
+        "description": field.description,
+        "unit": field.unit,
+        "type": field.type,
+        "size": field.size,
+        "labels": dict(field.labels),
+        "minimum": field.minimum,
+        "maximum": field.maximum,
+        "warning": field.warning,
+        "alarm": field.alarm,
+    }

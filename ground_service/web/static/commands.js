@@ -1,0 +1,128 @@
+import { get, send } from "./api.js";
+import { acting, byId, dictionary, element, notice, pager, show, stateMark, table, timeText, trouble, watch } from "./page.js";
+
+const words = (name) => name.replaceAll("_", " ");
+const definition = Object.fromEntries(dictionary.telecommands.map((one) => [one.name, one]));
+const STAGES = ["accepted", "started", "completed"];
+
+function input(field, id) {
+  const labels = Object.entries(field.labels);
+  const about = [field.description, field.unit && `[${field.unit}]`].filter(Boolean).join(" ");
+  if (labels.length) {
+    return element("label", { title: about }, words(field.name), element("select", { id }, labels.map(([, label]) => element("option", { value: label }, words(label)))));
+  }
+  return element(
+    "label",
+    { title: about },
+    `${words(field.name)}${field.unit ? `, ${field.unit}` : ""}`,
+    element("input", { id, type: "number", step: field.type[0] === "f" ? "any" : "1", min: field.minimum ?? (field.type[0] === "u" ? 0 : null), max: field.maximum, value: Math.max(0, field.minimum ?? 0), required: true }),
+  );
+}
+
+function showArguments() {
+  const chosen = definition[byId("name").value];
+  byId("description").textContent = `${chosen.description} Service ${chosen.service}, subtype ${chosen.subtype}.${chosen.critical ? " Critical: somebody else has to release it." : ""}`;
+  const fields = chosen.fields.filter((field) => field.name !== chosen.count);
+  const inputs = fields.map((field) => input(field, `argument-${field.name}`));
+  if (chosen.repeats.length) {
+    inputs.push(
+      element("label", { title: "One item a line, values in order, separated by spaces" }, `${words(chosen.group)}: ${chosen.repeats.map((field) => field.name).join(" ")}`, element("textarea", { id: "argument-items", rows: 3 })),
+    );
+  }
+  show("arguments", inputs.length ? inputs : element("p", { class: "hint" }, "No arguments."));
+}
+
+function argumentsOf(chosen) {
+  const given = {};
+  for (const field of chosen.fields) {
+    if (field.name === chosen.count) continue;
+    const { value } = byId(`argument-${field.name}`);
+    given[field.name] = Object.keys(field.labels).length ? value : Number(value);
+  }
+  if (chosen.repeats.length) {
+    const lines = byId("argument-items").value.split("\n").filter((line) => line.trim());
+    given[chosen.group] = lines.map((line) => {
+      const values = line.trim().split(/\s+/);
+      return Object.fromEntries(chosen.repeats.map((field, index) => [field.name, Number(values[index])]));
+    });
+  }
+  return given;
+}
+
+function lights(command) {
+  const reached = new Set(command.reports.map((report) => report.stage));
+  const failure = command.reports.find((report) => report.failure);
+  const bad = Boolean(failure) || command.timed_out || command.state === "failed";
+  const text = [...STAGES.filter((stage) => reached.has(stage)), failure ? `failed: ${words(failure.failure)}` : null, command.timed_out ? "timed out" : null].filter(Boolean).join(", ") || "no report yet";
+  return element(
+    "span",
+    { class: "lights", role: "img", "aria-label": text, title: text },
+    STAGES.map((stage) => element("span", { class: `light${reached.has(stage) ? " on" : bad ? " bad" : ""}` })),
+    element("span", { class: "after" }, bad ? (failure ? words(failure.failure) : "timed out") : ""),
+  );
+}
+
+const act = (command, deed, json) =>
+  acting(async () => {
+    await send("POST", `telecommands/${command.id}/${deed}`, json);
+    await load();
+  });
+
+function deeds(command) {
+  if (command.state !== "queued") return "";
+  return element(
+    "span",
+    { class: "actions" },
+    element("button", { type: "button", onclick: act(command, "release") }, "Release"),
+    element("button", { type: "button", onclick: act(command, "reject", { reason: "rejected on the page" }) }, "Reject"),
+  );
+}
+
+const load = pager(async (limit, offset) => {
+  const page = await get("telecommands", { limit, offset });
+  show(
+    "commands",
+    table(
+      "Telecommands",
+      [
+        ["No", (row) => String(row.id), "num"],
+        ["Telecommand", (row) => element("span", {}, words(row.name), row.critical ? element("b", { class: "critical" }, " critical") : null)],
+        ["Arguments", (row) => Object.entries(row.arguments).map(([key, value]) => `${words(key)} ${typeof value === "object" ? JSON.stringify(value).slice(0, 80) : value}`).join(", ")],
+        ["Entered", (row) => `${timeText(row.requested)} by ${row.requested_by}`],
+        ["State", (row) => stateMark(row.state)],
+        ["Verification", lights],
+        ["", deeds],
+      ],
+      page.items,
+      "No telecommand yet.",
+    ),
+  );
+  return page;
+});
+
+show("name", dictionary.telecommands.map((one) => element("option", { value: one.name }, words(one.name))));
+byId("name").value = "test_connection";
+byId("name").addEventListener("change", showArguments);
+showArguments();
+byId("enter").addEventListener(
+  "submit",
+  acting(async () => {
+    const chosen = definition[byId("name").value];
+    const made = await send("POST", "telecommands", {
+      name: chosen.name,
+      arguments: argumentsOf(chosen),
+      spacecraft_id: byId("spacecraft").valueAsNumber,
+      instance: byId("instance").value,
+      timeout_s: byId("timeout").valueAsNumber,
+    });
+    notice(`${words(made.name)} is queued as number ${made.id}`);
+    await load();
+  }),
+);
+
+let pending = null;
+watch(() => {
+  clearTimeout(pending);
+  pending = setTimeout(() => load().catch(trouble), 300);
+});
+load().catch((error) => error.status === 401 || trouble(error));

@@ -1,0 +1,78 @@
+// The Moon as a plate carrée map, east longitudes from -180 to 180.
+/* global L */
+import { element } from "./page.js";
+import { token } from "./api.js";
+
+export function moonMap(place) {
+  const map = L.map(place, {
+    crs: L.CRS.EPSG4326,
+    preferCanvas: true,
+    zoomSnap: 0.25,
+    minZoom: 0,
+    maxZoom: 10,
+    maxBounds: [
+      [-95, -190],
+      [95, 190],
+    ],
+    attributionControl: false,
+  });
+  map.fitBounds([
+    [-90, -180],
+    [90, 180],
+  ]);
+  const background = new Image();
+  background.onload = () => L.imageOverlay(background.src, [[-90, -180], [90, 180]]).addTo(map).bringToBack();
+  fetch("/moon.jpg", token() ? { headers: { Authorization: `Bearer ${token()}` } } : {}).then(async (answer) => {
+    if (answer.ok) background.src = URL.createObjectURL(await answer.blob());
+    else place.classList.add("bare");
+  });
+  const lines = { weight: 0.5, color: "#8792a0", interactive: false };
+  for (let longitude = -180; longitude <= 180; longitude += 30) {
+    L.polyline([[-90, longitude], [90, longitude]], lines).addTo(map);
+  }
+  for (let latitude = -60; latitude <= 60; latitude += 30) {
+    L.polyline([[latitude, -180], [latitude, 180]], lines).addTo(map);
+    L.marker([latitude, -180], {
+      interactive: false,
+      keyboard: false,
+      icon: L.divIcon({ className: "degrees", html: `${Math.abs(latitude)}°${latitude < 0 ? "S" : latitude > 0 ? "N" : ""}` }),
+    }).addTo(map);
+  }
+  return map;
+}
+
+const wrapped = (longitude) => ((((longitude + 180) % 360) + 360) % 360) - 180;
+
+// A track in parts, so that no line crosses the whole map at the 180 degree meridian or bridges a missing value.
+export function parts(latitudes, longitudes) {
+  const found = [[]];
+  let before = null;
+  latitudes.forEach((latitude, index) => {
+    const longitude = longitudes[index];
+    if (latitude === null || longitude === null || !Number.isFinite(latitude) || !Number.isFinite(longitude)) {
+      if (found.at(-1).length) found.push([]);
+      before = null;
+      return;
+    }
+    const here = wrapped(longitude);
+    if (before !== null && Math.abs(here - before) > 180 && found.at(-1).length) found.push([]);
+    found.at(-1).push([latitude, here]);
+    before = here;
+  });
+  return found.filter((part) => part.length);
+}
+
+export function track(map, latitudes, longitudes, options) {
+  const pieces = parts(latitudes, longitudes);
+  return L.polyline(pieces, { weight: 2, interactive: false, ...options }).addTo(map);
+}
+
+export function dot(map, latitude, longitude, options) {
+  return L.circleMarker([latitude, wrapped(longitude)], { radius: 5, weight: 2, interactive: false, ...options }).addTo(map);
+}
+
+export function legendItem(label, css) {
+  const mark = element("span", { class: "mark" });
+  mark.style.background = css;
+  return element("li", {}, mark, label);
+}

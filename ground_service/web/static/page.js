@@ -1,0 +1,165 @@
+// What every page shares: elements, tables, notices, sign-in, clock.
+import { follow, get, setToken, token } from "./api.js";
+
+export const dictionary = JSON.parse(document.getElementById("dictionary").textContent);
+
+export const byId = (id) => document.getElementById(id);
+
+// element("a", {href: "/"}, "text", child...); properties that start with "on" are listeners.
+export function element(name, attributes = {}, ...children) {
+  const made = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (value === null || value === undefined || value === false) continue;
+    if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
+    else made.setAttribute(key, value === true ? "" : value);
+  }
+  made.append(...children.flat().filter((child) => child !== null && child !== undefined));
+  return made;
+}
+
+const SVG = "http://www.w3.org/2000/svg";
+export function svg(name, attributes = {}, ...children) {
+  const made = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
+    else made.setAttribute(key, value);
+  }
+  made.append(...children);
+  return made;
+}
+
+export function show(id, ...children) {
+  const place = typeof id === "string" ? byId(id) : id;
+  place.replaceChildren(...children.flat().filter((child) => child !== null && child !== undefined));
+}
+
+// columns: [heading, row => text or node, "num" for right-aligned numbers]
+export function table(caption, columns, rows, empty) {
+  if (!rows.length) return element("p", { class: "hint" }, empty);
+  const head = columns.map(([heading, , kind]) => element("th", { scope: "col", class: kind }, heading));
+  const body = rows.map((row) =>
+    element("tr", {}, columns.map(([, cell, kind]) => element("td", { class: kind }, cell(row) ?? ""))),
+  );
+  return element(
+    "div",
+    { class: "scroll", tabindex: "0", role: "group", "aria-label": caption },
+    element(
+      "table",
+      {},
+      element("caption", { class: "hidden" }, caption),
+      element("thead", {}, element("tr", {}, head)),
+      element("tbody", {}, body),
+    ),
+  );
+}
+
+export function notice(text, kind = "good") {
+  const shown = element(
+    "p",
+    { class: `notice ${kind}` },
+    text,
+    element("button", { type: "button", class: "quiet", "aria-label": "dismiss", onclick: () => shown.remove() }, "×"),
+  );
+  byId("notices").append(shown);
+  if (kind === "good") setTimeout(() => shown.remove(), 8000);
+}
+
+export const trouble = (error) => notice(error.message, "bad");
+
+// A listener whose failure is told, and which keeps its button from being pressed twice.
+export function acting(task) {
+  return async (event) => {
+    event?.preventDefault?.();
+    const button = event?.submitter ?? (event?.currentTarget instanceof HTMLButtonElement ? event.currentTarget : null);
+    if (button) button.disabled = true;
+    try {
+      await task(event);
+    } catch (error) {
+      trouble(error);
+    } finally {
+      if (button) button.disabled = false;
+    }
+  };
+}
+
+export const seconds = (text) => (text ? Date.parse(`${text.slice(0, 23).replace(/Z$/, "")}Z`) / 1000 : NaN);
+export const timeText = (text) => (text ? `${text.slice(0, 10)} ${text.slice(11, 19)}` : "");
+export const isoText = (unix) => `${new Date(1000 * unix).toISOString().slice(0, 19)}Z`;
+
+export function lengthText(totalSeconds) {
+  const whole = Math.round(totalSeconds);
+  const [hours, minutes, rest] = [Math.floor(whole / 3600), Math.floor((whole % 3600) / 60), whole % 60];
+  return hours ? `${hours} h ${minutes} min` : minutes ? `${minutes} min ${rest} s` : `${rest} s`;
+}
+
+export function figure(value, digits = 3) {
+  if (value === null || value === undefined || Number.isNaN(value)) return "–";
+  if (typeof value !== "number") return String(value);
+  if (Number.isInteger(value)) return value.toLocaleString("en").replaceAll(",", " ");
+  return Math.abs(value) >= 1000 ? Math.round(value).toLocaleString("en").replaceAll(",", " ") : String(+value.toPrecision(digits));
+}
+
+export const stateMark = (state) => element("span", { class: `state ${state}` }, state);
+
+export function pager(load, size = 25) {
+  let offset = 0;
+  async function go(to) {
+    offset = Math.max(0, to);
+    const page = await load(size, offset);
+    byId("range").textContent = page.total
+      ? `${offset + 1} to ${Math.min(offset + size, page.total)} of ${page.total}`
+      : "none";
+    byId("previous").disabled = offset === 0;
+    byId("next").disabled = offset + size >= page.total;
+  }
+  byId("previous").addEventListener("click", acting(() => go(offset - size)));
+  byId("next").addEventListener("click", acting(() => go(offset + size)));
+  return () => go(offset);
+}
+
+// Sign-in, clock and feed of every page.
+const dialog = byId("sign-in");
+window.addEventListener("linna-sign-in", () => {
+  if (!dialog.open) dialog.showModal();
+});
+dialog.querySelector("[data-close]").addEventListener("click", () => dialog.close("cancel"));
+dialog.addEventListener("close", () => {
+  if (dialog.returnValue !== "sign-in") return;
+  setToken(byId("token").value.trim());
+  location.reload();
+});
+byId("caller").textContent = token() ? "Sign out" : "Sign in";
+byId("caller").addEventListener("click", () => {
+  if (!token()) {
+    dialog.showModal();
+    return;
+  }
+  setToken("");
+  location.reload();
+});
+
+function tick() {
+  const now = new Date().toISOString();
+  byId("clock").textContent = `${now.slice(0, 10)} ${now.slice(11, 19)} UTC`;
+  byId("clock").dateTime = now;
+}
+tick();
+setInterval(tick, 1000);
+
+const watchers = [];
+export const watch = (onMessage) => watchers.push(onMessage);
+
+// Only after a first answer: a socket that is refused tells nothing, an answer tells that a token is needed.
+get("passes", { limit: 1 })
+  .then(() =>
+    follow(
+      (message) => watchers.forEach((onMessage) => onMessage(message)),
+      (connected) => {
+        byId("feed-light").classList.toggle("on", connected);
+        byId("feed-light").setAttribute("aria-label", `live feed: ${connected ? "connected" : "not connected"}`);
+      },
+    ),
+  )
+  .catch((error) => {
+    if (error.status !== 401) trouble(error);
+  });

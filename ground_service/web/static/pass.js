@@ -1,0 +1,193 @@
+import { finished, get, request, send } from "./api.js";
+import { chart, colour, columns } from "./charts.js";
+import { legendItem, moonMap, track } from "./moon.js";
+import { acting, byId, dictionary, element, figure, lengthText, notice, seconds, show, stateMark, table, timeText, trouble } from "./page.js";
+
+const passId = Number(location.pathname.split("/").at(-1));
+const STATES = ["latitude_deg", "longitude_deg", "altitude_m"];
+const words = (name) => name.replaceAll("_", " ");
+
+async function openReport(id, format) {
+  const answer = await request(`reports/${id}?format=${format}`);
+  const link = URL.createObjectURL(await answer.blob());
+  if (format === "html") window.open(link, "_blank", "noopener");
+  else element("a", { href: link, download: `pass-${passId}.${format}` }).click();
+}
+
+function showReport(report, id) {
+  show(
+    "verdict",
+    element("p", { class: `verdict ${report.verdict_level || ""}` }, report.verdict),
+    element(
+      "dl",
+      { class: "glance" },
+      report.headline.map((one) =>
+        element(
+          "div",
+          {},
+          element("dt", {}, one.label),
+          element("dd", { class: "number" }, figure(one.value), one.unit ? element("small", {}, ` ${one.unit}`) : null),
+          element("dd", { class: "note" }, one.note),
+        ),
+      ),
+    ),
+    element("p", { class: "hint" }, `Evidence: ${report.evidence_rung || "no rung stated"}.`),
+  );
+  show(
+    "report-links",
+    ["html", "pdf", "json"].map((format) =>
+      element("button", { type: "button", onclick: acting(() => openReport(id, format)) }, `Open ${format.toUpperCase()}`),
+    ),
+  );
+}
+
+// Errors against the reference: the report has them, estimators and baselines on one axis.
+function showErrors(report) {
+  const series = report.navigation
+    .filter((one) => one.error_rtn_m?.length)
+    .map((one, index) => ({
+      label: one.name,
+      colour: colour(index),
+      dash: one.kind === "baseline" ? [6, 4] : undefined,
+      times: one.utc_ns.map((time) => time / 1e9),
+      mean: one.error_rtn_m.map((error) => {
+        const size = Math.hypot(...error.map((part) => (part === null ? NaN : part)));
+        return size > 0 ? size : null;
+      }),
+    }));
+  if (series.length) chart(byId("navigation"), "distance from the reference", "m", series, { logarithmic: true, group: "pass", height: 300 });
+}
+
+function showCompleteness(found) {
+  const rows = found.by_apid.map((one) => {
+    const share = one.packets + one.lost ? one.packets / (one.packets + one.lost) : 1;
+    return { ...one, share };
+  });
+  show(
+    "completeness",
+    element(
+      "p",
+      { class: "lead" },
+      `${figure(found.packets)} packets, ${figure(found.lost)} lost, ${figure(found.duplicates)} repeated, ` +
+        `${figure(found.conflicts)} in conflict, ${figure(found.crc_errors)} with a bad checksum; ` +
+        `${figure(found.octets_skipped)} octets skipped, ${figure(found.symbols_corrected)} symbols corrected.`,
+    ),
+    table(
+      "Packets by application process",
+      [
+        ["APID", (row) => `0x${row.apid.toString(16)}`],
+        ["Packets of", (row) => words(row.name)],
+        ["", (row) => element("meter", { min: 0, max: 1, low: 0.99, optimum: 1, value: row.share, "aria-label": `share of ${row.name} that came` })],
+        ["Came", (row) => figure(row.packets), "num"],
+        ["Lost", (row) => figure(row.lost), "num"],
+        ["Complete", (row) => `${(100 * row.share).toFixed(2)} %`, "num"],
+      ],
+      rows,
+      "No packet of this pass has come.",
+    ),
+  );
+}
+
+async function showStates(estimators) {
+  const found = [];
+  for (const name of estimators) {
+    const answer = await get(`passes/${passId}/states`, { estimator: name, value: STATES, max_points: 2000 }).catch(() => null);
+    if (answer?.series[0].samples) found.push(answer);
+  }
+  const map = moonMap(byId("map"));
+  const bounds = [];
+  found.forEach((one, index) => {
+    const [latitude, longitude] = one.series.map((series) => columns(series.buckets, seconds).mean);
+    const line = track(map, latitude, longitude, { color: colour(index) });
+    if (line.getLatLngs().length) bounds.push(line.getBounds());
+    byId("map-legend").append(legendItem(one.estimator, colour(index)));
+  });
+  if (bounds.length) map.fitBounds(bounds.reduce((all, one) => all.extend(one)), { maxZoom: 4, padding: [20, 20] });
+  STATES.forEach((value, which) => {
+    const unit = found[0]?.series[which].unit ?? "";
+    const series = found.map((one, index) => ({
+      label: one.estimator,
+      colour: colour(index),
+      ...columns(one.series[which].buckets, seconds),
+    }));
+    if (series.length) chart(byId("navigation"), words(value.replace(/_(deg|m)$/, "")), unit, series, { group: "pass" });
+  });
+  if (!found.length) show("navigation", element("p", { class: "hint" }, "No navigation states of this pass have come."));
+}
+
+async function showParameter() {
+  const name = byId("parameter").value;
+  const series = await get(`passes/${passId}/telemetry/${name}`, { max_points: 2000 });
+  show("housekeeping");
+  chart(byId("housekeeping"), words(name), series.unit, [{ label: words(name), ...columns(series.buckets, seconds) }], { group: "pass" });
+}
+
+let events = [];
+function showEvents() {
+  const chosen = byId("only-alarms").checked ? events.filter((one) => ["medium", "high"].includes(one.severity)) : events;
+  show(
+    "events",
+    table(
+      "Events",
+      [
+        ["Time", (row) => timeText(row.time)],
+        ["Severity", (row) => stateMark(row.severity)],
+        ["Event", (row) => words(row.name)],
+        ["Detail", (row) => row.detail],
+      ],
+      chosen,
+      "None.",
+    ),
+  );
+}
+
+async function showLatestReport(ids) {
+  if (!ids.length) {
+    show("verdict", element("p", { class: "hint" }, "No report has been made of this pass yet."));
+    return;
+  }
+  const report = await get(`reports/${ids[0]}`, { format: "json" });
+  showReport(report, ids[0]);
+  showErrors(report);
+}
+
+byId("make-report").addEventListener(
+  "click",
+  acting(async () => {
+    const job = await send("POST", `passes/${passId}/reports`);
+    const bar = element("progress", { max: 1, value: 0, "aria-label": "report" });
+    byId("report-links").replaceChildren(bar);
+    await finished(job.id, (now) => (bar.value = now.progress));
+    notice("The report is made.");
+    const { reports } = await get(`passes/${passId}`);
+    const report = await get(`reports/${reports[0]}`, { format: "json" });
+    showReport(report, reports[0]);
+  }),
+);
+byId("parameter").append(...dictionary.parameters.map((one) => element("option", { value: one.name }, words(one.name))));
+byId("parameter").value = dictionary.parameters.some((one) => one.name === "temperature_c") ? "temperature_c" : dictionary.parameters[0].name;
+byId("parameter").addEventListener("change", acting(showParameter));
+byId("only-alarms").addEventListener("change", showEvents);
+
+async function load() {
+  const pass = await get(`passes/${passId}`);
+  document.title = `${pass.name} · LINNA`;
+  document.querySelector("h1").textContent = pass.name;
+  byId("span").textContent =
+    `${timeText(pass.start)} to ${timeText(pass.stop)}, ${lengthText(seconds(pass.stop) - seconds(pass.start))}, ` +
+    `spacecraft ${pass.spacecraft_id} (${pass.instance})`;
+  const { scenario_toml: _, files: __, ...origin } = pass.manifest;
+  show("origin", Object.keys(origin).length ? element("details", {}, element("summary", {}, "Manifest"), element("pre", {}, JSON.stringify(origin, null, 2))) : element("p", { class: "hint" }, "Defined by hand: no archive, no manifest."));
+  await Promise.all([
+    get(`passes/${passId}/completeness`).then(showCompleteness),
+    showLatestReport(pass.reports),
+    get(`passes/${passId}/events`, { limit: 1000 }).then((page) => {
+      events = page.items;
+      showEvents();
+    }),
+    showParameter(),
+  ]);
+  await showStates(dictionary.estimators);
+}
+
+load().catch((error) => error.status === 401 || trouble(error));

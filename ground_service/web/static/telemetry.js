@@ -1,0 +1,49 @@
+import { get } from "./api.js";
+import { chart, columns } from "./charts.js";
+import { acting, byId, dictionary, element, figure, seconds, show, timeText, trouble } from "./page.js";
+
+const words = (name) => name.replaceAll("_", " ");
+const definition = Object.fromEntries(dictionary.parameters.map((one) => [one.name, one]));
+
+function csv(series) {
+  const lines = ["start,stop,count,min,max,mean,after_gap"];
+  for (const one of series.buckets) {
+    lines.push([one.start, one.stop, one.count, one.min, one.max, one.mean, one.after_gap].join(","));
+  }
+  return URL.createObjectURL(new Blob([`${lines.join("\n")}\n`], { type: "text/csv" }));
+}
+
+async function add() {
+  const [passId, name] = [byId("pass").value, byId("parameter").value];
+  const series = await get(`passes/${passId}/telemetry/${name}`, { max_points: byId("points").value });
+  const { box } = chart(byId("charts"), words(name), series.unit, [{ label: words(name), ...columns(series.buckets, seconds) }], { group: "telemetry" });
+  const about = definition[name];
+  const limits = [
+    about.warning ? `warning outside ${about.warning.join(" to ")}` : null,
+    about.alarm ? `alarm outside ${about.alarm.join(" to ")}` : null,
+  ].filter(Boolean);
+  const last = series.buckets.at(-1);
+  box.append(
+    element(
+      "p",
+      { class: "hint" },
+      `${about.description}. ${figure(series.samples)} samples` + (last ? `, last ${figure(last.mean)} at ${timeText(last.stop)}` : "") + (limits.length ? `; ${limits.join(", ")}` : "") + ". ",
+      element("a", { href: csv(series), download: `pass-${passId}-${name}.csv` }, "CSV"),
+    ),
+  );
+}
+
+async function load() {
+  const passes = await get("passes", { limit: 200 });
+  show("pass", passes.items.map((one) => element("option", { value: one.id }, `${one.name}, ${timeText(one.start)}`)));
+  show("parameter", dictionary.parameters.map((one) => element("option", { value: one.name }, words(one.name))));
+  const wanted = new URLSearchParams(location.search);
+  if (wanted.get("pass")) byId("pass").value = wanted.get("pass");
+  if (wanted.get("parameter") in definition) byId("parameter").value = wanted.get("parameter");
+  if (passes.items.length) await add();
+  else show("charts", element("p", { class: "hint" }, "No pass yet."));
+}
+
+byId("choice").addEventListener("submit", acting(add));
+byId("clear").addEventListener("click", () => show("charts"));
+load().catch((error) => error.status === 401 || trouble(error));
