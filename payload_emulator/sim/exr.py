@@ -33,10 +33,14 @@ def read_exr(path: Path) -> dict[str, npt.NDArray[np.float32]]:
         attributes, place = _attributes(octets, path)
         names = _channels(attributes["channels"], path)
         if attributes["compression"][0] != UNCOMPRESSED:
-            raise RendererError(f"{path}: expected an uncompressed EXR, found method {attributes['compression'][0]}")
+            raise RendererError(
+                f"{path}: expected an uncompressed EXR, found method {attributes['compression'][0]}"
+            )
         left, top, right, bottom = struct.unpack("<4i", attributes["dataWindow"])
     except (KeyError, struct.error, ValueError) as error:
-        raise RendererError(f"{path}: expected the header of an EXR file, found it damaged ({error})") from None
+        raise RendererError(
+            f"{path}: expected the header of an EXR file, found it damaged ({error})"
+        ) from None
     wide, high = right - left + 1, bottom - top + 1
     line = np.dtype([("number", "<i4"), ("size", "<i4"), ("values", "<f4", (len(names), wide))])
     start = place + 8 * high
@@ -55,7 +59,9 @@ def _attributes(octets: bytes, path: Path) -> tuple[dict[str, bytes], int]:
     """Values of the header's attributes by name, and where the header ends."""
     magic, version = struct.unpack_from("<ii", octets)
     if magic != MAGIC or version & ~LONG_NAMES != 2:
-        raise RendererError(f"{path}: expected a single-part EXR of version 2, found octets {octets[:8].hex()}")
+        raise RendererError(
+            f"{path}: expected a single-part EXR of version 2, found octets {octets[:8].hex()}"
+        )
     attributes = {}
     place = 8
     while octets[place] != 0:

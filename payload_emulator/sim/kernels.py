@@ -410,6 +410,41 @@ def trace_pixels(
 
 
 @njit(fastmath=True, error_model="numpy", nogil=True)
+def trace_shifted(
+    heights: Any,
+    peaks: Any,
+    x0: Any,
+    y0: Any,
+    texel: Any,
+    altitude: Any,
+    tangent_from_camera: Any,
+    focal: Any,
+    centre_u: Any,
+    centre_v: Any,
+    shift_u: Any,
+    shift_v: Any,
+    depth_along: Any,
+) -> Any:
+    """As `trace_pixels` for a lens that shifts its pixels: the rays of a line no longer lie in a plane, so each pixel
+    is searched on its own.
+    """
+    inverse = 1.0 / texel
+    i0 = -x0 * inverse
+    j0 = -y0 * inverse
+    top = float(peaks.max()) + 1.0
+    low = float(heights.min()) - 1.0
+    eye = tangent_from_camera
+    for v in range(depth_along.shape[0]):
+        for u in range(depth_along.shape[1]):
+            right = (u + shift_u[v, u] - centre_u) / focal
+            below = (v + shift_v[v, u] - centre_v) / focal
+            di = (eye[0, 0] * right + eye[0, 1] * below + eye[0, 2]) * inverse
+            dj = (eye[1, 0] * right + eye[1, 1] * below + eye[1, 2]) * inverse
+            dz = eye[2, 0] * right + eye[2, 1] * below + eye[2, 2]
+            depth_along[v, u] = _search(heights, peaks, i0, j0, altitude, di, dj, dz, 0.0, top, low)
+
+
+@njit(fastmath=True, error_model="numpy", nogil=True)
 def _search(
     heights: Any,
     peaks: Any,
@@ -477,11 +512,15 @@ def shade_pixels(
     albedo_step: Any,
     mean_albedo: Any,
     contrast: Any,
+    shift_u: Any,
+    shift_v: Any,
     radiance: Any,
     lit: Any,
     range_m: Any,
 ) -> Any:
     """Fill the pictures from ``range_m``, which comes as the depth along the boresight.
+
+    ``shift_u`` and ``shift_v`` (H, W) are what a lens takes off its pixels' places, None for a lens without distortion.
 
     The Sun stands at -x: its vector is (-sun_flat, 0, sun_up).  Slopes come from the terrain's own pixels: the tangent
     grid would blur them once more.
@@ -525,6 +564,9 @@ def shade_pixels(
     ay = np.float32(tangent_from_camera[1, 0] / focal)
     az = np.float32(tangent_from_camera[2, 0] / focal)
     per_pixel = np.float32(1.0 / focal)
+    cx = np.float32(tangent_from_camera[0, 1] / focal)
+    cy = np.float32(tangent_from_camera[1, 1] / focal)
+    cz = np.float32(tangent_from_camera[2, 1] / focal)
     work = np.empty(13 * LINE, np.float32)
     places = np.empty(2 * LINE, np.int32)
     for v in range(radiance.shape[0]):
@@ -547,9 +589,16 @@ def shade_pixels(
         for k in range(wide):
             c = np.float32(k)
             t = max(work[k], zero)
-            x = t * (ax * c + bx)
-            y = t * (ay * c + by)
-            z = high + t * (az * c + bz)
+            if shift_u is None:
+                x = t * (ax * c + bx)
+                y = t * (ay * c + by)
+                z = high + t * (az * c + bz)
+            else:
+                c += shift_u[v, k]
+                d = shift_v[v, k]
+                x = t * (ax * c + cx * d + bx)
+                y = t * (ay * c + cy * d + by)
+                z = high + t * (az * c + cz * d + bz)
             i = max(i0 + x * inverse, zero)
             j = max(j0 + y * inverse, zero)
             whole_i = np.int32(i)
@@ -662,12 +711,23 @@ def shade_pixels(
             gx = gx * lean * stretch - x * steep
             gy = gy * lean * stretch - y * steep
             norm = one / np.float32(math.sqrt(gx * gx + gy * gy + one))
-            right = left + c * per_pixel
-            length = np.float32(math.sqrt(right * right + square))
-            reach = one / length
-            vx = -(ax * c + bx) * reach
-            vy = -(ay * c + by) * reach
-            vz = -(az * c + bz) * reach
+            if shift_u is None:
+                right = left + c * per_pixel
+                length = np.float32(math.sqrt(right * right + square))
+                reach = one / length
+                vx = -(ax * c + bx) * reach
+                vy = -(ay * c + by) * reach
+                vz = -(az * c + bz) * reach
+            else:
+                c += shift_u[v, k]
+                d = shift_v[v, k]
+                right = left + c * per_pixel
+                below = np.float32(b) + d * per_pixel
+                length = np.float32(math.sqrt(right * right + below * below + one))
+                reach = one / length
+                vx = -(ax * c + cx * d + bx) * reach
+                vy = -(ay * c + cy * d + by) * reach
+                vz = -(az * c + cz * d + bz) * reach
             mu0 = (gx * flat + up) * norm
             mu = max((vz - gx * vx - gy * vy) * norm, np.float32(0.02))
             s = min(work[k + 9 * LINE], one)

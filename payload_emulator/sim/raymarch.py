@@ -59,7 +59,7 @@ def render(
     level = terrain.level_for((altitude - ground) / camera.focal_px)
     v, u = np.mgrid[0 : camera.height_px : every, 0 : camera.width_px : every]
     rays = camera.rays(np.stack([u, v], axis=-1).astype(np.float64)) @ rotation
-    places = _window(terrain, camera, position, rotation, sun)
+    places = rays_window(camera, position, rotation, sun)
     patch = terrain.patch(*places, level)
     radiance, lit, range_m = (np.empty(u.shape, np.float32) for _ in range(3))
     _march(
@@ -86,8 +86,7 @@ def render(
     return Rendering(radiance, lit, range_m)
 
 
-def _window(
-    terrain: Terrain,
+def rays_window(
     camera: PinholeCamera,
     position: npt.NDArray[np.float64],
     rotation: npt.NDArray[np.float64],

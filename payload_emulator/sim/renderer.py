@@ -19,6 +19,7 @@ from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import spherical_from_mcmf
 from payload_emulator.errors import TerrainError
+from payload_emulator.sim.lens import BrownCamera, pixel_shifts
 from payload_emulator.sim.light import SUN_ANGULAR_RADIUS_RAD
 from payload_emulator.sim.photometry import Photometry
 from payload_emulator.sim.terrain.tiles import (
@@ -153,17 +154,12 @@ def _render_grid(
     )
     eye = np.ascontiguousarray(view.tangent_from_camera)
     lens = (camera.focal_px, *camera.centre_px)
-    kernels.trace_pixels(
-        heights,
-        kernels.block_peaks(heights),
-        grid.x0_m,
-        grid.y0_m,
-        grid.texel_m,
-        view.altitude_m,
-        eye,
-        *lens,
-        range_m,
-    )
+    ground = (heights, kernels.block_peaks(heights), grid.x0_m, grid.y0_m, grid.texel_m)
+    shifts = pixel_shifts(camera) if isinstance(camera, BrownCamera) else (None, None)
+    if shifts[0] is None:
+        kernels.trace_pixels(*ground, view.altitude_m, eye, *lens, range_m)
+    else:
+        kernels.trace_shifted(*ground, view.altitude_m, eye, *lens, *shifts, range_m)
     kernels.shade_pixels(
         lit,
         grid.x0_m,
@@ -184,6 +180,8 @@ def _render_grid(
         TILE_SHIFT - ALBEDO_SHIFT,
         MEAN_ALBEDO,
         photometry.albedo_contrast,
+        shifts[0],
+        shifts[1],
         radiance,
         mask,
         range_m,
