@@ -19,7 +19,7 @@ from reports.sections.opening import (
     settings,
 )
 from reports.text import count_text, number_text
-from reports.values import DetectorReport, NamedScore, ResidualSeries
+from reports.values import DetectorReport, NamedScore, ResidualSeries, SigmaBin
 
 
 def detector_document(report: DetectorReport) -> Document:
@@ -47,6 +47,10 @@ def detector_document(report: DetectorReport) -> Document:
     ):
         if scores:
             blocks += [Heading(heading), *_named(key, scores, caption)]
+    for number, group in enumerate(report.groups):
+        blocks += [Heading(group.heading), *_named(f"group-{number}", group.scores, group.caption)]
+    if report.sigma:
+        blocks += [Heading("Predicted uncertainty"), _sigma_table(report.sigma)]
     if report.training:
         curves = report.training[:9]
         rows = -(-len(curves) // 3)
@@ -72,10 +76,10 @@ def detector_document(report: DetectorReport) -> Document:
     else:
         blocks.append(absent(report, "gallery", "Gallery of detections", "no images were given"))
     if report.worst_frames:
-        worst = report.worst_frames[:10]
+        worst = report.worst_frames[:24]
         blocks.append(
             gallery_picture(
-                "worst", worst, 5, f"The worst {len(worst)} frames, chosen by number, not by hand."
+                "worst", worst, 4, f"The worst {len(worst)} frames, chosen by number, not by hand."
             )
         )
     blocks += provenance_and_data(report)
@@ -85,6 +89,7 @@ def detector_document(report: DetectorReport) -> Document:
 
 
 def _named(key: str, scores: Sequence[NamedScore], caption: str) -> list[Block]:
+    both = any(np.isfinite(s.fair_precision) or np.isfinite(s.fair_recall) for s in scores)
     table = Table(
         caption,
         (
@@ -93,10 +98,12 @@ def _named(key: str, scores: Sequence[NamedScore], caption: str) -> list[Block]:
             Column("precision"),
             Column("recall"),
             Column("localisation", unit="px"),
+            *((Column("precision, ignore-aware"), Column("recall, ignore-aware")) if both else ()),
         ),
         tuple(
             (s.label, count_text(s.expected), number_text(s.precision, 3), number_text(s.recall, 3),
-             number_text(s.localisation_px, 2))
+             number_text(s.localisation_px, 2),
+             *((number_text(s.fair_precision, 3), number_text(s.fair_recall, 3)) if both else ()))
             for s in scores
         ),
     )  # fmt: skip
@@ -104,6 +111,26 @@ def _named(key: str, scores: Sequence[NamedScore], caption: str) -> list[Block]:
         key, caption, caption, 0.85 + 0.3 * len(scores), lambda c: dataset.draw_named_scores(c, scores)
     )
     return [picture, table]
+
+
+def _sigma_table(bins: Sequence[SigmaBin]) -> Table:
+    return Table(
+        "Centre errors of matched craters over the standard deviation that the network predicted for each.",
+        (
+            Column("craters seen", numeric=False),
+            Column("pairs"),
+            Column("mean sigma", unit="px"),
+            Column("rms of error over sigma"),
+            Column("inside 1 sigma"),
+            Column("inside 3 sigma"),
+        ),
+        tuple(
+            (s.label, count_text(s.pairs), number_text(s.mean_sigma_px, 2), number_text(s.rms, 2),
+             number_text(s.inside_one_sigma, 3), number_text(s.inside_three_sigma, 3))
+            for s in bins
+        ),
+        note="1, 0.683 and 0.997 would be perfect for Gaussian errors of each axis.",
+    )  # fmt: skip
 
 
 def _bias_table(residuals: ResidualSeries) -> Table | None:

@@ -431,13 +431,39 @@ class CampaignReport:
 
 @dataclass(frozen=True, slots=True)
 class NamedScore:
-    """Precision, recall and localisation of one named group, such as a state of degradation or a renderer."""
+    """Precision, recall and localisation of one named group, such as a state of degradation or a renderer.
+
+    The fair ones are scored without what hardly anyone could see; NaN where only strict scores are given.
+    """
 
     label: str
     expected: int
     precision: float
     recall: float
     localisation_px: float = float("nan")
+    fair_precision: float = float("nan")
+    fair_recall: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class ScoreGroup:
+    """Scores by one quantity: a heading, a row for each value of it, what should be known about them."""
+
+    heading: str
+    scores: tuple[NamedScore, ...]
+    caption: str
+
+
+@dataclass(frozen=True, slots=True)
+class SigmaBin:
+    """How centre errors compare with the sigma predicted for them: rms of error over sigma, shares inside."""
+
+    label: str
+    pairs: int
+    mean_sigma_px: float
+    rms: float
+    inside_one_sigma: float
+    inside_three_sigma: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -458,6 +484,8 @@ class DetectorReport:
     score: DetectorScore | None = None
     by_degradation: tuple[NamedScore, ...] = ()
     by_source: tuple[NamedScore, ...] = ()
+    groups: tuple[ScoreGroup, ...] = ()
+    sigma: tuple[SigmaBin, ...] = ()
     training: tuple[TrainingCurve, ...] = ()
     cost: Mapping[str, str] = field(default_factory=dict)
     gallery: tuple[GalleryFrame, ...] = ()

@@ -29,7 +29,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     train.add_argument("--learning-rate", type=float, default=2.5e-3)
     train.add_argument("--start-from", type=Path, default=None, metavar="CHECKPOINT")
-    train.add_argument("--paper-classes", action="store_true", help="add the paper's three class heatmaps")
+    train.add_argument(
+        "--replicas", type=int, default=0, help="threads that train side by side (0: one per core)"
+    )
     add_json_flag(train)
     train.set_defaults(handler=_train)
 
@@ -45,15 +47,28 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="whose validation split fixes the thresholds",
     )
     export.add_argument("--revision", default="", help="source revision for the model's metadata")
+    export.add_argument(
+        "--paper-classes", action="store_true", help="keep the heatmaps of the paper's three classes"
+    )
+    export.add_argument(
+        "--test", action="store_true", help="score the test splits and write the figures into the model"
+    )
     add_json_flag(export)
     export.set_defaults(handler=_export)
 
     evaluate = verbs.add_parser("evaluate", help="precision, recall and localisation on a data set")
     _add_model(evaluate)
-    evaluate.add_argument("--dataset", type=Path, required=True, metavar="DIR")
+    evaluate.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
     evaluate.add_argument("--split", choices=("train", "val", "test"), default="test")
     evaluate.add_argument("--source", default="", help="only the frames of this source")
     evaluate.add_argument("--threshold", type=float, default=None, help="instead of the model's own")
+    evaluate.add_argument(
+        "--paper-classes",
+        action="store_true",
+        help="the paper's design: the class from its own heatmap instead of diameter and altitude",
+    )
+    evaluate.add_argument("--report", type=Path, default=None, metavar="F.html", help="write one HTML report")
+    evaluate.add_argument("--run", type=Path, default=None, help="training run whose curves the report shows")
     add_json_flag(evaluate)
     evaluate.set_defaults(handler=_evaluate)
 
@@ -128,7 +143,7 @@ def _train(arguments: argparse.Namespace) -> int:
         learning_rate=arguments.learning_rate,
         patience=arguments.patience,
         seed=arguments.seed,
-        paper_classes=arguments.paper_classes,
+        replicas=arguments.replicas,
     )
     datasets = [Dataset(folder) for folder in arguments.datasets]
     figures = train(datasets, arguments.out, parameters, start_from=arguments.start_from, report=log)
@@ -152,25 +167,50 @@ def _export(arguments: argparse.Namespace) -> int:
         best = checkpoint / "best.pt"
         checkpoint = best if best.is_file() else checkpoint / "checkpoint.pt"
     datasets = [Dataset(folder) for folder in arguments.dataset]
-    emit(arguments, export(checkpoint, arguments.out, datasets, arguments.revision))
+    figures = export(
+        checkpoint,
+        arguments.out,
+        datasets,
+        arguments.revision,
+        paper_classes=arguments.paper_classes,
+        test=arguments.test,
+    )
+    emit(arguments, figures)
     return 0
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     from linna.output import emit, progress
     from payload_emulator.training.dataset import Dataset
-    from payload_emulator.training.evaluate import evaluate, format_figures
+    from payload_emulator.training.evaluate import format_figures, open_for_evaluation, run, summary
 
-    figures = evaluate(
-        _model_octets(arguments.model),
-        Dataset(arguments.dataset),
+    datasets = [Dataset(folder) for folder in arguments.dataset]
+    detector = open_for_evaluation(_model_octets(arguments.model))
+    scored = run(
+        detector,
+        datasets,
         arguments.split,
         arguments.source,
         arguments.threshold,
         lambda frames: progress(frames, len(frames), "evaluate", "frames"),
+        paper_classes=arguments.paper_classes,
     )
+    figures = summary(detector, datasets, scored, arguments.split, arguments.source)
+    if arguments.report is not None:
+        from payload_emulator.training.report import detector_report
+        from reports.render import render_html
+
+        report = detector_report(detector, scored, figures, arguments.run)
+        _write_text(arguments.report, render_html(report))
     emit(arguments, figures, format_figures(figures))
     return 0
+
+
+def _write_text(path: Path, text: str) -> None:
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished.write_text(text, encoding="utf-8")
+    unfinished.replace(path)
 
 
 def _detect(arguments: argparse.Namespace) -> int:

@@ -15,10 +15,16 @@ from payload_emulator.flight.preprocess import ImageQuality
 
 Float = NDArray[np.float64]
 
+FRESH_DEPTH_RATIO = 0.10
+DEGRADED_DEPTH_RATIO = 0.06
+"""Above the first a crater is called fresh, below the second degraded: the bins of degradation used in scoring."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detections:
     """Craters found in one image; float64 arrays of one length n, NaN where a quantity is not known.
+
+    `depth_ratio` is None where the network does not tell it.
 
     Attributes
     ----------
@@ -30,6 +36,8 @@ class Detections:
         Confidence, 0 to 1.
     sigma_px
         Standard deviation of the centre along each axis.
+    depth_ratio
+        Depth over diameter as it looks: about 0.2 fresh, under `DEGRADED_DEPTH_RATIO` worn down.
     """
 
     u_px: Float
@@ -37,6 +45,7 @@ class Detections:
     diameter_px: Float
     score: Float
     sigma_px: Float
+    depth_ratio: Float | None = None
 
     def __len__(self) -> int:
         return int(self.u_px.shape[0])
@@ -49,7 +58,18 @@ class Detections:
             self.diameter_px[which],
             self.score[which],
             self.sigma_px[which],
+            None if self.depth_ratio is None else self.depth_ratio[which],
         )
+
+
+def states(found: Detections) -> list[str]:
+    """Return "fresh", "worn" or "degraded" for each detection, "" where the network does not tell."""
+    if found.depth_ratio is None:
+        return [""] * len(found)
+    return [
+        "fresh" if ratio >= FRESH_DEPTH_RATIO else "worn" if ratio >= DEGRADED_DEPTH_RATIO else "degraded"
+        for ratio in found.depth_ratio
+    ]
 
 
 def no_detections() -> Detections:

@@ -2,8 +2,12 @@
 
 The network (MobileNetV3 backbone, CenterNet heads) sees one gray plane of 512 x 512, Sun-up, and gives two maps at a
 quarter of that resolution: the probability that a crater is centred in a cell, and its geometry (offset of the centre
-from the cell, logarithm of the diameter, logarithm of the one-sigma centre error). Size in kilometres is not its
-business: that needs the altitude.
+from the cell, logarithm of the diameter, logarithm of the one-sigma centre error, and from newer networks ten times the
+depth/diameter). Size in kilometres is not its business: that needs the altitude.
+
+What the eye (and the network) takes for the centre of a crater is the middle of its walls, which lies some way below
+the rim; away from the middle of a wide picture that displaces it inward, by parallax. The network cannot know where in
+the picture it looks, so the detector puts it right with the share of the depth that the model's metadata carry.
 
 Pixel centres are integers; a cell (row i, column j) of stride 4 is centred at (4 j + 1.5, 4 i + 1.5).
 
@@ -15,7 +19,7 @@ X. Zhou, D. Wang, P. Kraehenbuehl, "Objects as Points", 2019, section 4 (peaks b
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -71,6 +75,7 @@ class OnnxDetector:
     sha256: str = field(init=False)
     metadata: dict[str, str] = field(init=False)
     score_threshold: float = field(init=False)
+    parallax_per_px: float = field(init=False)
     _session: onnxruntime.InferenceSession = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -85,6 +90,7 @@ class OnnxDetector:
         self.score_threshold = (
             float(self.metadata.get("score_threshold", "0.4")) if chosen is None else chosen
         )
+        self.parallax_per_px = float(self.metadata.get("parallax_per_px", "0.0"))
 
     @property
     def model_hash(self) -> int:
@@ -123,7 +129,10 @@ class OnnxDetector:
         turns = sun_up_turns(sun_in_camera)
         found = self._search(np.rot90(prepared.gray, turns))
         u_px, v_px = turn_back(found.u_px, found.v_px, turns, height_px, width_px)
-        return ImageQuality.OK, Detections(u_px, v_px, found.diameter_px, found.score, found.sigma_px)
+        found = replace(found, u_px=u_px, v_px=v_px)
+        if (height_px, width_px) == (self.parameters.height_px, self.parameters.width_px):
+            found = remove_parallax(found, self.parallax_per_px, height_px, width_px)
+        return ImageQuality.OK, found
 
     def run_network(self, tile: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Heatmap and geometry maps of one prepared tile (1, 1, 512, 512)."""
@@ -140,7 +149,7 @@ class OnnxDetector:
                 for top in _tile_starts(rows)
                 for left in _tile_starts(columns)
             ]
-        every = Detections(*(np.concatenate([getattr(part, name) for part in found]) for name in _ARRAYS))
+        every = found[0] if len(found) == 1 else _joined(found)
         order = np.argsort(-every.score, kind="stable")
         kept = drop_duplicates(every.select(order), self.parameters)
         return kept.select(np.arange(min(len(kept), self.parameters.max_detections * len(found))))
@@ -156,11 +165,11 @@ class OnnxDetector:
         found = decode(heatmap[0, 0], geometry[0], self.score_threshold)
         inside = (found.u_px < columns) & (found.v_px < rows)
         found = found.select(inside)
-        return Detections(found.u_px + left, found.v_px + top, found.diameter_px, found.score, found.sigma_px)
+        return replace(found, u_px=found.u_px + left, v_px=found.v_px + top)
 
 
 def decode(heatmap: NDArray[np.float32], geometry: NDArray[np.float32], score_threshold: float) -> Detections:
-    """Detections of one image from heatmap (h, w) and geometry (4, h, w): offsets in cells, ln diameter, ln sigma.
+    """Detections of one image from heatmap (h, w) and geometry (4 or 5, h, w): see the head of this module.
 
     A peak is a cell not below its eight neighbours. Its centre and diameter are the score-weighted means of what the
     nine cells around it say, since each was trained to point at the same centre.
@@ -198,10 +207,43 @@ def decode(heatmap: NDArray[np.float32], geometry: NDArray[np.float32], score_th
         REFERENCE_DIAMETER_PX * np.exp(mean(log_diameter)),
         score,
         np.exp(mean(log_sigma)),
+        np.clip(0.1 * mean(geometry[4][near_row, near_column].astype(np.float64)), 0.0, 0.25)
+        if geometry.shape[0] > 4
+        else None,
     )
 
 
-_ARRAYS = ("u_px", "v_px", "diameter_px", "score", "sigma_px")
+TYPICAL_DEPTH_RATIO = 0.1  # of craters that are found, where the network does not tell
+
+
+def remove_parallax(found: Detections, share_per_px: float, height_px: int, width_px: int) -> Detections:
+    """Detections with their centres brought from the middle of the walls up to the plane of the rim.
+
+    A point that lies d below the rim appears nearer the middle of the picture by the fraction d / range of its distance
+    from there; d is a share of the crater's depth, and depth / range = depth/diameter times diameter_px / focal_px.
+    `share_per_px` is that share over the focal length in pixels; zero leaves the detections as they are.
+    """
+    if share_per_px == 0.0 or len(found) == 0:
+        return found
+    ratio = TYPICAL_DEPTH_RATIO if found.depth_ratio is None else found.depth_ratio
+    outward = share_per_px * ratio * found.diameter_px
+    return replace(
+        found,
+        u_px=found.u_px + outward * (found.u_px - 0.5 * (width_px - 1)),
+        v_px=found.v_px + outward * (found.v_px - 0.5 * (height_px - 1)),
+    )
+
+
+def _joined(parts: list[Detections]) -> Detections:
+    known = [part.depth_ratio for part in parts if part.depth_ratio is not None]
+    return Detections(
+        np.concatenate([part.u_px for part in parts]),
+        np.concatenate([part.v_px for part in parts]),
+        np.concatenate([part.diameter_px for part in parts]),
+        np.concatenate([part.score for part in parts]),
+        np.concatenate([part.sigma_px for part in parts]),
+        np.concatenate(known) if len(known) == len(parts) else None,
+    )
 
 
 def _tile_starts(length: int) -> list[int]:
@@ -214,18 +256,17 @@ def _tile_starts(length: int) -> list[int]:
 
 def drop_duplicates(found: Detections, parameters: DetectorParameters) -> Detections:
     """Detections (best first) without those that repeat a better one."""
+    radius = 0.5 * found.diameter_px
+    size = np.log(found.diameter_px)
+    distance = np.hypot(found.u_px[:, None] - found.u_px, found.v_px[:, None] - found.v_px)
+    same = (distance < parameters.duplicate_distance * np.minimum(radius[:, None], radius)) & (
+        np.abs(size[:, None] - size) < np.log(parameters.duplicate_ratio)
+    )
+    better, worse = np.nonzero(np.triu(same, 1))
     keep = np.ones(len(found), bool)
-    for i in range(len(found)):
-        if not keep[i]:
-            continue
-        later = slice(i + 1, None)
-        distance = np.hypot(found.u_px[later] - found.u_px[i], found.v_px[later] - found.v_px[i])
-        smaller = 0.5 * np.minimum(found.diameter_px[later], found.diameter_px[i])
-        ratio = np.abs(np.log(found.diameter_px[later] / found.diameter_px[i]))
-        same = (distance < parameters.duplicate_distance * smaller) & (
-            ratio < np.log(parameters.duplicate_ratio)
-        )
-        keep[later] &= ~same
+    for first, second in zip(better, worse, strict=True):  # in order of the better one's rank
+        if keep[first]:
+            keep[second] = False
     return found.select(keep)
 
 
@@ -250,7 +291,7 @@ def _open_session(model_octets: bytes, threads: int) -> onnxruntime.InferenceSes
         inputs != [(INPUT_NAME, [1, 1, INPUT_SIZE_PX, INPUT_SIZE_PX])]
         or outputs.get(HEATMAP_NAME) is None
         or outputs[HEATMAP_NAME][2:] != [cells, cells]
-        or outputs.get(GEOMETRY_NAME) != [1, 4, cells, cells]
+        or outputs.get(GEOMETRY_NAME) not in ([1, 4, cells, cells], [1, 5, cells, cells])
     ):
         raise ModelError(
             f"detector network: expected input {INPUT_NAME} [1, 1, {INPUT_SIZE_PX}, {INPUT_SIZE_PX}] and outputs "

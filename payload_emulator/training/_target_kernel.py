@@ -19,6 +19,7 @@ def paint(  # type: ignore[no-untyped-def]
     weight,
     size_class,
     log_diameter,
+    tenfold_depth,
     sigma_of_radius,
     min_sigma,
     ignore_of_radius,
@@ -65,4 +66,5 @@ def paint(  # type: ignore[no-untyped-def]
                     geometry[0, r, c] = x[i] - c
                     geometry[1, r, c] = y[i] - r
                     geometry[2, r, c] = log_diameter[i]
+                    geometry[3, r, c] = tenfold_depth[i]
                     regressed[r, c] = weight[i] * (1.0 if r == row and c == column else 0.3)

@@ -125,7 +125,9 @@ class Dataset:
         try:
             self.index: dict[str, Any] = json.loads(index.read_text(encoding="utf-8"))
         except FileNotFoundError:
-            found = "an unfinished one: build it again to go on" if (folder / "recipe.json").is_file() else "none"
+            found = (
+                "an unfinished one: build it again to go on" if (folder / "recipe.json").is_file() else "none"
+            )
             raise DatasetError(f"{folder}: expected a data set (dataset.json), found {found}") from None
         except (OSError, ValueError) as error:
             raise DatasetError(f"{index}: expected a JSON object, found: {error}") from error
@@ -329,14 +331,19 @@ def read_gray(path: Path) -> NDArray[np.uint8]:
     return np.asarray(image, dtype=np.uint8)
 
 
-def write_gray(path: Path, image: NDArray[Any]) -> str:
-    """Write a gray PNG of 8 or 16 bits in one move; its SHA-256 comes back."""
+def write_picture(path: Path, image: NDArray[Any]) -> str:
+    """Write a PNG of 8 or 16 bits, gray (H, W) or blue-green-red (H, W, 3), in one move; its SHA-256 comes back."""
     import cv2
 
     done, octets = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not done:
         raise DatasetError(f"{path}: expected an image of 8 or 16 bits, found {image.dtype} {image.shape}")
     return write_whole(path, octets.tobytes())
+
+
+def write_gray(path: Path, image: NDArray[Any]) -> str:
+    """Write a gray frame (H, W); its SHA-256 comes back."""
+    return write_picture(path, image)
 
 
 def write_json(path: Path, document: dict[str, Any]) -> str:

@@ -22,6 +22,8 @@ class LossWeights:
     offset: float = 1.0
     diameter: float = 0.7
     sigma: float = 0.1
+    depth: float = 0.2
+    class_heat: float = 0.25  # of the paper's class heatmaps, a variant beside the common one
     high_score: float = 0.85  # background above this on incompletely catalogued terrain is left alone
 
 
@@ -34,6 +36,7 @@ class LossTerms:
     offset: Tensor
     diameter: Tensor
     sigma: Tensor
+    depth: Tensor
 
 
 def crater_loss(
@@ -51,13 +54,15 @@ def crater_loss(
     probability = torch.sigmoid(heat_logit)
     log_p = torch.nn.functional.logsigmoid(heat_logit)
     log_not_p = log_p - heat_logit
-    centres = target_weight.sum().clamp(min=1.0)
-    positive = -(target_weight * (1.0 - probability) ** 2 * log_p).sum()
+    share = torch.full((heat_logit.shape[1], 1, 1), weights.class_heat, device=heat_logit.device)
+    share[0] = 1.0
+    centres = target_weight[:, 0].sum().clamp(min=1.0)
+    positive = -(share * target_weight * (1.0 - probability) ** 2 * log_p).sum()
     unlisted = (
         incomplete[:, None, None, None] & (probability.detach() > weights.high_score) & (target_heat < 0.05)
     )
     negative_weight = negative_weight.masked_fill(unlisted, 0.0).masked_fill(target_weight > 0.0, 0.0)
-    negative = -(negative_weight * (1.0 - target_heat) ** 4 * probability**2 * log_not_p).sum()
+    negative = -(share * negative_weight * (1.0 - target_heat) ** 4 * probability**2 * log_not_p).sum()
     heat = (positive + negative) / centres
 
     mass = regressed.sum().clamp(min=1.0)
@@ -68,5 +73,14 @@ def crater_loss(
     log_b = geometry[:, 3].clamp(-4.0, 4.0) - 0.5 * float(torch.log(torch.tensor(2.0)))
     error_px = STRIDE_PX * error.detach().mean(1)
     sigma = (regressed * (error_px * torch.exp(-log_b) + log_b)).sum() / mass
-    total = heat + weights.offset * offset + weights.diameter * diameter + weights.sigma * sigma
-    return LossTerms(total, heat.detach(), offset.detach(), diameter.detach(), sigma.detach())
+    depth = torch.zeros_like(sigma)
+    if geometry.shape[1] > 4:
+        depth = (regressed * (geometry[:, 4] - target_geometry[:, 3]).abs()).sum() / mass
+    total = (
+        heat
+        + weights.offset * offset
+        + weights.diameter * diameter
+        + weights.sigma * sigma
+        + weights.depth * depth
+    )
+    return LossTerms(total, heat.detach(), offset.detach(), diameter.detach(), sigma.detach(), depth.detach())

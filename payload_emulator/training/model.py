@@ -1,8 +1,9 @@
 """The crater network: MobileNetV3-small backbone, depthwise feature pyramid, CenterNet heads at stride 4.
 
 Input (B, 1, H, W), H and W multiples of 32, as `payload_emulator.flight.preprocess` makes it. Outputs at (H/4, W/4):
-heatmap logits (B, 1 or 4, h, w): any crater, then the paper's three classes where asked for; geometry (B, 4, h, w):
-offset to the centre in cells (right, down), ln(diameter / 16 px), ln(one-sigma centre error / 1 px).
+heatmap logits (B, 1 or 4, h, w): any crater, then the three classes of the paper; geometry (B, 4 or 5, h, w):
+offset to the centre in cells (right, down), ln(diameter / 16 px), ln(one-sigma centre error / 1 px), and if asked
+for ten times the depth/diameter, by which a crater is fresh or degraded.
 
 References
 ----------
@@ -34,6 +35,7 @@ _BLOCKS = (
 _TAPS = (0, 2, 7, 10)  # last block of strides 4, 8, 16, 32
 _PRIOR_LOGIT = -4.0  # about one cell in fifty before training: keeps the first focal losses finite
 _INITIAL_LOG_SIGMA = 0.3
+_INITIAL_TENFOLD_DEPTH = 0.8  # depth/diameter 0.08, the middle of the catalogue
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +46,7 @@ class ModelConfig:
     detail_blocks: int = 1
     detail_channels: int = 24
     paper_classes: bool = False
+    depth: bool = False
 
     def to_dict(self) -> dict[str, int | bool]:
         return asdict(self)
@@ -78,15 +81,21 @@ class CraterNet(nn.Module):
         self.lateral = nn.ModuleList(nn.Conv2d(c, width, 1) for c in tapped)
         self.smooth = nn.ModuleList(_separable(width, width) for _ in tapped[:-1])
         self.trunk = _separable(width, width)
-        self.head = nn.Conv2d(width, self.heat_channels + 4, 1)
+        self.head = nn.Conv2d(width, self.heat_channels + self.geometry_channels, 1)
         _initialise(self)
         assert self.head.bias is not None
         self.head.bias.data[: self.heat_channels] = _PRIOR_LOGIT
         self.head.bias.data[self.heat_channels + 3] = _INITIAL_LOG_SIGMA
+        if self.config.depth:
+            self.head.bias.data[self.heat_channels + 4] = _INITIAL_TENFOLD_DEPTH
 
     @property
     def heat_channels(self) -> int:
         return 4 if self.config.paper_classes else 1
+
+    @property
+    def geometry_channels(self) -> int:
+        return 5 if self.config.depth else 4
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
         features: list[Tensor] = []
@@ -109,18 +118,27 @@ class CraterNet(nn.Module):
 
 
 class ExportedCraterNet(nn.Module):
-    """The network as flight runs it: probabilities, and geometry with the corrections of `export.calibrate`."""
+    """The network as flight runs it: probabilities, and geometry with the corrections of `calibrate.calibrate`.
+
+    `heat_channels` 1 leaves the paper's class heatmaps out.
+    """
 
     def __init__(
-        self, network: CraterNet, geometry_shift: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+        self,
+        network: CraterNet,
+        geometry_shift: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0),
+        heat_channels: int = 1,
     ) -> None:
         super().__init__()
         self.network = network
-        self.register_buffer("shift", torch.tensor(geometry_shift, dtype=torch.float32).reshape(1, 4, 1, 1))
+        self.heat_channels = heat_channels
+        shift = torch.zeros(1, network.geometry_channels, 1, 1)
+        shift[0, :4, 0, 0] = torch.tensor(geometry_shift)
+        self.register_buffer("shift", shift)
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
         heat, geometry = self.network(image)
-        return torch.sigmoid(heat), geometry + self.shift
+        return torch.sigmoid(heat[:, : self.heat_channels]), geometry + self.shift
 
 
 def count_parameters(network: nn.Module) -> int:

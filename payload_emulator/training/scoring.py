@@ -12,7 +12,7 @@ and craters of 5-30 km whatever their class.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +49,10 @@ class FrameTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameDetections:
-    """Detections of one frame, arrays (n,), best first, with the diameter on the ground."""
+    """Detections of one frame, arrays (n,), best first, with the diameter on the ground.
+
+    `depth_ratio` where the network tells it; `size_class` where it names the class itself, as the paper's does.
+    """
 
     u_px: Floats
     v_px: Floats
@@ -57,6 +60,8 @@ class FrameDetections:
     diameter_m: Floats
     score: Floats
     sigma_px: Floats
+    depth_ratio: Floats | None = None
+    size_class: NDArray[np.int8] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +128,8 @@ class Tally:
 
     Detections: score, outcome (1 right, 0 wrong, -1 not counted); where right error_u, error_v (detection minus
     crater) and log_diameter_ratio (detection over crater). Craters: score at which each was found (NaN: never).
+    Places in the image (u, v) and numbers of the frames say where and when; matched_depth_ratio is the crater's,
+    detection_depth_ratio what the network says (NaN: it does not).
     """
 
     score: Floats
@@ -133,12 +140,31 @@ class Tally:
     detection_block: NDArray[np.int64]
     detection_octant: NDArray[np.int64]
     log_diameter_ratio: Floats
+    detection_u: Floats
+    detection_v: Floats
+    detection_frame: NDArray[np.int64]
+    detection_depth_ratio: Floats
+    matched_depth_ratio: Floats
     crater_score: Floats
     crater_depth_ratio: Floats
     crater_diameter_px: Floats
     crater_diameter_m: Floats
     crater_id: NDArray[np.int64]
     crater_block: NDArray[np.int64]
+    crater_u: Floats
+    crater_v: Floats
+    crater_frame: NDArray[np.int64]
+
+    def select(self, detections: NDArray[np.bool_], craters: NDArray[np.bool_]) -> Tally:
+        """The part of a tally that masks of its detections and craters choose."""
+        return Tally(
+            **{
+                item.name: getattr(self, item.name)[
+                    craters if item.name.startswith("crater_") else detections
+                ]
+                for item in fields(self)
+            }
+        )
 
     def figures(self, threshold: float) -> Figures:
         """Figures of the detections with a score of at least `threshold`."""
@@ -192,7 +218,7 @@ def tally(
     rule = rule or MatchRule()
     parts: list[tuple[NDArray[np.generic], ...]] = []
     craters: list[tuple[NDArray[np.generic], ...]] = []
-    for truth, found in zip(truths, detections, strict=True):
+    for number, (truth, found) in enumerate(zip(truths, detections, strict=True)):
         in_frame = (
             (truth.u_px >= -0.5)
             & (truth.u_px <= truth.width_px - 0.5)
@@ -201,7 +227,8 @@ def tally(
         )
         if classes:
             wanted = in_frame & np.isin(size_class(truth.diameter_m), classes)
-            chosen = np.isin(size_class(found.diameter_m), classes)
+            own = size_class(found.diameter_m) if found.size_class is None else found.size_class
+            chosen = np.isin(own, classes)
         else:
             wanted = in_frame & (truth.diameter_m >= low_m) & (truth.diameter_m <= high_m)
             chosen = (found.diameter_m >= low_m) & (found.diameter_m <= high_m)
@@ -244,6 +271,11 @@ def tally(
                 np.full(d.size, truth.block),
                 np.full(d.size, octant),
                 log_ratio,
+                found.u_px[d],
+                found.v_px[d],
+                np.full(d.size, number),
+                np.full(d.size, np.nan) if found.depth_ratio is None else found.depth_ratio[d],
+                np.where(hit >= 0, truth.depth_ratio[w][hit] if w.size else np.nan, np.nan),
             )
         )
         score = np.full(w.size, np.nan)
@@ -256,9 +288,12 @@ def tally(
                 truth.diameter_m[w],
                 truth.ids[w],
                 np.full(w.size, truth.block),
+                truth.u_px[w],
+                truth.v_px[w],
+                np.full(w.size, number),
             )
         )
-    return Tally(*_columns(parts, 8), *_columns(craters, 6))
+    return Tally(*_columns(parts, 13), *_columns(craters, 9))
 
 
 def match_any(
@@ -309,6 +344,21 @@ def threshold_for_precision(tallied: Tally, precision: float) -> float:
             break
         chosen = float(threshold)
     return chosen
+
+
+def average_precision(tallied: Tally) -> float:
+    """Area under precision over recall, with precision made to fall with recall as usual; NaN without craters."""
+    counted = tallied.outcome >= 0
+    if tallied.crater_score.size == 0:
+        return float("nan")
+    order = np.argsort(-tallied.score[counted], kind="stable")
+    right = np.cumsum(tallied.outcome[counted][order] == 1)
+    if right.size == 0:
+        return 0.0
+    precision = right / np.arange(1, right.size + 1)
+    precision = np.maximum.accumulate(precision[::-1])[::-1]
+    recall = np.concatenate([[0.0], right / tallied.crater_score.size])
+    return float(np.sum(np.diff(recall) * precision))
 
 
 def bootstrap_f1(tallied: Tally, threshold: float, seed: int = 0, rounds: int = 400) -> tuple[float, float]:

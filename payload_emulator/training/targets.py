@@ -33,8 +33,8 @@ class Targets:
     """Arrays on the cells of one image (h, w).
 
     heat (c, h, w): 1 at centres, Gaussian around. weight (c, h, w): of the positive term at centres, else 0.
-    negative (c, h, w): weight of the negative term. geometry (3, h, w): offsets in cells, ln diameter; regressed
-    (h, w): weight of the geometry loss, non-zero on the 3 x 3 cells around centres.
+    negative (c, h, w): weight of the negative term. geometry (4, h, w): offsets in cells, ln diameter, ten times
+    depth/diameter; regressed (h, w): weight of the geometry loss, non-zero on the 3 x 3 cells around centres.
     """
 
     heat: NDArray[np.float32]
@@ -53,8 +53,12 @@ def make_targets(
     tier: NDArray[np.int8],
     weight: NDArray[np.float64],
     size_class: NDArray[np.int8] | None = None,
+    depth_ratio: NDArray[np.float64] | None = None,
 ) -> Targets:
-    """Targets of craters (n,) in an image; `size_class` given: three class heatmaps follow the common one."""
+    """Targets of craters (n,) in an image; `size_class` given: three class heatmaps follow the common one.
+
+    `depth_ratio` (n,) is depth/diameter; None leaves that target zero.
+    """
     from payload_emulator.training._target_kernel import paint
 
     rows, columns = height_px // STRIDE_PX, width_px // STRIDE_PX
@@ -63,10 +67,11 @@ def make_targets(
         np.zeros((channels, rows, columns), np.float32),
         np.zeros((channels, rows, columns), np.float32),
         np.ones((channels, rows, columns), np.float32),
-        np.zeros((3, rows, columns), np.float32),
+        np.zeros((4, rows, columns), np.float32),
         np.zeros((rows, columns), np.float32),
     )
     centre_of_cell = (STRIDE_PX - 1) / 2.0
+    tenfold_depth = 10.0 * np.asarray(np.zeros(np.shape(u_px)) if depth_ratio is None else depth_ratio, float)
     classes = np.full(np.shape(u_px), -1, np.int8) if size_class is None else np.asarray(size_class, np.int8)
     paint(
         (np.asarray(u_px, np.float64) - centre_of_cell) / STRIDE_PX,
@@ -76,6 +81,7 @@ def make_targets(
         np.asarray(weight, np.float64),
         classes,
         np.log(np.asarray(diameter_px, np.float64) / REFERENCE_DIAMETER_PX),
+        tenfold_depth,
         SIGMA_OF_RADIUS,
         MIN_SIGMA_CELLS,
         IGNORE_OF_RADIUS,

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import copy
 import csv
+import hashlib
 import json
 import math
 import os
@@ -26,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lunar.catalogue import size_class
-from payload_emulator.errors import DatasetError
+from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.training.augment import AugmentParameters, make_crop
 from payload_emulator.training.dataset import Dataset, Frame, choose_tiers
 from payload_emulator.training.targets import Tier, make_targets
@@ -69,7 +70,8 @@ class TrainParameters:
     patience: int = 0
     seed: int = 1
     replicas: int = 0
-    paper_classes: bool = False
+    paper_classes: bool = True
+    depth: bool = True
     pyramid_channels: int = 48
     detail_blocks: int = 1
     detail_channels: int = 24
@@ -119,6 +121,7 @@ def train(
         parameters.detail_blocks,
         parameters.detail_channels,
         parameters.paper_classes,
+        parameters.depth,
     )
     network = CraterNet(config).to(device, memory_format=torch.channels_last)
     average = copy.deepcopy(network).eval()
@@ -126,6 +129,7 @@ def train(
         _parameter_groups(network, parameters.weight_decay), lr=parameters.learning_rate, fused=True
     )
     state = _Progress()
+    origin: dict[str, Any] | None = None
     checkpoint = run / "checkpoint.pt"
     if checkpoint.is_file():
         stored = torch.load(checkpoint, map_location=device, weights_only=False)
@@ -135,12 +139,10 @@ def train(
         state = _Progress(**stored["progress"])
         report(f"resumed at step {state.step}, {state.seconds / 60:.1f} min, best F1 {state.best_f1:.3f}")
     elif start_from is not None:
-        stored = torch.load(start_from, map_location=device, weights_only=False)
-        network.load_state_dict(stored["average"])
-        average.load_state_dict(stored["average"])
+        origin = _start_from(start_from, network, average)
         report(f"started from {start_from.name}")
     images = _load_images(train_frames, report)
-    _write_run(run, parameters, datasets, config.to_dict(), replicas, device)
+    _write_run(run, parameters, datasets, config.to_dict(), replicas, device, origin)
     team = _Team(network, replicas, device, parameters)
     feeder = _Feeder(train_frames, images, parameters)
     shown = _Shown()
@@ -208,10 +210,10 @@ class _Shown:
     """Running means of the loss terms since the last line."""
 
     def __init__(self) -> None:
-        self.names = ("total", "heat", "offset", "diameter", "sigma")
-        self.sums = np.zeros(5)
+        self.names = ("total", "heat", "offset", "diameter", "sigma", "depth")
+        self.sums = np.zeros(6)
         self.count = 0
-        self.last = np.full(5, np.nan)
+        self.last = np.full(6, np.nan)
         self.clock = time.monotonic()
 
     def add(self, terms: NDArray[np.float64]) -> None:
@@ -222,7 +224,7 @@ class _Shown:
         self.last = self.sums / max(self.count, 1)
         now = time.monotonic()
         speed = self.count * batch / max(now - self.clock, 1e-9)
-        self.sums, self.count, self.clock = np.zeros(5), 0, now
+        self.sums, self.count, self.clock = np.zeros(6), 0, now
         parts = " ".join(f"{name} {value:.3f}" for name, value in zip(self.names, self.last, strict=True))
         return f"step {state.step} {state.seconds / 60:.1f} min {parts} rate {rate:.2e} {speed:.1f} images/s"
 
@@ -285,6 +287,7 @@ class _Feeder:
             tier,
             weights[near],
             size_class(craters["diameter_m"].astype(np.float64))[near] if p.paper_classes else None,
+            np.nan_to_num(craters["depth_ratio"].astype(np.float64))[near],
         )
         return {
             "image": crop.image[None],
@@ -358,7 +361,7 @@ class _Team:
 
         p = self.parameters
         micro = count if self.device == "cuda" else min(p.micro_batch, count)
-        sums = np.zeros(5)
+        sums = np.zeros(6)
         for start in range(0, count, micro):
             size = min(micro, count - start)
             arrays = feeder.batch(first + start, size)
@@ -377,9 +380,46 @@ class _Team:
                 LossWeights(),
             )
             (terms.total * (size / count)).backward()
-            values = (terms.total.detach(), terms.heat, terms.offset, terms.diameter, terms.sigma)
+            values = (
+                terms.total.detach(),
+                terms.heat,
+                terms.offset,
+                terms.diameter,
+                terms.sigma,
+                terms.depth,
+            )
             sums += np.array([float(value) for value in values]) * (size / count)
         return sums
+
+
+def _start_from(path: Path, network: Any, average: Any) -> dict[str, Any]:
+    """Give both networks the averaged weights of a checkpoint; what it was comes back.
+
+    A checkpoint with fewer heads gives those it has; class heatmaps begin as copies of the common one.
+    """
+    from payload_emulator.training.export import load_network
+
+    other, stored = load_network(path)
+    weights = other.state_dict()
+    heats, mine = other.heat_channels, network.heat_channels
+    for name in ("head.weight", "head.bias"):
+        old, new = weights[name], network.state_dict()[name].clone().cpu()
+        new[:mine] = old[:1]
+        new[: min(heats, mine)] = old[: min(heats, mine)]
+        shared = min(other.geometry_channels, network.geometry_channels)
+        new[mine : mine + shared] = old[heats : heats + shared]
+        weights[name] = new
+    try:
+        network.load_state_dict(weights)
+    except RuntimeError as error:
+        raise ModelError(f"{path}: expected a network of {network.config}, found {other.config}") from error
+    average.load_state_dict(network.state_dict())
+    return {
+        "checkpoint": path.name,
+        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "steps": stored["progress"]["step"],
+        "minutes": stored["progress"]["seconds"] / 60.0,
+    }
 
 
 def _parameter_groups(network: Any, weight_decay: float) -> list[dict[str, Any]]:
@@ -480,7 +520,11 @@ def _write_run(
     config: dict[str, Any],
     replicas: int,
     device: str,
+    origin: dict[str, Any] | None,
 ) -> None:
+    path = run / "run.json"
+    if origin is None and path.is_file():
+        origin = json.loads(path.read_text(encoding="utf-8")).get("started_from")
     document = {
         "parameters": asdict(parameters),
         "model": config,
@@ -489,8 +533,9 @@ def _write_run(
         ],
         "replicas": replicas,
         "device": device,
+        "started_from": origin,
     }
-    (run / "run.json").write_text(json.dumps(document, indent=1), encoding="utf-8")
+    path.write_text(json.dumps(document, indent=1), encoding="utf-8")
 
 
 _CURVE_COLUMNS = (
@@ -501,6 +546,7 @@ _CURVE_COLUMNS = (
     "offset",
     "diameter",
     "sigma",
+    "depth",
     "f1",
     "precision",
     "recall",
@@ -517,7 +563,7 @@ def _append_curve(run: Path, state: _Progress, shown: _Shown, figures: dict[str,
         if fresh:
             writer.writerow(_CURVE_COLUMNS)
         losses = [f"{value:.5f}" for value in shown.last]
-        scores = [f"{figures[key]:.5f}" for key in _CURVE_COLUMNS[7:]]
+        scores = [f"{figures[key]:.5f}" for key in _CURVE_COLUMNS[8:]]
         writer.writerow([state.step, f"{state.seconds / 60:.3f}", *losses, *scores])
 
 
