@@ -18,6 +18,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from lunar.errors import LunarError
 from lunar.timescales import parse_utc
 from payload_emulator.errors import ScenarioError
+from payload_emulator.sim.sensor import SensorModel
 
 SHIPPED = Path(__file__).resolve().parent.parent / "scenarios"
 
@@ -93,19 +94,35 @@ class WindowSection:
 
 @dataclass(frozen=True, slots=True)
 class CameraSection:
-    """The pinhole camera (paper, section V-B.3)."""
+    """The camera (paper, section V-B.3).
+
+    `yaw_deg` turns it clockwise from image up to the north, then `tilt_deg` leans it from nadir toward image up.
+    `k1` to `p2` are Brown's coefficients of the true lens: flight software knows a pinhole, so they are what its
+    calibration missed.
+    """
 
     width_px: int = 512
     height_px: int = 512
     fov_deg: float = 120.0
     frame_interval_s: float = 15.0
+    tilt_deg: float = 0.0
+    yaw_deg: float = 0.0
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class LightSection:
-    """`paper`: the Sun drawn anew for each frame (section V-B.4); `real`: from the ephemeris."""
+    """`paper`: the Sun drawn anew for each frame (section V-B.4); `real`: from the ephemeris.
+
+    `photometry` is the law by which the ground scatters it.
+    """
 
     mode: Literal["paper", "real"] = "paper"
+    photometry: Literal["lunar-lambert", "lambert", "hapke"] = "lunar-lambert"
     elevation_min_deg: float = 5.0
     elevation_max_deg: float = 15.0
     azimuth_min_deg: float = -45.0
@@ -204,6 +221,7 @@ class Scenario:
     maneuvers: ManeuverSection = field(default_factory=ManeuverSection)
     window: WindowSection = field(default_factory=WindowSection)
     camera: CameraSection = field(default_factory=CameraSection)
+    sensor: SensorModel = field(default_factory=SensorModel)
     light: LightSection = field(default_factory=LightSection)
     terrain: TerrainSection = field(default_factory=TerrainSection)
     navigation: NavigationSection = field(default_factory=NavigationSection)
@@ -383,6 +401,7 @@ def _check(scenario: Scenario, source: str) -> None:
     require(16 <= camera.width_px <= 8192, "camera.width_px", "from 16 to 8192", camera.width_px)
     require(16 <= camera.height_px <= 8192, "camera.height_px", "from 16 to 8192", camera.height_px)
     require(1.0 <= camera.fov_deg <= 170.0, "camera.fov_deg", "from 1 to 170", camera.fov_deg)
+    require(-60.0 <= camera.tilt_deg <= 60.0, "camera.tilt_deg", "from -60 to 60", camera.tilt_deg)
     require(camera.frame_interval_s > 0.0, "camera.frame_interval_s", "positive", camera.frame_interval_s)
     require(
         0.0 < window.latitude_limit_deg <= 90.0,

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
+from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder
@@ -26,9 +26,11 @@ from payload_emulator.errors import ScenarioError
 from payload_emulator.orbit import force_model, propagate_scenario
 from payload_emulator.scenario import Scenario
 from payload_emulator.sim.disturbances import TrueBurn, changed, executed, turned_state
+from payload_emulator.sim.lens import BrownCamera, pointed_camera_from_mcmf
 from payload_emulator.sim.light import sun_direction_mcmf
+from payload_emulator.sim.photometry import Photometry
 from payload_emulator.sim.renderer import render
-from payload_emulator.sim.sensor import SensorModel, expose
+from payload_emulator.sim.sensor import Picture, take_picture
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.tiles import TiledTerrain
 from payload_emulator.sim.truth import (
@@ -68,8 +70,25 @@ class World:
 
     @property
     def camera(self) -> PinholeCamera:
+        """The camera as flight and ground know it."""
         section = self.scenario.camera
         return PinholeCamera(section.width_px, section.height_px, np.radians(section.fov_deg))
+
+    @property
+    def true_camera(self) -> PinholeCamera:
+        """The camera that takes the pictures: with the distortion of its lens, where it has some."""
+        section, ideal = self.scenario.camera, self.camera
+        distortion = (section.k1, section.k2, section.k3, section.p1, section.p2)
+        if not any(distortion):
+            return ideal
+        return BrownCamera(ideal.width_px, ideal.height_px, ideal.fov_rad, *distortion)
+
+    def camera_from_mcmf(self, position_mcmf_m: FloatArray) -> FloatArray:
+        """Rotation (3, 3) to the camera as it is meant to point from a position (3,)."""
+        section = self.scenario.camera
+        return pointed_camera_from_mcmf(
+            position_mcmf_m, np.radians(section.tilt_deg), np.radians(section.yaw_deg)
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +102,7 @@ class Exposure:
     """
 
     utc_ns: int
-    image: NDArray[np.uint8]
+    image: Picture
     attitude: FloatArray
     clock_ticks: int
     camera_from_mcmf: FloatArray
@@ -189,7 +208,7 @@ def expose_frame(world: World, number: int) -> Exposure:
     sun = true_sun_direction(world, position, utc_ns, rng)
     attitude = scenario.attitude
     pointing = np.radians(attitude.pointing_error_deg) * rng.standard_normal(3)
-    camera_from_mcmf = perturbed(nadir_camera_from_mcmf(position), pointing)
+    camera_from_mcmf = perturbed(world.camera_from_mcmf(position), pointing)
     camera_from_icrf = camera_from_mcmf @ world.truth.orientation.mcmf_from_icrf(tdb_s)
     image = _image(world, utc_ns, position, camera_from_mcmf, sun, rng)
     bias = np.radians(attitude.knowledge_bias_deg) * np.random.default_rng(
@@ -213,17 +232,18 @@ def _image(
     camera_from_mcmf: FloatArray,
     sun_mcmf: FloatArray,
     rng: np.random.Generator,
-) -> NDArray[np.uint8]:
+) -> Picture:
     """What the camera gives: nothing in an outage, noise in deep night."""
-    section, camera = world.scenario.disturbances, world.camera
+    section, camera = world.scenario.disturbances, world.true_camera
     elapsed_s = (utc_ns - int(world.frame_utc_ns[0])) / _NS
     if section.outage_at_s <= elapsed_s < section.outage_at_s + section.outage_duration_s:
         return np.empty((0, 0, 3), dtype=np.uint8)
     if position_mcmf_m @ sun_mcmf < -np.sin(_NIGHT_RAD) * np.linalg.norm(position_mcmf_m):
         radiance = np.zeros((camera.height_px, camera.width_px), dtype=np.float32)
     else:
-        radiance = render(world.terrain, camera, position_mcmf_m, camera_from_mcmf, sun_mcmf).radiance
-    return expose(radiance, SensorModel(), rng)
+        law = Photometry(world.scenario.light.photometry)
+        radiance = render(world.terrain, camera, position_mcmf_m, camera_from_mcmf, sun_mcmf, law).radiance
+    return take_picture(radiance, world.scenario.sensor, rng)
 
 
 def true_sun_direction(

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from payload_emulator.errors import PayloadError
 
 Image = npt.NDArray[np.float32]
+Picture = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 COLOUR = (1.06, 1.0, 0.90)
 """Red, green and blue response to sunlit regolith after white balance on the Sun: the Moon is slightly red."""
@@ -23,6 +24,25 @@ FULL_RADIANCE_FLOOR = 1.0e-4
 TRANSFER_STEPS = 16_384
 
 
+_BOUNDS = (
+    ("exposure", 0.0, math.inf),
+    ("gain", 1.0e-3, 1.0e3),
+    ("exposure_target", 1.0e-3, 1.0e3),
+    ("exposure_percentile", 0.0, 100.0),
+    ("psf_sigma_px", 0.0, 50.0),
+    ("vignetting", 0.0, 1.0),
+    ("full_well_e", 1.0, math.inf),
+    ("read_noise_e", 0.0, math.inf),
+    ("dark_e", 0.0, math.inf),
+    ("gain_mismatch", 0.0, 1.0),
+    ("gamma", 0.05, 20.0),
+    ("offset", 0.0, 1.0),
+    ("hot_pixels", 0.0, 1.0),
+    ("smear", 0.0, 1.0),
+    ("stray", 0.0, 1.0),
+)
+
+
 @dataclass(frozen=True, slots=True)
 class SensorModel:
     """A colour camera; the defaults are a decent space-grade CMOS behind a fast wide-angle lens.
@@ -30,7 +50,9 @@ class SensorModel:
     Attributes
     ----------
     exposure
-        Full-scale signal per unit of radiance; 0 sets it frame by frame from the picture.
+        Share of the full well per unit of radiance; 0 sets it frame by frame from the picture.
+    gain
+        Of the amplifier: full scale is reached at this part of the full well, so less light makes a noisier picture.
     exposure_target, exposure_percentile
         Auto exposure brings this percentile of the sunlit pixels to this share of full scale.
     psf_sigma_px
@@ -56,6 +78,7 @@ class SensorModel:
     """
 
     exposure: float = 0.0
+    gain: float = 1.0
     exposure_target: float = 0.85
     exposure_percentile: float = 99.0
     psf_sigma_px: float = 0.55
@@ -74,6 +97,10 @@ class SensorModel:
     def __post_init__(self) -> None:
         if self.bits not in (8, 12, 16):
             raise PayloadError(f"sensor: expected 8, 12 or 16 bits, found {self.bits}")
+        for name, low, high in _BOUNDS:
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise PayloadError(f"sensor: expected {name} from {low:g} to {high:g}, found {value:g}")
 
 
 def expose(radiance: Image, sensor: SensorModel, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
@@ -86,6 +113,11 @@ def expose(radiance: Image, sensor: SensorModel, rng: np.random.Generator) -> np
 def expose_deep(radiance: Image, sensor: SensorModel, rng: np.random.Generator) -> npt.NDArray[np.uint16]:
     """RGB picture (H, W, 3) in 16 bits with the sensor's own steps: full scale is 65535 at any depth."""
     return _read_out(radiance, sensor, rng)
+
+
+def take_picture(radiance: Image, sensor: SensorModel, rng: np.random.Generator) -> Picture:
+    """RGB picture (H, W, 3) of a radiance (H, W): 8-bit numbers of an 8-bit sensor, 16-bit numbers of a deeper one."""
+    return expose(radiance, sensor, rng) if sensor.bits == 8 else expose_deep(radiance, sensor, rng)
 
 
 def random_sensor(rng: np.random.Generator) -> SensorModel:
@@ -120,7 +152,7 @@ def _read_out(radiance: Image, sensor: SensorModel, rng: np.random.Generator) ->
 
     signal = _blurred(np.asarray(radiance, dtype=np.float32), sensor.psf_sigma_px)
     height, width = signal.shape
-    signal *= np.float32(sensor.exposure or auto_exposure(radiance, sensor))
+    signal *= np.float32(sensor.exposure * sensor.gain or auto_exposure(radiance, sensor))
     if sensor.vignetting:
         v = np.linspace(-1.0, 1.0, height, dtype=np.float32)[:, None]
         u = np.linspace(-1.0, 1.0, width, dtype=np.float32)[None, :]
@@ -137,7 +169,7 @@ def _read_out(radiance: Image, sensor: SensorModel, rng: np.random.Generator) ->
         signal,
         noise,
         np.array(COLOUR, np.float32),
-        sensor.full_well_e,
+        sensor.full_well_e / sensor.gain,
         sensor.dark_e,
         sensor.read_noise_e,
         sensor.offset,
