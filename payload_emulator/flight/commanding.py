@@ -1,18 +1,23 @@
-"""Telecommand octets to commands: cut, checked, named; what cannot be read is refused with a reason."""
+"""Telecommand octets to commands: cut, checked, named, never twice; others are refused with a reason."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import zlib
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import ChecksumError, MalformedPacket, TmtcError, UnknownPacket
+from tmtc.packets import SEQUENCE_COUNT_LIMIT
 
 _PRIMARY_HEADER_LENGTH = 6
 _SHORTEST_PACKET = 13
 # Codes of the dictionary's failure table.
-_UNKNOWN_PACKET, _BAD_CHECKSUM, _BAD_LENGTH, _OUT_OF_RANGE = 1, 2, 3, 4
+_CODES = {name: code for code, name in DICTIONARY.labels("verification_not_accepted", "failure_code").items()}
+# Commands remembered, so that none is carried out twice; older ones are out of sequence in any case.
+_REMEMBERED = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +28,11 @@ class Command:
     values: dict[str, Any]
     request_id: int
     acknowledgements: int
+    packet: bytes
+
+    @property
+    def sequence_count(self) -> int:
+        return self.request_id & (SEQUENCE_COUNT_LIMIT - 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +43,11 @@ class Refusal:
     failure_code: int
 
 
+def failure(name: str) -> int:
+    """The code of a reason in the dictionary's failure table."""
+    return _CODES[name]
+
+
 def parse_commands(octets: bytes) -> Iterator[Command | Refusal]:
     """Return the telecommand packets laid end to end in the octets; a broken length ends the reading."""
     while octets:
@@ -40,21 +55,68 @@ def parse_commands(octets: bytes) -> Iterator[Command | Refusal]:
         request_id = int.from_bytes(padded, "big")
         length = 7 + int.from_bytes(octets[4:6], "big") if len(octets) >= _PRIMARY_HEADER_LENGTH else 0
         if length < _SHORTEST_PACKET or length > len(octets):
-            yield Refusal(request_id, _BAD_LENGTH)
+            yield Refusal(request_id, failure("bad_length"))
             return
         packet, octets = octets[:length], octets[length:]
         yield _read(packet, request_id)
+
+
+@dataclass(slots=True)
+class CommandHistory:
+    """Which commands came before: a repeated packet is a duplicate, an older count is out of sequence.
+
+    Counts may jump forward (commands lost on the way), by less than half of their range. A packet is known by its
+    request id and CRC-32.
+    """
+
+    newest_count: int = -1
+    _seen: OrderedDict[tuple[int, int], None] = field(default_factory=OrderedDict)
+
+    def judge(self, packet: bytes, *, in_sequence: bool = True) -> int:
+        """0 for a new command in sequence, else the code of what is wrong."""
+        if self._key(packet) in self._seen:
+            return failure("duplicate")
+        if in_sequence and self.newest_count >= 0:
+            ahead = (self._count(packet) - self.newest_count) % SEQUENCE_COUNT_LIMIT
+            if not 0 < ahead < SEQUENCE_COUNT_LIMIT // 2:
+                return failure("out_of_sequence")
+        return 0
+
+    def note(self, packet: bytes, *, in_sequence: bool = True) -> None:
+        """Remember a command as taken; `in_sequence` ones move the newest count."""
+        self._seen[self._key(packet)] = None
+        if in_sequence:
+            self.newest_count = self._count(packet)
+        while len(self._seen) > _REMEMBERED:
+            self._seen.popitem(last=False)
+
+    def to_plain(self) -> list[Any]:
+        """The history as numbers, for non-volatile memory."""
+        return [self.newest_count, [list(key) for key in self._seen]]
+
+    def restore(self, plain: Iterable[Any]) -> None:
+        """Take what `to_plain` gave."""
+        self.newest_count, seen = plain
+        self._seen = OrderedDict(((int(request), int(crc)), None) for request, crc in seen)
+
+    @staticmethod
+    def _key(packet: bytes) -> tuple[int, int]:
+        return int.from_bytes(packet[:4], "big"), zlib.crc32(packet)
+
+    @staticmethod
+    def _count(packet: bytes) -> int:
+        return int.from_bytes(packet[2:4], "big") & (SEQUENCE_COUNT_LIMIT - 1)
 
 
 def _read(packet: bytes, request_id: int) -> Command | Refusal:
     try:
         decoded = DICTIONARY.unpack_command(packet)
     except ChecksumError:
-        return Refusal(request_id, _BAD_CHECKSUM)
+        return Refusal(request_id, failure("bad_checksum"))
     except UnknownPacket:
-        return Refusal(request_id, _UNKNOWN_PACKET)
+        return Refusal(request_id, failure("unknown_packet"))
     except MalformedPacket:
-        return Refusal(request_id, _BAD_LENGTH)
+        return Refusal(request_id, failure("bad_length"))
     except TmtcError:
-        return Refusal(request_id, _OUT_OF_RANGE)
-    return Command(decoded.name, decoded.values, request_id, decoded.acknowledgements)
+        return Refusal(request_id, failure("value_out_of_range"))
+    return Command(decoded.name, decoded.values, request_id, decoded.acknowledgements, packet)

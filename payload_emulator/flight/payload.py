@@ -1,132 +1,58 @@
 """The payload as the spacecraft sees it: images, attitude, clock and telecommands in, space packets out.
 
-`Payload.step` is the only door of flight software. Everything it takes is an array, a count or octets;
-everything it says comes back as packets of the dictionary. It reads no clock but the ticks it is given.
+`Payload.step` is the only door of flight software; what else it needs of the spacecraft comes through the `Board` that
+it runs on. Everything it takes is an array, a count or octets; everything it says comes back as packets of the
+dictionary. It reads no clock but the ticks it is given.
 """
 
 from __future__ import annotations
 
-import hashlib
-from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from enum import IntEnum
-from typing import Any, TypeVar
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar.camera import PinholeCamera
-from lunar.catalogue import size_class
-from lunar.frames import matrix_from_quaternion
-from payload_emulator.errors import TableError
-from payload_emulator.flight import odometry
-from payload_emulator.flight.anchored import AnchoredNavigator, AnchoredParameters
-from payload_emulator.flight.commanding import Command, Refusal, parse_commands
-from payload_emulator.flight.detections import Detections, Detector
-from payload_emulator.flight.odometry import OdometryParameters, OdometryState
-from payload_emulator.flight.outcomes import Mode, Outcome, ResetTrigger
-from payload_emulator.flight.preprocess import ImageQuality
-from payload_emulator.flight.tables import (
-    TICKS_PER_SECOND,
-    AnchorTable,
-    table_hash,
-    unpack_anchor_table,
-    unpack_burn_table,
-    unpack_catalogue_table,
-    unpack_gravity_table,
-    unpack_initial_state,
-    unpack_orientation_table,
-)
-from tmtc.dictionary import DICTIONARY
-from tmtc.packets import PacketSequencer
+from payload_emulator.flight.commanding import Command, Refusal, failure, parse_commands
+from payload_emulator.flight.detections import Detector
+from payload_emulator.flight.fdir import Monitors, Reaction
+from payload_emulator.flight.housekeeping import StageTimer
+from payload_emulator.flight.loads import MODEL_NUMBER, TABLE_NUMBERS, FlightParameters, FlightTables
+from payload_emulator.flight.machine import PARAMETERS_NUMBER, Machine, Observation
+from payload_emulator.flight.memory import ProtectedMemory
+from payload_emulator.flight.modes import PayloadMode
+from payload_emulator.flight.observer import Observer
+from payload_emulator.flight.parameters import ParameterStore
+from payload_emulator.flight.ports import BareBoard, Board, Load, ResetCause, Stage
+from payload_emulator.flight.products import thumbnail_octets
+from payload_emulator.flight.reports import send_large_data, send_structure
+from payload_emulator.flight.services import check, execute, name_of
+from payload_emulator.flight.settings import Recovery, Settings
+from payload_emulator.flight.store import PacketStore, StoreClass
+from payload_emulator.flight.tables import TICKS_PER_SECOND
+from payload_emulator.flight.telemetry import Telemetry
+from tmtc.cuc import TICKS_LIMIT
 from tmtc.pus import ACK_ACCEPTANCE, ACK_COMPLETION, ACK_START
 
+__all__ = ["FlightParameters", "FlightTables", "Payload", "PayloadMode"]
+
 Float = NDArray[np.float64]
-Table = TypeVar("Table")
 
-_NAN = float("nan")
-_UNKNOWN_VECTOR = (_NAN, _NAN, _NAN)
-_PIXEL_LIMIT = 65_535 / 64.0
-# Numbers of tables in events, as in the dictionary's table of tables; orientation and initial state follow it.
-_TABLE_NUMBERS = {
-    "anchor_ephemeris": 1,
-    "catalogue": 2,
-    "gravity": 3,
-    "orientation": 8,
-    "initial_state": 9,
-    "burns": 10,
+_PARAMETERS, _NO_TABLES = FlightParameters(), FlightTables()
+# Octets of packets in a transfer frame, for time reports.
+_FRAME_OCTETS = 1_107
+_HOUR_TICKS = 3_600 * TICKS_PER_SECOND
+_SCRUBBED_RECORDS = 256
+# What is sent in modes without a science downlink.
+_SMALL_CLASSES = (StoreClass.critical, StoreClass.housekeeping)
+# Events of 32-bit hashes by region; other regions have one event between them.
+_MISMATCH_EVENTS = {
+    MODEL_NUMBER: "model_hash_mismatch",
+    PARAMETERS_NUMBER: "parameters_hash_mismatch",
+    TABLE_NUMBERS["catalogue"]: "catalogue_hash_mismatch",
+    TABLE_NUMBERS["anchor_ephemeris"]: "anchor_table_hash_mismatch",
 }
-_STAGES = ((ACK_ACCEPTANCE, "accepted"), (ACK_START, "started"), (ACK_COMPLETION, "completed"))
-# Codes of the dictionary's failure table.
-_UNKNOWN_FUNCTION, _OUT_OF_RANGE = 9, 4
-# No estimate is worth less than this (position in m, velocity in m/s).
-_WIDEST_M = 1e6
-
-
-class PayloadMode(IntEnum):
-    """Mode of the payload as a machine; frames are processed in `observing` only."""
-
-    safe = 0
-    standby = 1
-    observing = 2
-    downlinking = 3
-
-
-@dataclass(frozen=True, slots=True)
-class FlightParameters:
-    """What the parameter table of the payload holds.
-
-    Attributes
-    ----------
-    camera
-        The camera as calibrated on the ground.
-    modes
-        Estimators to run on each frame's detections.
-    odometry
-        Rules of `paper` and `spherical`.
-    anchored
-        Rules of `anchored`.
-    housekeeping_interval_s
-        Time between housekeeping packets.
-    temperature_c, bus_voltage_v, power_w
-        Readings of the sensors of the board; constant until the platform interfaces supply them.
-    """
-
-    camera: PinholeCamera = field(default_factory=PinholeCamera)
-    modes: tuple[Mode, ...] = (Mode.paper, Mode.spherical)
-    odometry: OdometryParameters = field(default_factory=OdometryParameters)
-    anchored: AnchoredParameters = field(default_factory=AnchoredParameters)
-    housekeeping_interval_s: float = 60.0
-    temperature_c: float = 20.0
-    bus_voltage_v: float = 12.0
-    power_w: float = 6.0
-
-    @property
-    def hash(self) -> int:
-        """First 32 bits of the SHA-256 of the parameters as text."""
-        return int.from_bytes(hashlib.sha256(repr(self).encode()).digest()[:4], "big")
-
-    @property
-    def sha256(self) -> str:
-        """SHA-256 of the parameters as text, hexadecimal."""
-        return hashlib.sha256(repr(self).encode()).hexdigest()
-
-
-@dataclass(frozen=True, slots=True)
-class FlightTables:
-    """Tables as uploaded; empty octets where there is none.
-
-    `paper` and `spherical` need the anchor ephemeris; `anchored` needs all the others but the burns, which are only
-    there where some are planned, and never reads that one.
-    """
-
-    anchor_ephemeris: bytes = b""
-    catalogue: bytes = b""
-    gravity: bytes = b""
-    orientation: bytes = b""
-    initial_state: bytes = b""
-    burns: bytes = b""
 
 
 class Payload:
@@ -137,56 +63,69 @@ class Payload:
     detector
         Finds craters in images.
     parameters, tables
-        As loaded at boot. A damaged table is reported and not used.
+        As loaded at boot; tables kept by the board from before a reset go first.
     model_hash
         First 32 bits of the SHA-256 of the detector model, for housekeeping.
     model_octets
-        Size of the detector model, for housekeeping.
+        The detector model itself, which is then protected, or its size in octets.
     boot_count
-        Boots since manufacture.
+        Boots since manufacture, where the board remembers none.
+    board
+        What it runs on.
+    mode
+        Mode after the first boot of a board; later boots come up in `standby`, or resume.
+    make_detector
+        Builds a detector from model octets, so that a damaged model can be replaced by its kept copy.
     """
 
     def __init__(
         self,
         detector: Detector,
-        parameters: FlightParameters = FlightParameters(),
-        tables: FlightTables = FlightTables(),
+        parameters: FlightParameters = _PARAMETERS,
+        tables: FlightTables = _NO_TABLES,
         *,
         model_hash: int = 0,
-        model_octets: int = 0,
+        model_octets: bytes | int = 0,
         boot_count: int = 1,
+        board: Board | None = None,
+        mode: PayloadMode = PayloadMode.observing,
+        make_detector: Callable[[bytes], Detector] | None = None,
     ) -> None:
-        self._detector = detector
-        self._parameters = parameters
-        self._tables = tables
-        self._model_hash = model_hash
-        self._memory_octets = model_octets + sum(len(getattr(tables, name)) for name in _TABLE_NUMBERS)
-        self._boot_count = boot_count
-        self._mode = PayloadMode.observing
-        self._sequencer = PacketSequencer()
-        self._messages: Counter[tuple[int, int]] = Counter()
-        self._counts: Counter[str] = Counter()
-        self._outcomes: dict[Mode, Counter[Outcome]] = {mode: Counter() for mode in parameters.modes}
-        self._triggers: dict[Mode, Counter[ResetTrigger]] = {mode: Counter() for mode in parameters.modes}
-        self._odometry: dict[Mode, OdometryState | None] = {}
-        self._anchor: AnchorTable | None = None
-        self._navigator: AnchoredNavigator | None = None
-        self._reacquisitions = 0
-        self._in_trouble: set[str] = set()
-        self._manual_step = False
-        self._housekeeping_on = True
-        self._housekeeping_interval_s = parameters.housekeeping_interval_s
-        self._next_housekeeping_ticks: int | None = None
+        board = BareBoard() if board is None else board
+        self._first_mode = mode
+        self._make_detector = make_detector
+        self._model = model_octets if isinstance(model_octets, bytes) else b""
+        values = ParameterStore(defaults={"housekeeping_interval_s": parameters.housekeeping_interval_s})
+        store = PacketStore(board.store)
+        telemetry = Telemetry(store)
+        timer = StageTimer(board)
+        self._machine = Machine(
+            board=board,
+            telemetry=telemetry,
+            store=store,
+            timer=timer,
+            settings=Settings(board.settings),
+            observer=Observer(detector, parameters, telemetry, timer),
+            monitors=Monitors(telemetry, values),
+            parameters=values,
+            memory=ProtectedMemory(board),
+            tables=tables,
+            mode=PayloadMode.standby,
+            build=parameters,
+            model_hash=model_hash,
+            model_octets=0 if isinstance(model_octets, bytes) else model_octets,
+            boot_count=boot_count,
+        )
         self._last_ticks: int | None = None
-        self._clock_suspect = False
-        self._last_quality = ImageQuality.OK
-        self._packets: list[bytes] = []
-        self._ticks = 0
+        self._last_uptime = -1
+        self._next_scrub: int | None = None
+        self._camera_off = False
+        self._sent_octets = 0
 
     def step(
         self, image: NDArray[Any], attitude: Float, clock_ticks: int, telecommand_octets: bytes
     ) -> list[bytes]:
-        """Return the space packets that one frame gives rise to.
+        """Return the space packets that go down after one frame, or one turn without a frame.
 
         Parameters
         ----------
@@ -197,444 +136,307 @@ class Payload:
             camera frame; NaN where absent. clock_ticks On-board time of the image, units of 2^-16 s.
             telecommand_octets Telecommand packets that arrived since the frame before, one after another.
         """
-        self._packets, self._ticks = [], int(clock_ticks)
+        machine = self._machine
+        machine.timer.enter(Stage.commands)
+        machine.telemetry.ticks = min(max(int(clock_ticks), 0), TICKS_LIMIT - 1)
         if self._last_ticks is None:
             self._boot()
-        elif self._ticks <= self._last_ticks:
-            self._clock_suspect = True
-            self._event("medium", "clock_jump", (self._ticks - self._last_ticks) / TICKS_PER_SECOND)
-        self._last_ticks = self._ticks
+        self._check_clock(int(clock_ticks))
         for item in parse_commands(telecommand_octets):
-            self._obey(item)
-        if self._mode is PayloadMode.observing:
-            self._observe(image, np.asarray(attitude, dtype=np.float64).reshape(-1))
-        else:
-            self._event("info", "frame_skipped", float(self._mode))
-        self._housekeep()
-        return self._packets
+            self._receive(item)
+        self._release_activities()
+        self._look(image, np.asarray(attitude, dtype=np.float64).reshape(-1))
+        machine.timer.enter(Stage.monitoring)
+        self._monitor()
+        machine.timer.enter(Stage.telemetry)
+        machine.timer.steps += 1
+        for number in machine.housekeeping.due(machine.telemetry.ticks):
+            send_structure(machine, number)
+        packets = self._downlink()
+        machine.save()
+        if machine.reset_wanted is not None:
+            machine.board.request_reset(machine.reset_wanted)
+        machine.timer.enter(Stage.idle)
+        return packets
+
+    @property
+    def mode(self) -> PayloadMode:
+        """The present mode."""
+        return self._machine.mode
+
+    @property
+    def waiting(self) -> int:
+        """Packets that wait for downlink."""
+        return self._machine.store.waiting
 
     def summary(self) -> dict[str, Any]:
         """Return what the payload counted since boot, for the operators of the emulator."""
-        estimators = {mode.name: self._summary_of(mode) for mode in self._parameters.modes}
-        modes = self._parameters.modes
-        primary = Mode.anchored if Mode.anchored in modes else next(iter(modes), None)
-        chosen = estimators[primary.name] if primary is not None else {}
-        return {
-            "estimators": estimators,
-            "outcomes": chosen.get("outcomes", {}),
-            "fixes": {**estimators["anchored"]["outcomes"], "reacquired": self._reacquisitions}
-            if "anchored" in estimators
-            else {},
-            "truth_reads_after_start": chosen.get("anchor_reads_after_start", 0),
-            "frames_processed": self._counts["frames"],
-            "frames_bad": self._counts["frames_bad"],
-            "detections": self._counts["detections"],
-            "events": self._counts["events"],
-        }
+        return self._machine.observer.summary()
 
-    def _summary_of(self, mode: Mode) -> dict[str, Any]:
-        names = [outcome for outcome in Outcome if (outcome >= Outcome.fixed) is (mode is Mode.anchored)]
-        state = self._odometry.get(mode)
-        altitude_reads, resets = (0, 0) if state is None else (state.altitude_reads, state.resets)
-        return {
-            "outcomes": {outcome.name: self._outcomes[mode][outcome] for outcome in names},
-            "reset_triggers": {trigger.name: n for trigger, n in sorted(self._triggers[mode].items())},
-            "resets": resets,
-            "altitude_reads": altitude_reads,
-            "anchor_reads_after_start": max(0, altitude_reads - 1) + max(0, resets - 1),
-        }
+    # Boot
 
     def _boot(self) -> None:
-        self._event("info", "boot", float(self._boot_count))
-        self._anchor = self._load("anchor_ephemeris", unpack_anchor_table)
-        if Mode.anchored in self._parameters.modes:
-            catalogue = self._load("catalogue", unpack_catalogue_table)
-            gravity = self._load("gravity", unpack_gravity_table)
-            orientation = self._load("orientation", unpack_orientation_table)
-            state = self._load("initial_state", unpack_initial_state)
-            burns = self._load("burns", unpack_burn_table)
-            if catalogue and gravity and orientation and state:
-                self._navigator = AnchoredNavigator(
-                    catalogue,
-                    gravity,
-                    orientation,
-                    state,
-                    self._parameters.camera,
-                    self._parameters.anchored,
-                    burns,
-                )
+        machine = self._machine
+        board, telemetry = machine.board, machine.telemetry
+        machine.start_housekeeping(machine.parameters["housekeeping_interval_s"])
+        recovery, kept = machine.settings.read()
+        before = machine.restore(kept) if kept else None
+        stored = machine.store.recover()
+        if stored:
+            telemetry.resume()
+        telemetry.event("info", "boot", float(machine.boot_count), float(board.reset_cause))
+        if recovery in (Recovery.whole, Recovery.older):
+            severity = "info" if recovery is Recovery.whole else "low"
+            telemetry.event(severity, "state_recovered", float(recovery), float(stored))
+        elif recovery is Recovery.lost:
+            telemetry.event("high", "state_lost", float(stored))
+        machine.store.overwrite = bool(machine.parameters["store_overwrite"])
+        self._load_memory()
+        machine.mode = PayloadMode.standby
+        window = machine.observation
+        machine.observation = Observation()
+        if board.reset_cause == ResetCause.watchdog:
+            self._after_watchdog()
+        if machine.mode is PayloadMode.safe:
+            pass
+        elif before is None:
+            wanted = PayloadMode.safe if recovery is Recovery.lost else self._first_mode
+            self._begin(wanted, window)
+        elif before is PayloadMode.safe:
+            self._begin(PayloadMode.safe, window)
+        elif before is PayloadMode.observing and self._may_resume(window):
+            self._begin(PayloadMode.observing, window)
+        machine.switch_loads()
+        machine.changed = True
 
-    def _load(self, name: str, unpack: Callable[[bytes], Table]) -> Table | None:
-        """Return a table as uploaded; None, with an event, where it is damaged, and None where there is none."""
-        octets: bytes = getattr(self._tables, name)
-        if not octets:
-            return None
-        number, identity = float(_TABLE_NUMBERS[name]), float(table_hash(octets))
-        try:
-            table = unpack(octets)
-        except TableError:
-            self._event("high", "table_refused", number, identity)
-            return None
-        self._event("info", "table_loaded", number, identity)
-        return table
+    def _begin(self, mode: PayloadMode, window: Observation) -> None:
+        """The mode after a boot, and the observation that goes on in it."""
+        machine = self._machine
+        machine.mode = mode
+        machine.observation = window if mode is PayloadMode.observing else Observation()
 
-    def _observe(self, image: NDArray[Any], attitude: Float) -> None:
-        """Detect craters in one frame, run every estimator on them, report both."""
-        sun = attitude[4:7] if attitude.size == 7 and np.all(np.isfinite(attitude[4:7])) else None
-        camera_from_icrf = _rotation(attitude)
-        if camera_from_icrf is None:
-            self._event("low", "attitude_missing")
-        quality, found = self._detector.examine(image, sun)
-        finite = np.isfinite(found.u_px) & np.isfinite(found.v_px) & np.isfinite(found.diameter_px)
-        found = found.select(finite)
-        self._last_quality = quality
-        if quality is not ImageQuality.OK:
-            self._counts["frames_bad"] += 1
-            self._event("low", f"image_{quality.name.lower()}")
-        altitude_m = _NAN
-        for mode in self._parameters.modes:
-            if mode is Mode.anchored:
-                usable = found if quality is ImageQuality.OK else None
-                below_m = self._anchored_frame(usable, camera_from_icrf)
-            else:
-                below_m = self._odometry_frame(mode, found)
-            altitude_m = below_m if np.isfinite(below_m) else altitude_m
-        self._report_detections(found, altitude_m)
-        self._manual_step = False
-        self._counts["frames"] += 1
-        self._counts["detections"] += len(found)
+    def _may_resume(self, window: Observation) -> bool:
+        machine = self._machine
+        if machine.board.reset_cause == ResetCause.commanded or not machine.parameters["autoresume"]:
+            return False
+        return window.stop_ticks == 0 or machine.telemetry.ticks < window.stop_ticks
 
-    def _anchored_frame(self, found: Detections | None, camera_from_icrf: Float | None) -> float:
-        """Run the anchored estimator on one frame, report it, and return its altitude."""
-        mode, detections = Mode.anchored, 0 if found is None else len(found)
-        navigator = self._navigator
-        report = None
-        if navigator is not None:
-            try:
-                report = navigator.step(self._ticks, found, camera_from_icrf)
-            except np.linalg.LinAlgError:
-                self._event("high", "estimator_error", float(mode))
-        outcome = Outcome.refused if report is None else report.outcome
-        self._outcomes[mode][outcome] += 1
-        self._send_outcome(
-            mode,
-            outcome,
-            ResetTrigger.none,
-            detections,
-            (0, 0) if report is None else (report.candidates, report.matched),
-            (_NAN, _NAN),
-            0,
-        )
-        if report is None or navigator is None or not np.isfinite(report.latitude_rad):
-            return _NAN
-        if report.reacquired:
-            self._reacquisitions += 1
-            self._event("medium", "filter_reset", float(report.matched), max(report.sigma_rtn_m))
-        self._trouble(
-            "fix_refused", outcome is Outcome.refused, float(report.candidates), float(report.expected)
-        )
-        self._trouble("filter_divergence", navigator.lost, max(report.sigma_rtn_m), 0.0)
-        self._send(
-            "navigation_state",
-            {
-                "frame_number": self._counts["frames"],
-                "image_ticks": self._ticks,
-                "estimator": int(mode),
-                "outcome": int(outcome),
-                "latitude_deg": float(np.degrees(report.latitude_rad)),
-                "longitude_deg": float(np.degrees(report.longitude_rad)) % 360.0,
-                "altitude_m": report.altitude_m,
-                "velocity_icrf_m_s": report.velocity_icrf_m_s,
-                "sigma_rtn_m": report.sigma_rtn_m,
-                "nis": report.nis,
-                "matched": report.matched,
-            },
-        )
-        self._send_filter(navigator, found)
-        return report.altitude_m
+    def _after_watchdog(self) -> None:
+        """Report the reset; too many of them end in safe mode."""
+        machine = self._machine
+        now = machine.telemetry.ticks
+        machine.counts["watchdog_resets"] += 1
+        recent = [ticks for ticks in machine.watchdog_ticks if 0 <= now - ticks < _HOUR_TICKS]
+        machine.watchdog_ticks = [*recent, now]
+        machine.telemetry.event("high", "watchdog_reset", float(machine.counts["watchdog_resets"]))
+        if len(machine.watchdog_ticks) >= machine.parameters["watchdog_limit"]:
+            self._go_safe(float(ResetCause.watchdog))
 
-    def _send_filter(self, navigator: AnchoredNavigator, found: Detections | None) -> None:
-        """Send what the ground needs to judge and to smooth the filter: its orbit in full, the pairs of its fix."""
-        frame = {"frame_number": self._counts["frames"], "image_ticks": self._ticks}
-        mean, covariance = navigator.state.mean, navigator.state.covariance[:9, :9]
-        self._send(
-            "filter_state",
-            {
-                **frame,
-                "position_icrf_m": mean[:3],
-                "velocity_icrf_m_s": mean[3:6],
-                "acceleration_rtn_m_s2": mean[6:9],
-                "covariance": covariance[np.tril_indices(9)],
-            },
-        )
-        fix = navigator.last_fix
-        if fix is not None and found is not None:
-            reported = _reported(found)
-            sent = np.isin(fix.identification.detection, reported)
-            pairs = {
-                "detection": np.searchsorted(reported, fix.identification.detection[sent]),
-                "crater_id": navigator.landmarks.ids[fix.index[sent]],
-            }
-            self._send("identifications", {**frame, "items": pairs})
+    def _load_memory(self) -> None:
+        """Tables and model into protected memory; those that the board kept go before those given."""
+        machine = self._machine
+        kept = {
+            name: machine.board.read_table(number) or getattr(machine.tables, name)
+            for name, number in TABLE_NUMBERS.items()
+        }
+        machine.tables = replace(machine.tables, **kept)
+        for name, octets in kept.items():
+            if octets:
+                machine.memory.load(TABLE_NUMBERS[name], octets)
+        if self._model:
+            machine.memory.load(MODEL_NUMBER, self._model)
+        machine.protect_parameters()
+        machine.observer.load_tables(machine.tables)
 
-    def _trouble(self, event: str, present: bool, value_1: float, value_2: float) -> None:
-        """Report the beginning of a lasting trouble, once."""
-        if present and event not in self._in_trouble:
-            self._event("medium", event, value_1, value_2)
-        (self._in_trouble.add if present else self._in_trouble.discard)(event)
+    # Time, telecommands, schedule
 
-    def _odometry_frame(self, mode: Mode, found: Detections) -> float:
-        """Run one odometry on one frame, report it, and return the altitude it scaled the frame with."""
-        if self._anchor is None:
-            self._outcomes[mode][Outcome.missed] += 1
-            self._send_outcome(mode, Outcome.missed, ResetTrigger.none, len(found), (0, 0), (_NAN, _NAN), 0)
-            return _NAN
-        state, report = odometry.step(
-            self._odometry.get(mode),
-            self._ticks,
-            found,
-            self._anchor,
-            self._parameters.camera,
-            mode,
-            self._parameters.odometry,
-            manual_step=self._manual_step,
-        )
-        self._odometry[mode] = state
-        self._outcomes[mode][report.outcome] += 1
-        if report.reset_trigger is not ResetTrigger.none:
-            self._triggers[mode][report.reset_trigger] += 1
-            self._event("info", "anchor_read", float(report.reset_trigger), float(mode))
-        self._send_outcome(
-            mode,
-            report.outcome,
-            report.reset_trigger,
-            len(found),
-            (report.candidate_pairs, report.pairs),
-            (report.shift_east_m, report.shift_north_m),
-            0 if state is None else state.altitude_reads,
-        )
-        if state is None:
-            return _NAN
-        self._send(
-            "navigation_state",
-            {
-                "frame_number": self._counts["frames"],
-                "image_ticks": self._ticks,
-                "estimator": int(mode),
-                "outcome": int(report.outcome),
-                "latitude_deg": float(np.degrees(state.latitude_rad)),
-                "longitude_deg": float(np.degrees(state.longitude_rad)) % 360.0,
-                "altitude_m": state.altitude_m,
-                "velocity_icrf_m_s": _UNKNOWN_VECTOR,
-                "sigma_rtn_m": _UNKNOWN_VECTOR,
-                "nis": _NAN,
-                "matched": report.pairs,
-            },
-        )
-        return state.features.altitude_m
+    def _check_clock(self, ticks: int) -> None:
+        """Notice a clock that jumps; what hangs on it starts anew."""
+        machine = self._machine
+        uptime = machine.board.uptime_ticks()
+        if self._last_ticks is not None:
+            ran = uptime - self._last_uptime if uptime >= 0 and self._last_uptime >= 0 else None
+            jump_s = machine.monitors.clock(ticks - self._last_ticks, ran)
+            if jump_s != 0.0 or ticks == self._last_ticks:
+                machine.counts["clock_status"] = 2
+                machine.telemetry.event("medium", "clock_jump", jump_s)
+                machine.housekeeping.restart()
+                self._next_scrub = None
+                machine.observation.next_ticks = 0
+        self._last_ticks, self._last_uptime = ticks, uptime
 
-    def _send_outcome(
-        self,
-        mode: Mode,
-        outcome: Outcome,
-        trigger: ResetTrigger,
-        detections: int,
-        pairs: tuple[int, int],
-        shift_m: tuple[float, float],
-        reads: int,
-    ) -> None:
-        self._send(
-            "frame_outcome",
-            {
-                "frame_number": self._counts["frames"],
-                "image_ticks": self._ticks,
-                "estimator": int(mode),
-                "outcome": int(outcome),
-                "reset_trigger": int(trigger),
-                "detections": detections,
-                "candidate_pairs": pairs[0],
-                "pairs": pairs[1],
-                "shift_east_m": shift_m[0],
-                "shift_north_m": shift_m[1],
-                "anchor_reads": reads,
-            },
-        )
-
-    def _report_detections(self, found: Detections, altitude_m: float) -> None:
-        kept = found.select(_reported(found))
-        self._send(
-            "detections",
-            {
-                "frame_number": self._counts["frames"],
-                "image_ticks": self._ticks,
-                "image_quality": int(self._last_quality),
-                "items": {
-                    "u_px": np.clip(kept.u_px, 0.0, _PIXEL_LIMIT),
-                    "v_px": np.clip(kept.v_px, 0.0, _PIXEL_LIMIT),
-                    "diameter_px": np.clip(kept.diameter_px, 0.0, _PIXEL_LIMIT),
-                    "score": np.clip(np.nan_to_num(kept.score), 0.0, 1.0),
-                    "size_class": self._size_class(kept, altitude_m),
-                    "sigma_px": kept.sigma_px,
-                },
-            },
-        )
-
-    def _size_class(self, found: Detections, altitude_m: float) -> NDArray[np.int8]:
-        """Return size classes by diameter on the sphere below the given altitude; -1 where it is unknown."""
-        camera = self._parameters.camera
-        depth = odometry.depth_on_sphere(found.u_px, found.v_px, altitude_m, camera)
-        return size_class(found.diameter_px * depth / camera.focal_px)
-
-    def _obey(self, item: Command | Refusal) -> None:
-        """Carry out one telecommand and report every stage that it asked to have reported."""
+    def _receive(self, item: Command | Refusal) -> None:
+        """Carry out one telecommand that came over the link, unless it came before or out of sequence."""
+        machine = self._machine
         if isinstance(item, Refusal):
             self._refuse(item.request_id, item.failure_code)
             return
-        failure = self._execute(item)
-        if failure:
-            self._refuse(item.request_id, failure)
+        in_sequence = name_of(item) != "resynchronise_commands"
+        code = machine.history.judge(item.packet, in_sequence=in_sequence) or check(machine, item)
+        if code:
+            self._refuse(item.request_id, code)
             return
-        self._counts["telecommands_accepted"] += 1
-        for flag, name in (
-            (ACK_ACCEPTANCE, "accepted"),
-            (ACK_START, "started"),
-            (ACK_COMPLETION, "completed"),
+        machine.history.note(item.packet)
+        machine.changed = True
+        self._carry_out(item)
+
+    def _release_activities(self) -> None:
+        """Carry out what the schedule holds for this time; what is too late is refused."""
+        machine = self._machine
+        tolerance = round(machine.parameters["schedule_tolerance_s"] * TICKS_PER_SECOND)
+        for activity in machine.schedule.due(machine.telemetry.ticks):
+            machine.changed = True
+            late = machine.telemetry.ticks - activity.release_ticks
+            if late > tolerance:
+                machine.telemetry.event(
+                    "medium", "activity_expired", float(activity.request_id), late / TICKS_PER_SECOND
+                )
+                self._refuse(activity.request_id, failure("expired"))
+                continue
+            command = next(parse_commands(activity.packet))
+            if isinstance(command, Refusal):
+                self._refuse(activity.request_id, command.failure_code)
+                continue
+            machine.telemetry.event("info", "activity_released", float(activity.request_id))
+            if not self._carry_out(command):
+                machine.telemetry.event("medium", "activity_failed", float(activity.request_id))
+
+    def _carry_out(self, command: Command) -> bool:
+        """Execute a command that is acceptable, and report the stages that it asked to have reported."""
+        machine = self._machine
+        request = {"request_id": command.request_id}
+        if command.acknowledgements & ACK_ACCEPTANCE:
+            machine.telemetry.send("verification_accepted", request)
+        code = execute(machine, command)
+        if code:
+            machine.counts["telecommands_rejected"] += 1
+            machine.telemetry.send("verification_not_started", {**request, "failure_code": code})
+            machine.telemetry.event("low", "telecommand_rejected", float(code), float(command.request_id))
+            return False
+        machine.counts["telecommands_accepted"] += 1
+        for flag, name in ((ACK_START, "started"), (ACK_COMPLETION, "completed")):
+            if command.acknowledgements & flag:
+                machine.telemetry.send(f"verification_{name}", request)
+        return True
+
+    def _refuse(self, request_id: int, code: int) -> None:
+        machine = self._machine
+        machine.counts["telecommands_rejected"] += 1
+        machine.telemetry.send("verification_not_accepted", {"request_id": request_id, "failure_code": code})
+        machine.telemetry.event("low", "telecommand_rejected", float(code), float(request_id))
+
+    # Frames
+
+    def _look(self, image: NDArray[Any], attitude: Float) -> None:
+        """Work on a frame, if it is time for one; end the observation when its time is over."""
+        machine = self._machine
+        ticks, window = machine.telemetry.ticks, machine.observation
+        if machine.mode is PayloadMode.observing and window.stop_ticks and ticks >= window.stop_ticks:
+            machine.enter(PayloadMode.standby)
+        if machine.mode is not PayloadMode.observing:
+            if image.size:
+                machine.telemetry.event("info", "frame_skipped", float(machine.mode))
+            return
+        if window.cadence_ticks:
+            if ticks < window.next_ticks - window.cadence_ticks // 2:
+                return
+            window.next_ticks = max(window.next_ticks, ticks - window.cadence_ticks) + window.cadence_ticks
+        if self._camera_off:
+            machine.switch_loads()
+            self._camera_off = False
+        parameters, observer = machine.parameters, machine.observer
+        frame_number = machine.telemetry.frame_number
+        observer.frame(
+            image,
+            attitude,
+            parameters["detector_score_floor"],
+            parameters["detector_timeout_s"],
+            machine.monitors.in_streak,
+        )
+        machine.timer.detector_max_ms = max(machine.timer.detector_max_ms, observer.detector_ms)
+        interval = int(parameters["thumbnail_interval"])
+        if machine.thumbnail_wanted or (interval and frame_number % interval == 0):
+            self._keep_thumbnail(image, frame_number)
+        self._react(machine.monitors.image(image.size > 0, observer.last_quality))
+        self._react(machine.monitors.detector(observer.detector_failed))
+
+    def _keep_thumbnail(self, image: NDArray[Any], frame_number: int) -> None:
+        machine = self._machine
+        machine.thumbnail_wanted = False
+        if image.ndim < 2 or image.dtype.kind not in "uif":
+            return
+        factor = int(machine.parameters["thumbnail_factor"])
+        octets = thumbnail_octets(image, factor, frame_number, machine.telemetry.ticks)
+        send_large_data(machine, "thumbnail", octets)
+        machine.telemetry.event("info", "thumbnail_stored", float(frame_number), float(len(octets)))
+
+    # Faults
+
+    def _monitor(self) -> None:
+        machine = self._machine
+        ticks = machine.telemetry.ticks
+        self._react(machine.monitors.sensors(machine.board.sensors()))
+        machine.monitors.memory(machine.board.memory_octets() / 1024.0)
+        if self._next_scrub is None or ticks >= self._next_scrub:
+            self._next_scrub = ticks + round(machine.parameters["scrub_interval_s"] * TICKS_PER_SECOND)
+            self._scrub()
+        machine.monitors.store(machine.store.overwritten, machine.store.refused)
+
+    def _scrub(self) -> None:
+        """Compare memory with what was loaded; restore what radiation has changed."""
+        machine = self._machine
+        for number, found in machine.memory.damaged():
+            event = _MISMATCH_EVENTS.get(number, "table_hash_mismatch")
+            machine.telemetry.event("high", event, float(number), float(found))
+            octets = machine.memory.repair(number)
+            if octets is None:
+                machine.telemetry.event("high", "memory_unrepairable", float(number))
+                self._go_safe(float(number))
+                continue
+            if number == MODEL_NUMBER and self._make_detector is not None:
+                machine.observer.detector = self._make_detector(octets)
+            machine.telemetry.event("medium", "memory_repaired", float(number), float(machine.memory.repairs))
+        damaged = machine.store.scrub(_SCRUBBED_RECORDS)
+        if damaged:
+            machine.telemetry.event("medium", "storage_corrupt", float(damaged), float(machine.store.damaged))
+
+    def _react(self, reaction: Reaction) -> None:
+        machine = self._machine
+        if reaction is Reaction.cycle_camera:
+            machine.board.switch(Load.accelerator)
+            self._camera_off = True
+        elif reaction is Reaction.end_observation:
+            machine.enter(PayloadMode.standby)
+        elif reaction is Reaction.go_safe:
+            self._go_safe(0.0)
+
+    def _go_safe(self, reason: float) -> None:
+        machine = self._machine
+        if machine.mode is not PayloadMode.safe:
+            machine.telemetry.event("high", "safe_mode_entered", float(machine.mode), reason)
+            machine.enter(PayloadMode.safe)
+
+    # Downlink
+
+    def _downlink(self) -> list[bytes]:
+        """What TM/TC takes of the store; a report of time every so many frames of it."""
+        machine = self._machine
+        takes = machine.board.downlink_octets()
+        kinds = StoreClass if self._sends_all else _SMALL_CLASSES
+        if (
+            machine.time_exponent >= 0
+            and takes
+            and self._sent_octets >= _FRAME_OCTETS << machine.time_exponent
         ):
-            if item.acknowledgements & flag:
-                self._send(f"verification_{name}", {"request_id": item.request_id})
-
-    def _refuse(self, request_id: int, failure_code: int) -> None:
-        self._counts["telecommands_rejected"] += 1
-        self._send("verification_not_accepted", {"request_id": request_id, "failure_code": failure_code})
-        self._event("low", "telecommand_rejected", float(failure_code))
-
-    def _execute(self, command: Command) -> int:
-        """Carry out a telecommand; return 0 or a code of the dictionary's failure table."""
-        values = command.values
-        if command.name == "perform_function":
-            code = int(values["function_id"])
-            function = DICTIONARY.labels("perform_function", "function_id").get(code, "")
-            return self._perform(function, float(values["argument_1"]), float(values["argument_2"]))
-        if command.name in ("enable_housekeeping", "disable_housekeeping"):
-            self._housekeeping_on = command.name == "enable_housekeeping"
-        elif command.name == "set_housekeeping_interval":
-            self._housekeeping_interval_s = float(values["interval_s"])
-            self._next_housekeeping_ticks = self._ticks
-        elif command.name == "request_housekeeping":
-            self._send_housekeeping()
-        elif command.name == "test_connection":
-            self._send("connection_report", {})
-        else:
-            return _UNKNOWN_FUNCTION
-        return 0
-
-    def _perform(self, function: str, argument: float, second: float) -> int:
-        if function == "set_mode" and argument not in (0.0, 1.0, 2.0, 3.0):
-            return _OUT_OF_RANGE
-        if function == "manual_step":
-            self._manual_step = True
-        elif function == "reset_estimators":
-            self._odometry.clear()
-        elif function == "set_mode":
-            self._enter(PayloadMode(int(argument)))
-        elif function == "start_observation":
-            self._enter(PayloadMode.observing)
-        elif function == "widen_estimate":
-            if not (0.0 <= argument <= _WIDEST_M and 0.0 <= second <= _WIDEST_M):
-                return _OUT_OF_RANGE
-            if self._navigator is not None:
-                self._navigator.widen(argument, second)
-        elif function == "stop_observation":
-            self._enter(PayloadMode.standby)
-        else:
-            return _UNKNOWN_FUNCTION
-        return 0
-
-    def _enter(self, mode: PayloadMode) -> None:
-        if mode is not self._mode:
-            self._event("info", "mode_changed", float(self._mode), float(mode))
-            self._mode = mode
-
-    def _housekeep(self) -> None:
-        due = self._next_housekeeping_ticks
-        if not self._housekeeping_on or (due is not None and self._ticks < due and not self._clock_suspect):
-            return
-        self._send_housekeeping()
-        self._next_housekeeping_ticks = self._ticks + round(self._housekeeping_interval_s * TICKS_PER_SECOND)
-
-    def _send_housekeeping(self) -> None:
-        reads = sum(state.altitude_reads + state.resets for state in self._odometry.values() if state)
-        anchor = self._tables.anchor_ephemeris
-        self._send(
-            "housekeeping",
-            {
-                "structure_id": 1,
-                "boot_count": self._boot_count & 0xFFFF,
-                "mode": int(self._mode),
-                "frames_processed": self._counts["frames"],
-                "frames_bad": self._counts["frames_bad"],
-                "detections_total": self._counts["detections"],
-                "packets_sent": self._counts["packets"],
-                "anchor_reads": reads,
-                "events_sent": self._counts["events"],
-                "telecommands_accepted": self._counts["telecommands_accepted"] & 0xFFFF,
-                "telecommands_rejected": self._counts["telecommands_rejected"] & 0xFFFF,
-                "last_image_quality": int(self._last_quality),
-                "temperature_c": self._parameters.temperature_c,
-                "bus_voltage_v": self._parameters.bus_voltage_v,
-                "power_w": self._parameters.power_w,
-                "memory_used_kib": self._memory_octets // 1024,
-                "queue_depth": min(len(self._packets), 0xFFFF),
-                "storage_used_permille": 0,
-                "model_hash": self._model_hash,
-                "parameters_hash": self._parameters.hash,
-                "catalogue_hash": table_hash(self._tables.catalogue) if self._tables.catalogue else 0,
-                "anchor_table_hash": table_hash(anchor) if anchor else 0,
-                "clock_status": 2 if self._clock_suspect else 0,
-                "watchdog_resets": 0,
-            },
-        )
-        self._clock_suspect = False
-
-    def _event(self, severity: str, event: str, value_1: float = 0.0, value_2: float = 0.0) -> None:
-        self._counts["events"] += 1
-        self._send(
-            f"event_{severity}",
-            {
-                "event_id": event,
-                "frame_number": self._counts["frames"],
-                "value_1": value_1,
-                "value_2": value_2,
-            },
-        )
-
-    def _send(self, name: str, values: Mapping[str, object]) -> None:
-        definition = DICTIONARY.packet(name)
-        kind = (definition.service, definition.subtype)
-        self._packets.append(
-            DICTIONARY.pack(
-                name,
-                values,
-                ticks=max(self._ticks, 0),
-                sequence_count=self._sequencer.next(definition.apid),
-                message_counter=self._messages[kind] & 0xFFFF,
+            self._sent_octets = 0
+            machine.telemetry.send(
+                "time_report",
+                {"reported_ticks": machine.telemetry.ticks, "rate_exponent": machine.time_exponent},
             )
-        )
-        self._messages[kind] += 1
-        self._counts["packets"] += 1
+        packets = machine.store.take(takes, kinds)
+        self._sent_octets += sum(map(len, packets))
+        return packets
 
-
-def _reported(found: Detections) -> NDArray[np.int64]:
-    """Return the detections that fit into a packet, the strongest, in their order."""
-    return np.sort(np.argsort(-found.score, kind="stable")[:255])
-
-
-def _rotation(attitude: Float) -> Float | None:
-    """Return camera_from_icrf of an ADCS message, None where it holds no rotation."""
-    if attitude.size != 7 or not np.all(np.isfinite(attitude[:4])):
-        return None
-    length = float(np.linalg.norm(attitude[:4]))
-    # Rounding of a unit quaternion is far below this; anything else is no attitude.
-    if abs(length - 1.0) > 1e-3:
-        return None
-    return matrix_from_quaternion(attitude[:4] / length)
+    @property
+    def _sends_all(self) -> bool:
+        return self._machine.mode in (PayloadMode.observing, PayloadMode.downlinking)

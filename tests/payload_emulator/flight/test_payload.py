@@ -62,8 +62,8 @@ def named(packets: list[bytes], name: str) -> list[dict[str, Any]]:
     return [values for found, values in decoded if found == name]
 
 
-def command(name: str, **values: Any) -> bytes:
-    return DICTIONARY.pack_command(name, values, sequence_count=5)
+def command(name: str, count: int = 5, **values: Any) -> bytes:
+    return DICTIONARY.pack_command(name, values, sequence_count=count)
 
 
 def test_each_frame_reports_detections_states_and_outcomes_of_every_estimator(moon: Any) -> None:
@@ -139,7 +139,7 @@ def test_outside_observing_no_frame_is_processed(moon: Any) -> None:
     packets = flown.step(IMAGE, ATTITUDE, moon.ticks_at(FIRST_S), standby)
     assert not named(packets, "detections")
     assert named(packets, "housekeeping")[0]["mode"] == 1
-    observe = command("perform_function", function_id="start_observation", argument_1=60.0, argument_2=15.0)
+    observe = command("perform_function", 6, function_id="start_observation", argument_1=60.0, argument_2=15.0)
     packets = flown.step(IMAGE, ATTITUDE, moon.ticks_at(FIRST_S + 15.0), observe)
     assert len(named(packets, "detections")) == 1
 
@@ -147,7 +147,8 @@ def test_outside_observing_no_frame_is_processed(moon: Any) -> None:
 def test_telecommands_that_make_no_sense_are_refused_with_a_reason(moon: Any) -> None:
     good = command("perform_function", function_id="set_mode", argument_1=9.0, argument_2=0.0)
     damaged = good[:-1] + bytes([good[-1] ^ 1])
-    cases = [(good, 4), (damaged, 2), (good[:-3], 3), (b"\x18", 3), (command("reset_schedule"), 9)]
+    unknown = command("set_parameter", parameter_id=999, value=1.0)
+    cases = [(good, 4), (damaged, 2), (good[:-3], 3), (b"\x18", 3), (unknown, 10)]
     for octets, code in cases:
         flown = payload(moon, [EMPTY])
         packets = flown.step(IMAGE, ATTITUDE, moon.ticks_at(FIRST_S), octets)
@@ -156,8 +157,8 @@ def test_telecommands_that_make_no_sense_are_refused_with_a_reason(moon: Any) ->
 
 
 def test_two_telecommands_in_one_delivery_are_both_obeyed(moon: Any) -> None:
-    ping = command("test_connection")
-    packets = payload(moon, [EMPTY]).step(IMAGE, ATTITUDE, moon.ticks_at(FIRST_S), ping + ping)
+    pings = command("test_connection", 5) + command("test_connection", 6)
+    packets = payload(moon, [EMPTY]).step(IMAGE, ATTITUDE, moon.ticks_at(FIRST_S), pings)
     assert len(named(packets, "connection_report")) == 2
 
 

@@ -1,0 +1,56 @@
+"""Products in large data: image thumbnails and the map of landmarks that were used.
+
+Thumbnail: frame number (u32), on-board time (u64), rows (u16), columns (u16), zlib-compressed gray levels (u8, row by
+row). Landmark map: for every crater, by identity: identity (u32), frames that used it (u16). Big-endian.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_THUMBNAIL = struct.Struct(">IQHH")
+_LANDMARK = np.dtype([("crater_id", ">u4"), ("frames", ">u2")])
+
+
+def thumbnail_octets(image: NDArray[Any], factor: int, frame_number: int, ticks: int) -> bytes:
+    """The image in gray, averaged over squares of `factor` pixels; edges that fill no square are left out.
+
+    Integer levels are scaled to 8 bits, fractions to 0..255.
+    """
+    gray = image.astype(np.float64)
+    gray = gray.mean(axis=2) if gray.ndim == 3 else gray
+    full = float(np.iinfo(image.dtype).max) if image.dtype.kind in "ui" else 1.0
+    rows, columns = (size // factor for size in gray.shape)
+    squares = gray[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor)
+    levels = (
+        np.nan_to_num(squares.mean(axis=(1, 3)) * (255.0 / full)) if squares.size else squares[:, 0, :, 0]
+    )
+    octets = np.clip(np.rint(levels), 0, 255).astype(np.uint8).tobytes()
+    return _THUMBNAIL.pack(frame_number & 0xFFFFFFFF, ticks, rows, columns) + zlib.compress(octets, 9)
+
+
+def unpack_thumbnail(octets: bytes) -> tuple[int, int, NDArray[np.uint8]]:
+    """(frame number, on-board time, gray levels (rows, columns)) of a thumbnail."""
+    frame_number, ticks, rows, columns = _THUMBNAIL.unpack_from(octets)
+    levels = np.frombuffer(zlib.decompress(octets[_THUMBNAIL.size :]), dtype=np.uint8)
+    return frame_number, ticks, levels.reshape(rows, columns)
+
+
+def map_octets(sightings: Mapping[int, int]) -> bytes:
+    """The landmark map of how often each crater was used."""
+    rows = np.array(
+        [(crater, min(count, 0xFFFF)) for crater, count in sorted(sightings.items())], dtype=_LANDMARK
+    )
+    return rows.tobytes()
+
+
+def unpack_map(octets: bytes) -> dict[int, int]:
+    """Frames that used each crater."""
+    rows = np.frombuffer(octets, dtype=_LANDMARK)
+    return dict(zip(rows["crater_id"].tolist(), rows["frames"].tolist(), strict=True))

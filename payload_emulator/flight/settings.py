@@ -1,0 +1,82 @@
+"""What survives a reset: one text of settings in two copies, the newer of which that is whole counts.
+
+Each half of the memory holds a block: magic `LNST`, generation (u32), length (u32), CRC-32 of generation, length and
+content (u32), content (JSON, UTF-8); big-endian. Blocks are written in turns, so that a reset in the middle of writing,
+or a flipped bit, costs the newest change at most.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+from payload_emulator.flight.ports import Memory
+
+_MAGIC = b"LNST"
+_HEADER = struct.Struct(">4sIII")
+
+
+class Recovery(IntEnum):
+    """What was found in the settings memory at boot."""
+
+    blank = 0
+    whole = 1
+    older = 2
+    lost = 3
+
+
+@dataclass(slots=True, eq=False)
+class Settings:
+    """The settings memory of a board."""
+
+    memory: Memory
+    generation: int = 0
+
+    def read(self) -> tuple[Recovery, dict[str, Any]]:
+        """The newest whole copy, and whether it was the newest written."""
+        found = [self._copy(half) for half in (0, 1)]
+        if not self.memory.any():
+            return Recovery.blank, {}
+        whole = [copy for copy in found if copy is not None]
+        if not whole:
+            return Recovery.lost, {}
+        generation, values = max(whole, key=lambda copy: copy[0])
+        self.generation = generation
+        # Copies are written in turns: the one before the newest stands in the other half.
+        other = self._copy((generation + 1) & 1)
+        intact = generation == 1 or (other is not None and other[0] == generation - 1)
+        return (Recovery.whole if intact else Recovery.older), values
+
+    def write(self, values: Mapping[str, Any]) -> bool:
+        """Keep a set of settings; False where it does not fit, in which case the memory stays as it is."""
+        content = json.dumps(values, separators=(",", ":")).encode()
+        generation = self.generation + 1
+        half = self._half(generation & 1)
+        if _HEADER.size + len(content) > half.size:
+            return False
+        checked = struct.pack(">II", generation, len(content)) + content
+        block = _HEADER.pack(_MAGIC, generation, len(content), zlib.crc32(checked)) + content
+        half[: len(block)] = np.frombuffer(block, dtype=np.uint8)
+        self.generation = generation
+        return True
+
+    def _half(self, which: int) -> Memory:
+        size = self.memory.size // 2
+        return self.memory[which * size : (which + 1) * size]
+
+    def _copy(self, which: int) -> tuple[int, dict[str, Any]] | None:
+        half = self._half(which)
+        magic, generation, length, checksum = _HEADER.unpack(half[: _HEADER.size].tobytes())
+        if magic != _MAGIC or generation & 1 != which or length > half.size - _HEADER.size:
+            return None
+        content = half[_HEADER.size : _HEADER.size + length].tobytes()
+        if zlib.crc32(struct.pack(">II", generation, length) + content) != checksum:
+            return None
+        return generation, json.loads(content)
