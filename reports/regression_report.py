@@ -7,6 +7,7 @@ import numpy as np
 from reports.campaign_report import solution_table, solutions
 from reports.document import Block, Cell, Column, Document, Heading, Picture, Table
 from reports.figures import campaign
+from reports.sections.detection import gallery_picture
 from reports.sections.opening import about, absent, judgement, missing_and_remarks, provenance_and_data
 from reports.statistics import quantiles
 from reports.text import count_text, significant_text
@@ -30,6 +31,7 @@ def regression_document(report: RegressionReport) -> Document:
             Heading("Candidate against baseline"),
             absent(report, "candidate_passes", "Passes", "no pass was run with both builds"),
         ]
+    blocks += [Heading("Frames that changed most"), _changed(report)]
     blocks += provenance_and_data(report)
     facts = about(
         report,
@@ -67,6 +69,20 @@ def _gates(report: RegressionReport) -> Table:
             Column("verdict", numeric=False),
         ),
         rows,
+    )
+
+
+def _changed(report: RegressionReport) -> Block:
+    """Frames with both builds side by side, a pair to a row."""
+    if not report.changed_frames:
+        return absent(report, "changed_frames", "Frames", "no frame with an image changed")
+    sides = tuple(side for pair in report.changed_frames for side in (pair.baseline, pair.candidate))
+    return gallery_picture(
+        "changed",
+        sides,
+        2,
+        "Left the baseline, right the candidate, on the same image: the frames in which most craters were found by "
+        "one build and not by the other.",
     )
 
 

@@ -580,7 +580,16 @@ class RegressionGate:
     pass_id: str = ""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
+class ChangedFrame:
+    """One image with what the baseline and what the candidate found in it."""
+
+    pass_id: str
+    baseline: GalleryFrame
+    candidate: GalleryFrame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class RegressionReport:
     """A candidate build against a baseline over archived passes."""
 
@@ -591,6 +600,7 @@ class RegressionReport:
     gates: tuple[RegressionGate, ...] = ()
     candidate_passes: tuple[CampaignPass, ...] = ()
     baseline_passes: tuple[CampaignPass, ...] = ()
+    changed_frames: tuple[ChangedFrame, ...] = ()
     verdict: str = ""
     verdict_level: str = ""
     generated_for: str = ""
