@@ -189,6 +189,15 @@ def _manifest(world: World, loaded: LoadedPayload, folder: Path) -> dict[str, An
         "camera": {"width_px": camera.width_px, "height_px": camera.height_px, "fov_deg": camera.fov_deg},
         "estimators": list(scenario.navigation.estimators),
         "start_state": loaded.start_state,
+        "burns": [
+            {
+                "utc": format_utc(burn.utc_ns, 9),
+                "delta_v_icrf_m_s": burn.planned_m_s.tolist(),
+                "sigma_m_s": burn.sigma_m_s,
+            }
+            for burn in world.burns
+            if burn.declared and int(world.frame_utc_ns[0]) <= burn.utc_ns <= int(world.frame_utc_ns[-1])
+        ],
         "gravity": {
             "truth": world.gravity.name,
             "degree": min(world.gravity.degree, scenario.dynamics.degree),

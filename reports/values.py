@@ -144,7 +144,8 @@ class DriftSample:
 class NavigationSeries:
     """One estimate, or one baseline, against the reference, sampled at ``utc_ns`` (n,).
 
-    ``kind`` is "estimate" (flown on board) or "baseline" (computed on the ground for comparison).
+    ``kind`` is "estimate" (flown on board), "smoothed" (an estimate improved on the ground by what came later) or
+    "baseline" (computed on the ground for comparison).
     ``error_rtn_m`` and ``sigma_rtn_m`` are (n, 3), estimate minus reference. ``outcome`` and
     ``reset_trigger`` name what the matcher did at each sample (see `ODOMETRY_OUTCOMES`, `FIX_OUTCOMES`,
     `RESET_TRIGGERS`); empty tuples where the solution has no such thing. ``error_rtn_m`` at a reset is the

@@ -27,6 +27,8 @@ from ground_service.processing.recall import (
     score_detections,
 )
 from ground_service.processing.samples import DetectionSamples, NavigationSamples, OutcomeSamples
+from ground_service.processing.smoothed_series import SMOOTHED, smoothed_series, smoother_model
+from ground_service.processing.smoother import CommandedBurn, FilterStates
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M, NANOSECONDS_PER_SECOND
@@ -94,6 +96,8 @@ class PassInputs:
     navigation: tuple[NavigationSamples, ...] = ()
     outcomes: tuple[OutcomeSamples, ...] = ()
     start_state: StartState | None = None
+    filter_states: FilterStates | None = None
+    burns: tuple[CommandedBurn, ...] = ()
     gravity: GravityField | None = None
     other_gravity: GravityField | None = None
     frames_expected: int | None = None
@@ -183,6 +187,7 @@ def summary_of(report: PassReport) -> dict[str, Any]:
             ],
         },
         "navigation": {s.name: _figures(s.statistics) for s in report.navigation if s.kind == "estimate"},
+        "smoothed": {s.name: _figures(s.statistics) for s in report.navigation if s.kind == SMOOTHED},
         "baselines": {s.name: _figures(s.statistics) for s in report.navigation if s.kind == "baseline"},
         "verdict": report.verdict,
         "evidence_rung": report.evidence_rung,
@@ -206,6 +211,7 @@ def _navigation(
         for samples in inputs.navigation
         if len(samples.utc_ns)
     ]
+    series += _smoothed(inputs, track, path_m, provenance)
     uncovered = int(np.count_nonzero(~track.covered))
     if uncovered:
         remarks.append(
@@ -292,6 +298,28 @@ def _estimate_series(
         time_since_fix_s=_time_since_fix_s(samples),
         drift_by_length=drift_by_length(error, path_m[rows], is_reset),
     )
+
+
+def _smoothed(
+    inputs: PassInputs, track: ReferenceStates, path_m: FloatArray, provenance: dict[str, str]
+) -> list[NavigationSeries]:
+    """The filter's orbit smoothed on the ground, where its states came down in full and the reference covers them."""
+    filtered = inputs.filter_states
+    reported = next((s for s in inputs.navigation if s.estimator == "anchored"), None)
+    gravity = inputs.other_gravity or inputs.gravity
+    if filtered is None or reported is None or gravity is None or not len(filtered):
+        return []
+    rows = np.minimum(np.searchsorted(track.utc_ns, filtered.utc_ns), len(track.utc_ns) - 1)
+    kept = track.covered[rows] & (track.utc_ns[rows] == filtered.utc_ns)
+    filtered, rows = filtered.select(kept), rows[kept]
+    model = smoother_model(gravity, inputs.orientation, inputs.burns)
+    series = smoothed_series(filtered, reported, _at(track, rows), path_m[rows], model)
+    if series is None:
+        return []
+    provenance["gravity of the smoother"] = (
+        f"{gravity.name}, degree {model.forces.degree}, with Earth and Sun"
+    )
+    return [series]
 
 
 def _joined(

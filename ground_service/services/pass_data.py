@@ -23,6 +23,7 @@ from ground_service.processing.samples import (
     no_detections,
 )
 from ground_service.processing.sequence import Gap, account_sequence
+from ground_service.processing.smoother import SIZE, CommandedBurn, FilterStates
 from ground_service.services.ground import Ground
 from ground_service.store import repository
 from ground_service.store.codec import unpack_detections
@@ -38,7 +39,8 @@ from reports.values import (
     PacketAccounting,
     PassEvent,
 )
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary import APID_NAVIGATION_STATE, DICTIONARY
+from tmtc.stream import cut_packets
 
 IntArray = NDArray[np.int64]
 
@@ -144,6 +146,8 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             navigation=navigation_samples(connection, span),
             outcomes=outcome_samples(connection, span),
             start_state=start_state_of(manifest),
+            filter_states=filter_states(connection, span),
+            burns=burns_of(manifest),
             gravity=ground.gravity,
             other_gravity=ground.other_gravity,
             frames_expected=manifest.get("frames_expected"),
@@ -215,6 +219,29 @@ def navigation_samples(connection: Connection, span: PassSpan) -> tuple[Navigati
             outcome=_labels(outcomes, part["outcome"]),
         )
         for name, part in _by_estimator(columns, "navigation_state")
+    )
+
+
+def filter_states(connection: Connection, span: PassSpan) -> FilterStates | None:
+    """States of the navigation filter in full, in time order, out of the packets; None where none came down."""
+    octets = repository.packet_octets(
+        connection, span.vehicle, APID_NAVIGATION_STATE, span.start_ticks, span.stop_ticks
+    )
+    table = DICTIONARY.unpack_many(octets, cut_packets(octets), only=("filter_state",)).get("filter_state")
+    if table is None or not len(table):
+        return None
+    columns = table.columns
+    _, first = np.unique(columns["image_ticks"], return_index=True)
+    covariance = np.zeros((len(first), SIZE, SIZE))
+    rows, places = np.tril_indices(SIZE)
+    covariance[:, rows, places] = covariance[:, places, rows] = columns["covariance"][first]
+    return FilterStates(
+        span.utc_ns(columns["image_ticks"][first]),
+        np.concatenate(
+            [columns["position_icrf_m"], columns["velocity_icrf_m_s"], columns["acceleration_rtn_m_s2"]],
+            axis=1,
+        )[first],
+        covariance,
     )
 
 
@@ -335,6 +362,18 @@ def start_state_of(manifest: Mapping[str, Any]) -> StartState | None:
         utc_ns=parse_utc(given["utc"]),
         position_icrf_m=np.array(given["position_icrf_m"], dtype=np.float64),
         velocity_icrf_m_s=np.array(given["velocity_icrf_m_s"], dtype=np.float64),
+    )
+
+
+def burns_of(manifest: Mapping[str, Any]) -> tuple[CommandedBurn, ...]:
+    """The burns that were commanded during a pass, as the manifest names them."""
+    return tuple(
+        CommandedBurn(
+            parse_utc(burn["utc"]),
+            np.array(burn["delta_v_icrf_m_s"], dtype=np.float64),
+            float(burn["sigma_m_s"]),
+        )
+        for burn in manifest.get("burns", ())
     )
 
 

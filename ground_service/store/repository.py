@@ -54,6 +54,10 @@ AUDIT = _table(models.AuditEntry)
 FEED = _table(models.FeedItem)
 TELECOMMANDS = _table(models.Telecommand)
 WINDOWS = _table(models.Window)
+BUILDS = _table(models.RegisteredBuild)
+REGRESSION_ARCHIVES = _table(models.RegressionArchive)
+REPLAYS = _table(models.Replay)
+REGRESSIONS = _table(models.Regression)
 SAMPLES: dict[str, Table] = {model.__tablename__: _table(model) for model in models.SAMPLE_TABLES}
 
 
@@ -175,6 +179,23 @@ def packet_headers(
     query = query.order_by(PACKETS.c.apid, PACKETS.c.ticks, PACKETS.c.sequence_count, PACKETS.c.digest)
     rows = np.array([tuple(row) for row in connection.execute(query)], dtype=np.int64).reshape(-1, 3)
     return {"apid": rows[:, 0], "ticks": rows[:, 1], "sequence_count": rows[:, 2]}
+
+
+def packet_octets(
+    connection: Connection, vehicle: int, apid: int, start_ticks: int, stop_ticks: int
+) -> bytes:
+    """The stored packets of one APID between two on-board times (both included), end to end in order of time."""
+    query = (
+        select(PACKETS.c.octets)
+        .where(
+            PACKETS.c.vehicle_id == vehicle,
+            PACKETS.c.apid == apid,
+            PACKETS.c.ticks >= start_ticks,
+            PACKETS.c.ticks <= stop_ticks,
+        )
+        .order_by(PACKETS.c.ticks, PACKETS.c.sequence_count, PACKETS.c.digest)
+    )
+    return b"".join(bytes(octets) for (octets,) in connection.execute(query))
 
 
 def samples(

@@ -72,7 +72,7 @@ def describe(figures: dict) -> str:
         f"{'navigation':<28}{'median':>10}{'p95':>10}{'max':>10}{'drift':>10}",
         f"{'':<28}{'m':>10}{'m':>10}{'m':>10}{'% of path':>10}",
     ]
-    for name, row in figures["navigation"].items():
+    for name, row in {**figures["navigation"], **figures["smoothed"]}.items():
         lines.append(
             f"{name:<28}{_number(row['median_3d_m'], '.0f'):>10}{_number(row['p95_3d_m'], '.0f'):>10}"
             f"{_number(row['max_3d_m'], '.0f'):>10}{_number(row['drift_percent'], '.3f'):>10}"

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from lunar.constants import GM_EARTH_M3_S2, GM_SUN_M3_S2
 from lunar.gravity import GravityField, packed, packed_gradient
+from lunar.gravity_omission import omission_psd_m2_s3
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns, utc_ns_from_ticks
 from payload_emulator.flight.tables import TICKS_PER_SECOND, BurnTable, GravityTable, OrientationTable
@@ -46,31 +47,9 @@ class ProcessNoise:
     correlation_s: float = 900.0
 
 
-# Root mean square of what a field cut at a degree leaves out at 30 km, radial, transverse, normal, in mGal
-# (1e-5 m/s^2), against GRAIL to degree 150.
-_OMISSION_MGAL = {
-    0: (72.0, 52.0, 49.0),
-    8: (55.0, 38.0, 38.0),
-    20: (44.0, 31.0, 30.0),
-    30: (37.0, 26.0, 25.0),
-    50: (25.0, 18.0, 18.0),
-    70: (16.0, 12.0, 12.0),
-    100: (8.0, 6.0, 6.0),
-}
-_OMISSION_CORRELATION_S = 40.0
-# Omitted gravity has no power at the low frequencies where a random walk has most: this share of the white density
-# of equal rms keeps the filter's claims true (tuned on the errors of separate runs at degree 100).
-_WHITE_SHARE = 0.12
-
-
 def process_noise(degree: int) -> ProcessNoise:
     """Return the process noise that goes with a gravity table used to a degree."""
-    degrees = sorted(_OMISSION_MGAL)
-    rms = [float(np.interp(degree, degrees, [_OMISSION_MGAL[n][axis] for n in degrees])) for axis in range(3)]
-    # Waves longer than those of degree 50 take longer to fly over.
-    correlation_s = _OMISSION_CORRELATION_S * max(1.0, 50.0 / max(degree, 4))
-    psd = [2.0 * (1e-5 * value) ** 2 * correlation_s * _WHITE_SHARE for value in rms]
-    return ProcessNoise(white_psd_m2_s3=(psd[0], psd[1], psd[2]))
+    return ProcessNoise(white_psd_m2_s3=omission_psd_m2_s3(degree))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

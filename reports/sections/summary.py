@@ -30,7 +30,7 @@ def _statistics_table(view: PassView) -> Table:
         s = completed(one)
         color = view.styles[one.name][0]
         reads = one.anchor_reads_after_start
-        kind = "baseline" if one.kind == "baseline" else "flown"
+        kind = {"baseline": "baseline", "smoothed": "smoothed"}.get(one.kind, "flown")
         rows.append(
             (
                 Cell(one.name, swatch=role_of(color), strong=one.kind != "baseline"),
@@ -42,9 +42,7 @@ def _statistics_table(view: PassView) -> Table:
                 number_text(s.max_3d_m, 0),
                 number_text(s.end_of_pass_m, 0),
                 number_text(s.drift_percent, 3),
-                NOT_A_VALUE
-                if kind == "baseline"
-                else count_text(one.anchor_reads if reads is None else reads),
+                NOT_A_VALUE if kind != "flown" else count_text(one.anchor_reads if reads is None else reads),
             )
         )
     return Table(
@@ -90,11 +88,15 @@ def error_picture(view: PassView, key: str, height_in: float, time: TimeScale) -
 def _smallest_medians(view: PassView, time: TimeScale) -> str:
     """Words for the best of the flown solutions and the best of the baselines."""
     parts = []
-    for kind, words in (("estimate", "of those flown"), ("baseline", "of the baselines")):
+    for kind, words in (
+        ("estimate", "of those flown"),
+        ("smoothed", "afterwards on the ground"),
+        ("baseline", "of the baselines"),
+    ):
         known = [
             (quantiles(error_3d_m(s.error_rtn_m)[time.inside(s.utc_ns)], (0.5,))[0], s.name)
             for s in view.with_error
-            if (s.kind == "baseline") == (kind == "baseline")
+            if s.kind == kind
         ]
         finite = [k for k in known if math.isfinite(k[0])]
         if finite:

@@ -1,0 +1,93 @@
+"""The smoothed orbit of a pass as a series of the report, beside the filter that it came from."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ground_service.processing.alignment import (
+    ReferenceStates,
+    error_of_places_rtn_m,
+    places_of_positions,
+)
+from ground_service.processing.drift import drift_by_length, navigation_statistics
+from ground_service.processing.samples import NavigationSamples
+from ground_service.processing.smoother import CommandedBurn, FilterStates, SmootherModel, smooth
+from lunar.frames import Orientation, mcmf_from_spherical, rtn_from_inertial
+from lunar.gravity import GravityField
+from lunar.gravity_omission import omission_psd_m2_s3
+from lunar.propagation import ForceModel
+from reports.values import NavigationSeries
+
+FloatArray = NDArray[np.float64]
+
+SMOOTHED = "smoothed"
+SMOOTHER_DEGREE = 100
+
+
+def smoother_model(
+    gravity: GravityField, orientation: Orientation, burns: tuple[CommandedBurn, ...]
+) -> SmootherModel:
+    """What the ground knows of the motion, with a field to the degree that it holds."""
+    degree = min(SMOOTHER_DEGREE, gravity.degree)
+    return SmootherModel(
+        ForceModel(gravity, orientation, degree), white_psd_m2_s3=omission_psd_m2_s3(degree), burns=burns
+    )
+
+
+def smoothed_series(
+    filtered: FilterStates,
+    reported: NavigationSamples,
+    track: ReferenceStates,
+    path_m: FloatArray,
+    model: SmootherModel,
+) -> NavigationSeries | None:
+    """The smoothed orbit against the reference; None where no state came down in full.
+
+    The payload flies its own rotation of the Moon: what it reports as a place on the Moon is taken from it, and the
+    smoother's correction, a difference of two inertial states, is added.
+
+    Parameters
+    ----------
+    reported
+        Places that the same filter reported.
+    track
+        Reference at the times of `filtered`; `path_m` (n,) is the ground path to each.
+    """
+    rows = np.searchsorted(reported.utc_ns, filtered.utc_ns)
+    rows = np.minimum(rows, max(len(reported.utc_ns) - 1, 0))
+    if len(filtered) < 2 or not np.array_equal(reported.utc_ns[rows], filtered.utc_ns):
+        return None
+    smoothed = smooth(filtered, model)
+    correction = smoothed.state[:, :3] - filtered.state[:, :3]
+    place = mcmf_from_spherical(
+        np.radians(reported.latitude_deg[rows]),
+        np.radians(reported.longitude_deg[rows]),
+        reported.altitude_m[rows],
+    )
+    position = np.einsum("nji,nj->ni", track.mcmf_from_icrf, place) + correction
+    latitude, longitude, altitude = places_of_positions(track, position)
+    error = error_of_places_rtn_m(track, latitude, longitude, altitude)
+    never = np.zeros(len(filtered), dtype=np.bool_)
+    sigma = smoothed.sigma_rtn_m
+    rtn = rtn_from_inertial(smoothed.state[:, :3], smoothed.state[:, 3:6])
+    block = rtn @ smoothed.covariance[:, :3, :3] @ np.swapaxes(rtn, 1, 2)
+    with np.errstate(invalid="ignore"):
+        nees = np.einsum("ni,nij,nj->n", error, np.linalg.pinv(block, hermitian=True), error)
+    return NavigationSeries(
+        name=SMOOTHED,
+        kind=SMOOTHED,
+        utc_ns=filtered.utc_ns,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        altitude_m=altitude,
+        error_rtn_m=error,
+        sigma_rtn_m=sigma,
+        statistics=navigation_statistics(error, path_m, never),
+        description=(
+            f"the filter smoothed on the ground with {model.forces.gravity.name} to degree "
+            f"{model.forces.degree}, Earth and Sun"
+        ),
+        nees=nees,
+        drift_by_length=drift_by_length(error, path_m, never),
+    )
