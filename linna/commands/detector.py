@@ -28,6 +28,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--patience", type=int, default=0, help="stop after this many validations without gain (0: never)"
     )
     train.add_argument("--learning-rate", type=float, default=2.5e-3)
+    train.add_argument(
+        "--landmarks",
+        type=Path,
+        default=None,
+        metavar="F.csv",
+        help="uncatalogued landmarks as further labels",
+    )
     train.add_argument("--start-from", type=Path, default=None, metavar="CHECKPOINT")
     train.add_argument(
         "--replicas", type=int, default=0, help="threads that train side by side (0: one per core)"
@@ -71,6 +78,35 @@ def configure(parser: argparse.ArgumentParser) -> None:
     evaluate.add_argument("--run", type=Path, default=None, help="training run whose curves the report shows")
     add_json_flag(evaluate)
     evaluate.set_defaults(handler=_evaluate)
+
+    landmarks = verbs.add_parser(
+        "landmarks", help="places that are found again and again under different Suns and no catalogue lists"
+    )
+    _add_model(landmarks)
+    landmarks.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
+    landmarks.add_argument("--split", choices=("train", "val", "test"), default="train")
+    landmarks.add_argument("--source", default="", help="only the frames of this source")
+    landmarks.add_argument("--threshold", type=float, default=None, help="instead of the model's own")
+    landmarks.add_argument("--sightings", type=int, default=3, help="frames that must show it")
+    landmarks.add_argument(
+        "--hide",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="hide this share of the catalogue first and tell how many landmarks were hidden craters",
+    )
+    landmarks.add_argument("--out", type=Path, default=None, metavar="F.csv")
+    add_json_flag(landmarks)
+    landmarks.set_defaults(handler=_landmarks)
+
+    trials = verbs.add_parser(
+        "trials", help="ways of showing frames to the network, each with its effect on held-out frames"
+    )
+    _add_model(trials)
+    trials.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
+    trials.add_argument("--source", default="", help="only the test frames of this source")
+    add_json_flag(trials)
+    trials.set_defaults(handler=_trials)
 
     detect = verbs.add_parser("detect", help="craters in any PNG, TIFF or JPEG")
     detect.add_argument("images", type=Path, nargs="+", metavar="IMAGE")
@@ -122,6 +158,7 @@ def _train(arguments: argparse.Namespace) -> int:
     if importlib.util.find_spec("torch") is None:
         raise UsageError(_TRAIN_MODULE_MISSING)
     from payload_emulator.training.dataset import Dataset
+    from payload_emulator.training.landmarks import load_landmarks
     from payload_emulator.training.train import ENVIRONMENT, TrainParameters, set_environment, train
 
     if (
@@ -146,7 +183,15 @@ def _train(arguments: argparse.Namespace) -> int:
         replicas=arguments.replicas,
     )
     datasets = [Dataset(folder) for folder in arguments.datasets]
-    figures = train(datasets, arguments.out, parameters, start_from=arguments.start_from, report=log)
+    landmarks = None if arguments.landmarks is None else load_landmarks(arguments.landmarks)
+    figures = train(
+        datasets,
+        arguments.out,
+        parameters,
+        start_from=arguments.start_from,
+        landmarks=landmarks,
+        report=log,
+    )
     emit(arguments, figures)
     return 0
 
@@ -203,6 +248,57 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         report = detector_report(detector, scored, figures, arguments.run)
         _write_text(arguments.report, render_html(report))
     emit(arguments, figures, format_figures(figures))
+    return 0
+
+
+def _landmarks(arguments: argparse.Namespace) -> int:
+    from linna.errors import UsageError
+    from linna.output import emit, progress
+    from payload_emulator.training.dataset import Dataset
+    from payload_emulator.training.evaluate import open_for_evaluation, run
+    from payload_emulator.training.landmarks import RecurrenceRule, format_landmarks, study
+
+    if not 0.0 <= arguments.hide < 1.0:
+        raise UsageError(f"--hide: expected a share from 0 to below 1, found {arguments.hide:g}")
+    if arguments.sightings < 2:
+        raise UsageError(f"--sightings: expected 2 or more, found {arguments.sightings}")
+    detector = open_for_evaluation(_model_octets(arguments.model))
+    scored = run(
+        detector,
+        [Dataset(folder) for folder in arguments.dataset],
+        arguments.split,
+        arguments.source,
+        arguments.threshold,
+        lambda frames: progress(frames, len(frames), "detect", "frames"),
+    )
+    landmarks, figures = study(
+        scored.frames,
+        scored.found,
+        scored.thresholds.on_board,
+        arguments.hide,
+        RecurrenceRule(sightings=arguments.sightings),
+    )
+    if arguments.out is not None:
+        _write_text(arguments.out, format_landmarks(landmarks))
+    emit(arguments, {**figures, "model_sha256": detector.sha256})
+    return 0
+
+
+def _trials(arguments: argparse.Namespace) -> int:
+    from linna.output import emit, progress
+    from payload_emulator.training.dataset import Dataset
+    from payload_emulator.training.evaluate import open_for_evaluation
+    from payload_emulator.training.trials import format_trials, run_trials
+
+    detector = open_for_evaluation(_model_octets(arguments.model))
+    datasets = [Dataset(folder) for folder in arguments.dataset]
+    rows = run_trials(
+        detector,
+        datasets,
+        source=arguments.source,
+        progress=lambda frames: progress(frames, len(frames), "trial", "frames"),
+    )
+    emit(arguments, {"trials": rows, "model_sha256": detector.sha256}, format_trials(rows))
     return 0
 
 

@@ -30,6 +30,7 @@ from lunar.catalogue import size_class
 from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.training.augment import AugmentParameters, make_crop
 from payload_emulator.training.dataset import Dataset, Frame, choose_tiers
+from payload_emulator.training.landmarks import Landmarks, with_landmarks
 from payload_emulator.training.targets import Tier, make_targets
 
 ENVIRONMENT = {
@@ -89,9 +90,12 @@ def train(
     parameters: TrainParameters,
     *,
     start_from: Path | None = None,
+    landmarks: Landmarks | None = None,
     report: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
     """Train (or resume) a run; the best validation figures come back.
+
+    `start_from` gives the first weights, `landmarks` further labels that no catalogue lists.
 
     Raises
     ------
@@ -105,6 +109,8 @@ def train(
 
     train_frames = [(d, f) for d in datasets for f in d.frames("train")]
     validation = [(d, f) for d in datasets for f in d.frames("val")]
+    if landmarks is not None:
+        train_frames = [(d, with_landmarks(d, f, landmarks)) for d, f in train_frames]
     if not train_frames:
         raise DatasetError("training: expected frames of the split 'train', found none")
     if len({(d.width_px, d.height_px, round(d.focal_px, 3)) for d in datasets}) > 1:
