@@ -455,3 +455,65 @@ class Window(Base):
     created_by: Mapped[str] = mapped_column(String(64))
     created_utc_ns: Mapped[int] = mapped_column(BigInteger)
     changed_utc_ns: Mapped[int] = mapped_column(BigInteger)
+
+
+class RegisteredBuild(Base):
+    """A payload build under test; `digest` is the hash of everything that decides what it does."""
+
+    __tablename__ = "builds"
+    digest: Mapped[str] = mapped_column(String(64), primary_key=True)
+    name: Mapped[str] = mapped_column(Text)
+    version: Mapped[str] = mapped_column(Text)
+    description: Mapped[str] = mapped_column(Text)
+    kind: Mapped[str] = mapped_column(String(16))
+    files: Mapped[dict[str, Any]] = mapped_column(JSON)
+    flight_code: Mapped[str | None] = mapped_column(String(64))
+    provenance: Mapped[dict[str, Any]] = mapped_column(JSON)
+    registered_by: Mapped[str] = mapped_column(String(64))
+    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+
+
+class RegressionArchive(Base):
+    """A pass archive kept to be flown again; `digest` is the SHA-256 of its manifest."""
+
+    __tablename__ = "regression_archives"
+    digest: Mapped[str] = mapped_column(String(64), primary_key=True)
+    name: Mapped[str] = mapped_column(Text)
+    manifest_sha256: Mapped[str] = mapped_column(String(64))
+    frames: Mapped[int] = mapped_column(Integer)
+    octets: Mapped[int] = mapped_column(BigInteger)
+    pinned: Mapped[int] = mapped_column(Flag)
+    used_utc_ns: Mapped[int] = mapped_column(BigInteger, index=True)
+    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+
+
+class Replay(Base):
+    """What became of one build on one archive, once; `id` is the hash of both identities."""
+
+    __tablename__ = "replays"
+    id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    archive_digest: Mapped[str] = mapped_column(String(64), index=True)
+    build_digest: Mapped[str] = mapped_column(String(64), index=True)
+    outcome: Mapped[str] = mapped_column(String(16))
+    detail: Mapped[str] = mapped_column(Text)
+    downlink_sha256: Mapped[str | None] = mapped_column(String(64))
+    performance_sha256: Mapped[str | None] = mapped_column(String(64))
+    wall_s: Mapped[float] = mapped_column(Double)
+    cpu_s: Mapped[float] = mapped_column(Double)
+    peak_rss_mib: Mapped[float] = mapped_column(Double)
+    isolation: Mapped[str] = mapped_column(Text)
+    machine: Mapped[str] = mapped_column(Text)
+    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+
+
+class Regression(Base):
+    """A candidate build judged against a baseline over archived passes."""
+
+    __tablename__ = "regressions"
+    id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    baseline_digest: Mapped[str] = mapped_column(String(64))
+    candidate_digest: Mapped[str] = mapped_column(String(64))
+    verdict: Mapped[str] = mapped_column(String(16))
+    result: Mapped[dict[str, Any]] = mapped_column(JSON)
+    html_sha256: Mapped[str | None] = mapped_column(String(64))
+    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
