@@ -35,9 +35,18 @@ def format_parameters(parameters: BuildParameters) -> str:
 
 
 def parse_parameters(
-    text: str, flown: BuildParameters = BuildParameters(), source: str = "parameters"
+    text: str,
+    flown: BuildParameters = BuildParameters(),
+    source: str = "parameters",
+    dropped: list[str] | None = None,
 ) -> BuildParameters:
     """`flown` with what the TOML text changes.
+
+    Parameters
+    ----------
+    dropped
+        Takes the names of parameters that this flight code does not have, as a record of older code may hold; None
+        refuses them.
 
     Raises
     ------
@@ -48,7 +57,7 @@ def parse_parameters(
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ParameterError(f"{source}: not TOML: {error}") from None
-    changed: BuildParameters = _changed(flown, BuildParameters, table, source, "")
+    changed: BuildParameters = _changed(flown, BuildParameters, table, source, "", dropped)
     return changed
 
 
@@ -112,7 +121,9 @@ def _toml(value: Any) -> str:
     return repr(value)
 
 
-def _changed(value: Any, kind: type, table: Any, source: str, path: str) -> Any:
+def _changed(
+    value: Any, kind: type, table: Any, source: str, path: str, dropped: list[str] | None = None
+) -> Any:
     """A dataclass with the fields that `table` names changed; built anew where there was none."""
     if not isinstance(table, dict):
         raise ParameterError(f"{source}: [{path}] must be a table, found {type(table).__name__}")
@@ -121,18 +132,23 @@ def _changed(value: Any, kind: type, table: Any, source: str, path: str) -> Any:
     values: dict[str, Any] = {}
     for key, given in table.items():
         place = f"{path}.{key}" if path else key
+        if key not in known and dropped is not None:
+            dropped.append(place)
+            continue
         if key not in known:
             close = difflib.get_close_matches(key, known, n=1)
             hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(known)}"
             raise ParameterError(f"{source}: unknown key '{place}'; {hint}")
-        values[key] = _converted(hints[key], getattr(value, key, None), given, source, place)
+        values[key] = _converted(hints[key], getattr(value, key, None), given, source, place, dropped)
     try:
         return kind(**values) if value is None else dataclasses.replace(value, **values)
     except TypeError:
         raise ParameterError(f"{source}: [{path}] needs all of {', '.join(known)}") from None
 
 
-def _converted(hint: Any, present: Any, given: Any, source: str, place: str) -> Any:
+def _converted(
+    hint: Any, present: Any, given: Any, source: str, place: str, dropped: list[str] | None = None
+) -> Any:
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
         if given is None and NoneType in inner:
@@ -140,7 +156,7 @@ def _converted(hint: Any, present: Any, given: Any, source: str, place: str) -> 
         (hint,) = (item for item in inner if item is not NoneType)
         origin, inner = get_origin(hint), get_args(hint)
     if dataclasses.is_dataclass(hint):
-        return _changed(present, hint, given, source, place)  # type: ignore[arg-type]
+        return _changed(present, hint, given, source, place, dropped)  # type: ignore[arg-type]
     if origin is tuple:
         if not isinstance(given, list):
             raise ParameterError(f"{source}: {place} must be a list, found {given!r}")
@@ -148,7 +164,7 @@ def _converted(hint: Any, present: Any, given: Any, source: str, place: str) -> 
         if len(kinds) != len(given):
             raise ParameterError(f"{source}: {place} must have {len(kinds)} values, found {len(given)}")
         return tuple(
-            _converted(kind, None, item, source, f"{place}[{i}]")
+            _converted(kind, None, item, source, f"{place}[{i}]", dropped)
             for i, (kind, item) in enumerate(zip(kinds, given, strict=True))
         )
     if isinstance(hint, type) and issubclass(hint, IntEnum):

@@ -57,11 +57,18 @@ class FrameInput:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PassRecord:
-    """Everything but the images that a payload was given during a pass."""
+    """Everything but the images that a payload was given during a pass.
+
+    Attributes
+    ----------
+    dropped
+        Parameters and tables of the record that the flight code at hand does not have any more.
+    """
 
     inputs: tuple[FrameInput, ...]
     parameters: BuildParameters
     tables: FlightTables
+    dropped: tuple[str, ...] = ()
 
 
 def frame_input(
@@ -122,13 +129,18 @@ def load_record(folder: Path) -> PassRecord:
     except UnicodeDecodeError:
         raise RecordError(f"{folder / INPUTS}: expected UTF-8 text, found other octets") from None
     known = {item.name for item in fields(FlightTables)}
-    tables = {
-        path.stem: path.read_bytes() for path in sorted((folder / TABLES).glob("*.bin")) if path.stem in known
-    }
+    tables, dropped = {}, list[str]()
+    for path in sorted((folder / TABLES).glob("*.bin")):
+        if path.stem in known:
+            tables[path.stem] = path.read_bytes()
+        else:
+            dropped.append(f"tables.{path.stem}")
+    parameters = parse_parameters(text, source=str(folder / PARAMETERS), dropped=dropped)
     return PassRecord(
         tuple(_parse(line, folder / INPUTS, i) for i, line in enumerate(lines)),
-        parse_parameters(text, source=str(folder / PARAMETERS)),
+        parameters,
         FlightTables(**tables),
+        tuple(dropped),
     )
 
 

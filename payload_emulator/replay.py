@@ -160,6 +160,7 @@ def replay_archive(
         "frames": frames,
         "packets": len(flown.packets),
         "downlink_octets": len(octets),
+        "dropped": list(record.dropped),
         **flown.summary,
         "cpu_ms_per_frame": cpu_ms / max(frames, 1),
         "wall_s": round(wall_s, 3),
@@ -340,7 +341,9 @@ def _manifest(archive: Path) -> dict[str, Any]:
 
 
 def _coding(manifest: dict[str, Any]) -> str:
-    """Coding of the archived downlink, as its scenario says."""
+    """Coding of the archived downlink, as its manifest or its scenario says."""
+    if "coding" in manifest:
+        return str(manifest["coding"])
     text = str(manifest.get("scenario_toml") or "")
     return str(tomllib.loads(text).get("link", {}).get("coding", "rs"))
 

@@ -1,0 +1,354 @@
+"""Payload builds: what a build file says, and builds as they are registered.
+
+A build is a program (any command that keeps the contract in docs/build-contract.md), or a network and a parameter file
+on the flight code at hand. Its identity is the hash of everything that decides what it does: command and files, or
+network, parameters and the flight code itself.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+import shutil
+import sys
+import tomllib
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from ground_service.clock import utc_now_ns
+from ground_service.errors import InvalidInput, NotFound, storage_error
+from ground_service.services.ground import Ground
+from ground_service.store import repository
+
+SCHEMA_VERSION = 1
+CURRENT = "current"
+BUILD_FILE = "build.toml"
+BUILD_FILE_LIMIT_OCTETS = 1 << 20
+FLIGHT_COMMAND = (
+    "{python}", "-m", "linna", "replay", "{archive}", "--build", "{build}", "--out", "{out}", "--recorded-only",
+)  # fmt: skip
+_KEYS = (
+    "schema_version", "name", "version", "description", "command", "files", "model", "parameters", "camera",
+    "limits", "provenance",
+)  # fmt: skip
+# What the flight code of this checkout consists of, beside the shipped network.
+_FLIGHT_CODE = (
+    "payload_emulator/flight",
+    "payload_emulator/replay.py",
+    "payload_emulator/recording.py",
+    "payload_emulator/parameter_file.py",
+    "lunar",
+    "tmtc",
+)
+_SHIPPED_MODEL = "payload_emulator/flight/models/craters.onnx"
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a run of a build may use: seconds, MiB, open files. `folder_mib` is all that it writes together."""
+
+    wall_s: int = 900
+    cpu_s: int = 900
+    memory_mib: int = 6144
+    file_mib: int = 256
+    folder_mib: int = 512
+    open_files: int = 256
+
+
+@dataclass(frozen=True, slots=True)
+class Build:
+    """A build under test.
+
+    Attributes
+    ----------
+    file
+        The build file; other names in it are of files beside it.
+    command
+        Program and arguments with the places {archive}, {out} and {build}; empty for a build on the flight code.
+    files
+        SHA-256 of every file that belongs to the build, by name.
+    camera
+        What the build is made for, where it is made for one camera only.
+    digest
+        Identity of the build.
+    """
+
+    name: str
+    version: str
+    digest: str
+    file: Path
+    command: tuple[str, ...] = ()
+    files: tuple[tuple[str, str], ...] = ()
+    description: str = ""
+    camera: tuple[tuple[str, float], ...] = ()
+    limits: Limits = field(default_factory=Limits)
+    provenance: tuple[tuple[str, str], ...] = ()
+    flight_code: str = ""
+
+    @property
+    def title(self) -> str:
+        """Name, version and the beginning of the identity."""
+        return " ".join(part for part in (self.name, self.version, f"({self.digest[:12]})") if part)
+
+    @property
+    def folder(self) -> Path:
+        return self.file.parent
+
+    def arguments(self, archive: Path, out: Path) -> list[str]:
+        """The command line that flies an archive."""
+        places = {
+            "{archive}": str(archive),
+            "{out}": str(out),
+            "{build}": str(self.folder) if self.command else _file_argument(self.file),
+            "{python}": sys.executable,
+        }
+        words = []
+        for word in self.command or FLIGHT_COMMAND:
+            for place, value in places.items():
+                word = word.replace(place, value)
+            words.append(word)
+        first = self.folder / words[0]
+        if words[0] in dict(self.files) and first.is_file():
+            words[0] = str(first.absolute())
+        return words
+
+
+def load_build(given: str | Path) -> Build:
+    """The build that a file describes; "current" is this flight code with its own network.
+
+    Raises
+    ------
+    InvalidInput
+        The file is missing, is no build, or names files that are not there.
+    """
+    if str(given) == CURRENT:
+        return _current()
+    path = Path(given)
+    if path.is_dir():
+        path = path / BUILD_FILE
+    table = _read(path)
+    source = str(path)
+    for key in table:
+        if key not in _KEYS:
+            raise InvalidInput(source, key, f"one of {', '.join(_KEYS)}", "an unknown key")
+    if table.get("schema_version", SCHEMA_VERSION) != SCHEMA_VERSION:
+        raise InvalidInput(source, "schema_version", str(SCHEMA_VERSION), repr(table["schema_version"]))
+    name = _text(table, "name", source, required=True)
+    command = _texts(table, "command", source)
+    own = {key: _text(table, key, source) for key in ("model", "parameters")}
+    if command and any(own.values()):
+        raise InvalidInput(source, "command", "a command, or a model and parameters", "both")
+    names = (*_texts(table, "files", source), *(value for value in own.values() if value))
+    files = tuple((item, _file_hash(path, item)) for item in sorted(set(names)))
+    camera = _numbers(table, "camera", source, ("width_px", "height_px", "fov_deg"))
+    code = "" if command else flight_code_hash()
+    if command:
+        if not any("{archive}" in word for word in command) or not any("{out}" in word for word in command):
+            raise InvalidInput(source, "command", "the places {archive} and {out} in it", " ".join(command))
+        content: dict[str, Any] = {"command": command, "files": files}
+    else:
+        model = dict(files).get(own["model"]) or _hash_of(_root() / _SHIPPED_MODEL)
+        content = {"model": model, "parameters": dict(files).get(own["parameters"], ""), "flight_code": code}
+    provenance = table.get("provenance", {})
+    if not isinstance(provenance, dict):
+        raise InvalidInput(source, "provenance", "a table", repr(provenance)[:80])
+    return Build(
+        name=name,
+        version=_text(table, "version", source),
+        digest=_digest({**content, "camera": camera}),
+        file=path,
+        command=command,
+        files=files,
+        description=_text(table, "description", source),
+        camera=tuple(sorted(camera.items())),
+        limits=_limits(table, source),
+        provenance=tuple((str(key), str(value)) for key, value in sorted(provenance.items())),
+        flight_code=code,
+    )
+
+
+def register_build(ground: Ground, build: Build, *, actor: str = "local") -> Build:
+    """Keep a build with the service: its files by content, its identity and origin; the kept build comes back."""
+    folder = ground.home / "regression" / "builds" / build.digest
+    try:
+        if not folder.exists():
+            partial = folder.with_name(f".{build.digest}.partial")
+            shutil.rmtree(partial, ignore_errors=True)
+            partial.mkdir(parents=True)
+            text = build.file.read_bytes() if build.file.is_file() else _current_text().encode()
+            (partial / BUILD_FILE).write_bytes(text)
+            for name, _ in build.files:
+                (partial / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy(build.folder / name, partial / name)
+            partial.rename(folder)
+    except OSError as error:
+        raise storage_error(error, folder) from None
+    with ground.database.writing() as connection:
+        if repository.find(connection, repository.BUILDS, digest=build.digest) is None:
+            repository.add(
+                connection,
+                repository.BUILDS,
+                digest=build.digest,
+                name=build.name,
+                version=build.version,
+                description=build.description,
+                kind="command" if build.command else "flight",
+                files=dict(build.files),
+                flight_code=build.flight_code or None,
+                provenance=dict(build.provenance),
+                registered_by=actor,
+                created_utc_ns=utc_now_ns(),
+            )
+    return load_build(folder)
+
+
+def registered_build(ground: Ground, digest: str) -> Build:
+    """A build that was registered, found by its identity or the unmistakable beginning of it.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    InvalidInput
+        If its files are no longer those that were registered.
+    """
+    with ground.database.reading() as connection:
+        page = repository.page(
+            connection, repository.BUILDS, limit=2, conditions=[repository.BUILDS.c.digest.startswith(digest)]
+        )
+    if page.total != 1 or len(digest) < 8:
+        raise NotFound("build", digest)
+    whole = page.rows[0]["digest"]
+    build = load_build(ground.home / "regression" / "builds" / whole)
+    if build.digest != whole:
+        raise InvalidInput(
+            f"build {whole[:12]}",
+            "",
+            "the files and flight code it was registered with",
+            f"{build.digest[:12]}",
+        )
+    return build
+
+
+def build_of(ground: Ground, given: str) -> Build:
+    """A build by file, by "current", or by the identity it was registered under; registered in any case."""
+    if given == CURRENT or Path(given).exists() or Path(given).suffix == ".toml":
+        return register_build(ground, load_build(given))
+    return registered_build(ground, given)
+
+
+def flight_code_hash() -> str:
+    """SHA-256 over the sources of the flight code at hand, which is never imported here."""
+    digest = hashlib.sha256()
+    root = _root()
+    for place in _FLIGHT_CODE:
+        where = root / place
+        for path in [where] if where.is_file() else sorted(where.rglob("*.py")):
+            digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+def _root() -> Path:
+    """Folder that holds the packages of this checkout or installation."""
+    spec = importlib.util.find_spec("ground_service")
+    assert spec is not None and spec.submodule_search_locations
+    return Path(next(iter(spec.submodule_search_locations))).parent
+
+
+def package_root() -> Path:
+    """Folder to put on the module path of a run on the flight code."""
+    return _root()
+
+
+def _current() -> Build:
+    code = flight_code_hash()
+    model = _hash_of(_root() / _SHIPPED_MODEL)
+    return Build(
+        name="current",
+        version="",
+        digest=_digest({"model": model, "parameters": "", "flight_code": code, "camera": {}}),
+        file=Path(CURRENT),
+        description="the flight code at hand with its own network and the parameters that flew",
+        flight_code=code,
+    )
+
+
+def _current_text() -> str:
+    return 'schema_version = 1\nname = "current"\n'
+
+
+def _file_argument(path: Path) -> str:
+    return str(path) if str(path) == CURRENT else str(path.absolute())
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        octets = path.read_bytes()
+    except FileNotFoundError:
+        raise InvalidInput(str(path), "", "a build file (TOML) or 'current'", "nothing there") from None
+    except OSError as error:
+        raise storage_error(error, path) from None
+    if len(octets) > BUILD_FILE_LIMIT_OCTETS:
+        raise InvalidInput(str(path), "", f"at most {BUILD_FILE_LIMIT_OCTETS} octets", str(len(octets)))
+    try:
+        return tomllib.loads(octets.decode("utf-8"))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InvalidInput(str(path), "", "a build file (TOML)", str(error)) from None
+
+
+def _limits(table: dict[str, Any], source: str) -> Limits:
+    names = tuple(item.name for item in fields(Limits))
+    given = _numbers(table, "limits", source, names)
+    for name, value in given.items():
+        if value <= 0 or value != int(value):
+            raise InvalidInput(source, f"limits.{name}", "a whole number above 0", repr(value))
+    return Limits(**{name: int(value) for name, value in given.items()})
+
+
+def _numbers(table: dict[str, Any], key: str, source: str, names: tuple[str, ...]) -> dict[str, float]:
+    given = table.get(key, {})
+    if not isinstance(given, dict):
+        raise InvalidInput(source, key, "a table", repr(given)[:80])
+    for name, value in given.items():
+        if name not in names:
+            raise InvalidInput(source, f"{key}.{name}", f"one of {', '.join(names)}", "an unknown key")
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise InvalidInput(source, f"{key}.{name}", "a number", repr(value)[:80])
+    return {name: float(value) for name, value in given.items()}
+
+
+def _text(table: dict[str, Any], key: str, source: str, *, required: bool = False) -> str:
+    value = table.get(key, None if required else "")
+    if not isinstance(value, str) or (required and not value):
+        raise InvalidInput(source, key, "a text", repr(value)[:80])
+    return value
+
+
+def _texts(table: dict[str, Any], key: str, source: str) -> tuple[str, ...]:
+    value = table.get(key, [])
+    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+        raise InvalidInput(source, key, "a list of texts", repr(value)[:80])
+    return tuple(value)
+
+
+def _file_hash(build_file: Path, name: str) -> str:
+    path = build_file.parent / name
+    inside = not Path(name).is_absolute() and path.resolve().is_relative_to(build_file.parent.resolve())
+    if not inside:
+        raise InvalidInput(str(build_file), name, "a file beside the build file", "one elsewhere")
+    if not path.is_file():
+        raise InvalidInput(str(build_file), name, "a file beside the build file", "nothing there")
+    return _hash_of(path)
+
+
+def _hash_of(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise storage_error(error, path) from None
+
+
+def _digest(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,88 @@
+"""`linna replay`: a payload build over an archived pass."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from linna.output import add_json_flag, emit, progress
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("archive", type=Path, help="pass archive: a folder, or a zip of one")
+    parser.add_argument(
+        "--build", default="current", help="build file (TOML), or 'current': this flight code and its network"
+    )
+    parser.add_argument(
+        "--out", required=True, type=Path, metavar="DIR", help="folder for downlink and summary"
+    )
+    parser.add_argument(
+        "--complete",
+        action="store_true",
+        help="fly nothing; write to --out a copy of the archive with all its frames, rendered from its scenario",
+    )
+    parser.add_argument(
+        "--recorded-only",
+        action="store_true",
+        help="refuse an archive that lacks frames instead of rendering them from its scenario",
+    )
+    add_json_flag(parser)
+    parser.set_defaults(handler=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from ground_service.services.regression_archives import opened_archive
+
+    with opened_archive(arguments.archive) as archive:
+        return _complete(arguments, archive) if arguments.complete else _replay(arguments, archive)
+
+
+def _complete(arguments: argparse.Namespace, archive: Path) -> int:
+    from linna.data import data_folder
+    from payload_emulator.replay import complete_archive
+
+    manifest = complete_archive(archive, arguments.out, data_folder(), progress=_bar)
+    frames = sum(name.startswith("frames/") for name in manifest["files"])
+    emit(
+        arguments,
+        {"archive": str(arguments.out), "frames": frames},
+        text=f"{frames} frames, archive: {arguments.out}",
+    )
+    return 0
+
+
+def _replay(arguments: argparse.Namespace, archive: Path) -> int:
+    from ground_service.services.builds import load_build
+
+    build = load_build(arguments.build)
+    if build.command:
+        from ground_service.services.build_runs import run_build
+
+        summary = run_build(build, archive, arguments.out).summary()
+        emit(arguments, summary, text=summary["text"])
+        return 0 if summary["outcome"] == "ok" else 1
+    from linna.data import data_folder
+    from payload_emulator.replay import FlightBuild, load_flight_build, replay_archive
+
+    flight = FlightBuild() if arguments.build == "current" else load_flight_build(build.file)
+    data = None if arguments.recorded_only else data_folder()
+    summary = replay_archive(archive, flight, arguments.out, data=data, progress=_bar)
+    emit(arguments, summary, text=_describe(summary, arguments.out))
+    return 0
+
+
+def _bar(items, total):  # type: ignore[no-untyped-def]
+    return progress(items, total, "frames", "frame")
+
+
+def _describe(summary: dict, out: Path) -> str:
+    outcomes = ", ".join(f"{name} {count}" for name, count in summary["outcomes"].items() if count)
+    return "\n".join(
+        [
+            f"{summary['frames']} frames flown again, {summary['packets']} packets, "
+            f"{summary['downlink_octets']} octets of downlink",
+            f"outcomes: {outcomes}",
+            f"CPU time: {summary['cpu_ms_per_frame']:.1f} ms per frame",
+            f"downlink: {out / 'downlink.cadu'}",
+        ]
+    )
