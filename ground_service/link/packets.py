@@ -161,6 +161,25 @@ def _outcomes(table: Table, place: IntArray) -> Columns:
     return {**_frame_columns(table, place), **{name: table.columns[name] for name in names}}
 
 
+def _filter_states(table: Table, place: IntArray) -> Columns:
+    columns = table.columns
+    names = ("position_icrf_m", "velocity_icrf_m_s", "acceleration_rtn_m_s2", "covariance")
+    packed = np.concatenate([columns[name] for name in names], axis=1).astype("<f8")
+    values = np.empty(len(packed), dtype=object)
+    values[:] = [row.tobytes() for row in packed]
+    return {**_frame_columns(table, place), "values": values}
+
+
+def _identifications(table: Table, place: IntArray) -> Columns:
+    counts = table.columns["count"]
+    return {
+        **_frame_columns(table, place),
+        "count": counts,
+        "items": table.items,
+        "offsets": np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
+    }
+
+
 _SEVERITIES = {"event_info": 1, "event_low": 2, "event_medium": 3, "event_high": 4}
 
 
@@ -217,5 +236,7 @@ _KINDS: tuple[tuple[str, frozenset[str], _Translation], ...] = (
     ("events", frozenset(_SEVERITIES), _events),
     ("time_reports", frozenset({"time_report"}), _time_reports),
     ("verifications", frozenset(_VERIFICATION_SUBTYPES), _verifications),
+    ("filter_states", frozenset({"filter_state"}), _filter_states),
+    ("identifications", frozenset({"identifications"}), _identifications),
 )
 """Kinds of samples, the packets they come from, and how."""

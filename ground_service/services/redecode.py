@@ -11,6 +11,7 @@ from ground_service.link.packets import batch_of_cut
 from ground_service.services.ground import Ground
 from ground_service.store import repository
 from ground_service.store.packets import store_samples
+from ground_service.store.rollups import forget_rollups
 from tmtc.schema import Dictionary
 from tmtc.stream import cut_packets
 
@@ -29,6 +30,7 @@ def redecode(ground: Ground, vehicle: int, dictionary: Dictionary) -> int:
                     table.c.vehicle_id == vehicle, table.c.dictionary_version == dictionary.version
                 )
             )
+        forget_rollups(connection, vehicle, dictionary.version)
     rows = 0
     last = 0
     table: Any = repository.PACKETS

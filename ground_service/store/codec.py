@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +22,26 @@ DETECTION_ITEM = np.dtype(
 """Steps of 1/64 px and 1/255 are far coarser than float32 here (2^-15 px at 512 px), so nothing is lost."""
 
 
+IDENTIFICATION_ITEM = np.dtype([("detection", "<u2"), ("crater_id", "<u4")])
+
+
 def pack_detections(items: dict[str, NDArray[np.float64]], offsets: NDArray[np.int64]) -> list[bytes]:
     """One octet string per frame of all items (n,), frame i holding rows ``offsets[i]`` to ``offsets[i + 1]``."""
-    records = np.empty(len(items["u_px"]), dtype=DETECTION_ITEM)
-    for name in DETECTION_ITEM.names or ():
+    return _pack(items, offsets, DETECTION_ITEM)
+
+
+def pack_identifications(items: dict[str, NDArray[np.int64]], offsets: NDArray[np.int64]) -> list[bytes]:
+    """As `pack_detections`, of pairs of detection and crater."""
+    return _pack(items, offsets, IDENTIFICATION_ITEM)
+
+
+def _pack(items: dict[str, NDArray[Any]], offsets: NDArray[np.int64], kind: np.dtype[Any]) -> list[bytes]:
+    names = kind.names or ()
+    records = np.empty(len(items[names[0]]), dtype=kind)
+    for name in names:
         records[name] = items[name]
     octets = records.tobytes()
-    ends = (offsets * DETECTION_ITEM.itemsize).tolist()
+    ends = (offsets * kind.itemsize).tolist()
     return [octets[start:stop] for start, stop in pairwise(ends)]
 
 

@@ -28,6 +28,7 @@ from ground_service.errors import (
     StorageReadOnly,
     storage_error,
 )
+from ground_service.store.rollups import build_rollups
 
 if TYPE_CHECKING:
     from alembic.config import Config
@@ -118,6 +119,8 @@ def prepare_database(url: str, *, upgrade: bool | None = None) -> Database:
         if upgrade is False or (upgrade is None and database.dialect != "sqlite"):
             raise DatabaseNotMigrated(database.label, head, found or "none")
         upgrade_database(database)
+        with database.writing() as connection:
+            build_rollups(connection)
     except BaseException:
         database.engine.dispose()
         raise

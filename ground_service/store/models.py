@@ -251,6 +251,33 @@ class Verification(Sample, Base):
     failure_code: Mapped[int | None] = mapped_column(Integer)
 
 
+class FilterState(Sample, Base):
+    """State of the navigation filter with its covariance; `ticks` is the image's time.
+
+    `values` packs position (3), velocity (3), acceleration (3) and the lower triangle of the covariance (45), float64.
+    """
+
+    __tablename__ = "filter_states"
+    __table_args__ = CLUSTERED
+    packet_ticks: Mapped[int] = mapped_column(BigInteger)
+    frame_number: Mapped[int] = mapped_column(BigInteger)
+    values: Mapped[bytes] = mapped_column(LargeBinary)
+
+
+class Identification(Sample, Base):
+    """Which catalogued crater each used detection of an image was taken for; `ticks` is the image's time.
+
+    `items` packs pairs of detection (uint16) and crater (uint32), little-endian.
+    """
+
+    __tablename__ = "identifications"
+    __table_args__ = CLUSTERED
+    packet_ticks: Mapped[int] = mapped_column(BigInteger)
+    frame_number: Mapped[int] = mapped_column(BigInteger)
+    count: Mapped[int] = mapped_column(SmallInteger)
+    items: Mapped[bytes] = mapped_column(LargeBinary)
+
+
 SAMPLE_TABLES = (
     Housekeeping,
     DetectionFrame,
@@ -259,7 +286,26 @@ SAMPLE_TABLES = (
     Event,
     TimeReport,
     Verification,
+    FilterState,
+    Identification,
 )
+
+
+class Rollup(Base):
+    """Samples of one kind aggregated over a bucket of on-board time; see `store.rollups`."""
+
+    __tablename__ = "rollups"
+    __table_args__ = CLUSTERED
+    vehicle_id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
+    dictionary_version: Mapped[int] = mapped_column(SmallInteger, primary_key=True, autoincrement=False)
+    kind: Mapped[int] = mapped_column(SmallInteger, primary_key=True, autoincrement=False)
+    part: Mapped[int] = mapped_column(SmallInteger, primary_key=True, autoincrement=False)
+    level: Mapped[int] = mapped_column(SmallInteger, primary_key=True, autoincrement=False)
+    bucket: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
+    first_ticks: Mapped[int] = mapped_column(BigInteger)
+    last_ticks: Mapped[int] = mapped_column(BigInteger)
+    rows: Mapped[int] = mapped_column(BigInteger)
+    statistics: Mapped[bytes] = mapped_column(LargeBinary)
 
 
 class Correlation(Base):
@@ -351,6 +397,7 @@ class Report(Base):
     pass_id: Mapped[int] = mapped_column(ForeignKey("passes.id"), index=True)
     html_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"))
     json_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"))
+    pdf_sha256: Mapped[str | None] = mapped_column(String(64))
     summary: Mapped[dict[str, Any]] = mapped_column(JSON)
     created_utc_ns: Mapped[int] = mapped_column(BigInteger)
 

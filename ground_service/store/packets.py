@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, bindparam, func, select, text
 
 from ground_service.store.bulk import insert_columns
-from ground_service.store.codec import pack_detections
+from ground_service.store.codec import pack_detections, pack_identifications
 from ground_service.store.models import SAMPLE_TABLES, Packet, Vehicle
+from ground_service.store.rollups import add_to_rollups
 
 IntArray = NDArray[np.int64]
 
@@ -22,6 +23,8 @@ with one stray packet of another year does not read the years between."""
 
 _TABLES = {table.__tablename__: table.__table__ for table in SAMPLE_TABLES}
 _PACKETS: Any = Packet.__table__
+
+_PACKED = {"detections": pack_detections, "identifications": pack_identifications}
 
 _IN_RANGE = select(_PACKETS.c.digest).where(
     _PACKETS.c.vehicle_id == bindparam("vehicle_id"),
@@ -109,8 +112,8 @@ def store_samples(
             for name, column in columns.items()
             if name not in ("packet", "items", "offsets")
         }
-        if kind == "detections":
-            packed = pack_detections(columns["items"], columns["offsets"])
+        if kind in _PACKED:
+            packed = _PACKED[kind](columns["items"], columns["offsets"])
             chosen["items"] = [packed[i] for i in keep.tolist()]
         stored += insert_columns(
             connection,
@@ -122,6 +125,7 @@ def store_samples(
                 **chosen,
             },
         )
+        add_to_rollups(connection, vehicle_id, dictionary_version, kind, chosen)
     return stored
 
 

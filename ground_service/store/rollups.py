@@ -1,0 +1,274 @@
+"""Roll-ups: series aggregated ahead of time, so that a long one is drawn without reading its samples.
+
+Samples are gathered in buckets of on-board time on several levels, each four times as long as the one below. One row
+holds one bucket of all values of a kind: count, sum, least and greatest value of each. Rows are added to in the
+transaction that stores new samples, and a packet is stored once, so roll-ups count every sample once in whatever
+order samples come. (Sums are of floating-point numbers: their last bits may depend on the order.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection, delete, func, select
+
+from ground_service.store.bulk import insert_columns
+from ground_service.store.models import SAMPLE_TABLES, Rollup
+
+IntArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+
+STATE_VALUES = (
+    "latitude_deg", "longitude_deg", "altitude_m", "velocity_x_m_s", "velocity_y_m_s", "velocity_z_m_s",
+    "sigma_r_m", "sigma_t_m", "sigma_n_m", "nis", "matched",
+)  # fmt: skip
+HOUSEKEEPING_VALUES = (
+    "boot_count", "mode", "frames_processed", "frames_bad", "detections_total", "packets_sent", "anchor_reads",
+    "events_sent", "telecommands_accepted", "telecommands_rejected", "last_image_quality", "temperature_c",
+    "bus_voltage_v", "power_w", "memory_used_kib", "queue_depth", "storage_used_permille", "model_hash",
+    "parameters_hash", "catalogue_hash", "anchor_table_hash", "clock_status", "watchdog_resets",
+)  # fmt: skip
+
+KINDS: dict[str, tuple[int, str | None, tuple[str, ...]]] = {
+    "housekeeping": (1, None, HOUSEKEEPING_VALUES),
+    "navigation_states": (2, "estimator", STATE_VALUES),
+}
+"""Kinds of samples with roll-ups: code, the column that parts them, and the values (only ever added to at the end)."""
+
+LEVELS = 7
+BASE_TICKS = 64 << 16
+"""The shortest buckets are 64 s long, the longest 4^6 times that: three days."""
+
+STATISTICS = 4
+"""Numbers kept of each value: count, sum, least, greatest."""
+
+_TABLE: Any = Rollup.__table__
+_SAMPLES: dict[str, Any] = {table.__tablename__: table.__table__ for table in SAMPLE_TABLES}
+_BLOCK_ROWS = 50_000
+
+
+def width_ticks(level: int) -> int:
+    """Length of the buckets of a level."""
+    return BASE_TICKS * 4**level
+
+
+def add_to_rollups(
+    connection: Connection, vehicle_id: int, dictionary_version: int, kind: str, columns: Mapping[str, Any]
+) -> None:
+    """Count new samples, within the transaction that stores them; columns (n,) as they are stored."""
+    if kind not in KINDS or len(columns["ticks"]) == 0:
+        return
+    code, part_column, names = KINDS[kind]
+    ticks = np.asarray(columns["ticks"], dtype=np.int64)
+    parts = (
+        np.zeros(len(ticks), dtype=np.int64)
+        if part_column is None
+        else np.asarray(columns[part_column], dtype=np.int64)
+    )
+    values = np.column_stack([np.asarray(columns[name], dtype=np.float64) for name in names])
+    for part in np.unique(parts).tolist():
+        mine = parts == part
+        key = {
+            "vehicle_id": vehicle_id,
+            "dictionary_version": dictionary_version,
+            "kind": code,
+            "part": part,
+        }
+        level_values = _buckets(ticks[mine], values[mine])
+        for level in range(LEVELS):
+            if level:
+                level_values = _merged(*level_values, 4)
+            _store(connection, {**key, "level": level}, *level_values)
+
+
+def forget_rollups(connection: Connection, vehicle_id: int, dictionary_version: int) -> None:
+    """Remove the roll-ups of one dictionary version, before its samples are decoded again."""
+    connection.execute(
+        delete(_TABLE).where(
+            _TABLE.c.vehicle_id == vehicle_id, _TABLE.c.dictionary_version == dictionary_version
+        )
+    )
+
+
+def rollup_rows(
+    connection: Connection,
+    kind: str,
+    vehicle_id: int,
+    dictionary_version: int,
+    part: int,
+    level: int,
+    first_bucket: int,
+    last_bucket: int,
+    value: str,
+) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
+    """First and last on-board time and number of samples (n,) of buckets, and the statistics (n, 4) of one value."""
+    code, _, names = KINDS[kind]
+    rows = connection.execute(
+        select(_TABLE.c.first_ticks, _TABLE.c.last_ticks, _TABLE.c.rows, _TABLE.c.statistics)
+        .where(
+            _TABLE.c.vehicle_id == vehicle_id,
+            _TABLE.c.dictionary_version == dictionary_version,
+            _TABLE.c.kind == code,
+            _TABLE.c.part == part,
+            _TABLE.c.level == level,
+            _TABLE.c.bucket.between(first_bucket, last_bucket),
+        )
+        .order_by(_TABLE.c.bucket)
+    ).all()
+    if not rows:
+        none = np.zeros(0, dtype=np.int64)
+        return none, none, none, np.zeros((0, STATISTICS))
+    place = names.index(value) * STATISTICS * 8
+    octets = b"".join([bytes(row[3][place : place + STATISTICS * 8]) for row in rows])
+    whole = np.array([row[:3] for row in rows], dtype=np.int64)
+    return whole[:, 0], whole[:, 1], whole[:, 2], np.frombuffer(octets, "<f8").reshape(-1, STATISTICS)
+
+
+def rolled_rows(
+    connection: Connection,
+    kind: str,
+    vehicle_id: int,
+    dictionary_version: int,
+    part: int,
+    start_ticks: int,
+    stop_ticks: int,
+) -> int:
+    """About how many samples there are between two times: those of the longest buckets that touch them."""
+    width = width_ticks(LEVELS - 1)
+    return int(
+        connection.execute(
+            select(func.coalesce(func.sum(_TABLE.c.rows), 0)).where(
+                _TABLE.c.vehicle_id == vehicle_id,
+                _TABLE.c.dictionary_version == dictionary_version,
+                _TABLE.c.kind == KINDS[kind][0],
+                _TABLE.c.part == part,
+                _TABLE.c.level == LEVELS - 1,
+                _TABLE.c.bucket.between(start_ticks // width, stop_ticks // width),
+            )
+        ).scalar_one()
+    )
+
+
+def build_rollups(connection: Connection) -> int:
+    """Make the roll-ups of all samples of a database that has none yet; how many samples were counted."""
+    if connection.execute(select(_TABLE.c.bucket).limit(1)).first() is not None:
+        return 0
+    counted = 0
+    for kind, (_, part_column, names) in KINDS.items():
+        table = _SAMPLES[kind]
+        wanted = [table.c.vehicle_id, table.c.dictionary_version, table.c.ticks]
+        wanted += [table.c[part_column]] if part_column else []
+        rows = connection.execution_options(yield_per=_BLOCK_ROWS).execute(
+            select(*wanted, *(table.c[name] for name in names)).order_by(
+                table.c.vehicle_id, table.c.dictionary_version
+            )
+        )
+        for block in rows.partitions(_BLOCK_ROWS):
+            found = np.array([tuple(row) for row in block], dtype=np.float64)
+            heads = np.array([(row[0], row[1], row[2]) for row in block], dtype=np.int64)
+            labels = [*([part_column] if part_column else []), *names]
+            for vehicle, version in np.unique(heads[:, :2], axis=0).tolist():
+                mine = (heads[:, 0] == vehicle) & (heads[:, 1] == version)
+                columns: dict[str, Any] = {"ticks": heads[mine, 2]}
+                columns.update({name: found[mine, 3 + i] for i, name in enumerate(labels)})
+                add_to_rollups(connection, vehicle, version, kind, columns)
+            counted += len(block)
+    return counted
+
+
+_Level = tuple[IntArray, IntArray, IntArray, IntArray, FloatArray]
+
+
+def _buckets(ticks: IntArray, values: FloatArray) -> _Level:
+    """Bucket numbers (b,), first and last time, rows, statistics (b, v, 4) of samples on the lowest level."""
+    order = np.argsort(ticks, kind="stable")
+    ticks, values = ticks[order], values[order]
+    number = ticks // BASE_TICKS
+    starts = np.flatnonzero(np.concatenate(([True], np.diff(number) > 0)))
+    ends = np.concatenate((starts[1:], [len(ticks)]))
+    known = np.isfinite(values)
+    statistics = np.stack(
+        [
+            np.add.reduceat(known.astype(np.float64), starts, axis=0),
+            np.add.reduceat(np.where(known, values, 0.0), starts, axis=0),
+            np.minimum.reduceat(np.where(known, values, np.inf), starts, axis=0),
+            np.maximum.reduceat(np.where(known, values, -np.inf), starts, axis=0),
+        ],
+        axis=-1,
+    )
+    return number[starts], ticks[starts], ticks[ends - 1], (ends - starts).astype(np.int64), statistics
+
+
+def _merged(
+    number: IntArray, first: IntArray, last: IntArray, rows: IntArray, statistics: FloatArray, factor: int
+) -> _Level:
+    """Buckets put together by bucket number divided by `factor`; numbers have to ascend."""
+    number = number // factor
+    starts = np.flatnonzero(np.concatenate(([True], np.diff(number) > 0)))
+    return (
+        number[starts],
+        np.minimum.reduceat(first, starts),
+        np.maximum.reduceat(last, starts),
+        np.add.reduceat(rows, starts),
+        np.stack(
+            [
+                np.add.reduceat(statistics[..., 0], starts, axis=0),
+                np.add.reduceat(statistics[..., 1], starts, axis=0),
+                np.minimum.reduceat(statistics[..., 2], starts, axis=0),
+                np.maximum.reduceat(statistics[..., 3], starts, axis=0),
+            ],
+            axis=-1,
+        ),
+    )
+
+
+def _store(
+    connection: Connection,
+    key: Mapping[str, int],
+    number: IntArray,
+    first: IntArray,
+    last: IntArray,
+    rows: IntArray,
+    statistics: FloatArray,
+) -> None:
+    """Add buckets to those that are stored."""
+    mine = [_TABLE.c[name] == value for name, value in key.items()]
+    stored = connection.execute(
+        select(
+            _TABLE.c.bucket, _TABLE.c.first_ticks, _TABLE.c.last_ticks, _TABLE.c.rows, _TABLE.c.statistics
+        ).where(*mine, _TABLE.c.bucket.between(int(number[0]), int(number[-1])))
+    ).all()
+    wanted = set(number.tolist())
+    stored = [row for row in stored if row[0] in wanted]
+    if stored:
+        shape = (len(stored), -1, STATISTICS)
+        old = np.frombuffer(b"".join(bytes(row[4]) for row in stored), "<f8").reshape(shape)
+        heads = np.array([row[:4] for row in stored], dtype=np.int64)
+        order = np.argsort(np.concatenate([heads[:, 0], number]), kind="stable")
+        number, first, last, rows, statistics = _merged(
+            np.concatenate([heads[:, 0], number])[order],
+            np.concatenate([heads[:, 1], first])[order],
+            np.concatenate([heads[:, 2], last])[order],
+            np.concatenate([heads[:, 3], rows])[order],
+            np.concatenate([old, statistics])[order],
+            1,
+        )
+        for row in range(0, len(stored), 500):
+            chosen = [int(bucket) for bucket in heads[row : row + 500, 0]]
+            connection.execute(delete(_TABLE).where(*mine, _TABLE.c.bucket.in_(chosen)))
+    flat = np.ascontiguousarray(statistics, dtype="<f8")
+    insert_columns(
+        connection,
+        _TABLE,
+        {
+            **{name: np.full(len(number), value) for name, value in key.items()},
+            "bucket": number,
+            "first_ticks": first,
+            "last_ticks": last,
+            "rows": rows,
+            "statistics": [one.tobytes() for one in flat],
+        },
+    )
