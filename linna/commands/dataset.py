@@ -1,9 +1,12 @@
-"""`linna dataset`: build, check and summarise detector data sets."""
+"""`linna dataset`: build, check, summarise and show detector data sets."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
+
+_CLASSES = ("5-10 km", "10-15 km", "15-30 km")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -18,31 +21,43 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--workers", type=int, default=1, metavar="W", help="processes; the frames do not depend on it"
     )
     build.add_argument("--seed", type=int, default=None, help="instead of the recipe's")
-    build.add_argument("--renderer", choices=("fast",), default="fast")
+    build.add_argument("--bits", type=int, choices=(8, 16), default=None, help="of the PNG files")
+    build.add_argument("--renderer", default=None, metavar="NAME", help="fast (default), raymarch or cycles")
     add_json_flag(build)
     build.set_defaults(handler=_build)
     for name, handler, text in (
-        ("check", _check, "verify every file of a data set"),
-        ("stats", _stats, "frames by split, crater instances by class"),
+        ("check", _check, "find missing and damaged files"),
+        ("stats", _stats, "frames by split, crater instances by class, beside the paper's"),
     ):
         verb = verbs.add_parser(name, help=text)
         verb.add_argument("folder", type=Path, metavar="DIR")
         add_json_flag(verb)
         verb.set_defaults(handler=handler)
+    sheet = verbs.add_parser("sheet", help="a picture of frames with their labels, as the paper's Fig. 5")
+    sheet.add_argument("folder", type=Path, metavar="DIR")
+    sheet.add_argument("--out", type=Path, required=True, metavar="F.png")
+    sheet.add_argument("--split", choices=("train", "val", "test"), default="", help="default: all")
+    sheet.add_argument("--columns", type=int, default=4)
+    sheet.add_argument("--rows", type=int, default=2)
+    add_json_flag(sheet)
+    sheet.set_defaults(handler=_sheet)
 
 
 def _build(arguments: argparse.Namespace) -> int:
     import dataclasses
+    import resource
     import time
 
     from linna.data import data_folder
     from linna.output import emit, log
     from payload_emulator.training.build import build
     from payload_emulator.training.recipe import load_recipe
+    from payload_emulator.training.summary import summarise
 
-    recipe = load_recipe(arguments.recipe)
-    if arguments.seed is not None:
-        recipe = dataclasses.replace(recipe, seed=arguments.seed)
+    chosen = {key: getattr(arguments, key) for key in ("seed", "bits", "renderer")}
+    recipe = dataclasses.replace(
+        load_recipe(arguments.recipe), **{key: value for key, value in chosen.items() if value is not None}
+    )
     began = time.monotonic()
     first: int | None = None
     done = 0
@@ -54,8 +69,16 @@ def _build(arguments: argparse.Namespace) -> int:
         rate = (done - first) / elapsed
         left = f", {(total - done) / rate:.0f} s left" if rate > 0 else ""
         log(f"dataset: {done}/{total} frames ({rate:.1f}/s{left})")
-    rate = (done - (first or 0)) / max(time.monotonic() - began, 1e-9)
-    figures = _summary(arguments.out) | {"frames_per_s": rate}
+    made = done - (first or 0)
+    usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    cpu_s = sum(used.ru_utime + used.ru_stime for used in usage)
+    figures = summarise(arguments.out) | {
+        "frames_made": made,
+        "frames_per_s": made / max(time.monotonic() - began, 1e-9),
+        "cpu_ms_per_frame": 1e3 * cpu_s / made if made else None,
+        "peak_rss_mb": max(used.ru_maxrss for used in usage) / 1024.0,
+        "workers": max(1, arguments.workers),
+    }
     emit(arguments, figures, _text(figures))
     return 0
 
@@ -63,55 +86,56 @@ def _build(arguments: argparse.Namespace) -> int:
 def _check(arguments: argparse.Namespace) -> int:
     from linna.output import emit, log
     from payload_emulator.training.integrity import check
+    from payload_emulator.training.summary import summarise
 
     problems = check(arguments.folder)
     for problem in problems:
         log(problem)
-    figures = _summary(arguments.folder) | {"problems": problems}
-    emit(
-        arguments,
-        figures,
-        f"{_text(figures)}\n{len(problems)} problems" if problems else f"{_text(figures)}\nwhole",
-    )
-    return 1 if problems else 0
+    if problems:
+        emit(arguments, {"whole": False, "problems": problems}, f"{len(problems)} problems")
+        return 1
+    figures = summarise(arguments.folder)
+    emit(arguments, figures | {"whole": True, "problems": []}, f"{_text(figures)}\nwhole")
+    return 0
 
 
 def _stats(arguments: argparse.Namespace) -> int:
     from linna.output import emit
+    from payload_emulator.training.summary import summarise
 
-    figures = _summary(arguments.folder)
+    figures = summarise(arguments.folder)
     emit(arguments, figures, _text(figures))
     return 0
 
 
-def _summary(folder: Path) -> dict[str, object]:
-    from payload_emulator.training.dataset import Dataset, count_instances
-    from payload_emulator.training.recipe import SPLITS
+def _sheet(arguments: argparse.Namespace) -> int:
+    from linna.errors import UsageError
+    from linna.output import emit
+    from payload_emulator.training.dataset import Dataset, write_picture
+    from payload_emulator.training.sheet import draw_sheet
 
-    dataset = Dataset(folder)
-    frames = dataset.frames()
-    instances = count_instances(frames, dataset.width_px, dataset.height_px)
-    total = max(sum(instances), 1)
-    return {
-        "frames": len(frames),
-        "instances": instances,
-        "shares": [count / total for count in instances],
-        "split": {split: len(dataset.frames(split)) for split in SPLITS},
-        "sources": {
-            name: sum(f.source == name for f in frames) for name in sorted({f.source for f in frames})
-        },
-        "labels_sha256": dataset.digest,
-        "data": dataset.index["data"],
-    }
+    if arguments.out.suffix.lower() != ".png":
+        raise UsageError(f"--out: expected a .png file, found {arguments.out.name}")
+    if min(arguments.columns, arguments.rows) < 1:
+        raise UsageError("--columns, --rows: expected 1 or more each")
+    picture = draw_sheet(Dataset(arguments.folder), arguments.split, arguments.columns, arguments.rows)
+    write_picture(arguments.out, picture[..., ::-1])
+    emit(arguments, {"sheet": str(arguments.out)}, str(arguments.out))
+    return 0
 
 
-def _text(figures: dict[str, object]) -> str:
-    split = figures["split"]
-    instances, shares = figures["instances"], figures["shares"]
-    assert isinstance(split, dict) and isinstance(instances, list) and isinstance(shares, list)
-    classes = ", ".join(
-        f"{name} {count} ({100 * share:.1f} %)"
-        for name, count, share in zip(("5-10 km", "10-15 km", "15-30 km"), instances, shares, strict=True)
-    )
-    splits = ", ".join(f"{name} {count}" for name, count in split.items())
-    return f"{figures['frames']} frames: {splits}\ncraters in view: {classes}"
+def _text(figures: dict[str, Any]) -> str:
+    paper = figures["paper"]
+    splits = ", ".join(f"{name} {count}" for name, count in figures["split"].items())
+    lines = [
+        f"{figures['frames']} frames: {splits}",
+        f"{'craters in view':<16}{'here':>10}{'share':>8}{'a frame':>9}{'paper':>10}{'share':>8}{'a frame':>9}",
+    ]
+    for k, name in enumerate(_CLASSES):
+        ours, theirs = (
+            f"{of['instances'][k]:>10}{100 * of['shares'][k]:>6.1f} %{of['instances_per_frame'][k]:>9.2f}"
+            for of in (figures, paper)
+        )
+        lines.append(f"{name:<16}{ours}{theirs}")
+    lines.append(f"{'frames':<16}{figures['frames']:>10}{'':17}{paper['frames']:>10}")
+    return "\n".join(lines)

@@ -23,6 +23,7 @@ from payload_emulator.sim.raymarch import rays_window
 from payload_emulator.sim.terrain.tiles import (
     ALBEDO_SHIFT,
     MEAN_ALBEDO,
+    MEASURE_LEVEL,
     TILE_PIXELS,
     TILE_SHIFT,
     Terrain,
@@ -155,7 +156,7 @@ def describe_scene(
     rotation = np.asarray(camera_from_mcmf, dtype=np.float64)
     sun = np.asarray(sun_direction_mcmf, dtype=np.float64)
     latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))
-    ground = float(terrain.height_m(latitude, longitude))
+    ground = float(terrain.height_m(latitude, longitude, MEASURE_LEVEL))
     if altitude <= ground + 50.0:
         raise TerrainError(
             f"cycles: expected a camera above the ground, found it {altitude - ground:.0f} m above terrain "

@@ -21,7 +21,7 @@ from payload_emulator.errors import TerrainError
 from payload_emulator.sim.light import SUN_ANGULAR_RADIUS_RAD
 from payload_emulator.sim.photometry import Photometry
 from payload_emulator.sim.renderer import Rendering
-from payload_emulator.sim.terrain.tiles import ALBEDO_SHIFT, MEAN_ALBEDO, TILE_SHIFT, Terrain
+from payload_emulator.sim.terrain.tiles import ALBEDO_SHIFT, MEAN_ALBEDO, MEASURE_LEVEL, TILE_SHIFT, Terrain
 
 SHADOW_REACH_M = 90.0e3
 MARGIN_M = 6_000.0
@@ -50,7 +50,7 @@ def render(
     rotation = np.asarray(camera_from_mcmf, dtype=np.float64)
     sun = np.asarray(sun_direction_mcmf, dtype=np.float64)
     latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))
-    ground = float(terrain.height_m(latitude, longitude))
+    ground = float(terrain.height_m(latitude, longitude, MEASURE_LEVEL))
     if altitude <= ground + 50.0:
         raise TerrainError(
             f"raymarch: expected a camera above the ground, found it {altitude - ground:.0f} m above terrain "

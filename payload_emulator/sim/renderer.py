@@ -25,6 +25,7 @@ from payload_emulator.sim.photometry import Photometry
 from payload_emulator.sim.terrain.tiles import (
     ALBEDO_SHIFT,
     MEAN_ALBEDO,
+    MEASURE_LEVEL,
     TILE_SHIFT,
     Floats,
     Terrain,
@@ -106,7 +107,7 @@ def render(
     """
     photometry = photometry or Photometry()
     view = tangent_view(position_mcmf_m, camera_from_mcmf, sun_direction_mcmf)
-    ground_m = float(terrain.height_m(*_below(position_mcmf_m)))
+    ground_m = float(terrain.height_m(*_below(position_mcmf_m), MEASURE_LEVEL))
     if view.altitude_m <= ground_m + 50.0:
         raise TerrainError(
             f"render: expected a camera above the ground, found it {view.altitude_m - ground_m:.0f} m above terrain "

@@ -7,6 +7,7 @@ shard, in one move. Memory: each worker keeps one terrain at a time, and of that
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import math
 import multiprocessing
@@ -32,6 +33,7 @@ from payload_emulator.training.shots import Place, draw_box, draw_pose, pose_at
 from payload_emulator.training.track import Track, lay_track
 
 _FOLDERS = ("images", "metadata", "shards")
+_LONGEST_RUN = 8  # shards that one worker makes in turn
 _TERRAIN_KINDS = {"real": "raster", "procedural": "procedural", "catalogue": "catalogue"}
 
 
@@ -172,15 +174,28 @@ def _make(
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(min(workers, len(todo)), mp_context=context, initializer=_follow_parent)
     try:
-        running: dict[Future[None], Shard] = {
-            pool.submit(make_shard, recipe, shard, folder, data_root): shard for shard in todo
+        running: dict[Future[None], Sequence[Shard]] = {
+            pool.submit(_make_run, recipe, run, folder, data_root): run for run in _runs(todo, workers)
         }
         for finished in as_completed(running):
             finished.result()
-            yield running.pop(finished)
+            yield from running.pop(finished)
     finally:
         # After an error nothing more is begun; shards under way are finished.
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _runs(todo: Sequence[Shard], workers: int) -> Iterator[Sequence[Shard]]:
+    """Neighbouring shards of one terrain together, so that a worker finds much of the ground still in its memory."""
+    longest = max(1, min(_LONGEST_RUN, len(todo) // (4 * workers)))
+    for _, group in itertools.groupby(todo, key=lambda shard: (shard.source.name, shard.seed)):
+        shards = list(group)
+        yield from (shards[first : first + longest] for first in range(0, len(shards), longest))
+
+
+def _make_run(recipe: Recipe, shards: Sequence[Shard], folder: Path, data_root: str) -> None:
+    for shard in shards:
+        make_shard(recipe, shard, folder, data_root)
 
 
 def _follow_parent() -> None:

@@ -217,7 +217,8 @@ def stamped_craters(
     arc = shapes.radius_rad[chosen][:, None]
     rim_latitude = place_latitude[:, None] + arc * np.cos(azimuth)
     rim_longitude = place_longitude[:, None] + arc * np.sin(azimuth) / np.cos(place_latitude)[:, None]
-    height = terrain.height_m(rim_latitude, rim_longitude).mean(axis=1) if chosen.size else np.zeros(0)
+    level = terrain.level_for(altitude_m / camera.focal_px)
+    height = terrain.height_m(rim_latitude, rim_longitude, level).mean(axis=1) if chosen.size else np.zeros(0)
     points = (
         np.asarray(mcmf_from_spherical(place_latitude, place_longitude, height)) - position
     ) @ rotation.T

@@ -106,7 +106,7 @@ def pose_at(
     rotation = draw_pointing(source.vary, rng) @ nadir_camera_from_mcmf(position_mcmf_m)
     ground = ground_point_sphere(camera, rotation, position_mcmf_m, edge_pixels(camera))
     heights = _heights_in_view(terrain, ground)
-    under = float(terrain.height_m(latitude, longitude))
+    under = float(heights[-1])
     if altitude_m <= under:
         raise DatasetError(
             f"data set source {source.name!r}: {where}: expected a place above the ground at "
@@ -117,11 +117,16 @@ def pose_at(
 
 
 def _heights_in_view(terrain: Any, edge_mcmf_m: Floats) -> Floats:
-    """Heights (n + 1,) half-way to the points (n, 3) of a footprint's edge and in its middle."""
+    """Heights (n + 1,) half-way to the points (n, 3) of a footprint's edge and in its middle.
+
+    On the level on which rims are measured, which the labels need anyway.
+    """
+    from payload_emulator.sim.terrain.tiles import MEASURE_LEVEL
+
     middle = edge_mcmf_m.mean(axis=0)
     inner = np.concatenate([0.5 * (edge_mcmf_m + middle), middle[None]])
     latitude, longitude, _ = spherical_from_mcmf(inner)
-    return np.asarray(terrain.height_m(latitude, longitude))
+    return np.asarray(terrain.height_m(latitude, longitude, MEASURE_LEVEL))
 
 
 def _about(box: Box, latitude_deg: float, longitude_deg: float) -> Box:

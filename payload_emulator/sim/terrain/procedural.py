@@ -159,7 +159,7 @@ class ProceduralTerrain(TiledTerrain):
         stamp(
             out, latitude_rad, longitude_rad, self._craters_about(latitude_rad, longitude_rad), self._profiles
         )
-        small = self._small.around(latitude_rad, longitude_rad)
+        small = self.small_craters(latitude_rad, longitude_rad)
         stamp(
             out, latitude_rad, longitude_rad, small.above(SMALLEST_CRATER_PIXELS * 0.5 * step), self._profiles
         )

@@ -238,7 +238,7 @@ class RasterTerrain(TiledTerrain):
         for (wavelength, rms), salt in zip(ROUGHNESS_WAVES_KM, self._salts, strict=False):
             if wavelength > shortest:
                 kernels.add_noise(out, *angles, MOON_RADIUS_M / 1000.0 / wavelength, rms, salt, gain)
-        small = self._small.around(latitude_rad, longitude_rad)
+        small = self.small_craters(latitude_rad, longitude_rad)
         stamp(
             out, latitude_rad, longitude_rad, small.above(SMALLEST_CRATER_PIXELS * 0.5 * step), self._profiles
         )

@@ -8,6 +8,7 @@ every window is the same bits whatever was asked before, and no seam can appear 
 from __future__ import annotations
 
 import math
+import threading
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from dataclasses import dataclass
@@ -97,8 +98,8 @@ class Terrain(Protocol):
         """Whether the source itself holds each place."""
         ...
 
-    def height_m(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> Floats:
-        """Height above the map sphere, bilinear on the grid."""
+    def height_m(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike, level: int = 0) -> Floats:
+        """Height above the map sphere, bilinear on the grid of a level of detail."""
         ...
 
     def level_for(self, sample_m: float) -> int:
@@ -127,8 +128,8 @@ class Terrain(Protocol):
 class TiledTerrain(ABC):
     """Cache of tiles and everything that follows from it; a source only has to make one tile.
 
-    A terrain belongs to one thread: the tiles of a patch are overwritten by later ones.  Another thread that asks it
-    for heights while it is at work is refused.
+    A terrain belongs to one thread, the first that asks it for ground: the tiles of a patch are overwritten by later
+    ones.  Other threads are refused; each opens a terrain of its own, which gives the same bits.
     """
 
     _small: SmallCraters | None = None
@@ -163,6 +164,7 @@ class TiledTerrain(ABC):
         self._rim_m = np.array(catalogue.rim_height_m, dtype=np.float64)
         self._depth_m = np.array(catalogue.depth_m, dtype=np.float64)
         self._measured = np.zeros(len(catalogue), dtype=bool)
+        self._owner: int | None = None
 
     @abstractmethod
     def make_heights(self, latitude_rad: Floats, longitude_rad: Floats) -> Heights:
@@ -193,8 +195,10 @@ class TiledTerrain(ABC):
         Raises
         ------
         TerrainError
-            Beyond 84 degrees of latitude, where an equirectangular grid is no use, or wider than the cache.
+            Beyond 84 degrees of latitude, where an equirectangular grid is no use, or wider than the cache, or from
+            another thread than the one this terrain belongs to.
         """
+        self._keep_to_one_thread()
         latitude = np.asarray(latitude_rad, dtype=np.float64).ravel()
         longitude = np.asarray(longitude_rad, dtype=np.float64).ravel()
         worst = int(np.abs(latitude).argmax())
@@ -255,9 +259,9 @@ class TiledTerrain(ABC):
         sizes = [math.pi * MOON_RADIUS_M / (rows * TILE_PIXELS) for rows in self._level_rows]
         return next((level for level, size in enumerate(sizes) if size >= 0.75 * sample_m), LEVELS - 1)
 
-    def height_m(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> Floats:
-        """Height above the map sphere (...) in metres, bilinear on the grid; places may lie anywhere apart."""
-        return self._sample(latitude_rad, longitude_rad, 0)
+    def height_m(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike, level: int = 0) -> Floats:
+        """Height above the map sphere (...) in metres, bilinear on the grid of a level; places may lie far apart."""
+        return self._sample(latitude_rad, longitude_rad, level)
 
     def _sample(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike, level: int) -> Floats:
         from payload_emulator.sim.terrain import kernels
@@ -331,6 +335,16 @@ class TiledTerrain(ABC):
             self._rim_m[part] = rim
             self._depth_m[part] = rim - floor
             self._measured[part] = True
+
+    def _keep_to_one_thread(self) -> None:
+        thread = threading.get_ident()
+        if self._owner is None:
+            self._owner = thread
+        elif self._owner != thread:
+            raise TerrainError(
+                f"terrain {self.name}: expected the thread that first asked it for ground, found another "
+                f"({threading.current_thread().name}): open a terrain for each thread"
+            )
 
     def _slot(self, key: tuple[int, int, int]) -> int:
         slot = self._slots.get(key)
