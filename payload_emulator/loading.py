@@ -23,13 +23,15 @@ from lunar.ephemeris import Ephemeris
 from lunar.frames import IauOrientation, Orientation
 from lunar.gravity import GravityField, builtin_gravity, load_gravity
 from lunar.timescales import format_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
-from payload_emulator.errors import ModelError
+from payload_emulator.errors import ModelError, TableError
 from payload_emulator.flight.anchored import AnchoredParameters
+from payload_emulator.flight.detections import Detector
 from payload_emulator.flight.detector import DetectorParameters, OnnxDetector
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.odometry import OdometryParameters
 from payload_emulator.flight.outcomes import Mode
-from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload
+from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload, PayloadMode
+from payload_emulator.flight.ports import Board
 from payload_emulator.flight.tables import (
     BurnTable,
     CatalogueTable,
@@ -41,6 +43,7 @@ from payload_emulator.flight.tables import (
     pack_gravity_table,
     pack_initial_state,
     pack_orientation_table,
+    unpack_catalogue_table,
 )
 from payload_emulator.parameter_file import BuildParameters, format_parameters, parse_parameters
 from payload_emulator.scenario import Scenario
@@ -65,7 +68,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadedPayload:
-    """A payload ready to observe, and what the archive records of how it was loaded."""
+    """A payload ready to observe, what it can be started anew from, and what the archive records of its loading."""
 
     payload: Payload
     parameters: BuildParameters
@@ -74,6 +77,25 @@ class LoadedPayload:
     start_state: dict[str, Any]
     table_hashes: dict[str, str]
     gravity: dict[str, Any]
+    model: bytes
+    detector: OnnxDetector
+
+    def boot(self, board: Board, detector: Detector | None = None) -> Payload:
+        """Flight software started on a board, in standby; `detector` in place of the network."""
+
+        def from_octets(octets: bytes) -> Detector:
+            return OnnxDetector(octets, self.parameters.detector) if detector is None else detector
+
+        return Payload(
+            self.detector if detector is None else detector,
+            self.parameters.flight,
+            self.tables,
+            model_hash=self.detector.model_hash,
+            model_octets=self.model,
+            board=board,
+            mode=PayloadMode.standby,
+            make_detector=from_octets,
+        )
 
 
 def load_payload(
@@ -116,7 +138,7 @@ def load_payload(
     start_state = _initial_state(scenario, first_frame_utc_ns, position[0], velocity[0])
     tables = FlightTables(
         anchor_ephemeris=_anchor_table(reference, orientation),
-        catalogue=pack_catalogue_table(_catalogue_table(scenario, catalogue)),
+        catalogue=_catalogue_octets(scenario, catalogue),
         gravity=pack_gravity_table(
             GravityTable(field.name, field.gm_m3_s2, field.radius_m, field.c_bar, field.s_bar)
         ),
@@ -150,7 +172,25 @@ def load_payload(
             "filter_degree": field.degree,
             "filter_orientation": flight_orientation.name,
         },
+        model=model_octets,
+        detector=detector,
     )
+
+
+def _catalogue_octets(scenario: Scenario, catalogue: CraterCatalogue) -> bytes:
+    """The anchoring catalogue as uploaded: the table the scenario names, else one of the terrain's craters."""
+    named = scenario.navigation.anchoring_catalogue
+    if not named:
+        return pack_catalogue_table(_catalogue_table(scenario, catalogue))
+    try:
+        octets = Path(named).read_bytes()
+    except OSError as error:
+        raise TableError(
+            f"navigation.anchoring_catalogue {named}: expected a table made by linna catalogue curate, "
+            f"found {error.strerror}"
+        ) from None
+    unpack_catalogue_table(octets)
+    return octets
 
 
 def _catalogue_table(scenario: Scenario, catalogue: CraterCatalogue) -> CatalogueTable:

@@ -141,7 +141,8 @@ class NavigationSection:
     """Estimators on board, and what they are started and fed with.
 
     The initial errors are of the state that starts the filter (1 sigma per axis declared, that length drawn). Errors of
-    the on-board catalogue come on top of those that the terrain's own catalogue has.
+    the on-board catalogue come on top of those that the terrain's own catalogue has. `anchoring_catalogue` names a
+    table made by `linna catalogue curate`; it is uploaded as it is, in place of the terrain's catalogue.
     """
 
     estimators: tuple[str, ...] = ("paper", "spherical", "anchored")
@@ -149,6 +150,7 @@ class NavigationSection:
     initial_velocity_error_m_s: float = 1.0
     filter_gravity: str = "auto"
     filter_degree: int = 100
+    anchoring_catalogue: str = ""
     catalogue_min_diameter_km: float = 3.0
     catalogue_max_diameter_km: float = 30.0
     catalogue_error_fraction_of_diameter: float = 0.0

@@ -1,4 +1,4 @@
-"""`linna catalogue`: size classes of a crater catalogue."""
+"""`linna catalogue`: size classes of a crater catalogue, and the anchoring catalogue made of one."""
 
 from __future__ import annotations
 
@@ -32,6 +32,46 @@ def configure(parser: argparse.ArgumentParser) -> None:
     stats.add_argument("--plot", type=Path, metavar="FILE", help="histogram of diameters (png, svg or pdf)")
     add_json_flag(stats)
     stats.set_defaults(handler=run_stats)
+    _configure_curate(
+        commands.add_parser(
+            "curate", help="make the on-board anchoring catalogue from a crater list and terrain"
+        )
+    )
+
+
+def _configure_curate(curate: argparse.ArgumentParser) -> None:
+    curate.add_argument("catalogue", metavar="CATALOGUE", help="crater list (CSV, plain or gzip)")
+    curate.add_argument(
+        "--terrain",
+        nargs="+",
+        type=Path,
+        metavar="F",
+        help="height rasters in longitude and latitude (default: the 128 px/deg tiles of the data at hand)",
+    )
+    curate.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="F",
+        help="table to write: *.csv as text, without uncertainties; any other name as the table that is uploaded",
+    )
+    curate.add_argument(
+        "--region",
+        default="0,360,-80,80",
+        metavar="W,E,S,N",
+        help="degrees, longitude east (default: 0,360,-80,80)",
+    )
+    curate.add_argument("--min-diameter", type=float, default=3.0, metavar="KM", help="default: 3 km")
+    curate.add_argument("--max-diameter", type=float, default=30.0, metavar="KM", help="default: 30 km")
+    curate.add_argument(
+        "--depth-ratio",
+        type=float,
+        default=0.03,
+        metavar="R",
+        help="least depth over diameter (default: 0.03)",
+    )
+    add_json_flag(curate)
+    curate.set_defaults(handler=run_curate)
 
 
 def run_stats(arguments: argparse.Namespace) -> int:
@@ -63,6 +103,83 @@ def run_stats(arguments: argparse.Namespace) -> int:
     ]
     emit(arguments, figures, text="\n".join(lines))
     return 0
+
+
+def run_curate(arguments: argparse.Namespace) -> int:
+    import numpy as np
+
+    from linna.data import data_folder
+    from linna.errors import UsageError
+    from lunar.catalogue import format_catalogue, load_catalogue
+    from payload_emulator.curation import CurationRules, RasterHeights, curate
+    from payload_emulator.flight.tables import pack_catalogue_table, table_hash
+
+    region = _region(arguments.region)
+    if not 0.5 <= arguments.min_diameter < arguments.max_diameter <= 200.0:
+        raise UsageError(
+            f"--min-diameter, --max-diameter: expected 0.5 to 200 km in this order, "
+            f"found {arguments.min_diameter:g} and {arguments.max_diameter:g}"
+        )
+    paths = arguments.terrain
+    if paths is None:
+        paths = [path for path in data_folder().dem_tiles if "128ppd" in path.name]
+        if not paths:
+            raise UsageError(
+                "--terrain: expected height rasters, found none named and no tiles of 128 px/deg in the data folder"
+            )
+    rules = CurationRules(
+        smallest_m=1e3 * arguments.min_diameter,
+        largest_m=1e3 * arguments.max_diameter,
+        depth_ratio=arguments.depth_ratio,
+    )
+    listed = load_catalogue(arguments.catalogue)
+    heights = RasterHeights(paths)
+    curation = curate(listed, heights, region, rules)
+    table = curation.table
+    octets = pack_catalogue_table(table)
+    if arguments.out.suffix == ".csv":
+        written = format_catalogue(curation.catalogue(f"curated {listed.source}")).encode("ascii")
+    else:
+        written = octets
+    arguments.out.write_bytes(written)
+    shift_m = np.hypot(*curation.shift_m.T)
+    figures = {
+        "kept": len(table),
+        "dropped": curation.dropped,
+        "offset_removed_m": {"east": curation.offset_m[0], "north": curation.offset_m[1]},
+        "offset_sigma_m": curation.offset_sigma_m,
+        "height_correction_m": curation.height_correction_m,
+        "pixels_per_degree": heights.pixels_per_degree,
+        "median_shift_m": float(np.median(shift_m)) if len(table) else None,
+        "median_sigma_m": np.median(table.sigma_m, axis=0) if len(table) else None,
+        "octets": len(octets),
+        "table_hash": f"{table_hash(octets):08x}",
+        "out": str(arguments.out),
+        "data": [f"crater catalogue {listed.source}", *sorted({path.name.split("_")[0] for path in paths})],
+    }
+    emit(
+        arguments,
+        figures,
+        text=f"{len(table)} craters kept of {len(table) + sum(curation.dropped.values())}; dropped: "
+        + ", ".join(f"{reason} {count}" for reason, count in curation.dropped.items())
+        + f"\ncommon offset removed: {curation.offset_m[0]:.0f} m east, {curation.offset_m[1]:.0f} m north "
+        f"(+- {curation.offset_sigma_m:.0f} m); {heights.pixels_per_degree:g} px/deg, rim heights raised by "
+        f"{curation.height_correction_m:.0f} m\n{arguments.out}: {len(written)} octets, table {table_hash(octets):08x}",
+    )
+    return 0
+
+
+def _region(text: str):
+    from linna.errors import UsageError
+    from payload_emulator.curation import Region
+
+    try:
+        west, east, south, north = (float(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(f"--region: expected four numbers W,E,S,N in degrees, found {text!r}") from None
+    if not (-90.0 <= south < north <= 90.0 and 0.0 < east - west <= 360.0):
+        raise UsageError(f"--region: expected west before east and south before north, found {text!r}")
+    return Region(west, east, south, north)
 
 
 def open_catalogue(name: str | None, seed: int) -> CraterCatalogue:

@@ -85,7 +85,7 @@ def vote(
             piece = log_diameter[bin_start[b] : bin_start[b + 1]]
             votes += np.searchsorted(piece, wanted + gate) - np.searchsorted(piece, wanted - gate)
         expected = votes * 4.0 * cell * cell / area
-        weight = int(round(2.0 * min(math.log(0.5 / max(expected, 1e-9)), weight_limit)))
+        weight = round(2.0 * min(math.log(0.5 / max(expected, 1e-9)), weight_limit))
         if votes == 0 or weight < 1:
             continue
         for b in range(bin_height.size):
@@ -109,13 +109,13 @@ def vote(
                     continue
                 latitude = math.asin(s) - turn
                 y = (latitude - south) / cell
-                row = int(math.floor(y))
+                row = math.floor(y)
                 if row < 1 or row >= rows:
                     continue
                 away = longitude[j] - math.asin(t) - west
                 for r in range(row - 1, row + 1):
                     x = away * math.cos(south + (r + 1.0) * cell) / cell
-                    column = int(math.floor(x))
+                    column = math.floor(x)
                     if column < 1 or column >= columns:
                         continue
                     for c in range(column - 1, column + 1):
