@@ -1,8 +1,9 @@
-"""Where the real data products are: $LINNA_DATA, else the user's data directory, else nowhere."""
+"""Where the real data products are: $LINNA_DATA, else the user's data directory, else nowhere; and where Blender is."""
 
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 from lunar.datafolder import DataFolder, find_data
@@ -21,3 +22,8 @@ def data_folder() -> DataFolder:
         return find_data(Path(named))
     default = user_data_directory()
     return find_data(default if default.is_dir() else None)
+
+
+def blender_python() -> str:
+    """The interpreter that has Blender as a module: $LINNA_BLENDER_PYTHON, else the one that runs this."""
+    return os.environ.get("LINNA_BLENDER_PYTHON") or sys.executable

@@ -1,45 +1,121 @@
-"""`linna render`: one frame of a scenario as a picture, with its metadata and labels."""
+"""`linna render`: frames of a scenario as a picture, a labelled contact sheet, or renderers side by side."""
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from pathlib import Path
 from typing import Any
 
-from linna.output import add_json_flag, emit, log
+from linna.output import add_json_flag, emit, log, progress
 
-RENDERERS = ("fast", "raymarch")
+RENDERERS = ("fast", "raymarch", "cycles")
+LAWS = ("lunar-lambert", "lambert", "hapke")
+TERRAINS = ("auto", "raster", "procedural")
+SHEET_VIEWS = 6
+SHEET_COLUMNS = 3
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Render one frame; with --sheet several frames on one picture; with --compare the same frames by every "
+        "renderer, side by side with figures of how they agree. Sheets take the epochs named, or --views frames "
+        "spread over the scenario's observation windows."
+    )
     parser.add_argument("scenario", type=Path, metavar="SCENARIO", help="scenario file (TOML)")
-    parser.add_argument("--epoch", required=True, metavar="UTC", help="when, as 2029-08-07T12:00:00Z")
-    parser.add_argument("--out", required=True, type=Path, metavar="F.png", help="8-bit RGB picture to write")
+    parser.add_argument(
+        "--epoch",
+        action="append",
+        default=[],
+        metavar="UTC",
+        help="when, as 2029-08-07T12:00:00Z; may be repeated",
+    )
+    parser.add_argument("--out", required=True, type=Path, metavar="F.png", help="RGB picture to write")
     parser.add_argument("--renderer", choices=RENDERERS, default="fast", help="default: fast")
+    parser.add_argument("--sheet", action="store_true", help="a contact sheet of several frames")
+    parser.add_argument(
+        "--compare", action="store_true", help="all renderers side by side on several frames, with figures"
+    )
+    parser.add_argument(
+        "--views",
+        type=int,
+        default=SHEET_VIEWS,
+        metavar="N",
+        help=f"frames of a sheet (default: {SHEET_VIEWS})",
+    )
+    parser.add_argument(
+        "--draw-labels",
+        action="store_true",
+        help="draw the labels: cyan, lime, yellow by class (paper, Fig. 5)",
+    )
+    parser.add_argument(
+        "--label-rule",
+        choices=("exact", "paper"),
+        default="exact",
+        help="exact rims, or the paper's local equirectangular map (default: exact)",
+    )
+    parser.add_argument("--terrain", choices=TERRAINS, help="instead of the scenario's")
+    parser.add_argument("--photometry", choices=LAWS, help="instead of the scenario's")
+    parser.add_argument(
+        "--tilt", type=float, metavar="DEG", help="from nadir toward image up, instead of the scenario's"
+    )
+    parser.add_argument(
+        "--yaw", type=float, metavar="DEG", help="azimuth of image up, instead of the scenario's"
+    )
+    parser.add_argument(
+        "--bits", type=int, choices=(8, 12, 16), help="of the sensor, instead of the scenario's"
+    )
     add_json_flag(parser)
     parser.set_defaults(handler=run_render)
 
 
 def run_render(arguments: argparse.Namespace) -> int:
-    from linna.data import data_folder
     from linna.errors import UsageError
-    from lunar.timescales import parse_utc
-    from payload_emulator.frame import render_frame
-    from payload_emulator.scenario import load_scenario
 
     if arguments.out.suffix.lower() != ".png":
         raise UsageError(f"--out: expected a .png file, found {arguments.out.name}")
     if not arguments.out.parent.is_dir():
         raise UsageError(f"--out: expected an existing folder, found {arguments.out.parent}")
-    utc_ns = parse_utc(arguments.epoch)
-    frame = render_frame(load_scenario(arguments.scenario), data_folder(), utc_ns, arguments.renderer)
-    _save_picture(frame.image, arguments.out)
+    if not 1 <= arguments.views <= 60:
+        raise UsageError(f"--views: expected 1 to 60 frames, found {arguments.views}")
+    if arguments.tilt is not None and not abs(arguments.tilt) <= 60.0:
+        raise UsageError(f"--tilt: expected -60 to 60 degrees, found {arguments.tilt:g}")
+    if arguments.sheet and arguments.compare:
+        raise UsageError("--sheet and --compare: expected one of them, found both")
+    if arguments.compare:
+        return _run_compare(arguments)
+    if arguments.sheet:
+        return _run_sheet(arguments)
+    if len(arguments.epoch) != 1:
+        raise UsageError(f"--epoch: expected one for one frame, found {len(arguments.epoch)} (see --sheet)")
+    return _run_frame(arguments)
+
+
+def _run_frame(arguments: argparse.Namespace) -> int:
+    from linna.data import blender_python, data_folder
+    from lunar.timescales import parse_utc
+    from payload_emulator.frame import render_frame
+    from payload_emulator.sheets import draw_labels, save_octets, save_png
+
+    frame = render_frame(
+        _scenario(arguments),
+        data_folder(),
+        parse_utc(arguments.epoch[0]),
+        arguments.renderer,
+        blender_python(),
+        arguments.label_rule,
+    )
+    save_png(draw_labels(frame.image, frame.labels) if arguments.draw_labels else frame.image, arguments.out)
     figures: dict[str, Any] = {
         "image": str(arguments.out),
         "metadata": frame.metadata,
         "labels": frame.labels,
         "data": list(frame.data_names),
     }
+    if frame.filmic_png:
+        filmic = arguments.out.with_name(f"{arguments.out.stem}-filmic.png")
+        save_octets(frame.filmic_png, filmic)
+        figures["filmic"] = str(filmic)
     log(f"{arguments.out}: {len(frame.labels)} craters; data: {'; '.join(frame.data_names)}")
     metadata = frame.metadata
     text = (
@@ -52,15 +128,108 @@ def run_render(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _save_picture(image: Any, path: Path) -> None:
-    """Write the whole file or none of it."""
-    import cv2
+def _run_sheet(arguments: argparse.Namespace) -> int:
+    from linna.data import blender_python
+    from payload_emulator.frame import take_frame, view_at
+    from payload_emulator.sheets import contact_sheet, draw_labels, eight_bits, save_png
 
-    done, octets = cv2.imencode(".png", image[..., ::-1])
-    assert done
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        partial.write_bytes(octets.tobytes())
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    world, epochs = _views(arguments)
+    views = [view_at(world, utc_ns) for utc_ns in epochs]
+    frames = [
+        take_frame(world, view, arguments.renderer, blender_python(), arguments.label_rule)
+        for view in progress(views, len(views), "render", "frames")
+    ]
+    pictures = [
+        draw_labels(frame.image, frame.labels) if arguments.draw_labels else eight_bits(frame.image)
+        for frame in frames
+    ]
+    captions = [_caption(world, view) for view in views]
+    save_png(contact_sheet(pictures, captions, min(SHEET_COLUMNS, len(pictures))), arguments.out)
+    labels = [label for frame in frames for label in frame.labels if label["inside"]]
+    counts = [sum(label["class"] == size for label in labels) for size in range(3)]
+    figures = {
+        "image": str(arguments.out),
+        "views": [frame.metadata | {"labels": len(frame.labels)} for frame in frames],
+        "instances": counts,
+        "data": list(world.data_names),
+    }
+    text = f"{arguments.out}: {len(frames)} frames; craters of classes 0, 1, 2: {', '.join(map(str, counts))}"
+    emit(arguments, figures, text)
+    return 0
+
+
+def _run_compare(arguments: argparse.Namespace) -> int:
+    from linna.data import blender_python
+    from payload_emulator.comparison import compare_on_views
+    from payload_emulator.frame import blender_at_hand, view_at
+    from payload_emulator.sheets import comparison_sheet, save_png
+
+    world, epochs = _views(arguments)
+    views = [view_at(world, utc_ns) for utc_ns in epochs]
+    python = blender_python()
+    names = RENDERERS if blender_at_hand(python) else RENDERERS[:2]
+    if "cycles" not in names:
+        log("cycles is left out: name an interpreter that has Blender's bpy in LINNA_BLENDER_PYTHON")
+    made, agreements = compare_on_views(
+        world, views, names, python, lambda jobs, total: progress(jobs, total, "render", "pictures")
+    )
+    captions = [_caption(world, view) for view in views]
+    save_png(comparison_sheet(made, captions, world.scenario.sensor, world.scenario.seed), arguments.out)
+    figures: dict[str, Any] = {
+        "image": str(arguments.out),
+        "renderers": list(names),
+        "views": captions,
+        **{name: dataclasses.asdict(row) for name, row in agreements.items()},
+        "terrain": world.terrain.name,
+        "data": list(world.data_names),
+    }
+    lines = [
+        f"{name.replace('_', ' ')}: shadow IoU {row.shadow_iou:.3f}, radiance RMSE of lit pixels "
+        f"{100.0 * row.radiance_rmse:.1f} %, correlation {row.correlation:.3f}"
+        for name, row in agreements.items()
+    ]
+    text = "\n".join([f"{arguments.out}: {len(views)} views over {world.terrain.name}", *lines])
+    emit(arguments, figures, text)
+    return 0
+
+
+def _scenario(arguments: argparse.Namespace) -> Any:
+    """The scenario with what the command line says otherwise."""
+    from payload_emulator.scenario import load_scenario
+
+    scenario = load_scenario(arguments.scenario)
+    replaced = {
+        "terrain": {"source": arguments.terrain},
+        "light": {"photometry": arguments.photometry},
+        "camera": {"tilt_deg": arguments.tilt, "yaw_deg": arguments.yaw},
+        "sensor": {"bits": arguments.bits},
+    }
+    sections = {
+        name: dataclasses.replace(
+            getattr(scenario, name), **{key: value for key, value in keys.items() if value is not None}
+        )
+        for name, keys in replaced.items()
+    }
+    return dataclasses.replace(scenario, **sections)
+
+
+def _views(arguments: argparse.Namespace) -> tuple[Any, list[int]]:
+    """The world, and the epochs named or those spread over its observation windows."""
+    from linna.data import data_folder
+    from lunar.timescales import parse_utc
+    from payload_emulator.frame import window_epochs, world_at
+
+    if not arguments.epoch:
+        return window_epochs(_scenario(arguments), data_folder(), arguments.views)
+    epochs = [parse_utc(text) for text in arguments.epoch]
+    return world_at(_scenario(arguments), data_folder(), epochs), epochs
+
+
+def _caption(world: Any, view: Any) -> str:
+    from payload_emulator.frame import metadata_of
+
+    row = metadata_of(world, view)
+    return (
+        f"{row['latitude_deg']:.1f} N {row['longitude_deg']:.1f} E, {row['altitude_km']:.1f} km, "
+        f"Sun {row['sun_elevation_deg']:.1f} deg"
+    )

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from lunar.camera import PinholeCamera, project_mcmf
+from lunar.camera import PinholeCamera, nadir_camera_from_mcmf, project_mcmf
 from lunar.catalogue import CraterCatalogue, size_class
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
@@ -17,6 +17,9 @@ from payload_emulator.sim.terrain.tiles import Terrain
 Floats = npt.NDArray[np.float64]
 
 RIM_POINTS = 24
+HIDDEN_SHARE = 0.1
+"""A rim is hidden where the picture's ground is nearer by this share of the way: more than rims are uneven."""
+
 LARGEST_LABEL_M = 120.0e3
 """Larger basins never fit in a picture and are not labelled."""
 
@@ -45,6 +48,8 @@ class Labels:
         Share of the rim within the picture (1 is not cut).
     lit_fraction
         Share of the visible ground within the rim that sees the Sun; NaN if no shadow picture was given.
+    sight_fraction
+        Share of the rim within the picture that no nearer ground hides; NaN if no ranges were given.
     """
 
     index: npt.NDArray[np.int64]
@@ -60,6 +65,7 @@ class Labels:
     inside: npt.NDArray[np.bool_]
     visible_fraction: Floats
     lit_fraction: Floats
+    sight_fraction: Floats
 
     def __len__(self) -> int:
         return self.index.size
@@ -88,6 +94,7 @@ def label_frame(
     camera_from_mcmf: npt.ArrayLike,
     minimum_diameter_m: float = 2_500.0,
     lit: npt.NDArray[np.float32] | None = None,
+    range_m: npt.NDArray[np.float32] | None = None,
 ) -> Labels:
     """Labels of a terrain's own catalogue, rims at the heights the terrain shows; ``index`` is into that catalogue.
 
@@ -113,7 +120,7 @@ def label_frame(
         off = np.abs(uv - np.array(camera.centre_px)) - np.array([camera.width_px, camera.height_px]) / 2.0
         possible |= off.max(axis=1) <= 1.3 * margin + 4.0
     measured = terrain.measured(near[possible])
-    labels = project_craters(measured, camera, position, rotation, minimum_diameter_m, lit)
+    labels = project_craters(measured, camera, position, rotation, minimum_diameter_m, lit, range_m)
     return replace(labels, index=near[possible][labels.index])
 
 
@@ -124,11 +131,12 @@ def project_craters(
     camera_from_mcmf: npt.ArrayLike,
     minimum_diameter_m: float = 2_500.0,
     lit: npt.NDArray[np.float32] | None = None,
+    range_m: npt.NDArray[np.float32] | None = None,
 ) -> Labels:
     """Labels of all craters of the catalogue with any part of the rim in the picture.
 
     Rims are circles at rim height (the map sphere where it is unknown) about the local vertical, projected point by
-    point; centre and axes come from the ellipse through them.  ``lit`` (H, W) is the shadow picture of a `Rendering`.
+    point; centre and axes come from the ellipse through them.  ``lit`` and ``range_m`` (H, W) are a `Rendering`'s.
     """
     position = np.asarray(position_mcmf_m, dtype=np.float64)
     rotation = np.asarray(camera_from_mcmf, dtype=np.float64)
@@ -148,6 +156,7 @@ def project_craters(
     keep = (within & facing).any(axis=1) & np.isfinite(rim_uv).all(axis=(1, 2)) & facing.all(axis=1)
     keep |= camera.contains(centre_uv) & np.isfinite(rim_uv).all(axis=(1, 2)) & facing.all(axis=1)
     near, centre_uv, rim_uv, within = near[keep], centre_uv[keep], rim_uv[keep], within[keep]
+    distance = np.linalg.norm(rim[keep] - position, axis=-1)
     major, minor, angle = _axes(rim_uv, centre_uv)
     return Labels(
         index=near,
@@ -163,6 +172,40 @@ def project_craters(
         inside=camera.contains(centre_uv),
         visible_fraction=within.mean(axis=1) if near.size else np.empty(0),
         lit_fraction=np.full(near.size, np.nan) if lit is None else _lit_fraction(rim_uv, centre_uv, lit),
+        sight_fraction=(
+            np.full(near.size, np.nan)
+            if range_m is None
+            else _sight_fraction(rim_uv, within, distance, range_m)
+        ),
+    )
+
+
+def label_frame_as_the_paper(
+    terrain: Terrain,
+    camera: PinholeCamera,
+    position_mcmf_m: npt.ArrayLike,
+    minimum_diameter_m: float = 2_500.0,
+    lit: npt.NDArray[np.float32] | None = None,
+    range_m: npt.NDArray[np.float32] | None = None,
+) -> Labels:
+    """The labels of a nadir picture with image up to the north, moved to where the paper's local map puts them.
+
+    What is known of visibility and light stays that of the true place.
+    """
+    position = np.asarray(position_mcmf_m, dtype=np.float64)
+    rotation = nadir_camera_from_mcmf(position)
+    exact = label_frame(terrain, camera, position, rotation, minimum_diameter_m, lit, range_m)
+    u, v, diameter = project_as_the_paper(terrain.catalogue.select(exact.index), camera, position)
+    inside = camera.contains(np.stack([u, v], axis=-1))
+    return replace(
+        exact,
+        u_px=u,
+        v_px=v,
+        diameter_px=diameter,
+        major_px=diameter,
+        minor_px=diameter,
+        angle_rad=np.zeros(len(exact)),
+        inside=inside,
     )
 
 
@@ -229,3 +272,17 @@ def _lit_fraction(rim_uv: Floats, centre_uv: Floats, lit: npt.NDArray[np.float32
     values = np.where(inside, lit[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)], 0.0)
     count = inside.sum(axis=(1, 2))
     return np.where(count > 0, values.sum(axis=(1, 2)) / np.maximum(count, 1), np.nan)
+
+
+def _sight_fraction(
+    rim_uv: Floats, within: npt.NDArray[np.bool_], distance_m: Floats, range_m: npt.NDArray[np.float32]
+) -> Floats:
+    """Share of the rim points within the picture at which the picture shows the rim and nothing nearer."""
+    if not rim_uv.size:
+        return np.empty(0)
+    height, width = range_m.shape
+    u = np.clip(np.rint(rim_uv[..., 0]).astype(np.int64), 0, width - 1)
+    v = np.clip(np.rint(rim_uv[..., 1]).astype(np.int64), 0, height - 1)
+    clear = within & (range_m[v, u] >= (1.0 - HIDDEN_SHARE) * distance_m)
+    count = within.sum(axis=1)
+    return np.where(count > 0, clear.sum(axis=1) / np.maximum(count, 1), np.nan)

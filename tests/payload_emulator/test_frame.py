@@ -53,5 +53,5 @@ def test_an_epoch_before_the_orbit_is_refused(scenario):
 
 
 def test_an_unknown_renderer_is_refused(scenario):
-    with pytest.raises(ScenarioError, match="fast, raymarch, found 'magic'"):
+    with pytest.raises(ScenarioError, match="fast, raymarch, cycles, found 'magic'"):
         render_frame(scenario, DataFolder(), EPOCH, "magic")
