@@ -20,6 +20,8 @@ _THREAD_POLICY = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "NUMBA_SL
 GROUPS: dict[str, tuple[str, str]] = {
     "demo": ("demo", "fly one observation window, downlink it, ingest it, write the report"),
     "emulate": ("emulate", "run the payload over a scenario and write a pass archive"),
+    "replay": ("replay", "fly an archived pass again with a payload build"),
+    "regress": ("regress", "gate a payload build against a baseline over archived passes"),
     "orbit": ("orbit", "propagate, compare and interpolate ephemerides"),
     "catalogue": ("catalogue", "crater catalogues: statistics and on-board curation"),
     "camera": ("camera", "camera studies (field of view)"),

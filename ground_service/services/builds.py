@@ -239,6 +239,12 @@ def build_of(ground: Ground, given: str) -> Build:
     return registered_build(ground, given)
 
 
+def registered_builds(ground: Ground) -> list[dict[str, Any]]:
+    """Builds that are registered, the newest first."""
+    with ground.database.reading() as connection:
+        return repository.page(connection, repository.BUILDS, limit=1000).rows
+
+
 def flight_code_hash() -> str:
     """SHA-256 over the sources of the flight code at hand, which is never imported here."""
     digest = hashlib.sha256()

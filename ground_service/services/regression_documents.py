@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ground_service.processing.recall import expected_craters, match_detections
 from ground_service.processing.alignment import reference_states
 from ground_service.processing.drift import navigation_statistics
+from ground_service.processing.recall import expected_craters, match_detections
 from ground_service.processing.regression_gates import Gate
 from ground_service.services.ground import Ground
 from ground_service.services.pass_data import read_image
@@ -78,17 +78,13 @@ def regression_text(outcome: RegressionOutcome) -> str:
 def regression_junit(outcome: RegressionOutcome) -> str:
     """JUnit XML: a case for every gate and for every pass."""
     cases = [
-        *((f"pass {one.name}", "passes", "" if one.state == "judged" else one.detail, one.state) for one in outcome.passes),
-        *(
-            (
-                f"{gate.name} ({gate.pass_name or 'suite'})",
-                "gates",
-                "" if gate.passed else f"{gate.baseline:.6g} -> {gate.candidate:.6g} {gate.unit}, limit {gate.limit:.6g}",
-                "waived" if gate.waived else "failed",
-            )
-            for gate in outcome.gates
-        ),
-    ]  # fmt: skip
+        (f"pass {one.name}", "passes", "" if one.state == "judged" else one.detail, one.state)
+        for one in outcome.passes
+    ]
+    for gate in outcome.gates:
+        told = f"{gate.baseline:.6g} -> {gate.candidate:.6g} {gate.unit}, limit {gate.limit:.6g}"
+        name = f"{gate.name} ({gate.pass_name or 'suite'})"
+        cases.append((name, "gates", "" if gate.passed else told, "waived" if gate.waived else "failed"))
     suite = ET.Element("testsuite", name="linna regress", tests=str(len(cases)))
     failures = errors = skipped = 0
     for name, kind, message, state in cases:
@@ -270,7 +266,12 @@ def _gate(gate: Gate) -> dict[str, Any]:
 
 
 def _pass(one: PassVerdict) -> dict[str, Any]:
-    found: dict[str, Any] = {"name": one.name, "archive": one.digest, "state": one.state, "detail": one.detail}
+    found: dict[str, Any] = {
+        "name": one.name,
+        "archive": one.digest,
+        "state": one.state,
+        "detail": one.detail,
+    }
     for label, replay, read in (
         ("baseline", one.baseline, one.baseline_read),
         ("candidate", one.candidate, one.candidate_read),
@@ -318,7 +319,9 @@ def _campaign_pass(one: PassVerdict, side: str) -> CampaignPass:
 
 
 def _statistics(estimator: Any) -> NavigationStatistics:
-    along = np.column_stack([estimator.error_m, np.zeros(len(estimator.error_m)), np.zeros(len(estimator.error_m))])
+    along = np.column_stack(
+        [estimator.error_m, np.zeros(len(estimator.error_m)), np.zeros(len(estimator.error_m))]
+    )
     return navigation_statistics(
         along, np.zeros(len(estimator.error_m)), np.zeros(len(estimator.error_m), dtype=np.bool_)
     )
@@ -339,10 +342,14 @@ def _headline(outcome: RegressionOutcome) -> tuple[HeadlineFigure, ...]:
         if gate is None:
             figures.append(HeadlineFigure(label, None, unit, "not gated"))
         elif scale == 0.0:
-            figures.append(HeadlineFigure(label, 100.0 * (gate.candidate / gate.baseline - 1.0), unit, "CPU time"))
+            figures.append(
+                HeadlineFigure(label, 100.0 * (gate.candidate / gate.baseline - 1.0), unit, "CPU time")
+            )
         else:
             figures.append(
-                HeadlineFigure(label, scale * gate.candidate, unit, f"baseline {scale * gate.baseline:.3g} {unit}")
+                HeadlineFigure(
+                    label, scale * gate.candidate, unit, f"baseline {scale * gate.baseline:.3g} {unit}"
+                )
             )
     return tuple(figures)
 
@@ -351,7 +358,9 @@ def _verdict_text(outcome: RegressionOutcome, failed: list[Gate], troubled: list
     parts = []
     if failed:
         names = list(dict.fromkeys(gate.name for gate in failed))
-        parts.append(f"{len(failed)} gates failed: {', '.join(names[:6])}{' and others' if len(names) > 6 else ''}.")
+        parts.append(
+            f"{len(failed)} gates failed: {', '.join(names[:6])}{' and others' if len(names) > 6 else ''}."
+        )
     else:
         parts.append(f"All {len(outcome.gates)} gates passed.")
     if troubled:
@@ -364,7 +373,9 @@ def _coarse(outcome: RegressionOutcome) -> list[str]:
     gate = next((g for g in outcome.gates if g.name == "detector.recall" and not g.pass_name), None)
     if gate is None or not np.isfinite(gate.resolution):
         return []
-    return [f"These passes show a loss of recall of {gate.resolution:.3f} or more with a probability of nine in ten."]
+    return [
+        f"These passes show a loss of recall of {gate.resolution:.3f} or more with a probability of nine in ten."
+    ]
 
 
 def _rung(sources: list[str]) -> str:

@@ -1,0 +1,304 @@
+"""`linna regress`: gate a payload build against a baseline over archived passes."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from linna.commands._ground import add_service_options, open_service
+from linna.output import add_json_flag, emit, log, progress
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    commands = parser.add_subparsers(dest="what", metavar="COMMAND", required=True)
+    run = commands.add_parser("run", help="fly archives with two builds and judge the candidate")
+    _archives(run)
+    run.add_argument(
+        "--build", required=True, metavar="BUILD", help="candidate: build file, 'current' or identity"
+    )
+    run.add_argument("--baseline", default="current", metavar="BUILD", help="baseline (default: current)")
+    run.add_argument(
+        "--policy", type=Path, metavar="FILE", help="policy of the gates (default: the shipped one)"
+    )
+    run.add_argument("--junit", type=Path, metavar="FILE", help="write JUnit XML")
+    run.add_argument("--report", type=Path, metavar="FILE", help="write the report as HTML")
+    _finish(run, _run)
+    baseline = commands.add_parser(
+        "baseline", help="fly archives with one build; its figures with their confidence"
+    )
+    _archives(baseline)
+    baseline.add_argument("--build", default="current", metavar="BUILD", help="build (default: current)")
+    _finish(baseline, _baseline)
+    suite = commands.add_parser("suite", help="write the small archived passes that builds are judged on")
+    suite.add_argument("scenario", nargs="*", help="scenario files (default: the shipped suite)")
+    suite.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the archives")
+    suite.add_argument(
+        "--frames", type=int, metavar="N", help="frames of each pass (default: the scenario's)"
+    )
+    suite.add_argument(
+        "--seeds", type=int, default=1, metavar="K", help="passes of each scenario (default: 1)"
+    )
+    add_json_flag(suite)
+    suite.set_defaults(handler=_suite)
+    bisect = commands.add_parser("bisect", help="find the change of model or parameters that moved a figure")
+    _archives(bisect)
+    bisect.add_argument("--good", required=True, metavar="BUILD")
+    bisect.add_argument("--bad", required=True, metavar="BUILD")
+    bisect.add_argument("--figure", required=True, metavar="NAME", help="such as detector.recall")
+    _finish(bisect, _bisect)
+    search = commands.add_parser("search", help="find the passes on which two builds differ most")
+    _archives(search)
+    search.add_argument("--build", required=True, metavar="BUILD")
+    search.add_argument("--baseline", default="current", metavar="BUILD")
+    search.add_argument("--top", type=int, default=10, metavar="N")
+    _finish(search, _search)
+    archive = commands.add_parser("archive", help="archives that are kept to be flown again")
+    archive.add_argument("action", choices=("list", "add", "pin", "unpin", "pack", "prune"))
+    archive.add_argument("target", nargs="?", help="archive to add or pack; identity to pin or unpin")
+    archive.add_argument("--out", type=Path, metavar="FILE", help="zip to write (pack)")
+    archive.add_argument(
+        "--unused-days", type=float, default=90.0, help="prune what was not used for so long"
+    )
+    _finish(archive, _archive)
+    build = commands.add_parser("build", help="register a build, or list those registered")
+    build.add_argument("action", choices=("register", "list"))
+    build.add_argument("file", nargs="?", help="build file")
+    _finish(build, _build)
+
+
+def _archives(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--archive",
+        required=True,
+        nargs="+",
+        action="extend",
+        metavar="ARCHIVE",
+        help="pass archives: folders, zips, folders of archives, or identities of kept ones",
+    )
+    parser.add_argument("--workers", type=int, metavar="N", help="replays at a time (default: one a core)")
+
+
+def _finish(parser: argparse.ArgumentParser, handler) -> None:  # type: ignore[no-untyped-def]
+    add_service_options(parser)
+    add_json_flag(parser)
+    parser.set_defaults(handler=handler)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from ground_service.services.builds import build_of
+    from ground_service.services.regression_documents import (
+        regression_html,
+        regression_json,
+        regression_junit,
+        regression_text,
+    )
+    from ground_service.services.regression_policy import load_policy
+    from ground_service.services.regressions import keep_regression, run_regression
+
+    policy = load_policy(arguments.policy)
+    with open_service(arguments) as ground:
+        candidate, baseline = build_of(ground, arguments.build), build_of(ground, arguments.baseline)
+        outcome = run_regression(
+            ground,
+            _listed(arguments.archive),
+            candidate,
+            baseline,
+            policy,
+            workers=arguments.workers,
+            progress=_bar,
+        )
+        identity = keep_regression(ground, outcome)
+        if arguments.junit:
+            arguments.junit.write_text(regression_junit(outcome), encoding="utf-8")
+        if arguments.report:
+            arguments.report.write_text(regression_html(ground, outcome, identity), encoding="utf-8")
+        emit(arguments, {"id": identity, **regression_json(outcome)}, text=regression_text(outcome))
+    return outcome.exit_status
+
+
+def _baseline(arguments: argparse.Namespace) -> int:
+    from ground_service.services.builds import build_of
+    from ground_service.services.regression_baseline import baseline_figures, baseline_text
+    from ground_service.services.regression_policy import load_policy
+    from ground_service.services.regressions import run_regression
+
+    with open_service(arguments) as ground:
+        build = build_of(ground, arguments.build)
+        policy = load_policy()
+        outcome = run_regression(
+            ground, _listed(arguments.archive), build, build, policy, workers=arguments.workers, progress=_bar
+        )
+        figures = baseline_figures(outcome)
+        emit(arguments, figures, text=baseline_text(figures))
+    return 0 if all(one.state == "judged" for one in outcome.passes) else 2
+
+
+def _suite(arguments: argparse.Namespace) -> int:
+    from linna.data import data_folder
+    from payload_emulator.suite import suite_scenarios, write_suite
+
+    scenarios = suite_scenarios(arguments.scenario, frames=arguments.frames, seeds=arguments.seeds)
+    written = write_suite(
+        scenarios,
+        data_folder(),
+        arguments.out,
+        progress=lambda items, total: progress(items, total, "frames", "frame"),
+    )
+    rows = [
+        {
+            "archive": str(one.folder),
+            "scenario": one.scenario,
+            "frames": one.frames,
+            "altitude_km": list(one.altitude_km),
+        }
+        for one in written
+    ]
+    lines = [
+        f"{row['archive']}: {row['frames']} frames, {one.altitude_km[0]:.0f} to {one.altitude_km[1]:.0f} km"
+        for row, one in zip(rows, written, strict=True)
+    ]
+    emit(arguments, {"passes": rows}, text="\n".join(lines))
+    return 0
+
+
+def _bisect(arguments: argparse.Namespace) -> int:
+    from ground_service.services.builds import build_of
+    from ground_service.services.regression_policy import load_policy
+    from ground_service.services.regression_search import bisect
+
+    with open_service(arguments) as ground:
+        found = bisect(
+            ground,
+            _listed(arguments.archive),
+            build_of(ground, arguments.good),
+            build_of(ground, arguments.bad),
+            arguments.figure,
+            load_policy(),
+            workers=arguments.workers,
+            tell=log,
+        )
+    lines = [
+        f"{found.figure}: {found.good:.6g} -> {found.bad:.6g}, {len(found.changes)} changes, {found.runs} builds"
+    ]
+    lines += [f"  {' + '.join(item.changes)}: {item.value:.6g}" for item in found.culprits]
+    emit(
+        arguments,
+        {
+            "figure": found.figure,
+            "good": found.good,
+            "bad": found.bad,
+            "changes": list(found.changes),
+            "culprits": [{"changes": list(item.changes), "value": item.value} for item in found.culprits],
+            "runs": found.runs,
+        },
+        text="\n".join(lines),
+    )
+    return 0
+
+
+def _search(arguments: argparse.Namespace) -> int:
+    from dataclasses import asdict
+
+    from ground_service.services.builds import build_of
+    from ground_service.services.regression_policy import load_policy
+    from ground_service.services.regression_search import differences
+    from ground_service.services.regressions import run_regression
+
+    with open_service(arguments) as ground:
+        outcome = run_regression(
+            ground,
+            _listed(arguments.archive),
+            build_of(ground, arguments.build),
+            build_of(ground, arguments.baseline),
+            load_policy(),
+            workers=arguments.workers,
+            progress=_bar,
+        )
+    found = differences(outcome)[: arguments.top]
+    lines = [
+        f"{item.name}: {item.frames_changed} of {item.frames} frames changed, {item.craters_changed} craters, "
+        f"positions {item.position_m:.1f} m apart"
+        for item in found
+    ]
+    emit(
+        arguments,
+        {"passes": [asdict(item) for item in found]},
+        text="\n".join(lines) or "no pass was flown by both",
+    )
+    return 0
+
+
+def _archive(arguments: argparse.Namespace) -> int:
+    from ground_service.services import regression_archives as archives
+    from linna.errors import UsageError
+
+    if arguments.action in ("add", "pin", "unpin", "pack") and not arguments.target:
+        raise UsageError(f"regress archive {arguments.action}: expected an archive, found none")
+    if arguments.action == "pack":
+        if arguments.out is None:
+            raise UsageError("regress archive pack: expected --out FILE, found none")
+        archives.pack_archive(Path(arguments.target), arguments.out)
+        emit(arguments, {"archive": str(arguments.out)}, text=f"archive: {arguments.out}")
+        return 0
+    with open_service(arguments) as ground:
+        removed: list[str] = []
+        if arguments.action == "add":
+            archives.keep_archive(ground, Path(arguments.target))
+        elif arguments.action in ("pin", "unpin"):
+            archives.pin_archive(ground, arguments.target, arguments.action == "pin")
+        elif arguments.action == "prune":
+            removed = archives.let_go(ground, unused_for_ns=round(arguments.unused_days * 86_400e9))
+        rows = archives.kept_archives(ground)
+    shown = [
+        {key: row[key] for key in ("digest", "name", "frames", "octets")} | {"pinned": bool(row["pinned"])}
+        for row in rows
+    ]
+    lines = [
+        f"{row['digest'][:16]}  {row['frames']:5} frames  {row['octets'] / 1e6:8.1f} MB  {row['name']}"
+        f"{'  pinned' if row['pinned'] else ''}"
+        for row in shown
+    ]
+    emit(arguments, {"archives": shown, "removed": removed}, text="\n".join(lines) or "no archive is kept")
+    return 0
+
+
+def _build(arguments: argparse.Namespace) -> int:
+    from ground_service.services.builds import build_of, registered_builds
+    from linna.errors import UsageError
+
+    with open_service(arguments) as ground:
+        if arguments.action == "register":
+            if not arguments.file:
+                raise UsageError("regress build register: expected a build file, found none")
+            build = build_of(ground, arguments.file)
+            emit(
+                arguments,
+                {"digest": build.digest, "name": build.name, "version": build.version},
+                text=build.title,
+            )
+            return 0
+        rows = registered_builds(ground)
+    shown = [{key: row[key] for key in ("digest", "name", "version", "kind", "provenance")} for row in rows]
+    lines = [
+        f"{row['digest'][:16]}  {row['kind']:<8} {row['name']} {row['version']}".rstrip() for row in shown
+    ]
+    emit(arguments, {"builds": shown}, text="\n".join(lines) or "no build is registered")
+    return 0
+
+
+def _listed(given: list[str]) -> list[str]:
+    """Archives as given, folders of archives opened up."""
+    found = []
+    for item in given:
+        folder = Path(item)
+        inside = sorted(path.parent for path in folder.glob("*/manifest.json")) if folder.is_dir() else []
+        packed = sorted(folder.glob("*.zip")) if folder.is_dir() else []
+        if (folder / "manifest.json").is_file() or not (inside or packed):
+            found.append(item)
+        else:
+            found += [str(path) for path in (*inside, *packed)]
+    return found
+
+
+def _bar(items, total):  # type: ignore[no-untyped-def]
+    return progress(items, total, "replays", "replay")
