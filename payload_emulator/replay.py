@@ -233,6 +233,7 @@ def rendered_images(archive: Path, record: PassRecord, data: DataFolder) -> Iter
     if not text:
         raise RecordError(f"{archive}: expected frames, or a scenario to render them from, found neither")
     world = build_world(parse_scenario(str(text), source=f"scenario of {archive}"), data)
+    world.terrain.hand_over()
     absent = set(missing_frames(archive, record.inputs))
 
     def image_of(item: FrameInput) -> Image:

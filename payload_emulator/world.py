@@ -171,12 +171,16 @@ def _disturbed(
 
 def exposures(world: World) -> Iterator[Exposure]:
     """The frames of a world in time order, the next ones rendered while the payload works on this one."""
-    with ThreadPoolExecutor(max_workers=1) as renderer:
-        pending = [renderer.submit(expose_frame, world, 0)]
-        for number in range(world.frame_utc_ns.size):
-            if number + 1 < world.frame_utc_ns.size:
-                pending.append(renderer.submit(expose_frame, world, number + 1))
-            yield pending.pop(0).result()
+    world.terrain.hand_over()
+    try:
+        with ThreadPoolExecutor(max_workers=1) as renderer:
+            pending = [renderer.submit(expose_frame, world, 0)]
+            for number in range(world.frame_utc_ns.size):
+                if number + 1 < world.frame_utc_ns.size:
+                    pending.append(renderer.submit(expose_frame, world, number + 1))
+                yield pending.pop(0).result()
+    finally:
+        world.terrain.hand_over()
 
 
 def orders_before(world: World, number: int) -> bytes:

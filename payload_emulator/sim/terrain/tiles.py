@@ -336,6 +336,10 @@ class TiledTerrain(ABC):
             self._depth_m[part] = rim - floor
             self._measured[part] = True
 
+    def hand_over(self) -> None:
+        """Let go of the thread that asked for ground so far: the next one that asks is kept to."""
+        self._owner = None
+
     def _keep_to_one_thread(self) -> None:
         thread = threading.get_ident()
         if self._owner is None:
