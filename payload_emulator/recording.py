@@ -33,7 +33,7 @@ FRAME_TIMES = "frame_times.csv"
 DICTIONARY_FILE = f"{FOLDER}/dictionary.json"
 
 FloatArray = NDArray[np.float64]
-Image = NDArray[np.uint8]
+Image = NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,7 +159,9 @@ def missing_frames(folder: Path, inputs: Sequence[FrameInput]) -> list[int]:
 
 
 def save_image(folder: Path, number: int, image: Image) -> None:
-    """Write one frame into an archive."""
+    """Write one frame into an archive; an image without pixels leaves no file."""
+    if image.size == 0:
+        return
     import cv2
 
     path = folder / frame_path(number)
