@@ -31,6 +31,8 @@ class DataFolder:
     dem_tiles: tuple[Path, ...] = ()
     dem_global: Path | None = None
     albedo: Path | None = None
+    dem_sldem: tuple[Path, ...] = ()
+    albedo_tiles: tuple[Path, ...] = ()
     photometry: Path | None = None
 
     def names(self) -> tuple[str, ...]:
@@ -47,7 +49,9 @@ class DataFolder:
             (self.catalogue_robbins, "crater catalogue Robbins 2019"),
             (self.dem_tiles or None, "height model LROC WAC GLD100 (Scholten et al. 2012)"),
             (self.dem_global, "height model LROC WAC GLD100, 16 px/deg"),
+            (self.dem_sldem or None, "height model SLDEM2015 (Barker et al. 2016)"),
             (self.albedo, "albedo map"),
+            (self.albedo_tiles or None, "albedo LROC WAC empirically normalised mosaic"),
             (self.photometry, "photometry SELENE SP (Kouyama et al. 2016)"),
         )
         return tuple(name for path, name in present if path is not None)
@@ -67,7 +71,9 @@ def find_data(path: Path | str | None) -> DataFolder:
     if not root.is_dir():
         raise DataFileError(root, "", "a data folder", "a file" if root.exists() else "nothing there")
     global_dem = _first(root, "dem/*_global.jp2", "dem/*_global.tif")
-    tiles = sorted([*root.glob("dem/*ppd_*E_*.jp2"), *root.glob("dem/*ppd_*E_*.tif")])
+    tiles = _all(
+        root, "dem/*ppd_*E_*.jp2", "dem/*ppd_*E_*.tif", "dem/WAC_GLD100_E*.IMG", "dem/WAC_GLD100_E*.tif"
+    )
     return DataFolder(
         root=root,
         gravity=_first(root, "gravity/GRGM*.gfc", "gravity/*.gfc", "gravity/*GRGM*", "gravity/*.tab"),
@@ -76,10 +82,12 @@ def find_data(path: Path | str | None) -> DataFolder:
         orientation_tf=_first(root, "kernels/moon_080317.tf", "kernels/moon*.tf"),
         catalogue_lu=_first(root, "craters/lu1319381*.csv.gz", "craters/lu1319381*.csv"),
         catalogue_composite=_first(root, "craters/composite*.csv.gz", "craters/composite*.csv"),
-        catalogue_robbins=_first(root, "craters/lunar_craters_ge20km.csv", "craters/*robbins*.csv*"),
-        dem_tiles=tuple(tiles),
+        catalogue_robbins=_first(root, "craters/*robbins*.csv*", "craters/lunar_craters_ge20km.csv"),
+        dem_tiles=tiles,
         dem_global=global_dem,
-        albedo=_first(root, "albedo/moon_albedo*.jpg", "albedo/*.jpg", "albedo/*.tif"),
+        dem_sldem=_all(root, "dem/SLDEM2015*.LBL", "dem/sldem2015*.lbl", "dem/SLDEM2015*.tif"),
+        albedo=_first(root, "albedo/moon_albedo*.jpg", "albedo/*.jpg"),
+        albedo_tiles=_all(root, "albedo/WAC_*.IMG", "albedo/WAC_*.tif"),
         photometry=_first(root, "photometry/parameters"),
     )
 
@@ -96,6 +104,10 @@ def default_gravity(data: DataFolder) -> GravityField:
     from lunar.gravity import builtin_gravity, load_gravity
 
     return builtin_gravity() if data.gravity is None else load_gravity(data.gravity)
+
+
+def _all(root: Path, *patterns: str) -> tuple[Path, ...]:
+    return tuple(sorted(found for pattern in patterns for found in root.glob(pattern)))
 
 
 def _first(root: Path, *patterns: str) -> Path | None:

@@ -7,12 +7,8 @@ resolution form a layer; the finest layer that holds a place gives its height, a
 from __future__ import annotations
 
 import math
-import warnings
-from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +17,7 @@ from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import TerrainError
 from payload_emulator.sim.terrain import kernels
+from payload_emulator.sim.terrain.albedo import open_albedo
 from payload_emulator.sim.terrain.craters import SmallCraters, crater_profiles
 from payload_emulator.sim.terrain.procedural import (
     SHORTEST_WAVE_PIXELS,
@@ -28,6 +25,7 @@ from payload_emulator.sim.terrain.procedural import (
     mottled_albedo,
     stamp,
 )
+from payload_emulator.sim.terrain.rasters import RasterLayer, open_layers
 from payload_emulator.sim.terrain.tiles import (
     Floats,
     Heights,
@@ -54,123 +52,12 @@ REFERENCE_SLOPE = 0.10
 
 SLOPE_SPACING_M = 950.0
 SMALL_LOW_M = 350.0
-SMALL_HIGH_M = 1_800.0
+EFFECTIVE_RESOLUTION_M = 1_800.0
+"""GLD100 shows craters from about this size on, at 128 or 256 pixels per degree alike."""
+
 SMALL_EXPONENT = 2.2
 CATALOGUE_DENSITY_2KM = 0.0080
 """Craters above 2 km per km2 in LU1319381 (222,451 over 53 of 72 tiles); scales the smaller ones by place."""
-
-CHUNK_PIXELS = 1024
-CHUNKS_KEPT = 96
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class RasterFile:
-    """One georeferenced file: its place on the pixel lattice of its layer."""
-
-    path: Path
-    first_row: int
-    first_column: int
-    rows: int
-    columns: int
-    scale_m: float
-    nodata: float | None
-
-
-class RasterLayer:
-    """Files of one resolution on one global pixel lattice, read in chunks as they are needed."""
-
-    def __init__(
-        self, pixels_per_degree: float, north_offset: float, west_offset: float, files: Sequence[RasterFile]
-    ) -> None:
-        """The lattice has pixel centres at latitude ``90 - (row + 0.5 + north_offset) / ppd``, likewise longitude."""
-        self.pixels_per_degree = pixels_per_degree
-        self.north_offset = north_offset
-        self.west_offset = west_offset
-        self.files = tuple(files)
-        self.turn = round(360.0 * pixels_per_degree)
-        self._chunks: OrderedDict[tuple[int, int, int], Heights] = OrderedDict()
-
-    def read(self, first_row: int, first_column: int, rows: int, columns: int) -> Heights:
-        """Heights (rows, columns) in metres of a window of the lattice; NaN where no file has data."""
-        out = np.full((rows, columns), np.nan, np.float32)
-        for number, file in enumerate(self.files):
-            top = max(first_row, file.first_row)
-            bottom = min(first_row + rows, file.first_row + file.rows)
-            if top >= bottom:
-                continue
-            turns = {
-                math.floor((first_column - file.first_column) / self.turn),
-                math.floor((first_column + columns - 1 - file.first_column) / self.turn),
-            }
-            for turn in turns:
-                west = file.first_column + turn * self.turn
-                left, right = max(first_column, west), min(first_column + columns, west + file.columns)
-                if left < right:
-                    self._copy(
-                        number, file, out, (top, bottom), (left, right), (first_row, first_column), west
-                    )
-        return out
-
-    def holds(self, latitude_rad: Floats, longitude_rad: Floats) -> npt.NDArray[np.bool_]:
-        """Whether a file spans each place."""
-        row = (90.0 - np.degrees(latitude_rad)) * self.pixels_per_degree - self.north_offset
-        column = np.degrees(longitude_rad) * self.pixels_per_degree - self.west_offset
-        held = np.zeros(row.shape, dtype=bool)
-        for file in self.files:
-            east = (column - file.first_column) % self.turn
-            held |= (row >= file.first_row) & (row <= file.first_row + file.rows) & (east <= file.columns)
-        return held
-
-    def _copy(
-        self,
-        number: int,
-        file: RasterFile,
-        out: Heights,
-        rows: tuple[int, int],
-        columns: tuple[int, int],
-        origin: tuple[int, int],
-        west: int,
-    ) -> None:
-        top, bottom = rows[0] - file.first_row, rows[1] - file.first_row
-        left, right = columns[0] - west, columns[1] - west
-        for i in range(top // CHUNK_PIXELS, (bottom - 1) // CHUNK_PIXELS + 1):
-            for j in range(left // CHUNK_PIXELS, (right - 1) // CHUNK_PIXELS + 1):
-                chunk = self._chunk(number, file, i, j)
-                a, b = max(top, i * CHUNK_PIXELS), min(bottom, i * CHUNK_PIXELS + chunk.shape[0])
-                c, d = max(left, j * CHUNK_PIXELS), min(right, j * CHUNK_PIXELS + chunk.shape[1])
-                part = chunk[
-                    a - i * CHUNK_PIXELS : b - i * CHUNK_PIXELS, c - j * CHUNK_PIXELS : d - j * CHUNK_PIXELS
-                ]
-                row = a + file.first_row - origin[0]
-                column = c + west - origin[1]
-                place = out[row : row + part.shape[0], column : column + part.shape[1]]
-                np.copyto(place, part, where=~np.isnan(part))
-
-    def _chunk(self, number: int, file: RasterFile, i: int, j: int) -> Heights:
-        key = (number, i, j)
-        found = self._chunks.get(key)
-        if found is not None:
-            self._chunks.move_to_end(key)
-            return found
-        import rasterio
-        from rasterio.windows import Window
-
-        top, left = i * CHUNK_PIXELS, j * CHUNK_PIXELS
-        window = Window(left, top, min(CHUNK_PIXELS, file.columns - left), min(CHUNK_PIXELS, file.rows - top))
-        try:
-            with rasterio.open(file.path) as source:
-                raw = source.read(1, window=window)
-        except rasterio.errors.RasterioError as error:
-            raise TerrainError(f"{file.path}: expected readable raster data, found {error}") from None
-        values: Heights = raw.astype(np.float32)
-        if file.nodata is not None:
-            values[raw == file.nodata] = np.nan
-        if file.scale_m != 1.0:
-            values *= np.float32(file.scale_m)
-        if len(self._chunks) >= CHUNKS_KEPT:
-            self._chunks.popitem(last=False)
-        self._chunks[key] = values
-        return values
 
 
 class RasterTerrain(TiledTerrain):
@@ -182,7 +69,7 @@ class RasterTerrain(TiledTerrain):
         catalogue: CraterCatalogue,
         *,
         coarse_paths: Sequence[Path | str] = (),
-        albedo_path: Path | str | None = None,
+        albedo_paths: Sequence[Path | str] = (),
         name: str = "rasters",
         data_names: tuple[str, ...] = (),
         seed: int = 0,
@@ -190,12 +77,14 @@ class RasterTerrain(TiledTerrain):
         registration_north_m: float = REGISTRATION_NORTH_M,
         registration_east_m: float = 0.0,
         smoothing_pixels: float = SMOOTHING_PIXELS,
+        effective_resolution_m: float = EFFECTIVE_RESOLUTION_M,
         pixels_per_degree: int = 256,
         cache_tiles: int = 192,
     ) -> None:
         """``coarse_paths`` fill in around ``paths`` (under shadows and at edges) and do not count as covered.
 
-        ``sharpen`` adds seeded craters below 1.8 km and roughness; ``registration_*`` shift the rasters on the ground.
+        ``sharpen`` adds seeded craters and roughness below ``effective_resolution_m``, the size of what the rasters
+        still show, whatever their pixels; ``registration_*`` shift the rasters on the ground.
         """
         if not paths:
             raise TerrainError("terrain rasters: expected at least one height raster, found none")
@@ -209,11 +98,14 @@ class RasterTerrain(TiledTerrain):
         self._profiles = crater_profiles()
         rng = np.random.Generator(np.random.PCG64([seed, 0x52415354]))
         self._salts = [int(salt) for salt in rng.integers(1, 2**31 - 1, 32)]
-        per_km2 = CATALOGUE_DENSITY_2KM * (2_000.0 / SMALL_LOW_M) ** SMALL_EXPONENT
-        self._small = SmallCraters(
-            seed, SMALL_LOW_M, SMALL_HIGH_M, per_km2, SMALL_EXPONENT, _density_map(catalogue)
-        )
-        self._albedo_map = None if albedo_path is None else load_albedo_map(Path(albedo_path))
+        if sharpen and effective_resolution_m > SMALL_LOW_M:
+            per_km2 = CATALOGUE_DENSITY_2KM * (2_000.0 / SMALL_LOW_M) ** SMALL_EXPONENT
+            per_km2 *= _share_below(effective_resolution_m) / _share_below(EFFECTIVE_RESOLUTION_M)
+            self._small = SmallCraters(
+                seed, SMALL_LOW_M, effective_resolution_m, per_km2, SMALL_EXPONENT, _density_map(catalogue)
+            )
+        self._waves = [wave for wave in ROUGHNESS_WAVES_KM if wave[0] * 1e3 <= effective_resolution_m]
+        self._reflectance = open_albedo(albedo_paths) if albedo_paths else None
         super().__init__(name, data_names or (name,), catalogue, pixels_per_degree, cache_tiles)
 
     def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> npt.NDArray[np.bool_]:
@@ -235,7 +127,7 @@ class RasterTerrain(TiledTerrain):
         shortest = SHORTEST_WAVE_PIXELS * step * MOON_RADIUS_M / 1000.0
         gain = self._slope_gain(latitude_rad, longitude_rad)
         angles = (np.cos(latitude_rad), np.sin(latitude_rad), np.cos(longitude_rad), np.sin(longitude_rad))
-        for (wavelength, rms), salt in zip(ROUGHNESS_WAVES_KM, self._salts, strict=False):
+        for (wavelength, rms), salt in zip(self._waves, self._salts, strict=False):
             if wavelength > shortest:
                 kernels.add_noise(out, *angles, MOON_RADIUS_M / 1000.0 / wavelength, rms, salt, gain)
         small = self.small_craters(latitude_rad, longitude_rad)
@@ -246,10 +138,10 @@ class RasterTerrain(TiledTerrain):
 
     def make_albedo(self, latitude_rad: Floats, longitude_rad: Floats) -> Heights:
         """Normal albedo on a grid of places: the map where there is one, mottled."""
-        if self._albedo_map is None:
+        if self._reflectance is None:
             base = np.ones((latitude_rad.size, longitude_rad.size))
         else:
-            base = _sample_map(self._albedo_map, latitude_rad, longitude_rad)
+            base = self._reflectance.relative(latitude_rad, longitude_rad)
         return mottled_albedo(base, latitude_rad, longitude_rad, self._salts[10:15])
 
     def _resampled(self, latitude: Floats, longitude: Floats) -> Heights:
@@ -341,96 +233,9 @@ class RasterTerrain(TiledTerrain):
         return out
 
 
-def open_layers(paths: Sequence[Path | str]) -> list[RasterLayer]:
-    """Files grouped by resolution into layers, coarsest first; reads headers only.
-
-    Raises
-    ------
-    TerrainError
-        A file is missing, has no georeference, is not in longitude and latitude, is rotated, or has uneven pixels.
-    """
-    groups: dict[tuple[float, float, float], list[RasterFile]] = {}
-    for path in paths:
-        key, file = _open_header(Path(path))
-        groups.setdefault(key, []).append(file)
-    layers = [RasterLayer(ppd, north, west, files) for (ppd, north, west), files in groups.items()]
-    return sorted(layers, key=lambda layer: layer.pixels_per_degree)
-
-
-def load_albedo_map(path: Path) -> npt.NDArray[np.float32]:
-    """Relative albedo (1 = mean) of the whole Moon, (rows, columns) from the north pole and 180 degrees west.
-
-    The map is a picture whose stretch is compressed; its 2nd and 98th percentiles are spread over the span that normal
-    albedo has on the Moon, 0.5 to 1.5 of the mean.
-    """
-    import rasterio
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-            with rasterio.open(path) as source:
-                values = source.read(1).astype(np.float32)
-    except rasterio.errors.RasterioError as error:
-        raise TerrainError(f"{path}: expected an albedo map, found {error}") from None
-    if values.shape[1] != 2 * values.shape[0]:
-        raise TerrainError(
-            f"{path}: expected a map of the whole Moon, twice as wide as high, "
-            f"found {values.shape[1]} x {values.shape[0]} pixels"
-        )
-    middle = values[values.shape[0] // 6 : -values.shape[0] // 6]
-    low, mean, high = np.percentile(middle, 2), float(middle.mean()), np.percentile(middle, 98)
-    darker, brighter = (mean - values) / (mean - low), (values - mean) / (high - mean)
-    scaled = np.where(values < mean, 1.0 - 0.5 * darker, 1.0 + 0.5 * brighter)
-    return np.asarray(np.clip(scaled, 0.3, 2.0), dtype=np.float32)
-
-
-def _open_header(path: Path) -> tuple[tuple[float, float, float], RasterFile]:
-    try:
-        import rasterio
-    except ImportError:
-        raise TerrainError(
-            f"{path}: expected rasterio, which reads height rasters, found it not installed (pip install rasterio)"
-        ) from None
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-            with rasterio.open(path) as source:
-                profile: dict[str, Any] = dict(source.profile)
-                crs, transform = source.crs, source.transform
-                unit, scale = source.units[0], source.scales[0]
-    except rasterio.errors.RasterioError as error:
-        raise TerrainError(f"{path}: expected a height raster, found {error}") from None
-    if crs is None:
-        raise TerrainError(f"{path}: expected a georeferenced raster, found no coordinate system")
-    if not crs.is_geographic:
-        raise TerrainError(
-            f"{path}: expected longitude and latitude in degrees, found the projection {crs.to_string()[:60]}"
-        )
-    if (
-        transform.b
-        or transform.d
-        or transform.a <= 0.0
-        or abs(transform.a + transform.e) > 1e-9 * transform.a
-    ):
-        raise TerrainError(
-            f"{path}: expected square pixels, north up, found the transform {tuple(transform)[:6]}"
-        )
-    ppd = round(1.0 / transform.a, 6)
-    row, column = (90.0 - transform.f) * ppd, transform.c * ppd
-    first_row, first_column = round(row), round(column)
-    factor = 1000.0 if unit and unit.lower() in ("km", "kilometer", "kilometre") else 1.0
-    offsets = round(row - first_row, 3) + 0.0, round(column - first_column, 3) + 0.0
-    file = RasterFile(
-        path,
-        first_row,
-        first_column,
-        profile["height"],
-        profile["width"],
-        factor * (scale or 1.0),
-        profile.get("nodata"),
-    )
-    return (ppd, *offsets), file
+def _share_below(diameter_m: float) -> float:
+    """Share of all craters above the low limit that are smaller than this."""
+    return 1.0 - float((SMALL_LOW_M / diameter_m) ** SMALL_EXPONENT)
 
 
 def _span(places: Floats, origin: int) -> tuple[float, float]:
@@ -470,16 +275,3 @@ def _box(values: Floats) -> Floats:
     """Mean over 7 x 7 cells, around the meridian."""
     padded = np.pad(np.pad(values, ((3, 3), (0, 0)), mode="edge"), ((0, 0), (3, 3)), mode="wrap")
     return np.asarray(sum(padded[i : i + 180, j : j + 360] for i in range(7) for j in range(7)) / 49.0)
-
-
-def _sample_map(values: npt.NDArray[np.float32], latitude: Floats, longitude: Floats) -> Floats:
-    """Bilinear values (rows, columns) of a whole-Moon map that starts at the north pole and 180 degrees west."""
-    height, width = values.shape
-    row = np.clip((0.5 - latitude / math.pi) * height - 0.5, 0.0, height - 1.001)
-    column = ((np.degrees(longitude) + 180.0) % 360.0) / 360.0 * width - 0.5
-    i, j = np.floor(row).astype(np.int64), np.floor(column).astype(np.int64)
-    fi, fj = (row - i)[:, None], (column - j)[None, :]
-    west, east = j % width, (j + 1) % width
-    top = values[np.ix_(i, west)] * (1.0 - fj) + values[np.ix_(i, east)] * fj
-    low = values[np.ix_(i + 1, west)] * (1.0 - fj) + values[np.ix_(i + 1, east)] * fj
-    return np.asarray(top * (1.0 - fi) + low * fi)

@@ -8,7 +8,8 @@ from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder, find_data
 from payload_emulator.errors import TerrainError
 from payload_emulator.sim.terrain.opening import open_terrain
-from payload_emulator.sim.terrain.raster import RasterTerrain, open_layers
+from payload_emulator.sim.terrain.raster import RasterTerrain
+from payload_emulator.sim.terrain.rasters import open_layers
 
 rasterio = pytest.importorskip("rasterio", reason="rasterio is an optional extra")
 
@@ -122,16 +123,16 @@ def test_a_raster_without_georeference_is_refused(tmp_path):
 
 def test_a_projected_raster_is_refused(tmp_path):
     path = write_raster(tmp_path / "p.tif", 10.0, 20.0, 4.0, slope, crs="+proj=stere +lat_0=90 +R=1737400")
-    with pytest.raises(TerrainError, match="longitude and latitude in degrees, found the projection"):
+    with pytest.raises(TerrainError, match="found the projection stere"):
         open_layers([path])
 
 
 def test_a_missing_or_damaged_raster_is_named(tmp_path):
-    with pytest.raises(TerrainError, match=r"gone\.tif: expected a height raster"):
+    with pytest.raises(TerrainError, match=r"gone\.tif: expected a raster"):
         open_layers([tmp_path / "gone.tif"])
     broken = tmp_path / "broken.tif"
     broken.write_bytes(b"not a raster at all")
-    with pytest.raises(TerrainError, match=r"broken\.tif: expected a height raster"):
+    with pytest.raises(TerrainError, match=r"broken\.tif: expected a raster"):
         open_layers([broken])
 
 
