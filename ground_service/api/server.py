@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import socket
+import sys
 
 from ground_service.api.app import LOOPBACK, create_app
 from ground_service.errors import ServerError
@@ -32,6 +33,9 @@ def serve(settings: Settings) -> None:
     config = uvicorn.Config(
         create_app(settings), log_level="info", timeout_graceful_shutdown=20, server_header=False
     )
+    host, port = listener.getsockname()[:2]
+    shown = f"[{host}]" if ":" in host else host
+    print(f"LINNA ground service on http://{shown}:{port}/", file=sys.stderr, flush=True)
     with listener:
         uvicorn.Server(config).run(sockets=[listener])
 

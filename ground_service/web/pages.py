@@ -65,7 +65,9 @@ pages = APIRouter(include_in_schema=False)
 def _page_answer(page: Page) -> Any:
     def answer() -> Response:
         return Response(
-            _rendered(page), media_type="text/html; charset=utf-8", headers={"Content-Security-Policy": POLICY}
+            _rendered(page),
+            media_type="text/html; charset=utf-8",
+            headers={"Content-Security-Policy": POLICY},
         )
 
     return answer

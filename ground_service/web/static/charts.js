@@ -25,6 +25,16 @@ export function columns(buckets, seconds) {
   return { times, low, high, mean };
 }
 
+// Clock times as in the tables, with the date where the day begins or the axis does.
+function clockTexts(plot, times, _, __, step) {
+  return times.map((time, index) => {
+    const iso = new Date(1000 * time).toISOString();
+    if (step >= 86400) return iso.slice(5, 10);
+    const clock = iso.slice(11, step < 60 ? 19 : 16);
+    return index === 0 || time % 86400 === 0 ? `${clock}\n${iso.slice(0, 10)}` : clock;
+  });
+}
+
 const faint = (css) => (css.startsWith("#") && css.length === 7 ? `${css}38` : css);
 
 // series: [{label, times, mean, low?, high?}]; logarithmic axis where asked for.
@@ -41,7 +51,7 @@ export function chart(place, title, unit, series, { logarithmic = false, group =
     one.low ? [one.times, one.mean, one.low, one.high] : [one.times, one.mean],
   );
   const data = tables.length === 1 ? tables[0] : uPlot.join(tables, tables.map((t) => t.slice(1).map(() => 2)));
-  const lines = [{}];
+  const lines = [{ label: "UTC", value: (_, time) => (time === null ? "–" : new Date(1000 * time).toISOString().slice(0, 19).replace("T", " ")) }];
   const bands = [];
   series.forEach((one, index) => {
     const stroke = one.colour ?? colour(index);
@@ -65,9 +75,10 @@ export function chart(place, title, unit, series, { logarithmic = false, group =
       width: box.clientWidth,
       height,
       tzDate: (time) => uPlot.tzDate(new Date(1000 * time), "Etc/UTC"),
-      scales: { y: logarithmic ? { distr: 3 } : {} },
+      // What is nearer than a metre is drawn at the edge: zeros at a reset would rule the axis.
+      scales: { y: logarithmic ? { distr: 3, range: (_, low, high) => [Math.max(1, 10 ** Math.floor(Math.log10(Math.max(low, 1)))), 10 ** Math.ceil(Math.log10(Math.max(high, 10)))] } : {} },
       axes: [
-        { stroke: ink, grid, ticks: grid },
+        { stroke: ink, grid, ticks: grid, values: clockTexts, space: 80 },
         { stroke: ink, grid, ticks: grid, size: 70 },
       ],
       series: lines,

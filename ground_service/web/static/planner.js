@@ -8,7 +8,9 @@ let windows = [];
 let candidates = [];
 let contacts = [];
 let chosen = null;
-let view = null; // seconds of UTC [from, to]
+let view = [0, 1]; // seconds of UTC [from, to]
+let viewChosen = false; // else the view follows what there is to see
+let dragging = false; // what is in the hand is not drawn anew
 
 const selectable = (row) => ({ start: seconds(row.start), stop: seconds(row.stop) });
 
@@ -41,9 +43,10 @@ function lanes(rows) {
 }
 
 function drawTimeline() {
+  if (dragging) return;
   const place = byId("timeline");
   const width = Math.max(320, place.clientWidth);
-  view ??= whole();
+  if (!viewChosen) view = whole();
   const scale = width / (view[1] - view[0]);
   const x = (time) => (time - view[0]) * scale;
   const ordered = [...windows].sort((a, b) => seconds(a.start) - seconds(b.start));
@@ -126,6 +129,7 @@ function drag(down, row, made, start, stop, scale) {
   const box = made.querySelector("rect").getBoundingClientRect();
   const end = box.width > 24 && down.clientX < box.left + 8 ? "start" : box.width > 24 && down.clientX > box.right - 8 ? "stop" : "both";
   let shift = 0;
+  dragging = true;
   made.setPointerCapture(down.pointerId);
   const moved = (event) => {
     shift = Math.round((event.clientX - down.clientX) / scale);
@@ -137,15 +141,17 @@ function drag(down, row, made, start, stop, scale) {
     }
   };
   made.addEventListener("pointermove", moved);
-  made.addEventListener(
-    "pointerup",
-    () => {
-      made.removeEventListener("pointermove", moved);
-      if (!shift) return;
+  const letGo = (event) => {
+    dragging = false;
+    made.removeEventListener("pointermove", moved);
+    made.removeEventListener("pointerup", letGo);
+    made.removeEventListener("pointercancel", letGo);
+    if (shift && event.type === "pointerup") {
       acting(() => move(row, start + (end === "stop" ? 0 : shift), stop + (end === "start" ? 0 : shift)))();
-    },
-    { once: true },
-  );
+    } else choose(row.id);
+  };
+  made.addEventListener("pointerup", letGo);
+  made.addEventListener("pointercancel", letGo);
 }
 
 async function move(row, start, stop) {
@@ -239,7 +245,7 @@ async function search() {
   });
   candidates = found.candidates;
   contacts = found.contacts;
-  view = whole();
+  viewChosen = false;
   drawTimeline();
   const refused = Object.entries(found.refused).map(([reason, count]) => `${count} ${reason.replaceAll("_", " ")}`).join(", ");
   show(
@@ -289,6 +295,7 @@ const zoom = (factor, shift = 0) => () => {
   const half = ((view[1] - view[0]) / 2) * factor;
   const middle = (view[0] + view[1]) / 2 + shift * half;
   view = [middle - half, middle + half];
+  viewChosen = true;
   drawTimeline();
 };
 byId("earlier").addEventListener("click", zoom(1, -1));
@@ -296,7 +303,7 @@ byId("later").addEventListener("click", zoom(1, 1));
 byId("nearer").addEventListener("click", zoom(0.5));
 byId("farther").addEventListener("click", zoom(2));
 byId("whole").addEventListener("click", () => {
-  view = whole();
+  viewChosen = false;
   drawTimeline();
 });
 byId("search").addEventListener("submit", acting(search));

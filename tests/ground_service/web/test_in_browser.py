@@ -1,0 +1,161 @@
+"""What operators do on the pages, done in Chromium."""
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import expect
+
+from lunar.ephemeris import ephemeris_from_states
+from lunar.oem import format_oem
+from lunar.timescales import parse_utc
+
+PATHS = [
+    "/",
+    "/planner",
+    "/passes",
+    "/passes/1",
+    "/telemetry",
+    "/commands",
+    "/regression",
+    "/live",
+    "/licences",
+]
+NS = 1_000_000_000
+
+
+def settled(page, path):
+    page.goto(path)
+    expect(page.locator("#feed-light")).to_have_class("light on")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("path", PATHS)
+def test_pages_have_no_serious_barrier(page, path, scheme):
+    page.emulate_media(color_scheme=scheme)
+    settled(page, path)
+    found = Axe().run(page).response["violations"]
+    serious = [
+        (one["id"], [node["html"][:120] for node in one["nodes"]][:3])
+        for one in found
+        if one["impact"] in ("serious", "critical")
+    ]
+    assert serious == []
+
+
+def test_a_narrow_screen_scrolls_down_only(page):
+    page.set_viewport_size({"width": 768, "height": 1024})
+    for path in PATHS:
+        settled(page, path)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 768, path
+
+
+def test_the_pass_page_shows_what_came_and_makes_a_report(page):
+    settled(page, "/passes")
+    page.get_by_role("link", name="synthetic pass").click()
+    expect(page.get_by_role("heading", name="synthetic pass")).to_be_visible()
+    expect(page.locator("#completeness")).to_contain_text("0 lost")
+    expect(page.get_by_label("chart: altitude, m")).to_be_visible()
+    expect(page.locator("#map-legend")).to_contain_text("spherical")
+    page.get_by_role("button", name="Make a report").click()
+    expect(page.locator("#verdict .verdict")).not_to_be_empty(timeout=60_000)
+    expect(page.locator("#verdict")).to_contain_text("Median position error")
+    with page.expect_popup() as opened:
+        page.get_by_role("button", name="Open HTML").click()
+    expect(opened.value.get_by_role("heading", level=1)).to_be_visible()
+
+
+def test_a_chart_is_zoomed_with_the_keyboard(page):
+    settled(page, "/telemetry")
+    chart = page.locator(".chart").first
+    expect(chart.locator("canvas")).to_be_visible()
+    before = chart.screenshot()
+    chart.focus()
+    page.keyboard.press("+")
+    page.wait_for_timeout(200)
+    assert chart.screenshot() != before
+    page.keyboard.press("0")
+
+
+def test_a_telecommand_goes_from_entry_to_release(page):
+    settled(page, "/commands")
+    page.locator("#name").select_option("test_connection")
+    page.get_by_role("button", name="Queue").click()
+    row = page.locator("#commands tbody tr").first
+    expect(row).to_contain_text("test connection")
+    expect(row).to_contain_text("queued")
+    row.get_by_role("button", name="Release").click()
+    expect(row).to_contain_text("released")
+    expect(row.get_by_role("img", name="no report yet")).to_be_visible()
+
+
+def test_a_telecommand_that_the_dictionary_refuses_is_told(page):
+    settled(page, "/commands")
+    page.locator("#name").select_option("insert_activity")
+    page.locator("#argument-items").fill("300\n4")
+    page.get_by_role("button", name="Queue").click()
+    expect(page.locator("#notices .bad")).to_be_visible()
+
+
+@pytest.fixture
+def day_of_orbits(tmp_path):
+    """Six hours of a circular orbit as an OEM file."""
+    import numpy as np
+
+    start = parse_utc("2030-01-01T00:00:00Z")
+    elapsed = np.arange(0.0, 6 * 3600.0 + 1.0, 60.0)
+    angle = (elapsed * 2 * np.pi / 6672.0)[:, None]
+    along, across = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.4, 0.9165])
+    position = 1_768_180.0 * (np.cos(angle) * along + np.sin(angle) * across)
+    velocity = 1_768_180.0 * 2 * np.pi / 6672.0 * (np.cos(angle) * across - np.sin(angle) * along)
+    path = tmp_path / "orbits.oem"
+    path.write_text(
+        format_oem(ephemeris_from_states(start + np.rint(elapsed * NS).astype(np.int64), position, velocity))
+    )
+    return path
+
+
+def test_a_window_is_found_moved_approved_and_uplinked(page, day_of_orbits):
+    settled(page, "/")
+    page.locator("#file").set_input_files(day_of_orbits)
+    page.locator("#kind").select_option("ephemerides")
+    page.get_by_role("button", name="Upload").click()
+    expect(page.locator("#notices")).to_contain_text("361 states")
+
+    settled(page, "/planner")
+    page.locator("#ephemeris").select_option(label="orbits.oem, 2030-01-01 00:00:00")
+    page.get_by_role("button", name="Search").click()
+    expect(page.locator("#candidates tbody tr").first).to_be_visible(timeout=30_000)
+    page.locator("#candidates").get_by_role("button", name="Plan").nth(1).click()
+    bar = page.locator("#timeline .window.draft")
+    expect(bar).to_have_count(1)
+    start = page.locator("#windows tbody td").nth(1).inner_text()
+    bar.focus()
+    page.keyboard.press("ArrowRight")
+    expect(page.locator("#windows tbody td").nth(1)).not_to_have_text(start)
+
+    page.get_by_role("button", name="Approve").click()
+    expect(page.locator("#selected")).to_contain_text("approved")
+    page.get_by_role("button", name="Uplink").click()
+    expect(page.locator("#notices")).to_contain_text("telecommands released")
+    settled(page, "/commands")
+    expect(page.locator("#commands tbody tr", has_text="insert activity").first).to_contain_text("released")
+
+
+def test_a_draft_is_dragged_and_taken_off_the_plan(page, day_of_orbits):
+    settled(page, "/planner")
+    page.evaluate(
+        """async () => fetch("/api/v1/windows", {method: "POST", headers: {"Content-Type": "application/json"},
+        body: JSON.stringify({name: "to be moved", start: "2030-01-01T03:00:00Z", stop: "2030-01-01T03:20:00Z",
+        spacecraft_id: 76})})"""
+    )
+    bar = page.get_by_role("button", name="to be moved, draft")
+    expect(bar).to_be_visible()
+    before = bar.get_attribute("aria-label")
+    box = bar.bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] / 2 + 60, box["y"] + box["height"] / 2, steps=4)
+    page.mouse.up()
+    expect(page.get_by_role("button", name=before, exact=True)).to_have_count(0)
+    page.get_by_role("button", name="to be moved, draft").click()
+    page.get_by_role("button", name="Delete").click()
+    expect(page.get_by_role("button", name="to be moved, draft")).to_have_count(0)
