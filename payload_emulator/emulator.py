@@ -16,31 +16,32 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lunar.catalogue import save_catalogue
+from lunar.catalogue import CraterCatalogue, save_catalogue
 from lunar.datafolder import DataFolder
+from lunar.ephemeris import Ephemeris
 from lunar.frames import spherical_from_mcmf
 from lunar.oem import save_oem
 from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
+from payload_emulator.flight.ports import ResetCause
+from payload_emulator.flying import SPACECRAFT_ID, CatalogueDetector, Sender, fly, timeline
+from payload_emulator.link import Reception, save_receptions, transmit
 from payload_emulator.loading import LoadedPayload, load_payload
 from payload_emulator.recording import FrameInput, frame_input, save_frame_times, save_image, save_record
 from payload_emulator.scenario import Scenario, format_scenario
-from payload_emulator.scoring import score_navigation
+from payload_emulator.sim.faults import parse_fault
+from payload_emulator.spacecraft import Spacecraft, new_board
 from payload_emulator.world import (
     World,
     build_world,
     catalogue_near_track,
-    exposures,
-    orders_before,
     sample_truth,
     with_reference_error,
 )
 from tmtc.dictionary import DICTIONARY
-from tmtc.downlink import encode_cadus
+from tmtc.downlink import LinkSettings
 
-SPACECRAFT_ID = 0x4C
 Progress = Callable[[Iterable[Any], int], Iterator[Any]]
 
 
@@ -82,14 +83,20 @@ def emulate(
     return summary
 
 
-def _emulate_into(
-    world: World,
-    data: DataFolder,
-    folder: Path,
-    frames_kept: int | None,
-    progress: Progress | None,
-    started: float,
-) -> dict[str, Any]:
+def new_spacecraft(world: World, loaded: LoadedPayload) -> Spacecraft:
+    """The payload of a scenario on a new board, with the faults of the scenario ahead of it."""
+    scenario = world.scenario
+    return Spacecraft(
+        loaded,
+        new_board(scenario.seed),
+        int(world.frame_utc_ns[0]),
+        tuple(parse_fault(text) for text in scenario.faults.events),
+        CatalogueDetector(world) if scenario.camera.images == "reduced" else None,
+    )
+
+
+def load_scenario_payload(world: World, data: DataFolder) -> tuple[LoadedPayload, Ephemeris, CraterCatalogue]:
+    """The payload loaded for a world, with the reference and the catalogue that the ground made its tables of."""
     scenario = world.scenario
     truth_ephemeris = sample_truth(world.truth, world.frame_utc_ns)
     reference = with_reference_error(truth_ephemeris, scenario.reference.position_error_m, scenario.seed)
@@ -104,39 +111,64 @@ def _emulate_into(
         int(world.frame_utc_ns[0]),
         world.burns,
     )
+    return loaded, reference, catalogue
+
+
+def _emulate_into(
+    world: World,
+    data: DataFolder,
+    folder: Path,
+    frames_kept: int | None,
+    progress: Progress | None,
+    started: float,
+) -> dict[str, Any]:
+    scenario = world.scenario
+    loaded, reference, catalogue = load_scenario_payload(world, data)
     total = int(world.frame_utc_ns.size)
     kept = (
         set(range(total))
         if frames_kept is None
         else set(np.linspace(0, total - 1, frames_kept + 2, dtype=int)[1:-1])
     )
-    frames = exposures(world)
-    packets: list[bytes] = []
+    spacecraft = new_spacecraft(world, loaded)
+    sender = Sender(world, LinkSettings(coding=scenario.link.coding))
     inputs: list[FrameInput] = []
-    attitudes: list[NDArray[np.float64]] = []
-    for number, frame in enumerate(progress(frames, total) if progress else frames):
-        orders = orders_before(world, number)
-        attitudes.append(frame.camera_from_mcmf)
-        inputs.append(frame_input(number, frame.image, frame.attitude, frame.clock_ticks, orders))
-        packets += loaded.payload.step(frame.image, frame.attitude, frame.clock_ticks, orders)
+    flown = fly(world, spacecraft)
+    for moment in progress(flown, len(timeline(world))) if progress else flown:
+        sender.take(moment)
+        frame, number = moment.exposure, moment.moment.frame
+        if frame is None:
+            continue
+        inputs.append(
+            frame_input(number, frame.image, frame.attitude, frame.clock_ticks, moment.telecommands)
+        )
         if number in kept:
             save_image(folder, number, frame.image)
+    sender.flush()
+    reception = transmit(sender.transmitter.dumps, sender.transmitter.settings, scenario.link, scenario.seed)
     save_record(folder, inputs, loaded.parameters, loaded.tables)
     save_frame_times(folder, world.frame_utc_ns)
-    save_oem(truth_ephemeris, folder / "truth.oem")
+    save_oem(sample_truth(world.truth, world.frame_utc_ns), folder / "truth.oem")
     save_oem(reference, folder / "reference.oem")
     save_catalogue(catalogue, folder / "catalogue.csv")
-    octets = encode_cadus(packets, spacecraft_id=SPACECRAFT_ID, coding=scenario.link.coding)
-    (folder / "downlink.cadu").write_bytes(octets)
-    summary = _summary(world, loaded, packets, len(octets), len(kept), time.monotonic() - started)
-    summary |= score_navigation(world, loaded, catalogue, np.array(attitudes), b"".join(packets))
+    (folder / "downlink.cadu").write_bytes(reception.octets)
+    save_receptions(folder, sender.transmitter.dumps)
+    packets = [packet for dump in sender.transmitter.dumps for packet in dump.packets]
+    wall_s = time.monotonic() - started
+    summary = _summary(world, loaded, spacecraft, packets, reception, len(kept), wall_s)
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     (folder / "manifest.json").write_text(json.dumps(_manifest(world, loaded, folder), indent=2) + "\n")
     return summary
 
 
 def _summary(
-    world: World, loaded: LoadedPayload, packets: list[bytes], octets: int, kept: int, wall_s: float
+    world: World,
+    loaded: LoadedPayload,
+    spacecraft: Spacecraft,
+    packets: list[bytes],
+    reception: Reception,
+    kept: int,
+    wall_s: float,
 ) -> dict[str, Any]:
     scenario = world.scenario
     total = int(world.frame_utc_ns.size)
@@ -147,7 +179,7 @@ def _summary(
         "frames": total,
         "frames_kept": kept,
         "packets": len(packets),
-        "downlink_octets": octets,
+        "downlink_octets": len(reception.octets),
         "start_utc": format_utc(int(world.frame_utc_ns[0])),
         "stop_utc": format_utc(int(world.frame_utc_ns[-1])),
         "altitude_km": {
@@ -160,7 +192,10 @@ def _summary(
             "last": float(np.degrees(longitude[-1])) % 360.0,
         },
         "maneuvers": len(world.burns),
-        **loaded.payload.summary(),
+        **spacecraft.payload.summary(),
+        "link": reception.account,
+        "resets": [ResetCause(cause).name for cause in spacecraft.resets],
+        "mode": spacecraft.payload.mode.name,
         "data": list(world.data_names),
         "wall_s": round(wall_s, 3),
         "realtime_factor": round(total * scenario.camera.frame_interval_s / wall_s, 2),

@@ -18,6 +18,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from lunar.errors import LunarError
 from lunar.timescales import parse_utc
 from payload_emulator.errors import ScenarioError
+from payload_emulator.sim.faults import parse_fault
 from payload_emulator.sim.sensor import SensorModel
 
 SHIPPED = Path(__file__).resolve().parent.parent / "scenarios"
@@ -105,6 +106,7 @@ class CameraSection:
     height_px: int = 512
     fov_deg: float = 120.0
     frame_interval_s: float = 15.0
+    images: Literal["rendered", "reduced"] = "rendered"
     tilt_deg: float = 0.0
     yaw_deg: float = 0.0
     k1: float = 0.0
@@ -197,11 +199,35 @@ class ClockSection:
 
 @dataclass(frozen=True, slots=True)
 class LinkSection:
-    """What the link does to the downlink: probabilities per transfer frame, and bit error rate."""
+    """What the link does to the downlink, frame by frame, and when there is one.
+
+    Losses and bit errors have two states: a burst begins and ends with the given probabilities per frame. What is sent
+    at once (a dump) comes again with probability `repeat_share`, and behind the next one with `reorder_share`.
+    `stations` are those that listen (one of `payload_emulator.link.STATIONS`), behind the limb of the Moon or not;
+    without any the link never ends. `rate_bps` counts the bits of packets. With `playback` the first half of each
+    contact's packets is asked for again in the next one.
+    """
 
     coding: Literal["rs", "none"] = "rs"
     frame_loss: float = 0.0
     bit_error_rate: float = 0.0
+    burst_start: float = 0.0
+    burst_end: float = 0.2
+    burst_frame_loss: float = 0.5
+    burst_bit_error_rate: float = 1e-3
+    repeat_share: float = 0.0
+    reorder_share: float = 0.0
+    stations: tuple[str, ...] = ()
+    minimum_elevation_deg: float = 10.0
+    rate_bps: float = 64_000.0
+    playback: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class FaultsSection:
+    """What breaks: a line each, `KIND at SECONDS [for SECONDS] [size NUMBER]`; the kinds are in `sim.faults`."""
+
+    events: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,6 +257,7 @@ class Scenario:
     disturbances: DisturbancesSection = field(default_factory=DisturbancesSection)
     clock: ClockSection = field(default_factory=ClockSection)
     link: LinkSection = field(default_factory=LinkSection)
+    faults: FaultsSection = field(default_factory=FaultsSection)
     reference: ReferenceSection = field(default_factory=ReferenceSection)
 
     @property
@@ -454,12 +481,13 @@ def _check(scenario: Scenario, source: str) -> None:
     for name in scenario.navigation.estimators:
         require(name in ESTIMATORS, "navigation.estimators", f"of {', '.join(ESTIMATORS)}", name)
     require(len(scenario.navigation.estimators) > 0, "navigation.estimators", "at least one estimator", ())
-    require(
-        0.0 <= scenario.link.frame_loss <= 1.0, "link.frame_loss", "from 0 to 1", scenario.link.frame_loss
-    )
-    require(
-        0.0 <= scenario.link.bit_error_rate <= 0.5,
-        "link.bit_error_rate",
-        "from 0 to 0.5",
-        scenario.link.bit_error_rate,
-    )
+    link = scenario.link
+    for key in ("frame_loss", "burst_start", "burst_end", "burst_frame_loss", "repeat_share", "reorder_share"):
+        share = getattr(link, key)
+        require(0.0 <= share <= 1.0, f"link.{key}", "from 0 to 1", share)
+    for key in ("bit_error_rate", "burst_bit_error_rate"):
+        rate = getattr(link, key)
+        require(0.0 <= rate <= 0.5, f"link.{key}", "from 0 to 0.5", rate)
+    require(link.rate_bps > 0.0, "link.rate_bps", "positive", link.rate_bps)
+    for text in scenario.faults.events:
+        parse_fault(text)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -49,6 +49,8 @@ _EPHEMERIS_MARGIN_NS = 120 * _NS
 _BEFORE_JUMP_NS = 10_000
 _SEARCH_CHUNK_DAYS = 15.0
 _CATALOGUE_MARGIN_M = 15_000.0
+# What stands for an image where none is rendered.
+_REDUCED_PX = 8
 # With the Sun this far below the horizon of the sub-satellite point no ground in view is lit, mountains included.
 _NIGHT_RAD = np.radians(12.0)
 
@@ -169,7 +171,7 @@ def _disturbed(
     return truth, burns
 
 
-def exposures(world: World) -> Iterator[Exposure]:
+def exposures(world: World) -> Generator[Exposure]:
     """The frames of a world in time order, the next ones rendered while the payload works on this one."""
     world.terrain.hand_over()
     try:
@@ -183,7 +185,7 @@ def exposures(world: World) -> Iterator[Exposure]:
         world.terrain.hand_over()
 
 
-def orders_before(world: World, number: int) -> bytes:
+def orders_before(world: World, number: int, sequence_count: int = 0) -> bytes:
     """Telecommands that reach the payload with a frame: after a told kidnap, to trust its estimate less."""
     section = world.scenario.disturbances
     if not (section.kidnap_told and section.kidnap_distance_km > 0.0):
@@ -198,7 +200,7 @@ def orders_before(world: World, number: int) -> bytes:
         "perform_function",
         # A jump of place on an orbit comes with one of velocity: 1e-3 rad/s times the distance.
         {"function_id": "widen_estimate", "argument_1": distance_m, "argument_2": 1e-3 * distance_m},
-        sequence_count=0,
+        sequence_count=sequence_count,
     )
 
 
@@ -224,7 +226,7 @@ def expose_frame(world: World, number: int) -> Exposure:
         utc_ns,
         image,
         attitude_message(known, known @ camera_from_icrf.T @ camera_from_mcmf @ sun),
-        _clock_ticks(world, utc_ns),
+        clock_ticks(world, utc_ns),
         camera_from_mcmf,
     )
 
@@ -242,6 +244,8 @@ def _image(
     elapsed_s = (utc_ns - int(world.frame_utc_ns[0])) / _NS
     if section.outage_at_s <= elapsed_s < section.outage_at_s + section.outage_duration_s:
         return np.empty((0, 0, 3), dtype=np.uint8)
+    if world.scenario.camera.images == "reduced":
+        return np.full((_REDUCED_PX, _REDUCED_PX, 3), 128, dtype=np.uint8)
     if position_mcmf_m @ sun_mcmf < -np.sin(_NIGHT_RAD) * np.linalg.norm(position_mcmf_m):
         radiance = np.zeros((camera.height_px, camera.width_px), dtype=np.float32)
     else:
@@ -265,7 +269,7 @@ def true_sun_direction(
     return world.truth.orientation.mcmf_from_icrf(tdb_s) @ (from_moon / np.linalg.norm(from_moon))
 
 
-def _clock_ticks(world: World, utc_ns: int) -> int:
+def clock_ticks(world: World, utc_ns: int) -> int:
     """The on-board clock's reading: ideal ticks, an offset, and a drift since the first frame."""
     clock = world.scenario.clock
     elapsed_s = (utc_ns - int(world.frame_utc_ns[0])) / _NS

@@ -1,0 +1,297 @@
+"""A scenario flown moment by moment: frames, turns without frames, contacts, and the operators' telecommands."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lunar.camera import project_mcmf
+from lunar.constants import MOON_RADIUS_M
+from lunar.frames import spherical_from_mcmf
+from lunar.third_bodies import sun_position_icrf_m
+from lunar.timescales import tdb_s_from_utc_ns
+from lunar.visibility import sunlit_fraction
+from payload_emulator.flight.detections import Detections, no_detections
+from payload_emulator.flight.modes import PayloadMode
+from payload_emulator.flight.ports import UNLIMITED
+from payload_emulator.flight.preprocess import ImageQuality
+from payload_emulator.link import Transmitter, contacts
+from payload_emulator.spacecraft import Spacecraft
+from payload_emulator.world import Exposure, World, clock_ticks, exposures, orders_before, sample_truth
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import LinkSettings
+
+SPACECRAFT_ID = 0x4C
+
+_NS = 1_000_000_000
+_PLAYBACK_CHANNEL = 1
+_LATE_TICKS = 120 * 65_536
+_DUMP_OCTETS = 64_000
+_BEFORE_ARC_NS = 60 * _NS
+_IDLE_STEP_NS = 60 * _NS
+_STANDBY_BEFORE_TICKS = 20 * 65_536
+_AHEAD_NS = 12 * 3_600 * _NS
+_NO_ATTITUDE = np.full(7, np.nan)
+# A detector as the one that flies, roughly: what is drawn where no image is rendered.
+_REDUCED_RECALL, _REDUCED_SIGMA_PX, _SMALLEST_PX = 0.7, 0.6, 5.0
+
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """One step of the spacecraft; `frame` is -1 where none is taken, `heard` whether a station listens."""
+
+    utc_ns: int
+    frame: int
+    sunlit: float
+    heard: bool
+    downlink_octets: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Flown:
+    """What became of a moment."""
+
+    moment: Moment
+    exposure: Exposure | None
+    telecommands: bytes
+    packets: list[bytes]
+
+
+@dataclass(slots=True, eq=False)
+class CatalogueDetector:
+    """In place of the network where no images are rendered: the craters in view, some missed, all a little off."""
+
+    world: World
+    _rng: np.random.Generator = field(init=False)
+    _next: Detections = field(default_factory=no_detections)
+
+    def __post_init__(self) -> None:
+        self._rng = np.random.default_rng((self.world.scenario.seed, 2**43))
+
+    def show(self, exposure: Exposure) -> None:
+        """Prepare what is found in the next frame."""
+        world = self.world
+        position = world.truth.positions_mcmf(exposure.utc_ns)[0]
+        latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))
+        craters = world.terrain.catalogue
+        reach_m = min(2.5 * altitude * np.tan(world.camera.fov_rad / 2.0), 0.1 * MOON_RADIUS_M)
+        near = craters.near(latitude, longitude, reach_m)
+        points = craters.position_mcmf_m[near]
+        uv = project_mcmf(world.true_camera, exposure.camera_from_mcmf, position, points)
+        depth_m = (points - position) @ exposure.camera_from_mcmf[2]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            diameter_px = world.camera.focal_px * craters.diameter_m[near] / depth_m
+            size = np.array([world.camera.width_px, world.camera.height_px])
+            seen = np.all((uv > 0.0) & (uv < size - 1), axis=1) & (diameter_px > _SMALLEST_PX)
+        seen &= self._rng.random(near.size) < _REDUCED_RECALL
+        count = int(np.count_nonzero(seen))
+        noise = _REDUCED_SIGMA_PX * self._rng.standard_normal((count, 2))
+        self._next = Detections(
+            uv[seen, 0] + noise[:, 0],
+            uv[seen, 1] + noise[:, 1],
+            diameter_px[seen],
+            np.full(count, 0.9),
+            np.full(count, _REDUCED_SIGMA_PX),
+        )
+
+    def examine(
+        self, image: NDArray[Any], sun_in_camera: NDArray[np.float64] | None = None
+    ) -> tuple[ImageQuality, Detections]:
+        found, self._next = self._next, no_detections()
+        if not image.size:
+            return ImageQuality.INVALID, no_detections()
+        if not image.any():
+            return ImageQuality.DARK, no_detections()
+        if image.min() == 255:
+            return ImageQuality.SATURATED, no_detections()
+        return ImageQuality.OK, found
+
+
+def timeline(world: World) -> list[Moment]:
+    """The moments of a scenario: frames, a minute before and the end of each arc, each minute where stations listen."""
+    frames, section = world.frame_utc_ns, world.scenario.link
+    interval_ns = round(world.scenario.camera.frame_interval_s * _NS)
+    between = []
+    for first, last in arcs(world):
+        between += [int(frames[first]) - _BEFORE_ARC_NS, int(frames[last]) + interval_ns]
+    if section.stations:
+        between += list(range(between[0], int(frames[-1]) + interval_ns, _IDLE_STEP_NS))
+    start, stop = world.truth.start_utc_ns, world.truth.stop_utc_ns
+    idle = np.array([t for t in between if start <= t <= stop], dtype=np.int64)
+    utc_ns = np.union1d(frames, idle)
+    number = np.full(utc_ns.size, -1)
+    number[np.searchsorted(utc_ns, frames)] = np.arange(frames.size)
+    position, _ = world.truth.states(utc_ns)
+    sunlit = sunlit_fraction(position, sun_position_icrf_m(np.asarray(tdb_s_from_utc_ns(utc_ns))))
+    heard, _ = contacts(sample_truth(world.truth, utc_ns), utc_ns, section)
+    seconds = np.diff(utc_ns, prepend=utc_ns[:1]) / _NS
+    allowed = np.floor(section.rate_bps / 8.0 * seconds).astype(np.int64)
+    return [
+        Moment(
+            int(utc_ns[k]),
+            int(number[k]),
+            float(sunlit[k]),
+            bool(heard[k]),
+            (int(allowed[k]) if section.stations else UNLIMITED) if heard[k] else 0,
+        )
+        for k in range(utc_ns.size)
+    ]
+
+
+def arcs(world: World) -> list[tuple[int, int]]:
+    """First and last frame of every stretch of frames without a gap."""
+    interval_ns = round(world.scenario.camera.frame_interval_s * _NS)
+    breaks = np.flatnonzero(np.diff(world.frame_utc_ns) > 1.5 * interval_ns)
+    first = np.concatenate([[0], breaks + 1])
+    last = np.concatenate([breaks, [world.frame_utc_ns.size - 1]])
+    return list(zip(first.tolist(), last.tolist(), strict=True))
+
+
+@dataclass(slots=True, eq=False)
+class Operator:
+    """What the ground sends: the observation windows for the schedule, modes around contacts, requests for playback."""
+
+    world: World
+    sequence_count: int = 0
+    _uploaded: int = 0
+    _in_contact: bool = False
+    _last_contact: tuple[int, int] | None = None
+    _contact_start: int = 0
+    _started: bool = False
+
+    def command(self, name: str, **values: object) -> bytes:
+        """The next telecommand packet."""
+        packet = DICTIONARY.pack_command(name, values, sequence_count=self.sequence_count)
+        self.sequence_count = (self.sequence_count + 1) % (1 << 14)
+        return packet
+
+    def function(self, name: str, first: float = 0.0, second: float = 0.0) -> bytes:
+        """A telecommand that performs a function."""
+        return self.command("perform_function", function_id=name, argument_1=first, argument_2=second)
+
+    def orders(self, moment: Moment, mode: PayloadMode) -> bytes:
+        """What is sent at a moment, seeing the mode that telemetry shows."""
+        first = not self._started
+        self._started = True
+        if not (moment.heard or first):
+            self._end_contact(moment)
+            return b""
+        orders = [*self._windows(moment)]
+        if self.world.scenario.link.stations:
+            orders += self._contact(moment, mode)
+        if moment.frame >= 0:
+            order = orders_before(self.world, moment.frame, self.sequence_count)
+            if order:
+                orders.append(order)
+                self.sequence_count += 1
+        return b"".join(orders)
+
+    def _windows(self, moment: Moment) -> Iterator[bytes]:
+        world, every = self.world, arcs(self.world)
+        interval_s = world.scenario.camera.frame_interval_s
+        while self._uploaded < len(every):
+            first, last = every[self._uploaded]
+            start_utc_ns = int(world.frame_utc_ns[first])
+            if start_utc_ns > moment.utc_ns + _AHEAD_NS:
+                return
+            self._uploaded += 1
+            duration_s = (int(world.frame_utc_ns[last]) - start_utc_ns) / _NS + 0.5 * interval_s
+            if start_utc_ns <= moment.utc_ns:
+                late_s = (moment.utc_ns - start_utc_ns) / _NS
+                if late_s < duration_s:
+                    yield self.function("start_observation", duration_s - late_s)
+                continue
+            ticks = clock_ticks(world, start_utc_ns)
+            if world.scenario.link.stations:
+                yield self._at(ticks - _STANDBY_BEFORE_TICKS, self.function("set_mode", PayloadMode.standby))
+            yield self._at(ticks, self.function("start_observation", duration_s))
+
+    def _at(self, ticks: int, packet: bytes) -> bytes:
+        octets = np.frombuffer(packet, dtype=np.uint8)
+        return self.command("insert_activity", release_ticks=ticks, items={"octet": octets})
+
+    def _contact(self, moment: Moment, mode: PayloadMode) -> Iterator[bytes]:
+        """Downlinking while a station listens and nothing is observed; at the beginning, a playback."""
+        if not self._in_contact:
+            self._in_contact, self._contact_start = True, clock_ticks(self.world, moment.utc_ns)
+            if self.world.scenario.link.playback and self._last_contact and mode is not PayloadMode.observing:
+                start, stop = self._last_contact
+                yield self.command("replay_store", start_ticks=start, stop_ticks=start + (stop - start) // 2)
+        if mode is PayloadMode.standby and not self._arc_is_near(moment):
+            yield self.function("set_mode", PayloadMode.downlinking)
+
+    def _end_contact(self, moment: Moment) -> None:
+        if self._in_contact:
+            self._last_contact = (self._contact_start, clock_ticks(self.world, moment.utc_ns))
+        self._in_contact = False
+
+    def _arc_is_near(self, moment: Moment) -> bool:
+        after = np.searchsorted(self.world.frame_utc_ns, moment.utc_ns)
+        if after == self.world.frame_utc_ns.size:
+            return False
+        return int(self.world.frame_utc_ns[after]) - moment.utc_ns < 2 * _BEFORE_ARC_NS
+
+
+def fly(world: World, spacecraft: Spacecraft) -> Generator[Flown]:
+    """Fly the moments of a scenario in order."""
+    operator = Operator(world)
+    frames = exposures(world)
+    reduced = spacecraft.detector if isinstance(spacecraft.detector, CatalogueDetector) else None
+    for moment in timeline(world):
+        exposure = next(frames) if moment.frame >= 0 else None
+        if exposure is not None and reduced is not None:
+            reduced.show(exposure)
+        orders = operator.orders(moment, spacecraft.payload.mode)
+        packets = spacecraft.step(
+            moment.utc_ns,
+            None if exposure is None else exposure.image,
+            _NO_ATTITUDE if exposure is None else exposure.attitude,
+            clock_ticks(world, moment.utc_ns),
+            orders,
+            sunlit=moment.sunlit,
+            downlink_octets=moment.downlink_octets,
+        )
+        yield Flown(moment, exposure, orders, packets)
+    frames.close()
+
+
+@dataclass(slots=True, eq=False)
+class Sender:
+    """Puts what the payload hands over into dumps: one for all without stations, else several a contact.
+
+    Packets older than `_LATE_TICKS` travel on the channel for playback.
+    """
+
+    world: World
+    settings: LinkSettings
+    transmitter: Transmitter = field(init=False)
+    _waiting: dict[int, list[bytes]] = field(default_factory=dict)
+    _utc_ns: int = 0
+
+    def __post_init__(self) -> None:
+        self.transmitter = Transmitter(SPACECRAFT_ID, self.settings)
+
+    def take(self, flown: Flown) -> None:
+        """Take the packets of a moment, and send what is complete."""
+        self._utc_ns = flown.moment.utc_ns
+        stations = bool(self.world.scenario.link.stations)
+        now = clock_ticks(self.world, flown.moment.utc_ns)
+        for packet in flown.packets:
+            late = stations and now - int.from_bytes(packet[14:20], "big") > _LATE_TICKS
+            self._waiting.setdefault(_PLAYBACK_CHANNEL if late else 0, []).append(packet)
+        waiting = sum(len(packet) for packets in self._waiting.values() for packet in packets)
+        if stations and (not flown.moment.heard or waiting > _DUMP_OCTETS):
+            self.flush()
+
+    def flush(self) -> None:
+        """Send everything."""
+        for channel, packets in sorted(self._waiting.items()):
+            self.transmitter.send(packets, self._utc_ns, channel)
+        self._waiting = {}

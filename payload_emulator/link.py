@@ -1,0 +1,249 @@
+"""The radio link: passes over ground stations, and what becomes of the frames on their way, every one accounted for.
+
+A dump is what the encoder is given at once; frames of a dump hold whole packets, so dumps can be lost in part, come out
+of order and come twice without touching each other. Bit errors come in two states (Gilbert–Elliott), frame by frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lunar.ephemeris import Ephemeris
+from lunar.timescales import format_utc
+from lunar.visibility import GroundStation, link
+from payload_emulator.errors import ScenarioError
+from payload_emulator.scenario import LinkSection
+from tmtc import cadu
+from tmtc.downlink import DownlinkEncoder, LinkSettings
+
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+# WGS 84 latitude, east longitude (degrees) and height (m), from the agencies' public station pages, to 0.01 deg.
+STATIONS = {
+    "goldstone": (35.43, -116.89, 1000.0),
+    "madrid": (40.43, -4.25, 840.0),
+    "canberra": (-35.40, 148.98, 690.0),
+    "cebreros": (40.45, -4.37, 790.0),
+    "malargue": (-35.78, -69.40, 1550.0),
+    "new_norcia": (-31.05, 116.19, 250.0),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Dump:
+    """CADUs that were encoded together, when they left, and where each packet lies in them.
+
+    `first`, `last` (n,) are the frames that packet n begins and ends in.
+    """
+
+    cadus: bytes
+    virtual_channel: int
+    utc_ns: int
+    packets: tuple[bytes, ...]
+    first: IntArray
+    last: IntArray
+
+
+@dataclass(slots=True, eq=False)
+class Transmitter:
+    """Encodes what the payload hands over, and remembers it for the account."""
+
+    spacecraft_id: int
+    settings: LinkSettings
+    dumps: list[Dump] = field(default_factory=list)
+    _encoder: DownlinkEncoder = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._encoder = DownlinkEncoder(self.spacecraft_id, self.settings)
+
+    def send(self, packets: Sequence[bytes], utc_ns: int, virtual_channel: int = 0) -> bytes:
+        """The CADUs of these packets."""
+        octets = self._encoder.encode(packets, virtual_channel)
+        if not packets:
+            return octets
+        frames = len(octets) // self.settings.cadu_length
+        lengths = np.array([len(packet) for packet in packets], dtype=np.int64)
+        zone = self._zone()
+        stop = np.cumsum(lengths)
+        self.dumps.append(
+            Dump(
+                octets, virtual_channel, utc_ns, tuple(packets), (stop - lengths) // zone, (stop - 1) // zone
+            )
+        )
+        assert int(self.dumps[-1].last[-1]) < frames
+        return octets
+
+    def _zone(self) -> int:
+        return self.settings.frame_length - 6 - (2 if self.settings.checksum else 0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reception:
+    """What arrived.
+
+    Attributes
+    ----------
+    octets
+        The stream as recorded on the ground.
+    account
+        What was sent, lost, damaged and repeated; the keys that `linna tm check` has too mean the same.
+    """
+
+    octets: bytes
+    account: dict[str, Any]
+
+
+def transmit(dumps: Sequence[Dump], settings: LinkSettings, section: LinkSection, seed: int) -> Reception:
+    """Send dumps over the link of a scenario; equal inputs give equal octets."""
+    rng = np.random.default_rng((seed, 2**42))
+    sent = [np.frombuffer(dump.cadus, dtype=np.uint8).reshape(-1, settings.cadu_length) for dump in dumps]
+    counts: dict[str, int] = dict.fromkeys(
+        ("frames", "frames_bad", "symbols_corrected", "packets", "frames_lost_on_link", "bit_errors"), 0
+    )
+    arrived: list[NDArray[np.uint8]] = []
+    received: list[bytes] = []
+    bursting = False
+    for dump, frames in zip(dumps, sent, strict=True):
+        bursts, bursting = _bursts(frames.shape[0], section, bursting, rng)
+        lost = rng.random(frames.shape[0]) < np.where(bursts, section.burst_frame_loss, section.frame_loss)
+        counts["frames_lost_on_link"] += int(lost.sum())
+        rate = np.where(bursts, section.burst_bit_error_rate, section.bit_error_rate)
+        came, bad, repaired, flipped = _with_errors(frames, lost, rate, settings, rng)
+        whole = ~lost
+        whole[np.flatnonzero(~lost)[bad]] = False
+        counts["bit_errors"] += flipped
+        kept = [
+            packet
+            for packet, first, last in zip(dump.packets, dump.first.tolist(), dump.last.tolist(), strict=True)
+            if whole[first : last + 1].all()
+        ]
+        # What comes twice is the recording of one reception played again, errors and all.
+        for _ in range(1 + int(rng.random() < section.repeat_share)):
+            arrived.append(came)
+            received += kept
+            counts["frames"] += came.shape[0]
+            counts["frames_bad"] += int(bad.sum())
+            counts["symbols_corrected"] += repaired
+            counts["packets"] += len(kept)
+    arrived = _out_of_order(arrived, section.reorder_share, rng)
+    made = {packet for dump in dumps for packet in dump.packets}
+    stream = b"".join(block.tobytes() for block in arrived)
+    return Reception(
+        stream,
+        {
+            "dumps": len(dumps),
+            "frames_sent": sum(block.shape[0] for block in sent),
+            **counts,
+            "octets": len(stream),
+            "packets_made": len(made),
+            "packets_received": len(set(received)),
+            "packets_lost": len(made) - len(set(received)),
+            "duplicates": len(received) - len(set(received)),
+        },
+    )
+
+
+def save_receptions(folder: Path, dumps: Sequence[Dump]) -> None:
+    """Write when each dump left, on which channel and with how many frames, into an archive `folder`."""
+    rows = [
+        f"{format_utc(dump.utc_ns)},{dump.virtual_channel},{len(dump.packets)},{len(dump.cadus)}\n"
+        for dump in dumps
+    ]
+    (folder / "dumps.csv").write_text("sent_utc,virtual_channel,packets,octets\n" + "".join(rows))
+
+
+def station(name: str, minimum_elevation_deg: float = 10.0) -> GroundStation:
+    """A ground station by name.
+
+    Raises
+    ------
+    ScenarioError
+        There is none of that name here.
+    """
+    if name not in STATIONS:
+        raise ScenarioError(f"link.stations: expected names of {', '.join(STATIONS)}, found {name!r}")
+    latitude_deg, longitude_deg, height_m = STATIONS[name]
+    return GroundStation(
+        name,
+        np.radians(latitude_deg),
+        np.radians(longitude_deg),
+        height_m,
+        np.radians(minimum_elevation_deg),
+    )
+
+
+def contacts(
+    ephemeris: Ephemeris, utc_ns: IntArray, section: LinkSection
+) -> tuple[BoolArray, NDArray[np.float64]]:
+    """Whether any station hears the spacecraft at emission epochs (n,), and the light time in s.
+
+    Without stations it is always heard.
+    """
+    heard = np.zeros(utc_ns.size, dtype=np.bool_)
+    light_s = np.full(utc_ns.size, 1.28)
+    if not section.stations:
+        return ~heard, light_s
+    for name in section.stations:
+        # Reception comes later than emission by the light time: seen from here a second and a half of margin.
+        geometry = link(ephemeris, utc_ns + 1_500_000_000, station(name, section.minimum_elevation_deg))
+        heard |= geometry.visible
+        light_s = np.where(geometry.visible, geometry.light_time_s, light_s)
+    return heard, light_s
+
+
+def _bursts(
+    frames: int, section: LinkSection, bursting: bool, rng: np.random.Generator
+) -> tuple[BoolArray, bool]:
+    """Whether each frame falls into a burst, and whether one goes on behind the last."""
+    states = np.zeros(frames, dtype=np.bool_)
+    for k, draw in enumerate(rng.random(frames).tolist()):
+        bursting = draw >= section.burst_end if bursting else draw < section.burst_start
+        states[k] = bursting
+    return states, bursting
+
+
+def _with_errors(
+    frames: NDArray[np.uint8],
+    lost: BoolArray,
+    bit_error_rate: NDArray[np.float64],
+    settings: LinkSettings,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.uint8], BoolArray, int, int]:
+    """(frames that came, which of them cannot be repaired, symbols to repair in the others, wrong bits)."""
+    came = frames[~lost].copy()
+    bits = 8 * settings.cadu_length
+    wrong = rng.binomial(bits, bit_error_rate[~lost])
+    bad = np.zeros(came.shape[0], dtype=np.bool_)
+    repaired = 0
+    code = settings.code
+    for row in np.flatnonzero(wrong).tolist():
+        places = rng.choice(bits, int(wrong[row]), replace=False)
+        np.bitwise_xor.at(came[row], places >> 3, (0x80 >> (places & 7)).astype(np.uint8))
+        symbols = np.unique(places >> 3) - cadu.ASM_LENGTH
+        symbols = symbols[symbols >= 0]
+        if code is None:
+            bad[row] = symbols.size > 0
+            continue
+        by_codeword = np.bincount(symbols % code.interleave, minlength=code.interleave)
+        bad[row] = bool(np.any(by_codeword > code.errors))
+        # Repairs of the whole codewords of a lost frame count as well.
+        repaired += int(by_codeword[by_codeword <= code.errors].sum())
+    return came, bad, repaired, int(wrong.sum())
+
+
+def _out_of_order(
+    blocks: list[NDArray[np.uint8]], share: float, rng: np.random.Generator
+) -> list[NDArray[np.uint8]]:
+    """The blocks, a share of them exchanged with the next one."""
+    blocks = list(blocks)
+    for k in range(len(blocks) - 1):
+        if rng.random() < share:
+            blocks[k], blocks[k + 1] = blocks[k + 1], blocks[k]
+    return blocks

@@ -1,0 +1,217 @@
+"""The board and the bus around the payload: power, heat, processor time, memory that radiation reaches, watchdog.
+
+A lumped model. Power: a battery charged by the arrays in sunlight, whose open-circuit voltage follows its charge,
+behind a resistance. Heat: the processor board and the camera, each a heat
+capacity tied to a structure that follows sunlight.
+Processor: every stage of flight software takes a set time, with a spread of a tenth, drawn from the seed.
+The counts of stages, loads and sensors are those of the interface control document.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Memory = NDArray[np.uint8]
+
+UNLIMITED = 1 << 62
+TICKS_PER_SECOND = 65_536
+_CAMERA, _ACCELERATOR = 1, 2
+
+
+@dataclass(frozen=True, slots=True)
+class PlatformModel:
+    """Numbers of a 16U CubeSat's bus and of an edge computer of a few watts.
+
+    Attributes
+    ----------
+    idle_w, camera_w, accelerator_w
+        Drawn by the processor board alone, by the camera, and by the accelerator.
+    array_w, capacity_wh
+        Power of the solar arrays for the payload in sunlight, and energy of its share of the battery.
+    empty_v, full_v, resistance_ohm
+        Battery.
+    *_j_per_k, *_w_per_k
+        Heat capacities, and conductances to the structure.
+    lit_c, dark_c, structure_s
+        Temperatures that the structure tends to in sunlight and in shadow, and how quickly.
+    stage_ms
+        Processor time of idle, commands, detector, navigation, telemetry, monitoring.
+    program_octets
+        Memory of the program itself.
+    watchdog_s
+        Time without a sign of life after which the watchdog resets the processor.
+    """
+
+    idle_w: float = 2.2
+    camera_w: float = 1.6
+    accelerator_w: float = 3.4
+    array_w: float = 9.0
+    capacity_wh: float = 20.0
+    empty_v: float = 10.6
+    full_v: float = 12.6
+    resistance_ohm: float = 0.15
+    board_j_per_k: float = 180.0
+    board_w_per_k: float = 0.35
+    camera_j_per_k: float = 120.0
+    camera_w_per_k: float = 0.25
+    lit_c: float = 28.0
+    dark_c: float = -12.0
+    structure_s: float = 2_400.0
+    stage_ms: tuple[float, ...] = (0.0, 2.0, 850.0, 40.0, 8.0, 5.0)
+    program_octets: int = 48 << 20
+    watchdog_s: float = 30.0
+
+
+@dataclass(slots=True, eq=False)
+class SimulatedBoard:
+    """The board that flight software runs on; `advance` lets time pass on it.
+
+    Attributes
+    ----------
+    detector_factor
+        How much longer than usual the detector takes.
+    heat_c, drop_v
+        Added to the temperature and taken from the voltage by faults.
+    downlink
+        Octets of packets that TM/TC takes in this step.
+    """
+
+    model: PlatformModel
+    seed: int
+    store: Memory
+    settings: Memory
+    reset_cause: int = 0
+    detector_factor: float = 1.0
+    heat_c: float = 0.0
+    drop_v: float = 0.0
+    downlink: int = UNLIMITED
+    reset_requested: int | None = None
+    charge: float = 0.9
+    structure_c: float = 5.0
+    board_c: float = 8.0
+    camera_c: float = 6.0
+    tables: dict[int, bytearray] = field(default_factory=dict)
+    memory: dict[int, Memory] = field(default_factory=dict)
+    _loads: int = 0
+    _uptime: int = 0
+    _counter_ns: int = 0
+    _stage: int = 0
+    _generator: np.random.Generator = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._generator = np.random.default_rng((self.seed, 2**40))
+
+    def advance(self, seconds: float, sunlit: float) -> None:
+        """Let time pass, the arrays lit by a share of the Sun."""
+        model = self.model
+        self._uptime += round(seconds * TICKS_PER_SECOND)
+        drawn_w = self.drawn_w
+        energy_wh = (model.array_w * sunlit - drawn_w) * seconds / 3600.0
+        self.charge = min(max(self.charge + energy_wh / model.capacity_wh, 0.0), 1.0)
+        tends_c = model.dark_c + (model.lit_c - model.dark_c) * sunlit
+        self.structure_c = _relax(self.structure_c, tends_c, seconds, model.structure_s)
+        inside_w = model.idle_w + (model.accelerator_w if self._loads & _ACCELERATOR else 0.0)
+        self.board_c = _relax(
+            self.board_c,
+            self.structure_c + inside_w / model.board_w_per_k,
+            seconds,
+            model.board_j_per_k / model.board_w_per_k,
+        )
+        camera_w = model.camera_w if self._loads & _CAMERA else 0.0
+        self.camera_c = _relax(
+            self.camera_c,
+            self.structure_c + camera_w / model.camera_w_per_k,
+            seconds,
+            model.camera_j_per_k / model.camera_w_per_k,
+        )
+
+    @property
+    def drawn_w(self) -> float:
+        """Power drawn from the bus."""
+        model = self.model
+        return (
+            model.idle_w
+            + (model.camera_w if self._loads & _CAMERA else 0.0)
+            + (model.accelerator_w if self._loads & _ACCELERATOR else 0.0)
+        )
+
+    @property
+    def camera_on(self) -> bool:
+        """Whether the camera is powered."""
+        return bool(self._loads & _CAMERA)
+
+    def reset(self, cause: int) -> None:
+        """Start the processor anew: working memory is gone, the rest stays."""
+        self.reset_cause, self.reset_requested = cause, None
+        self.memory, self._stage, self._loads = {}, 0, 0
+
+    def flip(self, memory: Memory, bits: int, rng: np.random.Generator) -> None:
+        """Change so many bits of a memory, anywhere in it."""
+        for at in rng.integers(0, 8 * memory.size, bits).tolist():
+            memory[at >> 3] ^= 0x80 >> (at & 7)
+
+    # What flight software sees
+
+    def sensors(self) -> Float:
+        model = self.model
+        open_v = model.empty_v + (model.full_v - model.empty_v) * self.charge - self.drop_v
+        drawn_w = self.drawn_w
+        # The current that carries the power through the resistance.
+        root = math.sqrt(max(open_v**2 - 4.0 * model.resistance_ohm * drawn_w, 0.0))
+        volts = 0.5 * (open_v + root)
+        noise = self._generator.standard_normal(3) * (0.005, 0.05, 0.05)
+        return np.array(
+            [
+                volts + noise[0],
+                drawn_w / max(volts, 1.0),
+                self.board_c + self.heat_c + noise[1],
+                self.camera_c + noise[2],
+            ]
+        )
+
+    def switch(self, loads: int) -> None:
+        self._loads = int(loads)
+
+    def enter(self, stage: int) -> int:
+        spent_ms = self.model.stage_ms[self._stage]
+        if spent_ms:
+            spent_ms *= 1.0 + 0.1 * float(self._generator.standard_normal())
+            if self._stage == _DETECTOR:
+                spent_ms *= self.detector_factor
+        self._counter_ns += max(round(spent_ms * 1e6), 0)
+        self._stage = stage
+        return self._counter_ns
+
+    def memory_octets(self) -> int:
+        return self.model.program_octets + sum(memory.size for memory in self.memory.values())
+
+    def uptime_ticks(self) -> int:
+        return self._uptime
+
+    def downlink_octets(self) -> int:
+        return self.downlink
+
+    def load(self, region: int, octets: bytes) -> Memory:
+        self.memory[region] = np.frombuffer(octets, dtype=np.uint8).copy()
+        return self.memory[region]
+
+    def read_table(self, number: int) -> bytes:
+        return bytes(self.tables.get(number, b""))
+
+    def write_table(self, number: int, octets: bytes) -> None:
+        self.tables[number] = bytearray(octets)
+
+    def request_reset(self, cause: int) -> None:
+        self.reset_requested = cause
+
+
+_DETECTOR = 2
+
+
+def _relax(value: float, toward: float, seconds: float, time_s: float) -> float:
+    return toward + (value - toward) * math.exp(-seconds / time_s)
