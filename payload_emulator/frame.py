@@ -19,6 +19,7 @@ from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.scenario import Scenario
 from payload_emulator.sim import raymarch, renderer
+from payload_emulator.sim.cycles_scene import CyclesSettings, describe_scene
 from payload_emulator.sim.labels import Labels, label_frame, label_frame_as_the_paper
 from payload_emulator.sim.lens import BrownCamera
 from payload_emulator.sim.light import sun_angles
@@ -156,17 +157,17 @@ def render_view(
     renderer_name: str,
     blender_python: str = sys.executable,
     photometry: Photometry | None = None,
+    settings: CyclesSettings | None = None,
 ) -> tuple[Rendering, bytes]:
     """The picture before the sensor, and Cycles' Filmic PNG (empty from other renderers).
 
-    ``photometry`` stands in for the scenario's.
+    ``photometry`` stands in for the scenario's, ``settings`` for the paper's in Cycles.
     """
     pose = (world.terrain, world.true_camera, view.position_mcmf_m, view.camera_from_mcmf, view.sun_mcmf)
     if renderer_name == "cycles":
         from payload_emulator.sim.cycles import render_scene
-        from payload_emulator.sim.cycles_scene import CyclesSettings, describe_scene
 
-        picture = render_scene(describe_scene(*pose), CyclesSettings(), blender_python)
+        picture = render_scene(describe_scene(*pose), settings or CyclesSettings(), blender_python)
         return picture.rendering, picture.filmic_png
     law = photometry or Photometry(world.scenario.light.photometry)
     return {"fast": renderer.render, "raymarch": raymarch.render}[renderer_name](*pose, law), b""

@@ -126,6 +126,7 @@ def _add_ground(bpy: Any, scene: Any, told: Any) -> None:
     ground.cycles.shadow_terminator_geometry_offset = float(told["set_geometry_offset"])
     modifier = ground.modifiers.new("dicing", "SUBSURF")
     modifier.subdivision_type = "SIMPLE"
+    modifier.uv_smooth = "NONE"
     modifier.use_adaptive_subdivision = True
     modifier.adaptive_space = "PIXEL"
     modifier.adaptive_pixel_size = float(told["set_pixels_per_polygon"])
