@@ -78,6 +78,9 @@ class AnchoredParameters:
         Position sigma beyond which the estimate counts as lost.
     suspicion_frames
         Frames in a row that must disagree before the search is widened.
+    crater_limit
+        Craters used of one frame: more than these, the surest, say little more, since attitude and catalogue err alike
+        for all of them.
     """
 
     gravity_degree: int = 100
@@ -93,6 +96,7 @@ class AnchoredParameters:
     search_radius_m: float = 25_000.0
     divergence_limit_m: float = 5_000.0
     suspicion_frames: int = 4
+    crater_limit: int = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,6 +291,9 @@ class AnchoredNavigator:
         reacquired: bool,
     ) -> Fix | None:
         """Return the fix of identified craters, None where it contradicts the prediction as a whole."""
+        if len(identification) > self.parameters.crater_limit:
+            surest = np.argsort(self._detection_variance(found)[identification.detection], kind="stable")
+            identification = identification.select(np.sort(surest[: self.parameters.crater_limit]))
         index = sighting.index[identification.sighted]
         uv = np.stack([found.u_px, found.v_px], axis=1)[identification.detection]
         update = kalman.update(

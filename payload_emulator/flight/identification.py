@@ -36,7 +36,9 @@ class IdentificationParameters:
         Largest difference of the logarithms of measured and catalogued diameter; catalogues and detectors agree to
         0.1 to 0.15.
     false_set_limit
-        Largest expected number of sets that chance makes up per frame, for a set to be believed while tracking.
+        Largest expected number of sets that chance makes up per frame, for a set to be believed while tracking. It
+        holds for up to three detections and falls with the square of those beyond two: a frame full of detections
+        that hardly any crater explains speaks against the set, a mirrored image for example.
     hypothesis_limit
         Pairs tried as hypotheses.
     """
@@ -67,6 +69,10 @@ class Identification:
 
     def __len__(self) -> int:
         return int(self.detection.shape[0])
+
+    def select(self, which: Index) -> Identification:
+        """Return some of the pairs, believed as all of them were."""
+        return Identification(self.detection[which], self.sighted[which], self.candidates, self.needed)
 
     @property
     def believed(self) -> bool:
@@ -110,7 +116,8 @@ def identify(
     chosen = _consistent(
         chosen, sighted, offset, prior_px2, crater_noise_px2, detection_variance_px2[detection]
     )
-    needed = minimum_members(float(chance.sum()), tight_chance, parameters.false_set_limit)
+    limit = parameters.false_set_limit / max(1, len(found) - 2) ** 2
+    needed = minimum_members(float(chance.sum()), tight_chance, limit)
     return Identification(detection[chosen], sighted[chosen], count, needed)
 
 

@@ -26,6 +26,8 @@ SIZE = 18
 POSITION, VELOCITY, ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)
 ATTITUDE, PIXEL, OFFSET, SCALE = slice(9, 12), slice(12, 14), slice(14, 17), 17
 ORBIT = slice(0, 9)
+# Projection bends by the square of a move over the altitude: after one this small another iteration gains millimetres.
+_LINEAR_M = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,10 +291,11 @@ def update(
             mean_innovation = innovation.reshape(-1, 2).sum(axis=0) / np.sqrt(np.diag(spread_of_sum))
         gain = np.linalg.solve(spread, crossed).T
         previous, mean = mean, prior.mean + gain @ innovation
-        if np.linalg.norm(mean[POSITION] - previous[POSITION]) < 0.01:
+        if np.linalg.norm(mean[POSITION] - previous[POSITION]) < _LINEAR_M:
             break
-    left = np.eye(size) - gain @ design
-    covariance = left @ prior.covariance @ left.T + gain @ noise @ gain.T
+    # Joseph's form, (1 - K H) P (1 - K H)' + K R K', multiplied out: products of n x n by n x m only.
+    taken = gain @ crossed
+    covariance = prior.covariance - taken - taken.T + gain @ spread @ gain.T
     state = FilterState(prior.ticks, mean, 0.5 * (covariance + covariance.T), prior.craters)
     pose = pose_of(mean, camera_from_icrf, mcmf_from_icrf)
     after = look(landmarks, index, pose, camera, state.shifts(index))
