@@ -37,7 +37,7 @@ def read_exr(path: Path) -> dict[str, npt.NDArray[np.float32]]:
                 f"{path}: expected an uncompressed EXR, found method {attributes['compression'][0]}"
             )
         left, top, right, bottom = struct.unpack("<4i", attributes["dataWindow"])
-    except (KeyError, struct.error, ValueError) as error:
+    except (KeyError, IndexError, struct.error, ValueError) as error:
         raise RendererError(
             f"{path}: expected the header of an EXR file, found it damaged ({error})"
         ) from None

@@ -1,0 +1,272 @@
+"""The Cycles renderer up to the process boundary: the scene, what Blender is told, what comes back, what goes wrong.
+
+Blender itself (a 374 MB wheel under the GPL) is no part of the test requirements; `linna render --compare` and the
+benchmark run it where it is at hand.
+"""
+
+import math
+import sys
+import types
+
+import numpy as np
+import pytest
+
+from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
+from lunar.constants import MOON_RADIUS_M
+from lunar.frames import axis_rotation, mcmf_from_spherical
+from payload_emulator.errors import RendererError, TerrainError
+from payload_emulator.sim import cycles, cycles_worker
+from payload_emulator.sim.cycles_scene import GRID, CyclesSettings, describe_scene
+from payload_emulator.sim.lens import BrownCamera
+from payload_emulator.sim.light import sun_direction_mcmf
+from tests.payload_emulator.sim.exr_file import exr_octets
+
+CAMERA = PinholeCamera()
+PLACE = math.radians(-20.0), math.radians(359.8)
+SUN = sun_direction_mcmf(math.radians(10.0), math.radians(30.0), *PLACE)
+
+
+def pose(altitude_m=25e3):
+    position = mcmf_from_spherical(*PLACE, altitude_m)
+    return position, nadir_camera_from_mcmf(position)
+
+
+@pytest.fixture
+def hilly(formula_terrain):
+    return formula_terrain(
+        lambda latitude, longitude: 1500.0 * np.sin(90.0 * latitude) * np.cos(80.0 * longitude)
+    )
+
+
+@pytest.fixture
+def scene(hilly):
+    return describe_scene(hilly, CAMERA, *pose(), SUN)
+
+
+def test_the_cap_is_a_grid_of_65_on_the_sphere_through_the_middle_of_the_relief(hilly, scene):
+    assert scene.vertices_km.shape == (GRID, GRID, 3) == (65, 65, 3)
+    centre = np.array([0.0, 0.0, -MOON_RADIUS_M / 1e3])
+    radius = np.linalg.norm(scene.vertices_km - centre, axis=-1)
+    # One sphere, to the rounding of double precision over the Moon's radius in km.
+    assert np.ptp(radius) < 1e-8
+    low_m = 1e3 * (radius.mean() - MOON_RADIUS_M / 1e3 - scene.displacement_range_km / 2.0)
+    assert -1500.0 <= low_m < -1400.0
+
+
+def test_displaced_vertices_lie_on_the_terrain(hilly, scene):
+    """Height of the texture at a vertex, put on the vertex's radius, is the terrain's height there."""
+    position, _ = pose()
+    east = np.array([-math.sin(PLACE[1]), math.cos(PLACE[1]), 0.0])
+    up = position / np.linalg.norm(position)
+    north = np.cross(up, east)
+    for row, column in ((0, 0), (20, 40), (64, 3)):
+        local = scene.vertices_km[row, column] * 1e3
+        point = up * MOON_RADIUS_M + local[0] * east + local[1] * north + local[2] * up
+        latitude = math.asin(point[2] / np.linalg.norm(point))
+        longitude = math.atan2(point[1], point[0])
+        u, v = scene.uv[row, column]
+        high, wide = scene.displacement.shape
+        share = scene.displacement[min(int(v * high), high - 1), min(int(u * wide), wide - 1)]
+        height = np.linalg.norm(point) - MOON_RADIUS_M + 1e3 * (share - 0.5) * scene.displacement_range_km
+        # The texture is read at the nearest of its pixels, on slopes of up to 0.08.
+        assert height == pytest.approx(float(hilly.height_m(latitude, longitude)), abs=20.0)
+
+
+def test_the_displacement_texture_spans_0_to_1(scene):
+    assert scene.displacement.dtype == np.float32
+    assert scene.displacement.min() == pytest.approx(0.0, abs=1e-6)
+    assert scene.displacement.max() == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_cap_holds_the_footprint_and_reaches_toward_a_low_sun(scene):
+    x, y = scene.vertices_km[..., 0], scene.vertices_km[..., 1]
+    # Half the footprint of 120 degrees from 25 km is 43 km on flat ground.
+    assert x.min() < -43.0 and y.min() < -43.0
+    # The Sun stands 10 degrees high at azimuth 30: casters of 6 km shade ground 34 km on.
+    assert y.max() > 43.0 + 25.0 and x.max() > 43.0 + 14.0
+    assert y.max() < 140.0
+
+
+def test_camera_and_sun_are_in_blenders_axes(scene):
+    camera = scene.camera_to_world
+    np.testing.assert_allclose(camera[:3, 3], [0.0, 0.0, 25.0], atol=1e-9)
+    # Nadir, image up to the north: x east, y north, looking along -z.
+    np.testing.assert_allclose(camera[:3, :3], np.eye(3), atol=1e-12)
+    toward = [math.cos(0.1745329) * 0.5, math.cos(0.1745329) * math.cos(math.pi / 6.0), math.sin(0.1745329)]
+    np.testing.assert_allclose(scene.sun_to_world[:3, 2], toward, atol=1e-6)
+    np.testing.assert_allclose(
+        scene.sun_to_world[:3, :3] @ scene.sun_to_world[:3, :3].T, np.eye(3), atol=1e-12
+    )
+    assert math.degrees(scene.sun_angle_rad) == pytest.approx(0.533, abs=0.001)
+
+
+def test_a_tilted_camera_tilts(hilly):
+    position, rotation = pose()
+    tilted = describe_scene(hilly, CAMERA, position, axis_rotation(1, 0.1) @ rotation, SUN)
+    # The boresight, -z of Blender's camera, leans to the north.
+    np.testing.assert_allclose(
+        -tilted.camera_to_world[:3, 2], [0.0, math.sin(0.1), -math.cos(0.1)], atol=1e-12
+    )
+
+
+def test_a_distorting_lens_is_refused(hilly):
+    with pytest.raises(RendererError, match="without distortion"):
+        describe_scene(hilly, BrownCamera(k1=-0.01), *pose(), SUN)
+
+
+def test_a_camera_in_the_ground_and_a_view_along_the_horizon_are_refused(hilly):
+    with pytest.raises(TerrainError, match="above the ground"):
+        describe_scene(hilly, CAMERA, *pose(40.0), SUN)
+    with pytest.raises(TerrainError):
+        position, rotation = pose(400e3)
+        describe_scene(hilly, CAMERA, position, axis_rotation(1, 0.9) @ rotation, SUN)
+
+
+class Thing:
+    """Stands in for anything of Blender's: keeps what is set on it, makes up what is asked for, can be called."""
+
+    def __init__(self):
+        self.items = {}
+        self.calls = []
+
+    def __getattr__(self, name):
+        value = Thing()
+        setattr(self, name, value)
+        return value
+
+    def __getitem__(self, key):
+        return self.items.setdefault(key, Thing())
+
+    def __call__(self, *arguments, **options):
+        self.calls.append(arguments)
+        return self.items.setdefault((*map(str, arguments),), Thing())
+
+    def __iter__(self):
+        return iter(())
+
+
+@pytest.fixture
+def blender(monkeypatch):
+    fake = Thing()
+    fake.app.version_string = "0.0"
+    monkeypatch.setitem(sys.modules, "bpy", fake)
+    monkeypatch.setitem(sys.modules, "mathutils", types.SimpleNamespace(Matrix=lambda rows: rows))
+    return fake
+
+
+def test_blender_is_told_what_the_paper_says(tmp_path, scene, blender):
+    scene.save(tmp_path / "scene.npz", CyclesSettings(samples=16))
+    files = [str(tmp_path / name) for name in ("scene.npz", "out.exr", "picture.png", "cost.json")]
+    assert cycles_worker.main(*files) == 0
+    told = blender.context.scene
+    assert told.render.engine == "CYCLES"
+    assert (told.render.resolution_x, told.render.resolution_y) == (512, 512)
+    assert told.cycles.samples == 16 and told.cycles.use_adaptive_sampling is True
+    assert told.cycles.denoiser == "OPENIMAGEDENOISE"
+    assert told.cycles.denoising_input_passes == "RGB_ALBEDO_NORMAL"
+    assert told.world.node_tree.nodes["Background"].inputs["Strength"].default_value == 0.0
+    assert told.view_settings.view_transform == "Filmic"
+    # The last file format set is that of the picture.
+    assert (told.render.image_settings.file_format, told.render.image_settings.color_depth) == ("PNG", "16")
+    ground = blender.data.objects.new("ground", blender.data.meshes.new("cap"))
+    modifier = ground.modifiers.new("dicing", "SUBSURF")
+    assert modifier.use_adaptive_subdivision is True and modifier.adaptive_pixel_size == 0.5
+    assert ground.cycles.shadow_terminator_offset > 0.0
+    surface = blender.data.materials.new("regolith").node_tree.nodes["Principled BSDF"]
+    assert surface.inputs["Roughness"].default_value == 1.0
+    assert 1.0 < surface.inputs["IOR"].default_value < 1.1
+    lamp = blender.data.lights.new("Sun", "SUN")
+    assert lamp.energy == pytest.approx(math.pi)
+    vertices, _, faces = blender.data.meshes.new("cap").from_pydata.calls[0]
+    assert len(vertices) == 65 * 65 and len(faces) == 64 * 64
+    corners = np.array(vertices)[np.array(faces)]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
+    assert (normals[:, 2] > 0.0).all()
+
+
+def planes_of(scene, cosine, direct, range_km):
+    """Passes of ground lying ``range_km`` below the camera, its normal at a cosine to the Sun; sky in one corner."""
+    shape = (4, 5)
+    sun = scene.sun_to_world[:3, 2]
+    eye = scene.camera_to_world[:3, 3]
+    alpha = np.ones(shape, np.float32)
+    alpha[0, 0] = 0.0
+    planes = {"V.Combined.R": np.full(shape, 0.03, np.float32), "V.Combined.A": alpha}
+    for axis, s, e in zip("XYZ", sun, eye, strict=True):
+        planes[f"V.Normal.{axis}"] = np.full(shape, s * cosine, np.float32)
+        planes[f"V.Position.{axis}"] = np.full(shape, e - (range_km if axis == "Z" else 0.0), np.float32)
+    planes["V.Diffuse Direct.R"] = np.full(shape, direct, np.float32)
+    return planes
+
+
+def test_passes_become_radiance_share_of_the_sun_and_range(scene):
+    picture = cycles.rendering_of_passes(planes_of(scene, 0.4, 0.2, 24.0), scene)
+    assert picture.radiance[1, 1] == pytest.approx(0.03) and picture.radiance[0, 0] == 0.0
+    assert picture.lit[1, 1] == pytest.approx(0.5, abs=1e-6) and picture.lit[0, 0] == 0.0
+    assert picture.range_m[1, 1] == pytest.approx(24e3, rel=1e-6) and math.isnan(picture.range_m[0, 0])
+
+
+def test_ground_turned_from_the_sun_is_in_shadow(scene):
+    assert cycles.rendering_of_passes(planes_of(scene, -0.2, 0.0, 24.0), scene).lit.max() == 0.0
+
+
+def test_a_missing_pass_is_named(scene):
+    planes = planes_of(scene, 0.4, 0.2, 24.0)
+    del planes["V.Position.Y"]
+    with pytest.raises(RendererError, match=r"expected a pass Position\.Y, found V\.Combined"):
+        cycles.rendering_of_passes(planes, scene)
+
+
+def interpreter(folder, body):
+    """An executable that Blender's interpreter is replaced by: gets -P, worker, scene, exr, png, cost."""
+    file = folder / "python"
+    file.write_text(f"#!{sys.executable}\nimport json, sys\n{body}\n")
+    file.chmod(0o755)
+    return str(file)
+
+
+def test_what_another_process_renders_comes_back(tmp_path, hilly, scene):
+    exr = tmp_path / "made.exr"
+    exr.write_bytes(exr_octets(planes_of(scene, 0.4, 0.4, 20.0)))
+    python = interpreter(
+        tmp_path,
+        "import numpy, shutil\n"
+        "told = numpy.load(sys.argv[3])\n"
+        "assert told['set_samples'] == 7 and told['vertices_km'].shape == (65, 65, 3)\n"
+        f"shutil.copy({str(exr)!r}, sys.argv[4])\n"
+        "open(sys.argv[5], 'wb').write(b'png')\n"
+        "cost = {'blender': '5.0', 'scene_wall_s': 1, 'render_wall_s': 2, 'render_cpu_s': 3}\n"
+        "json.dump(cost, open(sys.argv[6], 'w'))",
+    )
+    picture = cycles.render_scene(scene, CyclesSettings(samples=7), python)
+    assert picture.filmic_png == b"png" and picture.blender == "5.0" and picture.render_cpu_s == 3.0
+    assert picture.rendering.lit[2, 2] == pytest.approx(1.0)
+    rendering = cycles.render(hilly, CAMERA, *pose(), SUN, settings=CyclesSettings(samples=7), python=python)
+    np.testing.assert_array_equal(rendering.range_m, picture.rendering.range_m)
+
+
+def test_without_blender_one_line_says_how_to_get_it(tmp_path, monkeypatch, scene):
+    (tmp_path / "bpy.py").write_text("raise ImportError('no Blender here')\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with pytest.raises(
+        RendererError, match=r"expected Blender as a module \(bpy\).*LINNA_BLENDER_PYTHON"
+    ) as caught:
+        cycles.render_scene(scene, CyclesSettings())
+    assert "\n" not in str(caught.value)
+
+
+def test_an_interpreter_that_is_not_there_is_named(scene):
+    with pytest.raises(RendererError, match="at /nowhere/python, found none"):
+        cycles.render_scene(scene, CyclesSettings(), "/nowhere/python")
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("sys.exit('out of memory')", "status 1: out of memory"),
+        ("pass", r"without writing out\.exr, picture\.png, cost\.json"),
+    ],
+)
+def test_a_blender_that_fails_is_quoted(tmp_path, scene, body, message):
+    with pytest.raises(RendererError, match=message):
+        cycles.render_scene(scene, CyclesSettings(), interpreter(tmp_path, body))
