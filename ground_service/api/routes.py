@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
+from starlette.responses import JSONResponse
 
 from ground_service.api import schemas
 from ground_service.api.common import (
@@ -26,7 +27,8 @@ from ground_service.api.common import (
     page_of,
     stored_body,
 )
-from ground_service.errors import InvalidInput
+from ground_service.api.plan_schemas import time_of
+from ground_service.errors import InvalidInput, NotFound
 from ground_service.services import ephemerides as ephemeris_service
 from ground_service.services import passes as pass_service
 from ground_service.services.ingest import FLOWN, begin_ingest
@@ -37,12 +39,14 @@ from ground_service.services.views import (
     job_view,
     pass_detail_view,
     pass_view,
+    series_view,
     time_text,
 )
 from ground_service.store import repository
-from lunar.timescales import parse_utc
 
 UPLOAD_PATHS = (f"{API_PREFIX}/telemetry", f"{API_PREFIX}/ephemerides")
+
+REPORT_MEDIA = {"html": "text/html", "pdf": "application/pdf", "json": "application/json"}
 
 router = APIRouter(prefix=API_PREFIX, responses=PROBLEMS)
 
@@ -158,8 +162,8 @@ def define_pass(ground: GroundOf, _: Operator, given: schemas.PassDefinition) ->
     pass_id = pass_service.define_pass(
         ground,
         name=given.name,
-        start_utc_ns=parse_utc(given.start),
-        stop_utc_ns=parse_utc(given.stop),
+        start_utc_ns=time_of(given.start, "start"),
+        stop_utc_ns=time_of(given.stop, "stop"),
         spacecraft_id=given.spacecraft_id,
         instance=given.instance,
     )
@@ -227,11 +231,11 @@ def get_states(
     estimator: Annotated[str, Query(max_length=40, examples=["spherical"])] = "paper",
     value: Annotated[list[str] | None, Query(max_length=len(STATE_VALUES))] = None,
     max_points: Annotated[int, Query(ge=1, le=10_000)] = 1000,
-) -> schemas.States:
+) -> Any:
     """Series of one estimator's states, made short: least, greatest and mean value per stretch, gaps marked."""
     names = tuple(value) if value else ("latitude_deg", "longitude_deg", "altitude_m")
     found = pass_service.state_series(ground, pass_id, estimator, names, max_points)
-    return schemas.States(estimator=estimator, series=[_series(one) for one in found])
+    return JSONResponse({"estimator": estimator, "series": [series_view(one) for one in found]})
 
 
 @router.get("/passes/{pass_id}/events", response_model=schemas.PageOf[schemas.EventItem])
@@ -261,9 +265,33 @@ def get_parameter(
     pass_id: PassId,
     parameter: Annotated[str, Path(max_length=64)],
     max_points: Annotated[int, Query(ge=1, le=10_000)] = 1000,
-) -> schemas.SeriesOut:
+) -> Any:
     """The series of one housekeeping parameter."""
-    return _series(pass_service.parameter_series(ground, pass_id, parameter, max_points))
+    return JSONResponse(series_view(pass_service.parameter_series(ground, pass_id, parameter, max_points)))
+
+
+@router.get("/spacecraft/{spacecraft_id}/telemetry/{parameter}", response_model=schemas.SeriesOut)
+def get_trend(
+    ground: GroundOf,
+    _: Viewer,
+    spacecraft_id: Annotated[int, Path(ge=0, le=1023)],
+    parameter: Annotated[str, Path(max_length=64)],
+    instance: Instance = FLOWN,
+    start: Annotated[str | None, Query(max_length=40)] = None,
+    stop: Annotated[str | None, Query(max_length=40)] = None,
+    max_points: Annotated[int, Query(ge=1, le=10_000)] = 1000,
+) -> Any:
+    """The series of one housekeeping parameter over any span: its trend."""
+    found = pass_service.trend_series(
+        ground,
+        spacecraft_id,
+        instance,
+        parameter,
+        max_points,
+        start_utc_ns=None if start is None else time_of(start, "start"),
+        stop_utc_ns=None if stop is None else time_of(stop, "stop"),
+    )
+    return JSONResponse(series_view(found))
 
 
 # Reports and jobs
@@ -305,7 +333,7 @@ def get_job(ground: GroundOf, _: Viewer, job_id: Key) -> Any:
 @router.get(
     "/reports/{report_id}",
     response_class=Response,
-    responses={200: {"content": {"text/html": {}, "application/json": {}}, "description": "The report"}},
+    responses={200: {"content": {media: {} for media in REPORT_MEDIA.values()}, "description": "The report"}},
 )
 def get_report(
     request: Request,
@@ -313,44 +341,31 @@ def get_report(
     _: Viewer,
     report_id: Key,
     format: Annotated[
-        str | None, Query(pattern="^(html|json)$", description="Default: by the Accept header")
+        Literal["html", "pdf", "json"] | None, Query(description="Default: by the Accept header")
     ] = None,
 ) -> Response:
-    """A report as HTML or JSON."""
+    """A report as HTML, PDF or JSON."""
     with ground.database.reading() as connection:
         row = repository.get(connection, repository.REPORTS, report_id, "report")
-    wants_html = "text/html" in request.headers.get("accept", "")
-    kind = format or ("html" if wants_html else "json")
-    media = "text/html; charset=utf-8" if kind == "html" else "application/json"
-    return Response(ground.files.get(row[f"{kind}_sha256"]), media_type=media)
+    kind = format or preferred_kind(request.headers.get("accept", ""))
+    sha256 = row[f"{kind}_sha256"]
+    if sha256 is None:
+        raise NotFound(f"report {report_id} as", kind)
+    media = REPORT_MEDIA[kind] + ("; charset=utf-8" if kind == "html" else "")
+    return Response(ground.files.get(sha256), media_type=media)
 
 
-def _series(series: pass_service.Series) -> schemas.SeriesOut:
-    buckets = series.buckets
-    columns = (
-        buckets.start_utc_ns,
-        buckets.stop_utc_ns,
-        buckets.count,
-        buckets.low,
-        buckets.high,
-        buckets.mean,
-        buckets.after_gap,
-    )
-    return schemas.SeriesOut(
-        name=series.name,
-        unit=series.unit,
-        samples=series.samples,
-        correlation_id=series.correlation_id,
-        buckets=[
-            schemas.Bucket(
-                start=time_text(start),
-                stop=time_text(stop),
-                count=count,
-                min=low,
-                max=high,
-                mean=mean,
-                after_gap=gap,
-            )
-            for start, stop, count, low, high, mean, gap in zip(*(c.tolist() for c in columns), strict=True)
-        ],
-    )
+def preferred_kind(accept: str) -> str:
+    """The kind of document that an Accept header likes best; JSON where it does not say."""
+    best, weight = "json", 0.0
+    for part in accept.split(","):
+        media, *parameters = (piece.strip() for piece in part.split(";"))
+        quality = next((text[2:] for text in parameters if text.startswith("q=")), "1")
+        try:
+            value = float(quality)
+        except ValueError:
+            continue
+        kind = next((kind for kind, name in REPORT_MEDIA.items() if name == media.lower()), None)
+        if kind is not None and value > weight:
+            best, weight = kind, value
+    return best

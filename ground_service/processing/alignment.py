@@ -34,6 +34,20 @@ class ReferenceStates:
     longitude_rad: FloatArray
     altitude_m: FloatArray
 
+    def at_rows(self, rows: IntArray) -> ReferenceStates:
+        """The reference at some of its epochs."""
+        return ReferenceStates(
+            self.utc_ns[rows],
+            self.covered[rows],
+            self.position_icrf_m[rows],
+            self.velocity_icrf_m_s[rows],
+            self.mcmf_from_icrf[rows],
+            self.position_mcmf_m[rows],
+            self.latitude_rad[rows],
+            self.longitude_rad[rows],
+            self.altitude_m[rows],
+        )
+
     @property
     def latitude_deg(self) -> FloatArray:
         """Mean-Earth latitude in degrees."""

@@ -19,6 +19,17 @@ from ground_service.processing.alignment import (
 )
 from ground_service.processing.baseline import BASELINE_DEGREE, StartState, propagated_positions
 from ground_service.processing.drift import drift_by_length, error_before_reset_m, navigation_statistics
+from ground_service.processing.fixes import (
+    IdentificationSamples,
+    join_pairs,
+)
+from ground_service.processing.pass_extras import (
+    FILTER,
+    snapshot_series,
+    sun_angles,
+    with_sun,
+    with_wrong_fixes,
+)
 from ground_service.processing.recall import (
     ExpectedCraters,
     Matches,
@@ -97,6 +108,8 @@ class PassInputs:
     outcomes: tuple[OutcomeSamples, ...] = ()
     start_state: StartState | None = None
     filter_states: FilterStates | None = None
+    identifications: IdentificationSamples | None = None
+    sun_known: bool = False
     burns: tuple[CommandedBurn, ...] = ()
     gravity: GravityField | None = None
     other_gravity: GravityField | None = None
@@ -148,6 +161,7 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
         packets=inputs.packets,
         reference=reference,
         navigation=navigation,
+        imaging_arcs=_imaging_arcs(inputs),
         gaps=_gaps(inputs),
         detector=detector,
         gallery=gallery,
@@ -227,10 +241,28 @@ def _navigation(
             remarks.append(f"no propagate-only baseline: {error}")
     else:
         remarks.append("no propagate-only baseline: the pass names no start state")
+    series = _with_extras(inputs, series, track, path_m)
     return (
         TrackSeries(times, track.latitude_deg, track.longitude_deg, track.altitude_m),
         tuple(series),
     )
+
+
+def _with_extras(
+    inputs: PassInputs, series: list[NavigationSeries], track: ReferenceStates, path_m: FloatArray
+) -> list[NavigationSeries]:
+    """Series with the Sun and the wrong fixes, and the snapshot baseline, where there is what they need."""
+    if inputs.sun_known:
+        series = [with_sun(one, track) for one in series]
+    if inputs.identifications is None or inputs.catalogue is None:
+        return series
+    pairs = join_pairs(inputs.identifications, inputs.detections, inputs.catalogue)
+    series = [with_wrong_fixes(one, pairs, inputs.camera, track) for one in series]
+    filtered = next((samples for samples in inputs.navigation if samples.estimator == FILTER), None)
+    snapshot = None
+    if filtered is not None:
+        snapshot = snapshot_series(pairs, filtered, inputs.camera, track, path_m)
+    return series if snapshot is None else [*series, snapshot]
 
 
 def _sample_times(inputs: PassInputs) -> IntArray:
@@ -242,22 +274,8 @@ def _sample_times(inputs: PassInputs) -> IntArray:
 def _path(track: ReferenceStates) -> FloatArray:
     """Ground path to each sample; NaN where the reference does not cover."""
     path = np.full(len(track.utc_ns), np.nan)
-    path[track.covered] = ground_path_m(_at(track, np.flatnonzero(track.covered)), MOON_RADIUS_M)
+    path[track.covered] = ground_path_m(track.at_rows(np.flatnonzero(track.covered)), MOON_RADIUS_M)
     return path
-
-
-def _at(track: ReferenceStates, rows: IntArray) -> ReferenceStates:
-    return ReferenceStates(
-        track.utc_ns[rows],
-        track.covered[rows],
-        track.position_icrf_m[rows],
-        track.velocity_icrf_m_s[rows],
-        track.mcmf_from_icrf[rows],
-        track.position_mcmf_m[rows],
-        track.latitude_rad[rows],
-        track.longitude_rad[rows],
-        track.altitude_m[rows],
-    )
 
 
 def _estimate_series(
@@ -265,7 +283,7 @@ def _estimate_series(
 ) -> NavigationSeries:
     rows = np.searchsorted(track.utc_ns, samples.utc_ns)
     error = error_of_places_rtn_m(
-        _at(track, rows), samples.latitude_deg, samples.longitude_deg, samples.altitude_m
+        track.at_rows(rows), samples.latitude_deg, samples.longitude_deg, samples.altitude_m
     )
     triggers, candidates, reads = _joined(samples, outcomes)
     is_reset = np.array([trigger in RESETS for trigger in triggers], dtype=np.bool_)
@@ -295,9 +313,16 @@ def _estimate_series(
         candidates=candidates,
         nis=samples.nis if bool(np.isfinite(samples.nis).any()) else None,
         nees=nees if has_sigma else None,
+        nis_dof=_nis_dof(samples),
         time_since_fix_s=_time_since_fix_s(samples),
         drift_by_length=drift_by_length(error, path_m[rows], is_reset),
     )
+
+
+def _nis_dof(samples: NavigationSamples) -> IntArray | None:
+    """Degrees of freedom of each NIS: two pixel coordinates for every crater that a fix used."""
+    known = np.isfinite(samples.nis)
+    return np.where(known, 2 * samples.matched, 0).astype(np.int64) if known.any() else None
 
 
 def _smoothed(
@@ -313,7 +338,7 @@ def _smoothed(
     kept = track.covered[rows] & (track.utc_ns[rows] == filtered.utc_ns)
     filtered, rows = filtered.select(kept), rows[kept]
     model = smoother_model(gravity, inputs.orientation, inputs.burns)
-    series = smoothed_series(filtered, reported, _at(track, rows), path_m[rows], model)
+    series = smoothed_series(filtered, reported, track.at_rows(rows), path_m[rows], model)
     if series is None:
         return []
     provenance["gravity of the smoother"] = (
@@ -355,7 +380,7 @@ def _baselines(
     rows = np.flatnonzero(track.covered & (track.utc_ns >= start.utc_ns))
     if len(rows) == 0:
         return []
-    here = _at(track, rows)
+    here = track.at_rows(rows)
     series = []
     runs = [("propagate-only", start, gravity, min(BASELINE_DEGREE, gravity.degree))]
     if inputs.other_gravity is not None:
@@ -414,7 +439,15 @@ def _detector(
     track = reference_states(inputs.reference, inputs.orientation, detections.utc_ns)
     expected = expected_craters(inputs.catalogue, inputs.camera, track.position_mcmf_m)
     matches = match_detections(detections, expected)
-    score = score_detections(detections, expected, matches, track.altitude_m)
+    sun = sun_angles(track) if inputs.sun_known else None
+    score = score_detections(
+        detections,
+        expected,
+        matches,
+        track.altitude_m,
+        None if sun is None else sun.elevation_deg,
+        None if sun is None else sun.azimuth_deg,
+    )
     chosen, worst = _choose_frames(inputs, expected, matches)
     frames = {frame: _gallery_frame(inputs, expected, matches, frame) for frame in sorted({*chosen, *worst})}
     return (
@@ -503,6 +536,19 @@ def _frame_accounting(inputs: PassInputs) -> FrameAccounting:
         bad_image=len(detections) - processed,
         quality=quality,
     )
+
+
+def _imaging_arcs(inputs: PassInputs) -> tuple[TimeSpan, ...]:
+    """Stretches in which downlinked frames follow one another without a silence."""
+    times = inputs.detections.utc_ns
+    if len(times) == 0:
+        return ()
+    edges = [
+        int(times[0]),
+        *(t for gap in _gaps(inputs) for t in (gap.start_utc_ns, gap.stop_utc_ns)),
+        int(times[-1]),
+    ]
+    return tuple(TimeSpan(a, b, "frames") for a, b in zip(edges[::2], edges[1::2], strict=True))
 
 
 def _gaps(inputs: PassInputs) -> tuple[TimeSpan, ...]:

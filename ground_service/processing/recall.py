@@ -43,7 +43,8 @@ CENTRE_TOLERANCE_PX = 10.0
 DIAMETER_TOLERANCE = 2.0
 """A detection more than twice or less than half as wide is of another crater (one inside it, or around it)."""
 
-ALTITUDE_BIN_M = 10e3
+ALTITUDE_BIN_KM = 10.0
+SUN_ELEVATION_BIN_DEG = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,9 +136,16 @@ def match_detections(detections: DetectionSamples, expected: ExpectedCraters) ->
 
 
 def score_detections(
-    detections: DetectionSamples, expected: ExpectedCraters, matches: Matches, altitude_m: FloatArray
+    detections: DetectionSamples,
+    expected: ExpectedCraters,
+    matches: Matches,
+    altitude_m: FloatArray,
+    sun_elevation_deg: FloatArray | None = None,
+    sun_azimuth_deg: FloatArray | None = None,
 ) -> DetectorScore:
     """Precision, recall and localisation per size class, with bins, curves and residuals.
+
+    Altitudes and Sun angles are those of the frames (f,); the Sun's are None where its light is not known.
 
     Frames whose image the payload judged unfit are left out; so are craters of regions where the catalogue is not
     complete, since a detection there can be neither confirmed nor refuted.
@@ -152,7 +160,10 @@ def score_detections(
             "catalogue projected at rim height from the reference orbit into a nadir camera; a detection is true "
             f"within {CENTRE_TOLERANCE_RADII:g} radii and {CENTRE_TOLERANCE_PX:g} px of the centre, one to one"
         ),
-        by_altitude_km=_altitude_bins(tally, altitude_m),
+        by_altitude_km=_bins(tally, altitude_m / 1e3, ALTITUDE_BIN_KM),
+        by_sun_elevation_deg=()
+        if sun_elevation_deg is None
+        else _bins(tally, sun_elevation_deg, SUN_ELEVATION_BIN_DEG),
         curves=tuple(
             curve
             for curve in (
@@ -162,7 +173,7 @@ def score_detections(
             if curve is not None
         ),
         calibration=_calibration(tally),
-        residuals=_residuals(detections, expected, tally),
+        residuals=_residuals(detections, expected, tally, sun_azimuth_deg),
     )
 
 
@@ -238,11 +249,12 @@ def _class_score(tally: _Tally, classes: Sequence[int], number: int, label: str)
     )
 
 
-def _altitude_bins(tally: _Tally, altitude_m: FloatArray) -> tuple[BinScore, ...]:
+def _bins(tally: _Tally, values: FloatArray, width: float) -> tuple[BinScore, ...]:
+    """Scores by bins of a value of the frames (f,)."""
     if len(tally.crater_frame) == 0:
         return ()
-    crater_bin = np.floor(altitude_m[tally.crater_frame] / ALTITUDE_BIN_M)
-    alarm_bin = np.floor(altitude_m[tally.alarm_frame] / ALTITUDE_BIN_M)
+    crater_bin = np.floor(values[tally.crater_frame] / width)
+    alarm_bin = np.floor(values[tally.alarm_frame] / width)
     found = np.isfinite(tally.crater_error_px)
     bins = []
     for number in np.unique(crater_bin[np.isfinite(crater_bin)]):
@@ -251,8 +263,8 @@ def _altitude_bins(tally: _Tally, altitude_m: FloatArray) -> tuple[BinScore, ...
         alarms = int(np.count_nonzero(alarm_bin == number))
         bins.append(
             BinScore(
-                low=float(number * ALTITUDE_BIN_M / 1e3),
-                high=float((number + 1) * ALTITUDE_BIN_M / 1e3),
+                low=float(number * width),
+                high=float((number + 1) * width),
                 expected=int(np.count_nonzero(here)),
                 precision=_share(true, true + alarms),
                 recall=_share(true, int(np.count_nonzero(here))),
@@ -290,7 +302,10 @@ def _calibration(tally: _Tally) -> tuple[CalibrationBin, ...]:
 
 
 def _residuals(
-    detections: DetectionSamples, expected: ExpectedCraters, tally: _Tally
+    detections: DetectionSamples,
+    expected: ExpectedCraters,
+    tally: _Tally,
+    sun_azimuth_deg: FloatArray | None,
 ) -> ResidualSeries | None:
     found = np.isfinite(tally.crater_error_px)
     at, by = tally.crater_rows[found], tally.crater_detection[found]
@@ -301,6 +316,8 @@ def _residuals(
         v_px=expected.v_px[at],
         du_px=detections.u_px[by] - expected.u_px[at],
         dv_px=detections.v_px[by] - expected.v_px[at],
+        # The image's up is north, so an azimuth on the ground is one in the image.
+        sun_azimuth_deg=None if sun_azimuth_deg is None else sun_azimuth_deg[tally.crater_frame[found]],
         diameter_px=expected.diameter_px[at],
     )
 

@@ -15,6 +15,7 @@ from sqlalchemy import Connection, func, select
 from ground_service.errors import InvalidInput
 from ground_service.processing.baseline import StartState
 from ground_service.processing.correlation import TimeCorrelation, ticks_of_utc_ns, utc_ns_of_ticks
+from ground_service.processing.fixes import IdentificationSamples
 from ground_service.processing.pass_evaluation import PassInputs
 from ground_service.processing.samples import (
     DetectionSamples,
@@ -26,7 +27,7 @@ from ground_service.processing.sequence import Gap, account_sequence
 from ground_service.processing.smoother import SIZE, CommandedBurn, FilterStates
 from ground_service.services.ground import Ground
 from ground_service.store import repository
-from ground_service.store.codec import unpack_detections
+from ground_service.store.codec import unpack_detections, unpack_identifications
 from ground_service.store.files import FileArchive
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, load_catalogue
@@ -147,6 +148,8 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             outcomes=outcome_samples(connection, span),
             start_state=start_state_of(manifest),
             filter_states=filter_states(connection, span),
+            identifications=identification_samples(connection, span),
+            sun_known=manifest.get("light", "real") == "real",
             burns=burns_of(manifest),
             gravity=ground.gravity,
             other_gravity=ground.other_gravity,
@@ -242,6 +245,29 @@ def filter_states(connection: Connection, span: PassSpan) -> FilterStates | None
             axis=1,
         )[first],
         covariance,
+    )
+
+
+def identification_samples(connection: Connection, span: PassSpan) -> IdentificationSamples | None:
+    """Which crater each used detection was taken for, in time order; None where nothing came down about it."""
+    rows = repository.samples(
+        connection,
+        "identifications",
+        span.vehicle,
+        span.start_ticks,
+        span.stop_ticks,
+        DICTIONARY.version,
+        ("ticks", "items"),
+    )
+    if not rows["ticks"]:
+        return None
+    by_image = dict(zip(reversed(rows["ticks"]), reversed(rows["items"]), strict=True))
+    ticks = sorted(by_image)
+    items, offsets = unpack_identifications([bytes(by_image[tick]) for tick in ticks])
+    return IdentificationSamples(
+        utc_ns=np.repeat(span.utc_ns(ticks), np.diff(offsets)),
+        detection=items["detection"].astype(np.int64),
+        crater_id=items["crater_id"].astype(np.int64),
     )
 
 

@@ -7,46 +7,26 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound
-from ground_service.processing.correlation import IDEAL_CLOCK, utc_ns_of_ticks
-from ground_service.processing.downsampling import Buckets, downsample
+from ground_service.processing.correlation import ticks_of_utc_ns
 from ground_service.services.ground import Ground
 from ground_service.services.ingest import FLOWN
 from ground_service.services.pass_data import (
     PassSpan,
     detection_samples,
     event_list,
+    load_correlations,
     packet_accounting,
     pass_span,
 )
+from ground_service.services.series import PARAMETERS, STATE_VALUES, Series, SeriesReading
 from ground_service.store import repository
 from reports.values import PacketAccounting, PassEvent
 from tmtc.dictionary import DICTIONARY
 
-STATE_VALUES = (
-    "latitude_deg", "longitude_deg", "altitude_m", "velocity_x_m_s", "velocity_y_m_s", "velocity_z_m_s",
-    "sigma_r_m", "sigma_t_m", "sigma_n_m", "nis", "matched",
-)  # fmt: skip
-"""Values of a navigation state that can be asked for as a series."""
-
-PARAMETERS = tuple(
-    field.name for field in DICTIONARY.packet("housekeeping").fields if field.name != "structure_id"
-)
-"""Housekeeping parameters that can be asked for as a series."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Series:
-    """A series of one value, made short, with the id of the time correlation used."""
-
-    name: str
-    unit: str
-    samples: int
-    correlation_id: int
-    buckets: Buckets
+LAST_TICKS = (1 << 48) - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,62 +147,58 @@ def state_series(
     codes = {name: code for code, name in DICTIONARY.labels("navigation_state", "estimator").items()}
     if estimator not in codes:
         raise NotFound("estimator", estimator[:80])
-    with ground.database.reading() as connection:
-        record = repository.get(connection, repository.PASSES, pass_id, "pass")
-        span = pass_span(connection, record)
-        columns = repository.sample_arrays(
-            connection,
-            "navigation_states",
-            span.vehicle,
-            span.start_ticks,
-            span.stop_ticks,
-            DICTIONARY.version,
-            ("ticks", *values),
-            estimator=codes[estimator],
-        )
     definition = DICTIONARY.packet("navigation_state")
     units = {field.name: field.unit for field in definition.fields}
-    return [
-        _series(
-            value,
-            units.get(value, "m/s" if "_m_s" in value else "m" if value.endswith("_m") else ""),
-            columns,
-            span,
-            max_points,
+    with ground.database.reading() as connection:
+        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        reading = SeriesReading(
+            connection, pass_span(connection, record), "navigation_states", codes[estimator], max_points
         )
-        for value in values
-    ]
+        return [
+            reading.series(
+                value,
+                units.get(value, "m/s" if "_m_s" in value else "m" if value.endswith("_m") else ""),
+            )
+            for value in values
+        ]
 
 
 def parameter_series(ground: Ground, pass_id: int, parameter: str, max_points: int) -> Series:
     """The series of one housekeeping parameter of a pass."""
-    if parameter not in PARAMETERS:
-        raise NotFound("parameter", parameter[:80])
+    _check_parameter(parameter)
     with ground.database.reading() as connection:
         record = repository.get(connection, repository.PASSES, pass_id, "pass")
-        span = pass_span(connection, record)
-        columns = repository.sample_arrays(
-            connection,
-            "housekeeping",
-            span.vehicle,
-            span.start_ticks,
-            span.stop_ticks,
-            DICTIONARY.version,
-            ("ticks", parameter),
-        )
-    return _series(
-        parameter, DICTIONARY.packet("housekeeping").field(parameter).unit, columns, span, max_points
-    )
+        reading = SeriesReading(connection, pass_span(connection, record), "housekeeping", 0, max_points)
+        return reading.series(parameter, DICTIONARY.packet("housekeeping").field(parameter).unit)
 
 
-def _series(
-    name: str, unit: str, columns: dict[str, NDArray[Any]], span: PassSpan, max_points: int
+def trend_series(
+    ground: Ground,
+    spacecraft_id: int,
+    instance: str,
+    parameter: str,
+    max_points: int,
+    *,
+    start_utc_ns: int | None = None,
+    stop_utc_ns: int | None = None,
 ) -> Series:
-    utc_ns, used = utc_ns_of_ticks(columns["ticks"], span.correlations)
-    return Series(
-        name=name,
-        unit=unit,
-        samples=len(utc_ns),
-        correlation_id=int(used[-1]) if len(used) else IDEAL_CLOCK,
-        buckets=downsample(utc_ns, columns[name].astype(np.float64), max_points),
-    )
+    """The series of one housekeeping parameter of a spacecraft over any span, all there is by default."""
+    _check_parameter(parameter)
+    with ground.database.reading() as connection:
+        vehicle = repository.find(connection, repository.VEHICLES, ccsds_id=spacecraft_id, instance=instance)
+        if vehicle is None:
+            raise NotFound("spacecraft", f"{spacecraft_id} ({instance})")
+        correlations = load_correlations(connection, vehicle["id"])
+        span = PassSpan(
+            vehicle["id"],
+            0 if start_utc_ns is None else ticks_of_utc_ns(start_utc_ns, correlations),
+            LAST_TICKS if stop_utc_ns is None else ticks_of_utc_ns(stop_utc_ns, correlations),
+            correlations,
+        )
+        reading = SeriesReading(connection, span, "housekeeping", 0, max_points)
+        return reading.series(parameter, DICTIONARY.packet("housekeeping").field(parameter).unit)
+
+
+def _check_parameter(parameter: str) -> None:
+    if parameter not in PARAMETERS:
+        raise NotFound("parameter", parameter[:80])

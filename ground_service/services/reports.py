@@ -29,6 +29,7 @@ class MadeReport:
     pass_id: int
     html: Path
     json: Path
+    pdf: Path | None
     summary: dict[str, Any]
 
 
@@ -43,23 +44,30 @@ def pass_summary(ground: Ground, pass_id: int) -> dict[str, Any]:
 
 
 def make_report(
-    ground: Ground, pass_id: int, *, report_id: str | None = None, out: Path | None = None
+    ground: Ground,
+    pass_id: int,
+    *,
+    report_id: str | None = None,
+    out: Path | None = None,
+    pdf: bool = False,
 ) -> MadeReport:
-    """Evaluate a pass, render its report as HTML and JSON, and keep both.
+    """Evaluate a pass, render its report as HTML and JSON, and as PDF where wanted, and keep them.
 
     Parameters
     ----------
     report_id
         Name of the report; the same name again gives the report that was made under it.
     out
-        Folder for the two documents; ``reports/pass-<id>`` under the service's home when None.
+        Folder for the documents; ``reports/pass-<id>`` under the service's home when None.
     """
-    from reports.render import render_html, to_json
+    from reports.render import render_html, render_pdf, to_json
 
     identity = report_id or uuid.uuid4().hex
     now = utc_now_ns()
     report = evaluate(ground, pass_id, created_utc=format_utc(now))
     documents = {"html": render_html(report).encode(), "json": to_json(report).encode()}
+    if pdf:
+        documents["pdf"] = render_pdf(report)
     stored = {kind: ground.files.put_octets(octets) for kind, octets in documents.items()}
     summary = _summary(report, pass_id)
     with ground.database.writing() as connection:
@@ -73,6 +81,7 @@ def make_report(
                 pass_id=pass_id,
                 html_sha256=stored["html"].sha256,
                 json_sha256=stored["json"].sha256,
+                pdf_sha256=stored["pdf"].sha256 if pdf else None,
                 summary=summary,
                 created_utc_ns=now,
             )
@@ -81,7 +90,14 @@ def make_report(
     folder = out if out is not None else ground.home / "reports" / f"pass-{pass_id}"
     for kind, octets in documents.items():
         _write_whole(folder / f"report.{kind}", octets)
-    return MadeReport(identity, pass_id, folder / "report.html", folder / "report.json", summary)
+    return MadeReport(
+        identity,
+        pass_id,
+        folder / "report.html",
+        folder / "report.json",
+        folder / "report.pdf" if pdf else None,
+        summary,
+    )
 
 
 def _summary(report: PassReport, pass_id: int) -> dict[str, Any]:

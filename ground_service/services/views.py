@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from ground_service.processing.planning import Candidate, SearchResult
 from ground_service.processing.verification import STAGES
+from ground_service.services.series import Series
 from ground_service.store.repository import Row
 from lunar.timescales import format_utc
 from tmtc.dictionary import FAILURES
@@ -185,3 +188,31 @@ def window_view(row: Row) -> View:
         "created": time_text(row["created_utc_ns"]),
         "changed": time_text(row["changed_utc_ns"]),
     }
+
+
+def series_view(series: Series) -> View:
+    """A series made short. Buckets are many, so their times are written all at once."""
+    buckets = series.buckets
+    columns = (
+        _time_texts(buckets.start_utc_ns),
+        _time_texts(buckets.stop_utc_ns),
+        buckets.count.tolist(),
+        buckets.low.tolist(),
+        buckets.high.tolist(),
+        buckets.mean.tolist(),
+        buckets.after_gap.tolist(),
+    )
+    names = ("start", "stop", "count", "min", "max", "mean", "after_gap")
+    return {
+        "name": series.name,
+        "unit": series.unit,
+        "samples": series.samples,
+        "correlation_id": series.correlation_id,
+        "buckets": [dict(zip(names, values, strict=True)) for values in zip(*columns, strict=True)],
+    }
+
+
+def _time_texts(utc_ns: Any) -> list[str]:
+    """As `time_text`, of many times."""
+    texts = np.datetime_as_string(np.asarray(utc_ns, dtype=np.int64).astype("datetime64[ns]"), unit="ns")
+    return [f"{text}Z" for text in texts.tolist()]

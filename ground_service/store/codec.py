@@ -47,6 +47,15 @@ def _pack(items: dict[str, NDArray[Any]], offsets: NDArray[np.int64], kind: np.d
 
 def unpack_detections(columns: Sequence[bytes]) -> tuple[NDArray[np.void], NDArray[np.int64]]:
     """The records of all frames one after another, and where each frame begins (f + 1,)."""
+    return _unpack(columns, DETECTION_ITEM)
+
+
+def unpack_identifications(columns: Sequence[bytes]) -> tuple[NDArray[np.void], NDArray[np.int64]]:
+    """As `unpack_detections`, of pairs of detection and crater."""
+    return _unpack(columns, IDENTIFICATION_ITEM)
+
+
+def _unpack(columns: Sequence[bytes], kind: np.dtype[Any]) -> tuple[NDArray[np.void], NDArray[np.int64]]:
     lengths = np.fromiter((len(c) for c in columns), dtype=np.int64, count=len(columns))
-    offsets = np.concatenate(([0], np.cumsum(lengths // DETECTION_ITEM.itemsize))).astype(np.int64)
-    return np.frombuffer(b"".join(columns), dtype=DETECTION_ITEM), offsets
+    offsets = np.concatenate(([0], np.cumsum(lengths // kind.itemsize))).astype(np.int64)
+    return np.frombuffer(b"".join(columns), dtype=kind), offsets

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, delete, func, select
+from sqlalchemy import Connection, LargeBinary, delete, func, select
 
 from ground_service.store.bulk import insert_columns
 from ground_service.store.models import SAMPLE_TABLES, Rollup
@@ -106,8 +106,10 @@ def rollup_rows(
 ) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
     """First and last on-board time and number of samples (n,) of buckets, and the statistics (n, 4) of one value."""
     code, _, names = KINDS[kind]
+    length = STATISTICS * 8
+    wanted = func.substr(_TABLE.c.statistics, names.index(value) * length + 1, length, type_=LargeBinary)
     rows = connection.execute(
-        select(_TABLE.c.first_ticks, _TABLE.c.last_ticks, _TABLE.c.rows, _TABLE.c.statistics)
+        select(_TABLE.c.first_ticks, _TABLE.c.last_ticks, _TABLE.c.rows, wanted)
         .where(
             _TABLE.c.vehicle_id == vehicle_id,
             _TABLE.c.dictionary_version == dictionary_version,
@@ -121,13 +123,12 @@ def rollup_rows(
     if not rows:
         none = np.zeros(0, dtype=np.int64)
         return none, none, none, np.zeros((0, STATISTICS))
-    place = names.index(value) * STATISTICS * 8
-    octets = b"".join([bytes(row[3][place : place + STATISTICS * 8]) for row in rows])
+    octets = b"".join([row[3] for row in rows])
     whole = np.array([row[:3] for row in rows], dtype=np.int64)
     return whole[:, 0], whole[:, 1], whole[:, 2], np.frombuffer(octets, "<f8").reshape(-1, STATISTICS)
 
 
-def rolled_rows(
+def rolled_extent(
     connection: Connection,
     kind: str,
     vehicle_id: int,
@@ -135,21 +136,24 @@ def rolled_rows(
     part: int,
     start_ticks: int,
     stop_ticks: int,
-) -> int:
-    """About how many samples there are between two times: those of the longest buckets that touch them."""
+) -> tuple[int, int, int]:
+    """How many samples there are in the longest buckets that touch a span, and their first and last time."""
     width = width_ticks(LEVELS - 1)
-    return int(
-        connection.execute(
-            select(func.coalesce(func.sum(_TABLE.c.rows), 0)).where(
-                _TABLE.c.vehicle_id == vehicle_id,
-                _TABLE.c.dictionary_version == dictionary_version,
-                _TABLE.c.kind == KINDS[kind][0],
-                _TABLE.c.part == part,
-                _TABLE.c.level == LEVELS - 1,
-                _TABLE.c.bucket.between(start_ticks // width, stop_ticks // width),
-            )
-        ).scalar_one()
-    )
+    row = connection.execute(
+        select(
+            func.coalesce(func.sum(_TABLE.c.rows), 0),
+            func.min(_TABLE.c.first_ticks),
+            func.max(_TABLE.c.last_ticks),
+        ).where(
+            _TABLE.c.vehicle_id == vehicle_id,
+            _TABLE.c.dictionary_version == dictionary_version,
+            _TABLE.c.kind == KINDS[kind][0],
+            _TABLE.c.part == part,
+            _TABLE.c.level == LEVELS - 1,
+            _TABLE.c.bucket.between(start_ticks // width, stop_ticks // width),
+        )
+    ).one()
+    return int(row[0]), int(row[1] or 0), int(row[2] or 0)
 
 
 def build_rollups(connection: Connection) -> int:

@@ -136,6 +136,10 @@ def test_a_report_is_made_and_read_as_html_and_json(client: TestClient) -> None:
     assert page.headers["content-type"].startswith("text/html")
     assert "synthetic pass" in page.text
     assert client.get(report, params={"format": "json"}).json()
+    paper = client.get(report, headers={"accept": "text/html;q=0.5, application/pdf"})
+    assert paper.headers["content-type"] == "application/pdf"
+    assert paper.content.startswith(b"%PDF-")
+    assert client.get(report, headers={"accept": "*/*"}).headers["content-type"] == "application/json"
     assert is_problem(client.get(report, params={"format": "exe"}), 422)
     assert is_problem(client.get(f"{V1}/reports/{'0' * 32}"), 404)
     assert is_problem(client.post(f"{V1}/passes/77/reports"), 404)
@@ -198,6 +202,7 @@ MATRIX = [
     ("GET", "/passes/1/events", "viewer"),
     ("GET", "/passes/1/telemetry/power_w", "viewer"),
     ("POST", "/passes/1/reports", "operator"),
+    ("GET", "/spacecraft/76/telemetry/power_w", "viewer"),
     ("POST", "/windows/search", "viewer"),
     ("GET", "/windows", "viewer"),
     ("POST", "/windows", "operator"),

@@ -1,0 +1,152 @@
+"""Fixes judged and repeated on the ground from the identifications that came down: which crater was taken for which.
+
+A fix is wrong when at least half of its identifications name a crater that, seen from the reference position, lies
+further from the detection than the detector's own tolerance. The snapshot baseline solves each frame for its position
+alone, from the same identifications and the nadir attitude, without dynamics and without memory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ground_service.processing.recall import CENTRE_TOLERANCE_PX, CENTRE_TOLERANCE_RADII
+from ground_service.processing.samples import DetectionSamples
+from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
+from lunar.catalogue import CraterCatalogue
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+ROUNDS = 8
+STEP_M = 1.0
+PAIRS_NEEDED = 3
+"""Two craters fix three coordinates just so; a third lets a wrong one show."""
+
+CONVERGED_M = 0.01
+LIMIT_M = 100e3
+"""A solution that moves further than this from where it began is none."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IdentificationSamples:
+    """Pairs of all frames (n,): time of the image, place in the detections of the frame, crater of the catalogue."""
+
+    utc_ns: IntArray
+    detection: IntArray
+    crater_id: IntArray
+
+    def __len__(self) -> int:
+        return len(self.utc_ns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """Identifications (n,) joined with what was detected and where the crater is; `frame` (n,) groups them."""
+
+    frame: IntArray
+    utc_ns: IntArray
+    uv_px: FloatArray
+    diameter_px: FloatArray
+    crater_mcmf_m: FloatArray
+
+
+def join_pairs(
+    found: IdentificationSamples, detections: DetectionSamples, catalogue: CraterCatalogue
+) -> Pairs:
+    """Identifications whose detection came down and whose crater the catalogue holds."""
+    order = np.argsort(catalogue.ids, kind="stable")
+    ids = catalogue.ids[order]
+    place = np.minimum(np.searchsorted(ids, found.crater_id), max(len(ids) - 1, 0))
+    known = ids[place] == found.crater_id if len(ids) else np.zeros(len(found), dtype=np.bool_)
+    frame = np.searchsorted(detections.utc_ns, found.utc_ns)
+    frame = np.minimum(frame, max(len(detections) - 1, 0))
+    if len(detections) == 0:
+        known &= False
+    else:
+        known &= detections.utc_ns[frame] == found.utc_ns
+        known &= found.detection < np.diff(detections.offsets)[frame]
+    keep = np.flatnonzero(known)
+    row = detections.offsets[frame[keep]] + found.detection[keep]
+    return Pairs(
+        frame[keep],
+        found.utc_ns[keep],
+        np.column_stack([detections.u_px[row], detections.v_px[row]]),
+        detections.diameter_px[row],
+        catalogue.position_mcmf_m[order[place[keep]]],
+    )
+
+
+def wrong_fixes(pairs: Pairs, camera: PinholeCamera, utc_ns: IntArray, position_mcmf_m: FloatArray) -> int:
+    """How many frames were identified wrongly; the reference (m, 3), MCMF, at the ascending times `utc_ns` (m,)."""
+    wrong = 0
+    for frame in np.unique(pairs.frame):
+        rows = np.flatnonzero(pairs.frame == frame)
+        at = int(np.searchsorted(utc_ns, pairs.utc_ns[rows[0]]))
+        if (
+            at >= len(utc_ns)
+            or utc_ns[at] != pairs.utc_ns[rows[0]]
+            or not np.isfinite(position_mcmf_m[at, 0])
+        ):
+            continue
+        uv = _projected(camera, position_mcmf_m[at], pairs.crater_mcmf_m[rows])
+        allowed = np.minimum(CENTRE_TOLERANCE_RADII * pairs.diameter_px[rows] / 2.0, CENTRE_TOLERANCE_PX)
+        right = np.hypot(*(uv - pairs.uv_px[rows]).T) <= allowed
+        wrong += int(2 * np.count_nonzero(right) <= len(rows))
+    return wrong
+
+
+def snapshot_positions(
+    pairs: Pairs, camera: PinholeCamera, utc_ns: IntArray, start_mcmf_m: FloatArray
+) -> FloatArray:
+    """Position (m, 3), MCMF, of each epoch from its own identifications; NaN where they do not give one.
+
+    Parameters
+    ----------
+    utc_ns, start_mcmf_m
+        Ascending epochs (m,) and where to begin (m, 3): what the payload itself believed.
+    """
+    result = np.full((len(utc_ns), 3), np.nan)
+    for frame in np.unique(pairs.frame):
+        rows = np.flatnonzero(pairs.frame == frame)
+        at = int(np.searchsorted(utc_ns, pairs.utc_ns[rows[0]]))
+        if len(rows) < PAIRS_NEEDED or at >= len(utc_ns) or utc_ns[at] != pairs.utc_ns[rows[0]]:
+            continue
+        result[at] = _solved(camera, start_mcmf_m[at], pairs.crater_mcmf_m[rows], pairs.uv_px[rows])
+    return result
+
+
+def _solved(
+    camera: PinholeCamera, start_m: FloatArray, crater_m: FloatArray, uv_px: FloatArray
+) -> FloatArray:
+    """Gauss-Newton on the position of a nadir camera; NaN where it does not settle."""
+    nothing = np.full(3, np.nan)
+    position = start_m.astype(np.float64)
+    for _ in range(ROUNDS):
+        residual = (uv_px - _projected(camera, position, crater_m)).ravel()
+        slope = np.column_stack(
+            [
+                (
+                    _projected(camera, position + step, crater_m)
+                    - _projected(camera, position - step, crater_m)
+                ).ravel()
+                / (2.0 * STEP_M)
+                for step in STEP_M * np.eye(3)
+            ]
+        )
+        if not np.isfinite(residual).all() or not np.isfinite(slope).all():
+            return nothing
+        move, _, rank, _ = np.linalg.lstsq(slope, residual, rcond=None)
+        position = position + move
+        if rank < 3 or np.linalg.norm(position - start_m) > LIMIT_M:
+            return nothing
+        if np.linalg.norm(move) < CONVERGED_M:
+            return position
+    return nothing
+
+
+def _projected(camera: PinholeCamera, position_m: FloatArray, crater_m: FloatArray) -> FloatArray:
+    rotation = nadir_camera_from_mcmf(position_m)
+    return np.asarray(camera.project((crater_m - position_m) @ rotation.T))

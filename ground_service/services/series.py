@@ -1,0 +1,125 @@
+"""Series read for plots: from samples where there are few, from roll-ups where there are many."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from sqlalchemy import Connection
+
+from ground_service.processing.correlation import IDEAL_CLOCK, utc_ns_of_ticks
+from ground_service.processing.downsampling import (
+    Aggregates,
+    Buckets,
+    aggregate,
+    downsample,
+    downsample_aggregates,
+    join,
+)
+from ground_service.services.pass_data import PassSpan
+from ground_service.store import repository, rollups
+from ground_service.store.rollups import HOUSEKEEPING_VALUES as PARAMETERS
+from ground_service.store.rollups import STATE_VALUES
+from tmtc.dictionary import DICTIONARY
+
+__all__ = ["PARAMETERS", "STATE_VALUES", "Series", "SeriesReading"]
+
+FEW_ROWS = 50_000
+"""Up to this many samples are read one by one, which is exact to the sample and quick enough."""
+
+COARSE = 8
+"""Roll-ups are used where they give at least an eighth of the points that were asked for."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Series:
+    """A series of one value, made short, with the id of the time correlation used."""
+
+    name: str
+    unit: str
+    samples: int
+    correlation_id: int
+    buckets: Buckets
+
+
+@dataclass(frozen=True, slots=True)
+class SeriesReading:
+    """Reads values of one kind of samples, of one part of it (an estimator), over a span of on-board time."""
+
+    connection: Connection
+    span: PassSpan
+    kind: str
+    part: int
+    max_points: int
+
+    def series(self, name: str, unit: str) -> Series:
+        """One value of the samples."""
+        level = self._level()
+        if level is None:
+            ticks, values = self._samples(name, self.span.start_ticks, self.span.stop_ticks)
+            utc_ns, used = utc_ns_of_ticks(ticks, self.span.correlations)
+            correlation = int(used[-1]) if len(used) else IDEAL_CLOCK
+            return Series(name, unit, len(utc_ns), correlation, downsample(utc_ns, values, self.max_points))
+        found, correlation = self._aggregates(name, level)
+        return Series(
+            name, unit, int(found.rows.sum()), correlation, downsample_aggregates(found, self.max_points)
+        )
+
+    def _level(self) -> int | None:
+        """The coarsest level of roll-ups that is fine enough; None where samples should be read."""
+        key = (self.kind, self.span.vehicle, DICTIONARY.version, self.part)
+        count, first, last = rollups.rolled_extent(
+            self.connection, *key, self.span.start_ticks, self.span.stop_ticks
+        )
+        if count <= FEW_ROWS:
+            return None
+        wanted = (min(last, self.span.stop_ticks) - max(first, self.span.start_ticks)) / self.max_points
+        if rollups.width_ticks(0) > COARSE * wanted:
+            return None
+        fine = [level for level in range(rollups.LEVELS) if rollups.width_ticks(level) <= wanted]
+        return fine[-1] if fine else 0
+
+    def _aggregates(self, name: str, level: int) -> tuple[Aggregates, int]:
+        """Whole buckets from the roll-ups; the samples of the two that the span cuts."""
+        width = rollups.width_ticks(level)
+        start, stop = self.span.start_ticks, self.span.stop_ticks
+        first, last = -(-start // width), (stop + 1) // width - 1
+        rows = rollups.rollup_rows(
+            self.connection,
+            self.kind,
+            self.span.vehicle,
+            DICTIONARY.version,
+            self.part,
+            level,
+            first,
+            last,
+            name,
+        )
+        begin, used = utc_ns_of_ticks(rows[0], self.span.correlations)
+        end, _ = utc_ns_of_ticks(rows[1], self.span.correlations)
+        count, total, low, high = rows[3].T
+        middle = Aggregates(begin, end, rows[2], count.astype(np.int64), total, low, high)
+        pieces = [
+            self._edge(name, start, first * width - 1),
+            middle,
+            self._edge(name, (last + 1) * width, stop),
+        ]
+        return join(pieces), int(used[-1]) if len(used) else IDEAL_CLOCK
+
+    def _edge(self, name: str, start: int, stop: int) -> Aggregates:
+        ticks, values = self._samples(name, start, stop)
+        return aggregate(utc_ns_of_ticks(ticks, self.span.correlations)[0], values)
+
+    def _samples(self, name: str, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
+        equal = {} if rollups.KINDS[self.kind][1] is None else {"estimator": self.part}
+        columns = repository.sample_arrays(
+            self.connection,
+            self.kind,
+            self.span.vehicle,
+            start,
+            stop,
+            DICTIONARY.version,
+            ("ticks", name),
+            **equal,
+        )
+        return columns["ticks"], columns[name].astype(np.float64)

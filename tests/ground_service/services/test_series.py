@@ -1,0 +1,157 @@
+"""Series from roll-ups: the same as from the samples, in whatever order they came, gaps marked."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import delete
+
+from ground_service.services import series
+from ground_service.services.ground import Ground
+from ground_service.services.pass_data import PassSpan
+from ground_service.services.passes import trend_series
+from ground_service.store import repository
+from ground_service.store.models import Rollup
+from ground_service.store.packets import store_samples
+from ground_service.store.rollups import BASE_TICKS, HOUSEKEEPING_VALUES, STATE_VALUES, build_rollups
+from tmtc.dictionary import DICTIONARY
+
+SECOND = 1 << 16
+FIRST = 900_000_000 * SECOND
+COUNT = 4000
+
+
+def states(seed: int = 1) -> dict[str, Any]:
+    """Samples of two estimators every 5 s with two silences; some values unknown, two samples at one time."""
+    rng = np.random.default_rng(seed)
+    seconds = np.arange(COUNT) * 5
+    seconds[1500:] += 4000
+    seconds[2500:] += 90_000
+    seconds[7] = seconds[6]
+    columns: dict[str, Any] = {name: rng.normal(size=COUNT) * 1e3 for name in STATE_VALUES}
+    columns["matched"] = rng.integers(0, 20, COUNT)
+    columns["nis"][::7] = np.nan
+    columns.update(
+        packet=np.arange(COUNT),
+        ticks=FIRST + seconds * SECOND + 11,
+        packet_ticks=FIRST + seconds * SECOND,
+        frame_number=np.arange(COUNT),
+        estimator=np.arange(COUNT) % 2,
+        outcome=np.zeros(COUNT, dtype=np.int64),
+    )
+    return columns
+
+
+def stored(ground: Ground, columns: dict[str, Any], batches: list[np.ndarray]) -> int:
+    with ground.database.writing() as connection:
+        vehicle = repository.vehicle_id(connection, 76, "flight")
+        for batch in batches:
+            chosen = {name: column[batch] for name, column in columns.items() if name != "packet"}
+            chosen["packet"] = np.arange(len(batch))
+            store_samples(
+                connection,
+                vehicle,
+                DICTIONARY.version,
+                {"navigation_states": chosen},
+                columns["packet"][batch] + 1,
+            )
+    return vehicle
+
+
+def read(ground: Ground, vehicle: int, name: str, start: int, stop: int, points: int = 50) -> Any:
+    with ground.database.reading() as connection:
+        return series.SeriesReading(
+            connection, PassSpan(vehicle, start, stop, ()), "navigation_states", 1, points
+        ).series(name, "")
+
+
+def rollup_statistics(ground: Ground) -> tuple[list[Any], np.ndarray]:
+    table: Any = Rollup.__table__
+    with ground.database.reading() as connection:
+        rows = connection.execute(table.select().order_by(*table.primary_key.columns)).all()
+    return [tuple(row[:-1]) for row in rows], np.frombuffer(b"".join(row[-1] for row in rows), "<f8")
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few samples are read from roll-ups too."""
+    monkeypatch.setattr(series, "FEW_ROWS", 10)
+    monkeypatch.setattr(series, "COARSE", 10**9)
+
+
+@pytest.mark.usefixtures("few")
+@pytest.mark.parametrize(("skip", "drop"), [(0, 0), (333, 200)])
+def test_a_series_from_roll_ups_holds_every_sample_once(ground: Ground, skip: int, drop: int) -> None:
+    columns = states()
+    vehicle = stored(ground, columns, [np.arange(COUNT)])
+    start, stop = int(columns["ticks"][skip]), int(columns["ticks"][-1 - drop])
+    for name in ("altitude_m", "nis"):
+        found = read(ground, vehicle, name, start, stop)
+        mine = (columns["estimator"] == 1) & (columns["ticks"] >= start) & (columns["ticks"] <= stop)
+        values = columns[name][mine]
+        known = values[np.isfinite(values)]
+        buckets = found.buckets
+        assert found.samples == np.count_nonzero(mine)
+        assert buckets.count.sum() == len(known)
+        assert len(buckets.count) <= 50
+        assert (buckets.low.min(), buckets.high.max()) == (known.min(), known.max())
+        # sums of 1000 numbers of size 1e3: 1e-10 is far above rounding
+        assert np.sum(buckets.mean * buckets.count) == pytest.approx(known.sum(), abs=1e-6)
+        assert np.all(buckets.start_utc_ns <= buckets.stop_utc_ns)
+        assert np.all(np.diff(buckets.start_utc_ns) > 0)
+
+
+@pytest.mark.usefixtures("few")
+def test_silences_are_marked(ground: Ground) -> None:
+    columns = states()
+    vehicle = stored(ground, columns, [np.arange(COUNT)])
+    found = read(ground, vehicle, "altitude_m", 0, (1 << 48) - 1, points=2000).buckets
+    assert np.count_nonzero(found.after_gap) == 2
+    for place in np.flatnonzero(found.after_gap):
+        silence = (found.start_utc_ns[place] - found.stop_utc_ns[place - 1]) / 1e9
+        assert silence > 3900.0
+
+
+def test_late_data_and_split_batches_give_the_same_roll_ups(ground: Ground, tmp_path: Any) -> None:
+    from ground_service.services.ground import open_ground
+
+    columns = states()
+    stored(ground, columns, [np.arange(COUNT)])
+    order = np.random.default_rng(5).permutation(COUNT)
+    with open_ground(tmp_path / "other") as other:
+        stored(other, columns, np.array_split(order, 7))
+        heads, statistics = rollup_statistics(other)
+    expected_heads, expected = rollup_statistics(ground)
+    assert heads == expected_heads
+    np.testing.assert_allclose(statistics, expected, rtol=1e-12, atol=1e-9)  # order of the sums
+    # counts, least and greatest values do not depend on it at all
+    assert np.array_equal(statistics.reshape(-1, 4)[:, [0, 2, 3]], expected.reshape(-1, 4)[:, [0, 2, 3]])
+
+
+def test_roll_ups_of_an_older_database_are_built_afterwards(ground: Ground) -> None:
+    columns = states()
+    stored(ground, columns, [np.arange(COUNT)])
+    expected_heads, expected = rollup_statistics(ground)
+    with ground.database.writing() as connection:
+        connection.execute(delete(Rollup))
+        assert build_rollups(connection) == COUNT
+        assert build_rollups(connection) == 0
+    heads, statistics = rollup_statistics(ground)
+    assert heads == expected_heads
+    np.testing.assert_allclose(statistics, expected, rtol=1e-12, atol=1e-9)
+
+
+def test_every_value_of_a_kind_is_rolled_up() -> None:
+    fields = {field.name for field in DICTIONARY.packet("housekeeping").fields} - {"structure_id"}
+    assert set(HOUSEKEEPING_VALUES) == fields
+    assert BASE_TICKS == 64 * SECOND
+
+
+def test_trends_of_a_spacecraft_need_no_pass(ground: Ground, synthetic_pass: Any) -> None:
+    from ground_service.services.ingest import ingest_file
+
+    ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
+    found = trend_series(ground, 76, "flight", "temperature_c", 10)
+    assert found.samples == 40
+    assert found.buckets.low.min() == pytest.approx(20.0)
+    assert found.buckets.high.max() == pytest.approx(23.9)
