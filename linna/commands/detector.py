@@ -79,6 +79,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_json_flag(evaluate)
     evaluate.set_defaults(handler=_evaluate)
 
+    quantise = verbs.add_parser(
+        "quantise", help="the network in 8-bit integers, beside the one it comes from"
+    )
+    _add_model(quantise)
+    quantise.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
+    quantise.add_argument("--out", type=Path, required=True, metavar="M.onnx")
+    add_json_flag(quantise)
+    quantise.set_defaults(handler=_quantise)
+
     landmarks = verbs.add_parser(
         "landmarks", help="places that are found again and again under different Suns and no catalogue lists"
     )
@@ -251,6 +260,45 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _quantise(arguments: argparse.Namespace) -> int:
+    import importlib.util
+
+    from linna.errors import UsageError
+    from linna.output import emit
+    from payload_emulator.training.dataset import Dataset
+    from payload_emulator.training.evaluate import evaluate
+    from payload_emulator.training.quantise import latency_ratio, quantise
+
+    if importlib.util.find_spec("onnx") is None:
+        raise UsageError("quantisation needs onnx: install the extra 'train' (pip install 'linna[train]')")
+    datasets = [Dataset(folder) for folder in arguments.dataset]
+    octets = _model_octets(arguments.model)
+    small = quantise(octets, datasets)
+    unfinished = arguments.out.with_name(f".{arguments.out.name}.unfinished")
+    unfinished.write_bytes(small)
+    unfinished.replace(arguments.out)
+    full_ms, small_ms, ratio = latency_ratio(octets, small)
+    kept = ("precision", "recall", "f1", "loc_px")
+    scores = {
+        name: {key: figures["micro"][key] for key in kept}
+        for name, figures in (
+            ("float32", evaluate(octets, datasets)),
+            ("int8", evaluate(small, datasets)),
+        )
+    }
+    emit(
+        arguments,
+        {
+            "model": str(arguments.out),
+            "bytes": {"float32": len(octets), "int8": len(small)},
+            "network_ms": {"float32": full_ms, "int8": small_ms},
+            "latency_ratio": ratio,
+            "strict": scores,
+        },
+    )
+    return 0
+
+
 def _landmarks(arguments: argparse.Namespace) -> int:
     from linna.errors import UsageError
     from linna.output import emit, progress
@@ -314,10 +362,18 @@ def _detect(arguments: argparse.Namespace) -> int:
 
     import numpy as np
 
+    from linna.errors import UsageError
     from linna.output import emit
     from lunar.catalogue import size_class
+    from payload_emulator.flight.detections import states
     from payload_emulator.flight.detector import DetectorParameters, OnnxDetector
 
+    if arguments.altitude_km is not None and not arguments.altitude_km > 0.0:
+        raise UsageError(
+            f"--altitude-km: expected a positive number of kilometres, found {arguments.altitude_km:g}"
+        )
+    if not 0.0 < arguments.fov_deg < 180.0:
+        raise UsageError(f"--fov-deg: expected an angle between 0 and 180, found {arguments.fov_deg:g}")
     detector = OnnxDetector(
         _model_octets(arguments.model), DetectorParameters(score_threshold=arguments.threshold)
     )
@@ -333,6 +389,7 @@ def _detect(arguments: argparse.Namespace) -> int:
         if arguments.altitude_km is not None:
             focal = 0.5 * image.shape[1] / math.tan(math.radians(arguments.fov_deg) / 2.0)
             classes = size_class(found.diameter_px * arguments.altitude_km * 1000.0 / focal)
+        ratios, called = found.depth_ratio, states(found)
         detections = [
             {
                 "u_px": round(float(found.u_px[k]), 3),
@@ -341,6 +398,7 @@ def _detect(arguments: argparse.Namespace) -> int:
                 "score": round(float(found.score[k]), 4),
                 "sigma_px": round(float(found.sigma_px[k]), 3),
                 "class": int(classes[k]),
+                **({} if ratios is None else {"depth_ratio": round(float(ratios[k]), 3), "state": called[k]}),
             }
             for k in range(len(found))
         ]
@@ -375,10 +433,15 @@ def _bench(arguments: argparse.Namespace) -> int:
 
 
 def _info(arguments: argparse.Namespace) -> int:
+    import json
+
     from linna.output import emit
     from payload_emulator.flight.detector import OnnxDetector
 
     octets = _model_octets(arguments.model)
     detector = OnnxDetector(octets)
-    emit(arguments, {"sha256": detector.sha256, "model_bytes": len(octets), **detector.metadata})
+    metadata = {
+        key: json.loads(text) if text[:1] in ("{", "[") else text for key, text in detector.metadata.items()
+    }
+    emit(arguments, {"sha256": detector.sha256, "model_bytes": len(octets), **metadata})
     return 0

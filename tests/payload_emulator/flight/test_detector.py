@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 
 from payload_emulator.errors import ModelError
-from payload_emulator.flight.detections import Detections
-from payload_emulator.flight.detector import DetectorParameters, OnnxDetector, decode, drop_duplicates
+from payload_emulator.flight.detections import Detections, states
+from payload_emulator.flight.detector import (
+    DetectorParameters,
+    OnnxDetector,
+    decode,
+    drop_duplicates,
+    remove_parallax,
+)
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.preprocess import ImageQuality
 
@@ -75,6 +81,11 @@ def test_turning_the_frame_with_the_sun_turns_the_detections(detector):
         (np.zeros((511, 512, 3), np.uint8), ImageQuality.INVALID),
         (np.zeros((512, 512, 7), np.uint8), ImageQuality.INVALID),
         (np.zeros(4, np.uint8), ImageQuality.INVALID),
+        (np.full((512, 512), np.inf), ImageQuality.INVALID),
+        (np.full((512, 512), "x"), ImageQuality.INVALID),
+        (np.full((512, 512), -1, np.int16), ImageQuality.INVALID),
+        (np.full((512, 512), 65535, np.uint16), ImageQuality.SATURATED),
+        (np.zeros((0, 512), np.uint8), ImageQuality.INVALID),
     ],
 )
 def test_a_bad_frame_is_a_verdict_and_no_detections(detector, image, verdict):
@@ -149,8 +160,56 @@ def test_a_flat_heatmap_gives_no_detections():
     assert len(found) == 0
 
 
+def detections(u, v, diameter=40.0, ratio=None):
+    n = len(u)
+    return Detections(
+        np.array(u, float),
+        np.array(v, float),
+        np.full(n, diameter),
+        np.full(n, 0.9),
+        np.ones(n),
+        None if ratio is None else np.array(ratio, float),
+    )
+
+
+def test_parallax_is_taken_out_radially_and_in_proportion_to_the_depth():
+    # A bowl 0.2 * 40 px deep whose middle is seen a tenth of its depth below the rim, f = 148 px: 0.1 * 8 / 148 of
+    # the distance from the middle of the picture.
+    found = detections([255.5, 455.5, 255.5], [255.5, 255.5, 55.5], ratio=[0.2, 0.2, 0.1])
+    moved = remove_parallax(found, 0.1 / 148.0, 512, 512)
+    assert moved.u_px == pytest.approx([255.5, 455.5 + 200 * 0.1 * 8 / 148, 255.5])
+    assert moved.v_px == pytest.approx([255.5, 255.5, 55.5 - 200 * 0.1 * 4 / 148])
+    assert remove_parallax(found, 0.0, 512, 512) is found
+
+
+def test_a_network_that_tells_depth_gives_each_crater_a_state():
+    heat = np.zeros((128, 128), np.float32)
+    geometry = np.zeros((5, 128, 128), np.float32)
+    for column, tenfold in ((20, 1.6), (60, 0.8), (100, 0.3)):
+        heat[50, column] = 0.9
+        geometry[4, 49:52, column - 1 : column + 2] = tenfold
+    found = decode(heat, geometry, 0.5)
+    assert found.depth_ratio == pytest.approx([0.16, 0.08, 0.03], abs=1e-6)
+    assert states(found) == ["fresh", "worn", "degraded"]
+    assert states(found.select(np.array([2]))) == ["degraded"]
+    assert states(detections([1], [1])) == [""]
+
+
+def test_craters_on_the_very_edge_of_the_heatmap_are_decoded():
+    heat = np.zeros((128, 128), np.float32)
+    heat[0, 0] = heat[127, 127] = 0.9
+    found = decode(heat, np.zeros((4, 128, 128), np.float32), 0.5)
+    assert sorted(zip(found.u_px, found.v_px, strict=True)) == [(1.5, 1.5), (509.5, 509.5)]
+
+
 def test_a_weaker_repetition_is_dropped_and_a_nested_crater_kept():
     columns = ([100, 104, 102], [100, 101, 100], [40, 44, 12], [0.9, 0.8, 0.7], [1, 1, 1])
     found = Detections(*(np.array(column, float) for column in columns))
     kept = drop_duplicates(found, DetectorParameters())
     assert kept.diameter_px.tolist() == [40, 12]
+
+
+def test_what_a_dropped_repetition_would_have_dropped_stays():
+    # The second repeats the first and goes; the third repeats only the second, so it is a crater of its own.
+    found = detections([100, 108, 116], [100, 100, 100], diameter=30.0)
+    assert drop_duplicates(found, DetectorParameters()).u_px.tolist() == [100, 116]

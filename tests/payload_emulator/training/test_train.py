@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,10 @@ torch = pytest.importorskip("torch")
 from payload_emulator.errors import DatasetError, ModelError  # noqa: E402
 from payload_emulator.flight.detector import OnnxDetector  # noqa: E402
 from payload_emulator.training import train as training  # noqa: E402
+from payload_emulator.training.evaluate import evaluate  # noqa: E402
 from payload_emulator.training.export import PARITY_LIMIT, export, load_network  # noqa: E402
+from payload_emulator.training.landmarks import Landmarks  # noqa: E402
+from payload_emulator.training.quantise import quantise  # noqa: E402
 from payload_emulator.training.train import TrainParameters, train  # noqa: E402
 
 SHORT = TrainParameters(
@@ -96,14 +100,99 @@ def test_the_loss_falls_on_blobs(blob_dataset, tmp_path):
     assert np.mean(losses[-4:]) < 0.8 * np.mean(losses[:4])
 
 
-def test_an_exported_network_agrees_with_torch_and_carries_its_origin(finished, blob_dataset, tmp_path):
+@pytest.fixture(scope="module")
+def exported(finished, blob_dataset, tmp_path_factory):
     run, _ = finished
-    figures = export(run / "checkpoint.pt", tmp_path / "m.onnx", [blob_dataset], revision="abc")
+    path = tmp_path_factory.mktemp("export") / "m.onnx"
+    figures = export(
+        run / "checkpoint.pt", path, [blob_dataset], revision="abc", paper_classes=True, test=True
+    )
+    return path.read_bytes(), figures
+
+
+def test_an_exported_network_agrees_with_torch_and_carries_its_origin(exported, blob_dataset):
+    octets, figures = exported
     assert figures["parity_max_abs"] <= PARITY_LIMIT
-    detector = OnnxDetector((tmp_path / "m.onnx").read_bytes())
-    assert detector.metadata["git_revision"] == "abc"
-    assert json.loads(detector.metadata["data"])[0]["labels_sha256"] == blob_dataset.digest
-    assert float(detector.metadata["score_threshold"]) == figures["score_threshold"]
+    metadata = OnnxDetector(octets).metadata
+    assert metadata["git_revision"] == "abc"
+    assert metadata["training_seed"] == "1"
+    assert json.loads(metadata["data"])[0]["labels_sha256"] == blob_dataset.digest
+    assert float(metadata["score_threshold"]) == figures["score_threshold"]
+    tested = json.loads(metadata["test_figures"])["test"]
+    assert set(tested) == {"frames", "rung", "strict", "ignore_aware"}
+
+
+def test_the_papers_variant_keeps_its_class_heatmaps_and_is_scored_by_them(exported, blob_dataset):
+    octets, _ = exported
+    detector = OnnxDetector(octets)
+    heatmap, geometry = detector.run_network(np.zeros((1, 1, 512, 512), np.float32))
+    assert heatmap.shape[1] == 4 and geometry.shape[1] == 5
+    scored = evaluate(octets, blob_dataset, threshold=0.01, paper_classes=True)
+    assert [row["size_class"] for row in scored["per_class"]] == [0, 1, 2]
+
+
+def test_a_network_without_class_heatmaps_is_no_papers_variant(blob_dataset, tmp_path):
+    train([blob_dataset], tmp_path, replace(SHORT, steps=1, paper_classes=False, depth=False))
+    with pytest.raises(ModelError, match="expected a network with the paper's class heatmaps"):
+        export(tmp_path / "checkpoint.pt", tmp_path / "p.onnx", [], paper_classes=True)
+
+
+def test_a_run_may_start_from_a_network_with_fewer_heads_and_says_so(blob_dataset, tmp_path):
+    old, new = tmp_path / "old", tmp_path / "new"
+    train([blob_dataset], old, replace(SHORT, steps=2, paper_classes=False, depth=False))
+    train([blob_dataset], new, replace(SHORT, steps=0), start_from=old / "checkpoint.pt")
+    before, _ = load_network(old / "checkpoint.pt")
+    after, _ = load_network(new / "checkpoint.pt")
+    image = torch.from_numpy(np.random.default_rng(0).standard_normal((1, 1, 128, 128)).astype(np.float32))
+    with torch.no_grad():
+        heat, geometry = before(image)
+        wide_heat, wide_geometry = after(image)
+    assert torch.allclose(wide_heat[:, :1], heat, atol=1e-5)
+    assert torch.allclose(wide_geometry[:, :4], geometry, atol=1e-5)
+    origin = json.loads((new / "run.json").read_text())["started_from"]
+    assert origin["steps"] == 2 and len(origin["sha256"]) == 64
+
+
+def test_a_run_without_gain_stops_early(blob_dataset, tmp_path, monkeypatch):
+    values = iter([0.5, 0.4, 0.3, 0.2])
+    monkeypatch.setattr(
+        training,
+        "_validate",
+        lambda *_: {"f1": next(values), "precision": 0.0, "recall": 0.0, "loc_px": 1.0, "threshold": 0.4},
+    )
+    lines = []
+    parameters = replace(SHORT, steps=50, patience=2, validate_every_minutes=0.0)
+    figures = train([blob_dataset], tmp_path, parameters, report=lines.append)
+    assert figures["steps"] == 3 and figures["best"]["step"] == 1
+    assert any("stopped early: 2 validations without gain" in line for line in lines)
+
+
+def test_eight_bits_make_the_network_smaller_and_keep_its_answers_near(exported, blob_dataset):
+    octets, _ = exported
+    small = quantise(octets, [blob_dataset], frames=2)
+    assert len(small) < 0.5 * len(octets)
+    image = np.random.default_rng(1).standard_normal((1, 1, 512, 512)).astype(np.float32)
+    full, coarse = (OnnxDetector(part).run_network(image)[1] for part in (octets, small))
+    # Eight bits through sixty layers of an untrained net: the maps must still be alike.
+    assert np.corrcoef(full[0, 2].ravel(), coarse[0, 2].ravel())[0, 1] > 0.8
+    assert OnnxDetector(small).metadata["score_threshold"] == OnnxDetector(octets).metadata["score_threshold"]
+
+
+def test_landmarks_are_labels_of_the_second_round(blob_dataset, tmp_path, monkeypatch):
+    seen = []
+    original = training._Feeder.__init__
+
+    def watched(self, frames, *rest):
+        seen.append(sum(frame.craters["id"].size for _, frame in frames))
+        original(self, frames, *rest)
+
+    monkeypatch.setattr(training._Feeder, "__init__", watched)
+    # Straight below the frames of the blob set.
+    one = [np.array([value]) for value in (0.0, 0.0, 0.0, 8_000.0)]
+    landmarks = Landmarks(*one, np.array([3]), np.array([3]), np.array([0.7]))
+    train([blob_dataset], tmp_path / "a", replace(SHORT, steps=1))
+    train([blob_dataset], tmp_path / "b", replace(SHORT, steps=1), landmarks=landmarks)
+    assert seen[1] - seen[0] == len(blob_dataset.frames("train"))
 
 
 def test_a_data_set_without_training_frames_is_refused(make_blob_dataset, tmp_path):
