@@ -28,7 +28,7 @@ from payload_emulator.flight.ports import ResetCause
 from payload_emulator.flying import SPACECRAFT_ID, CatalogueDetector, Sender, fly, timeline
 from payload_emulator.link import Reception, save_receptions, transmit
 from payload_emulator.loading import LoadedPayload, load_payload
-from payload_emulator.recording import FrameInput, frame_input, save_frame_times, save_image, save_record
+from payload_emulator.recording import StepInput, save_frame_times, save_image, save_record, step_input
 from payload_emulator.scenario import Scenario, format_scenario
 from payload_emulator.sim.faults import parse_fault
 from payload_emulator.spacecraft import Spacecraft, new_board
@@ -132,18 +132,16 @@ def _emulate_into(
     )
     spacecraft = new_spacecraft(world, loaded)
     sender = Sender(world, LinkSettings(coding=scenario.link.coding))
-    inputs: list[FrameInput] = []
+    inputs: list[StepInput] = []
     flown = fly(world, spacecraft)
     for moment in progress(flown, len(timeline(world))) if progress else flown:
         sender.take(moment)
-        frame, number = moment.exposure, moment.moment.frame
-        if frame is None:
+        given, number = spacecraft.given, moment.moment.frame
+        if given is None:
             continue
-        inputs.append(
-            frame_input(number, frame.image, frame.attitude, frame.clock_ticks, moment.telecommands)
-        )
+        inputs.append(step_input(number, given))
         if number in kept:
-            save_image(folder, number, frame.image)
+            save_image(folder, number, given.image)
     sender.flush()
     reception = transmit(sender.transmitter.dumps, sender.transmitter.settings, scenario.link, scenario.seed)
     save_record(folder, inputs, loaded.parameters, loaded.tables)

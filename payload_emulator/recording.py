@@ -1,8 +1,9 @@
 """What a payload was given during a pass, kept so that another build can be given the same.
 
-In a pass archive this is the folder `payload/`: `inputs.jsonl` (one line per frame: on-board time, message of the ADCS,
-telecommands, hash of the image), `parameters.toml`, `tables/*.bin` as uploaded, and `dictionary.json` (the packet
-definitions the downlink was made with); images lie in `frames/`. Nothing of the truth is here.
+In a pass archive this is the folder `payload/`: `inputs.jsonl` (one line per step: on-board time, message of the ADCS,
+telecommands, hash of the image, what the board said), `parameters.toml`, `tables/*.bin` as uploaded, and
+`dictionary.json` (the packet definitions the downlink was made with); images lie in `frames/`. Nothing of the truth is
+here.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,9 @@ from payload_emulator.flight.payload import FlightTables
 from payload_emulator.parameter_file import BuildParameters, format_parameters, parse_parameters
 from tmtc.definitions import format_dictionary
 from tmtc.dictionary import DICTIONARY
+
+if TYPE_CHECKING:
+    from payload_emulator.spacecraft import Given
 
 FOLDER = "payload"
 INPUTS = f"{FOLDER}/inputs.jsonl"
@@ -37,11 +41,17 @@ Image = NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FrameInput:
+class StepInput:
     """What one call of `Payload.step` was given, the image by its hash.
 
     Attributes
     ----------
+    number
+        Frame of the pass; -1 for a step without one.
+    boot
+        Cause of the start of the processor before this step, None without one.
+    sensors, uptime_ticks, downlink_octets
+        What the board said: readings (4,), time since power-on, room on the link.
     image_shape, image_sha256
         Shape of the pixels and SHA-256 of their octets, row by row; an empty shape and hash for a camera that gave
         none.
@@ -53,6 +63,10 @@ class FrameInput:
     telecommands: bytes
     image_shape: tuple[int, ...]
     image_sha256: str
+    boot: int | None
+    sensors: FloatArray
+    uptime_ticks: int
+    downlink_octets: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,23 +79,25 @@ class PassRecord:
         Parameters and tables of the record that the flight code at hand does not have any more.
     """
 
-    inputs: tuple[FrameInput, ...]
+    inputs: tuple[StepInput, ...]
     parameters: BuildParameters
     tables: FlightTables
     dropped: tuple[str, ...] = ()
 
 
-def frame_input(
-    number: int, image: NDArray[Any], attitude: FloatArray, clock_ticks: int, telecommands: bytes = b""
-) -> FrameInput:
-    """The record of one frame."""
-    return FrameInput(
+def step_input(number: int, given: Given) -> StepInput:
+    """The record of one step."""
+    return StepInput(
         number,
-        int(clock_ticks),
-        np.asarray(attitude, np.float64),
-        telecommands,
-        image.shape,
-        pixel_hash(image),
+        given.clock_ticks,
+        np.asarray(given.attitude, np.float64),
+        given.telecommands,
+        given.image.shape,
+        pixel_hash(given.image) if number >= 0 else "",
+        given.boot,
+        np.asarray(given.sensors, np.float64),
+        given.uptime_ticks,
+        given.downlink_octets,
     )
 
 
@@ -91,7 +107,7 @@ def pixel_hash(image: NDArray[Any]) -> str:
 
 
 def save_record(
-    folder: Path, inputs: Iterable[FrameInput], parameters: BuildParameters, tables: FlightTables
+    folder: Path, inputs: Iterable[StepInput], parameters: BuildParameters, tables: FlightTables
 ) -> None:
     """Write the record of a pass into its archive `folder`."""
     (folder / TABLES).mkdir(parents=True, exist_ok=True)
@@ -149,7 +165,7 @@ def frame_path(number: int) -> str:
     return f"frames/{number:06d}.png"
 
 
-def missing_frames(folder: Path, inputs: Sequence[FrameInput]) -> list[int]:
+def missing_frames(folder: Path, inputs: Sequence[StepInput]) -> list[int]:
     """Frames that had an image which is not in the archive."""
     return [
         item.number
@@ -172,7 +188,7 @@ def save_image(folder: Path, number: int, image: Image) -> None:
     path.write_bytes(encoded.tobytes())
 
 
-def load_image(folder: Path, item: FrameInput) -> Image:
+def load_image(folder: Path, item: StepInput) -> Image:
     """The image of a frame as the payload was given it, checked against its hash; no pixels where it had none.
 
     Raises
@@ -197,7 +213,7 @@ def load_image(folder: Path, item: FrameInput) -> Image:
     return image
 
 
-def check_image(item: FrameInput, image: Image, source: str) -> None:
+def check_image(item: StepInput, image: Image, source: str) -> None:
     """Refuse an image that is not the one that the payload was given."""
     if image.shape != item.image_shape:
         raise RecordError(
@@ -216,33 +232,47 @@ def _size(shape: tuple[int, ...]) -> str:
     return " x ".join(map(str, shape)) + " pixels"
 
 
-def _line(item: FrameInput) -> str:
-    attitude = [None if math.isnan(value) else value for value in item.attitude.tolist()]
+def _line(item: StepInput) -> str:
     row = {
         "frame": item.number,
         "ticks": item.clock_ticks,
-        "attitude": attitude,
+        "attitude": _numbers(item.attitude),
         "telecommands": base64.b64encode(item.telecommands).decode(),
         "image": frame_path(item.number) if item.image_sha256 else None,
         "shape": list(item.image_shape),
         "pixels_sha256": item.image_sha256,
+        "boot": item.boot,
+        "sensors": _numbers(item.sensors),
+        "uptime_ticks": item.uptime_ticks,
+        "downlink_octets": item.downlink_octets,
     }
     return json.dumps(row) + "\n"
 
 
-def _parse(line: str, path: Path, index: int) -> FrameInput:
+def _numbers(values: FloatArray) -> list[float | None]:
+    return [None if math.isnan(value) else value for value in values.tolist()]
+
+
+def _array(values: list[float | None]) -> FloatArray:
+    return np.array([math.nan if value is None else float(value) for value in values], dtype=np.float64)
+
+
+def _parse(line: str, path: Path, index: int) -> StepInput:
     try:
         row = json.loads(line)
-        attitude = [math.nan if value is None else float(value) for value in row["attitude"]]
-        return FrameInput(
+        return StepInput(
             int(row["frame"]),
             int(row["ticks"]),
-            np.array(attitude, dtype=np.float64),
+            _array(row["attitude"]),
             base64.b64decode(row["telecommands"], validate=True),
             tuple(int(value) for value in row["shape"]),
             str(row["pixels_sha256"]),
+            None if row["boot"] is None else int(row["boot"]),
+            _array(row["sensors"]),
+            int(row["uptime_ticks"]),
+            int(row["downlink_octets"]),
         )
     except (ValueError, KeyError, TypeError) as error:
         raise RecordError(
-            f"{path}, line {index + 1}: expected a frame's inputs, found something else ({error})"
+            f"{path}, line {index + 1}: expected the inputs of a step, found something else ({error})"
         ) from None

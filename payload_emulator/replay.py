@@ -26,12 +26,14 @@ from payload_emulator.errors import ModelError, ParameterError, RecordError
 from payload_emulator.flight.detections import Detections
 from payload_emulator.flight.detector import OnnxDetector
 from payload_emulator.flight.models import load_shipped_model
+from payload_emulator.flight.modes import PayloadMode
 from payload_emulator.flight.payload import Payload
+from payload_emulator.flight.ports import UNLIMITED, BareBoard, ResetCause
 from payload_emulator.flight.preprocess import ImageQuality
 from payload_emulator.parameter_file import BuildParameters, parse_parameters
 from payload_emulator.recording import (
-    FrameInput,
     PassRecord,
+    StepInput,
     check_image,
     load_image,
     load_record,
@@ -65,7 +67,7 @@ class FlightBuild:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replay:
-    """What a replay gave: packets, what the payload counted, and CPU milliseconds per frame of every stage (n,), of the yardstick."""
+    """What a replay gave: packets, counts of the payload, CPU milliseconds of every stage by frame and of the yardstick."""
 
     packets: list[bytes]
     summary: dict[str, Any]
@@ -81,12 +83,7 @@ def load_flight_build(path: Path) -> FlightBuild:
     ParameterError
         The file is no build on the flight code.
     """
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ParameterError(f"{path}: expected a build file, found nothing there") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ParameterError(f"{path}: expected a build file, not TOML: {error}") from None
+    table = _build_table(path)
     if "command" in table:
         raise ParameterError(f"{path}: expected a build of a model and parameters, found one with a command")
 
@@ -104,6 +101,11 @@ def load_flight_build(path: Path) -> FlightBuild:
         octets_of("model") if "model" in table else None,
         octets_of("parameters").decode() if "parameters" in table else "",
     )
+
+
+def names_command(path: Path) -> bool:
+    """Whether a build file names a program of its own instead of a network and parameters."""
+    return "command" in _build_table(path)
 
 
 def replay_archive(
@@ -131,7 +133,7 @@ def replay_archive(
     lacking = missing_frames(archive, record.inputs)
     if lacking and data is None:
         raise RecordError(
-            f"{archive}: expected {len(record.inputs)} frames, found {len(record.inputs) - len(lacking)}; "
+            f"{archive}: expected every frame, found {len(lacking)} missing, the first {lacking[0]}; "
             "complete the archive first (linna replay --complete)"
         )
     images = rendered_images(archive, record, data) if lacking and data else stored_images(archive, record)
@@ -153,7 +155,7 @@ def replay_archive(
         },
     )
     cpu_ms = float(sum(values.sum() for values in flown.stages_ms.values()))
-    frames = len(record.inputs)
+    frames = len(flown.stages_ms[STAGES[0]])
     summary = {
         "archive": str(manifest.get("pass_name", "")),
         "build": {"name": build.name, "version": build.version},
@@ -183,23 +185,35 @@ def replay(
     detector = _TimedDetector(
         load_shipped_model() if build.model is None else build.model, parameters, cpu_clock
     )
-    payload = Payload(
-        detector,
-        parameters.flight,
-        record.tables,
-        model_hash=detector.onnx.model_hash,
-        model_octets=len(detector.onnx.model_octets),
-    )
+    board = RecordedBoard()
+
+    def started() -> Payload:
+        return Payload(
+            detector,
+            parameters.flight,
+            record.tables,
+            model_hash=detector.onnx.model_hash,
+            model_octets=detector.onnx.model_octets,
+            board=board,
+            mode=PayloadMode.standby,
+            make_detector=lambda octets: _TimedDetector(octets, parameters, cpu_clock),
+        )
+
+    payload = started()
     packets: list[bytes] = []
     rows: list[tuple[float, float, float]] = []
     yardstick_ms: list[float] = []
-    pairs: Iterable[tuple[FrameInput, Image]] = zip(record.inputs, images, strict=True)
+    pairs: Iterable[tuple[StepInput, Image]] = zip(record.inputs, images, strict=True)
     weights = np.random.default_rng(0).standard_normal((YARDSTICK_SIZE, YARDSTICK_SIZE)).astype(np.float32)
     for item, image in progress(pairs, len(record.inputs)) if progress else pairs:
+        if board.tell(item) and item is not record.inputs[0]:
+            payload = started()
         detector.reset()
         began = cpu_clock()
         packets += payload.step(image, item.attitude, item.clock_ticks, item.telecommands)
         step_s = cpu_clock() - began
+        if item.number < 0:
+            continue
         rows.append(
             (detector.network_s, detector.examine_s - detector.network_s, step_s - detector.examine_s)
         )
@@ -236,8 +250,8 @@ def rendered_images(archive: Path, record: PassRecord, data: DataFolder) -> Iter
     world.terrain.hand_over()
     absent = set(missing_frames(archive, record.inputs))
 
-    def image_of(item: FrameInput) -> Image:
-        if item.number not in absent:
+    def image_of(item: StepInput) -> Image:
+        if item.number not in absent or not item.image_sha256:
             return load_image(archive, item)
         if item.number >= world.frame_utc_ns.size:
             raise RecordError(
@@ -268,6 +282,35 @@ def complete_archive(
     manifest["files"] = file_entries(out)
     _write_json(out / "manifest.json", manifest)
     return manifest
+
+
+@dataclass(slots=True, eq=False)
+class RecordedBoard(BareBoard):
+    """The board as it was when the pass was flown: its readings and its link, whatever the build does with it."""
+
+    uptime: int = -1
+    downlink: int = UNLIMITED
+    asked_to_reset: bool = False
+
+    def tell(self, item: StepInput) -> bool:
+        """Take the place of the board in a step; whether the processor starts anew before it."""
+        self.uptime, self.downlink = item.uptime_ticks, item.downlink_octets
+        if np.isfinite(item.sensors).all():
+            self.readings = item.sensors
+        starts = item.boot is not None or self.asked_to_reset
+        if item.boot is not None:
+            self.reset_cause = ResetCause(item.boot)
+        self.asked_to_reset = False
+        return starts
+
+    def uptime_ticks(self) -> int:
+        return self.uptime
+
+    def downlink_octets(self) -> int:
+        return self.downlink
+
+    def request_reset(self, cause: int) -> None:
+        self.reset_cause, self.asked_to_reset = ResetCause(cause), True
 
 
 @dataclass(slots=True, eq=False)
@@ -319,13 +362,22 @@ def _yardstick_s(weights: NDArray[np.float32], clock: CpuClock) -> float:
     return clock() - began
 
 
-def _ahead(load: Callable[[FrameInput], Image], inputs: tuple[FrameInput, ...]) -> Iterator[Image]:
+def _ahead(load: Callable[[StepInput], Image], inputs: tuple[StepInput, ...]) -> Iterator[Image]:
     with ThreadPoolExecutor(max_workers=1) as reader:
         pending = [reader.submit(load, item) for item in inputs[:2]]
         for number in range(len(inputs)):
             if number + 2 < len(inputs):
                 pending.append(reader.submit(load, inputs[number + 2]))
             yield pending.pop(0).result()
+
+
+def _build_table(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ParameterError(f"{path}: expected a build file, found none ({error.strerror})") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ParameterError(f"{path}: expected a build file, not TOML: {error}") from None
 
 
 def _manifest(archive: Path) -> dict[str, Any]:

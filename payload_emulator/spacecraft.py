@@ -33,6 +33,28 @@ _REGIONS = {
 FloatArray = NDArray[np.float64]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Given:
+    """What the payload was given in a step: at its door, and by its board.
+
+    Attributes
+    ----------
+    boot
+        Cause of the start of the processor before this step, None without one.
+    sensors
+        Readings of the board (4,), NaN before the first.
+    """
+
+    image: NDArray[Any]
+    attitude: FloatArray
+    clock_ticks: int
+    telecommands: bytes
+    boot: int | None
+    sensors: FloatArray
+    uptime_ticks: int
+    downlink_octets: int
+
+
 class ProcessorHang(BaseException):
     """The simulated processor stands still; nothing that runs on it can catch this."""
 
@@ -75,6 +97,8 @@ class Spacecraft:
         What breaks; seconds count from `first_utc_ns`.
     resets
         Starts of the processor after the first, by cause.
+    given
+        What the payload was given in the last step; None while the processor was down.
     """
 
     loaded: LoadedPayload
@@ -84,6 +108,8 @@ class Spacecraft:
     detector: Detector | None = None
     resets: list[int] = field(default_factory=list)
     payload: Payload = field(init=False)
+    given: Given | None = None
+    _booted: int | None = None
     _breakable: BreakableDetector = field(init=False)
     _begun: set[Fault] = field(default_factory=set)
     _rng: np.random.Generator = field(init=False)
@@ -113,6 +139,7 @@ class Spacecraft:
         if self._last_utc_ns is not None:
             board.advance((utc_ns - self._last_utc_ns) / _NS, sunlit)
         self._last_utc_ns = utc_ns
+        self.given = None
         board.downlink = downlink_octets
         picture, message = self._break(utc_ns, image, attitude)
         if self._down_until_ns is not None:
@@ -122,15 +149,17 @@ class Spacecraft:
             self._reset(ResetCause.watchdog)
         if self._camera_dead and not board.camera_on:
             self._camera_dead = False
+        shown, ticks = _NO_IMAGE if picture is None else picture, clock_ticks + self._clock_error_ticks
+        cause, self._booted = self._booted, None
         try:
-            packets = self.payload.step(
-                _NO_IMAGE if picture is None else picture,
-                message,
-                clock_ticks + self._clock_error_ticks,
-                telecommands,
-            )
+            packets = self.payload.step(shown, message, ticks, telecommands)
         except ProcessorHang:
             self._down_until_ns = utc_ns + round(board.model.watchdog_s * _NS)
+            packets = []
+        self.given = Given(
+            shown, message, ticks, telecommands, cause, board.readings, board.uptime_ticks(), downlink_octets
+        )
+        if self._down_until_ns is not None:
             return []
         if self._camera_dead and not board.camera_on:
             self._camera_dead = False
@@ -139,6 +168,7 @@ class Spacecraft:
         return packets
 
     def _boot(self) -> Payload:
+        self._booted = self.board.reset_cause
         return self.loaded.boot(self.board, self._breakable)
 
     def _reset(self, cause: int) -> None:

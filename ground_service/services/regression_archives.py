@@ -105,9 +105,6 @@ def check_archive(folder: Path) -> PassArchive:
             f"{len(rows)} frames",
             f"{len(lacking)} missing, the first {lacking[0]} (linna replay --complete renders them)",
         )
-    expected = manifest.get("frames_expected")
-    if isinstance(expected, int) and expected != len(rows):
-        raise InvalidInput(str(folder / INPUTS), "", f"{expected} frames as in the manifest", str(len(rows)))
     camera = manifest.get("camera") or {}
     size = (camera.get("width_px"), camera.get("height_px"))
     for row in rows:
@@ -338,7 +335,7 @@ def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
 
 
 def frame_inputs(folder: Path) -> list[dict[str, Any]]:
-    """What the payload was given with each frame, a row per frame."""
+    """What the payload was given with each frame, a row per frame; steps without one are left out."""
     path = folder / INPUTS
     rows = []
     try:
@@ -346,9 +343,10 @@ def frame_inputs(folder: Path) -> list[dict[str, Any]]:
             row = json.loads(line)
             if not isinstance(row["frame"], int) or not isinstance(row["shape"], list):
                 raise ValueError(f"line {number + 1}")
-            rows.append({"image": None, **row})
+            if row["frame"] >= 0:
+                rows.append({"image": None, **row})
     except (ValueError, KeyError, TypeError) as error:
-        raise InvalidInput(str(path), f"line {len(rows) + 1}", "inputs of a frame", str(error)) from None
+        raise InvalidInput(str(path), "", "a line of inputs for each step", str(error)) from None
     return rows
 
 

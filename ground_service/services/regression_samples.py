@@ -66,7 +66,7 @@ def pass_context(archive: PassArchive, orientation: Orientation) -> PassContext:
         name=archive.name,
         manifest=archive.manifest,
         frame_ticks=ticks,
-        frame_utc_ns=_frame_times(folder, ticks),
+        frame_utc_ns=_frame_times(folder, [row["frame"] for row in rows], ticks),
         frame_names=tuple(row["image"] or "" for row in rows),
         dictionary=parse_dictionary(text, str(folder / "payload/dictionary.json")),
         reference=load_ephemeris(folder / "reference.oem"),
@@ -130,19 +130,17 @@ def read_downlink(
     )
 
 
-def _frame_times(folder: Path, ticks: IntArray) -> IntArray:
+def _frame_times(folder: Path, numbers: list[int], ticks: IntArray) -> IntArray:
     """UTC of every frame: as the archive correlates it, else by an ideal clock."""
     path = folder / FRAME_TIMES
     if not path.is_file():
         return np.asarray(utc_ns_from_ticks(ticks), dtype=np.int64)
     try:
         rows = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()[1:]]
-        times = np.array([int(utc) for _, utc in rows], dtype=np.int64)
-    except ValueError as error:
-        raise InvalidInput(str(path), "", "frame numbers and UTC in ns", str(error)) from None
-    if len(times) != len(ticks):
-        raise InvalidInput(str(path), "", f"{len(ticks)} frames", str(len(times)))
-    return times
+        times = {int(number): int(utc) for number, utc in rows}
+        return np.array([times[number] for number in numbers], dtype=np.int64)
+    except (ValueError, KeyError) as error:
+        raise InvalidInput(str(path), "", "the UTC of every frame in ns", str(error)) from None
 
 
 def _rows(table: Table, context: PassContext) -> tuple[IntArray, NDArray[np.bool_]]:

@@ -31,10 +31,31 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    if arguments.archive.is_dir():
+        return _fly(arguments, arguments.archive)
     from ground_service.services.regression_archives import opened_archive
 
     with opened_archive(arguments.archive) as archive:
-        return _complete(arguments, archive) if arguments.complete else _replay(arguments, archive)
+        return _fly(arguments, archive)
+
+
+def _fly(arguments: argparse.Namespace, archive: Path) -> int:
+    if arguments.complete:
+        return _complete(arguments, archive)
+    from payload_emulator.replay import FlightBuild, load_flight_build, names_command, replay_archive
+
+    current = arguments.build == "current"
+    if not current and names_command(Path(arguments.build)):
+        return _run_command(arguments, archive)
+    flight = FlightBuild() if current else load_flight_build(Path(arguments.build))
+    data = None
+    if not arguments.recorded_only:
+        from linna.data import data_folder
+
+        data = data_folder()
+    summary = replay_archive(archive, flight, arguments.out, data=data, progress=_bar)
+    emit(arguments, summary, text=_describe(summary, arguments.out))
+    return 0
 
 
 def _complete(arguments: argparse.Namespace, archive: Path) -> int:
@@ -51,24 +72,13 @@ def _complete(arguments: argparse.Namespace, archive: Path) -> int:
     return 0
 
 
-def _replay(arguments: argparse.Namespace, archive: Path) -> int:
+def _run_command(arguments: argparse.Namespace, archive: Path) -> int:
+    from ground_service.services.build_runs import run_build
     from ground_service.services.builds import load_build
 
-    build = load_build(arguments.build)
-    if build.command:
-        from ground_service.services.build_runs import run_build
-
-        summary = run_build(build, archive, arguments.out).summary()
-        emit(arguments, summary, text=summary["text"])
-        return 0 if summary["outcome"] == "ok" else 1
-    from linna.data import data_folder
-    from payload_emulator.replay import FlightBuild, load_flight_build, replay_archive
-
-    flight = FlightBuild() if arguments.build == "current" else load_flight_build(build.file)
-    data = None if arguments.recorded_only else data_folder()
-    summary = replay_archive(archive, flight, arguments.out, data=data, progress=_bar)
-    emit(arguments, summary, text=_describe(summary, arguments.out))
-    return 0
+    summary = run_build(load_build(arguments.build), archive, arguments.out).summary()
+    emit(arguments, summary, text=summary["text"])
+    return 0 if summary["outcome"] == "ok" else 1
 
 
 def _bar(items, total):  # type: ignore[no-untyped-def]

@@ -79,6 +79,8 @@ class SimulatedBoard:
         Added to the temperature and taken from the voltage by faults.
     downlink
         Octets of packets that TM/TC takes in this step.
+    readings
+        What the sensors said last.
     """
 
     model: PlatformModel
@@ -97,6 +99,7 @@ class SimulatedBoard:
     camera_c: float = 6.0
     tables: dict[int, bytearray] = field(default_factory=dict)
     memory: dict[int, Memory] = field(default_factory=dict)
+    readings: Float = field(default_factory=lambda: np.full(4, np.nan))
     _loads: int = 0
     _uptime: int = 0
     _counter_ns: int = 0
@@ -165,7 +168,7 @@ class SimulatedBoard:
         root = math.sqrt(max(open_v**2 - 4.0 * model.resistance_ohm * drawn_w, 0.0))
         volts = 0.5 * (open_v + root)
         noise = self._generator.standard_normal(3) * (0.005, 0.05, 0.05)
-        return np.array(
+        self.readings = np.array(
             [
                 volts + noise[0],
                 drawn_w / max(volts, 1.0),
@@ -173,6 +176,7 @@ class SimulatedBoard:
                 self.camera_c + noise[2],
             ]
         )
+        return self.readings
 
     def switch(self, loads: int) -> None:
         self._loads = int(loads)
