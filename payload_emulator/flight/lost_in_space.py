@@ -261,7 +261,8 @@ def find_place_in_frames(
     ]
     chains: list[tuple[float, tuple[tuple[int, Place], ...]]] = []
     for number, places in enumerate(per_frame):
-        grown = [(place.log_false, ((number, place),)) for place in places]
+        grown: list[tuple[float, tuple[tuple[int, Place], ...]]] = []
+        grown += [(place.log_false, ((number, place),)) for place in places]
         for _, chain in list(chains):
             for place in places:
                 longer = (*chain, (number, place))

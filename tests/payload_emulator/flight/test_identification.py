@@ -31,7 +31,7 @@ def test_the_minimum_is_the_smallest_set_that_chance_makes_less_often_than_the_l
 def sighting(uv: np.ndarray) -> Sighting:
     count = len(uv)
     nothing = np.zeros((count, 2, 3))
-    return Sighting(np.arange(count), uv, np.full(count, 30.0), nothing, nothing, nothing)
+    return Sighting(np.arange(count), uv, np.full(count, 30.0), nothing, nothing, nothing, nothing[:, :, 0])
 
 
 def found(uv: np.ndarray, diameter: float = 30.0) -> Detections:
@@ -90,3 +90,12 @@ def test_no_detections_and_no_craters_make_no_set() -> None:
     nothing = np.empty((0, 2))
     assert run(found(nothing), sighting(np.array([[5.0, 5.0]])), 1.0) == []
     assert run(found(np.array([[5.0, 5.0]])), sighting(nothing), 1.0) == []
+
+
+def test_a_frame_full_of_detections_that_craters_hardly_explain_is_believed_less() -> None:
+    places = np.random.default_rng(5).uniform(20.0, 490.0, (25, 2))
+    pair = places[:2] + 0.5
+    clutter = np.random.default_rng(6).uniform(0.0, 511.0, (20, 2))
+    assert run(found(pair), sighting(places), sigma_px=3.0) == [(0, 0), (1, 1)]
+    crowded = found(np.concatenate([pair, clutter]))
+    assert not {(0, 0), (1, 1)} <= set(run(crowded, sighting(places), sigma_px=3.0))

@@ -1,0 +1,176 @@
+"""`linna identify`: how often craters are found and taken for others, on simulated detections."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+
+from linna.output import add_json_flag, emit, log
+
+RUNG = "rung 1-2: simulated detections of the craters of a catalogue (recall, precision, errors as stated), no images"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    lost = commands.add_parser(
+        "lost", help="lost in space: places found from one frame or four, without a prior"
+    )
+    tracking = commands.add_parser(
+        "tracking", help="identification around a prediction: wrong pairs, wrong fixes"
+    )
+    for command, frames in ((lost, 300), (tracking, 10_000)):
+        command.add_argument(
+            "catalogue",
+            nargs="?",
+            metavar="FILE",
+            help="anchoring table of `linna catalogue curate`, or a catalogue (default: the one at hand)",
+        )
+        command.add_argument("--frames", type=int, default=frames, help=f"default: {frames}")
+        command.add_argument("--seed", type=int, default=1, help="default: 1")
+        command.add_argument("--recall", type=float, default=0.5, help="default: 0.5")
+        command.add_argument("--precision", type=float, default=0.8, help="default: 0.8")
+        command.add_argument("--sigma-px", type=float, default=1.4, help="per axis (default: 1.4)")
+        command.add_argument("--log-diameter-sigma", type=float, default=0.05, help="default: 0.05")
+        add_json_flag(command)
+    lost.add_argument(
+        "--attitude-deg",
+        type=float,
+        default=0.5,
+        help="error of nadir and heading, 1 sigma per axis (default: 0.5)",
+    )
+    lost.add_argument("--sets", type=int, help="sets of four frames (default: a third of the frames)")
+    lost.set_defaults(handler=run_lost)
+    tracking.set_defaults(handler=run_tracking)
+
+
+def run_lost(arguments: argparse.Namespace) -> int:
+    import math
+
+    from payload_emulator.flight.lost_in_space import place_index
+    from payload_emulator.identification_study import KINDS, study_lost, study_lost_in_frames
+
+    world, model = _world(arguments), _model(arguments)
+    attitude_rad = math.radians(arguments.attitude_deg)
+    hostile = max(arguments.frames // 3, 1)
+    scores = []
+    for kind in KINDS:
+        frames = arguments.frames if kind == "true" else hostile
+        log(f"{frames} frames, {kind}")
+        scores.append(
+            study_lost(world, frames, arguments.seed, kind=kind, model=model, attitude_rad=attitude_rad)
+        )
+    sets = hostile if arguments.sets is None else arguments.sets
+    log(f"{sets} sets of four frames")
+    scores.append(study_lost_in_frames(world, sets, arguments.seed, model=model, attitude_rad=attitude_rad))
+    figures = {
+        "single_correct_share": scores[0].correct_share,
+        "four_frames_correct_share": scores[-1].correct_share,
+        "wrong": sum(score.wrong for score in scores),
+        "searches": sum(score.frames for score in scores),
+        "median_cpu_s": scores[0].median_cpu_s,
+        "scores": [asdict(score) | {"correct_share": score.correct_share} for score in scores],
+        "craters": len(world.board),
+        "index_octets": place_index(world.board).octets,
+        "altitude_km": [14.0, 50.0],
+        "attitude_sigma_deg": arguments.attitude_deg,
+        "least_true_detections": 6,
+        **_provenance(arguments, world.name, model),
+    }
+    lines = [
+        f"{'frames':<12}{'searches':>9}{'correct':>9}{'wrong':>7}{'no fix':>8}{'error m':>9}{'p95':>7}{'CPU s':>7}"
+    ]
+    for score in scores:
+        none = score.frames - score.correct - score.wrong
+        lines.append(
+            f"{score.kind:<12}{score.frames:>9}{score.correct:>9}{score.wrong:>7}{none:>8}"
+            f"{score.median_error_m:>9.0f}{score.p95_error_m:>7.0f}{score.median_cpu_s:>7.2f}"
+        )
+    emit(arguments, figures, text="\n".join([*lines, f"{world.name}, {len(world.board)} craters; {RUNG}"]))
+    return 0
+
+
+def run_tracking(arguments: argparse.Namespace) -> int:
+    from payload_emulator.identification_study import KINDS, study_tracking
+
+    world, model = _world(arguments), _model(arguments)
+    hostile = max(arguments.frames // 10, 1)
+    scores = []
+    for kind in KINDS:
+        frames = arguments.frames - 3 * hostile if kind == "true" else hostile
+        log(f"{frames} frames, {kind}")
+        scores.append(study_tracking(world, max(frames, 1), arguments.seed, kind=kind, model=model))
+    pairs = sum(score.pairs for score in scores)
+    figures = {
+        "frames": sum(score.frames for score in scores),
+        "wrong_association_share": sum(score.wrong_pairs for score in scores) / max(pairs, 1),
+        "wrong_fixes": sum(score.wrong_fixes for score in scores),
+        "majority_wrong": sum(score.majority_wrong for score in scores),
+        "fixed_of_four_or_more": scores[0].findable_fixed / max(scores[0].findable, 1),
+        "scores": [asdict(score) for score in scores],
+        "craters": len(world.board),
+        "prior_sigma_m": [30.0, 1400.0],
+        **_provenance(arguments, world.name, model),
+    }
+    lines = [
+        f"{'frames':<12}{'count':>7}{'fixed':>7}{'pairs':>8}{'wrong':>7}{'majority wrong':>16}{'wrong fixes':>13}"
+    ]
+    lines += [
+        f"{score.kind:<12}{score.frames:>7}{score.fixed:>7}{score.pairs:>8}{score.wrong_pairs:>7}"
+        f"{score.majority_wrong:>16}{score.wrong_fixes:>13}"
+        for score in scores
+    ]
+    lines.append(
+        f"wrong associations {100 * figures['wrong_association_share']:.2f} %; "
+        f"{100 * figures['fixed_of_four_or_more']:.1f} % of frames with four findable craters fixed"
+    )
+    emit(arguments, figures, text="\n".join([*lines, f"{world.name}, {len(world.board)} craters; {RUNG}"]))
+    return 0
+
+
+def _provenance(arguments: argparse.Namespace, name: str, model) -> dict[str, object]:
+    return {
+        "detections": asdict(model),
+        "seed": arguments.seed,
+        "rung": RUNG,
+        "data": [f"crater catalogue {name}"],
+    }
+
+
+def _model(arguments: argparse.Namespace):
+    from linna.errors import UsageError
+    from payload_emulator.identification_study import DetectionModel
+
+    if arguments.frames < 1:
+        raise UsageError(f"--frames: expected at least 1, found {arguments.frames}")
+    for name in ("recall", "precision"):
+        if not 0.0 < getattr(arguments, name) <= 1.0:
+            raise UsageError(
+                f"--{name}: expected a share above 0 and up to 1, found {getattr(arguments, name):g}"
+            )
+    if not (arguments.sigma_px > 0.0 and arguments.log_diameter_sigma >= 0.0):
+        raise UsageError(
+            f"--sigma-px, --log-diameter-sigma: expected positive sizes, found {arguments.sigma_px:g} and "
+            f"{arguments.log_diameter_sigma:g}"
+        )
+    return DetectionModel(
+        arguments.recall, arguments.precision, arguments.sigma_px, arguments.log_diameter_sigma
+    )
+
+
+def _world(arguments: argparse.Namespace):
+    from linna.commands.catalogue import open_catalogue
+    from payload_emulator.curation import catalogue_of_table
+    from payload_emulator.identification_study import study_world
+
+    name = arguments.catalogue
+    table = None
+    if name is not None and Path(name).is_file():
+        table = catalogue_of_table(Path(name))
+    craters = open_catalogue(name, arguments.seed) if table is None else table
+    sized = (craters.diameter_m >= 5e3 if table is None else craters.diameter_m >= 3e3) & (
+        craters.diameter_m <= 30e3
+    )
+    with_depth = ~(craters.depth_m < 0.03 * craters.diameter_m)
+    chosen = craters.select(sized & with_depth)
+    return study_world(chosen, arguments.seed, craters.source)

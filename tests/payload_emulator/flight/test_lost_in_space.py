@@ -1,0 +1,203 @@
+"""A place without a prior: found, or refused, on a map small enough to search in moments."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from lunar.camera import PinholeCamera
+from lunar.frames import enu_from_mcmf, mcmf_from_spherical
+from payload_emulator.flight.detections import Detections, no_detections
+from payload_emulator.flight.lost_in_space import (
+    NADIR_NORTH_UP,
+    LostFrame,
+    LostParameters,
+    PlaceIndex,
+    candidate_places,
+    find_place,
+    find_place_in_frames,
+    log_poisson_tail,
+    place_index,
+)
+from payload_emulator.flight.sighting import LandmarkMap, landmark_map
+from payload_emulator.flight.tables import CatalogueTable
+
+RADIUS_M = 1_737_400.0
+CAMERA = PinholeCamera()
+RULES = LostParameters(attitude_sigma_rad=math.radians(0.5))
+SIGMA_PX = 1.4
+
+
+def craters(west_deg: float = 350.0, seed: int = 1) -> LandmarkMap:
+    """Craters of 5 to 30 km over 20 x 40 degrees, as dense as the paper's, on two kilometres of relief."""
+    rng = np.random.default_rng(seed)
+    area = math.radians(20.0) * 2.0 * math.sin(math.radians(20.0)) * RADIUS_M**2
+    count = int(area * 2.09e-9)
+    latitude = np.arcsin(rng.uniform(-1.0, 1.0, count) * math.sin(math.radians(20.0)))
+    longitude = np.radians(west_deg + rng.uniform(0.0, 20.0, count))
+    diameter = 5e3 * (1.0 - rng.uniform(size=count) * (1.0 - 6.0**-1.77)) ** (-1.0 / 1.77)
+    height = 1_500.0 * np.sin(8.0 * longitude) * np.cos(6.0 * latitude)
+    sigma = np.full((count, 3), 80.0)
+    return landmark_map(CatalogueTable(np.arange(count), latitude, longitude, diameter, height, sigma))
+
+
+@pytest.fixture(scope="module")
+def index() -> PlaceIndex:
+    return place_index(craters())
+
+
+def frame(
+    landmarks: LandmarkMap,
+    latitude_deg: float,
+    longitude_deg: float,
+    altitude_m: float,
+    seed: int,
+    recall: float = 0.6,
+    false: int = 3,
+    tilt_deg: float = 0.5,
+) -> tuple[np.ndarray, Detections]:
+    """A camera's place, and what it detects: projection written out here, apart from the code under test."""
+    rng = np.random.default_rng(seed)
+    latitude, longitude = math.radians(latitude_deg), math.radians(longitude_deg)
+    place = mcmf_from_spherical(latitude, longitude, altitude_m)
+    enu = enu_from_mcmf(latitude, longitude)
+    away = (landmarks.position_mcmf_m - place) @ enu.T
+    away = away[away[:, 2] < 0.0], landmarks.diameter_m[away[:, 2] < 0.0]
+    east, north, depth = away[0][:, 0], away[0][:, 1], -away[0][:, 2]
+    tilt = math.radians(tilt_deg) * rng.standard_normal(3)
+    seen = np.stack([east, -north, depth], axis=1)
+    seen = seen - np.cross(tilt, seen)
+    f = 256.0 / math.tan(math.radians(60.0))
+    u, v = 255.5 + f * seen[:, 0] / seen[:, 2], 255.5 + f * seen[:, 1] / seen[:, 2]
+    size = away[1] * f / seen[:, 2]
+    inside = (np.abs(u - 255.5) < 256.0) & (np.abs(v - 255.5) < 256.0) & (rng.uniform(size=u.size) < recall)
+    count = int(inside.sum())
+    uv = np.stack([u[inside], v[inside]], axis=1) + SIGMA_PX * rng.standard_normal((count, 2))
+    uv = np.concatenate([uv, rng.uniform(0.0, 511.0, (false, 2))])
+    size = np.concatenate(
+        [size[inside] * np.exp(0.05 * rng.standard_normal(count)), rng.uniform(20.0, 60.0, false)]
+    )
+    total = count + false
+    return place, Detections(uv[:, 0], uv[:, 1], size, rng.uniform(size=total), np.full(total, SIGMA_PX))
+
+
+def changed(found: Detections, u: np.ndarray, v: np.ndarray) -> Detections:
+    return Detections(u, v, found.diameter_px, found.score, found.sigma_px)
+
+
+@pytest.mark.parametrize("altitude_m", [33e3, 40e3, 49e3])
+@pytest.mark.parametrize("place_deg", [(3.0, 359.7), (-12.0, 7.0)])
+def test_a_place_is_found_anywhere_on_the_map_at_any_altitude(
+    index: PlaceIndex, altitude_m: float, place_deg: tuple[float, float]
+) -> None:
+    place, found = frame(index.landmarks, *place_deg, altitude_m, seed=5)
+    result = find_place(found, found.sigma_px, index, CAMERA, RULES)
+    assert result is not None
+    error = np.linalg.norm(result.position_mcmf_m - place)
+    # Ten detections and an attitude of half a degree leave about 1 % of the altitude; three times that here.
+    assert error < 0.03 * altitude_m
+    assert error < 5.0 * np.linalg.norm(result.sigma_m) + 100.0
+
+
+def test_false_detections_mirrored_and_turned_images_find_no_place(index: PlaceIndex) -> None:
+    rng = np.random.default_rng(3)
+    _, found = frame(index.landmarks, 2.0, 3.0, 35e3, seed=6, false=6)
+    scattered = rng.uniform(0.0, 511.0, (2, len(found)))
+    hostile = [
+        changed(found, scattered[0], scattered[1]),
+        changed(found, 511.0 - found.u_px, found.v_px),
+        changed(found, 511.0 - found.v_px, found.u_px),
+        changed(found, 511.0 - found.u_px, 511.0 - found.v_px),
+    ]
+    assert find_place(found, found.sigma_px, index, CAMERA, RULES) is not None
+    for detections in hostile:
+        assert find_place(detections, found.sigma_px, index, CAMERA, RULES) is None
+
+
+def test_a_place_off_the_map_is_no_fix(index: PlaceIndex) -> None:
+    other = craters(west_deg=100.0, seed=8)
+    _, found = frame(other, 0.0, 110.0, 30e3, seed=2)
+    assert find_place(found, found.sigma_px, index, CAMERA, RULES) is None
+
+
+def test_too_few_detections_and_detections_that_are_no_numbers_are_no_fix(index: PlaceIndex) -> None:
+    nothing = no_detections()
+    assert find_place(nothing, nothing.sigma_px, index, CAMERA, RULES) is None
+    _, found = frame(index.landmarks, 3.0, 359.7, 30e3, seed=5)
+    few = found.select(np.arange(2))
+    assert find_place(few, few.sigma_px, index, CAMERA, RULES) is None
+    gone = changed(found, np.full(len(found), np.nan), found.v_px)
+    assert find_place(gone, found.sigma_px, index, CAMERA, RULES) is None
+
+
+def test_detections_that_are_no_numbers_are_left_out(index: PlaceIndex) -> None:
+    place, found = frame(index.landmarks, 3.0, 359.7, 49e3, seed=5)
+    u = found.u_px.copy()
+    u[::7] = np.nan
+    broken = changed(found, u, found.v_px)
+    result = find_place(broken, found.sigma_px, index, CAMERA, RULES)
+    assert result is not None
+    assert np.all(np.isfinite(u[result.detection]))
+    assert np.linalg.norm(result.position_mcmf_m - place) < 2_000.0
+
+
+def test_frames_too_poor_alone_find_the_place_together(index: PlaceIndex) -> None:
+    speed_rad_s = math.sqrt(4.9028e12 / (RADIUS_M + 30e3) ** 3)
+    frames, places = [], []
+    for k in range(4):
+        latitude_deg = -6.0 + math.degrees(speed_rad_s * 15.0 * k)
+        place, found = frame(index.landmarks, latitude_deg, 4.0, 30e3, seed=20 + k, recall=0.28)
+        frames.append(LostFrame(found, found.sigma_px, 15.0 * k))
+        places.append(place)
+    alone = [find_place(f.found, f.sigma_px, index, CAMERA, RULES) for f in frames]
+    together = find_place_in_frames(frames, index, CAMERA, RULES)
+    assert sum(place is not None for place in alone) < 4
+    assert together is not None
+    for place in together:
+        assert min(np.linalg.norm(place.position_mcmf_m - true) for true in places) < 1_500.0
+
+
+def test_no_frames_and_frames_of_different_orbits_are_no_fix(index: PlaceIndex) -> None:
+    assert find_place_in_frames([], index, CAMERA, RULES) is None
+    first = frame(index.landmarks, -10.0, 353.0, 45e3, seed=1)[1]
+    second = frame(index.landmarks, 10.0, 367.0, 45e3, seed=2)[1]
+    frames = [LostFrame(f, f.sigma_px, 15.0 * k) for k, f in enumerate((first, second))]
+    # Each alone is certain of its place; no orbit leads from one to the other within 15 s.
+    assert find_place_in_frames(frames, index, CAMERA, RULES) is None
+
+
+def test_fewer_inliers_suffice_on_a_smaller_map() -> None:
+    whole = craters()
+    near = np.flatnonzero(np.abs(whole.latitude_rad) < math.radians(4.0))
+    part = LandmarkMap(
+        whole.ids[near],
+        whole.latitude_rad[near],
+        whole.position_mcmf_m[near],
+        whole.enu_from_mcmf[near],
+        whole.diameter_m[near],
+        whole.sigma_m[near],
+    )
+    _, found = frame(whole, 0.5, 0.0, 30e3, seed=4)
+    best = [candidate_places(found, found.sigma_px, place_index(m), CAMERA, RULES)[0] for m in (whole, part)]
+    assert len(best[0]) == len(best[1])
+    assert best[1].log_false < best[0].log_false
+
+
+def test_the_tail_of_the_poisson_distribution_is_that_of_the_sum() -> None:
+    for mean, count in ((0.1, 3), (2.0, 7), (5.0, 20)):
+        exact = 1.0 - sum(math.exp(-mean) * mean**k / math.factorial(k) for k in range(count))
+        assert log_poisson_tail(count, mean) == pytest.approx(math.log(exact), abs=1e-3)
+    assert log_poisson_tail(3, 5.0) == 0.0
+    assert log_poisson_tail(0, 0.5) == 0.0
+
+
+def test_the_index_is_small_beside_the_table(index: PlaceIndex) -> None:
+    # Four float64 per crater and a few bins; 22 octets per crater in the table itself.
+    assert index.octets < 33 * len(index) + 2_000
+
+
+def test_the_nominal_attitude_looks_down_with_north_up() -> None:
+    assert NADIR_NORTH_UP @ np.array([0.0, 0.0, -1.0]) == pytest.approx([0.0, 0.0, 1.0])
+    assert NADIR_NORTH_UP @ np.array([0.0, 1.0, 0.0]) == pytest.approx([0.0, -1.0, 0.0])
