@@ -14,6 +14,7 @@ from ground_service.api.live import live
 from ground_service.api.metrics import Metrics, Watch
 from ground_service.api.operations import operations
 from ground_service.api.planning import planning
+from ground_service.api.regression_routes import REGRESSION_UPLOAD_PATHS, regressions
 from ground_service.api.routes import UPLOAD_PATHS, router
 from ground_service.api.telecommands import telecommands
 from ground_service.services.ground import ground_from_settings
@@ -56,7 +57,7 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
     )
     app.state.open_without_users = settings.host in LOOPBACK
     app.state.upload_limit_octets = settings.upload_limit_mib << 20
-    for one in (router, planning, telecommands):
+    for one in (router, planning, telecommands, regressions):
         app.include_router(one)
     app.include_router(operations)
     app.include_router(live)
@@ -64,7 +65,9 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
     app.state.metrics = Metrics()
     problems.install(app)
     app.add_middleware(
-        BodyLimit, upload_paths=UPLOAD_PATHS, upload_limit_octets=settings.upload_limit_mib << 20
+        BodyLimit,
+        upload_paths=(*UPLOAD_PATHS, *REGRESSION_UPLOAD_PATHS),
+        upload_limit_octets=settings.upload_limit_mib << 20,
     )
     app.add_middleware(HeadersAndTags)
     app.add_middleware(Watch, metrics=app.state.metrics)

@@ -46,7 +46,19 @@ def _ingest(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[
     return {"ingest_id": result.ingest_id, "packets": result.packets, "packets_new": result.packets_new}
 
 
-WORK: dict[str, Work] = {"report": _report, "ingest": _ingest}
+def _replay(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
+    from ground_service.services.regression_jobs import replay_job
+
+    return replay_job(ground, arguments, job_id)
+
+
+def _regression(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
+    from ground_service.services.regression_jobs import regression_job
+
+    return regression_job(ground, arguments, job_id)
+
+
+WORK: dict[str, Work] = {"report": _report, "ingest": _ingest, "replay": _replay, "regression": _regression}
 """What can be asked for, by kind. Each may be run twice with the same arguments and job without harm."""
 
 
