@@ -35,6 +35,7 @@ GROUPS: dict[str, tuple[str, str]] = {
     "ingest": ("ingest", "ingest downlink files or pass archives into the ground database"),
     "pass": ("pass_", "list and show passes"),
     "report": ("report", "write the report of a pass"),
+    "plan": ("plan", "observation windows: search, enter, approve, uplink, exchange"),
     "command": ("command", "telecommands: queue, release, uplink, verification"),
     "serve": ("serve", "run the ground service's HTTP API"),
     "worker": ("worker", "run a job worker of the ground service"),

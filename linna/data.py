@@ -15,6 +15,12 @@ def user_data_directory() -> Path:
     return Path(base) / "linna" / "data"
 
 
+def data_directory() -> Path:
+    """Where the data products lie or are to be fetched to: $LINNA_DATA, else the user's data directory."""
+    named = os.environ.get("LINNA_DATA")
+    return Path(named) if named else user_data_directory()
+
+
 def data_folder() -> DataFolder:
     """The data products at hand; an empty folder object when there are none. A wrong $LINNA_DATA is an error."""
     named = os.environ.get("LINNA_DATA")

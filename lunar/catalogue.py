@@ -309,8 +309,8 @@ def load_catalogue(path: Path | str) -> CraterCatalogue:
     """Return the craters of a CSV file (plain or gzip), recognised by its columns.
 
     Known are LU1319381 (``longitude_deg, latitude_deg, diameter_m, depth_m``), the composite of several
-    sources (``diameter_km, source, tile_complete``), Robbins (``lat, lon, diam`` in km) and our own.  Exact
-    repetitions of a crater are kept once.
+    sources (``diameter_km, source, tile_complete``), Robbins (``lat, lon, diam`` in km, or as published with
+    ``LAT_CIRC_IMG, LON_CIRC_IMG, DIAM_CIRC_IMG``) and our own.  Exact repetitions of a crater are kept once.
 
     Raises
     ------
@@ -382,6 +382,11 @@ def _read_columns(path: Path) -> dict[str, list[str]]:
         lines = [line for line in text.replace("\r", "").split("\n") if line]
         header = lines[0].split(",") if lines else []
         widths = [line.count(",") + 1 for line in lines]
+        wanted = [k for k, name in enumerate(header) if name.strip() in _KNOWN_COLUMNS]
+        if 2 * len(wanted) < len(header):
+            # Of a wide table (Robbins has 21 columns and 1.3 million rows) only what is used is taken apart.
+            _check_widths(path, widths, len(header))
+            return _some_columns(header, lines[1:], wanted)
         flat = ",".join(lines[1:]).split(",") if len(lines) > 1 else []
     else:
         rows = [row for row in rows if row]
@@ -390,10 +395,25 @@ def _read_columns(path: Path) -> dict[str, list[str]]:
         flat = [value for row in rows[1:] for value in row]
     if not header:
         raise DataFileError(path, "line 1", "the column names of a crater catalogue", "an empty file")
-    for number, width in enumerate(widths, start=1):
-        if width != len(header):
-            raise DataFileError(path, f"line {number}", f"{len(header)} values", f"{width}")
+    _check_widths(path, widths, len(header))
     return {name.strip(): flat[k :: len(header)] for k, name in enumerate(header)}
+
+
+def _check_widths(path: Path, widths: list[int], expected: int) -> None:
+    for number, width in enumerate(widths, start=1):
+        if width != expected:
+            raise DataFileError(path, f"line {number}", f"{expected} values", f"{width}")
+
+
+def _some_columns(header: list[str], lines: list[str], wanted: list[int]) -> dict[str, list[str]]:
+    """Columns of a table by name; those not wanted are named and left empty."""
+    columns: dict[str, list[str]] = {name.strip(): [] for name in header}
+    last = max(wanted, default=0) + 1
+    for line in lines:
+        values = line.split(",", last)
+        for k in wanted:
+            columns[header[k].strip()].append(values[k])
+    return columns
 
 
 def _numbers(path: Path, columns: dict[str, list[str]], name: str, missing: bool = False) -> FloatArray:
@@ -445,6 +465,15 @@ def _read_robbins(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
     )
 
 
+def _read_robbins_whole(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
+    return make_catalogue(
+        np.radians(_numbers(path, columns, "LAT_CIRC_IMG")),
+        np.radians(_numbers(path, columns, "LON_CIRC_IMG")),
+        1000.0 * _numbers(path, columns, "DIAM_CIRC_IMG"),
+        source="Robbins",
+    )
+
+
 def _read_own(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
     return make_catalogue(
         np.radians(_numbers(path, columns, "latitude_deg")),
@@ -464,7 +493,9 @@ _READERS: tuple[tuple[Reader, set[str]], ...] = (
     (_read_composite, {"latitude_deg", "longitude_deg", "diameter_km", "source", "tile_complete"}),
     (_read_lu, {"id", "latitude_deg", "longitude_deg", "diameter_m", "depth_m"}),
     (_read_robbins, {"lat", "lon", "diam"}),
+    (_read_robbins_whole, {"LAT_CIRC_IMG", "LON_CIRC_IMG", "DIAM_CIRC_IMG"}),
 )
+_KNOWN_COLUMNS = frozenset().union(*(needed for _, needed in _READERS), {"rim_height_m", "complete"})
 
 
 def _check_ranges(path: Path, catalogue: CraterCatalogue) -> None:

@@ -77,7 +77,7 @@ def find_data(path: Path | str | None) -> DataFolder:
     return DataFolder(
         root=root,
         gravity=_first(root, "gravity/GRGM*.gfc", "gravity/*.gfc", "gravity/*GRGM*", "gravity/*.tab"),
-        gravity_alternative=_first(root, "gravity/LP165P.cof", "gravity/*.cof"),
+        gravity_alternative=_first(root, "gravity/LP165P.cof", "gravity/*.cof", "gravity/jgl165p1.sha"),
         orientation_bpc=_first(root, "kernels/moon_pa_de421*.bpc"),
         orientation_tf=_first(root, "kernels/moon_080317.tf", "kernels/moon*.tf"),
         catalogue_lu=_first(root, "craters/lu1319381*.csv.gz", "craters/lu1319381*.csv"),

@@ -8,7 +8,9 @@ PayloadError
 ├── TableError         an uploaded table (anchor ephemeris, catalogue, gravity) is damaged or of another kind
 ├── ParameterError     a parameter file cannot be read
 ├── RecordError        an archived pass cannot be flown again
-└── DatasetError       a data set is missing, incomplete or of another camera
+├── DatasetError       a data set is missing, incomplete or of another camera
+├── DataProductError   a public data product cannot be fetched, or is damaged
+└── LinkError          a port of the live payload cannot be opened
 """
 
 
@@ -46,3 +48,11 @@ class ParameterError(PayloadError):
 
 class RecordError(PayloadError):
     """An archived pass lacks what is needed to fly it again, or holds something else than was recorded."""
+
+
+class LinkError(PayloadError):
+    """A port of the live payload cannot be opened."""
+
+
+class DataProductError(PayloadError):
+    """A public data product cannot be fetched, or is not what its publisher says it is."""

@@ -1,0 +1,140 @@
+"""`linna data`: the public data products, their licences and checksums; fetching and re-checking them."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    from linna.output import add_json_flag
+
+    verbs = parser.add_subparsers(title="verbs", required=True)
+    listing = verbs.add_parser("list", help="the products: what is at hand, size, licence, address")
+    fetch = verbs.add_parser("fetch", help="download products into the data folder; resumes what broke off")
+    fetch.add_argument("names", nargs="*", metavar="PRODUCT", help="default: the small ones all need")
+    fetch.add_argument(
+        "--only", default="", metavar="TEXT", help="only files with this in their name (tiles)"
+    )
+    fetch.add_argument(
+        "--mirror", default="", metavar="URL", help="take files from URL/<path in the data folder> instead"
+    )
+    verify = verbs.add_parser("verify", help="read every file again and compare checksums")
+    for verb, handler in ((listing, _list), (fetch, _fetch), (verify, _verify)):
+        verb.add_argument(
+            "--to",
+            type=Path,
+            default=None,
+            metavar="DIR",
+            help="data folder; default $LINNA_DATA or the user's",
+        )
+        add_json_flag(verb)
+        verb.set_defaults(handler=handler)
+
+
+def _list(arguments: argparse.Namespace) -> int:
+    from linna.output import emit
+    from payload_emulator.data_products import PRODUCTS
+    from payload_emulator.fetching import survey
+
+    root = _root(arguments)
+    rows = survey(root, PRODUCTS)
+    lines = [f"data folder: {root}{'' if root.is_dir() else ' (not there)'}"]
+    for row in rows:
+        have = f"{row['files_present']} of {row['files']}" if row["files"] else "none known"
+        own = f", {row['files_of_its_own']} other files of it" if row["files_of_its_own"] else ""
+        lines += [
+            f"\n{row['name']}: {row['title']}",
+            f"  files at hand: {have}{own}; to fetch: {_size(row['octets'])}; "
+            f"checksums: {', '.join(row['checksums']) or 'unknown'}",
+            f"  licence: {row['licence']}",
+            f"  cite: {row['citation']}",
+            f"  from: {row['address'] or 'no address known'}",
+        ]
+        if row["note"]:
+            lines.append(f"  {row['note']}")
+    emit(arguments, {"root": str(root), "products": rows}, "\n".join(lines))
+    return 0
+
+
+def _fetch(arguments: argparse.Namespace) -> int:
+    from linna.errors import UsageError
+    from linna.output import emit, log
+    from payload_emulator.data_products import PRODUCTS, find_product
+    from payload_emulator.fetching import fetch, from_mirror
+
+    root = _root(arguments)
+    products = [find_product(name) for name in arguments.names] or [p for p in PRODUCTS if p.basic]
+    for name, product in zip(arguments.names, products, strict=False):
+        if product is None:
+            known = ", ".join(product.name for product in PRODUCTS)
+            raise UsageError(f"data fetch: expected one of {known}, found {name!r}")
+        if not product.files:
+            raise UsageError(
+                f"data fetch: {name}: expected a product with an address, found none: {product.note}"
+            )
+    files = [file for product in products if product for file in product.files if arguments.only in file.path]
+    if not files:
+        raise UsageError(f"data fetch: expected files with {arguments.only!r} in their name, found none")
+    report = _Progress()
+    done = []
+    for file in files:
+        chosen = from_mirror(file, arguments.mirror) if arguments.mirror else file
+        log(f"{file.path}: from {chosen.url or 'nowhere known'} ({_size(chosen.octets)})")
+        found = fetch(chosen, root, report=report)
+        log(f"{file.path}: {found.status}, {_size(found.octets)}")
+        done.append({"path": found.path, "status": found.status, "octets": found.octets})
+    emit(arguments, {"root": str(root), "files": done}, f"{len(done)} files in {root}")
+    return 0
+
+
+def _verify(arguments: argparse.Namespace) -> int:
+    from linna.output import emit, log
+    from payload_emulator.fetching import verify
+
+    root = _root(arguments)
+    checked = verify(root)
+    counts = {
+        status: sum(c.status == status for c in checked)
+        for status in ("whole", "damaged", "missing", "unknown")
+    }
+    for c in checked:
+        if c.status != "whole":
+            log(f"{root / c.path}: {c.status} ({c.against})")
+    bad = counts["damaged"] + counts["missing"]
+    rows = [{"path": c.path, "status": c.status, "against": c.against, "sha256": c.sha256} for c in checked]
+    text = ", ".join(f"{count} {status}" for status, count in counts.items())
+    emit(arguments, {"root": str(root), **counts, "files": rows}, f"{root}: {text}")
+    return 1 if bad else 0
+
+
+def _root(arguments: argparse.Namespace) -> Path:
+    from linna.data import data_directory
+
+    chosen: Path | None = arguments.to
+    return data_directory() if chosen is None else chosen
+
+
+def _size(octets: int) -> str:
+    if not octets:
+        return "size unknown"
+    return f"{octets / 1e9:.2f} GB" if octets >= 1e9 else f"{octets / 1e6:.2f} MB"
+
+
+class _Progress:
+    """Writes how far a download is, every few seconds."""
+
+    def __init__(self) -> None:
+        self._last_s = 0.0
+
+    def __call__(self, path: str, have: int, total: int) -> Any:
+        import time
+
+        from linna.output import log
+
+        now = time.monotonic()
+        if now - self._last_s >= 5.0:
+            self._last_s = now
+            share = f" of {_size(total)} ({100 * have / total:.0f} %)" if total else ""
+            log(f"{path}: {_size(have)}{share}")
