@@ -29,6 +29,8 @@ SPACECRAFT_ID = 0x4C
 
 _NS = 1_000_000_000
 _PLAYBACK_CHANNEL = 1
+# Source of the planned telecommands; whoever commands by hand has another one, with counts of its own.
+_PLANNING_SOURCE = 1
 _LATE_TICKS = 120 * 65_536
 _DUMP_OCTETS = 64_000
 _BEFORE_ARC_NS = 60 * _NS
@@ -77,20 +79,8 @@ class CatalogueDetector:
 
     def show(self, exposure: Exposure) -> None:
         """Prepare what is found in the next frame."""
-        world = self.world
-        position = world.truth.positions_mcmf(exposure.utc_ns)[0]
-        latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))
-        craters = world.terrain.catalogue
-        reach_m = min(2.5 * altitude * np.tan(world.camera.fov_rad / 2.0), 0.1 * MOON_RADIUS_M)
-        near = craters.near(latitude, longitude, reach_m)
-        points = craters.position_mcmf_m[near]
-        uv = project_mcmf(world.true_camera, exposure.camera_from_mcmf, position, points)
-        depth_m = (points - position) @ exposure.camera_from_mcmf[2]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            diameter_px = world.camera.focal_px * craters.diameter_m[near] / depth_m
-            size = np.array([world.camera.width_px, world.camera.height_px])
-            seen = np.all((uv > 0.0) & (uv < size - 1), axis=1) & (diameter_px > _SMALLEST_PX)
-        seen &= self._rng.random(near.size) < _REDUCED_RECALL
+        _, uv, diameter_px = craters_in_view(self.world, exposure, _SMALLEST_PX)
+        seen = self._rng.random(diameter_px.size) < _REDUCED_RECALL
         count = int(np.count_nonzero(seen))
         noise = _REDUCED_SIGMA_PX * self._rng.standard_normal((count, 2))
         self._next = Detections(
@@ -112,6 +102,25 @@ class CatalogueDetector:
         if image.min() == 255:
             return ImageQuality.SATURATED, no_detections()
         return ImageQuality.OK, found
+
+
+def craters_in_view(
+    world: World, exposure: Exposure, smallest_px: float
+) -> tuple[IntArray, NDArray[np.float64], NDArray[np.float64]]:
+    """Craters of the terrain's catalogue in a picture: index, place (n, 2) and diameter (n,) in pixels."""
+    position = world.truth.positions_mcmf(exposure.utc_ns)[0]
+    latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))
+    craters, camera = world.terrain.catalogue, world.true_camera
+    reach_m = min(2.5 * altitude * np.tan(camera.fov_rad / 2.0), 0.1 * MOON_RADIUS_M)
+    near = craters.near(latitude, longitude, reach_m)
+    points = craters.position_mcmf_m[near]
+    uv = project_mcmf(camera, exposure.camera_from_mcmf, position, points)
+    depth_m = (points - position) @ exposure.camera_from_mcmf[2]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        diameter_px = camera.focal_px * craters.diameter_m[near] / depth_m
+        inside = np.all((uv > 0.0) & (uv < np.array([camera.width_px, camera.height_px]) - 1), axis=1)
+        seen = np.flatnonzero(inside & (diameter_px > smallest_px))
+    return near[seen], uv[seen], diameter_px[seen]
 
 
 def timeline(world: World) -> list[Moment]:
@@ -168,7 +177,9 @@ class Operator:
 
     def command(self, name: str, **values: object) -> bytes:
         """The next telecommand packet."""
-        packet = DICTIONARY.pack_command(name, values, sequence_count=self.sequence_count)
+        packet = DICTIONARY.pack_command(
+            name, values, sequence_count=self.sequence_count, source=_PLANNING_SOURCE
+        )
         self.sequence_count = (self.sequence_count + 1) % (1 << 14)
         return packet
 
@@ -187,10 +198,7 @@ class Operator:
         if self.world.scenario.link.stations:
             orders += self._contact(moment, mode)
         if moment.frame >= 0:
-            order = orders_before(self.world, moment.frame, self.sequence_count)
-            if order:
-                orders.append(order)
-                self.sequence_count += 1
+            orders.append(orders_before(self.world, moment.frame))
         return b"".join(orders)
 
     def _windows(self, moment: Moment) -> Iterator[bytes]:
@@ -243,23 +251,34 @@ def fly(world: World, spacecraft: Spacecraft) -> Generator[Flown]:
     """Fly the moments of a scenario in order."""
     operator = Operator(world)
     frames = exposures(world)
-    reduced = spacecraft.detector if isinstance(spacecraft.detector, CatalogueDetector) else None
     for moment in timeline(world):
         exposure = next(frames) if moment.frame >= 0 else None
-        if exposure is not None and reduced is not None:
-            reduced.show(exposure)
-        orders = operator.orders(moment, spacecraft.payload.mode)
-        packets = spacecraft.step(
-            moment.utc_ns,
-            None if exposure is None else exposure.image,
-            _NO_ATTITUDE if exposure is None else exposure.attitude,
-            clock_ticks(world, moment.utc_ns),
-            orders,
-            sunlit=moment.sunlit,
-            downlink_octets=moment.downlink_octets,
-        )
-        yield Flown(moment, exposure, orders, packets)
+        yield fly_moment(world, spacecraft, operator, moment, exposure)
     frames.close()
+
+
+def fly_moment(
+    world: World,
+    spacecraft: Spacecraft,
+    operator: Operator,
+    moment: Moment,
+    exposure: Exposure | None,
+    by_hand: bytes = b"",
+) -> Flown:
+    """Fly one moment; `by_hand` are telecommand packets beside those of the operator."""
+    if exposure is not None and isinstance(spacecraft.detector, CatalogueDetector):
+        spacecraft.detector.show(exposure)
+    orders = operator.orders(moment, spacecraft.payload.mode) + by_hand
+    packets = spacecraft.step(
+        moment.utc_ns,
+        None if exposure is None else exposure.image,
+        _NO_ATTITUDE if exposure is None else exposure.attitude,
+        clock_ticks(world, moment.utc_ns),
+        orders,
+        sunlit=moment.sunlit,
+        downlink_octets=moment.downlink_octets,
+    )
+    return Flown(moment, exposure, orders, packets)
 
 
 @dataclass(slots=True, eq=False)

@@ -185,7 +185,7 @@ def exposures(world: World) -> Generator[Exposure]:
         world.terrain.hand_over()
 
 
-def orders_before(world: World, number: int, sequence_count: int = 0) -> bytes:
+def orders_before(world: World, number: int) -> bytes:
     """Telecommands that reach the payload with a frame: after a told kidnap, to trust its estimate less."""
     section = world.scenario.disturbances
     if not (section.kidnap_told and section.kidnap_distance_km > 0.0):
@@ -200,7 +200,7 @@ def orders_before(world: World, number: int, sequence_count: int = 0) -> bytes:
         "perform_function",
         # A jump of place on an orbit comes with one of velocity: 1e-3 rad/s times the distance.
         {"function_id": "widen_estimate", "argument_1": distance_m, "argument_2": 1e-3 * distance_m},
-        sequence_count=sequence_count,
+        sequence_count=0,
     )
 
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from linna.output import add_json_flag, emit, progress
+from linna.output import add_json_flag, emit, log, progress
+
+if TYPE_CHECKING:
+    from payload_emulator.scenario import Scenario
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scenario", help="scenario file, or the name of a shipped one")
-    parser.add_argument(
-        "--out", required=True, type=Path, metavar="DIR", help="folder of the pass archive to write"
-    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the pass archive to write")
     parser.add_argument(
         "--mode",
         action="append",
@@ -26,16 +28,47 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default="some",
         help="images kept in the archive (default: eight of them)",
     )
+    live = parser.add_argument_group("live", "the payload as a process to watch and to command over TCP")
+    live.add_argument("--live", action="store_true", help="fly live instead of writing an archive")
+    live.add_argument("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
+    live.add_argument("--port", type=int, default=10015, help="telemetry, CADUs (default: %(default)s)")
+    live.add_argument(
+        "--tc-port", type=int, default=10025, help="telecommands, CLTUs or packets (default: %(default)s)"
+    )
+    live.add_argument(
+        "--console-port",
+        type=int,
+        default=10035,
+        help="snapshots as JSON lines out, pause|run|step|rate X|quit in (default: %(default)s)",
+    )
+    live.add_argument(
+        "--rate",
+        type=float,
+        default=1.0,
+        help="simulated seconds a second, 0: as quick as it goes (default: 1)",
+    )
+    live.add_argument("--paused", action="store_true", help="wait for run or step on the console")
+    live.add_argument("--stop-at-end", action="store_true", help="end with the scenario")
+    parser.add_argument(
+        "--campaign", metavar="FILE", help="fly the fault campaign of a file, or a shipped one by name"
+    )
     add_json_flag(parser)
     parser.set_defaults(handler=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
+    from linna.errors import UsageError
     from payload_emulator.emulator import emulate
     from payload_emulator.scenario import load_scenario
 
     scenario = load_scenario(arguments.scenario).with_choices(modes=arguments.mode, seed=arguments.seed)
+    if arguments.campaign:
+        return _campaign(arguments, scenario)
+    if arguments.live:
+        return _live(arguments, scenario)
+    if arguments.out is None:
+        raise UsageError("emulate: expected --out DIR, --live or --campaign FILE, found none of them")
     kept = {"none": 0, "some": 8, "all": None}[arguments.frames]
     summary = emulate(
         scenario,
@@ -45,6 +78,82 @@ def run(arguments: argparse.Namespace) -> int:
         progress=lambda frames, total: progress(frames, total, "frames", "frame"),
     )
     emit(arguments, summary, text=describe(summary, arguments.out))
+    return 0
+
+
+def _campaign(arguments: argparse.Namespace, scenario: Scenario) -> int:
+    from dataclasses import asdict
+
+    from linna.data import data_folder
+    from payload_emulator.campaign import load_campaign, run_campaign, table
+
+    campaign = load_campaign(arguments.campaign)
+    results = run_campaign(
+        scenario,
+        campaign,
+        data_folder(),
+        progress=lambda runs, total: progress(runs, total, "campaign", "run"),
+    )
+    rows = table(results)
+    missed = sum(row["runs"] - row["detected"] for row in rows)
+    lost = sum(row["lost"] for row in rows)
+    figures = {
+        "campaign": campaign.name,
+        "scenario": scenario.name,
+        "runs": len(results),
+        "undetected": missed,
+        "lost": lost,
+        "table": rows,
+        "results": [asdict(result) for result in results],
+    }
+    width = max(len(row["case"]) for row in rows)
+    lines = [f"{'case':<{width}}  runs  detected  recovered  contained  lost  latest  frames"]
+    lines += [
+        f"{row['case']:<{width}}  {row['runs']:>4}  {row['detected']:>8}  {row['recovered']:>9}  "
+        f"{row['contained']:>9}  {row['lost']:>4}  {row['latency_max_s']:>4.0f} s  "
+        f"{row['frames_processed']}/{row['frames_expected']}"
+        for row in rows
+    ]
+    lines.append(f"{len(results)} runs, {missed} undetected, {lost} lost")
+    emit(arguments, figures, text="\n".join(lines))
+    return 1 if missed or lost else 0
+
+
+def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
+    import signal
+
+    from linna.data import data_folder
+    from linna.errors import UsageError
+    from payload_emulator.emulator import load_scenario_payload, new_spacecraft
+    from payload_emulator.live import LivePayload
+    from payload_emulator.world import build_world
+
+    if not arguments.rate >= 0.0:
+        raise UsageError(f"--rate: expected a number from 0, found {arguments.rate}")
+    data = data_folder()
+    world = build_world(scenario, data)
+    loaded, _, _ = load_scenario_payload(world, data)
+    live = LivePayload(
+        world,
+        new_spacecraft(world, loaded),
+        arguments.port,
+        arguments.tc_port,
+        arguments.console_port,
+        arguments.host,
+        arguments.rate,
+        arguments.paused,
+        arguments.stop_at_end,
+    )
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: live.stopping.set())
+    log(", ".join(f"{name} on {arguments.host}:{port}" for name, port in live.ports.items()))
+    live.run()
+    figures = {"ports": live.ports, "sent": live.sent, **live.spacecraft.payload.summary()}
+    emit(
+        arguments,
+        figures,
+        text=f"stopped; {live.sent} transmissions, mode {live.spacecraft.payload.mode.name}",
+    )
     return 0
 
 

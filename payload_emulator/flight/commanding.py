@@ -18,6 +18,8 @@ _SHORTEST_PACKET = 13
 _CODES = {name: code for code, name in DICTIONARY.labels("verification_not_accepted", "failure_code").items()}
 # Commands remembered, so that none is carried out twice; older ones are out of sequence in any case.
 _REMEMBERED = 256
+# Sources whose counts are kept apart.
+_SOURCES = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,49 +65,59 @@ def parse_commands(octets: bytes) -> Iterator[Command | Refusal]:
 
 @dataclass(slots=True)
 class CommandHistory:
-    """Which commands came before: a repeated packet is a duplicate, an older count is out of sequence.
+    """Which commands came before: a repeated packet is a duplicate, an older count of its source is out of sequence.
 
     Counts may jump forward (commands lost on the way), by less than half of their range. A packet is known by its
     request id and CRC-32.
     """
 
     newest_count: int = -1
+    _by_source: OrderedDict[int, int] = field(default_factory=OrderedDict)
     _seen: OrderedDict[tuple[int, int], None] = field(default_factory=OrderedDict)
 
     def judge(self, packet: bytes, *, in_sequence: bool = True) -> int:
         """0 for a new command in sequence, else the code of what is wrong."""
-        if self._key(packet) in self._seen:
+        if _key(packet) in self._seen:
             return failure("duplicate")
-        if in_sequence and self.newest_count >= 0:
-            ahead = (self._count(packet) - self.newest_count) % SEQUENCE_COUNT_LIMIT
+        newest = self._by_source.get(_source(packet)) if in_sequence else None
+        if newest is not None:
+            ahead = (_count(packet) - newest) % SEQUENCE_COUNT_LIMIT
             if not 0 < ahead < SEQUENCE_COUNT_LIMIT // 2:
                 return failure("out_of_sequence")
         return 0
 
     def note(self, packet: bytes, *, in_sequence: bool = True) -> None:
-        """Remember a command as taken; `in_sequence` ones move the newest count."""
-        self._seen[self._key(packet)] = None
+        """Remember a command as taken; `in_sequence` ones move the newest count of their source."""
+        self._seen[_key(packet)] = None
         if in_sequence:
-            self.newest_count = self._count(packet)
+            self.newest_count = self._by_source[_source(packet)] = _count(packet)
+            self._by_source.move_to_end(_source(packet))
         while len(self._seen) > _REMEMBERED:
             self._seen.popitem(last=False)
+        while len(self._by_source) > _SOURCES:
+            self._by_source.popitem(last=False)
 
     def to_plain(self) -> list[Any]:
         """The history as numbers, for non-volatile memory."""
-        return [self.newest_count, [list(key) for key in self._seen]]
+        return [self.newest_count, list(self._by_source.items()), [list(key) for key in self._seen]]
 
     def restore(self, plain: Iterable[Any]) -> None:
         """Take what `to_plain` gave."""
-        self.newest_count, seen = plain
+        self.newest_count, by_source, seen = plain
+        self._by_source = OrderedDict((int(source), int(count)) for source, count in by_source)
         self._seen = OrderedDict(((int(request), int(crc)), None) for request, crc in seen)
 
-    @staticmethod
-    def _key(packet: bytes) -> tuple[int, int]:
-        return int.from_bytes(packet[:4], "big"), zlib.crc32(packet)
 
-    @staticmethod
-    def _count(packet: bytes) -> int:
-        return int.from_bytes(packet[2:4], "big") & (SEQUENCE_COUNT_LIMIT - 1)
+def _key(packet: bytes) -> tuple[int, int]:
+    return int.from_bytes(packet[:4], "big"), zlib.crc32(packet)
+
+
+def _count(packet: bytes) -> int:
+    return int.from_bytes(packet[2:4], "big") & (SEQUENCE_COUNT_LIMIT - 1)
+
+
+def _source(packet: bytes) -> int:
+    return int.from_bytes(packet[9:11], "big")
 
 
 def _read(packet: bytes, request_id: int) -> Command | Refusal:

@@ -1,8 +1,8 @@
 """What survives a reset: one text of settings in two copies, the newer of which that is whole counts.
 
 Each half of the memory holds a block: magic `LNST`, generation (u32), length (u32), CRC-32 of generation, length and
-content (u32), content (JSON, UTF-8); big-endian. Blocks are written in turns, so that a reset in the middle of writing,
-or a flipped bit, costs the newest change at most.
+content (u32), content (JSON, UTF-8); big-endian. Both are written at every change, one after the other: a reset in the
+middle of writing costs that change at most, and flipped bits in one copy cost nothing.
 """
 
 from __future__ import annotations
@@ -48,23 +48,23 @@ class Settings:
         if not whole:
             return Recovery.lost, {}
         generation, values = max(whole, key=lambda copy: copy[0])
-        self.generation = generation
-        # Copies are written in turns: the one before the newest stands in the other half.
-        other = self._copy((generation + 1) & 1)
-        intact = generation == 1 or (other is not None and other[0] == generation - 1)
+        # A pair that was not finished counts as finished: the next one begins with an odd number again.
+        self.generation = generation + generation % 2
+        # The odd one of a pair is written first, the even one closes the pair.
+        intact = len(whole) == 2 and generation % 2 == 0 and whole[0][1] == whole[1][1]
         return (Recovery.whole if intact else Recovery.older), values
 
     def write(self, values: Mapping[str, Any]) -> bool:
         """Keep a set of settings; False where it does not fit, in which case the memory stays as it is."""
         content = json.dumps(values, separators=(",", ":")).encode()
-        generation = self.generation + 1
-        half = self._half(generation & 1)
-        if _HEADER.size + len(content) > half.size:
+        if _HEADER.size + len(content) > self.memory.size // 2:
             return False
-        checked = struct.pack(">II", generation, len(content)) + content
-        block = _HEADER.pack(_MAGIC, generation, len(content), zlib.crc32(checked)) + content
-        half[: len(block)] = np.frombuffer(block, dtype=np.uint8)
-        self.generation = generation
+        for generation in (self.generation + 1, self.generation + 2):
+            half = self._half(generation & 1)
+            checked = struct.pack(">II", generation, len(content)) + content
+            block = _HEADER.pack(_MAGIC, generation, len(content), zlib.crc32(checked)) + content
+            half[: len(block)] = np.frombuffer(block, dtype=np.uint8)
+        self.generation += 2
         return True
 
     def _half(self, which: int) -> Memory:

@@ -1,0 +1,444 @@
+"""The payload as a process to watch and to command: telemetry out and telecommands in over TCP, and a console.
+
+Three ports. Telemetry: CADUs to whoever is connected, from the moment of connection on. Telecommands: CLTUs or bare
+telecommand packets, told apart by their first octets. Console: one JSON object a line out, one word a line in (`pause`,
+`run`, `step`, `rate X`, `quit`). A step by hand, or going on after a pause, breaks the continuity of time for those who
+watch: as in the simulator of the paper, the odometries are told to start anew (trigger `manual_step`).
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import selectors
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
+from lunar.timescales import format_utc
+from payload_emulator.errors import LinkError
+from payload_emulator.flying import (
+    SPACECRAFT_ID,
+    Flown,
+    Moment,
+    Operator,
+    craters_in_view,
+    fly_moment,
+    timeline,
+)
+from payload_emulator.link import Transmitter, transmit
+from payload_emulator.spacecraft import Spacecraft
+from payload_emulator.world import World, exposures
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import LinkSettings
+from tmtc.errors import TmtcError
+from tmtc.uplink import CLTU_START, CLTU_TAIL, UplinkDecoder
+
+_NS = 1_000_000_000
+_POLL_S = 0.05
+_BUFFER_LIMIT = 1 << 20
+_SHOWN_CRATERS = 200
+_SMALLEST_SHOWN_PX = 6.0
+_CONSOLE_SOURCE = 2
+
+
+@dataclass(slots=True)
+class TelecommandBuffer:
+    """Telecommand packets out of octets as they come, CLTUs or bare packets; nothing on the wire stops it.
+
+    Attributes
+    ----------
+    dropped
+        Octets that were neither.
+    """
+
+    decoder: UplinkDecoder = field(default_factory=lambda: UplinkDecoder(SPACECRAFT_ID))
+    dropped: int = 0
+    _octets: bytes = b""
+
+    def take(self, octets: bytes) -> list[bytes]:
+        """The packets that these octets complete."""
+        self._octets += octets
+        packets: list[bytes] = []
+        while self._octets:
+            if self._octets[:1] == CLTU_START[:1]:
+                if len(self._octets) > 1 and self._octets[:2] != CLTU_START:
+                    self._drop(1)
+                    continue
+                end = self._octets.find(CLTU_TAIL)
+                if end < 0:
+                    break
+                stop = end + len(CLTU_TAIL)
+                decoded = self.decoder.decode(self._octets[:stop])
+                self.dropped += decoded.octets_skipped
+                packets += decoded.packets
+                self._octets = self._octets[stop:]
+            elif self._octets[0] >> 3 == _TELECOMMAND_START:
+                length = 7 + int.from_bytes(self._octets[4:6], "big") if len(self._octets) >= 6 else 1 << 17
+                if length > len(self._octets):
+                    break
+                packets.append(self._octets[:length])
+                self._octets = self._octets[length:]
+            else:
+                self._drop(1)
+        if len(self._octets) > _BUFFER_LIMIT:
+            self._drop(len(self._octets))
+        return packets
+
+    def _drop(self, count: int) -> None:
+        self.dropped += count
+        self._octets = self._octets[count:]
+
+
+# Version 000, type 1, secondary header flag 1.
+_TELECOMMAND_START = 0b00011
+
+
+@dataclass(slots=True, eq=False)
+class Server:
+    """Clients of one TCP port; what they send goes to `receive`, octet by octet as it comes."""
+
+    name: str
+    port: int
+    host: str
+    receive: Callable[[bytes], None]
+    listener: socket.socket = field(init=False)
+    clients: list[socket.socket] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        try:
+            self.listener = socket.create_server((self.host, self.port))
+        except OSError as error:
+            raise LinkError(
+                f"{self.name} port {self.port}: expected a free port on {self.host}, found {error.strerror}"
+            ) from None
+        self.listener.setblocking(False)
+        self.port = int(self.listener.getsockname()[1])
+
+    def send(self, octets: bytes) -> None:
+        """Give octets to every client; one that does not take them in time is let go."""
+        for client in list(self.clients):
+            try:
+                client.settimeout(2.0)
+                client.sendall(octets)
+            except OSError:
+                self.drop(client)
+
+    def drop(self, client: socket.socket) -> None:
+        with contextlib.suppress(ValueError):
+            self.clients.remove(client)
+        client.close()
+
+    def close(self) -> None:
+        for client in list(self.clients):
+            self.drop(client)
+        self.listener.close()
+
+
+@dataclass(slots=True, eq=False)
+class LivePayload:
+    """A scenario flown live.
+
+    Attributes
+    ----------
+    rate
+        Simulated seconds in a second of the wall clock; 0: as quick as it goes.
+    paused
+        Whether time stands still until `run` or `step`.
+    """
+
+    world: World
+    spacecraft: Spacecraft
+    telemetry_port: int = 0
+    telecommand_port: int = 0
+    console_port: int = 0
+    host: str = "127.0.0.1"
+    rate: float = 1.0
+    paused: bool = False
+    stop_at_end: bool = False
+    stopping: threading.Event = field(default_factory=threading.Event)
+    sent: int = 0
+    _servers: dict[str, Server] = field(init=False)
+    _orders: deque[bytes] = field(default_factory=deque)
+    _uplink: TelecommandBuffer = field(default_factory=TelecommandBuffer)
+    _words: bytes = b""
+    _steps: int = 0
+    _discontinuous: bool = False
+    _console_count: int = 0
+    _transmitter: Transmitter = field(init=False)
+
+    def __post_init__(self) -> None:
+        settings = LinkSettings(coding=self.world.scenario.link.coding)
+        self._transmitter = Transmitter(SPACECRAFT_ID, settings)
+        self._servers = {}
+        ports = (
+            ("telemetry", self.telemetry_port, lambda octets: None),
+            ("telecommand", self.telecommand_port, self._take_telecommands),
+            ("console", self.console_port, self._take_words),
+        )
+        try:
+            for name, port, receive in ports:
+                self._servers[name] = Server(name, port, self.host, receive)
+        except LinkError:
+            self.close()
+            raise
+
+    @property
+    def ports(self) -> dict[str, int]:
+        """The ports in use, by name."""
+        return {name: server.port for name, server in self._servers.items()}
+
+    def run(self) -> None:
+        """Fly until the scenario ends and `stop_at_end` is set, or until told to stop; then close everything."""
+        try:
+            self._fly()
+        finally:
+            self._say({"kind": "end"})
+            self.close()
+
+    def close(self) -> None:
+        """Close all connections."""
+        for server in self._servers.values():
+            server.close()
+
+    def _fly(self) -> None:
+        operator, frames = Operator(self.world), exposures(self.world)
+        moments = timeline(self.world)
+        interval_ns = round(self.world.scenario.camera.frame_interval_s * _NS)
+        last = moments[-1]
+        try:
+            with selectors.DefaultSelector() as selector:
+                for server in self._servers.values():
+                    selector.register(server.listener, selectors.EVENT_READ, server)
+                pending = deque(moments)
+                before: Moment | None = None
+                while not self.stopping.is_set():
+                    if not pending:
+                        if self.stop_at_end:
+                            return
+                        # The scenario is over, the machine is not: turns without frames go on.
+                        last = Moment(last.utc_ns + interval_ns, -1, last.sunlit, True, last.downlink_octets)
+                        pending.append(last)
+                    moment = pending.popleft()
+                    self._wait(selector, 0.0 if before is None else (moment.utc_ns - before.utc_ns) / _NS)
+                    if self.stopping.is_set():
+                        return
+                    before = moment
+                    exposure = next(frames) if moment.frame >= 0 else None
+                    flown = fly_moment(
+                        self.world, self.spacecraft, operator, moment, exposure, self._by_hand(moment)
+                    )
+                    self._tell(flown)
+        finally:
+            frames.close()
+
+    def _wait(self, selector: selectors.BaseSelector, seconds: float) -> None:
+        """Serve the ports until it is time for the next moment."""
+        due = time.monotonic() + (seconds / self.rate if self.rate > 0.0 else 0.0)
+        self._serve(selector, 0.0)
+        while not self.stopping.is_set():
+            if self._steps > 0:
+                self._steps -= 1
+                self._discontinuous = True
+                return
+            left = due - time.monotonic()
+            if self.paused:
+                self._serve(selector, _POLL_S)
+                self._discontinuous = True
+                continue
+            if left <= 0.0:
+                return
+            self._serve(selector, min(left, _POLL_S))
+
+    def _serve(self, selector: selectors.BaseSelector, timeout_s: float) -> None:
+        for key, _ in selector.select(timeout_s):
+            server: Server = key.data
+            if key.fileobj is server.listener:
+                with contextlib.suppress(OSError):
+                    client, _ = server.listener.accept()
+                    server.clients.append(client)
+                    selector.register(client, selectors.EVENT_READ, server)
+                continue
+            client = key.fileobj  # type: ignore[assignment]
+            try:
+                octets = client.recv(65_536)
+            except OSError:
+                octets = b""
+            if octets:
+                server.receive(octets)
+            else:
+                selector.unregister(client)
+                server.drop(client)
+
+    def _take_telecommands(self, octets: bytes) -> None:
+        self._orders.extend(self._uplink.take(octets))
+
+    def _take_words(self, octets: bytes) -> None:
+        self._words = (self._words + octets)[-_BUFFER_LIMIT:]
+        *lines, self._words = self._words.split(b"\n")
+        for line in lines:
+            self._obey(line.decode("utf-8", "replace").split())
+
+    def _obey(self, words: list[str]) -> None:
+        if words == ["pause"]:
+            self.paused = True
+        elif words == ["run"]:
+            self.paused = False
+        elif words == ["step"]:
+            self.paused = True
+            self._steps += 1
+        elif words == ["quit"]:
+            self.stopping.set()
+        elif len(words) == 2 and words[0] == "rate" and _is_rate(words[1]):
+            self.rate = float(words[1])
+        elif words:
+            text = " ".join(words)[:80]
+            self._say({"kind": "error", "text": f"expected pause, run, step, rate X or quit, found {text!r}"})
+
+    def _by_hand(self, moment: Moment) -> bytes:
+        """Telecommands that came since the moment before; and the manual step where time was not continuous."""
+        orders = b"".join(self._orders)
+        self._orders.clear()
+        if self._discontinuous and moment.frame > 0:
+            self._discontinuous = False
+            orders += DICTIONARY.pack_command(
+                "perform_function",
+                {"function_id": "manual_step", "argument_1": 0.0, "argument_2": 0.0},
+                sequence_count=self._console_count,
+                source=_CONSOLE_SOURCE,
+            )
+            self._console_count = (self._console_count + 1) & 0x3FFF
+        return orders
+
+    def _tell(self, flown: Flown) -> None:
+        """Send the packets of a moment to those who listen, and the snapshot to those who watch."""
+        if flown.packets:
+            self._transmitter.send(flown.packets, flown.moment.utc_ns)
+            dump = self._transmitter.dumps.pop()
+            section = self.world.scenario.link
+            seed = self.world.scenario.seed + self.sent
+            self._servers["telemetry"].send(
+                transmit([dump], self._transmitter.settings, section, seed).octets
+            )
+            self.sent += 1
+        if self._servers["console"].clients:
+            self._say(snapshot(self.world, self.spacecraft, flown, self.paused, self.rate))
+
+    def _say(self, message: dict[str, Any]) -> None:
+        if "console" in self._servers:
+            self._servers["console"].send(json.dumps(message).encode() + b"\n")
+
+
+def snapshot(world: World, spacecraft: Spacecraft, flown: Flown, paused: bool, rate: float) -> dict[str, Any]:
+    """A moment for a viewer: image, detections, catalogue, outcome and estimate of each estimator beside the truth."""
+    message: dict[str, Any] = {
+        "kind": "turn" if flown.exposure is None else "frame",
+        "utc": format_utc(flown.moment.utc_ns),
+        "mode": spacecraft.payload.mode.name,
+        "paused": paused,
+        "rate": rate,
+        "packets": len(flown.packets),
+        "waiting": spacecraft.payload.waiting,
+        "resets": len(spacecraft.resets),
+        "events": [],
+        "verifications": [],
+    }
+    estimates: dict[str, dict[str, Any]] = {}
+    labels = DICTIONARY.labels
+    for packet in flown.packets:
+        try:
+            name, values = DICTIONARY.unpack(packet)
+        except TmtcError:
+            continue
+        if name.startswith("event_"):
+            event = labels(name, "event_id").get(values["event_id"], "")
+            message["events"].append(
+                {"severity": name[6:], "event": event, "values": [values["value_1"], values["value_2"]]}
+            )
+        elif name.startswith("verification_"):
+            message["verifications"].append({"stage": name[13:], **values})
+        elif name == "detections":
+            items = values["items"]
+            message["detections"] = [
+                {"u_px": u, "v_px": v, "diameter_px": d, "score": s}
+                for u, v, d, s in zip(
+                    items["u_px"].tolist(),
+                    items["v_px"].tolist(),
+                    items["diameter_px"].tolist(),
+                    items["score"].tolist(),
+                    strict=True,
+                )
+            ]
+        elif name in ("frame_outcome", "navigation_state"):
+            estimator = labels(name, "estimator")[values["estimator"]]
+            estimate = estimates.setdefault(estimator, {})
+            estimate["outcome"] = labels(name, "outcome")[values["outcome"]]
+            if name == "frame_outcome":
+                estimate["reset_trigger"] = labels(name, "reset_trigger")[values["reset_trigger"]]
+            else:
+                estimate |= {key: values[key] for key in ("latitude_deg", "longitude_deg", "altitude_m")}
+    if flown.exposure is not None:
+        position = world.truth.positions_mcmf(flown.moment.utc_ns)[0]
+        latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))
+        message |= {
+            "frame": flown.moment.frame,
+            "reference": {
+                "latitude_deg": np.degrees(latitude),
+                "longitude_deg": np.degrees(longitude) % 360.0,
+                "altitude_m": altitude,
+            },
+            "altitude_km": altitude / 1e3,
+            "catalogue": _catalogue(world, flown),
+            "image_png": _png(flown.exposure.image),
+        }
+        for estimate in estimates.values():
+            if "altitude_m" in estimate:
+                place = mcmf_from_spherical(
+                    np.radians(estimate["latitude_deg"]),
+                    np.radians(estimate["longitude_deg"]),
+                    estimate["altitude_m"],
+                )
+                estimate["error_m"] = float(np.linalg.norm(place - position))
+        message["estimates"] = estimates
+    return message
+
+
+def _catalogue(world: World, flown: Flown) -> list[dict[str, float]]:
+    """Craters of the terrain's catalogue in the picture, the largest of them."""
+    assert flown.exposure is not None
+    index, uv, diameter_px = craters_in_view(world, flown.exposure, _SMALLEST_SHOWN_PX)
+    shown = np.argsort(-diameter_px, kind="stable")[:_SHOWN_CRATERS].tolist()
+    ids = world.terrain.catalogue.ids[index]
+    return [
+        {
+            "id": int(ids[k]),
+            "u_px": float(uv[k, 0]),
+            "v_px": float(uv[k, 1]),
+            "diameter_px": float(diameter_px[k]),
+        }
+        for k in shown
+    ]
+
+
+def _png(image: Any) -> str:
+    if not image.size:
+        return ""
+    import cv2
+
+    good, encoded = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
+    return base64.b64encode(encoded.tobytes()).decode() if good else ""
+
+
+def _is_rate(text: str) -> bool:
+    try:
+        return 0.0 <= float(text) < 1e9
+    except ValueError:
+        return False
