@@ -62,6 +62,8 @@ _VISIBLE_DEPTH_RATIO = 0.025
 _CENTRE_SIGMA_FLOOR_M = 90.0
 _CENTRE_SIGMA_OF_DIAMETER = 0.03
 _HEIGHT_SIGMA_M = 50.0
+# No place of a crater is better known than this.
+_SMALLEST_SIGMA_M = 10.0
 
 FloatArray = NDArray[np.float64]
 
@@ -204,14 +206,22 @@ def _catalogue_table(scenario: Scenario, catalogue: CraterCatalogue) -> Catalogu
     horizontal_m = navigation.catalogue_error_fraction_of_diameter * chosen.diameter_m
     north_m, east_m = horizontal_m * rng.standard_normal((2, len(chosen)))
     height_m = navigation.catalogue_height_error_m * rng.standard_normal(len(chosen))
-    centre_sigma_m = np.maximum(_CENTRE_SIGMA_FLOOR_M, _CENTRE_SIGMA_OF_DIAMETER * chosen.diameter_m)
+    # Craters of the procedural Moon lie where their list says, but for the errors that the scenario adds.
+    made = catalogue.source.startswith("synthetic")
+    listed_m = np.zeros_like(horizontal_m)
+    if not made:
+        listed_m = np.maximum(_CENTRE_SIGMA_FLOOR_M, _CENTRE_SIGMA_OF_DIAMETER * chosen.diameter_m)
+    centre_sigma_m = np.maximum(np.hypot(listed_m, horizontal_m), _SMALLEST_SIGMA_M)
+    height_sigma_m = np.hypot(
+        _SMALLEST_SIGMA_M if made else _HEIGHT_SIGMA_M, navigation.catalogue_height_error_m
+    )
     return CatalogueTable(
         chosen.ids,
         chosen.latitude_rad + north_m / MOON_RADIUS_M,
         chosen.longitude_rad + east_m / (MOON_RADIUS_M * np.cos(chosen.latitude_rad)),
         chosen.diameter_m,
         chosen.rim_height_m + height_m,
-        np.stack([centre_sigma_m, centre_sigma_m, np.full(len(chosen), _HEIGHT_SIGMA_M)], axis=1),
+        np.stack([centre_sigma_m, centre_sigma_m, np.full(len(chosen), height_sigma_m)], axis=1),
     )
 
 

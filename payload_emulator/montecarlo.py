@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from lunar.propagation import ForceModel, propagate
 from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
 from payload_emulator.flight.anchored import AnchoredNavigator, AnchoredParameters
 from payload_emulator.flight.detections import Detections
+from payload_emulator.flight.landmark_map import FIRST_LANDMARK_ID
 from payload_emulator.flight.outcomes import Outcome
 from payload_emulator.flight.sighting import LandmarkMap, Pose, in_view, landmark_map, look
 from payload_emulator.flight.tables import (
@@ -60,8 +61,10 @@ class SimulatedDetector:
         Error of centres, per axis; `claimed_sigma_px` is what the detector says of it (None: the truth).
     persistence
         Share of the variance that stays with its crater.
-    bias_px
-        Shift of all detections, right and down.
+    bias_px, bias_sigma_px
+        Shift of all detections, right and down: given, and drawn once per run on top.
+    scale, scale_sigma
+        Stretch of all detections about the image centre: given, and drawn once per run on top.
     log_diameter_sigma
         Error of the logarithm of the diameter.
     """
@@ -72,6 +75,9 @@ class SimulatedDetector:
     claimed_sigma_px: float | None = None
     persistence: float = 0.0
     bias_px: tuple[float, float] = (0.0, 0.0)
+    bias_sigma_px: float = 0.0
+    scale: float = 0.0
+    scale_sigma: float = 0.0
     log_diameter_sigma: float = 0.1
 
 
@@ -79,13 +85,15 @@ class SimulatedDetector:
 class CatalogueErrors:
     """Errors of the uploaded catalogue, one sigma, drawn once per run.
 
-    `offset_enu_m` is shared by all craters; `wrong_share` is the share of entries where there is no crater at all.
+    `offset_enu_m` is shared by all craters, with `offset_sigma_m` drawn on top; `wrong_share` is the share of entries
+    where there is no crater at all.
     """
 
     centre_of_diameter: float = 0.03
     centre_floor_m: float = 0.0
     height_m: float = 100.0
     offset_enu_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    offset_sigma_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     wrong_share: float = 0.0
 
 
@@ -118,6 +126,8 @@ class NavigationCase:
         Size (3-D, one sigma) of the error of the state that starts the filter.
     attitude_noise_rad, attitude_bias_rad
         Of the ADCS message, per axis, one sigma; the bias is drawn once per run.
+    on_board
+        Craters that the uploaded catalogue holds, a mask; None for all.
     """
 
     epoch_utc_ns: int
@@ -139,6 +149,7 @@ class NavigationCase:
     attitude_noise_rad: float = float(np.radians(0.01))
     attitude_bias_rad: float = float(np.radians(0.01))
     kidnap: Kidnap | None = None
+    on_board: NDArray[np.bool_] | None = None
     parameters: AnchoredParameters = field(default_factory=AnchoredParameters)
 
 
@@ -223,8 +234,11 @@ class Consistency:
 def fly(case: NavigationCase, seed: int) -> NavigationRun:
     """Return one run of a case: the same seed, the same run."""
     rng = np.random.default_rng(seed)
+    case = _with_drawn_biases(case, np.random.default_rng((seed, 1)))
     true_map = landmark_map(catalogue_table(case.craters))
     table = _with_errors(catalogue_table(case.craters), case.catalogue_errors, rng)
+    if case.on_board is not None:
+        table = table.select(case.on_board)
     states, rotations = _truth(case, rng)
     ticks = np.asarray(ticks_from_utc_ns(case.frame_utc_ns), dtype=np.int64)
     navigator = _navigator(case, table, states[0], int(ticks[0]), rng)
@@ -282,6 +296,40 @@ def anees_bounds(runs: int, degrees: int = 6, sigmas: float = 1.96) -> tuple[flo
     return degrees - float(width), degrees + float(width)
 
 
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether the claims of a filter hold over independent runs, and where they do not."""
+
+    consistent: bool
+    anees_bounds: tuple[float, float]
+    reasons: tuple[str, ...]
+
+
+def verdict(result: Consistency, runs: int) -> Verdict:
+    """Return whether ANEES lies in its bounds, NIS in 0.9 to 1.1, innovations are white and sigmas contain errors.
+
+    Errors last over many frames, so that a run counts as one independent draw: the share inside 1.96 sigma of one
+    axis is then known to 0.22 over the root of the runs (1 sigma), and three of those are allowed.
+    """
+    low, high = anees_bounds(runs)
+    slack = 3.0 * np.sqrt(0.95 * 0.05 / runs)
+    worst = max(abs(share - 0.95) for share in result.contained_95)
+    checks = (
+        (low <= result.anees <= high, f"ANEES {result.anees:.2f} outside {low:.2f} to {high:.2f}"),
+        (
+            0.9 <= result.nis_per_degree <= 1.1,
+            f"NIS per degree {result.nis_per_degree:.3f} outside 0.9 to 1.1",
+        ),
+        (
+            abs(result.innovation_correlation) <= 0.1,
+            f"innovations correlated by {result.innovation_correlation:.3f}, over 0.1",
+        ),
+        (worst <= slack, f"share inside 1.96 sigma {worst:.3f} from 0.95, over {slack:.3f}"),
+    )
+    reasons = tuple(text for good, text in checks if not good)
+    return Verdict(not reasons, (low, high), reasons)
+
+
 def catalogue_table(craters: CraterCatalogue) -> CatalogueTable:
     """Return craters as a table without uncertainty; those without a rim height stand on the sphere."""
     return CatalogueTable(
@@ -291,6 +339,19 @@ def catalogue_table(craters: CraterCatalogue) -> CatalogueTable:
         craters.diameter_m,
         np.nan_to_num(craters.rim_height_m),
         np.zeros((len(craters), 3)),
+    )
+
+
+def _with_drawn_biases(case: NavigationCase, rng: np.random.Generator) -> NavigationCase:
+    """The case with the errors that last for a run drawn into its given ones."""
+    detector, errors = case.detector, case.catalogue_errors
+    bias = np.array(detector.bias_px) + detector.bias_sigma_px * rng.standard_normal(2)
+    offset = np.array(errors.offset_enu_m) + np.array(errors.offset_sigma_m) * rng.standard_normal(3)
+    scale = detector.scale + detector.scale_sigma * float(rng.standard_normal())
+    return replace(
+        case,
+        detector=replace(detector, bias_px=(float(bias[0]), float(bias[1])), scale=scale),
+        catalogue_errors=replace(errors, offset_enu_m=(float(offset[0]), float(offset[1]), float(offset[2]))),
     )
 
 
@@ -382,7 +443,15 @@ def _detect(
 ) -> tuple[Detections, Index]:
     """Return the detections of a frame and the crater that each is of, -1 for none."""
     detector, camera = case.detector, case.camera
-    pose = Pose(position_icrf_m, camera_from_icrf, mcmf_from_icrf, np.zeros(3), np.zeros(2), np.zeros(3))
+    pose = Pose(
+        position_icrf_m,
+        camera_from_icrf,
+        mcmf_from_icrf,
+        np.zeros(3),
+        np.zeros(2),
+        np.zeros(3),
+        detector.scale,
+    )
     index = in_view(craters, pose, camera, 0.0).index
     recall = np.array([*detector.recall, 0.0])[size_class(craters.diameter_m[index])]
     index = index[rng.uniform(size=index.size) < recall]
@@ -419,9 +488,10 @@ def _row(
     fix = navigator.last_fix
     if fix is not None:
         matched = int(fix.index.size)
-        wrong = int(
-            np.count_nonzero(truth[fix.identification.detection] != navigator.landmarks.ids[fix.index])
-        )
+        # Landmarks of the navigator's own map have identities that no true crater has.
+        used = navigator.landmarks.ids[fix.index]
+        other = truth[fix.identification.detection] != used
+        wrong = int(np.count_nonzero(other & (used < FIRST_LANDMARK_ID)))
         innovation = fix.update.mean_innovation
     findable = int(np.count_nonzero(truth >= 0))
     return (

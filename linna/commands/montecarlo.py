@@ -1,0 +1,74 @@
+"""`linna montecarlo`: many seeded runs of anchored navigation with simulated detections, errors against claims."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+
+from linna.output import add_json_flag, emit
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--runs", type=int, default=50, metavar="N", help="runs (default: 50)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the first run (default: 1)")
+    parser.add_argument("--hours", type=float, default=3.0, metavar="H", help="length of a run (default: 3)")
+    parser.add_argument(
+        "--track",
+        choices=("test", "tuning"),
+        default="test",
+        help="orbit flown: that of the paper, or the one noise is tuned on (default: test)",
+    )
+    parser.add_argument(
+        "--noise-factor", type=float, default=1.0, metavar="F", help="factor on the filter's process noise"
+    )
+    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
+    parser.add_argument("--gate", action="store_true", help="exit 1 where errors and claims do not agree")
+    add_json_flag(parser)
+    parser.set_defaults(handler=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from linna.data import data_folder
+    from linna.errors import UsageError
+    from payload_emulator.montecarlo import consistency, fly_many, verdict
+    from payload_emulator.montecarlo_world import standard_case
+
+    if arguments.runs < 1 or not arguments.hours > 0.1 or not arguments.noise_factor > 0.0:
+        raise UsageError(
+            "expected --runs of 1 or more, --hours over 0.1 and a positive --noise-factor, found "
+            f"{arguments.runs}, {arguments.hours:g} and {arguments.noise_factor:g}"
+        )
+    case = standard_case(data_folder(), arguments.track, arguments.hours, arguments.noise_factor)
+    seeds = list(range(arguments.seed, arguments.seed + arguments.runs))
+    result = consistency(fly_many(case, seeds, arguments.workers), settle_frames=60)
+    judged = verdict(result, arguments.runs)
+    figures = {
+        "runs": arguments.runs,
+        "seeds": [seeds[0], seeds[-1]],
+        "hours": arguments.hours,
+        "track": arguments.track,
+        "noise_factor": arguments.noise_factor,
+        "gravity": {"truth": case.gravity.name, "filter": case.filter_gravity.name},
+        "detections": "simulated",
+        **asdict(result),
+        **asdict(judged),
+    }
+    emit(arguments, figures, text=describe(figures))
+    return 1 if arguments.gate and not judged.consistent else 0
+
+
+def describe(figures: dict) -> str:
+    """A few lines about the runs, for people."""
+    low, high = figures["anees_bounds"]
+    inside = ", ".join(f"{share:.3f}" for share in figures["contained_95"])
+    return "\n".join(
+        [
+            f"{figures['runs']} runs of {figures['hours']:g} h, track {figures['track']}, simulated detections",
+            f"position error: median {figures['median_m']:.0f} m, 95 % {figures['p95_m']:.0f} m, largest "
+            f"{figures['largest_m']:.0f} m",
+            f"ANEES(6) {figures['anees']:.2f}, 95 % bounds {low:.2f} to {high:.2f}; NIS per degree "
+            f"{figures['nis_per_degree']:.3f}; lag-one correlation {figures['innovation_correlation']:.3f}",
+            f"inside 1.96 sigma, radial, transverse, normal: {inside}",
+            "consistent" if figures["consistent"] else f"not consistent: {'; '.join(figures['reasons'])}",
+        ]
+    )

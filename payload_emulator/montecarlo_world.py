@@ -1,0 +1,120 @@
+"""Worlds for Monte Carlo runs: gravity rough to any degree, craters of the paper's density, two tracks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from lunar.catalogue import CraterCatalogue, make_catalogue
+from lunar.constants import MOON_RADIUS_M
+from lunar.datafolder import DataFolder
+from lunar.elements import Elements, icrf_state_from_elements
+from lunar.frames import IauOrientation
+from lunar.gravity import GravityField, builtin_gravity, load_gravity
+from lunar.timescales import parse_utc, tdb_s_from_utc_ns
+from payload_emulator.flight.anchored import AnchoredParameters
+from payload_emulator.flight.dynamics import ProcessNoise, process_noise
+from payload_emulator.montecarlo import CatalogueErrors, NavigationCase, SimulatedDetector
+
+Track = Literal["tuning", "test"]
+
+# Kaula's rule for the Moon: size of a normalised coefficient of degree n is this over n squared.
+KAULA = 2.5e-4
+_TRUTH_DEGREE, _FILTER_DEGREE = 150, 100
+# Craters of 5 to 30 km per square metre, and the slope of their cumulative size distribution (the paper's counts).
+_DENSITY_M2, _SIZE_SLOPE = 2.09e-9, -1.77
+_NS = 1_000_000_000
+# The paper's orbit; the track for tuning lies elsewhere in inclination, node, perilune and time.
+_TRACKS = {
+    "test": ("2029-08-07T00:00:00Z", (89.076, 3.164, 333.604, 8.882)),
+    "tuning": ("2029-09-16T06:00:00Z", (86.5, 121.0, 210.0, 80.0)),
+}
+
+
+def rough_gravity(degree: int, seed: int = 3) -> GravityField:
+    """The built-in field continued with random coefficients of the size that the Moon's have."""
+    known = builtin_gravity()
+    rng = np.random.default_rng(seed)
+    n = np.arange(degree + 1)
+    size = np.where(n > known.degree, KAULA / np.maximum(n, 1) ** 2, 0.0)[:, None]
+    c_bar = np.tril(rng.standard_normal((degree + 1, degree + 1))) * size
+    s_bar = np.tril(rng.standard_normal((degree + 1, degree + 1)), -1) * size
+    s_bar[:, 0] = 0.0
+    k = known.degree + 1
+    c_bar[:k, :k], s_bar[:k, :k] = known.c_bar, known.s_bar
+    return GravityField("rough", known.gm_m3_s2, known.radius_m, c_bar, s_bar)
+
+
+def crater_world(seed: int = 11) -> CraterCatalogue:
+    """Craters of 5 to 30 km, uniform on the sphere at the paper's density, with heights of two kilometres' range."""
+    rng = np.random.default_rng(seed)
+    count = int(4.0 * np.pi * MOON_RADIUS_M**2 * _DENSITY_M2)
+    z, longitude = rng.uniform(-1.0, 1.0, count), rng.uniform(0.0, 2.0 * np.pi, count)
+    diameter = 5e3 * (1.0 - rng.uniform(size=count) * (1.0 - 6.0**_SIZE_SLOPE)) ** (1.0 / _SIZE_SLOPE)
+    height = 1_500.0 * np.sin(3.0 * longitude) * z + 500.0 * rng.standard_normal(count)
+    return make_catalogue(np.arcsin(z), longitude, diameter, source="simulated", rim_height_m=height)
+
+
+def standard_case(data: DataFolder, track: Track, hours: float, noise_factor: float = 1.0) -> NavigationCase:
+    """The paper's orbit from 5 km and 5 m/s off, a frame each 15 s, images within 60 degrees of latitude.
+
+    Truth flies GRAIL to degree 150, the filter Lunar Prospector's field to 100, where both are at hand; else a rough
+    field and the same cut. Every error that the filter allows for is drawn with the size that it allows.
+
+    Parameters
+    ----------
+    noise_factor
+        Factor on all process noise of the filter: 1 is as shipped.
+    """
+    if data.gravity is not None and data.gravity_alternative is not None:
+        gravity, other = load_gravity(data.gravity), load_gravity(data.gravity_alternative)
+    else:
+        gravity = other = rough_gravity(_TRUTH_DEGREE)
+    epoch, degrees = _TRACKS[track]
+    epoch_utc_ns = parse_utc(epoch)
+    inclination, node, perilune, anomaly = (float(value) for value in np.radians(degrees))
+    position, velocity = icrf_state_from_elements(
+        Elements(1_768_180.0, 0.006908, inclination, node, perilune, anomaly),
+        float(tdb_s_from_utc_ns(epoch_utc_ns)),
+        gravity.gm_m3_s2,
+    )
+    parameters = AnchoredParameters(gravity_degree=_FILTER_DEGREE)
+    errors = parameters.errors
+    frames = round(hours * 240.0)
+    # Two arcs of 37 minutes in each period of 111, with gaps of 18 over the poles.
+    elapsed_s = np.arange(frames) * 15.0
+    return NavigationCase(
+        epoch_utc_ns=epoch_utc_ns,
+        position_icrf_m=position,
+        velocity_icrf_m_s=velocity,
+        frame_utc_ns=epoch_utc_ns + np.arange(frames) * 15 * _NS,
+        imaging=elapsed_s % 3_336.0 < 2_226.0,
+        gravity=gravity,
+        gravity_degree=min(_TRUTH_DEGREE, gravity.degree),
+        orientation=IauOrientation(),
+        filter_gravity=other.truncated(_FILTER_DEGREE),
+        filter_orientation=IauOrientation(),
+        craters=crater_world(),
+        detector=SimulatedDetector(
+            persistence=parameters.detection_persistence,
+            bias_sigma_px=errors.pixel_bias_px,
+            scale_sigma=errors.scale_sigma,
+        ),
+        catalogue_errors=CatalogueErrors(offset_sigma_m=errors.catalogue_offset_m),
+        start_position_m=5_000.0,
+        start_velocity_m_s=5.0,
+        attitude_noise_rad=errors.attitude_noise_rad,
+        attitude_bias_rad=errors.attitude_bias_rad,
+        parameters=replace(parameters, noise=_scaled(process_noise(_FILTER_DEGREE), noise_factor)),
+    )
+
+
+def _scaled(noise: ProcessNoise, factor: float) -> ProcessNoise:
+    r, t, n = noise.white_psd_m2_s3
+    a, b, c = noise.markov_sigma_m_s2
+    root = float(np.sqrt(factor))
+    return ProcessNoise(
+        (factor * r, factor * t, factor * n), (root * a, root * b, root * c), noise.correlation_s
+    )
