@@ -133,9 +133,12 @@ class LightSection:
 
 @dataclass(frozen=True, slots=True)
 class TerrainSection:
-    """`auto`: the real terrain where its rasters are at hand, else the procedural Moon."""
+    """`auto`: the real terrain where its rasters are at hand, else the procedural Moon.
 
-    source: Literal["auto", "raster", "procedural"] = "auto"
+    `catalogue`: the craters of the data folder's catalogue, at their places and sizes, on a procedural base.
+    """
+
+    source: Literal["auto", "raster", "procedural", "catalogue"] = "auto"
 
 
 @dataclass(frozen=True, slots=True)
