@@ -1,74 +1,217 @@
-"""Time of a 512 x 512 frame with shadows on one core, its stages beside it: python -m benchmarks.render.
+"""Renderers: python -m benchmarks render [--poses N] [--every K].
 
-Alternative named beside it: the ray march over the same frame (every 8th pixel of every 8th row, scaled up).
+One JSON object, on the procedural Moon and, where LINNA_DATA names it, on GLD100 terrain no detector was trained on.
+
+speed: milliseconds of processor time of a 512 x 512 frame with shadows, by stage, at three altitudes, the smallest of
+nine; beside it the ray march over the same frame, and Blender's Cycles at 16 samples where LINNA_BLENDER_PYTHON names
+an interpreter that has it.
+fast_vs_raymarch: random poses of 14 to 50 km, Sun of 3 to 60 degrees, any azimuth and yaw, tilt to 5 degrees.
+labels_vs_cast_rims: labels against rims found by casting rays onto the same terrain, pixels.
 """
 
 from __future__ import annotations
 
+import argparse
+import dataclasses
 import json
 import math
 import os
 import resource
 import time
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.datafolder import find_data
+from lunar.errors import LunarError
 from lunar.frames import mcmf_from_spherical
+from payload_emulator.comparison import compare_renderings, thinned
+from payload_emulator.errors import PayloadError
 from payload_emulator.sim import raymarch, renderer
+from payload_emulator.sim.cycles import render_scene
+from payload_emulator.sim.cycles_scene import CyclesSettings, describe_scene
 from payload_emulator.sim.labels import label_frame
+from payload_emulator.sim.lens import pointed_camera_from_mcmf
 from payload_emulator.sim.light import paper_light, sun_direction_mcmf
+from payload_emulator.sim.rims import rim_errors
 from payload_emulator.sim.sensor import SensorModel, expose
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.tiles import TiledTerrain
 
 REPEATS = 9
+CAMERA = PinholeCamera()
+SIZES_M = ((5e3, 10e3), (10e3, 15e3), (15e3, 30e3), (5e3, 30e3))
 
 
-def measure(terrain: TiledTerrain, latitude_deg: float, longitude_deg: float) -> dict[str, object]:
-    """Milliseconds of processor time per stage at three altitudes, the smallest of nine."""
-    camera = PinholeCamera()
-    rows: dict[str, object] = {}
-    for number, altitude_km in enumerate((14.0, 30.0, 48.6)):
-        place = math.radians(latitude_deg), math.radians(longitude_deg)
-        position = mcmf_from_spherical(*place, 1000.0 * altitude_km)
-        rotation = nadir_camera_from_mcmf(position)
-        sun = sun_direction_mcmf(*paper_light(1, number), *place)
-        first = time.thread_time()
-        picture = renderer.render(terrain, camera, position, rotation, sun)
-        first = time.thread_time() - first
-        label_frame(terrain, camera, position, rotation, lit=picture.lit)
-        stages: dict[str, list[float]] = {"render": [], "sensor": [], "labels": []}
-        for _ in range(REPEATS):
-            marks = [time.thread_time()]
-            picture = renderer.render(terrain, camera, position, rotation, sun)
-            marks.append(time.thread_time())
-            expose(picture.radiance, SensorModel(), np.random.default_rng(0))
-            marks.append(time.thread_time())
-            label_frame(terrain, camera, position, rotation, lit=picture.lit)
-            marks.append(time.thread_time())
-            for name, spent in zip(stages, np.diff(marks), strict=True):
-                stages[name].append(1e3 * float(spent))
-        raymarch.render(terrain, camera, position, rotation, sun, every=64)
-        began = time.thread_time()
-        raymarch.render(terrain, camera, position, rotation, sun, every=8)
-        marched = 64.0 * (time.thread_time() - began)
-        rows[f"{altitude_km:g} km"] = {
-            **{f"{name}_ms": round(min(values), 1) for name, values in stages.items()},
-            "first_frame_with_tiles_ms": round(1e3 * first, 1),
-            "raymarch_ms": round(1e3 * marched),
-        }
-    return rows
+@dataclasses.dataclass(frozen=True)
+class Region:
+    """Where random poses are drawn: latitudes and longitudes in degrees; the place of the timed frames."""
+
+    latitude_deg: tuple[float, float]
+    longitude_deg: tuple[float, float]
+    timed_deg: tuple[float, float]
+
+
+PROCEDURAL = Region((-55.0, 55.0), (0.0, 360.0), (10.0, 20.0))
+# Western Procellarum to the southern highlands, away from the edges of the tiles at hand.
+REAL = Region((-50.0, 50.0), (286.0, 298.0), (-25.0, 295.0))
+
+
+def speed(terrain: TiledTerrain, region: Region, blender: str) -> dict[str, object]:
+    """Milliseconds of processor time per stage at three altitudes."""
+    return {
+        f"{km:g} km": _speed_at(terrain, region, km, n, blender) for n, km in enumerate((14.0, 30.0, 48.6))
+    }
+
+
+def _speed_at(
+    terrain: TiledTerrain, region: Region, altitude_km: float, number: int, blender: str
+) -> dict[str, object]:
+    place = math.radians(region.timed_deg[0]), math.radians(region.timed_deg[1])
+    position = mcmf_from_spherical(*place, 1000.0 * altitude_km)
+    pose = (terrain, CAMERA, position, nadir_camera_from_mcmf(position))
+    view = (*pose, sun_direction_mcmf(*paper_light(1, number), *place))
+    first_ms = _cpu_ms(lambda: renderer.render(*view))
+    picture = renderer.render(*view)
+    label_frame(*pose, lit=picture.lit)
+    render_ms = _least_ms(lambda: renderer.render(*view))
+    raymarch.render(*view, every=64)
+    march_ms = 64.0 * _cpu_ms(lambda: raymarch.render(*view, every=8))
+    sensor_ms = _least_ms(lambda: expose(picture.radiance, SensorModel(), np.random.default_rng(0)))
+    row: dict[str, object] = {
+        "render_ms": round(render_ms, 1),
+        "sensor_ms": round(sensor_ms, 1),
+        "labels_ms": round(_least_ms(lambda: label_frame(*pose, lit=picture.lit)), 1),
+        "first_frame_with_tiles_ms": round(first_ms, 1),
+        "raymarch_ms": round(march_ms),
+        "raymarch_over_fast": round(march_ms / render_ms),
+    }
+    if blender and number == 1:
+        made = render_scene(describe_scene(*view), CyclesSettings(samples=16), blender)
+        row["cycles_16_samples_cpu_ms"] = round(1e3 * made.render_cpu_s)
+        row["cycles_16_samples_wall_ms"] = round(1e3 * made.render_s)
+        row["cycles_cpu_over_fast"] = round(1e3 * made.render_cpu_s / render_ms)
+        row["blender"] = made.blender
+    return row
+
+
+def agreement(terrain: TiledTerrain, region: Region, poses: int, every: int) -> dict[str, object]:
+    """Fast against the ray march, and labels against cast rims, over the same random poses."""
+    rng = np.random.default_rng(20)
+    fast, marched = [], []
+    offsets: list[np.ndarray] = []
+    tried = 0
+    while len(fast) < poses and tried < 4 * poses:
+        tried += 1
+        latitude = math.radians(rng.uniform(*region.latitude_deg))
+        longitude = math.radians(rng.uniform(*region.longitude_deg))
+        position = mcmf_from_spherical(latitude, longitude, rng.uniform(14e3, 50e3))
+        rotation = pointed_camera_from_mcmf(
+            position, math.radians(rng.uniform(-5.0, 5.0)), rng.uniform(0.0, 2.0 * math.pi)
+        )
+        elevation, azimuth = math.radians(rng.uniform(3.0, 60.0)), rng.uniform(0.0, 2.0 * math.pi)
+        view = (
+            terrain,
+            CAMERA,
+            position,
+            rotation,
+            sun_direction_mcmf(elevation, azimuth, latitude, longitude),
+        )
+        try:
+            picture = renderer.render(*view)
+            oracle = raymarch.render(*view, every=every)
+        except (PayloadError, LunarError) as error:
+            print(f"pose left out: {error}", flush=True)
+            continue
+        fast.append(thinned(picture, every))
+        marched.append(oracle)
+        if len(fast) % 2:
+            errors = rim_errors(terrain, CAMERA, position, rotation)
+            offsets.append(
+                np.stack(
+                    [
+                        terrain.catalogue.diameter_m[errors.index],
+                        errors.offset_u_px,
+                        errors.offset_v_px,
+                        errors.scatter_px,
+                    ]
+                )
+            )
+    found = np.concatenate(offsets, axis=1)
+    return {
+        "fast_vs_raymarch": {
+            **{
+                key: round(value, 4)
+                for key, value in dataclasses.asdict(compare_renderings(marched, fast)).items()
+            },
+            "worst_view_radiance_rmse": round(
+                max(compare_renderings([m], [f]).radiance_rmse for m, f in zip(marched, fast, strict=True)), 4
+            ),
+            "median_range_error_m": round(
+                float(
+                    np.median(
+                        [
+                            np.nanmedian(np.abs(m.range_m - f.range_m))
+                            for m, f in zip(marched, fast, strict=True)
+                        ]
+                    )
+                ),
+                2,
+            ),
+        },
+        "labels_vs_cast_rims": {
+            f"{low / 1e3:g}-{high / 1e3:g} km": _rims(found, low, high) for low, high in SIZES_M
+        },
+    }
+
+
+def _rims(found: np.ndarray, low_m: float, high_m: float) -> dict[str, float]:
+    chosen = found[:, (found[0] >= low_m) & (found[0] < high_m)]
+    if not chosen.shape[1]:
+        return {"craters": 0}
+    offset = np.hypot(chosen[1], chosen[2])
+    return {
+        "craters": int(offset.size),
+        "rms_px_per_axis": round(float(np.sqrt(np.mean(offset**2) / 2.0)), 4),
+        "median_px": round(float(np.median(offset)), 4),
+        "p95_px": round(float(np.percentile(offset, 95)), 4),
+        "scatter_along_rim_px": round(float(np.median(chosen[3])), 3),
+    }
+
+
+def _least_ms(work: Callable[[], Any]) -> float:
+    return min(_cpu_ms(work) for _ in range(REPEATS))
+
+
+def _cpu_ms(work: Callable[[], Any]) -> float:
+    began = time.thread_time()
+    work()
+    return 1e3 * (time.thread_time() - began)
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--poses", type=int, default=50, help="random poses per terrain (default: 50)")
+    parser.add_argument(
+        "--every", type=int, default=4, help="march every so-manieth pixel and row (default: 4)"
+    )
+    arguments = parser.parse_args()
     root = os.environ.get("LINNA_DATA")
-    results: dict[str, object] = {
-        "procedural": measure(open_terrain("procedural", find_data(None), 3), 10.0, 20.0)
-    }
+    blender = os.environ.get("LINNA_BLENDER_PYTHON", "")
+    results: dict[str, object] = {}
+    worlds = [("procedural Moon (rung 2)", "procedural", None, PROCEDURAL)]
     if root:
-        results["GLD100"] = measure(open_terrain("raster", find_data(root), 3), -25.0, 305.0)
+        worlds.append(("GLD100, regions never trained on (rung 3)", "raster", root, REAL))
+    for name, kind, data, region in worlds:
+        terrain = open_terrain(kind, find_data(data), 3)
+        results[name] = {
+            "speed": speed(terrain, region, blender),
+            **agreement(terrain, region, arguments.poses, arguments.every),
+        }
     results["peak_rss_mb"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0)
     print(json.dumps(results, indent=1))
 

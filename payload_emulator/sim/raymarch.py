@@ -86,6 +86,49 @@ def render(
     return Rendering(radiance, lit, range_m)
 
 
+def cast(
+    terrain: Terrain,
+    camera: PinholeCamera,
+    position_mcmf_m: npt.ArrayLike,
+    camera_from_mcmf: npt.ArrayLike,
+    uv_px: npt.ArrayLike,
+) -> npt.NDArray[np.float64]:
+    """Where the rays of picture points (n, 2), inside the picture or not far outside, meet the ground: (n, 3) in MCMF,
+    NaN for the sky.  The same march, over the same level of detail, as that of `render`.
+    """
+    position = np.asarray(position_mcmf_m, dtype=np.float64)
+    rotation = np.asarray(camera_from_mcmf, dtype=np.float64)
+    rays = camera.rays(uv_px) @ rotation
+    latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))
+    ground = float(terrain.height_m(latitude, longitude))
+    level = terrain.level_for((altitude - ground) / camera.focal_px)
+    overhead = position / float(np.linalg.norm(position))
+    patch = terrain.patch(*rays_window(camera, position, rotation, overhead), level)
+    radiance, lit, range_m = (np.empty((1, rays.shape[0]), np.float32) for _ in range(3))
+    _march(
+        position,
+        np.ascontiguousarray(rays[None]),
+        overhead,
+        patch.heights,
+        patch.albedo,
+        patch.table,
+        patch.first_row,
+        patch.first_column,
+        patch.pixels_per_radian,
+        patch.low_m,
+        patch.high_m,
+        SUN_ANGULAR_RADIUS_RAD,
+        Photometry().tables(),
+        False,
+        MEAN_ALBEDO,
+        1.0,
+        radiance,
+        lit,
+        range_m,
+    )
+    return np.asarray(position + rays * range_m[0, :, None])
+
+
 def rays_window(
     camera: PinholeCamera,
     position: npt.NDArray[np.float64],
