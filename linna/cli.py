@@ -36,6 +36,7 @@ GROUPS: dict[str, tuple[str, str]] = {
     "pass": ("pass_", "list and show passes"),
     "report": ("report", "write the report of a pass"),
     "plan": ("plan", "observation windows: search, enter, approve, uplink, exchange"),
+    "trajectory": ("trajectory", "solutions of a pass as TUM files, absolute and relative errors"),
     "command": ("command", "telecommands: queue, release, uplink, verification"),
     "serve": ("serve", "run the ground service's HTTP API"),
     "worker": ("worker", "run a job worker of the ground service"),
