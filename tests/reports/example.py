@@ -43,7 +43,9 @@ from reports.values import (
     RegressionGate,
     RegressionReport,
     ResidualSeries,
+    ScoreGroup,
     Sensitivity,
+    SigmaBin,
     TerrainMap,
     TimeSpan,
     TrackSeries,
@@ -680,6 +682,20 @@ def detector_report(seed: int = 13) -> DetectorReport:
         by_source=(
             NamedScore("procedural Moon", 1_200, 0.86, 0.73, 1.2),
             NamedScore("real terrain", 1_053, 0.79, 0.55, 1.7),
+        ),
+        groups=(
+            ScoreGroup(
+                "By type of terrain",
+                (
+                    NamedScore("lowland", 612, 0.87, 0.43, 1.1, 0.93, 0.61),
+                    NamedScore("upland", 1_641, 0.79, 0.38, 1.8, 0.88, 0.52),
+                ),
+                "Lowland: mean ground below −1 km.",
+            ),
+        ),
+        sigma=(
+            SigmaBin("all", 1_400, 0.92, 1.21, 0.691, 0.958),
+            SigmaBin("14–20 km up", 210, 1.40, 1.33, 0.655, 0.941),
         ),
         training=(
             TrainingCurve("training loss", epoch, 3.0 * np.exp(-epoch / 12) + 0.4 + rng.normal(0, 0.03, 40)),

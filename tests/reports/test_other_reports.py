@@ -120,3 +120,18 @@ def test_the_bias_of_every_octant_met_is_in_the_table() -> None:
     words = Page(render_html(example.detector_report())).text
     table = words[words.index("Mean residual by octant of Sun azimuth") :]
     assert "NE" in table and "NW" in table
+
+
+def test_strict_and_ignore_aware_scores_stand_side_by_side() -> None:
+    words = Page(render_html(example.detector_report())).text
+    table = words[words.index("By type of terrain") :]
+    assert "precision, ignore-aware" in table and "recall, ignore-aware" in table
+    lowland = table[table.index("lowland") :]
+    assert lowland.index("0.870") < lowland.index("0.930") < lowland.index("0.610")
+
+
+def test_predicted_uncertainty_stands_beside_what_it_should_be() -> None:
+    words = Page(render_html(example.detector_report())).text
+    table = words[words.index("Predicted uncertainty") :]
+    for figure in ("14–20 km up", "1.33", "0.655", "0.941", "0.683"):
+        assert figure in table

@@ -1,11 +1,10 @@
-"""Training learns, resumes to the same weights, and exports what it trained."""
+"""Training learns, stops early, resumes to the same weights, begins where another left off."""
 
 import json
 import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -14,12 +13,9 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from payload_emulator.errors import DatasetError, ModelError  # noqa: E402
-from payload_emulator.flight.detector import OnnxDetector  # noqa: E402
 from payload_emulator.training import train as training  # noqa: E402
-from payload_emulator.training.evaluate import evaluate  # noqa: E402
-from payload_emulator.training.export import PARITY_LIMIT, export, load_network  # noqa: E402
+from payload_emulator.training.export import load_network  # noqa: E402
 from payload_emulator.training.landmarks import Landmarks  # noqa: E402
-from payload_emulator.training.quantise import quantise  # noqa: E402
 from payload_emulator.training.train import TrainParameters, train  # noqa: E402
 
 SHORT = TrainParameters(
@@ -100,43 +96,6 @@ def test_the_loss_falls_on_blobs(blob_dataset, tmp_path):
     assert np.mean(losses[-4:]) < 0.8 * np.mean(losses[:4])
 
 
-@pytest.fixture(scope="module")
-def exported(finished, blob_dataset, tmp_path_factory):
-    run, _ = finished
-    path = tmp_path_factory.mktemp("export") / "m.onnx"
-    figures = export(
-        run / "checkpoint.pt", path, [blob_dataset], revision="abc", paper_classes=True, test=True
-    )
-    return path.read_bytes(), figures
-
-
-def test_an_exported_network_agrees_with_torch_and_carries_its_origin(exported, blob_dataset):
-    octets, figures = exported
-    assert figures["parity_max_abs"] <= PARITY_LIMIT
-    metadata = OnnxDetector(octets).metadata
-    assert metadata["git_revision"] == "abc"
-    assert metadata["training_seed"] == "1"
-    assert json.loads(metadata["data"])[0]["labels_sha256"] == blob_dataset.digest
-    assert float(metadata["score_threshold"]) == figures["score_threshold"]
-    tested = json.loads(metadata["test_figures"])["test"]
-    assert set(tested) == {"frames", "rung", "strict", "ignore_aware"}
-
-
-def test_the_papers_variant_keeps_its_class_heatmaps_and_is_scored_by_them(exported, blob_dataset):
-    octets, _ = exported
-    detector = OnnxDetector(octets)
-    heatmap, geometry = detector.run_network(np.zeros((1, 1, 512, 512), np.float32))
-    assert heatmap.shape[1] == 4 and geometry.shape[1] == 5
-    scored = evaluate(octets, blob_dataset, threshold=0.01, paper_classes=True)
-    assert [row["size_class"] for row in scored["per_class"]] == [0, 1, 2]
-
-
-def test_a_network_without_class_heatmaps_is_no_papers_variant(blob_dataset, tmp_path):
-    train([blob_dataset], tmp_path, replace(SHORT, steps=1, paper_classes=False, depth=False))
-    with pytest.raises(ModelError, match="expected a network with the paper's class heatmaps"):
-        export(tmp_path / "checkpoint.pt", tmp_path / "p.onnx", [], paper_classes=True)
-
-
 def test_a_run_may_start_from_a_network_with_fewer_heads_and_says_so(blob_dataset, tmp_path):
     old, new = tmp_path / "old", tmp_path / "new"
     train([blob_dataset], old, replace(SHORT, steps=2, paper_classes=False, depth=False))
@@ -165,17 +124,6 @@ def test_a_run_without_gain_stops_early(blob_dataset, tmp_path, monkeypatch):
     figures = train([blob_dataset], tmp_path, parameters, report=lines.append)
     assert figures["steps"] == 3 and figures["best"]["step"] == 1
     assert any("stopped early: 2 validations without gain" in line for line in lines)
-
-
-def test_eight_bits_make_the_network_smaller_and_keep_its_answers_near(exported, blob_dataset):
-    octets, _ = exported
-    small = quantise(octets, [blob_dataset], frames=2)
-    assert len(small) < 0.5 * len(octets)
-    image = np.random.default_rng(1).standard_normal((1, 1, 512, 512)).astype(np.float32)
-    full, coarse = (OnnxDetector(part).run_network(image)[1] for part in (octets, small))
-    # Eight bits through sixty layers of an untrained net: the maps must still be alike.
-    assert np.corrcoef(full[0, 2].ravel(), coarse[0, 2].ravel())[0, 1] > 0.8
-    assert OnnxDetector(small).metadata["score_threshold"] == OnnxDetector(octets).metadata["score_threshold"]
 
 
 def test_landmarks_are_labels_of_the_second_round(blob_dataset, tmp_path, monkeypatch):
@@ -207,31 +155,39 @@ def test_a_damaged_checkpoint_is_refused(tmp_path):
         load_network(tmp_path / "x.pt")
 
 
-def test_a_killed_run_keeps_a_checkpoint_that_can_be_read(blob_dataset, tmp_path):
-    """The file is replaced in one move, so whenever the process dies there is a whole one or none."""
+def test_a_run_killed_and_resumed_reaches_the_figures_of_one_left_alone(blob_dataset, tmp_path):
+    """The checkpoint is replaced in one move, so whenever the process dies there is a whole one to go on from."""
+    parameters = replace(SHORT, steps=5, batch=2, crop_px=96, replicas=1, validate_every_minutes=0.0)
     code = (
-        "import sys; from pathlib import Path\n"
+        "import sys, time; from dataclasses import replace; from pathlib import Path\n"
         "from payload_emulator.training import train as t; from payload_emulator.training.dataset import Dataset\n"
         "save = t._save\n"
         "def slow(path, *rest):\n"
-        "    save(path, *rest); print('saved', flush=True)\n"
+        "    save(path, *rest); print(path.name, flush=True); time.sleep(0.4)\n"
         "t._save = slow\n"
-        "p = t.TrainParameters(minutes=0.0, steps=500, batch=2, crop_px=96, validation_frames=1, replicas=1,\n"
-        "    validate_every_minutes=0.0, detail_blocks=0)\n"
+        f"p = t.TrainParameters(minutes=0.0, steps=5, batch=2, crop_px=96, warm_up_steps={SHORT.warm_up_steps},\n"
+        f"    validation_frames={SHORT.validation_frames}, replicas=1, validate_every_minutes=0.0, detail_blocks=0)\n"
         "t.train([Dataset(Path(sys.argv[1]))], Path(sys.argv[2]), p)\n"
     )
     process = subprocess.Popen(
-        [sys.executable, "-c", code, str(blob_dataset.folder), str(tmp_path)],
+        [sys.executable, "-c", code, str(blob_dataset.folder), str(tmp_path / "killed")],
         stdout=subprocess.PIPE,
         env={**os.environ, "PYTHONPATH": os.getcwd()},
         text=True,
     )
     assert process.stdout is not None
-    assert process.stdout.readline().strip() == "saved"
-    assert process.stdout.readline().strip() == "saved"
-    time.sleep(0.02)
+    while process.stdout.readline().strip() != "checkpoint.pt":
+        pass
     process.send_signal(signal.SIGKILL)
     process.wait()
     process.stdout.close()
-    _, stored = load_network(tmp_path / "checkpoint.pt")
-    assert stored["progress"]["step"] >= 1
+    _, stored = load_network(tmp_path / "killed" / "checkpoint.pt")
+    assert 1 <= stored["progress"]["step"] < 5
+    resumed = train([blob_dataset], tmp_path / "killed", parameters)
+    straight = train([blob_dataset], tmp_path / "straight", parameters)
+    assert resumed["steps"] == straight["steps"] == 5
+    assert resumed["best"] == straight["best"]
+    one, _ = load_network(tmp_path / "killed" / "checkpoint.pt")
+    other, _ = load_network(tmp_path / "straight" / "checkpoint.pt")
+    for name, value in one.state_dict().items():
+        assert torch.equal(value, other.state_dict()[name]), name
