@@ -39,6 +39,11 @@ class Settings(BaseSettings):
     )
     host: str = Field(default="127.0.0.1", description="Address that the HTTP server binds to")
     port: int = Field(default=8042, ge=0, le=65535, description="Port of the HTTP server")
+    live_console: str | None = Field(
+        default=None,
+        pattern=r"^[A-Za-z0-9.:-]+:[0-9]{1,5}$",
+        description="HOST:PORT of the console of a payload flown live, for the live page",
+    )
     upload_limit_mib: int = Field(default=4096, ge=1, description="Largest upload accepted, MiB")
 
     def resolved_database_url(self) -> str:
@@ -46,6 +51,13 @@ class Settings(BaseSettings):
         if self.database_url is not None:
             return normalised_url(self.database_url.get_secret_value())
         return f"sqlite:///{self.home / 'linna.db'}"
+
+    def resolved_live_console(self) -> tuple[str, int] | None:
+        """Host and port of the console of a live payload; None where there is none."""
+        if self.live_console is None:
+            return None
+        host, _, port = self.live_console.rpartition(":")
+        return host, int(port)
 
     def resolved_broker_url(self) -> str | None:
         """The Celery broker in force; None for in-process jobs."""

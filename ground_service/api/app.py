@@ -13,6 +13,7 @@ from ground_service.api.limits import BodyLimit, HeadersAndTags
 from ground_service.api.live import live
 from ground_service.api.metrics import Metrics, Watch
 from ground_service.api.operations import operations
+from ground_service.api.payload_console import payload_console
 from ground_service.api.planning import planning
 from ground_service.api.regression_routes import REGRESSION_UPLOAD_PATHS, regressions
 from ground_service.api.routes import UPLOAD_PATHS, router
@@ -56,11 +57,13 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         lifespan=lifespan,
     )
     app.state.open_without_users = settings.host in LOOPBACK
+    app.state.live_console = settings.resolved_live_console()
     app.state.upload_limit_octets = settings.upload_limit_mib << 20
     for one in (router, planning, telecommands, regressions):
         app.include_router(one)
     app.include_router(operations)
     app.include_router(live)
+    app.include_router(payload_console)
     app.include_router(pages)
     app.state.metrics = Metrics()
     problems.install(app)

@@ -16,7 +16,7 @@ from ground_service.api.common import API_PREFIX
 from ground_service.errors import NotAuthorised
 from ground_service.services.feed import last_number, read_feed
 from ground_service.services.ground import Ground
-from ground_service.services.users import authenticate, has_users
+from ground_service.services.users import LOCAL_CALLER, Caller, authenticate, has_users
 from ground_service.services.views import time_text
 
 POLL_S = 0.5
@@ -36,11 +36,11 @@ async def watch(
     is all that a browser can send).
     """
     ground: Ground = socket.app.state.ground
-    protocols = [value.strip() for value in socket.headers.get("sec-websocket-protocol", "").split(",")]
-    if not await run_in_threadpool(_may_watch, socket, ground, protocols):
+    caller = await run_in_threadpool(caller_of_socket, socket)
+    if caller is None or not caller.may("viewer"):
         await socket.close(POLICY_VIOLATION)
         return
-    await socket.accept(subprotocol="bearer" if protocols[0] == "bearer" else None)
+    await socket.accept(subprotocol="bearer" if "sec-websocket-protocol" in socket.headers else None)
     number = await run_in_threadpool(last_number, ground) if after is None else after
     gone = asyncio.create_task(_until_gone(socket))
     try:
@@ -73,13 +73,16 @@ async def _until_gone(socket: WebSocket) -> None:
                 return
 
 
-def _may_watch(socket: WebSocket, ground: Ground, protocols: list[str]) -> bool:
+def caller_of_socket(socket: WebSocket) -> Caller | None:
+    """Who opened a WebSocket: by the Authorization header or the second value of the sub-protocol ``bearer``."""
+    ground: Ground = socket.app.state.ground
+    protocols = [value.strip() for value in socket.headers.get("sec-websocket-protocol", "").split(",")]
     scheme, _, token = socket.headers.get("authorization", "").partition(" ")
     if scheme.lower() != "bearer" and len(protocols) == 2 and protocols[0] == "bearer":
         scheme, token = "bearer", protocols[1]
     if scheme.lower() != "bearer":
-        return socket.app.state.open_without_users and not has_users(ground)
+        return LOCAL_CALLER if socket.app.state.open_without_users and not has_users(ground) else None
     try:
-        return authenticate(ground, token.strip()).may("viewer")
+        return authenticate(ground, token.strip())
     except NotAuthorised:
-        return False
+        return None

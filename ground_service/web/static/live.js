@@ -1,1 +1,168 @@
-import "./page.js";
+// A payload flown live: what its camera sees, what it finds, where it believes to be.
+import { chart, colour } from "./charts.js";
+import { dot, legendItem, moonMap, track } from "./moon.js";
+import { token } from "./api.js";
+import { byId, element, figure, notice, show, timeText } from "./page.js";
+
+const KEPT = 600;
+const context = byId("frame").getContext("2d");
+const history = { times: [], names: [], errors: {}, altitude: [] };
+let socket = null;
+let map = null;
+let lines = {};
+let plots = [];
+let shown = 0;
+let shownSince = performance.now();
+
+function connect() {
+  const url = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/v1/payload`;
+  socket = token() ? new WebSocket(url, ["bearer", token()]) : new WebSocket(url);
+  let ready = true; // until a refusal says why
+  socket.onopen = () => say("connected");
+  socket.onmessage = (event) => {
+    const message = JSON.parse(event.data);
+    ready = message.kind !== "error";
+    take(message);
+  };
+  socket.onclose = () => {
+    if (ready) say("not connected");
+    setTimeout(connect, 5000);
+  };
+}
+
+const say = (text) => {
+  byId("state").textContent = text;
+};
+
+function take(message) {
+  if (message.kind === "error") {
+    say(message.text);
+    return;
+  }
+  if (message.kind === "end") {
+    say("the scenario has ended");
+    return;
+  }
+  say(message.paused ? "paused" : "running");
+  for (const event of message.events) {
+    log(`${timeText(message.utc)} ${event.severity}: ${event.event.replaceAll("_", " ")} ${event.values.map((value) => figure(value)).join(", ")}`);
+  }
+  if (message.kind === "frame") drawFrame(message);
+}
+
+function drawFrame(message) {
+  const picture = new Image();
+  picture.onload = () => {
+    if (byId("frame").width !== picture.width) byId("frame").width = picture.width;
+    if (byId("frame").height !== picture.height) byId("frame").height = picture.height;
+    context.drawImage(picture, 0, 0);
+    rings(message);
+    count();
+  };
+  if (message.image_png) picture.src = `data:image/png;base64,${message.image_png}`;
+  numbers(message);
+  remember(message);
+}
+
+// A detection counts as matched here where a catalogued crater lies within half its radius.
+function rings({ catalogue = [], detections = [] }) {
+  const ring = (one, css, dash) => {
+    context.beginPath();
+    context.setLineDash(dash);
+    context.strokeStyle = css;
+    context.arc(one.u_px + 0.5, one.v_px + 0.5, one.diameter_px / 2, 0, 2 * Math.PI);
+    context.stroke();
+  };
+  context.lineWidth = 1.5;
+  for (const one of catalogue) ring(one, "#ffd400", [3, 3]);
+  for (const one of detections) {
+    const matched = catalogue.some((other) => Math.hypot(other.u_px - one.u_px, other.v_px - one.v_px) < other.diameter_px / 4);
+    ring(one, matched ? "#5dff5d" : "#00e5ff", []);
+  }
+}
+
+function count() {
+  shown += 1;
+  const elapsed = (performance.now() - shownSince) / 1000;
+  if (elapsed < 2) return;
+  byId("frame").dataset.rate = (shown / elapsed).toFixed(1);
+  shown = 0;
+  shownSince = performance.now();
+}
+
+function numbers(message) {
+  const fact = (name, value) => element("div", {}, element("dt", {}, name), element("dd", {}, value));
+  const estimates = Object.entries(message.estimates ?? {});
+  show(
+    "numbers",
+    fact("Time", timeText(message.utc)),
+    fact("Frame", figure(message.frame)),
+    fact("Mode", message.mode),
+    fact("Altitude", `${figure(message.altitude_km, 4)} km`),
+    fact("Detections", figure((message.detections ?? []).length)),
+    estimates.map(([name, one]) => fact(name, `${one.outcome ?? "–"}${one.error_m === undefined ? "" : `, ${figure(one.error_m)} m off`}`)),
+    fact("Shown", `${byId("frame").dataset.rate ?? "–"} frames/s`),
+  );
+  for (const [name, one] of estimates) {
+    if (one.reset_trigger && one.reset_trigger !== "none") log(`${timeText(message.utc)} ${name}: reset, ${one.reset_trigger.replaceAll("_", " ")}`);
+  }
+}
+
+function log(text) {
+  byId("log").prepend(element("li", {}, text));
+  while (byId("log").children.length > 100) byId("log").lastChild.remove();
+}
+
+function remember(message) {
+  const { reference, estimates = {} } = message;
+  const time = Date.parse(message.utc) / 1000;
+  if (history.times.length && time <= history.times.at(-1)) return;
+  history.times.push(time);
+  history.altitude.push(message.altitude_km);
+  const names = Object.keys(estimates);
+  if (names.join() !== history.names.join()) begin(names, reference);
+  for (const name of history.names) (history.errors[name] ??= []).push(estimates[name]?.error_m || null);
+  if (history.times.length > KEPT) {
+    for (const column of [history.times, history.altitude, ...Object.values(history.errors)]) column.shift();
+  }
+  for (const [name, place] of [["reference", reference], ...Object.entries(estimates)]) {
+    if (place?.latitude_deg === undefined || place.latitude_deg === null) continue;
+    const longitude = ((((place.longitude_deg + 180) % 360) + 360) % 360) - 180;
+    lines[name]?.addLatLng([place.latitude_deg, longitude]);
+  }
+  plots[0]?.setData([history.times, ...history.names.map((name) => history.errors[name])]);
+  plots[1]?.setData([history.times, history.altitude]);
+}
+
+// Map, legend and charts, once it is known which estimators fly.
+function begin(names, reference) {
+  history.names = names;
+  for (const name of names) history.errors[name] = history.times.slice(1).map(() => null);
+  map?.remove();
+  map = moonMap(byId("map"));
+  lines = {};
+  show("map-legend");
+  for (const [index, name] of ["reference", ...names].entries()) {
+    const css = name === "reference" ? "#ffffff" : colour(index - 1);
+    lines[name] = track(map, [reference.latitude_deg], [reference.longitude_deg], { color: css });
+    byId("map-legend").append(legendItem(name, css));
+  }
+  dot(map, reference.latitude_deg, reference.longitude_deg, { color: "#ffffff" });
+  map.setView([reference.latitude_deg, ((reference.longitude_deg + 180) % 360) - 180], 2);
+  show("charts");
+  const times = history.times;
+  plots = [
+    chart(byId("charts"), "distance from the reference", "m", names.map((name) => ({ label: name, times, mean: times.map(() => null) })), { logarithmic: true }).plot,
+    chart(byId("charts"), "altitude", "km", [{ label: "altitude", times, mean: history.altitude }], { height: 160 }).plot,
+  ];
+}
+
+const steer = (words) => () => {
+  if (socket?.readyState === WebSocket.OPEN) socket.send(words);
+  else notice("No payload is connected.", "bad");
+};
+byId("run").addEventListener("click", steer("run"));
+byId("pause").addEventListener("click", steer("pause"));
+byId("step").addEventListener("click", steer("step"));
+byId("rate").addEventListener("change", () => steer(`rate ${byId("rate").value}`)());
+connect();

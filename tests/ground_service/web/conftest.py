@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import os
+import socket
 import subprocess
 import sys
+import threading
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
@@ -29,12 +33,88 @@ FLAGS = [
 ]
 
 
+class Console:
+    """The console of a payload flown live, without the payload: sends what it is told to, keeps what it hears."""
+
+    def __init__(self) -> None:
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listener.getsockname()[1]
+        self.heard: list[str] = []
+        self._clients: list[socket.socket] = []
+        self._thread = threading.Thread(target=self._accept, daemon=True)
+        self._thread.start()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                client, _ = self._listener.accept()
+            except OSError:
+                return
+            self._clients.append(client)
+            threading.Thread(target=self._hear, args=(client,), daemon=True).start()
+
+    def _hear(self, client: socket.socket) -> None:
+        with client, client.makefile("r") as lines:
+            for line in lines:
+                self.heard.append(line.strip())
+            self._clients.remove(client)
+
+    def say(self, message: dict[str, object]) -> None:
+        """One message to everyone connected."""
+        for client in list(self._clients):
+            client.sendall(json.dumps(message).encode() + b"\n")
+
+    def close(self) -> None:
+        self._listener.close()
+        for client in self._clients:
+            client.close()
+
+
+def live_frame(number: int) -> dict[str, object]:
+    """A frame as the console of the emulator tells it."""
+    _, png = cv2.imencode(".png", np.full((512, 512), 20 + number, np.uint8))
+    return {
+        "kind": "frame",
+        "utc": f"2029-08-07T06:{number // 4:02d}:{15 * (number % 4):02d}.000Z",
+        "mode": "observing",
+        "paused": False,
+        "rate": 1.0,
+        "events": [{"severity": "medium", "event": "image_dark", "values": [1.0, 2.0]}]
+        if number == 3
+        else [],
+        "verifications": [],
+        "frame": number,
+        "reference": {"latitude_deg": -50.0 + number, "longitude_deg": 294.0, "altitude_m": 30e3},
+        "altitude_km": 30.0,
+        "detections": [{"u_px": 100.0, "v_px": 120.0, "diameter_px": 40.0, "score": 0.9}],
+        "catalogue": [{"id": 1, "u_px": 101.0, "v_px": 121.0, "diameter_px": 41.0}],
+        "estimates": {
+            "anchored": {
+                "outcome": "fixed",
+                "reset_trigger": "none",
+                "latitude_deg": -50.0 + number,
+                "longitude_deg": 294.001,
+                "altitude_m": 30e3,
+                "error_m": 80.0 + number,
+            }
+        },
+        "image_png": base64.b64encode(png.tobytes()).decode(),
+    }
+
+
+@pytest.fixture
+def live_frames() -> list[dict[str, object]]:
+    """Five frames of a live payload."""
+    return [live_frame(number) for number in range(5)]
+
+
 class Service:
     """A running `linna serve`."""
 
-    def __init__(self, home: Path, log: Path) -> None:
+    def __init__(self, home: Path, log: Path, console_port: int) -> None:
         self.home = home
         environment = {key: value for key, value in os.environ.items() if not key.startswith("LINNA_")}
+        environment["LINNA_LIVE_CONSOLE"] = f"127.0.0.1:{console_port}"
         environment["XDG_DATA_HOME"] = str(home / "nothing")
         self._log = log.open("wb")
         command = [sys.executable, "-m", "linna", "serve", "--port", "0", "--home", str(home)]
@@ -62,12 +142,20 @@ class Service:
 
 
 @pytest.fixture(scope="session")
-def service(tmp_path_factory, synthetic_pass) -> Iterator[Service]:
+def console() -> Iterator[Console]:
+    """A payload's console."""
+    opened = Console()
+    yield opened
+    opened.close()
+
+
+@pytest.fixture(scope="session")
+def service(tmp_path_factory, synthetic_pass, console) -> Iterator[Service]:
     """A service without users, with the synthetic pass imported."""
     home = tmp_path_factory.mktemp("web") / "home"
     with open_ground(home) as ground:
         import_archive(ground, synthetic_pass.folder)
-    running = Service(home, home / "serve.log")
+    running = Service(home, home / "serve.log", console.port)
     yield running
     running.stop()
 
@@ -98,14 +186,3 @@ def page(browser: Browser, service: Service) -> Iterator[Page]:
 def _note_foreign(url: str, own: str, errors: list[str]) -> None:
     if not url.startswith((own, own.replace("http", "ws", 1), "blob:", "data:")):
         errors.append(f"asked another host: {url}")
-
-
-def ask(url: str, token: str = "") -> tuple[int, bytes, dict[str, str]]:
-    """Status, body and headers of a GET."""
-    request = urllib.request.Request(url, headers={"Authorization": f"Bearer {token}"} if token else {})
-    try:
-        with urllib.request.urlopen(request, timeout=20) as answer:
-            return answer.status, answer.read(), dict(answer.headers)
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code, error.read(), dict(error.headers)

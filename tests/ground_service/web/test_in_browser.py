@@ -159,3 +159,39 @@ def test_a_draft_is_dragged_and_taken_off_the_plan(page, day_of_orbits):
     page.get_by_role("button", name="to be moved, draft").click()
     page.get_by_role("button", name="Delete").click()
     expect(page.get_by_role("button", name="to be moved, draft")).to_have_count(0)
+
+
+def test_a_live_payload_is_watched_and_steered(page, console, live_frames):
+    settled(page, "/live")
+    expect(page.locator("#state")).to_have_text("connected")
+    for message in live_frames:
+        console.say(message)
+    expect(page.locator("#numbers")).to_contain_text("fixed, 84 m off")
+    expect(page.locator("#log")).to_contain_text("image dark")
+    expect(page.get_by_label("chart: distance from the reference, m")).to_be_visible()
+    grey = page.evaluate(
+        "Array.from(document.getElementById('frame').getContext('2d').getImageData(300, 300, 1, 1).data).slice(0, 3)"
+    )
+    assert grey == [24, 24, 24]  # the last frame's level
+    console.heard.clear()
+    page.get_by_role("button", name="Pause").click()
+    page.get_by_role("button", name="Step").click()
+    page.get_by_label("Rate").select_option("60")
+    page.wait_for_timeout(500)
+    assert console.heard == ["pause", "step", "rate 60"]
+
+
+def test_words_that_could_do_harm_do_not_reach_the_payload(page, console):
+    settled(page, "/live")
+    expect(page.locator("#state")).to_have_text("connected")
+    console.heard.clear()
+    answer = page.evaluate(
+        """() => new Promise((resolve) => {
+          const socket = new WebSocket(`ws://${location.host}/api/v1/payload`);
+          socket.onopen = () => ["quit", "run\\nquit", "rate -1", "x".repeat(5000)].forEach((one) => socket.send(one));
+          const heard = [];
+          socket.onmessage = (event) => { heard.push(JSON.parse(event.data)); if (heard.length === 4) resolve(heard); };
+        })"""
+    )
+    assert [one["kind"] for one in answer] == ["error"] * 4
+    assert console.heard == []

@@ -19,10 +19,10 @@ def ask(url):
     """Status, body and headers of a GET."""
     try:
         with urllib.request.urlopen(url, timeout=20) as answer:
-            return answer.status, answer.read(), dict(answer.headers)
+            return answer.status, answer.read(), answer.headers
     except urllib.error.HTTPError as error:
         with error:
-            return error.code, error.read(), dict(error.headers)
+            return error.code, error.read(), error.headers
 
 
 @pytest.mark.parametrize("path", PATHS)

@@ -1,0 +1,124 @@
+"""The WebSocket `payload`: the console of a payload that is flown live, handed on to a browser.
+
+The console is another program's (`linna emulate --live`): one JSON object a line comes from it, one word a line goes to
+it. Viewers may look, operators may also pause, run, step and set the rate. Nobody can end the payload from here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import re
+from collections import deque
+
+from fastapi import APIRouter, WebSocket, WebSocketDisconnect
+from starlette.concurrency import run_in_threadpool
+
+from ground_service.api.common import API_PREFIX
+from ground_service.api.live import POLICY_VIOLATION, caller_of_socket
+
+LINE_LIMIT_OCTETS = 8 << 20
+WAITING_LIMIT = 4
+"""Messages kept for a browser that cannot keep up; the oldest go first, as newer ones tell more."""
+
+CONNECT_TIMEOUT_S = 3.0
+TRY_AGAIN_LATER = 1013
+
+_WORDS = re.compile(r"pause|run|step|rate [0-9]{1,6}(\.[0-9]{1,3})?")
+
+payload_console = APIRouter()
+
+
+@payload_console.websocket(f"{API_PREFIX}/payload")
+async def watch_payload(socket: WebSocket) -> None:
+    """Messages of the payload's console as they come; words `pause`, `run`, `step` and `rate X` from operators."""
+    caller = await run_in_threadpool(caller_of_socket, socket)
+    if caller is None or not caller.may("viewer"):
+        await socket.close(POLICY_VIOLATION)
+        return
+    await socket.accept(subprotocol="bearer" if "sec-websocket-protocol" in socket.headers else None)
+    address: tuple[str, int] | None = socket.app.state.live_console
+    if address is None:
+        await _refuse(socket, "no payload to watch: serve with LINNA_LIVE_CONSOLE=HOST:PORT")
+        return
+    try:
+        async with asyncio.timeout(CONNECT_TIMEOUT_S):
+            reader, writer = await asyncio.open_connection(*address, limit=LINE_LIMIT_OCTETS)
+    except (OSError, TimeoutError):
+        await _refuse(
+            socket, f"no payload answers at {address[0]}:{address[1]}; start it with linna emulate --live"
+        )
+        return
+    try:
+        await _relay(socket, reader, writer, may_steer=caller.may("operator"))
+    finally:
+        writer.close()
+        with contextlib.suppress(OSError):
+            await writer.wait_closed()
+
+
+async def _relay(
+    socket: WebSocket, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, may_steer: bool
+) -> None:
+    waiting: deque[str] = deque(maxlen=WAITING_LIMIT)
+    arrived = asyncio.Event()
+    tasks = [
+        asyncio.create_task(task)
+        for task in (
+            _listen(reader, waiting, arrived),
+            _show(socket, waiting, arrived),
+            _steer(socket, writer, waiting, arrived, may_steer),
+        )
+    ]
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        results = await asyncio.gather(*tasks, return_exceptions=True)
+    gone = any(isinstance(result, WebSocketDisconnect | RuntimeError) for result in results)
+    if not gone:
+        await _refuse(socket, "the payload has ended")
+
+
+async def _listen(reader: asyncio.StreamReader, waiting: deque[str], arrived: asyncio.Event) -> None:
+    with contextlib.suppress(OSError, ValueError):  # a line over the limit ends the relay
+        while line := await reader.readline():
+            waiting.append(line.decode("utf-8", "replace").strip())
+            arrived.set()
+
+
+async def _show(socket: WebSocket, waiting: deque[str], arrived: asyncio.Event) -> None:
+    while True:
+        await arrived.wait()
+        arrived.clear()
+        while waiting:
+            await socket.send_text(waiting.popleft())
+
+
+async def _steer(
+    socket: WebSocket,
+    writer: asyncio.StreamWriter,
+    waiting: deque[str],
+    arrived: asyncio.Event,
+    may_steer: bool,
+) -> None:
+    while True:
+        words = (await socket.receive_text()).strip()
+        if not may_steer:
+            trouble = "expected the role operator or higher to steer the payload"
+        elif not _WORDS.fullmatch(words):
+            trouble = f"expected pause, run, step or rate X, found {words[:40]!r}"
+        else:
+            writer.write(words.encode() + b"\n")
+            await writer.drain()
+            continue
+        waiting.append(json.dumps({"kind": "error", "text": trouble}))
+        arrived.set()
+
+
+async def _refuse(socket: WebSocket, text: str) -> None:
+    with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+        await socket.send_json({"kind": "error", "text": text})
+        await socket.close(TRY_AGAIN_LATER)
