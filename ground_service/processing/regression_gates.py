@@ -169,7 +169,7 @@ def _tests(
     every: bool,
 ) -> list[_Test]:
     sizes = [len(one) for one in before]
-    weights = block_weights(sizes, policy.block_frames, policy.resamples)
+    weights = block_weights(tuple(sizes), policy.block_frames, policy.resamples)
     freedom = degrees_of_freedom(sizes, policy.block_frames)
     old, new = joined(before), joined(after)
     whole = np.ones((1, weights.shape[1]))

@@ -19,7 +19,8 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 
-def block_weights(frames_of_pass: Sequence[int], block: int, resamples: int, seed: int = 0) -> FloatArray:
+@functools.lru_cache(maxsize=8)
+def block_weights(frames_of_pass: tuple[int, ...], block: int, resamples: int, seed: int = 0) -> FloatArray:
     """Weights (resamples, frames) of bootstrap resamples: blocks of frames drawn with replacement within each pass.
 
     Parameters
@@ -81,19 +82,19 @@ def weighted_ratio(numerator: FloatArray, denominator: FloatArray, weights: Floa
 
 
 def weighted_quantile(values: FloatArray, level: float, weights: FloatArray) -> FloatArray:
-    """Quantile of the finite values (n,) for each row of weights (b, n); NaN where no value has weight."""
+    """Quantile of the finite values (n,) for each row of weights (b, n); NaN where no value has weight.
+
+    It is the smallest value with at least that share of the weight at or below it (inverse of the distribution).
+    """
     known = np.flatnonzero(np.isfinite(values))
-    if len(known) == 0:
-        return np.full(weights.shape[0], np.nan)
-    order = known[np.argsort(values[known], kind="stable")]
-    # The weight of a value lies around its place, half on each side: the median of two values is their mean.
-    mass = weights[:, order]
-    total = mass.sum(axis=1)
-    place = np.cumsum(mass, axis=1) - 0.5 * mass
     result = np.full(weights.shape[0], np.nan)
-    for row in np.flatnonzero(total > 0.0):
-        counted = mass[row] > 0.0
-        result[row] = np.interp(level * total[row], place[row, counted], values[order][counted])
+    if len(known) == 0:
+        return result
+    order = known[np.argsort(values[known], kind="stable")]
+    below = np.cumsum(weights[:, order], axis=1)
+    total = below[:, -1]
+    reached = np.argmax(below >= (level * total * (1.0 - 1e-12))[:, None], axis=1)
+    result[total > 0.0] = values[order][reached[total > 0.0]]
     return result
 
 

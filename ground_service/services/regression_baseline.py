@@ -55,7 +55,7 @@ def baseline_text(figures: dict[str, Any]) -> str:
 def _figures(passes: list[PassFrames], outcome: RegressionOutcome) -> dict[str, Any]:
     policy = outcome.policy.policy
     frames = joined(passes)
-    weights = block_weights([len(one) for one in passes], policy.block_frames, policy.resamples)
+    weights = block_weights(tuple(len(one) for one in passes), policy.block_frames, policy.resamples)
     whole = np.ones((1, len(frames)))
     return {
         figure.name: {
