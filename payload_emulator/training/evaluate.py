@@ -131,6 +131,8 @@ def run(
     for dataset in datasets:
         _refuse_other_camera(detector, dataset)
     own = float(detector.metadata.get("score_threshold", "0.4"))
+    if paper_classes:
+        own = float(detector.metadata.get("paper_threshold", str(own)))
     thresholds = Thresholds(
         own if threshold is None else threshold,
         float(detector.metadata.get("f1_threshold", str(own))),

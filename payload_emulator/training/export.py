@@ -20,7 +20,7 @@ from payload_emulator.flight.detector import (
     INPUT_SIZE_PX,
     OnnxDetector,
 )
-from payload_emulator.training.calibrate import Calibration, calibrate
+from payload_emulator.training.calibrate import Calibration, calibrate, paper_threshold
 from payload_emulator.training.dataset import Dataset
 
 PARITY_LIMIT = 2e-4
@@ -92,6 +92,9 @@ def export(
         **(notes or {}),
     }
     octets = _with_metadata(model, metadata)
+    if paper_classes:
+        metadata["paper_threshold"] = str(_paper_threshold(octets, datasets))
+        octets = _with_metadata(model, metadata)
     difference = parity(exported, octets)
     if difference > PARITY_LIMIT:
         raise ModelError(
@@ -99,7 +102,7 @@ def export(
         )
     tested: dict[str, Any] = {}
     if test:
-        tested = _test_figures(octets, datasets)
+        tested = _test_figures(octets, datasets, paper_classes)
         octets = _with_metadata(model, metadata | {"test_figures": json.dumps(tested)})
     unfinished = out.with_name(f".{out.name}.unfinished")
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -185,13 +188,22 @@ def _metadata(
     }
 
 
-def _test_figures(octets: bytes, datasets: Sequence[Dataset]) -> dict[str, Any]:
+def _paper_threshold(octets: bytes, datasets: Sequence[Dataset]) -> float:
+    from payload_emulator.training.evaluate import open_for_evaluation, run
+
+    if not any(dataset.frames("val") for dataset in datasets):
+        return 0.4
+    scored = run(open_for_evaluation(octets), datasets, "val", paper_classes=True)
+    return paper_threshold(scored.truths, scored.found)
+
+
+def _test_figures(octets: bytes, datasets: Sequence[Dataset], paper_classes: bool) -> dict[str, Any]:
     from payload_emulator.training.evaluate import evaluate
 
     kept = ("precision", "recall", "f1", "loc_px", "loc_median_px")
     tested: dict[str, Any] = {}
     for source in sorted({frame.source for dataset in datasets for frame in dataset.frames("test")}):
-        figures = evaluate(octets, datasets, "test", source)
+        figures = evaluate(octets, datasets, "test", source, paper_classes=paper_classes)
         tested[source] = {
             "frames": figures["frames"],
             "rung": figures["rung"],

@@ -47,6 +47,14 @@ def test_depth_and_colour_of_the_same_scene_make_no_difference():
         assert np.abs(prepare_image(other).gray - reference).max() < 0.06
 
 
+@pytest.mark.parametrize("shape", [(512, 512), (512, 512, 3), (300, 200, 4), (64, 64, 1)])
+def test_eight_bits_go_a_quicker_way_to_the_same_values(shape):
+    image = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
+    colours = image if image.ndim == 2 else image[..., : 3 if shape[2] >= 3 else 1].mean(axis=2)
+    # Rounding of 32-bit numbers up to 4 and the order of sums.
+    assert prepare_image(image).gray == pytest.approx(prepare_image(colours / 255.0).gray, abs=5e-6)
+
+
 def test_half_the_exposure_gives_the_same_input():
     bright = texture(dtype=np.uint16)
     reference = prepare_image(bright).gray

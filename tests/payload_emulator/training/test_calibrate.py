@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from payload_emulator.training.calibrate import fit_parallax, without_parallax
+from payload_emulator.training.calibrate import fit_parallax, paper_threshold, without_parallax
 from payload_emulator.training.scoring import FrameDetections, FrameTruth
 
 SHARE = 4e-4
@@ -68,3 +68,21 @@ def test_too_few_craters_give_no_correction():
     share, error = fit_parallax(frames(1)[:1])
     assert share == 0.0
     assert np.isnan(error)
+
+
+def test_the_papers_threshold_is_chosen_over_its_classes_together():
+    # One crater of class 0 found at 0.7, a false detection of class 1 at 0.5: anything in between is best.
+    one = np.array([100.0])
+    truth = FrameTruth(
+        one, one, np.array([30.0]), np.array([7e3]), np.array([0.1]), np.array([1]), 512, 512, 0.0, 0
+    )
+    found = FrameDetections(
+        np.array([100.0, 300.0]),
+        np.array([100.0, 300.0]),
+        np.full(2, 30.0),
+        np.array([7e3, 12e3]),
+        np.array([0.7, 0.5]),
+        np.ones(2),
+        size_class=np.array([0, 1], np.int8),
+    )
+    assert 0.5 < paper_threshold([truth], [found]) <= 0.7
