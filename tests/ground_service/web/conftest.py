@@ -161,6 +161,12 @@ def service(tmp_path_factory, synthetic_pass, console) -> Iterator[Service]:
 
 
 @pytest.fixture(scope="session")
+def serve() -> type[Service]:
+    """Start another service: ``serve(home, log, console_port)``."""
+    return Service
+
+
+@pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
     """The system's Chromium, without a screen."""
     with sync_playwright() as playwright:

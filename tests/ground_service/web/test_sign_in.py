@@ -1,0 +1,61 @@
+"""Pages of a service that has users."""
+
+import pytest
+from playwright.sync_api import expect
+
+from ground_service.services.ground import open_ground
+from ground_service.services.users import add_user
+
+
+@pytest.fixture(scope="module")
+def guarded(tmp_path_factory, console, serve):
+    """A service with one viewer; its address and the viewer's token."""
+    home = tmp_path_factory.mktemp("guarded") / "home"
+    with open_ground(home) as ground:
+        token = add_user(ground, "ada", "viewer")
+    running = serve(home, home / "serve.log", console.port)
+    yield running.url, token
+    running.stop()
+
+
+@pytest.fixture
+def stranger(browser, guarded):
+    """A page of somebody who has not signed in."""
+    context = browser.new_context(base_url=guarded[0])
+    opened = context.new_page()
+    yield opened
+    context.close()
+
+
+def sign_in(page, token):
+    page.get_by_label("Token").fill(token)
+    page.locator("dialog").get_by_role("button", name="Sign in").click()
+
+
+def test_a_stranger_is_asked_for_a_token_and_a_wrong_one_is_no_use(stranger):
+    stranger.goto("/")
+    expect(stranger.get_by_role("dialog", name="Sign in")).to_be_visible()
+    sign_in(stranger, "not-a-token")
+    expect(stranger.get_by_role("dialog", name="Sign in")).to_be_visible()
+    expect(stranger.locator("#feed-light")).not_to_have_class("light on")
+
+
+def test_a_viewer_sees_and_may_not_command(stranger, guarded):
+    stranger.goto("/commands")
+    sign_in(stranger, guarded[1])
+    expect(stranger.locator("#feed-light")).to_have_class("light on")
+    expect(stranger.locator("#caller")).to_have_text("Sign out")
+    stranger.get_by_role("button", name="Queue").click()
+    expect(stranger.locator("#notices .bad")).to_contain_text("operator")
+    stranger.locator("#caller").click()
+    expect(stranger.get_by_role("dialog", name="Sign in")).to_be_visible()
+
+
+def test_a_viewer_may_not_steer_the_payload(stranger, guarded, console):
+    stranger.goto("/live")
+    sign_in(stranger, guarded[1])
+    expect(stranger.locator("#state")).to_have_text("connected")
+    console.heard.clear()
+    stranger.get_by_role("button", name="Pause").click()
+    expect(stranger.locator("#state")).to_contain_text("operator")
+    assert console.heard == []
