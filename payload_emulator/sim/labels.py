@@ -33,7 +33,7 @@ class Labels:
     index
         Row in the catalogue that was projected.
     u_px, v_px
-        The crater's centre at rim height; pixel centres are integers.
+        The crater's centre at rim height, moved with the middle of a tilted rim; pixel centres are integers.
     diameter_px
         Apparent diameter: geometric mean of the axes of the rim's ellipse.
     major_px, minor_px, angle_rad
@@ -119,9 +119,12 @@ def label_frame(
         uv = project_mcmf(camera, rotation, position, up * (MOON_RADIUS_M + height))
         off = np.abs(uv - np.array(camera.centre_px)) - np.array([camera.width_px, camera.height_px]) / 2.0
         possible |= off.max(axis=1) <= 1.3 * margin + 4.0
-    measured = terrain.measured(near[possible])
-    labels = project_craters(measured, camera, position, rotation, minimum_diameter_m, lit, range_m)
-    return replace(labels, index=near[possible][labels.index])
+    near = near[possible]
+    tilts = terrain.rim_tilts_m(near)
+    labels = project_craters(
+        terrain.measured(near), camera, position, rotation, minimum_diameter_m, lit, range_m, tilts
+    )
+    return replace(labels, index=near[labels.index])
 
 
 def project_craters(
@@ -132,11 +135,13 @@ def project_craters(
     minimum_diameter_m: float = 2_500.0,
     lit: npt.NDArray[np.float32] | None = None,
     range_m: npt.NDArray[np.float32] | None = None,
+    rim_tilt_m: Floats | None = None,
 ) -> Labels:
     """Labels of all craters of the catalogue with any part of the rim in the picture.
 
-    Rims are circles at rim height (the map sphere where it is unknown) about the local vertical, projected point by
-    point; centre and axes come from the ellipse through them.  ``lit`` and ``range_m`` (H, W) are a `Rendering`'s.
+    Rims are circles at rim height (the map sphere where it is unknown) about the local vertical, higher by
+    ``rim_tilt_m`` (n, 2) in the north and the east and lower opposite, projected point by point; centre and axes come
+    from the ellipse through them.  ``lit`` and ``range_m`` (H, W) are a `Rendering`'s.
     """
     position = np.asarray(position_mcmf_m, dtype=np.float64)
     rotation = np.asarray(camera_from_mcmf, dtype=np.float64)
@@ -147,9 +152,16 @@ def project_craters(
         catalogue.near(float(latitude), float(longitude), radius + 0.5 * largest), dtype=np.int64
     )
     near = near[catalogue.diameter_m[near] >= minimum_diameter_m]
-    centre, rim = _rim_points(catalogue.select(near))
+    chosen = catalogue.select(near)
+    centre, rim = _rim_points(chosen)
     centre_uv = project_mcmf(camera, rotation, position, centre)
     rim_uv = project_mcmf(camera, rotation, position, rim)
+    if rim_tilt_m is not None:
+        level_uv = rim_uv
+        _, rim = _rim_points(chosen, rim_tilt_m[near])
+        rim_uv = project_mcmf(camera, rotation, position, rim)
+        # The far side of a tilted rim is drawn smaller than the near one: its middle moves.
+        centre_uv = centre_uv + (rim_uv - level_uv).mean(axis=1)
     within = camera.contains(rim_uv)
     # Beyond the limb the line of sight runs through the Moon: the surface normal there points away.
     facing = np.einsum("nki,nki->nk", position - rim, rim) > 0.0
@@ -228,8 +240,8 @@ def project_as_the_paper(
     return u, v, camera.focal_px * catalogue.diameter_m / altitude
 
 
-def _rim_points(catalogue: CraterCatalogue) -> tuple[Floats, Floats]:
-    """Centres (n, 3) and rims (n, 24, 3) in MCMF, all points of a rim at rim height."""
+def _rim_points(catalogue: CraterCatalogue, tilt_m: Floats | None = None) -> tuple[Floats, Floats]:
+    """Centres (n, 3) and rims (n, 24, 3) in MCMF at rim height, on planes tilted by (n, 2) toward north and east."""
     height = np.nan_to_num(catalogue.rim_height_m, nan=0.0)
     latitude, longitude = catalogue.latitude_rad, catalogue.longitude_rad
     up = np.stack(
@@ -244,7 +256,10 @@ def _rim_points(catalogue: CraterCatalogue) -> tuple[Floats, Floats]:
         np.cos(azimuth)[:, None] * north[:, None] + np.sin(azimuth)[:, None] * east[:, None]
     )
     distance = (MOON_RADIUS_M + height)[:, None]
-    return distance * up, distance[..., None] * circle
+    rim = np.broadcast_to(distance, (len(catalogue), RIM_POINTS))
+    if tilt_m is not None:
+        rim = rim + tilt_m @ np.stack([np.cos(azimuth), np.sin(azimuth)])
+    return distance * up, rim[..., None] * circle
 
 
 def _axes(rim_uv: Floats, centre_uv: Floats) -> tuple[Floats, Floats, Floats]:

@@ -35,9 +35,9 @@ class RimErrors:
     index
         Row in the terrain's catalogue.
     offset_u_px, offset_v_px
-        Mean over azimuths of where rays find the rim, less where the label's circle has it.
+        Middle of the rim that rays find, less the label's place.
     scatter_px
-        Rms of the single points about that mean: rims are no circles of one height.
+        Rms of the rim's single points about the label's ellipse, its middle set right: rims are uneven.
     """
 
     index: npt.NDArray[np.int64]
@@ -61,22 +61,24 @@ def rim_errors(
     position = np.asarray(position_mcmf_m, dtype=np.float64)
     rotation = np.asarray(camera_from_mcmf, dtype=np.float64)
     labels = label_frame(terrain, camera, position, rotation, minimum_diameter_m)
-    chosen = labels.index[labels.inside & (labels.visible_fraction == 1.0)]
-    craters = terrain.measured(chosen)
-    known = np.isfinite(craters.rim_height_m)
-    craters, chosen = craters.select(np.flatnonzero(known)), chosen[known]
-    if not chosen.size:
-        empty = np.empty(0)
-        return RimErrors(chosen, empty, empty, empty)
-    latitude, longitude = _circle(craters.latitude_rad, craters.longitude_rad, craters.diameter_m)
-    expected = _project(
-        camera,
-        position,
-        rotation,
-        latitude,
-        longitude,
-        np.broadcast_to(craters.rim_height_m[:, None], latitude.shape),
+    craters = terrain.measured(labels.index)
+    chosen = np.flatnonzero(
+        labels.inside & (labels.visible_fraction == 1.0) & np.isfinite(craters.rim_height_m)
     )
+    index, craters = labels.index[chosen], craters.select(chosen)
+    if not index.size:
+        empty = np.empty(0)
+        return RimErrors(index, empty, empty, empty)
+    latitude, longitude = _circle(craters.latitude_rad, craters.longitude_rad, craters.diameter_m)
+    azimuth = _azimuths()
+    level = np.broadcast_to(craters.rim_height_m[:, None], latitude.shape)
+    tilted = level + terrain.rim_tilts_m(index) @ np.stack([np.cos(azimuth), np.sin(azimuth)])
+    centre = project_mcmf(camera, rotation, position, craters.position_mcmf_m)
+    expected = project_mcmf(camera, rotation, position, mcmf_from_spherical(latitude, longitude, tilted))
+    circle = project_mcmf(camera, rotation, position, mcmf_from_spherical(latitude, longitude, level))
+    # What a rim of one height would show as its middle is the projected centre: perspective moves both alike.
+    middle = centre + (expected - circle).mean(axis=1)
+    place = np.stack([labels.u_px[chosen], labels.v_px[chosen]], axis=-1)
     uv = expected
     for _ in range(ROUNDS):
         hit = cast(terrain, camera, position, rotation, uv.reshape(-1, 2)).reshape(*latitude.shape, 3)
@@ -89,27 +91,21 @@ def rim_errors(
     count = found.sum(axis=1)
     good = count >= LEAST_FOUND * AZIMUTHS
     mean = difference[good].sum(axis=1) / count[good][:, None]
+    offset = middle[good] + mean - place[good]
     about = np.where(found[good][..., None], difference[good] - mean[:, None], 0.0)
     scatter = np.sqrt((about**2).sum(axis=(1, 2)) / count[good])
-    return RimErrors(chosen[good], mean[:, 0], mean[:, 1], scatter)
+    return RimErrors(index[good], offset[:, 0], offset[:, 1], scatter)
 
 
 def _circle(latitude: Floats, longitude: Floats, diameter_m: Floats) -> tuple[Floats, Floats]:
     """Places (n, 48) on the rims."""
     radius = (0.5 * diameter_m / MOON_RADIUS_M)[:, None]
-    azimuth = np.arange(AZIMUTHS) * (2.0 * math.pi / AZIMUTHS)
+    azimuth = _azimuths()
     sine0, cosine0 = np.sin(latitude)[:, None], np.cos(latitude)[:, None]
     sine = sine0 * np.cos(radius) + cosine0 * np.sin(radius) * np.cos(azimuth)
     east = np.sin(azimuth) * np.sin(radius) * cosine0
     return np.arcsin(sine), longitude[:, None] + np.arctan2(east, np.cos(radius) - sine0 * sine)
 
 
-def _project(
-    camera: PinholeCamera,
-    position: Floats,
-    rotation: Floats,
-    latitude: Floats,
-    longitude: Floats,
-    height_m: Floats,
-) -> Floats:
-    return project_mcmf(camera, rotation, position, mcmf_from_spherical(latitude, longitude, height_m))
+def _azimuths() -> Floats:
+    return np.asarray(np.arange(AZIMUTHS) * (2.0 * math.pi / AZIMUTHS))

@@ -120,6 +120,10 @@ class Terrain(Protocol):
         """Catalogue craters of these indices, likewise measured."""
         ...
 
+    def rim_tilts_m(self, indices: npt.NDArray[np.int64]) -> Floats:
+        """How much higher than its mean the rim's best plane is in the north and in the east, (n, 2)."""
+        ...
+
     def small_craters(self, latitude_rad: Floats, longitude_rad: Floats) -> CraterShapes:
         """Seeded craters below the catalogue's limit that can touch a window of these latitudes and longitudes."""
         ...
@@ -163,6 +167,7 @@ class TiledTerrain(ABC):
         self._slots: OrderedDict[tuple[int, int, int], int] = OrderedDict()
         self._rim_m = np.array(catalogue.rim_height_m, dtype=np.float64)
         self._depth_m = np.array(catalogue.depth_m, dtype=np.float64)
+        self._rim_tilt_m = np.zeros((len(catalogue), 2))
         self._measured = np.zeros(len(catalogue), dtype=bool)
         self._owner: int | None = None
 
@@ -309,6 +314,11 @@ class TiledTerrain(ABC):
             complete=chosen.complete,
         )
 
+    def rim_tilts_m(self, indices: npt.NDArray[np.int64]) -> Floats:
+        """How much higher than its mean the rim's best plane is in the north and in the east, (n, 2); 0 if unknown."""
+        self._measure(indices[~self._measured[indices]])
+        return self._rim_tilt_m[indices]
+
     def _measure(self, indices: npt.NDArray[np.int64]) -> None:
         if indices.size == 0:
             return
@@ -321,9 +331,10 @@ class TiledTerrain(ABC):
             latitude = self.catalogue.latitude_rad[part][:, None]
             longitude = self.catalogue.longitude_rad[part][:, None]
             radius = 0.5 * self.catalogue.diameter_m[part][:, None] / MOON_RADIUS_M
-            rim = self._sample(*_circle(latitude, longitude, radius, RIM_AZIMUTHS), MEASURE_LEVEL).mean(
-                axis=1
-            )
+            around = self._sample(*_circle(latitude, longitude, radius, RIM_AZIMUTHS), MEASURE_LEVEL)
+            rim = around.mean(axis=1)
+            azimuth = _azimuths(RIM_AZIMUTHS)
+            tilt = 2.0 / RIM_AZIMUTHS * around @ np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
             rings = [
                 self._sample(
                     *_circle(latitude, longitude, fraction * radius, FLOOR_AZIMUTHS), MEASURE_LEVEL
@@ -334,6 +345,7 @@ class TiledTerrain(ABC):
             floor = (1.0 * rings[0] + 2.2 * rings[1] + 3.4 * rings[2]) / 6.6
             self._rim_m[part] = rim
             self._depth_m[part] = rim - floor
+            self._rim_tilt_m[part] = tilt
             self._measured[part] = True
 
     def hand_over(self) -> None:
@@ -404,9 +416,14 @@ def coarse_nodes(
     return np.asarray(0.5 * math.pi - nodes[0]), np.asarray(nodes[1]), starts[0], starts[1]
 
 
+def _azimuths(count: int) -> Floats:
+    """Azimuths (count,) from north, clockwise, evenly spread."""
+    return np.asarray((np.arange(count) + 0.5) * (2.0 * math.pi / count))
+
+
 def _circle(latitude: Floats, longitude: Floats, radius: Floats, azimuths: int) -> tuple[Floats, Floats]:
     """Places (n, azimuths) on small circles of angular ``radius`` about centres (n, 1)."""
-    azimuth = (np.arange(azimuths) + 0.5) * (2.0 * math.pi / azimuths)
+    azimuth = _azimuths(azimuths)
     sine = np.sin(latitude) * np.cos(radius) + np.cos(latitude) * np.sin(radius) * np.cos(azimuth)
     east = np.sin(azimuth) * np.sin(radius) * np.cos(latitude)
     return np.arcsin(sine), longitude + np.arctan2(east, np.cos(radius) - np.sin(latitude) * sine)
