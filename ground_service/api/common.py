@@ -45,6 +45,7 @@ Limit = Annotated[int, Query(ge=1, le=1000, description="Items in a page")]
 Offset = Annotated[int, Query(ge=0, le=2**31 - 1, description="Items before the page")]
 PassId = Annotated[int, Path(ge=1, le=2**31 - 1)]
 RowId = Annotated[int, Path(ge=1, le=2**53)]
+SpacecraftId = Annotated[int, Path(ge=0, le=1023)]
 Key = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
 IdempotencyKey = Annotated[
     str | None,

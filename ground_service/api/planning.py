@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Query, Response
 
-from ground_service.api import plan_schemas, schemas
+from ground_service.api import schemas
 from ground_service.api.common import (
     API_PREFIX,
     PROBLEMS,
@@ -18,11 +18,9 @@ from ground_service.api.common import (
     Viewer,
     page_of,
 )
-from ground_service.api.plan_schemas import time_of
 from ground_service.api.problems import PreconditionFailed
-from ground_service.services import commanding, plan_exchange
+from ground_service.services import commanding, plan_exchange, plan_requests, plan_schemas
 from ground_service.services import planning as plan_service
-from ground_service.services.planning import WindowEntry
 from ground_service.services.views import search_view, telecommand_view, window_view
 from ground_service.store.repository import Row
 
@@ -36,20 +34,7 @@ IfMatch = Annotated[
 @planning.post("/windows/search", response_model=plan_schemas.SearchOut)
 def search_windows(ground: GroundOf, _: Viewer, given: plan_schemas.WindowSearch) -> Any:
     """Candidate windows by constraints over a reference ephemeris."""
-    found, row, names = plan_service.search_windows(
-        ground,
-        given.constraints(),
-        start_utc_ns=None if given.start is None else time_of(given.start, "start"),
-        stop_utc_ns=None if given.stop is None else time_of(given.stop, "stop"),
-        cadence_s=given.cadence_s,
-        step_s=given.step_s,
-        resources=given.resources.value(),
-        ephemeris_id=given.ephemeris_id,
-        catalogue_pass_id=given.catalogue_pass_id,
-        spacecraft_id=given.spacecraft_id,
-        instance=given.instance,
-    )
-    return search_view(found, row, names)
+    return search_view(*plan_requests.search(ground, given))
 
 
 @planning.get("/windows", response_model=schemas.PageOf[plan_schemas.WindowOut])
@@ -68,21 +53,7 @@ def list_windows(
 @planning.post("/windows", status_code=201, response_model=plan_schemas.WindowOut)
 def add_window(response: Response, ground: GroundOf, caller: Operator, given: plan_schemas.WindowIn) -> Any:
     """Enter a window as a draft; conflicts with committed windows or with resources are answered with 409."""
-    row = plan_service.add_window(
-        ground,
-        WindowEntry(
-            name=given.name,
-            start_utc_ns=time_of(given.start, "start"),
-            stop_utc_ns=time_of(given.stop, "stop"),
-            cadence_s=given.cadence_s,
-            spacecraft_id=given.spacecraft_id,
-            instance=given.instance,
-            predecessor_id=given.predecessor_id,
-            ephemeris_id=given.ephemeris_id,
-            resources=given.resources.value(),
-        ),
-        actor=caller.name,
-    )
+    row = plan_service.add_window(ground, plan_requests.window_entry(given), actor=caller.name)
     response.headers["Location"] = f"{API_PREFIX}/windows/{row['id']}"
     return _tagged(response, row)
 
@@ -103,19 +74,11 @@ def change_window(
     if_match: IfMatch = None,
 ) -> Any:
     """Change a draft, or approve a window, make it a draft again, or declare it failed."""
-    fields = given.model_dump(exclude_unset=True, exclude={"state", "reason"})
-    changes: dict[str, Any] = {}
-    for name, value in fields.items():
-        if name in ("start", "stop"):
-            if value is not None:
-                changes[f"{name}_utc_ns"] = time_of(value, name)
-        elif value is not None or name == "predecessor_id":
-            changes[name] = value
     row = plan_service.change_window(
         ground,
         window_id,
         actor=caller.name,
-        changes=changes,
+        changes=plan_requests.window_changes(given),
         decision=given.state,
         reason=given.reason,
         expected=lambda row: _expect(row, if_match),
@@ -151,21 +114,7 @@ def export_plan(ground: GroundOf, _: Viewer) -> Any:
 @planning.post("/plan", status_code=201, response_model=plan_schemas.Imported)
 def import_plan(ground: GroundOf, caller: Operator, given: plan_schemas.Plan) -> Any:
     """Enter all windows of a plan as drafts, or none of them; windows that are there already are left alone."""
-    entries = [
-        plan_exchange.PlanEntry(
-            key=one.key,
-            after=one.after,
-            window=WindowEntry(
-                name=one.name,
-                start_utc_ns=time_of(one.start, f"windows.{one.key}.start"),
-                stop_utc_ns=time_of(one.stop, f"windows.{one.key}.stop"),
-                cadence_s=one.cadence_s,
-                spacecraft_id=one.spacecraft_id,
-                instance=one.instance,
-            ),
-        )
-        for one in given.windows
-    ]
+    entries = plan_requests.plan_entries(given)
     return {"windows": plan_exchange.import_plan(ground, entries, actor=caller.name)}
 
 

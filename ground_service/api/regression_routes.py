@@ -32,6 +32,7 @@ from ground_service.services.builds import load_build, register_build
 from ground_service.services.ground import Ground
 from ground_service.services.regression_jobs import missing_replays, prepared
 from ground_service.services.users import Caller
+from ground_service.services.views import time_text
 from ground_service.store import repository
 from ground_service.store.files import StoredFile
 
@@ -77,7 +78,9 @@ class ArchiveOut(schemas.Schema):
 class RegressionRequest(schemas.Schema):
     """Which builds to hold against each other, over which archives."""
 
-    candidate: str = Field(pattern=r"^(current|[0-9a-f]{8,64})$", description="Identity of a build, or current")
+    candidate: str = Field(
+        pattern=r"^(current|[0-9a-f]{8,64})$", description="Identity of a build, or current"
+    )
     baseline: str = Field(default="current", pattern=r"^(current|[0-9a-f]{8,64})$")
     archives: list[Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]] = Field(
         default_factory=list, max_length=1000, description="Identities of kept archives; all when empty"
@@ -154,7 +157,7 @@ def get_regression(ground: GroundOf, _: Viewer, regression_id: Key) -> Regressio
     return RegressionOut(
         id=row["id"],
         verdict=row["verdict"],
-        created=schemas.time_text(row["created_utc_ns"]),
+        created=time_text(row["created_utc_ns"]),
         result=row["result"],
     )
 
@@ -172,15 +175,29 @@ def _register(ground: Ground, stored: StoredFile, caller: Caller) -> BuildOut:
         archive_service.unpack_archive(stored.path, FilePath(folder))
         build = load_build(FilePath(folder))
         if build.command and not caller.may("admin"):
-            raise Forbidden(f"{caller.name}: expected the role admin to register a program, found {caller.role}")
+            raise Forbidden(
+                f"{caller.name}: expected the role admin to register a program, found {caller.role}"
+            )
         register_build(ground, build, actor=caller.name)
     with ground.database.reading() as connection:
         return _build(repository.get(connection, repository.BUILDS, build.digest, "build"))
 
 
 def _build(row: repository.Row) -> BuildOut:
-    names = ("digest", "name", "version", "description", "kind", "files", "flight_code", "provenance", "registered_by")
-    return BuildOut(**{name: row[name] for name in names}, registered=schemas.time_text(row["created_utc_ns"]))
+    names = (
+        "digest",
+        "name",
+        "version",
+        "description",
+        "kind",
+        "files",
+        "flight_code",
+        "provenance",
+        "registered_by",
+    )
+    return BuildOut(
+        **{name: row[name] for name in names}, registered=time_text(row["created_utc_ns"])
+    )
 
 
 def _archive(row: repository.Row) -> ArchiveOut:
@@ -190,5 +207,5 @@ def _archive(row: repository.Row) -> ArchiveOut:
         frames=row["frames"],
         octets=row["octets"],
         pinned=bool(row["pinned"]),
-        kept_since=schemas.time_text(row["created_utc_ns"]),
+        kept_since=time_text(row["created_utc_ns"]),
     )

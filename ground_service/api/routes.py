@@ -22,18 +22,27 @@ from ground_service.api.common import (
     Operator,
     PassId,
     RowId,
+    SpacecraftId,
     Viewer,
     idempotent_id,
     page_of,
     stored_body,
 )
-from ground_service.api.plan_schemas import time_of
+from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.services import ephemerides as ephemeris_service
 from ground_service.services import passes as pass_service
 from ground_service.services.ingest import FLOWN, begin_ingest
 from ground_service.services.passes import STATE_VALUES
+from ground_service.services.plan_schemas import time_of
+from ground_service.services.reports import pass_summary
+from ground_service.services.timekeeping import (
+    correlate_spacecraft,
+    spacecraft_correlations,
+    time_points,
+)
 from ground_service.services.views import (
+    correlation_view,
     ephemeris_view,
     ingest_view,
     job_view,
@@ -44,7 +53,7 @@ from ground_service.services.views import (
 )
 from ground_service.store import repository
 
-UPLOAD_PATHS = (f"{API_PREFIX}/telemetry", f"{API_PREFIX}/ephemerides")
+UPLOAD_PATHS = tuple(f"{API_PREFIX}/{name}" for name in ("telemetry", "ephemerides", "archives"))
 
 REPORT_MEDIA = {"html": "text/html", "pdf": "application/pdf", "json": "application/json"}
 
@@ -131,6 +140,40 @@ async def upload_telemetry(
     return schemas.IngestAccepted(ingest_id=ingest_id, job_id=job, sha256=stored.sha256, octets=stored.octets)
 
 
+@router.post(
+    "/archives",
+    status_code=202,
+    response_model=schemas.Job,
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {"application/zip": {"schema": {"type": "string", "format": "binary"}}},
+        }
+    },
+)
+async def upload_archive(
+    request: Request,
+    response: Response,
+    ground: GroundOf,
+    caller: Operator,
+    name: Name = "archive.zip",
+    idempotency_key: IdempotencyKey = None,
+) -> Any:
+    """Take a zipped pass archive (manifest, downlink, reference, catalogue, images) and import it."""
+    stored = await stored_body(request)
+    job_id = idempotent_id("archive", caller, idempotency_key)
+    dispatcher = request.app.state.dispatcher
+
+    def enter() -> str:
+        with ground.database.writing() as connection:
+            repository.register_file(connection, stored, "archive", name, utc_now_ns())
+        return str(dispatcher.submit("archive", {"sha256": stored.sha256, "name": name}, job_id=job_id))
+
+    job = await run_in_threadpool(enter)
+    response.headers["Location"] = f"{API_PREFIX}/jobs/{job}"
+    return await run_in_threadpool(get_job, ground, caller, job)
+
+
 @router.get("/ingests", response_model=schemas.PageOf[schemas.Ingest])
 def list_ingests(ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Offset = 0) -> Any:
     """Ingests, the newest first."""
@@ -174,6 +217,12 @@ def define_pass(ground: GroundOf, _: Operator, given: schemas.PassDefinition) ->
 def get_pass(ground: GroundOf, _: Viewer, pass_id: PassId) -> Any:
     """One pass with its manifest and the reports made of it."""
     return pass_detail_view(pass_service.get_pass(ground, pass_id))
+
+
+@router.get("/passes/{pass_id}/summary")
+def get_summary(ground: GroundOf, _: Viewer, pass_id: PassId) -> dict[str, Any]:
+    """The figures of a pass, evaluated now: frames, packets, detector, navigation and baselines."""
+    return pass_summary(ground, pass_id)
 
 
 @router.get("/passes/{pass_id}/completeness", response_model=schemas.Completeness)
@@ -274,7 +323,7 @@ def get_parameter(
 def get_trend(
     ground: GroundOf,
     _: Viewer,
-    spacecraft_id: Annotated[int, Path(ge=0, le=1023)],
+    spacecraft_id: SpacecraftId,
     parameter: Annotated[str, Path(max_length=64)],
     instance: Instance = FLOWN,
     start: Annotated[str | None, Query(max_length=40)] = None,
@@ -369,3 +418,40 @@ def preferred_kind(accept: str) -> str:
         if kind is not None and value > weight:
             best, weight = kind, value
     return best
+
+
+@router.get("/reports/{report_id}/summary")
+def get_report_summary(ground: GroundOf, _: Viewer, report_id: Key) -> dict[str, Any]:
+    """The figures of a report."""
+    with ground.database.reading() as connection:
+        summary: dict[str, Any] = repository.get(connection, repository.REPORTS, report_id, "report")[
+            "summary"
+        ]
+    return summary
+
+
+@router.get("/spacecraft/{spacecraft_id}/correlations", response_model=schemas.PageOf[schemas.Correlation])
+def list_correlations(
+    ground: GroundOf, _: Viewer, spacecraft_id: SpacecraftId, instance: Instance = FLOWN
+) -> Any:
+    """Time correlations that a spacecraft ever had, the newest first."""
+    rows = spacecraft_correlations(ground, spacecraft_id, instance)
+    return page_of([correlation_view(row) for row in rows], len(rows), max(len(rows), 1), 0)
+
+
+@router.post(
+    "/spacecraft/{spacecraft_id}/correlations",
+    status_code=201,
+    response_model=schemas.PageOf[schemas.Correlation],
+)
+def add_correlations(
+    ground: GroundOf,
+    caller: Operator,
+    spacecraft_id: SpacecraftId,
+    given: schemas.TimePoints,
+    instance: Instance = FLOWN,
+) -> Any:
+    """Correlate on-board time with UTC from time reports; what is derived from ticks follows at once."""
+    points = time_points([point.model_dump() for point in given.points])
+    rows = correlate_spacecraft(ground, spacecraft_id, instance, points, actor=caller.name)
+    return page_of([correlation_view(row) for row in rows], len(rows), max(len(rows), 1), 0)

@@ -257,3 +257,34 @@ class Health(Schema):
     """Whether the service lives."""
 
     status: str = Field(examples=["ok"])
+
+
+class TimePointIn(Schema):
+    """A time report as it was received."""
+
+    ticks: int = Field(ge=0, lt=2**48, description="On-board time, 2^-16 s")
+    received: str = Field(max_length=40, examples=["2029-08-07T06:00:01.3Z"], description="On the Earth")
+    light_time_s: float = Field(ge=0.0, le=10.0, allow_inf_nan=False, examples=[1.28])
+    boot_count: int = Field(default=0, ge=0, le=65_535)
+
+
+class TimePoints(Schema):
+    """Time reports of one spacecraft."""
+
+    points: list[TimePointIn] = Field(min_length=1, max_length=10_000)
+
+
+class Correlation(Schema):
+    """A straight line from on-board time to UTC over one run of the clock."""
+
+    id: int
+    boot_count: int | None
+    start_ticks: int
+    stop_ticks: int
+    reference_ticks: int
+    reference: str = Field(description="UTC of reference_ticks")
+    drift_ppb: float
+    residual_rms_ns: float | None
+    points: int
+    in_force: bool
+    created: str

@@ -50,7 +50,7 @@ def import_archive(ground: Ground, folder: Path, progress: Callable[[str], None]
     manifest, digest = read_manifest(folder)
     say = progress or (lambda _text: None)
     say("checking the archive")
-    names = _checked_files(folder, manifest)
+    names = checked_files(folder, manifest)
     start_utc_ns, stop_utc_ns = _interval(folder, manifest)
     for name, load in (("reference.oem", load_ephemeris), ("catalogue.csv", load_catalogue)):
         if name in names:
@@ -112,7 +112,7 @@ def instance_of(manifest: Mapping[str, Any], digest: str) -> str:
     return f"{name}@{digest[:16]}"
 
 
-def _checked_files(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
+def checked_files(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
     """Names of the files of the archive, each found to have the size and hash that the manifest gives."""
     root = folder.resolve()
     names = []

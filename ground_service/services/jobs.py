@@ -15,6 +15,7 @@ from sqlalchemy import select
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, InvalidInput
+from ground_service.services.archive_zip import import_zip
 from ground_service.services.feed import publish
 from ground_service.services.ground import Ground
 from ground_service.services.ingest import run_ingest
@@ -46,6 +47,11 @@ def _ingest(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[
     return {"ingest_id": result.ingest_id, "packets": result.packets, "packets_new": result.packets_new}
 
 
+def _archive(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[str, Any]:
+    path = ground.files.path(str(arguments["sha256"]))
+    return {"pass_id": import_zip(ground, path, str(arguments["name"]))}
+
+
 def _replay(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
     from ground_service.services.regression_jobs import replay_job
 
@@ -58,7 +64,13 @@ def _regression(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> di
     return regression_job(ground, arguments, job_id)
 
 
-WORK: dict[str, Work] = {"report": _report, "ingest": _ingest, "replay": _replay, "regression": _regression}
+WORK: dict[str, Work] = {
+    "report": _report,
+    "ingest": _ingest,
+    "archive": _archive,
+    "replay": _replay,
+    "regression": _regression,
+}
 """What can be asked for, by kind. Each may be run twice with the same arguments and job without harm."""
 
 

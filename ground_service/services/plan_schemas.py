@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from ground_service.api.schemas import Schema
 from ground_service.errors import InvalidInput
 from ground_service.processing.planning import STATIONS, Constraints, Resources
 from lunar.errors import LunarError
@@ -21,6 +20,12 @@ Time = Annotated[str, Field(min_length=10, max_length=40, examples=["2029-08-07T
 WindowState = Literal[
     "draft", "approved", "uplinked", "executing", "executed", "downlinked", "processed", "failed"
 ]
+
+
+class Schema(BaseModel):
+    """Base of everything sent; what is not known is refused."""
+
+    model_config = ConfigDict(extra="forbid")
 
 
 class Limits(Schema):

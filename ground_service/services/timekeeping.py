@@ -6,18 +6,22 @@ late data are correlated like any others.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from sqlalchemy import select, update
 
 from ground_service.clock import utc_now_ns
-from ground_service.errors import InvalidInput
+from ground_service.errors import InvalidInput, NotFound
 from ground_service.processing.correlation import CorrelationFit, fit_correlation
 from ground_service.services.ground import Ground
 from ground_service.services.users import audit
+from ground_service.services.window_progress import advance_windows
 from ground_service.store import repository
+from lunar.errors import LunarError
+from lunar.timescales import parse_utc
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,3 +90,52 @@ def correlations_on_record(ground: Ground, vehicle: int) -> list[repository.Row]
             select(table).where(table.c.vehicle_id == vehicle).order_by(table.c.id.desc())
         ).mappings()
         return [dict(row) for row in rows]
+
+
+def correlate_spacecraft(
+    ground: Ground, spacecraft_id: int, instance: str, points: Sequence[TimePoint], *, actor: str
+) -> list[repository.Row]:
+    """As `correlate`, of a spacecraft by its number; the correlations now in force."""
+    vehicle = _vehicle(ground, spacecraft_id, instance)
+    correlate(ground, vehicle, points, actor=actor)
+    advance_windows(ground, vehicle)
+    return [row for row in correlations_on_record(ground, vehicle) if not row["superseded"]]
+
+
+def spacecraft_correlations(ground: Ground, spacecraft_id: int, instance: str) -> list[repository.Row]:
+    """All correlations that a spacecraft ever had, the newest first."""
+    return correlations_on_record(ground, _vehicle(ground, spacecraft_id, instance))
+
+
+def time_points(given: Sequence[Mapping[str, Any]]) -> list[TimePoint]:
+    """Time reports out of plain values: ticks, received (UTC text), light_time_s, boot_count.
+
+    Raises
+    ------
+    InvalidInput
+        If a value is missing or cannot be read.
+    """
+    points = []
+    for number, one in enumerate(given):
+        try:
+            points.append(
+                TimePoint(
+                    ticks=int(one["ticks"]),
+                    earth_utc_ns=parse_utc(str(one["received"])),
+                    light_time_ns=round(float(one["light_time_s"]) * 1e9),
+                    boot_count=int(one.get("boot_count") or 0),
+                )
+            )
+        except (KeyError, TypeError, ValueError, LunarError) as error:
+            raise InvalidInput(
+                "time report", f"points.{number}", "ticks, received and light_time_s", str(error)[:120]
+            ) from None
+    return points
+
+
+def _vehicle(ground: Ground, spacecraft_id: int, instance: str) -> int:
+    with ground.database.reading() as connection:
+        row = repository.find(connection, repository.VEHICLES, ccsds_id=spacecraft_id, instance=instance)
+    if row is None:
+        raise NotFound("spacecraft", f"{spacecraft_id} ({instance})")
+    return int(row["id"])

@@ -216,3 +216,16 @@ def _time_texts(utc_ns: Any) -> list[str]:
     """As `time_text`, of many times."""
     texts = np.datetime_as_string(np.asarray(utc_ns, dtype=np.int64).astype("datetime64[ns]"), unit="ns")
     return [f"{text}Z" for text in texts.tolist()]
+
+
+def correlation_view(row: Row) -> View:
+    """A time correlation."""
+    kept = (
+        "id", "boot_count", "start_ticks", "stop_ticks", "reference_ticks", "drift_ppb", "residual_rms_ns", "points",
+    )  # fmt: skip
+    return {
+        **{name: row[name] for name in kept},
+        "reference": time_text(row["reference_utc_ns"]),
+        "in_force": not row["superseded"],
+        "created": time_text(row["created_utc_ns"]),
+    }

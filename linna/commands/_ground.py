@@ -1,10 +1,12 @@
-"""What the ground's commands share: which service they work on."""
+"""What the ground's commands share: which service they work on, here or at a server."""
 
 from __future__ import annotations
 
 import argparse
+import getpass
+import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ground_service.services.ground import Ground
@@ -19,6 +21,34 @@ def add_service_options(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder of database, raw files and reports (default: $LINNA_HOME)",
     )
+
+
+def add_operator_options(parser: argparse.ArgumentParser) -> None:
+    """Options that choose the local service or a server."""
+    add_service_options(parser)
+    parser.add_argument(
+        "--server", metavar="URL", help="work on this server (default: $LINNA_SERVER, else this machine)"
+    )
+    parser.add_argument("--token", metavar="T", help="token for the server (default: $LINNA_TOKEN)")
+    parser.add_argument(
+        "--as", dest="actor", metavar="NAME", help="who does it, without a server (default: you)"
+    )
+
+
+def operations(arguments: argparse.Namespace) -> Any:
+    """The operators' work (`LocalOperations` or `Client`), to be used in a with statement."""
+    server = arguments.server or (None if arguments.home else os.environ.get("LINNA_SERVER"))
+    if server:
+        from ground_service.client import Client
+
+        if arguments.home:
+            from linna.errors import UsageError
+
+            raise UsageError("--home and --server: expected one of them, found both")
+        return Client(server, arguments.token or os.environ.get("LINNA_TOKEN"))
+    from ground_service.operations import LocalOperations
+
+    return LocalOperations(open_service(arguments), str(arguments.actor or getpass.getuser()))
 
 
 def settings_of(arguments: argparse.Namespace, **given: object) -> Settings:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import getpass
+import contextlib
 from pathlib import Path
 from typing import Any
 
-from linna.commands._ground import add_service_options, open_service
+from linna.commands._ground import add_operator_options, operations
 from linna.output import add_json_flag, emit
 
 
@@ -36,107 +36,103 @@ def configure(parser: argparse.ArgumentParser) -> None:
     taking = actions.add_parser("uplink", help="write what is to be sent now; it counts as sent from then on")
     taking.add_argument("--spacecraft-id", type=int, required=True, metavar="N")
     taking.add_argument("--format", choices=("cltu", "packets"), default="cltu")
-    taking.add_argument("--out", type=Path, required=True, metavar="FILE")
+    taking.add_argument("--out", type=Path, metavar="FILE", help="file to write them to")
+    taking.add_argument("--tcp", metavar="HOST:PORT", help="send them there, too")
     taking.set_defaults(handler=uplink)
     for action in (entering, taking):
         action.add_argument(
             "--instance", default="flight", help="instance of the spacecraft (default: flight)"
         )
     for action in (entering, listing, showing, releasing, rejecting, taking):
-        action.add_argument(
-            "--as", dest="actor", default=None, metavar="NAME", help="who does it (default: you)"
-        )
-        add_service_options(action)
+        add_operator_options(action)
         add_json_flag(action)
 
 
 def enter(arguments: argparse.Namespace) -> int:
-    from ground_service.services.commanding import enter_command
-
-    with open_service(arguments) as ground:
-        command_id = enter_command(
-            ground,
+    with operations(arguments) as service:
+        view = service.enter_command(
             arguments.name,
             dict(_argument(text) for text in arguments.arguments),
             spacecraft_id=arguments.spacecraft_id,
             instance=arguments.instance,
             timeout_s=arguments.timeout_s,
-            actor=_actor(arguments),
         )
-    return _show(arguments, command_id)
+    return _show(arguments, view)
 
 
 def list_all(arguments: argparse.Namespace) -> int:
-    from ground_service.services.commanding import list_commands
-
-    with open_service(arguments) as ground:
-        views, total = list_commands(ground, limit=max(arguments.limit, 1))
-    rows = [_figures(view) for view in views]
+    with operations(arguments) as service:
+        page = service.list_commands(max(arguments.limit, 1))
+    rows = [_figures(view) for view in page["items"]]
     lines = [f"{row['id']:>6}  {row['state']:<10} {row['name']}  {row['requested_by']}" for row in rows]
-    emit(arguments, {"telecommands": rows, "total": total}, text="\n".join(lines) or "no telecommands")
+    emit(
+        arguments, {"telecommands": rows, "total": page["total"]}, text="\n".join(lines) or "no telecommands"
+    )
     return 0
 
 
 def show(arguments: argparse.Namespace) -> int:
-    return _show(arguments, arguments.command_id)
+    with operations(arguments) as service:
+        return _show(arguments, service.get_command(arguments.command_id))
 
 
 def release(arguments: argparse.Namespace) -> int:
-    from ground_service.services.commanding import release_command
-
-    with open_service(arguments) as ground:
-        release_command(ground, arguments.command_id, actor=_actor(arguments))
-    return _show(arguments, arguments.command_id)
+    with operations(arguments) as service:
+        return _show(arguments, service.release_command(arguments.command_id))
 
 
 def reject(arguments: argparse.Namespace) -> int:
-    from ground_service.services.commanding import reject_command
-
-    with open_service(arguments) as ground:
-        reject_command(ground, arguments.command_id, actor=_actor(arguments), reason=arguments.reason)
-    return _show(arguments, arguments.command_id)
+    with operations(arguments) as service:
+        return _show(arguments, service.reject_command(arguments.command_id, arguments.reason))
 
 
 def uplink(arguments: argparse.Namespace) -> int:
-    from ground_service.services.commanding import take_uplink
+    from linna.errors import UsageError
 
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    with open_service(arguments) as ground, arguments.out.open("wb") as file:
-        stream, ids = take_uplink(
-            ground,
-            spacecraft_id=arguments.spacecraft_id,
-            instance=arguments.instance,
-            framed=arguments.format == "cltu",
-            actor=_actor(arguments),
-        )
-        file.write(stream)
-    figures = {"file": str(arguments.out), "octets": len(stream), "telecommands": ids}
-    emit(arguments, figures, text=f"{arguments.out}: {len(ids)} telecommands, {len(stream)} octets")
+    if arguments.out is None and arguments.tcp is None:
+        raise UsageError("uplink: expected --out FILE or --tcp HOST:PORT, found neither")
+    with contextlib.ExitStack() as opened:
+        # Connection and file come first: telecommands count as sent from the moment they are taken.
+        link = opened.enter_context(_connection(arguments.tcp)) if arguments.tcp else None
+        file = None
+        if arguments.out is not None:
+            arguments.out.parent.mkdir(parents=True, exist_ok=True)
+            file = opened.enter_context(arguments.out.open("wb"))
+        service = opened.enter_context(operations(arguments))
+        stream, ids = service.take_uplink(arguments.spacecraft_id, arguments.instance, arguments.format)
+        if file is not None:
+            file.write(stream)
+        if link is not None:
+            link.sendall(stream)
+    where = str(arguments.out or arguments.tcp)
+    figures = {"file": where, "octets": len(stream), "telecommands": ids}
+    emit(arguments, figures, text=f"{where}: {len(ids)} telecommands, {len(stream)} octets")
     return 0
 
 
-def _show(arguments: argparse.Namespace, command_id: int) -> int:
-    from ground_service.services.commanding import get_command
+def _connection(address: str) -> Any:
+    import socket
 
-    with open_service(arguments) as ground:
-        figures = _figures(get_command(ground, command_id))
-    emit(arguments, figures, text=f"telecommand {command_id} ({figures['name']}): {figures['state']}")
+    from linna.errors import UsageError
+
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdigit() or not 0 < int(port) < 65536:
+        raise UsageError(f"--tcp: expected HOST:PORT, found {address!r}")
+    try:
+        return socket.create_connection((host.strip("[]"), int(port)), timeout=10.0)
+    except OSError as error:
+        raise UsageError(f"--tcp {address}: expected a receiver of telecommands, found {error}") from None
+
+
+def _show(arguments: argparse.Namespace, view: dict[str, Any]) -> int:
+    figures = _figures(view)
+    emit(arguments, figures, text=f"telecommand {figures['id']} ({figures['name']}): {figures['state']}")
     return 0
 
 
-def _figures(view: Any) -> dict[str, Any]:
-    row, fate = view.row, view.fate
-    return {
-        "id": row["id"],
-        "name": row["name"],
-        "arguments": row["arguments"],
-        "state": view.state,
-        "critical": bool(row["critical"]),
-        "timed_out": fate is not None and fate.timed_out,
-        "requested_by": row["requested_by"],
-        "decided_by": row["decided_by"],
-        "reports": len(fate.reports) if fate is not None else 0,
-    }
+def _figures(view: dict[str, Any]) -> dict[str, Any]:
+    kept = ("id", "name", "arguments", "state", "critical", "timed_out", "requested_by", "decided_by")
+    return {**{name: view[name] for name in kept}, "reports": len(view["reports"])}
 
 
 def _argument(text: str) -> tuple[str, object]:
@@ -151,7 +147,3 @@ def _argument(text: str) -> tuple[str, object]:
         except ValueError:
             continue
     return name, value
-
-
-def _actor(arguments: argparse.Namespace) -> str:
-    return str(arguments.actor or getpass.getuser())

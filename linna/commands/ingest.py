@@ -1,4 +1,4 @@
-"""`linna ingest`: downlink files and pass archives into the ground database."""
+"""`linna ingest`: downlink files and pass archives into the ground database, or telemetry as it comes."""
 
 from __future__ import annotations
 
@@ -6,13 +6,20 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from linna.commands._ground import add_service_options, open_service
+from linna.commands._ground import add_operator_options, operations, settings_of
 from linna.output import add_json_flag, emit, log
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "files", nargs="+", type=Path, metavar="FILE", help="downlink file or pass archive folder"
+        "files", nargs="*", type=Path, metavar="FILE", help="downlink file or pass archive folder"
+    )
+    parser.add_argument("--tcp", metavar="HOST:PORT", help="take telemetry from this sender until it closes")
+    parser.add_argument("--watch", type=Path, metavar="DIR", help="ingest files as they appear in a folder")
+    parser.add_argument(
+        "--follow",
+        action="store_true",
+        help="with --tcp connect again, with --watch go on looking, until Ctrl-C",
     )
     parser.add_argument(
         "--spacecraft-id",
@@ -21,46 +28,96 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="whose the files are; needed for bare packets, 0 to 1023",
     )
     parser.add_argument("--instance", default="flight", help="instance of the spacecraft (default: flight)")
-    add_service_options(parser)
+    add_operator_options(parser)
     add_json_flag(parser)
     parser.set_defaults(handler=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from ground_service.services.archive_import import import_archive
-    from ground_service.services.ingest import ingest_file
+    from linna.errors import UsageError
 
     if arguments.spacecraft_id is not None and not 0 <= arguments.spacecraft_id <= 1023:
-        from linna.errors import UsageError
-
         raise UsageError(f"--spacecraft-id: expected 0 to 1023, found {arguments.spacecraft_id}")
+    if sum((bool(arguments.files), arguments.tcp is not None, arguments.watch is not None)) != 1:
+        raise UsageError("ingest: expected one of FILE..., --tcp and --watch")
     done: list[dict[str, Any]] = []
-    with open_service(arguments) as ground:
-        for path in arguments.files:
-            log(f"ingesting {path} ...")
+    with operations(arguments) as service:
+
+        def ingest(path: Path) -> dict[str, Any]:
             if path.is_dir():
-                done.append({"file": str(path), "pass_id": import_archive(ground, path)})
-                continue
-            result = ingest_file(
-                ground, path, spacecraft_id=arguments.spacecraft_id, instance=arguments.instance
+                return {"file": str(path), "pass_id": service.import_archive(path)}
+            result = service.ingest_file(
+                path, spacecraft_id=arguments.spacecraft_id, instance=arguments.instance
             )
-            done.append(
-                {
-                    "file": str(path),
-                    "ingest_id": result.ingest_id,
-                    "packets": result.packets,
-                    "packets_new": result.packets_new,
-                    "crc_errors": result.crc_errors,
-                    "octets_skipped": result.octets_skipped,
-                    "frames_bad": result.frames_bad,
-                    "symbols_corrected": result.symbols_corrected,
-                }
-            )
-    emit(arguments, {"ingested": done}, text="\n".join(_line(one) for one in done))
+            kept = (
+                "ingest_id", "packets", "packets_new", "crc_errors", "octets_skipped", "frames_bad",
+                "symbols_corrected",
+            )  # fmt: skip
+            return {"file": str(path), **{name: result[name] for name in kept}}
+
+        def report(path: Path, result: Any) -> None:
+            one = result if isinstance(result, dict) else {"file": str(path), "error": str(result)}
+            done.append(one)
+            log(_line(one))
+
+        if arguments.tcp is not None:
+            _follow(arguments, ingest, report)
+        elif arguments.watch is not None:
+            _watch(arguments, ingest, report)
+        else:
+            for path in arguments.files:
+                log(f"ingesting {path} ...")
+                done.append(ingest(path))
+    if arguments.files:
+        emit(arguments, {"ingested": done}, text="\n".join(_line(one) for one in done))
+    else:
+        figures = _totals(done)
+        text = f"{figures['packets']} packets, {figures['packets_new']} new, in {figures['ingests']} ingests"
+        emit(arguments, {**figures, "ingested": done}, text=text)
     return 0
 
 
+def _follow(arguments: argparse.Namespace, ingest: Any, report: Any) -> None:
+    from ground_service.services.live_ingest import Spool, follow_tcp
+    from linna.errors import UsageError
+
+    host, _, port = arguments.tcp.rpartition(":")
+    if not host or not port.isdigit() or not 0 < int(port) < 65536:
+        raise UsageError(f"--tcp: expected HOST:PORT, found {arguments.tcp!r}")
+    folder = settings_of(arguments).home / "incoming" / f"{host}-{port}".replace("/", "_").replace(":", "_")
+    spool = Spool(folder, ingest, report)
+    try:
+        follow_tcp((host.strip("[]"), int(port)), spool, reconnect=arguments.follow, stop=lambda: False)
+    except KeyboardInterrupt:
+        spool.seal()
+
+
+def _watch(arguments: argparse.Namespace, ingest: Any, report: Any) -> None:
+    import hashlib
+    import time
+
+    from ground_service.services.live_ingest import SETTLED_S, WatchedFolder
+
+    folder = arguments.watch.resolve()
+    name = hashlib.sha256(str(folder).encode()).hexdigest()[:16]
+    watched = WatchedFolder(folder, settings_of(arguments).home / "watched" / f"{name}.json", ingest, report)
+    try:
+        watched.look(time.time())
+        while arguments.follow:
+            time.sleep(SETTLED_S / 2.0)
+            watched.look(time.time())
+    except KeyboardInterrupt:
+        pass
+
+
+def _totals(done: list[dict[str, Any]]) -> dict[str, int]:
+    names = ("packets", "packets_new", "crc_errors", "octets_skipped", "frames_bad")
+    return {"ingests": len(done), **{name: sum(one.get(name, 0) for one in done) for name in names}}
+
+
 def _line(one: dict[str, Any]) -> str:
+    if "error" in one:
+        return f"{one['file']}: {one['error']}"
     if "pass_id" in one:
         return f"{one['file']}: pass {one['pass_id']}"
     return (

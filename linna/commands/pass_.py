@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from linna.commands._ground import add_service_options, open_service
+from linna.commands._ground import add_operator_options, operations
 from linna.output import add_json_flag, emit
 
 
@@ -18,37 +18,37 @@ def configure(parser: argparse.ArgumentParser) -> None:
     showing.add_argument("pass_id", type=int, metavar="ID")
     showing.set_defaults(handler=show_pass)
     for action in (listing, showing):
-        add_service_options(action)
+        add_operator_options(action)
         add_json_flag(action)
 
 
 def list_passes(arguments: argparse.Namespace) -> int:
-    from ground_service.services import passes
-    from lunar.timescales import format_utc
-
-    with open_service(arguments) as ground:
-        page = passes.list_passes(ground, limit=max(arguments.limit, 1))
+    with operations(arguments) as service:
+        page = service.list_passes(max(arguments.limit, 1))
     rows = [
         {
-            "pass_id": row["id"],
-            "name": row["name"],
-            "start": format_utc(row["start_utc_ns"]),
-            "stop": format_utc(row["stop_utc_ns"]),
+            "pass_id": item["id"],
+            "name": item["name"],
+            "start": _milliseconds(item["start"]),
+            "stop": _milliseconds(item["stop"]),
         }
-        for row in page.rows
+        for item in page["items"]
     ]
     lines = [f"{row['pass_id']:>6}  {row['start']}  {row['stop']}  {row['name']}" for row in rows]
-    emit(arguments, {"passes": rows, "total": page.total}, text="\n".join(lines) or "no passes")
+    emit(arguments, {"passes": rows, "total": page["total"]}, text="\n".join(lines) or "no passes")
     return 0
 
 
 def show_pass(arguments: argparse.Namespace) -> int:
-    from ground_service.services.reports import pass_summary
-
-    with open_service(arguments) as ground:
-        figures = pass_summary(ground, arguments.pass_id)
+    with operations(arguments) as service:
+        figures = service.pass_summary(arguments.pass_id)
     emit(arguments, figures, text=describe(figures))
     return 0
+
+
+def _milliseconds(time: str) -> str:
+    """A time with nanoseconds, cut to milliseconds."""
+    return f"{time[:23]}Z"
 
 
 def describe(figures: dict[str, Any]) -> str:

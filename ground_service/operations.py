@@ -1,0 +1,209 @@
+"""The operators' work on a service of this machine, with the methods and values of `ground_service.client.Client`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from ground_service.errors import InvalidInput
+from ground_service.services.ground import Ground
+from ground_service.services.views import (
+    correlation_view,
+    ephemeris_view,
+    pass_view,
+    search_view,
+    telecommand_view,
+    window_view,
+)
+
+View = dict[str, Any]
+
+
+class LocalOperations:
+    """Works on an opened service in the name of `actor`; closes the service at the end."""
+
+    def __init__(self, ground: Ground, actor: str) -> None:
+        self.ground = ground
+        self._actor = actor
+
+    def __enter__(self) -> LocalOperations:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.ground.close()
+
+    def list_passes(self, limit: int = 100) -> View:
+        from ground_service.services.passes import list_passes
+
+        page = list_passes(self.ground, limit=limit)
+        return {"items": [pass_view(row) for row in page.rows], "total": page.total}
+
+    def pass_summary(self, pass_id: int) -> View:
+        from ground_service.services.reports import pass_summary
+
+        return pass_summary(self.ground, pass_id)
+
+    def ingest_file(self, path: Path, *, spacecraft_id: int | None = None, instance: str = "flight") -> View:
+        from ground_service.services.ingest import ingest_file
+
+        return asdict(ingest_file(self.ground, path, spacecraft_id=spacecraft_id, instance=instance))
+
+    def import_archive(self, folder: Path) -> int:
+        from ground_service.services.archive_import import import_archive
+
+        return import_archive(self.ground, folder)
+
+    def make_report(self, pass_id: int, out: Path | None = None) -> View:
+        from ground_service.services.reports import make_report
+
+        made = make_report(self.ground, pass_id, out=out, pdf=True)
+        return {
+            "report": str(made.html),
+            "report_json": str(made.json),
+            "report_pdf": str(made.pdf),
+            "report_id": made.report_id,
+            **made.summary,
+        }
+
+    def add_ephemeris(self, path: Path, name: str | None = None, precedence: int = 0) -> View:
+        from ground_service.services.ephemerides import add_ephemeris
+
+        if not path.is_file():
+            raise InvalidInput(str(path), "", "an ephemeris file", "nothing there")
+        stored = self.ground.files.put_file(path)
+        return ephemeris_view(
+            add_ephemeris(
+                self.ground, stored, name=name or path.name, precedence=precedence, actor=self._actor
+            )
+        )
+
+    def enter_command(self, name: str, arguments: Mapping[str, Any], **where: Any) -> View:
+        from ground_service.services.commanding import enter_command
+
+        return self.get_command(enter_command(self.ground, name, arguments, actor=self._actor, **where))
+
+    def list_commands(self, limit: int = 100) -> View:
+        from ground_service.services.commanding import list_commands
+
+        views, total = list_commands(self.ground, limit=limit)
+        return {"items": [telecommand_view(view) for view in views], "total": total}
+
+    def get_command(self, command_id: int) -> View:
+        from ground_service.services.commanding import get_command
+
+        return telecommand_view(get_command(self.ground, command_id))
+
+    def release_command(self, command_id: int) -> View:
+        from ground_service.services.commanding import release_command
+
+        release_command(self.ground, command_id, actor=self._actor)
+        return self.get_command(command_id)
+
+    def reject_command(self, command_id: int, reason: str) -> View:
+        from ground_service.services.commanding import reject_command
+
+        reject_command(self.ground, command_id, actor=self._actor, reason=reason)
+        return self.get_command(command_id)
+
+    def take_uplink(self, spacecraft_id: int, instance: str, form: str) -> tuple[bytes, list[int]]:
+        from ground_service.services.commanding import take_uplink
+
+        return take_uplink(
+            self.ground,
+            spacecraft_id=spacecraft_id,
+            instance=instance,
+            framed=form == "cltu",
+            actor=self._actor,
+        )
+
+    def correlate(self, spacecraft_id: int, instance: str, points: list[View]) -> View:
+        from ground_service.services.timekeeping import correlate_spacecraft, time_points
+
+        rows = correlate_spacecraft(
+            self.ground, spacecraft_id, instance, time_points(points), actor=self._actor
+        )
+        return {"items": [correlation_view(row) for row in rows], "total": len(rows)}
+
+    def correlations(self, spacecraft_id: int, instance: str) -> View:
+        from ground_service.services.timekeeping import spacecraft_correlations
+
+        rows = spacecraft_correlations(self.ground, spacecraft_id, instance)
+        return {"items": [correlation_view(row) for row in rows], "total": len(rows)}
+
+    def search_windows(self, request: Mapping[str, Any]) -> View:
+        from ground_service.services.plan_requests import search
+
+        return search_view(*search(self.ground, self._read("WindowSearch", request)))
+
+    def add_window(self, request: Mapping[str, Any]) -> View:
+        from ground_service.services.plan_requests import window_entry
+        from ground_service.services.planning import add_window
+
+        entry = window_entry(self._read("WindowIn", request))
+        return window_view(add_window(self.ground, entry, actor=self._actor))
+
+    def list_windows(self, limit: int = 100) -> View:
+        from ground_service.services.planning import list_windows
+
+        rows, total = list_windows(self.ground, limit=limit)
+        return {"items": [window_view(row) for row in rows], "total": total}
+
+    def get_window(self, window_id: int) -> View:
+        from ground_service.services.planning import get_window
+
+        return window_view(get_window(self.ground, window_id))
+
+    def change_window(self, window_id: int, request: Mapping[str, Any]) -> View:
+        from ground_service.services.plan_requests import window_changes
+        from ground_service.services.planning import change_window
+
+        given = self._read("WindowChange", request)
+        row = change_window(
+            self.ground,
+            window_id,
+            actor=self._actor,
+            changes=window_changes(given),
+            decision=given.state,
+            reason=given.reason,
+        )
+        return window_view(row)
+
+    def delete_window(self, window_id: int) -> None:
+        from ground_service.services.planning import delete_window
+
+        delete_window(self.ground, window_id, actor=self._actor)
+
+    def uplink_window(self, window_id: int) -> View:
+        from ground_service.services.planning import uplink_window
+
+        views = [self.get_command(key) for key in uplink_window(self.ground, window_id, actor=self._actor)]
+        return {"items": views, "total": len(views)}
+
+    def export_plan(self) -> View:
+        from ground_service.services.plan_exchange import export_plan
+
+        return export_plan(self.ground)
+
+    def import_plan(self, plan: Mapping[str, Any]) -> View:
+        from ground_service.services.plan_exchange import import_plan
+        from ground_service.services.plan_requests import plan_entries
+
+        entries = plan_entries(self._read("Plan", plan))
+        return {"windows": import_plan(self.ground, entries, actor=self._actor)}
+
+    def _read(self, name: str, request: Mapping[str, Any]) -> Any:
+        """A request checked like one that comes over the wire."""
+        from pydantic import ValidationError
+
+        from ground_service.services import plan_schemas
+
+        try:
+            return getattr(plan_schemas, name).model_validate(dict(request))
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise InvalidInput(
+                "request", where, first["msg"].lower(), repr(first.get("input"))[:80]
+            ) from None

@@ -1,0 +1,138 @@
+"""Pass archives that come as zip files: unpacked only where nothing in them can do harm."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import stat
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+
+from ground_service.errors import InvalidInput, storage_error
+from ground_service.services.archive_import import import_archive
+from ground_service.services.ground import Ground
+
+ENTRIES_LIMIT = 20_000
+OCTETS_LIMIT = 16 << 30
+RATIO_LIMIT = 200
+"""Images and telemetry shrink by ten at most; what grows a hundredfold and more is made to fill the disk."""
+
+RATIO_FREE_OCTETS = 1 << 20
+BLOCK_OCTETS = 1 << 20
+
+
+def import_zip(ground: Ground, path: Path, name: str = "archive.zip") -> int:
+    """Import a zipped pass archive; the id of its pass.
+
+    Raises
+    ------
+    InvalidInput
+        If it is no zip file, would write outside its folder or fill the disk, or is no pass archive.
+    """
+    with unpacked(path, ground.home, name) as folder:
+        return import_archive(ground, folder)
+
+
+@contextmanager
+def unpacked(path: Path, work: Path, name: str) -> Iterator[Path]:
+    """The files of a zip in a folder under `work`, which is removed in the end."""
+    try:
+        folder = Path(tempfile.mkdtemp(prefix=".unpacking-", dir=work))
+    except OSError as error:
+        raise storage_error(error, work) from None
+    try:
+        with _opened(path, name) as archive:
+            _unpack(archive, folder, path.stat().st_size, name)
+        yield _root(folder)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _opened(path: Path, name: str) -> Iterator[zipfile.ZipFile]:
+    try:
+        archive = zipfile.ZipFile(path)
+    except (zipfile.BadZipFile, OSError, ValueError, EOFError):
+        raise InvalidInput(name, "", "a zip file of a pass archive", "something else") from None
+    with archive:
+        yield archive
+
+
+def _unpack(archive: zipfile.ZipFile, folder: Path, packed_octets: int, name: str) -> None:
+    entries = archive.infolist()
+    if len(entries) > ENTRIES_LIMIT:
+        raise InvalidInput(name, "", f"at most {ENTRIES_LIMIT} files", str(len(entries)))
+    seen: set[str] = set()
+    limit = min(OCTETS_LIMIT, max(packed_octets * RATIO_LIMIT, RATIO_FREE_OCTETS))
+    taken = 0
+    for entry in entries:
+        target = folder / _checked_name(entry, seen, name)
+        if entry.is_dir():
+            target.mkdir(parents=True, exist_ok=True)
+            continue
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with archive.open(entry) as source, target.open("xb") as sink:
+                while block := source.read(BLOCK_OCTETS):
+                    taken += len(block)
+                    if taken > limit:
+                        raise InvalidInput(
+                            name, entry.filename[:80], f"at most {limit} octets when unpacked", "more"
+                        )
+                    sink.write(block)
+        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+            raise InvalidInput(name, entry.filename[:80], "a whole file", str(error)[:120]) from None
+        except OSError as error:
+            raise storage_error(error, folder) from None
+
+
+def _checked_name(entry: zipfile.ZipInfo, seen: set[str], name: str) -> str:
+    """The path of an entry inside the archive; anything that could lead elsewhere is refused."""
+    path = PurePosixPath(entry.filename)
+    mode = entry.external_attr >> 16
+    harmless = (
+        entry.filename
+        and "\\" not in entry.filename
+        and "\0" not in entry.filename
+        and ":" not in entry.filename
+        and not path.is_absolute()
+        and ".." not in path.parts
+        and len(entry.filename) < 1000
+        and not stat.S_ISLNK(mode)
+        and not entry.flag_bits & 1
+    )
+    if not harmless:
+        raise InvalidInput(name, repr(entry.filename[:80]), "a plain file inside the archive", "another path")
+    if str(path) in seen:
+        raise InvalidInput(name, entry.filename[:80], "each file once", "it twice")
+    seen.add(str(path))
+    return str(path)
+
+
+def _root(folder: Path) -> Path:
+    """Where the manifest lies: in the folder, or in the only one within it."""
+    inside = list(folder.iterdir())
+    if len(inside) == 1 and inside[0].is_dir() and not (folder / "manifest.json").exists():
+        return inside[0]
+    return folder
+
+
+def zip_folder(folder: Path) -> Path:
+    """The files of a folder as a zip file of its own, not shrunk; the caller removes it."""
+    descriptor, name = tempfile.mkstemp(suffix=".zip")
+    os.close(descriptor)
+    try:
+        with zipfile.ZipFile(name, "w", zipfile.ZIP_STORED) as archive:
+            for path in sorted(folder.rglob("*")):
+                if path.is_file():
+                    archive.write(path, str(path.relative_to(folder)))
+    except BaseException:
+        with contextlib.suppress(OSError):
+            Path(name).unlink()
+        raise
+    return Path(name)

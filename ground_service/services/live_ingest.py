@@ -1,0 +1,236 @@
+"""Telemetry as it comes: from a TCP connection, or as files that appear in a folder.
+
+What comes over a connection is written to a spool first, cut into segments where the sender pauses, and ingested
+segment by segment; a segment is removed when it is in the archive. Since ingesting the same octets again changes
+nothing, whatever a crash leaves in the spool is simply ingested by the next run: exactly once, nothing lost.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import socket
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ground_service.errors import GroundError, InvalidInput, StoreError, storage_error
+from tmtc.downlink import decode
+from tmtc.errors import TmtcError
+
+log = logging.getLogger(__name__)
+
+SEGMENT_OCTETS = 4 << 20
+PAUSE_S = 0.5
+"""A sender that is silent for this long has finished a unit: what came so far is ingested."""
+
+CONNECT_S = 30.0
+RETRY_S = 1.0
+SETTLED_S = 2.0
+"""A file that has not changed for this long is taken to be whole."""
+
+_UNFINISHED = (".part", ".tmp", ".filepart", ".crdownload")
+
+Ingest = Callable[[Path], dict[str, Any]]
+Report = Callable[[Path, "dict[str, Any] | GroundError"], None]
+
+
+@dataclass(slots=True)
+class Spool:
+    """Octets on their way into the archive, in segments under `folder`.
+
+    What the ingest refuses (noise) is told to `report` and not tried again: the archive of files has it.
+    """
+
+    folder: Path
+    ingest: Ingest
+    report: Report
+    _size: int = 0
+    _next: int = 0
+    _stream: Any = field(default=None)
+
+    def recover(self) -> None:
+        """Ingest what an earlier run left behind."""
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            current = self._current
+            if current.exists() and current.stat().st_size:
+                os.replace(current, self._sealed(self._first_free()))
+            self._next = self._first_free()
+        except OSError as error:
+            raise storage_error(error, self.folder) from None
+        self._drain()
+
+    def take(self, octets: bytes) -> None:
+        """Keep octets; a full segment is ingested."""
+        try:
+            if self._stream is None:
+                self._stream = self._current.open("ab", buffering=0)
+            self._stream.write(octets)
+        except OSError as error:
+            raise storage_error(error, self.folder) from None
+        self._size += len(octets)
+        if self._size >= SEGMENT_OCTETS:
+            self.seal()
+
+    def pause(self) -> None:
+        """The sender is silent: ingest what came, unless it is less than one frame or packet."""
+        if self._size and _holds_a_unit(self._current.read_bytes()):
+            self.seal()
+
+    def seal(self) -> None:
+        """Ingest what came so far."""
+        if self._size == 0:
+            return
+        self._stream.close()
+        self._stream, self._size = None, 0
+        os.replace(self._current, self._sealed(self._next))
+        self._next += 1
+        self._drain()
+
+    @property
+    def _current(self) -> Path:
+        return self.folder / "current"
+
+    def _sealed(self, number: int) -> Path:
+        return self.folder / f"{number:012d}.segment"
+
+    def _first_free(self) -> int:
+        numbers = [int(path.stem) for path in self.folder.glob("*.segment") if path.stem.isdigit()]
+        return max(numbers, default=-1) + 1
+
+    def _drain(self) -> None:
+        for path in sorted(self.folder.glob("*.segment")):
+            try:
+                self.report(path, self.ingest(path))
+            except (StoreError, OSError):
+                raise
+            except GroundError as error:
+                self.report(path, error)
+            path.unlink()
+
+
+def _holds_a_unit(octets: bytes) -> bool:
+    try:
+        found = decode(octets)
+    except TmtcError:
+        return True
+    frames = found.frames
+    return found.packets > 0 or (frames is not None and len(frames) > 0)
+
+
+def follow_tcp(address: tuple[str, int], spool: Spool, *, reconnect: bool, stop: Callable[[], bool]) -> int:
+    """Take telemetry from a TCP sender until it closes (or for good, with `reconnect`); the octets taken.
+
+    Raises
+    ------
+    InvalidInput
+        If nobody answers there within `CONNECT_S`.
+    """
+    spool.recover()
+    taken = 0
+    while True:
+        with _connected(address, stop, patient=reconnect) as connection:
+            for block in _received(connection, spool, stop):
+                spool.take(block)
+                taken += len(block)
+        spool.seal()
+        if not reconnect or stop():
+            return taken
+
+
+@contextlib.contextmanager
+def _connected(address: tuple[str, int], stop: Callable[[], bool], *, patient: bool) -> Iterator[Any]:
+    until = time.monotonic() + CONNECT_S
+    while True:
+        try:
+            connection = socket.create_connection(address, timeout=5.0)
+            break
+        except OSError as error:
+            if stop() or (not patient and time.monotonic() > until):
+                raise InvalidInput(
+                    f"{address[0]}:{address[1]}", "", "a sender of telemetry", error.strerror or str(error)
+                ) from None
+            time.sleep(RETRY_S)
+    with connection:
+        connection.settimeout(PAUSE_S)
+        yield connection
+
+
+def _received(connection: socket.socket, spool: Spool, stop: Callable[[], bool]) -> Iterator[bytes]:
+    while not stop():
+        try:
+            block = connection.recv(1 << 16)
+        except TimeoutError:
+            spool.pause()
+            continue
+        except OSError as error:
+            log.warning("connection lost: %s", error)
+            return
+        if not block:
+            return
+        yield block
+
+
+@dataclass(slots=True)
+class WatchedFolder:
+    """Files and pass archives that appear in a folder, each ingested once; `ledger` remembers which were."""
+
+    folder: Path
+    ledger: Path
+    ingest: Ingest
+    report: Report
+
+    def look(self, now_s: float) -> int:
+        """Ingest what has settled since the last look; how many files that were."""
+        if not self.folder.is_dir():
+            raise InvalidInput(str(self.folder), "", "a folder to watch", "nothing there")
+        known = self._known()
+        done = 0
+        for path in sorted(self.folder.iterdir()):
+            if path.name.startswith(".") or path.suffix in _UNFINISHED:
+                continue
+            try:
+                mark = _mark(path)
+                settled = now_s - max(mark[1] / 1e9, 0.0) >= SETTLED_S
+            except OSError:
+                continue  # it went away while being looked at
+            if not settled or known.get(path.name) == mark:
+                continue
+            try:
+                self.report(path, self.ingest(path))
+            except (StoreError, OSError):
+                raise
+            except GroundError as error:
+                self.report(path, error)
+            known[path.name] = mark
+            self._remember(known)
+            done += 1
+        return done
+
+    def _known(self) -> dict[str, list[int]]:
+        try:
+            known = json.loads(self.ledger.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        return known if isinstance(known, dict) else {}
+
+    def _remember(self, known: dict[str, list[int]]) -> None:
+        temporary = self.ledger.with_suffix(".new")
+        try:
+            self.ledger.parent.mkdir(parents=True, exist_ok=True)
+            temporary.write_text(json.dumps(known), encoding="utf-8")
+            temporary.replace(self.ledger)
+        except OSError as error:
+            raise storage_error(error, self.ledger.parent) from None
+
+
+def _mark(path: Path) -> list[int]:
+    """Size and time of change of a file, or of all that is in a folder."""
+    files = [one for one in path.rglob("*") if one.is_file()] if path.is_dir() else [path]
+    stats = [one.stat() for one in files]
+    return [sum(stat.st_size for stat in stats), max((stat.st_mtime_ns for stat in stats), default=0)]

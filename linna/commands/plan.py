@@ -1,0 +1,207 @@
+"""`linna plan`: planned observation windows, from the search over an ephemeris to their uplink."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from linna.commands._ground import add_operator_options, operations
+from linna.output import add_json_flag, emit
+
+RANGE = ("MIN", "MAX")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    actions = parser.add_subparsers(metavar="ACTION", required=True)
+    ephemeris = actions.add_parser("ephemeris", help="add a reference ephemeris (OEM or STK .e)")
+    ephemeris.add_argument("file", type=Path)
+    ephemeris.add_argument("--name")
+    ephemeris.add_argument("--precedence", type=int, default=0)
+    ephemeris.set_defaults(handler=add_ephemeris)
+    searching = actions.add_parser("search", help="candidate windows over a reference ephemeris")
+    _search_options(searching)
+    searching.set_defaults(handler=search)
+    adding = actions.add_parser("add", help="enter a window as a draft")
+    adding.add_argument("--start", required=True, metavar="UTC")
+    adding.add_argument("--stop", required=True, metavar="UTC")
+    adding.add_argument("--spacecraft-id", type=int, required=True, metavar="N")
+    adding.add_argument("--instance", default="flight")
+    adding.add_argument("--name", default="observation")
+    adding.add_argument("--cadence-s", type=float, default=15.0)
+    adding.add_argument("--after", type=int, metavar="ID", help="window that has to come before")
+    adding.set_defaults(handler=add)
+    listing = actions.add_parser("list", help="planned windows, the newest first")
+    listing.add_argument("--limit", type=int, default=100)
+    listing.set_defaults(handler=list_all)
+    parsers = [ephemeris, searching, adding, listing]
+    for name, handler, text in (
+        ("show", show, "one window"),
+        ("approve", decide, "approve a draft"),
+        ("draft", decide, "make a window a draft again"),
+        ("fail", decide, "declare a window failed"),
+        ("delete", delete, "take a window off the plan"),
+        ("uplink", uplink, "release the time-tagged telecommands of a window"),
+    ):
+        one = actions.add_parser(name, help=text)
+        one.add_argument("window_id", type=int, metavar="ID")
+        if name == "fail":
+            one.add_argument("--reason", required=True)
+        one.set_defaults(handler=handler, action=name)
+        parsers.append(one)
+    exporting = actions.add_parser("export", help="write the plan as JSON")
+    exporting.add_argument("--out", type=Path, required=True, metavar="FILE")
+    exporting.set_defaults(handler=export)
+    importing = actions.add_parser("import", help="enter the windows of a plan as drafts, all or none")
+    importing.add_argument("file", type=Path)
+    importing.set_defaults(handler=import_file)
+    for one in (*parsers, exporting, importing):
+        add_operator_options(one)
+        add_json_flag(one)
+
+
+def _search_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--start", metavar="UTC", help="default: where the ephemeris begins")
+    parser.add_argument("--stop", metavar="UTC", help="default: where the ephemeris ends")
+    parser.add_argument("--ephemeris-id", type=int, metavar="ID")
+    parser.add_argument(
+        "--spacecraft-id", type=int, metavar="N", help="count with what it has to store already"
+    )
+    for name, unit in (("altitude", "km"), ("sun-elevation", "deg"), ("latitude", "deg")):
+        parser.add_argument(f"--{name}-{unit}", type=float, nargs=2, metavar=RANGE)
+    parser.add_argument("--craters-per-frame", type=float, metavar="N", help="catalogued craters at least")
+    parser.add_argument("--catalogue-pass-id", type=int, metavar="ID", help="crater catalogue of this pass")
+    parser.add_argument("--terrain", choices=("mare", "highland"))
+    parser.add_argument("--sunlit", action="store_true", help="the spacecraft in full sunlight")
+    parser.add_argument("--minimum-duration-s", type=float, metavar="S")
+    parser.add_argument("--maximum-duration-s", type=float, metavar="S")
+    parser.add_argument("--minimum-battery", type=float, metavar="SHARE")
+    parser.add_argument(
+        "--needs-contact", action="store_true", help="its data have to be down within the span"
+    )
+    parser.add_argument("--cadence-s", type=float, metavar="S")
+    parser.add_argument("--step-s", type=float, metavar="S")
+
+
+def add_ephemeris(arguments: argparse.Namespace) -> int:
+    with operations(arguments) as service:
+        made = service.add_ephemeris(arguments.file, arguments.name, arguments.precedence)
+    emit(arguments, made, text=f"ephemeris {made['id']} ({made['name']}): {made['start']} to {made['stop']}")
+    return 0
+
+
+def search(arguments: argparse.Namespace) -> int:
+    names = (
+        "start", "stop", "ephemeris_id", "spacecraft_id", "craters_per_frame", "catalogue_pass_id", "terrain",
+        "minimum_duration_s", "maximum_duration_s", "minimum_battery", "cadence_s", "step_s",
+    )  # fmt: skip
+    request: dict[str, Any] = {name: getattr(arguments, name) for name in names}
+    for name in ("altitude_km", "sun_elevation_deg", "latitude_deg"):
+        limits = getattr(arguments, name)
+        request[name] = None if limits is None else {"min": limits[0], "max": limits[1]}
+    request = {name: value for name, value in request.items() if value is not None}
+    request |= {"sunlit": arguments.sunlit, "needs_contact": arguments.needs_contact}
+    with operations(arguments) as service:
+        found = service.search_windows(request)
+    lines = [
+        f"{one['start'][:19]}Z  {one['stop'][:19]}Z  {one['frames']:>4} frames  "
+        f"{one['altitude_km']['min']:.1f} to {one['altitude_km']['max']:.1f} km  "
+        f"Sun {one['sun_elevation_deg']['min']:.0f} to {one['sun_elevation_deg']['max']:.0f} deg"
+        for one in found["candidates"]
+    ]
+    lines.append(f"{len(found['candidates'])} candidates; data: {'; '.join(found['data'])}")
+    emit(arguments, found, text="\n".join(lines))
+    return 0
+
+
+def add(arguments: argparse.Namespace) -> int:
+    request = {
+        "name": arguments.name,
+        "start": arguments.start,
+        "stop": arguments.stop,
+        "cadence_s": arguments.cadence_s,
+        "spacecraft_id": arguments.spacecraft_id,
+        "instance": arguments.instance,
+        "predecessor_id": arguments.after,
+    }
+    with operations(arguments) as service:
+        window = service.add_window(request)
+    return _show(arguments, window)
+
+
+def list_all(arguments: argparse.Namespace) -> int:
+    with operations(arguments) as service:
+        page = service.list_windows(max(arguments.limit, 1))
+    text = "\n".join(_line(window) for window in page["items"]) or "no windows"
+    emit(arguments, {"windows": page["items"], "total": page["total"]}, text=text)
+    return 0
+
+
+def show(arguments: argparse.Namespace) -> int:
+    with operations(arguments) as service:
+        return _show(arguments, service.get_window(arguments.window_id))
+
+
+def decide(arguments: argparse.Namespace) -> int:
+    state = {"approve": "approved", "draft": "draft", "fail": "failed"}[arguments.action]
+    request = {"state": state}
+    if arguments.action == "fail":
+        request["reason"] = arguments.reason
+    with operations(arguments) as service:
+        return _show(arguments, service.change_window(arguments.window_id, request))
+
+
+def delete(arguments: argparse.Namespace) -> int:
+    with operations(arguments) as service:
+        service.delete_window(arguments.window_id)
+    emit(arguments, {"deleted": arguments.window_id}, text=f"window {arguments.window_id}: deleted")
+    return 0
+
+
+def uplink(arguments: argparse.Namespace) -> int:
+    with operations(arguments) as service:
+        commands = service.uplink_window(arguments.window_id)["items"]
+    lines = [f"telecommand {one['id']} ({one['name']}): {one['state']}" for one in commands]
+    emit(arguments, {"window_id": arguments.window_id, "telecommands": commands}, text="\n".join(lines))
+    return 0
+
+
+def export(arguments: argparse.Namespace) -> int:
+    with operations(arguments) as service:
+        plan = service.export_plan()
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    arguments.out.write_text(json.dumps(plan, indent=2) + "\n", encoding="utf-8")
+    figures = {"file": str(arguments.out), "windows": len(plan["windows"])}
+    emit(arguments, figures, text=f"{arguments.out}: {len(plan['windows'])} windows")
+    return 0
+
+
+def import_file(arguments: argparse.Namespace) -> int:
+    from linna.errors import UsageError
+
+    try:
+        plan = json.loads(arguments.file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError):
+        raise UsageError(f"{arguments.file}: expected a plan as JSON, found something else") from None
+    if not isinstance(plan, dict):
+        raise UsageError(f"{arguments.file}: expected a plan as a JSON object, found {type(plan).__name__}")
+    with operations(arguments) as service:
+        made = service.import_plan(plan)
+    emit(
+        arguments, made, text="\n".join(f"{key}: window {number}" for key, number in made["windows"].items())
+    )
+    return 0
+
+
+def _show(arguments: argparse.Namespace, window: dict[str, Any]) -> int:
+    emit(arguments, window, text=_line(window))
+    return 0
+
+
+def _line(window: dict[str, Any]) -> str:
+    reason = f" ({window['reason']})" if window["reason"] else ""
+    return (
+        f"{window['id']:>4}  {window['start'][:19]}Z  {window['stop'][:19]}Z  {window['state']}{reason}  "
+        f"{window['name']}"
+    )

@@ -1,0 +1,81 @@
+"""Zipped pass archives: what could do harm is refused and leaves nothing behind."""
+
+import stat
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ground_service.errors import InvalidInput
+from ground_service.services import archive_zip
+from ground_service.services.archive_zip import import_zip, unpacked, zip_folder
+from ground_service.services.ground import Ground
+
+
+def zipped(path: Path, entries: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> Path:
+    with zipfile.ZipFile(path, "w", method) as archive:
+        for name, octets in entries.items():
+            archive.writestr(name, octets)
+    return path
+
+
+def test_a_zipped_archive_is_the_same_pass_as_its_folder(ground: Ground, synthetic_pass: Any) -> None:
+    from ground_service.services.archive_import import import_archive
+
+    packed = zip_folder(synthetic_pass.folder)
+    try:
+        assert import_zip(ground, packed) == import_archive(ground, synthetic_pass.folder)
+    finally:
+        packed.unlink()
+    assert not list(ground.home.glob(".unpacking-*"))
+
+
+@pytest.mark.parametrize("name", ["../evil", "/etc/evil", "a/../../evil", "..\\evil", "C:evil", "a" * 2000])
+def test_paths_that_lead_elsewhere_are_refused(ground: Ground, tmp_path: Path, name: str) -> None:
+    path = zipped(tmp_path / "bad.zip", {"manifest.json": b"{}", name: b"x"})
+    with pytest.raises(InvalidInput, match="expected a plain file inside the archive"):
+        import_zip(ground, path)
+    assert not list(tmp_path.rglob("evil"))
+    assert not list(ground.home.glob(".unpacking-*"))
+
+
+def test_links_are_refused(ground: Ground, tmp_path: Path) -> None:
+    entry = zipfile.ZipInfo("link")
+    entry.external_attr = (stat.S_IFLNK | 0o777) << 16
+    with zipfile.ZipFile(tmp_path / "link.zip", "w") as archive:
+        archive.writestr(entry, "/etc/passwd")
+    with pytest.raises(InvalidInput, match="expected a plain file inside the archive"):
+        import_zip(ground, tmp_path / "link.zip")
+
+
+def test_a_bomb_is_stopped_before_it_fills_the_disk(ground: Ground, tmp_path: Path) -> None:
+    path = zipped(tmp_path / "bomb.zip", {"a": b"\0" * (64 << 20)})
+    assert path.stat().st_size < 100_000
+    with pytest.raises(InvalidInput, match="octets when unpacked, found more"):
+        import_zip(ground, path)
+
+
+def test_too_many_files_files_twice_and_no_zip_at_all_are_refused(
+    ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with (
+        pytest.warns(UserWarning, match="Duplicate name"),
+        zipfile.ZipFile(tmp_path / "twice.zip", "w") as archive,
+    ):
+        archive.writestr("a", "1")
+        archive.writestr("a", "2")
+    with pytest.raises(InvalidInput, match="expected each file once"):
+        import_zip(ground, tmp_path / "twice.zip")
+    (tmp_path / "no.zip").write_bytes(b"PK\x03\x04 nothing of the kind")
+    with pytest.raises(InvalidInput, match="expected a zip file of a pass archive"):
+        import_zip(ground, tmp_path / "no.zip")
+    whole = zipped(tmp_path / "whole.zip", {"a": bytes(range(256)) * 400}, zipfile.ZIP_STORED)
+    damaged = bytearray(whole.read_bytes())
+    damaged[5000] ^= 1
+    whole.write_bytes(damaged)
+    with pytest.raises(InvalidInput, match="expected a whole file"), unpacked(whole, tmp_path, "whole.zip"):
+        pass
+    monkeypatch.setattr(archive_zip, "ENTRIES_LIMIT", 3)
+    with pytest.raises(InvalidInput, match="expected at most 3 files, found 4"):
+        import_zip(ground, zipped(tmp_path / "many.zip", {str(i): b"" for i in range(4)}))

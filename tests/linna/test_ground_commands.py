@@ -1,0 +1,195 @@
+"""The operators' commands on this machine and on a server: the same words, the same figures."""
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+
+from ground_service.api.app import create_app
+from ground_service.api.server import bind
+from ground_service.services.archive_import import import_archive
+from ground_service.services.ground import open_ground
+from ground_service.services.users import add_user
+from ground_service.settings import Settings
+from linna.cli import run
+from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
+from lunar.ephemeris import ephemeris_from_states
+from lunar.oem import save_oem
+from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import encode_cadus
+
+NS = 1_000_000_000
+START = parse_utc("2029-08-07T06:00:00Z")
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two hours of a polar circle at 40 km."""
+    import numpy as np
+
+    path = tmp_path_factory.mktemp("oem") / "reference.oem"
+    radius = MOON_RADIUS_M + 40e3
+    rate = np.sqrt(GM_MOON_M3_S2 / radius**3)
+    utc_ns = START + np.arange(0, 7200, 60, dtype=np.int64) * NS
+    angle = (rate * (utc_ns - START) / NS)[:, None]
+    x, z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    position = radius * (np.cos(angle) * x + np.sin(angle) * z)
+    velocity = radius * rate * (np.cos(angle) * z - np.sin(angle) * x)
+    save_oem(ephemeris_from_states(utc_ns, position, velocity), path)
+    return path
+
+
+@pytest.fixture
+def downlink(tmp_path: Path) -> Path:
+    ticks = int(ticks_from_utc_ns(START + 60 * NS))
+    packets = [
+        DICTIONARY.pack(
+            "event_info",
+            {"event_id": 1, "frame_number": 0, "value_1": 0.0, "value_2": 0.0},
+            ticks=ticks + k,
+            sequence_count=k,
+        )
+        for k in range(5)
+    ]
+    path = tmp_path / "downlink.cadu"
+    path.write_bytes(encode_cadus(packets, spacecraft_id=76))
+    return path
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[list[str]]:
+    """A served service with one operator: the options that name it."""
+    settings = Settings(home=tmp_path / "served")
+    with open_ground(settings.home) as ground:
+        token = add_user(ground, "ann", "operator")
+    listener = bind("127.0.0.1", 0)
+    service = uvicorn.Server(uvicorn.Config(create_app(settings), log_level="error"))
+    thread = threading.Thread(target=service.run, kwargs={"sockets": [listener]})
+    thread.start()
+    while not service.started and thread.is_alive():
+        time.sleep(0.05)
+    try:
+        yield ["--server", f"http://127.0.0.1:{listener.getsockname()[1]}", "--token", token]
+    finally:
+        service.should_exit = True
+        thread.join(30)
+        listener.close()
+
+
+def asked(capsys: pytest.CaptureFixture[str], *words: Any, status: int = 0) -> Any:
+    code = run([*map(str, words), "--json"])
+    printed = capsys.readouterr()
+    assert code == status, printed.err
+    return json.loads(printed.out) if status == 0 else printed.err
+
+
+def comparable(value: Any) -> Any:
+    """What two services have to say alike: no times of entry, no names of files."""
+    if isinstance(value, dict):
+        dropped = (
+            "created",
+            "changed",
+            "requested",
+            "decided",
+            "file",
+            "created_by",
+            "requested_by",
+            "decided_by",
+        )
+        return {key: comparable(item) for key, item in value.items() if key not in dropped}
+    return [comparable(item) for item in value] if isinstance(value, list) else value
+
+
+def test_every_command_says_the_same_here_and_on_a_server(
+    capsys: pytest.CaptureFixture[str], server: list[str], reference: Path, downlink: Path, tmp_path: Path
+) -> None:
+    told: list[list[Any]] = []
+    for where in (["--home", tmp_path / "here", "--as", "ann"], server):
+        said = []
+
+        def ask(*words: Any, said: list[Any] = said, where: list[Any] = where, status: int = 0) -> Any:
+            answer = asked(capsys, *words, *where, status=status)
+            said.append(comparable(answer))
+            return answer
+
+        ask("plan", "ephemeris", reference)
+        found = ask("plan", "search", "--altitude-km", 30, 50, "--maximum-duration-s", 900)
+        first = found["candidates"][0]
+        window = ["--start", first["start"], "--stop", first["stop"], "--spacecraft-id", 76]
+        key = ask("plan", "add", *window, "--name", "w")["id"]
+        ask("plan", "approve", key)
+        ask("plan", "add", *window, status=2)
+        ask("plan", "uplink", key)
+        ask("command", "uplink", "--spacecraft-id", 76, "--out", tmp_path / "up.cltu")
+        ask("plan", "show", key)
+        ask("plan", "list")
+        ask("plan", "export", "--out", tmp_path / "plan.json")
+        ask("plan", "import", tmp_path / "plan.json")
+        ask("plan", "delete", key, status=2)
+        ask("ingest", downlink)
+        ask("ingest", downlink)
+        ask("ingest", tmp_path / "nothing", status=2)
+        ask("command", "enter", "test_connection", "--spacecraft-id", 76)
+        ask("command", "enter", "dance", "--spacecraft-id", 76, status=2)
+        ask("command", "reject", 6, "--reason", "not now")
+        ask("command", "show", 6)
+        ask("command", "list")
+        ask("pass", "list")
+        ask("report", 99, "--out", tmp_path / "r", status=2)
+        told.append(said)
+    assert told[0] == told[1]
+
+
+def test_a_pass_archive_is_imported_and_reported_over_the_wire(
+    capsys: pytest.CaptureFixture[str], server: list[str], synthetic_archive: Path, tmp_path: Path
+) -> None:
+    with open_ground(tmp_path / "here") as ground:
+        import_archive(ground, synthetic_archive)
+    here = asked(capsys, "pass", "show", 1, "--home", tmp_path / "here")
+    assert asked(capsys, "ingest", synthetic_archive, *server)["ingested"][0]["pass_id"] == 1
+    assert asked(capsys, "pass", "show", 1, *server) == here
+    made = asked(capsys, "report", 1, "--out", tmp_path / "out", *server)
+    for kind, start in (("html", b"<!"), ("json", b"{"), ("pdf", b"%PDF")):
+        assert (tmp_path / "out" / f"report.{kind}").read_bytes().startswith(start)
+    assert made["packets"] == here["packets"]
+
+
+@pytest.fixture
+def synthetic_archive(tmp_path: Path, downlink: Path, reference: Path) -> Path:
+    """The smallest pass archive there is."""
+    import hashlib
+
+    folder = tmp_path / "archive"
+    folder.mkdir()
+    files = {}
+    for name, path in (("downlink.cadu", downlink), ("reference.oem", reference)):
+        octets = path.read_bytes()
+        (folder / name).write_bytes(octets)
+        files[name] = {"sha256": hashlib.sha256(octets).hexdigest(), "bytes": len(octets)}
+    manifest = {
+        "schema_version": 1,
+        "pass_name": "small",
+        "spacecraft_id": 76,
+        "start_utc": format_utc(START),
+        "stop_utc": format_utc(START + 600 * NS),
+        "files": files,
+    }
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    return folder
+
+
+def test_a_wrong_token_and_a_wrong_server_are_told_in_one_line(
+    capsys: pytest.CaptureFixture[str], server: list[str]
+) -> None:
+    wrong = asked(capsys, "pass", "list", *server[:3], "x", status=2)
+    assert wrong.strip() == "linna: error: token: expected one that 'linna user add' gave out, found another"
+    gone = asked(capsys, "pass", "list", "--server", "http://127.0.0.1:1", status=2)
+    assert gone.startswith("linna: error: http://127.0.0.1:1: cannot be reached")
+    odd = asked(capsys, "pass", "list", "--server", "ftp://x", status=2)
+    assert "expected a URL such as" in odd
