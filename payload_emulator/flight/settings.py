@@ -48,10 +48,8 @@ class Settings:
         if not whole:
             return Recovery.lost, {}
         generation, values = max(whole, key=lambda copy: copy[0])
-        # A pair that was not finished counts as finished: the next one begins with an odd number again.
-        self.generation = generation + generation % 2
-        # The odd one of a pair is written first, the even one closes the pair.
-        intact = len(whole) == 2 and generation % 2 == 0 and whole[0][1] == whole[1][1]
+        self.generation = generation
+        intact = len(whole) == 2 and whole[0][1] == whole[1][1]
         return (Recovery.whole if intact else Recovery.older), values
 
     def write(self, values: Mapping[str, Any]) -> bool:
@@ -59,6 +57,7 @@ class Settings:
         content = json.dumps(values, separators=(",", ":")).encode()
         if _HEADER.size + len(content) > self.memory.size // 2:
             return False
+        # The copy that is the older one goes first.
         for generation in (self.generation + 1, self.generation + 2):
             half = self._half(generation & 1)
             checked = struct.pack(">II", generation, len(content)) + content

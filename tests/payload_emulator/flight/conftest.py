@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from payload_emulator.flight.detections import Detections
+from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload, PayloadMode
+from payload_emulator.flight.preprocess import ImageQuality
+from payload_emulator.spacecraft import new_board
+from tmtc.dictionary import DICTIONARY
 
 Float = NDArray[np.float64]
 RADIUS_M = 1_737_400.0
@@ -126,3 +131,98 @@ class Toolbox:
 @pytest.fixture(scope="session")
 def moon() -> Toolbox:
     return Toolbox()
+
+
+class Rig:
+    """A payload on a simulated board, commanded as from the ground, its telemetry read as on the ground."""
+
+    image = np.full((16, 16, 3), 90, dtype=np.uint8)
+    attitude = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
+
+    def __init__(self, tables: FlightTables | None = None, model: bytes = b"network" * 40) -> None:
+        self.board = new_board(5, store_octets=1 << 18)
+        self.tables, self.model = tables or FlightTables(), model
+        self.quality: Any = ImageQuality.OK
+        self.examined = self.detectors_made = self.count = 0
+        self.second = 0.0
+        self.skew_ticks = 0
+        self.failing = False
+        self.boot()
+
+    def boot(self, cause: int | None = None, mode: PayloadMode = PayloadMode.standby) -> None:
+        if cause is not None:
+            self.board.reset(cause)
+        self.payload = Payload(
+            self,
+            FlightParameters(),
+            self.tables,
+            model_octets=self.model,
+            board=self.board,
+            mode=mode,
+            make_detector=self._make_detector,
+        )
+
+    def _make_detector(self, octets: bytes) -> Rig:
+        assert octets == self.model
+        self.detectors_made += 1
+        return self
+
+    def examine(self, image: Any, sun_in_camera: Any = None) -> tuple[ImageQuality, Detections]:
+        self.examined += 1
+        if self.failing:
+            raise RuntimeError("no such operator")
+        return self.quality, detections(np.empty(0), np.empty(0), np.empty(0))
+
+    @property
+    def ticks(self) -> int:
+        return ticks_at(self.second) + self.skew_ticks
+
+    def command(self, name: str, **values: Any) -> bytes:
+        """The next telecommand packet."""
+        self.count += 1
+        return DICTIONARY.pack_command(name, values, sequence_count=self.count)
+
+    def function(self, name: str, first: float = 0.0, second: float = 0.0) -> bytes:
+        return self.command("perform_function", function_id=name, argument_1=first, argument_2=second)
+
+    def at(self, second: float, packet: bytes) -> bytes:
+        """A telecommand that puts another one into the schedule."""
+        octets = np.frombuffer(packet, dtype=np.uint8)
+        return self.command("insert_activity", release_ticks=ticks_at(second), items={"octet": octets})
+
+    def step(self, orders: bytes = b"", seconds: float = 15.0, image: Any = "frame") -> list[bytes]:
+        """Let time pass, then take a step; `image` None: none is taken."""
+        self.second += seconds
+        self.board.advance(seconds, 1.0)
+        picture = np.zeros((0, 0), np.uint8) if image is None else self.image if isinstance(image, str) else image
+        packets = self.payload.step(picture, self.attitude, self.ticks, orders)
+        if self.board.reset_requested is not None:
+            self.boot(self.board.reset_requested)
+        return packets
+
+    @staticmethod
+    def named(packets: list[bytes], name: str) -> list[dict[str, Any]]:
+        decoded = [DICTIONARY.unpack(packet) for packet in packets]
+        return [values for found, values in decoded if found == name]
+
+    @staticmethod
+    def events(packets: list[bytes]) -> list[str]:
+        labels = DICTIONARY.labels("event_info", "event_id")
+        decoded = [DICTIONARY.unpack(packet) for packet in packets]
+        return [labels[values["event_id"]] for name, values in decoded if name.startswith("event_")]
+
+    def refusals(self, packets: list[bytes]) -> list[str]:
+        """Reasons of all refusals, at acceptance and at start."""
+        labels = DICTIONARY.labels("verification_not_accepted", "failure_code")
+        kinds = ("verification_not_accepted", "verification_not_started")
+        return [labels[v["failure_code"]] for kind in kinds for v in self.named(packets, kind)]
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+@pytest.fixture
+def make_rig() -> Callable[..., Rig]:
+    return Rig

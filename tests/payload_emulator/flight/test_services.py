@@ -1,0 +1,372 @@
+"""The services of the payload as a machine: what telecommands do, and why some do nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from payload_emulator.flight.loads import TABLE_NUMBERS
+from payload_emulator.flight.parameters import PARAMETERS, find_parameter
+from payload_emulator.flight.payload import PayloadMode
+from payload_emulator.flight.ports import ResetCause
+from payload_emulator.flight.products import map_octets, unpack_map, unpack_thumbnail
+from payload_emulator.flight.tables import pack_anchor_table
+from tmtc.crc import append_crc
+from tmtc.dictionary import DICTIONARY
+from tmtc.large_data import LargeDataReceiver, split
+
+NUMBERS = {parameter.name: parameter.number for parameter in PARAMETERS}
+
+
+# Telecommand verification (service 1)
+
+
+def test_every_stage_that_was_asked_for_is_reported_and_no_other(rig: Any) -> None:
+    for flags, stages in ((0b1111, 3), (0b0001, 1), (0b1000, 1), (0b0000, 0)):
+        rig.count += 1
+        order = DICTIONARY.pack_command(
+            "test_connection", {}, sequence_count=rig.count, acknowledgements=flags
+        )
+        packets = rig.step(order)
+        found = [DICTIONARY.unpack(packet)[0] for packet in packets]
+        assert sum(name.startswith("verification_") for name in found) == stages
+        assert found.count("connection_report") == 1
+
+
+def test_nothing_executes_twice_however_often_it_comes(rig: Any) -> None:
+    orders = [rig.command("test_connection") for _ in range(3)]
+    first = rig.step(orders[0] + orders[0] + orders[1])
+    assert len(rig.named(first, "connection_report")) == 2
+    assert rig.refusals(first) == ["duplicate"]
+    # Nor after a reset, whatever its cause.
+    rig.boot(ResetCause.watchdog)
+    again = rig.step(orders[1] + orders[0] + orders[2])
+    assert rig.refusals(again) == ["duplicate", "duplicate"]
+    assert len(rig.named(again, "connection_report")) == 1
+
+
+def test_counts_go_forward_only_and_each_source_has_its_own(rig: Any) -> None:
+    def ping(count: int, source: int = 0) -> bytes:
+        return DICTIONARY.pack_command("test_connection", {}, sequence_count=count, source=source)
+
+    assert rig.refusals(rig.step(ping(16_380))) == []
+    assert rig.refusals(rig.step(ping(3))) == []  # over the wrap, some lost
+    assert rig.refusals(rig.step(ping(16_382))) == ["out_of_sequence"]
+    assert rig.refusals(rig.step(ping(3 + 8192))) == ["out_of_sequence"]
+    assert rig.refusals(rig.step(ping(9, source=4))) == []
+    values = {"function_id": "resynchronise_commands", "argument_1": 0.0, "argument_2": 0.0}
+    back = DICTIONARY.pack_command("perform_function", values, sequence_count=16_000)
+    assert rig.refusals(rig.step(back)) == []
+    assert rig.refusals(rig.step(ping(16_001))) == []
+
+
+def test_values_out_of_range_are_refused_at_acceptance(rig: Any) -> None:
+    good = rig.command("set_time_report_rate", rate_exponent=8)
+    values = bytearray(good)
+    values[11] = 9
+    assert rig.refusals(rig.step(append_crc(bytes(values[:-2])))) == ["value_out_of_range"]
+    for order in (
+        rig.function("set_mode", 4.0),
+        rig.function("start_observation", float("nan")),
+        rig.function("widen_estimate", -1.0),
+        rig.command("replay_store", start_ticks=5, stop_ticks=5),
+        rig.command("set_parameter", parameter_id=NUMBERS["scrub_interval_s"], value=float("inf")),
+        rig.command("set_parameter", parameter_id=NUMBERS["store_overwrite"], value=0.5),
+    ):
+        assert rig.refusals(rig.step(order)) == ["value_out_of_range"]
+    assert rig.payload.mode is PayloadMode.standby
+
+
+def test_octets_that_are_no_telecommand_never_stop_the_payload(rig: Any) -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(300):
+        good = bytearray(rig.command("set_parameter", parameter_id=1, value=30.0))
+        kind = rng.integers(0, 3)
+        if kind == 0:
+            good[rng.integers(0, len(good))] ^= 1 << rng.integers(0, 8)
+        elif kind == 1:
+            good = good[: rng.integers(0, len(good))]
+        else:
+            good = bytearray(rng.bytes(int(rng.integers(1, 60))))
+        packets = rig.step(bytes(good), seconds=1.0)
+        assert not rig.named(packets, "parameter_report")
+
+
+# The schedule (service 11)
+
+
+def test_a_window_is_observed_by_the_schedule_and_ends_by_itself(rig: Any) -> None:
+    window = rig.function("start_observation", 30.0)
+    rig.step(rig.at(60.0, window), image=None)
+    assert not rig.named(rig.step(), "detections")  # 30 s
+    assert not rig.named(rig.step(), "detections")
+    packets = rig.step()  # 60 s
+    assert rig.events(packets).count("activity_released") == 1
+    assert len(rig.named(packets, "detections")) == 1
+    assert {v["request_id"] for v in rig.named(packets, "verification_completed")} == {
+        int.from_bytes(window[:4], "big")
+    }
+    assert len(rig.named(rig.step(), "detections")) == 1
+    ended = rig.step()  # 90 s
+    assert "observation_stopped" in rig.events(ended)
+    assert rig.payload.mode is PayloadMode.standby
+
+
+def test_the_cadence_of_a_window_thins_the_frames(rig: Any) -> None:
+    rig.step(rig.function("start_observation", 0.0, 30.0), image=None, seconds=0.5)
+    seen = [len(rig.named(rig.step(), "detections")) for _ in range(6)]
+    assert sum(seen) == 3
+
+
+def test_scheduled_telecommands_are_refused_when_expired_copied_nested_or_too_many(rig: Any) -> None:
+    ping = rig.command("test_connection")
+    assert rig.refusals(rig.step(rig.at(1.0, ping))) == ["expired"]
+    assert rig.refusals(rig.step(rig.at(1e4, ping))) == []
+    assert rig.refusals(rig.step(rig.at(2e4, ping))) == ["duplicate"]
+    assert rig.refusals(rig.step(ping)) == ["duplicate"]
+    assert rig.refusals(rig.step(rig.at(1e4, rig.at(2e4, ping)))) == ["unknown_function"]
+    assert rig.refusals(rig.step(rig.at(1e4, ping[:-1]))) == ["bad_length"]
+    assert rig.refusals(rig.step(rig.at(1e4, ping[:-1] + b"\0"))) == ["bad_checksum"]
+    for k in range(63):
+        assert rig.refusals(rig.step(rig.at(1e4 + k, rig.command("test_connection")), seconds=1.0)) == []
+    full = rig.step(rig.at(1e4, rig.command("test_connection")))
+    assert rig.refusals(full) == ["schedule_full"]
+    report = rig.named(rig.step(rig.command("report_schedule")), "schedule_report")[0]
+    assert report["count"] == 64 and report["enabled"] == 1
+    assert sorted(report["items"]["release_ticks"]) == list(report["items"]["release_ticks"])
+
+
+def test_a_held_schedule_releases_nothing_and_what_is_late_then_expires(rig: Any) -> None:
+    soon, later = rig.command("test_connection"), rig.command("test_connection")
+    gone = rig.command("test_connection")
+    orders = rig.at(20.0, soon) + rig.at(40.0, later) + rig.at(40.0, gone)
+    rig.step(orders + rig.command("disable_schedule"))
+    assert not rig.named(rig.step(), "connection_report")  # 30 s
+    removed = rig.command("delete_activity", request_id=int.from_bytes(gone[:4], "big"))
+    assert rig.refusals(rig.step(removed)) == []  # 45 s
+    packets = rig.step(rig.command("enable_schedule"))  # 60 s: one is 40 s late, one 20 s
+    assert rig.events(packets).count("activity_expired") == 1
+    assert rig.refusals(packets) == ["expired"]
+    assert len(rig.named(packets, "connection_report")) == 1
+    assert rig.refusals(rig.step(rig.command("delete_activity", request_id=1))) == ["no_such_activity"]
+    rig.step(rig.at(500.0, rig.command("test_connection")) + rig.command("reset_schedule"))
+    report = rig.named(rig.step(rig.command("report_schedule")), "schedule_report")[0]
+    assert report["count"] == 0
+
+
+def test_the_schedule_survives_a_reset(rig: Any) -> None:
+    rig.step(rig.at(100.0, rig.function("start_observation", 60.0)))
+    rig.boot(ResetCause.brown_out)
+    assert rig.payload.mode is PayloadMode.standby
+    rig.step(seconds=90.0)
+    assert rig.payload.mode is PayloadMode.observing
+
+
+# Parameters (service 20)
+
+
+@pytest.mark.parametrize("parameter", PARAMETERS, ids=lambda p: p.name)
+def test_every_parameter_takes_its_limits_and_nothing_beyond(rig: Any, parameter: Any) -> None:
+    assert parameter.accepts(parameter.default)
+    step = 1.0 if parameter.whole else 1e-3
+    for value, good in (
+        (parameter.minimum, True),
+        (parameter.maximum, True),
+        (parameter.minimum - step, False),
+        (parameter.maximum + step, False),
+        (float("nan"), False),
+    ):
+        assert parameter.accepts(value) is good
+
+
+def test_a_parameter_is_changed_reported_and_kept_through_resets(rig: Any) -> None:
+    number = NUMBERS["clock_jump_s"]
+    packets = rig.step(
+        rig.command("set_parameter", parameter_id=number, value=7.5)
+        + rig.command("request_parameter", parameter_id=number)
+    )
+    assert rig.named(packets, "parameter_report") == [{"parameter_id": number, "value": 7.5}]
+    assert "parameter_changed" in rig.events(packets)
+    hashes = [v["parameters_hash"] for v in rig.named(packets, "housekeeping")]
+    rig.boot(ResetCause.commanded)
+    after = rig.step(rig.command("request_parameter", parameter_id=number), seconds=60.0)
+    assert rig.named(after, "parameter_report")[0]["value"] == 7.5
+    assert rig.named(after, "housekeeping")[0]["parameters_hash"] == hashes[-1]
+    assert find_parameter(0) is None
+    for name in ("set_parameter", "request_parameter"):
+        values = {"parameter_id": 999, **({"value": 1.0} if name == "set_parameter" else {})}
+        assert rig.refusals(rig.step(rig.command(name, **values))) == ["unknown_parameter"]
+
+
+# Housekeeping (service 3) and events (service 5)
+
+
+def test_a_structure_defined_by_telecommand_is_sent_reported_and_deleted(rig: Any) -> None:
+    quantities = ["boot_count", "queue_depth", "camera_temperature_c", "cpu_detector_ms"]
+    create = rig.command(
+        "create_housekeeping", structure_id=16, interval_s=30, items={"quantity": quantities}
+    )
+    first = rig.named(rig.step(create), "housekeeping_report")
+    assert [v["structure_id"] for v in first] == [16]
+    labels = DICTIONARY.labels("housekeeping_report", "quantity")
+    assert [labels[code] for code in first[0]["items"]["quantity"]] == quantities
+    assert first[0]["items"]["value"][0] == 1.0
+    seen = [len(rig.named(rig.step(), "housekeeping_report")) for _ in range(6)]
+    assert sum(seen) == 3
+    rig.boot(ResetCause.brown_out)
+    report = rig.step(rig.command("report_housekeeping_definition", structure_id=16))
+    definition = rig.named(report, "housekeeping_definition")[0]
+    assert (definition["interval_s"], definition["count"]) == (30, 4)
+    assert rig.refusals(rig.step(rig.command("delete_housekeeping", structure_id=16))) == []
+    assert not any(rig.named(rig.step(), "housekeeping_report") for _ in range(4))
+    for name in ("delete_housekeeping", "report_housekeeping_definition"):
+        assert rig.refusals(rig.step(rig.command(name, structure_id=17))) == ["unknown_structure"]
+    assert rig.refusals(rig.step(rig.command("request_housekeeping", structure_id=20))) == ["unknown_structure"]
+
+
+def test_only_so_many_structures_can_be_defined(rig: Any) -> None:
+    def create(number: int) -> bytes:
+        return rig.command(
+            "create_housekeeping", structure_id=number, interval_s=0, items={"quantity": ["mode"]}
+        )
+
+    assert rig.refusals(rig.step(b"".join(create(16 + k) for k in range(8)))) == []
+    assert rig.refusals(rig.step(create(24))) == ["structures_full"]
+    assert rig.refusals(rig.step(create(23))) == []
+
+
+def test_housekeeping_can_be_stopped_asked_for_and_sent_more_often(rig: Any) -> None:
+    rig.step(rig.command("disable_housekeeping", structure_id=1))
+    assert not any(rig.named(rig.step(), "housekeeping") for _ in range(8))
+    asked = rig.step(rig.command("request_housekeeping", structure_id=1))
+    assert len(rig.named(asked, "housekeeping")) == 1
+    rig.step(
+        rig.command("enable_housekeeping", structure_id=1)
+        + rig.command("set_housekeeping_interval", structure_id=1, interval_s=15)
+    )
+    assert all(rig.named(rig.step(), "housekeeping") for _ in range(4))
+
+
+def test_performance_tells_the_time_of_every_stage_and_the_levels_of_the_store(rig: Any) -> None:
+    rig.step(rig.function("start_observation"))
+    for _ in range(3):
+        rig.step()
+    report = rig.named(rig.step(rig.command("request_housekeeping", structure_id=2)), "performance")[0]
+    # The board's model: 850 ms of detector, 40 ms of navigation a frame, a tenth of spread.
+    assert report["cpu_detector_ms"] == pytest.approx(850.0, rel=0.25)
+    assert report["cpu_navigation_ms"] == pytest.approx(40.0, rel=0.25)
+    assert report["detector_latency_max_ms"] >= report["cpu_detector_ms"]
+    assert report["last_command_count"] == rig.count
+    assert report["store_critical_permille"] > 0 and report["queue_bulk"] == 0
+
+
+def test_an_event_that_is_disabled_is_not_reported_until_it_is_enabled(rig: Any) -> None:
+    rig.step(rig.command("disable_event", event_id="frame_skipped"))
+    packets = rig.step(rig.command("report_disabled_events"))
+    assert "frame_skipped" not in rig.events(packets)
+    assert list(rig.named(packets, "disabled_events")[0]["items"]["event_id"]) == [22]
+    rig.boot(ResetCause.brown_out)
+    assert "frame_skipped" not in rig.events(rig.step())
+    assert "frame_skipped" in rig.events(rig.step(rig.command("enable_event", event_id="frame_skipped")))
+
+
+# Time (9), large data (13), the store (15)
+
+
+def test_time_is_reported_every_so_many_frames_of_downlink(rig: Any) -> None:
+    assert not rig.named(rig.step(), "time_report")
+    rig.step(rig.command("set_time_report_rate", rate_exponent=0) + rig.function("start_observation"))
+    reports = [v for _ in range(40) for v in rig.named(rig.step(), "time_report")]
+    assert 2 <= len(reports) <= 40
+    assert all(v["rate_exponent"] == 0 for v in reports)
+    assert reports[-1]["reported_ticks"] == pytest.approx(rig.ticks, abs=40 * 15 * 65_536)
+
+
+def test_a_thumbnail_comes_down_as_large_data(rig: Any) -> None:
+    image = np.arange(64 * 64 * 3, dtype=np.uint8).reshape(64, 64, 3)
+    packets = rig.step(rig.function("start_observation") + rig.function("downlink_thumbnail"), image=image)
+    assert "thumbnail_stored" in rig.events(packets)
+    receiver, whole = LargeDataReceiver(), None
+    for packet in packets:
+        name, values = DICTIONARY.unpack(packet)
+        if name.startswith("large_data_"):
+            whole = receiver.accept(name, values) or whole
+    assert whole is not None and whole.table == 6
+    frame, ticks, levels = unpack_thumbnail(whole.octets)
+    assert (frame, ticks, levels.shape) == (0, rig.ticks, (8, 8))
+    expected = image.astype(float).mean(axis=2).reshape(8, 8, 8, 8).mean(axis=(1, 3))
+    np.testing.assert_allclose(levels, expected, atol=0.5)
+
+
+def test_the_map_of_landmarks_reads_back(rig: Any) -> None:
+    sightings = {7: 3, 4_000_000_000: 70_000}
+    assert unpack_map(map_octets(sightings)) == {7: 3, 4_000_000_000: 65_535}
+    assert unpack_map(map_octets({})) == {}
+    packets = rig.step(rig.function("downlink_map"))
+    assert [v["table"] for v in rig.named(packets, "large_data_last")] == []
+    assert rig.payload.waiting == 1  # bulk waits for a mode that sends it
+    down = rig.step(rig.function("set_mode", PayloadMode.downlinking))
+    assert [v["table"] for v in rig.named(down, "large_data_last")] == [7]
+
+
+def test_a_table_is_uplinked_in_parts_in_any_order_and_used_after_resets(moon: Any, rig: Any) -> None:
+    seconds = np.arange(0.0, 3000.0, 30.0)
+    octets = pack_anchor_table([moon.ticks_at(s) for s in seconds], moon.orbit(seconds))
+    parts = split(octets, transaction=9, table=1, part_length=500, link="uplink")
+    orders = [rig.command(name, **values) for name, values in [parts[2], parts[0], parts[1], *parts[3:]]]
+    packets = rig.step(b"".join(orders))
+    assert rig.refusals(packets) == []
+    assert "table_loaded" in rig.events(packets)
+    assert rig.board.read_table(TABLE_NUMBERS["anchor_ephemeris"]) == octets
+    rig.boot(ResetCause.watchdog)
+    assert "table_loaded" in rig.events(rig.step())
+    observed = rig.step(rig.function("start_observation"))
+    assert {v["outcome"] for v in rig.named(observed, "frame_outcome")} == {0}
+
+
+def test_a_damaged_or_unknown_table_is_refused_and_the_old_one_stays(moon: Any, rig: Any) -> None:
+    octets = pack_anchor_table([moon.ticks_at(s) for s in (0.0, 30.0, 60.0)], moon.orbit([0.0, 30.0, 60.0]))
+    for table, content, reason in ((1, octets[:-1] + b"\0", "table_corrupt"), (6, b"x", "value_out_of_range")):
+        (name, values), *_ = split(content, transaction=table, table=table, part_length=4096, link="uplink")
+        packets = rig.step(rig.command(name, **values))
+        assert rig.refusals(packets) == [reason]
+    assert rig.board.read_table(1) == b""
+
+
+def test_the_store_keeps_what_no_link_takes_and_plays_it_again_by_time(rig: Any) -> None:
+    rig.board.downlink = 0
+    rig.step(rig.function("start_observation"))
+    from_ticks = rig.ticks
+    for _ in range(4):
+        assert rig.step() == []
+    waiting = rig.payload.waiting
+    assert waiting > 8
+    rig.board.downlink = 1 << 30
+    late = rig.step(rig.function("stop_observation") + rig.function("set_mode", PayloadMode.downlinking))
+    assert len(rig.named(late, "detections")) == 5
+    to_ticks = rig.ticks
+    again = rig.step(rig.command("replay_store", start_ticks=from_ticks, stop_ticks=to_ticks))
+    repeated = set(late) & set(again)
+    assert len([p for p in repeated if DICTIONARY.unpack(p)[0] == "detections"]) == 5
+    report = rig.named(rig.step(rig.command("report_store")), "store_report")[0]
+    assert report["items"]["packets"][3] == 5 and report["items"]["unsent"][3] == 0
+    rig.step(rig.command("delete_store", stop_ticks=to_ticks))
+    report = rig.named(rig.step(rig.command("report_store")), "store_report")[0]
+    assert report["items"]["packets"][3] == 0
+    rig.step(rig.function("clear_store"))
+    assert rig.payload.waiting == 0
+
+
+def test_standby_sends_what_is_small_and_keeps_the_rest(make_rig: Callable[..., Any]) -> None:
+    rig = make_rig()
+    rig.board.downlink = 0
+    rig.step(rig.function("start_observation"))
+    rig.step(rig.function("stop_observation"))
+    rig.board.downlink = 1 << 30
+    packets = rig.step(image=None)
+    assert packets and not rig.named(packets, "detections")
+    assert "observation_stopped" in rig.events(packets)
+    assert rig.payload.waiting > 0

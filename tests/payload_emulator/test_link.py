@@ -1,0 +1,149 @@
+"""The radio link: what it says of itself is what the ground finds, to the octet."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lunar.ephemeris import Ephemeris, ephemeris_from_states
+from lunar.third_bodies import earth_position_icrf_m
+from lunar.timescales import parse_utc, tdb_s_from_utc_ns
+from payload_emulator.errors import ScenarioError
+from payload_emulator.link import Transmitter, contacts, station, transmit
+from payload_emulator.scenario import LinkSection
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import LinkSettings, decode
+
+EPOCH = parse_utc("2029-08-08T00:00:00Z")
+
+
+def packets(count: int, start: int, rng: np.random.Generator) -> list[bytes]:
+    made = []
+    for k in range(start, start + count):
+        items = {"octet": rng.integers(0, 256, int(rng.integers(0, 900))).tolist()}
+        values = {"transaction": 1, "part": 1, "table": 6, "items": items}
+        made.append(
+            DICTIONARY.pack("large_data_middle", values, ticks=65_536 * k, sequence_count=k % 16_384)
+        )
+    return made
+
+
+def transmitter(coding: str = "rs", dumps: int = 8, each: int = 30) -> Transmitter:
+    rng = np.random.default_rng(3)
+    sender = Transmitter(76, LinkSettings(coding=coding))
+    for k in range(dumps):
+        sender.send(packets(each, k * each, rng), EPOCH + k, virtual_channel=k % 2)
+    return sender
+
+
+def test_a_perfect_link_loses_and_adds_nothing() -> None:
+    sender = transmitter()
+    reception = transmit(sender.dumps, sender.settings, LinkSection(), seed=1)
+    assert reception.octets == b"".join(dump.cadus for dump in sender.dumps)
+    account = reception.account
+    assert (account["packets_lost"], account["duplicates"], account["frames_bad"]) == (0, 0, 0)
+    assert decode(reception.octets).packets == account["packets"] == 240
+
+
+def test_where_each_packet_lies_in_the_frames_is_right() -> None:
+    sender = transmitter(dumps=1, each=60)
+    dump = sender.dumps[0]
+    length = sender.settings.cadu_length
+    frames = len(dump.cadus) // length
+    for lost in range(frames):
+        octets = dump.cadus[: lost * length] + dump.cadus[(lost + 1) * length :]
+        whole = {
+            packet
+            for packet, first, last in zip(dump.packets, dump.first, dump.last, strict=True)
+            if not first <= lost <= last
+        }
+        decoded = decode(octets, settings=sender.settings)
+        got = {bytes(packet) for packet in decoded.cut.packets(decoded.buffer)}
+        # The last frame is filled up with an idle packet.
+        assert {packet for packet in got if packet[:2] != b"\x07\xff"} == whole, lost
+
+
+LINKS = {
+    "losses": LinkSection(frame_loss=0.1),
+    "bit errors": LinkSection(bit_error_rate=1e-4),
+    "bursts": LinkSection(burst_start=0.05, burst_end=0.5, burst_frame_loss=0.3, burst_bit_error_rate=6e-3),
+    "copies": LinkSection(repeat_share=0.5),
+    "disorder": LinkSection(reorder_share=0.5),
+    "everything": LinkSection(
+        frame_loss=0.02,
+        bit_error_rate=1e-5,
+        burst_start=0.02,
+        burst_end=0.3,
+        burst_frame_loss=0.3,
+        burst_bit_error_rate=5e-3,
+        repeat_share=0.3,
+        reorder_share=0.3,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", sorted(LINKS))
+@pytest.mark.parametrize("coding", ["rs", "none"])
+def test_the_account_of_the_link_is_the_account_of_the_ground(name: str, coding: str) -> None:
+    sender = transmitter(coding)
+    section = replace(LINKS[name], coding=coding)
+    reception = transmit(sender.dumps, sender.settings, section, 1)
+    found = decode(reception.octets, settings=sender.settings).accounting()
+    account = reception.account
+    for key in ("frames", "frames_bad", "packets", "duplicates"):
+        assert found[key] == account[key], key
+    assert found["packets"] - found["duplicates"] == account["packets_received"]
+    assert account["packets_received"] + account["packets_lost"] == account["packets_made"] == 240
+    assert sum(found["octets"].values()) == account["octets"] == len(reception.octets)
+    assert (found["crc_errors"], found["conflicts"], found["unknown"]) == (0, 0, 0)
+    if coding == "rs" and account["frames_bad"] == 0:
+        assert found["symbols_corrected"] == account["symbols_corrected"]
+    assert transmit(sender.dumps, sender.settings, section, 1).octets == reception.octets
+
+
+def test_errors_come_in_bursts_of_the_length_that_is_asked_for() -> None:
+    sender = transmitter(dumps=16)
+    section = LinkSection(burst_start=0.05, burst_end=0.25, burst_frame_loss=1.0)
+    lost = frames = 0
+    for seed in range(40):
+        account = transmit(sender.dumps, sender.settings, section, seed).account
+        lost += account["frames_lost_on_link"]
+        frames += account["frames_sent"]
+    # Share of time in the bad state of a two-state chain: 0.05 / (0.05 + 0.25); 3 sigma of so many correlated frames.
+    assert lost / frames == pytest.approx(1 / 6, abs=0.03)
+
+
+def circling(hours: float = 4.0) -> Ephemeris:
+    """A circular polar orbit at 30 km whose plane holds the Earth at the epoch, in closed form."""
+    times = EPOCH + np.arange(-300, int(3600 * hours) + 300, 10) * 10**9
+    toward = np.asarray(earth_position_icrf_m(float(tdb_s_from_utc_ns(EPOCH))))
+    u = toward / np.linalg.norm(toward)
+    w = np.cross(u, np.cross([0.0, 0.0, 1.0], u))
+    w /= np.linalg.norm(w)
+    rate = np.sqrt(4.9028e12 / 1.7674e6**3)
+    angle = rate * (times - EPOCH)[:, None] / 1e9
+    position = 1.7674e6 * (np.cos(angle) * u + np.sin(angle) * w)
+    velocity = 1.7674e6 * rate * (np.cos(angle) * w - np.sin(angle) * u)
+    return ephemeris_from_states(times, position, velocity)
+
+
+def test_contacts_end_behind_the_limb_of_the_moon_once_an_orbit() -> None:
+    ephemeris = circling()
+    times = EPOCH + np.arange(0, 4 * 3600, 20) * 10**9
+    every = LinkSection(stations=("goldstone", "madrid", "canberra"), minimum_elevation_deg=5.0)
+    heard, light_s = contacts(ephemeris, times, every)
+    # The plane holds the Earth: hidden for the angle 180 deg - 2 acos(R / r), R / r = 1737.4 / 1767.4, of each orbit.
+    hidden = (np.pi - 2.0 * np.arccos(1737.4 / 1767.4)) / (2.0 * np.pi)
+    assert 1.0 - heard.mean() == pytest.approx(hidden, abs=0.04)
+    assert np.all((light_s > 1.1) & (light_s < 1.4))
+    always, _ = contacts(ephemeris, times, LinkSection())
+    assert always.all()
+    one, _ = contacts(ephemeris, times, LinkSection(stations=("madrid",)))
+    assert one.sum() < heard.sum()
+
+
+def test_a_station_that_there_is_not_is_named() -> None:
+    with pytest.raises(ScenarioError, match="expected names of goldstone, .* found 'atlantis'"):
+        station("atlantis")
