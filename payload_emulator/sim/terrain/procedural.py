@@ -201,7 +201,7 @@ class ProceduralTerrain(TiledTerrain):
             chosen[np.asarray(part.near(middle_latitude, middle_longitude, half + reach), dtype=np.int64)]
             for reach, chosen, part in self._bands
         ]
-        return self._shapes.select(np.sort(np.concatenate(found)))
+        return self._shapes.select(np.sort(np.concatenate([np.empty(0, np.int64), *found])))
 
 
 def stamp(

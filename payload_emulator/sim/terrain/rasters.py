@@ -225,6 +225,7 @@ def _lattice(path: Path, crs: Any, transform: Any) -> tuple[float, float, float]
             f"found a body of {radius_m / 1e3:.1f} km"
         )
     values = crs.to_dict()
+    west, north = transform.c, transform.f
     if crs.is_geographic:
         across = down = 1.0
         middle_deg = 0.0
@@ -232,7 +233,7 @@ def _lattice(path: Path, crs: Any, transform: Any) -> tuple[float, float, float]
         metres = math.radians(radius_m)
         across, down = metres * math.cos(math.radians(values.get("lat_ts", 0.0))), metres
         middle_deg = float(values.get("lon_0", 0.0))
-        transform = transform.translation(-values.get("x_0", 0.0), -values.get("y_0", 0.0)) * transform
+        west, north = west - values.get("x_0", 0.0), north - values.get("y_0", 0.0)
     else:
         raise TerrainError(
             f"{path}: expected longitude and latitude in degrees or the equirectangular projection, found the "
@@ -243,7 +244,7 @@ def _lattice(path: Path, crs: Any, transform: Any) -> tuple[float, float, float]
         raise TerrainError(
             f"{path}: expected square pixels in degrees, north up, found the transform {tuple(transform)[:6]}"
         )
-    return wide, middle_deg + transform.c / across, transform.f / down
+    return wide, middle_deg + west / across, north / down
 
 
 def _to_metres(

@@ -1,0 +1,229 @@
+"""Rasters as their publishers write them: PDS3 with labels, kilometres, projected metres, JPEG 2000, reflectance."""
+
+import math
+
+import numpy as np
+import pytest
+
+from lunar.catalogue import make_catalogue
+from lunar.constants import MOON_RADIUS_M
+from lunar.datafolder import find_data
+from payload_emulator.errors import TerrainError
+from payload_emulator.sim.terrain.albedo import open_albedo
+from payload_emulator.sim.terrain.opening import open_terrain
+from payload_emulator.sim.terrain.raster import RasterTerrain
+from payload_emulator.sim.terrain.rasters import open_layers
+
+rasterio = pytest.importorskip("rasterio", reason="rasterio is an optional extra")
+
+NONE = make_catalogue([], [], [], source="none")
+AS_IT_IS = {"sharpen": False, "registration_north_m": 0.0, "smoothing_pixels": 0.0}
+METRES_PER_DEGREE = math.radians(MOON_RADIUS_M)
+
+
+def plane(latitude, longitude):
+    """Heights in m that resampling leaves alone."""
+    return 100.0 * latitude + 50.0 * longitude - 2000.0
+
+
+def grid(west, north, rows, columns, ppd):
+    latitude = north - (np.arange(rows) + 0.5) / ppd
+    longitude = west + (np.arange(columns) + 0.5) / ppd
+    return latitude[:, None], longitude[None, :]
+
+
+def write_pds3(stem, west, north, rows, columns, ppd, values, kind, unit, offset, middle_deg):
+    """An image with a detached label, keywords as in the labels of LOLA's and LROC's archives."""
+    bits = values.dtype.itemsize * 8
+    label = f"""PDS_VERSION_ID            = "PDS3"
+RECORD_TYPE               = FIXED_LENGTH
+FILE_RECORDS              = {rows}
+RECORD_BYTES              = {columns * bits // 8}
+^IMAGE                    = "{stem.name}.IMG"
+TARGET_NAME               = MOON
+OBJECT                    = IMAGE
+  LINES                   = {rows}
+  LINE_SAMPLES            = {columns}
+  SAMPLE_TYPE             = {kind}
+  SAMPLE_BITS             = {bits}
+  UNIT                    = {unit}
+  SCALING_FACTOR          = 1
+  OFFSET                  = {offset}
+END_OBJECT                = IMAGE
+OBJECT                    = IMAGE_MAP_PROJECTION
+  MAP_PROJECTION_TYPE     = "SIMPLE CYLINDRICAL"
+  MAP_RESOLUTION          = {ppd:.1f} <PIXEL/DEGREE>
+  MAP_SCALE               = {METRES_PER_DEGREE / ppd / 1000.0:.12f} <KM/PIXEL>
+  A_AXIS_RADIUS           = 1737.4 <KILOMETER>
+  B_AXIS_RADIUS           = 1737.4 <KILOMETER>
+  C_AXIS_RADIUS           = 1737.4 <KILOMETER>
+  POSITIVE_LONGITUDE_DIRECTION = "EAST"
+  CENTER_LATITUDE         = 0.0 <DEGREE>
+  CENTER_LONGITUDE        = {middle_deg} <DEGREE>
+  LINE_PROJECTION_OFFSET  = {north * ppd - 0.5}
+  SAMPLE_PROJECTION_OFFSET = {(middle_deg - west) * ppd - 0.5}
+  MAXIMUM_LATITUDE        = {north} <DEGREE>
+  MINIMUM_LATITUDE        = {north - rows / ppd} <DEGREE>
+  WESTERNMOST_LONGITUDE   = {west} <DEGREE>
+  EASTERNMOST_LONGITUDE   = {west + columns / ppd} <DEGREE>
+END_OBJECT                = IMAGE_MAP_PROJECTION
+END
+"""
+    stem.with_suffix(".LBL").write_text(label.replace("\n", "\r\n"))
+    values.tofile(stem.with_suffix(".IMG"))
+    return stem.with_suffix(".LBL")
+
+
+def write_tiff(path, transform, values, crs, **profile):
+    settings = {"driver": "GTiff", "count": 1, "dtype": values.dtype.name} | profile
+    with rasterio.open(
+        path, "w", width=values.shape[1], height=values.shape[0], crs=crs, transform=transform, **settings
+    ) as target:
+        target.write(values, 1)
+    return path
+
+
+def heights_agree(terrain, latitude, longitude, within_m):
+    found = terrain.height_m(np.radians(latitude), np.radians(longitude))
+    np.testing.assert_allclose(found, plane(latitude, longitude), atol=within_m)
+
+
+def test_sldem2015_kilometres_with_a_detached_label(tmp_path):
+    ppd = 16
+    values = (plane(*grid(8.0, 22.0, 160, 160, ppd)) / 1000.0).astype("<f4")
+    # The labels of SLDEM2015 give OFFSET = 1737.4 and kilometres, and count longitudes from 180 degrees.
+    path = write_pds3(
+        tmp_path / "SLDEM", 8.0, 22.0, 160, 160, ppd, values, "PC_REAL", "KILOMETER", 1737.4, 180.0
+    )
+    terrain = RasterTerrain([path], NONE, **AS_IT_IS)
+    # Single precision of 2 km in kilometres is 0.1 mm; pixels from projected metres are good to a millimetre.
+    heights_agree(terrain, np.array([14.3, 17.1]), np.array([12.2, 15.9]), 0.05)
+
+
+@pytest.mark.parametrize(("unit", "offset"), [("KILOMETER", 0), ("METER", 1_737_400)])
+def test_the_unit_of_a_label_holds_without_and_with_an_offset(tmp_path, unit, offset):
+    ppd = 16
+    scale = 1000.0 if unit == "KILOMETER" else 1.0
+    values = (plane(*grid(8.0, 22.0, 160, 160, ppd)) / scale).astype("<f4")
+    path = write_pds3(tmp_path / "A", 8.0, 22.0, 160, 160, ppd, values, "PC_REAL", unit, offset, 0.0)
+    heights_agree(RasterTerrain([path], NONE, **AS_IT_IS), np.array([14.3]), np.array([12.2]), 0.05)
+
+
+def test_gld100_metres_of_16_bits_with_holes(tmp_path):
+    ppd = 16
+    latitude, longitude = grid(8.0, 22.0, 160, 160, ppd)
+    values = np.rint(plane(latitude, longitude)).astype("<i2")
+    values[(np.abs(latitude - 15.0) < 0.2) & (np.abs(longitude - 13.0) < 0.2)] = -32768
+    fine = write_pds3(
+        tmp_path / "GLD", 8.0, 22.0, 160, 160, ppd, values, "LSB_INTEGER", "METER", 1_737_400, 180.0
+    )
+    coarse = write_tiff(
+        tmp_path / "c.tif",
+        rasterio.Affine(0.25, 0, 0.0, 0, -0.25, 30.0),
+        plane(*grid(0.0, 30.0, 120, 120, 4)).astype("float32"),
+        "+proj=longlat +R=1737400 +no_defs",
+    )
+    terrain = RasterTerrain([fine], NONE, coarse_paths=[coarse], **AS_IT_IS)
+    # Whole metres, and the hole from pixels of 7.6 km.
+    heights_agree(terrain, np.array([17.1, 15.0]), np.array([15.9, 13.0]), 3.0)
+    alone = RasterTerrain([fine], NONE, **AS_IT_IS)
+    with pytest.raises(TerrainError, match=r"expected heights at latitude .*, found none"):
+        alone.height_m(math.radians(15.0), math.radians(13.0))
+
+
+def test_projected_metres_join_across_tiles_whose_pixels_do_not_divide_the_degree(tmp_path):
+    # LROC's products of 100 m have 303.23 pixels per degree; tiles of 90 degrees are 27,291.02 pixels wide.
+    step, rows, columns = 100.0, 60, 27_291
+    north = 0.5 * rows * step
+    values = np.repeat(np.rint(north - (np.arange(rows) + 0.5) * step)[:, None], columns, axis=1).astype(
+        "int16"
+    )
+    crs = "+proj=eqc +lat_ts=0 +lat_0=0 +lon_0=180 +x_0=0 +y_0=0 +R=1737400 +units=m +no_defs"
+    paths = []
+    for name, west in (("w", 270.0), ("e", 0.0)):
+        transform = rasterio.Affine(step, 0, (west - 180.0) * METRES_PER_DEGREE, 0, -step, north)
+        paths.append(write_tiff(tmp_path / f"{name}.tif", transform, values, crs, compress="deflate"))
+    (layer,) = open_layers(paths)
+    first_row, turn = round(90.0 * layer.pixels_per_degree) - rows // 2, layer.turn
+    for first_column in (turn - 6, -6, 2 * turn - 6):
+        window = layer.read(first_row, first_column, rows, 12)
+        # The file's own rows, the same in the columns on both sides of the meridian: nothing lost between the tiles.
+        np.testing.assert_array_equal(window, np.repeat(values[:, :1], 12, axis=1))
+    places = np.radians([-0.05, 0.05]), np.radians([359.9999, 90.1])
+    assert layer.holds(*places).tolist() == [True, False]
+
+
+def test_jpeg_2000_of_16_bits(tmp_path):
+    values = np.rint(plane(*grid(8.0, 22.0, 256, 256, 16))).astype("int16")
+    path = write_tiff(
+        tmp_path / "a.jp2",
+        rasterio.Affine(1 / 16, 0, 8.0, 0, -1 / 16, 22.0),
+        values,
+        "+proj=longlat +R=1737400 +no_defs",
+        driver="JP2OpenJPEG",
+        quality="100",
+        reversible="YES",
+    )
+    heights_agree(RasterTerrain([path], NONE, **AS_IT_IS), np.array([14.3]), np.array([12.2]), 1.0)
+
+
+def test_a_raster_of_another_body_is_refused(tmp_path):
+    path = write_tiff(
+        tmp_path / "earth.tif",
+        rasterio.Affine(0.1, 0, 0, 0, -0.1, 10),
+        np.zeros((9, 9), "int16"),
+        "EPSG:4326",
+    )
+    with pytest.raises(
+        TerrainError, match=r"earth\.tif: expected a raster of the Moon .* found a body of 6378"
+    ):
+        open_layers([path])
+
+
+def test_pixels_longer_than_wide_are_refused(tmp_path):
+    path = write_tiff(
+        tmp_path / "long.tif",
+        rasterio.Affine(0.1, 0, 0, 0, -0.2, 10),
+        np.zeros((9, 9), "int16"),
+        "+proj=longlat +R=1737400 +no_defs",
+    )
+    with pytest.raises(TerrainError, match="expected square pixels in degrees"):
+        open_layers([path])
+
+
+def test_reflectance_tiles_are_averaged_over_the_grid_and_relative_to_their_median(tmp_path):
+    ppd = 64
+    latitude, longitude = grid(300.0, 10.0, 640, 640, ppd)
+    checks = 0.02 * np.where((np.arange(640)[:, None] + np.arange(640)[None, :]) % 2, 1.0, -1.0)
+    values = (np.where(longitude < 305.0, 0.03, 0.06) + checks + 0.0 * latitude).astype("<f4")
+    values[:32] = -3.4028227e38  # missing in the archive's floating-point images
+    path = write_pds3(tmp_path / "WAC", 300.0, 10.0, 640, 640, ppd, values, "PC_REAL", "N/A", 0, 180.0)
+    albedo = open_albedo([path])
+    places = np.radians(np.linspace(8.0, 2.0, 13)), np.radians(np.linspace(301.0, 309.0, 17))
+    found = albedo.relative(*places)
+    median = float(np.median(values[32:][values[32:] > 0]))
+    np.testing.assert_allclose(found[:, :7], 0.03 / median, rtol=0.03)
+    np.testing.assert_allclose(found[:, -7:], 0.06 / median, rtol=0.03)
+    beyond = albedo.relative(np.radians([9.9, 9.8]), np.radians([304.0, 306.0]))
+    np.testing.assert_array_equal(beyond, 1.0)
+
+
+def test_a_folder_with_sldem2015_uses_it_before_gld100(tmp_path):
+    (tmp_path / "dem").mkdir()
+    (tmp_path / "craters").mkdir()
+    values = (plane(*grid(8.0, 22.0, 160, 160, 16)) / 1000.0).astype("<f4")
+    write_pds3(
+        tmp_path / "dem/SLDEM2015_256_0N_60N_000_120_FLOAT",
+        *(8.0, 22.0, 160, 160, 16, values, "PC_REAL", "KILOMETER", 1737.4, 180.0),
+    )
+    (tmp_path / "craters/lunar_crater_database_robbins_2018.csv").write_text(
+        "CRATER_ID,LAT_CIRC_IMG,LON_CIRC_IMG,LAT_ELLI_IMG,LON_ELLI_IMG,DIAM_CIRC_IMG,DIAM_CIRC_SD_IMG,ARC_IMG\n"
+        "00-1-000000,15.0,12.0,15.0,12.0,6.5,0.1,0.9\n00-1-000001,16.0,360.0,16.0,360.0,9.5,0.1,0.9\n"
+    )
+    terrain = open_terrain("raster", find_data(tmp_path), 1)
+    assert terrain.name == "SLDEM2015"
+    assert terrain.catalogue.diameter_m.tolist() == [6500.0, 9500.0]
+    assert any("SLDEM2015" in name for name in terrain.data_names)
+    # Its own resolution is finer than the smallest crater that could be stamped: it is left as it stands.
+    heights_agree(terrain, np.array([14.3]), np.array([12.2]), 0.05)
+    assert len(terrain.small_craters(np.radians([14.0, 15.0]), np.radians([12.0, 13.0]))) == 0
