@@ -242,7 +242,10 @@ def _propagated(loaded: LoadedPayload, model: OrbitModel, burns: BurnTable, tick
 def _judged_pairs(
     world: World, catalogue: CraterCatalogue, camera_from_mcmf: Float, tables: dict[str, Table]
 ) -> tuple[Index, Index]:
-    """Right and wrong pairs of each frame's fix, shape (n, 2), and detections that are catalogued craters (n,)."""
+    """Right and wrong pairs of each frame's fix, shape (n, 2), and detections that are catalogued craters (n,).
+
+    Landmarks that the payload mapped itself are in no catalogue and are not judged.
+    """
     frames = world.frame_utc_ns.size
     judged, findable = np.zeros((frames, 2), dtype=np.int64), np.zeros(frames, dtype=np.int64)
     seen = tables["detections"]
@@ -268,8 +271,10 @@ def _judged_pairs(
         if used is None or used_frame is None:
             continue
         pairs = _rows_of(used_frame, number)
-        detection = used.items["detection"][pairs].astype(np.int64)
-        crater = order[np.searchsorted(catalogue.ids[order], used.items["crater_id"][pairs].astype(np.int64))]
+        named = used.items["crater_id"][pairs].astype(np.int64)
+        listed = np.isin(named, catalogue.ids)
+        detection = used.items["detection"][pairs].astype(np.int64)[listed]
+        crater = order[np.searchsorted(catalogue.ids[order], named[listed])]
         at, _ = _seen(world, camera_from_mcmf[number], position[number], rim, catalogue, crater)
         right = np.linalg.norm(mine[detection, :2] - at, axis=1) < limit[detection]
         judged[number] = np.count_nonzero(right), np.count_nonzero(~right)

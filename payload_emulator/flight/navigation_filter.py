@@ -52,9 +52,9 @@ class CommonErrors:
 
     attitude_noise_rad: float = float(np.radians(0.01))
     attitude_bias_rad: float = float(np.radians(0.01))
-    attitude_correlation_s: float = 3_600.0
+    attitude_correlation_s: float = 14_400.0
     pixel_bias_px: float = 0.25
-    pixel_correlation_s: float = 3_600.0
+    pixel_correlation_s: float = 14_400.0
     catalogue_offset_m: tuple[float, float, float] = (15.0, 15.0, 10.0)
     scale: float = 0.0
     scale_sigma: float = 5e-4
