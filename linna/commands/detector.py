@@ -167,8 +167,9 @@ def _train(arguments: argparse.Namespace) -> int:
     if importlib.util.find_spec("torch") is None:
         raise UsageError(_TRAIN_MODULE_MISSING)
     from payload_emulator.training.dataset import Dataset
+    from payload_emulator.training.feeder import TrainParameters
     from payload_emulator.training.landmarks import load_landmarks
-    from payload_emulator.training.train import ENVIRONMENT, TrainParameters, set_environment, train
+    from payload_emulator.training.train import ENVIRONMENT, set_environment, train
 
     if (
         any(os.environ.get(name) is None for name in ENVIRONMENT)

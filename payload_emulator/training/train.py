@@ -11,7 +11,6 @@ run.json (settings and provenance).
 from __future__ import annotations
 
 import copy
-import csv
 import hashlib
 import json
 import math
@@ -19,19 +18,18 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar.catalogue import size_class
 from payload_emulator.errors import DatasetError, ModelError
-from payload_emulator.training.augment import AugmentParameters, make_crop
-from payload_emulator.training.dataset import Dataset, Frame, choose_tiers
+from payload_emulator.training.curves import append_curve, draw_curves
+from payload_emulator.training.dataset import Dataset, Frame
+from payload_emulator.training.feeder import Feeder, TrainParameters
 from payload_emulator.training.landmarks import Landmarks, with_landmarks
-from payload_emulator.training.targets import Tier, make_targets
 
 ENVIRONMENT = {
     "OMP_WAIT_POLICY": "PASSIVE",
@@ -41,42 +39,6 @@ ENVIRONMENT = {
     "MALLOC_TOP_PAD_": "268435456",
 }
 """Waiting without spinning, and an allocator that keeps its pages: each was measured at 2 to 10 times on two cores."""
-
-
-EVEN_DIAMETER_PX = 28.0
-EMPHASIS_LIMITS = (0.5, 4.0)
-STAMPED_EMPHASIS = 0.6
-"""Small craters outnumber large ones twenty to one; without a counterweight the network hardly learns the large."""
-
-
-@dataclass(frozen=True, slots=True)
-class TrainParameters:
-    """Settings of a run.
-
-    minutes : wall-clock budget; the learning rate falls to zero over it (0: `steps` counts instead).
-    micro_batch : crops that a replica sees at once; more does not pay on a CPU, whose cache they must share.
-    """
-
-    minutes: float = 15.0
-    steps: int = 0
-    batch: int = 8
-    micro_batch: int = 2
-    crop_px: int = 384
-    learning_rate: float = 2.5e-3
-    weight_decay: float = 1e-2
-    warm_up_steps: int = 100
-    average_decay: float = 0.998
-    validate_every_minutes: float = 4.0
-    validation_frames: int = 120
-    patience: int = 0
-    seed: int = 1
-    replicas: int = 0
-    paper_classes: bool = True
-    depth: bool = True
-    pyramid_channels: int = 48
-    detail_blocks: int = 1
-    detail_channels: int = 24
-    augment: AugmentParameters = field(default_factory=AugmentParameters)
 
 
 def set_environment() -> dict[str, str]:
@@ -150,7 +112,7 @@ def train(
     images = _load_images(train_frames, report)
     _write_run(run, parameters, datasets, config.to_dict(), replicas, device, origin)
     team = _Team(network, replicas, device, parameters)
-    feeder = _Feeder(train_frames, images, parameters)
+    feeder = Feeder(train_frames, images, parameters)
     shown = _Shown()
     began = time.monotonic() - state.seconds
     last_saved = last_validated = time.monotonic()
@@ -173,7 +135,7 @@ def train(
         if now - last_validated > 60.0 * parameters.validate_every_minutes or _finished(state, parameters):
             last_validated = now
             figures = _validate(average, validation, parameters.validation_frames, device)
-            _append_curve(run, state, shown, figures)
+            append_curve(run, state.step, state.seconds / 60.0, shown.last, figures)
             report(
                 f"validation at {state.seconds / 60:.1f} min: F1 {figures['f1']:.3f} (P {figures['precision']:.3f} "
                 f"R {figures['recall']:.3f} loc {figures['loc_px']:.2f} px, threshold {figures['threshold']:.2f})"
@@ -235,89 +197,6 @@ class _Shown:
         return f"step {state.step} {state.seconds / 60:.1f} min {parts} rate {rate:.2e} {speed:.1f} images/s"
 
 
-class _Feeder:
-    """Crops by number: crop k of a run is the same whatever thread asks for it."""
-
-    def __init__(
-        self,
-        frames: list[tuple[Dataset, Frame]],
-        images: list[NDArray[np.uint8]],
-        parameters: TrainParameters,
-    ) -> None:
-        self.frames = frames
-        self.images = images
-        self.parameters = parameters
-        self.tiers = [choose_tiers(f.craters, d.width_px, d.height_px, f.complete) for d, f in frames]
-
-    def batch(self, first: int, count: int) -> dict[str, NDArray[Any]]:
-        """Arrays of `count` crops from crop number `first` on."""
-        parts = [self._crop(first + k) for k in range(count)]
-        return {key: np.stack([part[key] for part in parts]) for key in parts[0]}
-
-    def _crop(self, number: int) -> dict[str, Any]:
-        p = self.parameters
-        rng = np.random.Generator(np.random.Philox(key=[p.seed, number]))
-        epoch, place = divmod(number, len(self.frames))
-        order = _permutation(p.seed, epoch, len(self.frames))
-        _, frame = self.frames[order[place]]
-        tiers, weights = self.tiers[order[place]]
-        craters = frame.craters
-        crop = make_crop(
-            self.images[order[place]],
-            frame.sun_camera,
-            craters["u_px"],
-            craters["v_px"],
-            craters["diameter_px"],
-            tiers == Tier.LABEL,
-            p.crop_px,
-            p.augment,
-            rng,
-        )
-        margin = 0.5 * crop.diameter_px
-        near = (
-            (crop.u_px > -margin)
-            & (crop.u_px < p.crop_px + margin)
-            & (crop.v_px > -margin)
-            & (crop.v_px < p.crop_px + margin)
-        )
-        inside = (crop.u_px > 1) & (crop.u_px < p.crop_px - 2) & (crop.v_px > 1) & (crop.v_px < p.crop_px - 2)
-        tier = np.where(inside & (crop.diameter_px >= 8.0), tiers, Tier.IGNORE).astype(np.int8)[near]
-        emphasis = np.clip(crop.diameter_px / EVEN_DIAMETER_PX, *EMPHASIS_LIMITS)
-        weights = weights * np.where(craters["id"] < 0, STAMPED_EMPHASIS, 1.0) * emphasis
-        targets = make_targets(
-            p.crop_px,
-            p.crop_px,
-            crop.u_px[near],
-            crop.v_px[near],
-            crop.diameter_px[near],
-            tier,
-            weights[near],
-            size_class(craters["diameter_m"].astype(np.float64))[near] if p.paper_classes else None,
-            np.nan_to_num(craters["depth_ratio"].astype(np.float64))[near],
-        )
-        return {
-            "image": crop.image[None],
-            "heat": targets.heat,
-            "weight": targets.weight,
-            "negative": targets.negative,
-            "geometry": targets.geometry,
-            "regressed": targets.regressed,
-            "incomplete": np.array(not frame.complete),
-        }
-
-
-_orders: dict[tuple[int, int, int], NDArray[np.int64]] = {}
-
-
-def _permutation(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
-    key = (seed, epoch, count)
-    if key not in _orders:
-        if len(_orders) > 8:
-            _orders.clear()
-        _orders[key] = np.random.Generator(np.random.Philox(key=[seed, 2**40 + epoch])).permutation(count)
-    return _orders[key]
-
-
 class _Team:
     """Replicas of the network, each on its own thread with a share of every batch; gradients are averaged."""
 
@@ -328,7 +207,7 @@ class _Team:
         self.parameters = parameters
         self.pool = ThreadPoolExecutor(replicas)
 
-    def step(self, feeder: _Feeder, step: int, optimiser: Any) -> NDArray[np.float64]:
+    def step(self, feeder: Feeder, step: int, optimiser: Any) -> NDArray[np.float64]:
         """One optimiser step over the step's batch; the mean loss terms come back."""
         import torch
 
@@ -360,7 +239,7 @@ class _Team:
                         held.copy_(lead)
         return np.asarray(terms)
 
-    def _work(self, member: Any, feeder: _Feeder, first: int, count: int) -> NDArray[np.float64]:
+    def _work(self, member: Any, feeder: Feeder, first: int, count: int) -> NDArray[np.float64]:
         import torch
 
         from payload_emulator.training.loss import LossWeights, crater_loss
@@ -542,58 +421,3 @@ def _write_run(
         "started_from": origin,
     }
     path.write_text(json.dumps(document, indent=1), encoding="utf-8")
-
-
-_CURVE_COLUMNS = (
-    "step",
-    "minutes",
-    "total",
-    "heat",
-    "offset",
-    "diameter",
-    "sigma",
-    "depth",
-    "f1",
-    "precision",
-    "recall",
-    "loc_px",
-    "threshold",
-)
-
-
-def _append_curve(run: Path, state: _Progress, shown: _Shown, figures: dict[str, float]) -> None:
-    path = run / "curves.csv"
-    fresh = not path.is_file()
-    with path.open("a", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        if fresh:
-            writer.writerow(_CURVE_COLUMNS)
-        losses = [f"{value:.5f}" for value in shown.last]
-        scores = [f"{figures[key]:.5f}" for key in _CURVE_COLUMNS[8:]]
-        writer.writerow([state.step, f"{state.seconds / 60:.3f}", *losses, *scores])
-
-
-def draw_curves(run: Path) -> None:
-    """Draw curves.png from curves.csv."""
-    path = run / "curves.csv"
-    if not path.is_file():
-        return
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    with path.open(encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
-    minutes = [float(row["minutes"]) for row in rows]
-    figure, (left, right) = pyplot.subplots(1, 2, figsize=(10, 4), constrained_layout=True)
-    for name in ("total", "heat", "offset", "diameter"):
-        left.plot(minutes, [float(row[name]) for row in rows], label=name)
-    left.set(xlabel="minutes", ylabel="training loss")
-    left.legend()
-    for name in ("f1", "precision", "recall"):
-        right.plot(minutes, [float(row[name]) for row in rows], label=name)
-    right.set(xlabel="minutes", ylabel="validation, strict, 5-30 km", ylim=(0, 1))
-    right.legend()
-    figure.savefig(run / "curves.png", dpi=110)
-    pyplot.close(figure)

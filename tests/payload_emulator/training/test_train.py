@@ -15,8 +15,9 @@ torch = pytest.importorskip("torch")
 from payload_emulator.errors import DatasetError, ModelError  # noqa: E402
 from payload_emulator.training import train as training  # noqa: E402
 from payload_emulator.training.export import load_network  # noqa: E402
+from payload_emulator.training.feeder import TrainParameters  # noqa: E402
 from payload_emulator.training.landmarks import Landmarks  # noqa: E402
-from payload_emulator.training.train import TrainParameters, train  # noqa: E402
+from payload_emulator.training.train import train  # noqa: E402
 
 SHORT = TrainParameters(
     minutes=0.0,
@@ -128,13 +129,13 @@ def test_a_run_without_gain_stops_early(blob_dataset, tmp_path, monkeypatch):
 
 def test_landmarks_are_labels_of_the_second_round(blob_dataset, tmp_path, monkeypatch):
     seen = []
-    original = training._Feeder.__init__
+    original = training.Feeder.__init__
 
     def watched(self, frames, *rest):
         seen.append(sum(frame.craters["id"].size for _, frame in frames))
         original(self, frames, *rest)
 
-    monkeypatch.setattr(training._Feeder, "__init__", watched)
+    monkeypatch.setattr(training.Feeder, "__init__", watched)
     # Straight below the frames of the blob set.
     one = [np.array([value]) for value in (0.0, 0.0, 0.0, 8_000.0)]
     landmarks = Landmarks(*one, np.array([3]), np.array([3]), np.array([0.7]))
@@ -161,11 +162,12 @@ def test_a_run_killed_and_resumed_reaches_the_figures_of_one_left_alone(blob_dat
     code = (
         "import sys, time; from dataclasses import replace; from pathlib import Path\n"
         "from payload_emulator.training import train as t; from payload_emulator.training.dataset import Dataset\n"
+        "from payload_emulator.training.feeder import TrainParameters\n"
         "save = t._save\n"
         "def slow(path, *rest):\n"
         "    save(path, *rest); print(path.name, flush=True); time.sleep(0.4)\n"
         "t._save = slow\n"
-        f"p = t.TrainParameters(minutes=0.0, steps=5, batch=2, crop_px=96, warm_up_steps={SHORT.warm_up_steps},\n"
+        f"p = TrainParameters(minutes=0.0, steps=5, batch=2, crop_px=96, warm_up_steps={SHORT.warm_up_steps},\n"
         f"    validation_frames={SHORT.validation_frames}, replicas=1, validate_every_minutes=0.0, detail_blocks=0)\n"
         "t.train([Dataset(Path(sys.argv[1]))], Path(sys.argv[2]), p)\n"
     )
