@@ -197,7 +197,7 @@ def main() -> None:
     )
     parser.add_argument("--poses", type=int, default=50, help="random poses per terrain (default: 50)")
     parser.add_argument(
-        "--every", type=int, default=4, help="march every so-manieth pixel and row (default: 4)"
+        "--every", type=int, default=8, help="march every so-manieth pixel and row (default: 8)"
     )
     arguments = parser.parse_args()
     root = os.environ.get("LINNA_DATA")

@@ -8,7 +8,12 @@ from lunar.catalogue import make_catalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import axis_rotation, mcmf_from_spherical
 from payload_emulator.sim import raymarch
-from payload_emulator.sim.labels import label_frame, project_as_the_paper, project_craters
+from payload_emulator.sim.labels import (
+    label_frame,
+    label_frame_as_the_paper,
+    project_as_the_paper,
+    project_craters,
+)
 from payload_emulator.sim.light import sun_direction_mcmf
 
 CAMERA = PinholeCamera()
@@ -152,3 +157,44 @@ def test_the_papers_labels_agree_below_the_camera_and_drift_off_toward_the_edge(
     # At 60 km the Moon has fallen by 1036 m below the plane that the paper's map lies in: u is short by 1036 / 41036.
     flat = CAMERA.focal_px * 60.0 / 40.0
     assert u[1] - exact.u_px[1] == pytest.approx(flat * 1036.0 / 41036.0, rel=0.03)
+
+
+def test_ground_in_front_of_a_rim_takes_it_out_of_sight():
+    position = mcmf_from_spherical(0.0, 0.0, 20e3)
+    rotation = nadir_camera_from_mcmf(position)
+    catalogue = crater_at(0.0, 0.0, 8000.0, 0.0)
+    clear = np.full((512, 512), 20e3, np.float32)
+    half = clear.copy()
+    half[:, :256] = 12e3
+    seen = [
+        project_craters(catalogue, CAMERA, position, rotation, range_m=ranges).sight_fraction[0]
+        for ranges in (clear, half, np.full_like(clear, np.nan))
+    ]
+    # 24 rim points; one or two lie on the line between the halves.
+    assert seen[0] == 1.0 and seen[1] == pytest.approx(0.5, abs=0.09) and seen[2] == 0.0
+    assert math.isnan(project_craters(catalogue, CAMERA, position, rotation).sight_fraction[0])
+
+
+def test_the_papers_labels_of_a_frame_name_the_same_craters_elsewhere(procedural):
+    position = mcmf_from_spherical(math.radians(10.0), math.radians(20.0), 30e3)
+    exact = label_frame(procedural, CAMERA, position, nadir_camera_from_mcmf(position))
+    flat = label_frame_as_the_paper(procedural, CAMERA, position)
+    np.testing.assert_array_equal(exact.index, flat.index)
+    off = np.hypot(exact.u_px - flat.u_px, exact.v_px - flat.v_px)[exact.inside]
+    # Relief and curvature at 120 degrees: pixels, not fractions of one.
+    assert 1.0 < np.median(off) < 30.0
+    np.testing.assert_array_equal(flat.major_px, flat.minor_px)
+
+
+def test_the_ellipse_of_a_crater_at_the_edge_is_that_of_perspective():
+    """Seen at 45 degrees a circle is foreshortened to cos 45 across and stretched by the flat image plane."""
+    position = mcmf_from_spherical(0.0, 0.0, 20e3)
+    longitude = math.degrees(20e3 / MOON_RADIUS_M)
+    label = project_craters(
+        crater_at(0.0, longitude, 3000.0, 0.0), CAMERA, position, nadir_camera_from_mcmf(position)
+    )
+    # On a plane below a nadir pinhole circles stay circles: f D / z, z = 20 km + the fall of 115 m.
+    flat = CAMERA.focal_px * 3.0 / 20.115
+    assert label.minor_px[0] == pytest.approx(flat, rel=0.02)
+    # The ground leans away by 0.66 degrees there: 1.2 % at 45 degrees.
+    assert label.major_px[0] == pytest.approx(flat, rel=0.02)

@@ -3,7 +3,12 @@ import math
 import numpy as np
 import pytest
 
+from lunar.camera import PinholeCamera
+from lunar.frames import mcmf_from_spherical
 from payload_emulator.errors import PayloadError
+from payload_emulator.sim import raymarch, renderer
+from payload_emulator.sim.lens import pointed_camera_from_mcmf
+from payload_emulator.sim.light import sun_direction_mcmf
 from payload_emulator.sim.photometry import LAWS, TABLE_SIZE, Photometry
 
 
@@ -36,3 +41,30 @@ def test_brightness_falls_with_phase(law):
 def test_an_unknown_law_is_refused_by_name():
     with pytest.raises(PayloadError, match="lunar-lambert, lambert, hapke, found 'phong'"):
         Photometry("phong")
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_both_renderers_shade_a_smooth_sphere_alike_by_every_law(formula_terrain, law):
+    terrain = formula_terrain(lambda latitude, longitude: 0.0 * latitude)
+    place = 0.2, 1.0
+    position = mcmf_from_spherical(*place, 30e3)
+    view = (position, pointed_camera_from_mcmf(position, 0.05, 0.4), sun_direction_mcmf(0.3, 1.0, *place))
+    fast = renderer.render(terrain, PinholeCamera(), *view, Photometry(law))
+    slow = raymarch.render(terrain, PinholeCamera(), *view, Photometry(law), every=32)
+    # Tables are read linearly by both; slopes differ in the last digits of single precision.
+    np.testing.assert_allclose(fast.radiance[::32, ::32], slow.radiance, rtol=5e-3)
+
+
+def test_laws_differ_where_they_should(formula_terrain):
+    """A Lambert surface does not know where it is seen from; the Moon is brighter looking down-Sun."""
+    terrain = formula_terrain(lambda latitude, longitude: 0.0 * latitude)
+    position = mcmf_from_spherical(0.0, 1.0, 30e3)
+    view = (position, pointed_camera_from_mcmf(position), sun_direction_mcmf(0.5, 0.0, 0.0, 1.0))
+    asymmetry = {}
+    for law in LAWS:
+        slope = 0.0 if law == "lambert" else 0.7
+        picture = renderer.render(terrain, PinholeCamera(), *view, Photometry(law, slope)).radiance
+        # The Sun stands in the north: the bottom of the picture is seen looking away from it.
+        asymmetry[law] = picture[500, 256] / picture[11, 256]
+    assert asymmetry["lambert"] == pytest.approx(1.0, abs=0.12)
+    assert asymmetry["lunar-lambert"] > 1.5 and asymmetry["hapke"] > 1.5

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from payload_emulator.errors import PayloadError
-from payload_emulator.sim.sensor import COLOUR, SensorModel, auto_exposure, expose, expose_deep, random_sensor
+from payload_emulator.sim.sensor import (
+    COLOUR,
+    SensorModel,
+    auto_exposure,
+    expose,
+    expose_deep,
+    random_sensor,
+    take_picture,
+)
 
 PLAIN = {
     "psf_sigma_px": 0.0,
@@ -95,3 +103,85 @@ def test_random_sensors_differ_but_are_reproducible():
     first, second = random_sensor(np.random.default_rng(1)), random_sensor(np.random.default_rng(1))
     assert first == second
     assert first != random_sensor(np.random.default_rng(2))
+
+
+def quiet(**options):
+    """A sensor that shows one thing at a time, without noise that matters, in 16 bits."""
+    return SensorModel(
+        **{**PLAIN, "exposure": 1.0, "read_noise_e": 1e-3, "full_well_e": 1e12, "bits": 16, **options}
+    )
+
+
+def green(scene, sensor):
+    return expose_deep(scene, sensor, np.random.default_rng(0))[..., 1] / 65535.0
+
+
+def test_exposure_is_the_share_of_full_scale_per_unit_of_radiance():
+    assert green(field(0.2), quiet(exposure=2.5)).mean() == pytest.approx(0.5, abs=1e-3)
+
+
+def test_gain_brightens_and_makes_noisier():
+    bright = green(field(0.1), quiet(exposure=1.0, gain=4.0))
+    assert bright.mean() == pytest.approx(0.4, abs=1e-3)
+    # At the same output level four times the gain is a quarter of the electrons: noise doubles.
+    deviations = [
+        green(field(0.4 / gain), quiet(gain=gain, full_well_e=10_000.0, read_noise_e=0.0)).std()
+        for gain in (1.0, 4.0)
+    ]
+    assert deviations[1] / deviations[0] == pytest.approx(2.0, rel=0.05)
+
+
+def test_vignetting_takes_its_share_at_the_corners_and_half_of_it_at_the_sides():
+    image = green(field(0.8), quiet(vignetting=0.4))
+    assert image[64, 64] == pytest.approx(0.8, rel=1e-3)
+    assert image[0, 0] == pytest.approx(0.8 * 0.6, rel=1e-3)
+    assert image[64, 0] == pytest.approx(0.8 * 0.8, rel=1e-2)
+
+
+def test_smear_follows_columns_and_stray_light_goes_everywhere():
+    scene = field(0.0)
+    scene[10:74, 30] = 0.5
+    smeared = green(scene, quiet(smear=0.1))
+    # Half of the column is lit: its mean is a quarter.
+    assert smeared[100, 30] == pytest.approx(0.025, abs=1e-3)
+    assert smeared[100, 31] == pytest.approx(0.0, abs=1e-3)
+    assert green(field(0.5), quiet(stray=0.1)).mean() == pytest.approx(0.55, abs=1e-3)
+
+
+def test_hot_pixels_are_the_same_ones_in_every_frame():
+    sensor = quiet(hot_pixels=1e-3)
+    first = expose_deep(field(0.1), sensor, np.random.default_rng(1))[..., 1] == 65535
+    second = expose_deep(field(0.1), sensor, np.random.default_rng(2))[..., 1] == 65535
+    np.testing.assert_array_equal(first, second)
+    # A thousandth of 16,384; two may fall on one place.
+    assert 14 <= first.sum() <= 16
+
+
+def test_dark_signal_and_offset_lift_a_black_picture():
+    sensor = quiet(full_well_e=1000.0, dark_e=50.0, offset=0.1, read_noise_e=0.0)
+    assert green(field(0.0), sensor).mean() == pytest.approx(0.15, abs=2e-3)
+
+
+def test_pixels_respond_unevenly_and_always_alike():
+    flat = green(field(0.5), quiet(gain_mismatch=0.02))
+    assert flat.std() / flat.mean() == pytest.approx(0.02, rel=0.05)
+    np.testing.assert_allclose(flat, green(field(0.5), quiet(gain_mismatch=0.02)), atol=1e-4)
+
+
+@pytest.mark.parametrize(("bits", "kind"), [(8, np.uint8), (12, np.uint16), (16, np.uint16)])
+def test_a_picture_comes_in_the_numbers_of_its_depth(bits, kind):
+    assert take_picture(field(0.3), SensorModel(bits=bits), np.random.default_rng(1)).dtype == kind
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"gain": 0.0}, "gain from 0.001 to 1000, found 0"),
+        ({"vignetting": 1.5}, "vignetting from 0 to 1"),
+        ({"full_well_e": -1.0}, "full_well_e from 1 to inf"),
+        ({"gamma": float("nan")}, "gamma from"),
+    ],
+)
+def test_impossible_sensors_are_refused_by_name(options, message):
+    with pytest.raises(PayloadError, match=message):
+        SensorModel(**options)

@@ -1,0 +1,82 @@
+"""Labels against rims found by casting rays: the demand is 0.1 px rms on the ray march's geometry."""
+
+import math
+
+import numpy as np
+import pytest
+
+from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
+from lunar.catalogue import make_catalogue
+from lunar.constants import MOON_RADIUS_M
+from lunar.datafolder import find_data
+from lunar.frames import mcmf_from_spherical
+from payload_emulator.sim.labels import label_frame, project_craters
+from payload_emulator.sim.lens import BrownCamera, pointed_camera_from_mcmf
+from payload_emulator.sim.raymarch import cast
+from payload_emulator.sim.rims import rim_errors
+from payload_emulator.sim.terrain.opening import open_terrain
+
+CAMERA = PinholeCamera()
+
+
+def errors_px(terrain, latitude_deg, longitude_deg, altitudes_m, camera=CAMERA):
+    offsets = []
+    for number, altitude_m in enumerate(altitudes_m):
+        place = math.radians(latitude_deg), math.radians(longitude_deg)
+        position = mcmf_from_spherical(*place, altitude_m)
+        rotation = pointed_camera_from_mcmf(position, math.radians(2.0 * number), 0.7 * number)
+        errors = rim_errors(terrain, camera, position, rotation)
+        labelled = terrain.catalogue.diameter_m[errors.index] <= 30e3
+        offsets += [*errors.offset_u_px[labelled], *errors.offset_v_px[labelled]]
+    return np.array(offsets)
+
+
+def test_rays_meet_a_smooth_sphere_where_geometry_says(formula_terrain):
+    terrain = formula_terrain(lambda latitude, longitude: 700.0 + 0.0 * latitude)
+    position = mcmf_from_spherical(0.2, 1.0, 25e3)
+    rotation = nadir_camera_from_mcmf(position)
+    uv = np.array([[255.5, 255.5], [400.25, 30.5], [0.0, 511.0]])
+    hits = cast(terrain, CAMERA, position, rotation, uv)
+    # Heights are single precision and a ray is halved onto the ground to millimetres.
+    np.testing.assert_allclose(np.linalg.norm(hits, axis=1) - MOON_RADIUS_M, 700.0, atol=0.05)
+    np.testing.assert_allclose(CAMERA.project((hits - position) @ rotation.T), uv, atol=1e-3)
+
+
+def test_a_label_on_a_slope_sits_on_the_slopes_rim(formula_terrain):
+    """A rim 300 m higher in the north, seen from the side: a label of one height is off by more than 0.1 px."""
+    latitude, longitude = 0.2 + 30e3 / MOON_RADIUS_M, 1.0
+    catalogue = make_catalogue([latitude], [longitude], [14_000.0], source="t")
+    slope = 300.0 / (7_000.0 / MOON_RADIUS_M)
+    terrain = formula_terrain(lambda lat, lon: slope * (lat - latitude) + 0.0 * lon, catalogue)
+    position = mcmf_from_spherical(0.2, 1.0, 25e3)
+    errors = rim_errors(terrain, CAMERA, position, nadir_camera_from_mcmf(position))
+    assert errors.index.tolist() == [0]
+    assert math.hypot(errors.offset_u_px[0], errors.offset_v_px[0]) < 0.01
+    level = project_craters(
+        terrain.measured(np.array([0])), CAMERA, position, nadir_camera_from_mcmf(position)
+    )
+    tilted = label_frame(terrain, CAMERA, position, nadir_camera_from_mcmf(position))
+    assert math.hypot(level.u_px[0] - tilted.u_px[0], level.v_px[0] - tilted.v_px[0]) > 0.1
+    tilt = terrain.rim_tilts_m(np.array([0]))[0]
+    # 300 m over one radius to the north, by the definition of the slope.
+    assert tilt[0] == pytest.approx(300.0, rel=0.01) and abs(tilt[1]) < 1.0
+
+
+def test_labels_sit_on_procedural_rims(procedural):
+    offsets = errors_px(procedural, 10.0, 20.0, (22e3, 45e3))
+    assert offsets.size >= 40
+    assert math.sqrt(np.mean(offsets**2)) <= 0.1
+
+
+def test_labels_sit_on_rims_seen_through_a_distorting_lens(procedural):
+    offsets = errors_px(procedural, 10.0, 20.0, (40e3,), BrownCamera(k1=-0.015, p1=5e-4))
+    assert offsets.size >= 20
+    assert math.sqrt(np.mean(offsets**2)) <= 0.1
+
+
+@pytest.mark.real_data
+def test_labels_sit_on_real_rims(data_path):
+    terrain = open_terrain("raster", find_data(data_path), 3)
+    offsets = errors_px(terrain, -30.0, 294.0, (45e3,))
+    assert offsets.size >= 20
+    assert math.sqrt(np.mean(offsets**2)) <= 0.1
