@@ -412,7 +412,10 @@ def _detect(arguments: argparse.Namespace) -> int:
 
 
 def _read_image(path: Path) -> Any:
-    """Pixels of an image file, 8 or 16 bits or float; colours in RGB order."""
+    """Pixels of an image file, 8 or 16 bits or float; colours in RGB order.
+
+    A 16-bit file whose greatest value would fit into 12 or 14 bits is taken for one of so many.
+    """
     import cv2
     import numpy as np
 
@@ -422,6 +425,9 @@ def _read_image(path: Path) -> Any:
     image = cv2.imdecode(octets, cv2.IMREAD_UNCHANGED) if octets.size else None
     if image is None:
         raise UsageError(f"{path}: expected an image (PNG, TIFF, JPEG), found none that can be read")
+    if image.dtype == np.uint16:
+        held = next(bits for bits in (12, 14, 16) if int(image.max()) < 1 << bits)
+        image = image << (16 - held)
     return image[..., [2, 1, 0]] if image.ndim == 3 and image.shape[2] >= 3 else image
 
 

@@ -52,6 +52,41 @@ def test_detect_takes_any_size_and_depth(write_image, capsys, name, image):
         assert -1 <= detection["class"] <= 3
 
 
+def test_twelve_bits_in_a_file_of_sixteen_are_no_dark_picture(write_image, capsys):
+    image = speckled().astype(np.uint16) * 16
+    assert run(["detector", "detect", str(write_image("raw.tiff", image)), "--json"]) == 0
+    (item,) = json.loads(capsys.readouterr().out)["images"]
+    assert item["quality"] == "ok"
+
+
+def test_a_picture_with_values_that_are_no_numbers_is_a_verdict(write_image, capsys):
+    image = np.full((512, 512), 0.5, np.float32)
+    image[3, 4] = np.nan
+    assert run(["detector", "detect", str(write_image("nan.tiff", image)), "--json"]) == 0
+    (item,) = json.loads(capsys.readouterr().out)["images"]
+    assert item["quality"] == "invalid" and item["detections"] == []
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        (["--altitude-km", "-3"], "--altitude-km: expected a positive number of kilometres, found -3"),
+        (["--fov-deg", "180"], "--fov-deg: expected an angle between 0 and 180, found 180"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused(write_image, capsys, extra, words):
+    assert run(["detector", "detect", str(write_image("a.png", speckled())), *extra]) == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("hide", "words"), [("1.5", "--hide: expected a share"), ("-0.1", "--hide: expected a share")]
+)
+def test_a_share_to_hide_outside_its_bounds_is_refused(tmp_path, capsys, hide, words):
+    assert run(["detector", "landmarks", "--dataset", str(tmp_path), f"--hide={hide}"]) == 2
+    assert words in capsys.readouterr().err
+
+
 def test_a_black_picture_is_a_verdict_not_an_error(write_image, capsys):
     assert (
         run(["detector", "detect", str(write_image("black.png", np.zeros((512, 512), np.uint8))), "--json"])
