@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field, SecretStr, ValidationError
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -43,6 +44,13 @@ class Settings(BaseSettings):
         default=None,
         pattern=r"^[A-Za-z0-9.:-]+:[0-9]{1,5}$",
         description="HOST:PORT of the console of a payload flown live, for the live page",
+    )
+    log_format: Literal["text", "json"] = Field(default="text", description="Form of the log on stderr")
+    rate_limit_per_s: float = Field(
+        default=200.0, ge=0.0, description="Requests a second that one caller may make; 0: any number"
+    )
+    retention_days: int = Field(
+        default=90, ge=1, description="Days for which the feed and finished jobs are kept"
     )
     upload_limit_mib: int = Field(default=4096, ge=1, description="Largest upload accepted, MiB")
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from fastapi import FastAPI
+from starlette.concurrency import run_in_threadpool
 
 from ground_service.api import problems
 from ground_service.api.common import API_PREFIX
-from ground_service.api.limits import BodyLimit, HeadersAndTags
+from ground_service.api.limits import BodyLimit, HeadersAndTags, RateLimit
 from ground_service.api.live import live
 from ground_service.api.metrics import Metrics, Watch
 from ground_service.api.operations import operations
@@ -18,10 +22,19 @@ from ground_service.api.planning import planning
 from ground_service.api.regression_routes import REGRESSION_UPLOAD_PATHS, regressions
 from ground_service.api.routes import UPLOAD_PATHS, router
 from ground_service.api.telecommands import telecommands
+from ground_service.clock import utc_now_ns
+from ground_service.errors import GroundError
 from ground_service.services.ground import ground_from_settings
+from ground_service.services.upkeep import nightly_job_id
 from ground_service.settings import Settings
 from ground_service.web.pages import pages
 from ground_service.worker.dispatch import dispatcher_for
+
+log = logging.getLogger(__name__)
+
+DAY_NS = 86_400_000_000_000
+NIGHT_NS = 1_800_000_000_000
+"""The nightly job is entered at 00:30 UTC."""
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
@@ -41,9 +54,13 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         app.state.ground = ground
         app.state.dispatcher = dispatcher_for(ground, settings, inline=inline_jobs)
         app.state.dispatcher.resume()
+        nights = asyncio.create_task(_nights(app, settings))
         try:
             yield
         finally:
+            nights.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await nights
             app.state.dispatcher.close()
             ground.close()
 
@@ -72,6 +89,25 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         upload_paths=(*UPLOAD_PATHS, *REGRESSION_UPLOAD_PATHS),
         upload_limit_octets=settings.upload_limit_mib << 20,
     )
+    app.add_middleware(RateLimit, per_second=settings.rate_limit_per_s)
     app.add_middleware(HeadersAndTags)
     app.add_middleware(Watch, metrics=app.state.metrics)
     return app
+
+
+async def _nights(app: FastAPI, settings: Settings) -> None:
+    """Enter the nightly job once a day; it is one job however many servers and schedulers enter it."""
+    if settings.resolved_broker_url() is not None:
+        return  # the workers' scheduler does it
+    while True:
+        now = utc_now_ns()
+        await asyncio.sleep((NIGHT_NS - now % DAY_NS) % DAY_NS / 1e9 + 1.0)
+        try:
+            await run_in_threadpool(
+                app.state.dispatcher.submit,
+                "nightly",
+                {"retention_days": settings.retention_days},
+                job_id=nightly_job_id(utc_now_ns()),
+            )
+        except GroundError:
+            log.exception("the nightly job could not be entered")

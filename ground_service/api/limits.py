@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import math
+import time
+from collections import OrderedDict
 from typing import Any
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -12,6 +15,9 @@ from ground_service.api.problems import problem
 
 JSON_LIMIT_OCTETS = 1 << 20
 TAGGED_LIMIT_OCTETS = 4 << 20
+
+CALLERS_KEPT = 10_000
+_WATCHED = ("/healthz", "/readyz", "/metrics")
 
 SECURE_HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -74,6 +80,48 @@ class BodyLimit:
         if over and not started:
             response = problem(413, "too large", f"body: expected at most {limit} octets")
             await response(scope, receive, send)
+
+
+class RateLimit:
+    """Refuses callers that ask more often than they may: a bucket of two seconds' worth for each, refilled evenly.
+
+    A caller is known by its token (its hash: tokens are not kept), else by its address.
+    """
+
+    def __init__(self, app: ASGIApp, per_second: float) -> None:
+        self._app = app
+        self._rate = per_second
+        self._depth = max(2.0 * per_second, 1.0)
+        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or self._rate <= 0.0 or scope["path"] in _WATCHED:
+            await self._app(scope, receive, send)
+            return
+        wait_s = self._wait_s(_caller(scope), time.monotonic())
+        if wait_s <= 0.0:
+            await self._app(scope, receive, send)
+            return
+        response = problem(429, "too many requests", f"expected at most {self._rate:g} requests a second")
+        response.headers["Retry-After"] = str(math.ceil(wait_s))
+        await response(scope, receive, send)
+
+    def _wait_s(self, caller: str, now_s: float) -> float:
+        """Take one from the caller's bucket; how long it has to wait where that is empty."""
+        left, since = self._buckets.pop(caller, (self._depth, now_s))
+        left = min(left + (now_s - since) * self._rate, self._depth)
+        allowed = left >= 1.0
+        self._buckets[caller] = (left - 1.0 if allowed else left, now_s)
+        if len(self._buckets) > CALLERS_KEPT:
+            self._buckets.popitem(last=False)
+        return 0.0 if allowed else (1.0 - left) / self._rate
+
+
+def _caller(scope: Scope) -> str:
+    token = Headers(scope=scope).get("authorization", "")
+    if token:
+        return hashlib.sha256(token.encode()).hexdigest()
+    return str((scope.get("client") or ("",))[0])
 
 
 class HeadersAndTags:

@@ -41,6 +41,7 @@ from ground_service.services.timekeeping import (
     spacecraft_correlations,
     time_points,
 )
+from ground_service.services.upkeep import spacecraft_trends, trend_view
 from ground_service.services.views import (
     correlation_view,
     ephemeris_view,
@@ -428,6 +429,12 @@ def get_report_summary(ground: GroundOf, _: Viewer, report_id: Key) -> dict[str,
             "summary"
         ]
     return summary
+
+
+@router.get("/spacecraft/{spacecraft_id}/trends", response_model=list[schemas.Trend])
+def get_trends(ground: GroundOf, _: Viewer, spacecraft_id: SpacecraftId, instance: Instance = FLOWN) -> Any:
+    """Housekeeping parameters over the last 30 days of on-board time: statistics, slope, worst limit state."""
+    return [trend_view(trend) for trend in spacecraft_trends(ground, spacecraft_id, instance)]
 
 
 @router.get("/spacecraft/{spacecraft_id}/correlations", response_model=schemas.PageOf[schemas.Correlation])

@@ -288,3 +288,16 @@ class Correlation(Schema):
     points: int
     in_force: bool
     created: str
+
+
+class Trend(Schema):
+    """How a housekeeping parameter moved."""
+
+    parameter: str = Field(examples=["temperature_c"])
+    unit: str
+    samples: int
+    low: float
+    high: float
+    mean: float
+    slope_per_day: float | None
+    limit_state: str = Field(description="Worst met: within, warning or alarm", examples=["within"])

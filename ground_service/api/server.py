@@ -8,6 +8,7 @@ import sys
 
 from ground_service.api.app import LOOPBACK, create_app
 from ground_service.errors import ServerError
+from ground_service.logs import logging_config
 from ground_service.services.ground import ground_from_settings
 from ground_service.services.users import has_users
 from ground_service.settings import Settings
@@ -31,7 +32,10 @@ def serve(settings: Settings) -> None:
             )
     listener = bind(settings.host, settings.port)
     config = uvicorn.Config(
-        create_app(settings), log_level="info", timeout_graceful_shutdown=20, server_header=False
+        create_app(settings),
+        log_config=logging_config(settings.log_format),
+        timeout_graceful_shutdown=20,
+        server_header=False,
     )
     host, port = listener.getsockname()[:2]
     shown = f"[{host}]" if ":" in host else host

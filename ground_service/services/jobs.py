@@ -20,6 +20,7 @@ from ground_service.services.feed import publish
 from ground_service.services.ground import Ground
 from ground_service.services.ingest import run_ingest
 from ground_service.services.reports import make_report
+from ground_service.services.upkeep import nightly
 from ground_service.store import repository
 from lunar.errors import LunarError
 from reports.errors import ReportError
@@ -70,6 +71,7 @@ WORK: dict[str, Work] = {
     "archive": _archive,
     "replay": _replay,
     "regression": _regression,
+    "nightly": nightly,
 }
 """What can be asked for, by kind. Each may be run twice with the same arguments and job without harm."""
 

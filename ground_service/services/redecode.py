@@ -12,6 +12,7 @@ from ground_service.services.ground import Ground
 from ground_service.store import repository
 from ground_service.store.packets import store_samples
 from ground_service.store.rollups import forget_rollups
+from tmtc.dictionary import DICTIONARY
 from tmtc.schema import Dictionary
 from tmtc.stream import cut_packets
 
@@ -49,3 +50,10 @@ def redecode(ground: Ground, vehicle: int, dictionary: Dictionary) -> int:
             ids = np.array([row[0] for row in block], dtype=np.int64)
             rows += store_samples(connection, vehicle, dictionary.version, batch.rows, ids)
             last = int(ids[-1])
+
+
+def redecode_all(ground: Ground) -> int:
+    """Decode everything with the dictionary of this version; how many rows that gave."""
+    with ground.database.reading() as connection:
+        vehicles = list(connection.execute(select(repository.VEHICLES.c.id)).scalars())
+    return sum(redecode(ground, int(vehicle), DICTIONARY) for vehicle in vehicles)

@@ -9,13 +9,17 @@ from __future__ import annotations
 from typing import Any
 
 from celery import Celery
+from celery.schedules import crontab
 
+from ground_service.clock import utc_now_ns
 from ground_service.errors import SettingsError
 from ground_service.services.ground import Ground, ground_from_settings
-from ground_service.services.jobs import run_job
+from ground_service.services.jobs import enter_job, run_job
+from ground_service.services.upkeep import nightly_job_id
 from ground_service.settings import Settings, load_settings
 
 RUN_JOB = "ground_service.run_job"
+NIGHTLY = "ground_service.nightly"
 TIME_LIMIT_S = 1800
 RETRIES = 5
 VISIBILITY_TIMEOUT_S = 2 * TIME_LIMIT_S
@@ -41,6 +45,8 @@ def make_app(settings: Settings) -> Celery:
         broker_transport_options={"visibility_timeout": VISIBILITY_TIMEOUT_S},
         task_default_queue="linna",
         worker_max_tasks_per_child=200,
+        timezone="UTC",
+        beat_schedule={"nightly": {"task": NIGHTLY, "schedule": crontab(minute=30, hour=0)}},
     )
 
     @app.task(
@@ -53,6 +59,12 @@ def make_app(settings: Settings) -> Celery:
     )
     def run(_task: Any, job_id: str) -> None:
         run_job(_ground_of(settings), job_id)
+
+    @app.task(name=NIGHTLY)
+    def night() -> None:
+        ground = _ground_of(settings)
+        arguments = {"retention_days": settings.retention_days}
+        run_job(ground, enter_job(ground, "nightly", arguments, job_id=nightly_job_id(utc_now_ns())))
 
     return app
 
@@ -96,8 +108,8 @@ def _app_of(settings: Settings) -> Celery:
     return _apps[key]
 
 
-def run_worker(settings: Settings, concurrency: int = 1) -> None:
-    """Do jobs until stopped.
+def run_worker(settings: Settings, concurrency: int = 1, *, beat: bool = False) -> None:
+    """Do jobs until stopped; with `beat` enter the scheduled ones, too (one worker of a deployment has to).
 
     Raises
     ------
@@ -107,6 +119,13 @@ def run_worker(settings: Settings, concurrency: int = 1) -> None:
     if settings.resolved_broker_url() is None:
         raise SettingsError("LINNA_BROKER_URL", "a broker such as redis://localhost:6379/0", "nothing")
     _ground_of(settings).close()
-    make_app(settings).worker_main(
-        ["worker", "--loglevel=INFO", f"--concurrency={concurrency}", "--without-gossip", "--without-mingle"]
-    )
+    words = [
+        "worker",
+        "--loglevel=INFO",
+        f"--concurrency={concurrency}",
+        "--without-gossip",
+        "--without-mingle",
+    ]
+    if beat:
+        words += ["--beat", "--schedule", str(settings.home / "beat-schedule")]
+    make_app(settings).worker_main(words)

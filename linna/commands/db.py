@@ -1,10 +1,11 @@
-"""`linna db upgrade | downgrade | status`: the schema of the ground database."""
+"""`linna db upgrade | downgrade | status | backup | restore | tidy | redecode`: the database of the ground."""
 
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
-from linna.commands._ground import add_service_options, settings_of
+from linna.commands._ground import add_service_options, open_service, settings_of
 from linna.output import add_json_flag, emit
 
 
@@ -17,7 +18,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
     downgrade.set_defaults(handler=run_downgrade)
     status = actions.add_parser("status", help="which revision the database has")
     status.set_defaults(handler=run_status)
-    for action in (upgrade, downgrade, status):
+    saving = actions.add_parser("backup", help="write the whole service into a new folder, while it runs")
+    saving.add_argument("--out", type=Path, required=True, metavar="DIR")
+    saving.set_defaults(handler=run_backup)
+    restoring = actions.add_parser("restore", help="fill an empty service from a backup")
+    restoring.add_argument("folder", type=Path)
+    restoring.set_defaults(handler=run_restore)
+    tidying = actions.add_parser("tidy", help="take away the feed and finished jobs that are old")
+    tidying.add_argument("--days", type=int, help="older than this (default: $LINNA_RETENTION_DAYS)")
+    tidying.set_defaults(handler=run_tidy)
+    decoding = actions.add_parser("redecode", help="decode the archive again with this version's dictionary")
+    decoding.set_defaults(handler=run_redecode)
+    for action in (upgrade, downgrade, status, saving, restoring, tidying, decoding):
         add_service_options(action)
         add_json_flag(action)
 
@@ -47,6 +59,49 @@ def run_status(arguments: argparse.Namespace) -> int:
 
     database = open_database(settings_of(arguments).resolved_database_url())
     return _show(arguments, *schema_revisions(database)[:2], database.label)
+
+
+def run_backup(arguments: argparse.Namespace) -> int:
+    from ground_service.clock import utc_now_ns
+    from ground_service.services.backup import backup
+
+    with open_service(arguments) as ground:
+        manifest = backup(ground, arguments.out, now_utc_ns=utc_now_ns())
+    text = f"{arguments.out}: {sum(manifest['rows'].values())} rows, {manifest['files']} files"
+    emit(arguments, {"folder": str(arguments.out), **manifest}, text=text)
+    return 0
+
+
+def run_restore(arguments: argparse.Namespace) -> int:
+    from ground_service.services.backup import restore
+
+    with open_service(arguments) as ground:
+        manifest = restore(arguments.folder, ground)
+        label = ground.database.label
+    text = f"{label}: {sum(manifest['rows'].values())} rows, {manifest['files']} files"
+    emit(arguments, {"database": label, **manifest}, text=text)
+    return 0
+
+
+def run_tidy(arguments: argparse.Namespace) -> int:
+    from ground_service.services.upkeep import tidy
+
+    days = arguments.days if arguments.days is not None else settings_of(arguments).retention_days
+    with open_service(arguments) as ground:
+        removed = tidy(ground, max(days, 0))
+    emit(
+        arguments, {"removed": removed}, text=", ".join(f"{count} {name}" for name, count in removed.items())
+    )
+    return 0
+
+
+def run_redecode(arguments: argparse.Namespace) -> int:
+    from ground_service.services.redecode import redecode_all
+
+    with open_service(arguments) as ground:
+        rows = redecode_all(ground)
+    emit(arguments, {"rows": rows}, text=f"{rows} rows")
+    return 0
 
 
 def _show(arguments: argparse.Namespace, found: str | None, head: str, label: str) -> int:

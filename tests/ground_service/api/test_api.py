@@ -205,6 +205,7 @@ MATRIX = [
     ("GET", "/passes/1/telemetry/power_w", "viewer"),
     ("POST", "/passes/1/reports", "operator"),
     ("GET", "/spacecraft/76/telemetry/power_w", "viewer"),
+    ("GET", "/spacecraft/76/trends", "viewer"),
     ("GET", "/spacecraft/76/correlations", "viewer"),
     ("POST", "/spacecraft/76/correlations", "operator"),
     ("POST", "/windows/search", "viewer"),

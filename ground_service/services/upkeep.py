@@ -1,0 +1,149 @@
+"""What the service does by itself every night: trends with limit checks, and taking away what is no longer needed.
+
+The raw telemetry, what is decoded from it and the audit log are kept for good. What is watched and forgotten (the
+feed, finished jobs, what broken uploads left) goes after `retention_days`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from sqlalchemy import delete, select
+
+from ground_service.clock import utc_now_ns
+from ground_service.errors import NotFound
+from ground_service.processing.trends import Trend, trend_of
+from ground_service.services.feed import publish
+from ground_service.services.ground import Ground
+from ground_service.services.pass_data import PassSpan, load_correlations
+from ground_service.services.series import PARAMETERS, SeriesReading
+from ground_service.store import repository, rollups
+from lunar.timescales import format_utc
+from tmtc.dictionary import DICTIONARY
+
+TREND_DAYS = 30
+TREND_POINTS = 60
+RETENTION_DAYS = 90
+DAY_NS = 86_400_000_000_000
+ABANDONED_S = 86_400.0
+"""Temporary files this old belong to nobody."""
+
+
+def nightly_job_id(utc_ns: int) -> str:
+    """The id of the nightly job of a day: whoever enters it, and how often, it is one job."""
+    return hashlib.sha256(f"nightly {format_utc(utc_ns)[:10]}".encode()).hexdigest()[:32]
+
+
+def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> dict[str, Any]:
+    """Trends of every spacecraft, and what was taken away."""
+    with ground.database.reading() as connection:
+        vehicles = [dict(row) for row in connection.execute(select(repository.VEHICLES)).mappings()]
+    found = []
+    for vehicle in vehicles:
+        trends = vehicle_trends(ground, vehicle["id"])
+        if trends:
+            found.append(
+                {
+                    "spacecraft_id": vehicle["ccsds_id"],
+                    "instance": vehicle["instance"],
+                    "trends": [trend_view(trend) for trend in trends],
+                }
+            )
+    broken = [
+        {**{key: one[key] for key in ("spacecraft_id", "instance")}, "parameter": trend["parameter"],
+         "limit_state": trend["limit_state"]}
+        for one in found
+        for trend in one["trends"]
+        if trend["limit_state"] != "within"
+    ]  # fmt: skip
+    if broken:
+        with ground.database.writing() as connection:
+            publish(connection, "limits", {"broken": broken})
+    removed = tidy(ground, int(arguments.get("retention_days", RETENTION_DAYS)))
+    return {"spacecraft": found, "limits_broken": broken, "removed": removed}
+
+
+def spacecraft_trends(ground: Ground, spacecraft_id: int, instance: str) -> list[Trend]:
+    """Trends of the last days of a spacecraft.
+
+    Raises
+    ------
+    NotFound
+        If nothing is known of it.
+    """
+    with ground.database.reading() as connection:
+        row = repository.find(connection, repository.VEHICLES, ccsds_id=spacecraft_id, instance=instance)
+    if row is None:
+        raise NotFound("spacecraft", f"{spacecraft_id} ({instance})")
+    return vehicle_trends(ground, row["id"])
+
+
+def vehicle_trends(ground: Ground, vehicle: int) -> list[Trend]:
+    """Trends of the last `TREND_DAYS` days of on-board time in which there is housekeeping."""
+    with ground.database.reading() as connection:
+        _, _, last = rollups.rolled_extent(
+            connection, "housekeeping", vehicle, DICTIONARY.version, 0, 0, (1 << 48) - 1
+        )
+        if last == 0:
+            return []
+        first = max(last - (TREND_DAYS * 86_400 << 16), 0)
+        span = PassSpan(vehicle, first, last, load_correlations(connection, vehicle))
+        reading = SeriesReading(connection, span, "housekeeping", 0, TREND_POINTS)
+        definition = DICTIONARY.packet("housekeeping")
+        found = []
+        for name in PARAMETERS:
+            field = definition.field(name)
+            trend = trend_of(field, reading.series(name, field.unit).buckets)
+            if trend is not None:
+                found.append(trend)
+        return found
+
+
+def trend_view(trend: Trend) -> dict[str, Any]:
+    """A trend as plain values; a slope that is not known as None."""
+    values = asdict(trend)
+    slope = values["slope_per_day"]
+    return {**values, "slope_per_day": None if slope != slope else slope}
+
+
+def tidy(ground: Ground, retention_days: int) -> dict[str, int]:
+    """Take away what is older than it is kept; how much of each kind that was."""
+    before = utc_now_ns() - retention_days * DAY_NS
+    feed, jobs = repository.FEED, repository.JOBS
+    with ground.database.writing() as connection:
+        # The newest item stays, so that numbers are never given twice.
+        newest = select(feed.c.id).order_by(feed.c.id.desc()).limit(1).scalar_subquery()
+        removed = {
+            "feed": connection.execute(
+                delete(feed).where(feed.c.utc_ns < before, feed.c.id != newest)
+            ).rowcount,
+            "jobs": connection.execute(
+                delete(jobs).where(jobs.c.finished_utc_ns < before, jobs.c.state.in_(("done", "failed")))
+            ).rowcount,
+        }
+    removed["files"] = _sweep(ground)
+    return removed
+
+
+def _sweep(ground: Ground) -> int:
+    """Temporary files that a killed process left."""
+    import shutil
+
+    count = 0
+    old = time.time() - ABANDONED_S
+    for path in (*ground.files.root.glob(".incoming-*"), *ground.home.glob(".unpacking-*")):
+        try:
+            if path.stat().st_mtime > old:
+                continue
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink()
+            count += 1
+        except OSError:
+            continue
+    return count

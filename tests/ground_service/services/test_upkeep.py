@@ -1,0 +1,66 @@
+"""The nightly job: trends with limits, and what is taken away and what never is."""
+
+import os
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ground_service.processing.downsampling import downsample
+from ground_service.processing.trends import trend_of
+from ground_service.services.feed import publish, read_feed
+from ground_service.services.ground import Ground
+from ground_service.services.ingest import ingest_file
+from ground_service.services.jobs import enter_job, run_job
+from ground_service.services.upkeep import nightly_job_id, spacecraft_trends, tidy
+from ground_service.services.users import audit
+from ground_service.store import repository
+from tmtc.dictionary import DICTIONARY
+
+DAY_NS = 86_400_000_000_000
+
+
+def test_a_trend_has_the_slope_of_its_line() -> None:
+    field = DICTIONARY.packet("housekeeping").field("temperature_c")
+    utc_ns = np.arange(200, dtype=np.int64) * (DAY_NS // 40)
+    trend = trend_of(field, downsample(utc_ns, 20.0 + 3.0 * utc_ns / DAY_NS, 50))
+    assert trend is not None
+    assert trend.slope_per_day == pytest.approx(3.0, rel=1e-9)
+    assert (trend.samples, trend.limit_state) == (200, "within")
+    # 62 degrees is above the warning limit of 60 of the dictionary, 90 above the alarm limit of 85
+    for value, state in ((62.0, "warning"), (90.0, "alarm")):
+        hot = trend_of(field, downsample(utc_ns[:2], np.array([20.0, value]), 50))
+        assert hot is not None
+        assert hot.limit_state == state
+    assert trend_of(field, downsample(utc_ns[:0], np.zeros(0), 5)) is None
+
+
+def test_the_night_tells_trends_and_broken_limits(ground: Ground, synthetic_pass: Any) -> None:
+    ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
+    trends = {trend.parameter: trend for trend in spacecraft_trends(ground, 76, "flight")}
+    # 0.1 degrees more every 15 s: 576 degrees a day
+    assert trends["temperature_c"].slope_per_day == pytest.approx(576.0, rel=1e-6)
+    job = enter_job(ground, "nightly", {}, job_id=nightly_job_id(DAY_NS + 5))
+    assert job == enter_job(ground, "nightly", {}, job_id=nightly_job_id(DAY_NS + 99))
+    assert job != nightly_job_id(2 * DAY_NS)
+    done = run_job(ground, job)
+    assert done["state"] == "done", done["error"]
+    assert done["result"]["spacecraft"][0]["spacecraft_id"] == 76
+    assert done["result"]["limits_broken"] == []
+
+
+def test_what_is_old_goes_and_the_record_stays(ground: Ground) -> None:
+    with ground.database.writing() as connection:
+        for _ in range(3):
+            publish(connection, "note", {})
+        audit(connection, "ann", "look", "", {})
+        connection.execute(repository.FEED.update().values(utc_ns=0))
+        connection.execute(repository.AUDIT.update().values(utc_ns=0))
+    for name in (".incoming-old", ".incoming-new"):
+        ground.files.root.mkdir(exist_ok=True)
+        (ground.files.root / name).write_bytes(b"")
+    os.utime(ground.files.root / ".incoming-old", (0, 0))
+    assert tidy(ground, 90) == {"feed": 2, "jobs": 0, "files": 1}
+    assert [item["id"] for item in read_feed(ground, 0)] == [3]
+    with ground.database.reading() as connection:
+        assert repository.page(connection, repository.AUDIT).total == 1
