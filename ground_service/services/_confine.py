@@ -91,7 +91,8 @@ def become(job: dict) -> None:
             (resource.RLIMIT_NOFILE, limits["open_files"]),
             (resource.RLIMIT_CORE, 0),
         ):
-            resource.setrlimit(kind, (value, value))
+            # The processor time has a second of warning, by a signal that tells it from other kills.
+            resource.setrlimit(kind, (value, value + (kind == resource.RLIMIT_CPU)))
         command = [*job["prefix"], *job["command"]]
         os.execvpe(command[0], command, job["environment"])
     except OSError as error:

@@ -36,12 +36,27 @@ OUTCOMES = {
     "garbage": "wrote a downlink that is no telemetry",
     "refused": "was not run",
 }
+# A shell that waits: the first process of a namespace is spared most signals, which the program shall not be.
+_WAITING_SHELL = ("sh", "-c", '"$@"; exit $?', "sh")
 # Ways to shut a program off from the network, the strongest first; a process namespace also holds back all it starts.
 _NAMESPACES = (
-    ("network and process namespace", ("unshare", "--net", "--pid", "--fork", "--kill-child", "--")),
+    (
+        "network and process namespace",
+        ("unshare", "--net", "--pid", "--fork", "--kill-child", "--", *_WAITING_SHELL),
+    ),
     (
         "network, process and user namespace",
-        ("unshare", "--user", "--map-root-user", "--net", "--pid", "--fork", "--kill-child", "--"),
+        (
+            "unshare",
+            "--user",
+            "--map-root-user",
+            "--net",
+            "--pid",
+            "--fork",
+            "--kill-child",
+            "--",
+            *_WAITING_SHELL,
+        ),
     ),
     ("network namespace", ("unshare", "--user", "--map-root-user", "--net", "--")),
 )

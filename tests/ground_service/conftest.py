@@ -270,3 +270,91 @@ def ground(tmp_path: Path) -> Iterator[Ground]:
     opened = open_ground(tmp_path / "home")
     yield opened
     opened.close()
+
+
+@dataclass(frozen=True)
+class FlyablePass:
+    """A pass archive that can be flown again, and the packets that it came down with."""
+
+    folder: Path
+    packets: list[bytes]
+
+
+@pytest.fixture(scope="session")
+def make_flyable(make_pass: Callable[..., SyntheticPass]) -> Callable[..., FlyablePass]:
+    """A function that writes a synthetic pass archive with what its payload was given: plain gray images."""
+    import io
+
+    from PIL import Image
+
+    from tmtc.definitions import format_dictionary
+
+    def make(frames: int = 12, seed: int = 1) -> FlyablePass:
+        made = make_pass(frames=frames, seed=seed)
+        folder = made.folder
+        manifest = json.loads((folder / "manifest.json").read_text())
+        manifest["pass_name"] = f"synthetic pass {seed}"
+        (folder / "payload").mkdir()
+        (folder / "frames").mkdir()
+        buffer = io.BytesIO()
+        Image.fromarray(np.full((512, 512), 90, np.uint8)).save(buffer, "PNG")
+        rows = []
+        for k in range(frames):
+            (folder / f"frames/{k:06d}.png").write_bytes(buffer.getvalue())
+            rows.append(
+                {
+                    "frame": k,
+                    "ticks": int(ticks_from_utc_ns(int(made.utc_ns[k]))),
+                    "image": f"frames/{k:06d}.png",
+                    "shape": [512, 512],
+                }
+            )
+        (folder / "payload/inputs.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+        (folder / "payload/parameters.toml").write_text("")
+        (folder / "payload/dictionary.json").write_text(format_dictionary(DICTIONARY))
+        del manifest["files"]
+        write_manifest(folder, manifest)
+        return FlyablePass(folder, made.packets)
+
+    return make
+
+
+PROGRAM = """
+import json, pathlib, sys, time
+archive, out, build = (pathlib.Path(word) for word in sys.argv[1:4])
+name = json.loads((archive / "manifest.json").read_text())["pass_name"].replace(" ", "-")
+(out / "downlink.packets").write_bytes((build / f"{name}.packets").read_bytes())
+frames = sum(1 for _ in (archive / "payload/inputs.jsonl").open())
+costs = json.loads((build / "costs.json").read_text())
+(out / "performance.json").write_text(json.dumps(
+    {"stages": {stage: [ms] * frames for stage, ms in costs.items()}, "yardstick": [2.0]}))
+"""
+
+
+@pytest.fixture
+def make_build(tmp_path: Path) -> Callable[..., Path]:
+    """A function that writes a build: a program that sends packets prepared for each pass, or any other script."""
+
+    def make(
+        name: str,
+        packets: dict[str, list[bytes]] | None = None,
+        *,
+        program: str = PROGRAM,
+        network_ms: float = 10.0,
+        extra: str = "",
+    ) -> Path:
+        folder = tmp_path / f"build-{name}"
+        folder.mkdir()
+        files = {"fly.py": program, "costs.json": json.dumps({"network": network_ms})}
+        for file, text in files.items():
+            (folder / file).write_text(text)
+        for pass_name, octets in (packets or {}).items():
+            (folder / f"{pass_name.replace(' ', '-')}.packets").write_bytes(b"".join(octets))
+        names = sorted(path.name for path in folder.iterdir())
+        (folder / "build.toml").write_text(
+            f'schema_version = 1\nname = "{name}"\nfiles = {json.dumps(names)}\n'
+            'command = ["{python}", "-I", "-S", "{build}/fly.py", "{archive}", "{out}", "{build}"]\n' + extra
+        )
+        return folder / "build.toml"
+
+    return make

@@ -1,0 +1,198 @@
+"""Builds as programs inside limits: what becomes of those that behave and of those that do not."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from ground_service.errors import InvalidInput
+from ground_service.services.build_runs import BuildRun, network_prefix, run_build
+from ground_service.services.builds import load_build
+
+LIMITS = "\n[limits]\nwall_s = 20\ncpu_s = 10\nmemory_mib = 300\nfile_mib = 4\nfolder_mib = 12\n"
+
+
+@pytest.fixture(scope="module")
+def archive(make_flyable: Callable) -> Path:
+    return make_flyable(frames=2, seed=31).folder
+
+
+@pytest.fixture
+def fly(make_build: Callable, archive: Path, tmp_path: Path) -> Callable[..., BuildRun]:
+    def run(program: str, limits: str = LIMITS) -> BuildRun:
+        build = load_build(
+            make_build("bad", program="import os, pathlib, sys, time\n" + program, extra=limits)
+        )
+        return run_build(build, archive, tmp_path / "out")
+
+    return run
+
+
+def test_a_program_that_ends_well_leaves_a_downlink_and_its_costs(fly, tmp_path: Path) -> None:
+    run = fly("pathlib.Path(sys.argv[2], 'downlink.packets').write_bytes(b'abc')\nx = [0] * 4_000_000")
+    assert (run.outcome, run.detail) == ("ok", "")
+    assert run.downlink == tmp_path / "out" / "downlink.packets"
+    assert run.downlink.read_bytes() == b"abc"
+    assert 0.0 < run.cpu_s < 10.0
+    # Four million pointers of eight octets, on top of an interpreter of some ten.
+    assert 30.0 < run.peak_rss_mib < 120.0
+    assert not (tmp_path / "out" / ".run").exists()
+
+
+def test_a_program_that_crashes_is_told_by_its_last_line(fly) -> None:
+    run = fly("raise RuntimeError('no such crater')")
+    assert (run.outcome, run.detail) == ("crashed", "exit status 1: RuntimeError: no such crater")
+
+
+def test_a_program_that_kills_itself_is_told_by_its_signal(fly) -> None:
+    run = fly("os.kill(os.getpid(), 11)")
+    assert run.outcome == "crashed"
+    assert "11" in run.detail
+
+
+def test_a_program_that_hangs_is_stopped_at_its_time_limit(fly) -> None:
+    run = fly("time.sleep(600)", LIMITS.replace("wall_s = 20", "wall_s = 1"))
+    assert run.outcome == "timeout"
+    assert run.downlink is None
+
+
+def test_a_program_that_uses_too_much_processor_time_is_stopped(fly) -> None:
+    assert fly("while True: pass", LIMITS.replace("cpu_s = 10", "cpu_s = 1")).outcome == "cpu"
+
+
+def test_a_program_that_wants_too_much_memory_runs_out_of_it(fly) -> None:
+    run = fly("x = bytearray(1 << 30)")
+    assert run.outcome == "memory"
+
+
+def test_a_program_that_writes_a_huge_file_is_stopped(fly) -> None:
+    run = fly("pathlib.Path(sys.argv[2], 'downlink.packets').write_bytes(bytes(8 << 20))")
+    assert run.outcome == "disk"
+    assert run.downlink is None
+
+
+def test_a_program_that_fills_the_disk_with_small_files_is_stopped(fly) -> None:
+    run = fly(
+        "for i in range(8): pathlib.Path(sys.argv[2], f'{i}.bin').write_bytes(bytes(2 << 20))\ntime.sleep(2)"
+    )
+    assert run.outcome == "disk"
+
+
+def test_a_program_that_writes_no_downlink_is_told_so(fly) -> None:
+    assert fly("").outcome == "nothing"
+
+
+def test_a_program_that_is_not_there_is_a_crash_and_no_error_of_the_ground(
+    archive: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "build.toml"
+    file.write_text('name = "gone"\ncommand = ["/nonexistent/program", "{archive}", "{out}"]\n')
+    run = run_build(load_build(file), archive, tmp_path / "out")
+    assert run.outcome == "crashed"
+
+
+def test_what_a_program_leaves_running_is_killed_with_it(fly, tmp_path: Path) -> None:
+    """It forks twice into a session of its own, as a daemon does."""
+    marker = tmp_path / "alive"
+    fly(
+        "if os.fork() == 0:\n"
+        "    os.setsid()\n"
+        "    if os.fork() == 0:\n"
+        f"        os.execv('/bin/sh', ['sh', '-c', 'while true; do echo x >> {marker}; sleep 0.05; done'])\n"
+        "    os._exit(0)\n"
+        "time.sleep(0.3)\n"
+        "pathlib.Path(sys.argv[2], 'downlink.packets').write_bytes(b'abc')\n"
+    )
+    before = marker.stat().st_size if marker.exists() else 0
+    time.sleep(0.3)
+    assert (marker.stat().st_size if marker.exists() else 0) == before
+
+
+def test_a_program_reaches_no_network_where_namespaces_are_permitted(fly) -> None:
+    name, prefix = network_prefix()
+    run = fly(
+        "import socket\n"
+        "s = socket.socket(); s.settimeout(3)\n"
+        "try:\n    s.connect(('192.0.2.1', 9)); told = 'reached'\n"
+        "except OSError as error: told = str(error.errno)\n"
+        "pathlib.Path(sys.argv[2], 'downlink.packets').write_text(told)\n"
+    )
+    assert run.isolation == name
+    if prefix:
+        # ENETUNREACH: there is no interface at all.
+        assert run.downlink is not None and run.downlink.read_text() == "101"
+
+
+def test_a_program_sees_what_the_payload_was_given_and_nothing_of_the_truth(fly) -> None:
+    run = fly(
+        "seen = sorted(str(p.relative_to(sys.argv[1])) for p in pathlib.Path(sys.argv[1]).rglob('*') if p.is_file())\n"
+        "told = [*seen, *sorted(os.environ)]\n"
+        "pathlib.Path(sys.argv[2], 'downlink.packets').write_text('\\n'.join(told))\n"
+    )
+    assert run.downlink is not None
+    told = run.downlink.read_text().split("\n")
+    assert {"manifest.json", "payload/inputs.jsonl", "frames/000000.png"} <= set(told)
+    assert not {"reference.oem", "truth.oem", "catalogue.csv", "downlink.cadu", "LINNA_DATA"} & set(told)
+
+
+def test_a_program_that_damages_its_archive_damages_a_copy(fly, archive: Path) -> None:
+    before = (archive / "frames/000000.png").read_bytes()
+    fly("pathlib.Path(sys.argv[1], 'frames/000000.png').write_bytes(b'')")
+    assert (archive / "frames/000000.png").read_bytes() == before
+
+
+def test_a_run_goes_into_a_new_folder_only(fly, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "precious").write_text("x")
+    with pytest.raises(InvalidInput, match="expected a new or empty folder"):
+        fly("")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ('command = ["x", "{archive}", "{out}"]', "name: expected a text"),
+        ('name = "x"\ncommand = ["x"]', "expected the places {archive} and {out}"),
+        ('name = "x"\ncomand = []', "comand: expected one of"),
+        (
+            'name = "x"\nmodel = "../../etc/passwd"',
+            "expected a file beside the build file, found one elsewhere",
+        ),
+        (
+            'name = "x"\nmodel = "gone.onnx"',
+            "gone.onnx: expected a file beside the build file, found nothing",
+        ),
+        ('name = "x"\n[limits]\nwall_s = -1', "limits.wall_s: expected a whole number above 0"),
+        ('name = "x"\nschema_version = 9', "schema_version: expected 1, found 9"),
+        ("name = ", "expected a build file (TOML)"),
+    ],
+)
+def test_a_bad_build_file_is_told_by_its_key(text: str, told: str, tmp_path: Path) -> None:
+    file = tmp_path / "build.toml"
+    file.write_text(text)
+    with pytest.raises(InvalidInput) as error:
+        load_build(file)
+    assert told in str(error.value)
+
+
+def test_the_identity_of_a_build_is_that_of_what_it_runs(make_build: Callable, tmp_path: Path) -> None:
+    first = load_build(make_build("one", program="pass"))
+    file = first.folder / "build.toml"
+    file.write_text(file.read_text().replace('name = "one"', 'name = "two"'))
+    assert load_build(file).digest == first.digest
+    (first.folder / "fly.py").write_text("pass  # changed")
+    assert load_build(file).digest != first.digest
+    assert len(load_build("current").digest) == 64
+
+
+def test_nothing_of_the_environment_gets_to_a_program(fly, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LINNA_DATABASE_URL", "postgresql://secret")
+    monkeypatch.setenv("HTTPS_PROXY", "http://proxy")
+    assert "LINNA_DATABASE_URL" in os.environ
+    run = fly("pathlib.Path(sys.argv[2], 'downlink.packets').write_text(' '.join(os.environ))")
+    assert run.downlink is not None
+    assert not {"LINNA_DATABASE_URL", "HTTPS_PROXY"} & set(run.downlink.read_text().split())

@@ -1,0 +1,412 @@
+"""Builds judged over archived passes: good ones, planted bad ones, and everything that can be wrong with either."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import xml.etree.ElementTree as ET
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ground_service.errors import InvalidInput
+from ground_service.processing.regression_gates import GatePolicy
+from ground_service.services.builds import Build, build_of
+from ground_service.services.ground import Ground, open_ground
+from ground_service.services.regression_archives import (
+    check_archive,
+    check_out,
+    keep_archive,
+    kept_archives,
+    let_go,
+    pack_archive,
+    pin_archive,
+)
+from ground_service.services.regression_documents import (
+    regression_html,
+    regression_json,
+    regression_junit,
+    regression_text,
+)
+from ground_service.services.regression_policy import load_policy
+from ground_service.services.regression_search import differences
+from ground_service.services.regressions import (
+    RegressionOutcome,
+    find_replay,
+    keep_regression,
+    run_regression,
+)
+from tmtc.crc import append_crc
+from tmtc.dictionary import DICTIONARY
+
+Packets = dict[str, list[bytes]]
+
+
+def altered(packets: Packets, change: Callable[[str, bytes], bytes]) -> Packets:
+    """Packets changed one by one; `change` gets the name of each."""
+    return {
+        name: [change(DICTIONARY.unpack(packet)[0], packet) for packet in some]
+        for name, some in packets.items()
+    }
+
+
+def with_detections(packets: Packets, change: Callable[[dict[str, Any]], dict[str, Any]]) -> Packets:
+    """Packets with the detections of each frame changed."""
+
+    def changed(name: str, packet: bytes) -> bytes:
+        if name != "detections":
+            return packet
+        decoded = DICTIONARY.unpack_packet(packet)
+        values = dict(decoded.values)
+        values["items"] = change(dict(values["items"]))
+        del values["count"]
+        return DICTIONARY.pack(
+            "detections",
+            values,
+            ticks=decoded.ticks,
+            sequence_count=int.from_bytes(packet[2:4], "big") & 0x3FFF,
+        )
+
+    return altered(packets, changed)
+
+
+def longer(name: str, packet: bytes) -> bytes:
+    """A packet with one more octet of data and a right checksum: another layout."""
+    if name != "navigation_state":
+        return packet
+    body = packet[:-2] + b"\0"
+    return append_crc(body[:4] + (len(body) + 2 - 7).to_bytes(2, "big") + body[6:])
+
+
+@pytest.fixture(scope="module")
+def passes(make_flyable: Callable) -> list[Any]:
+    return [make_flyable(frames=30, seed=seed) for seed in (41, 42)]
+
+
+@pytest.fixture(scope="module")
+def packets(passes: list[Any]) -> Packets:
+    return {f"synthetic pass {seed}": one.packets for seed, one in zip((41, 42), passes, strict=True)}
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """A service shared by the tests of this file: replays of the good build are done once."""
+    with open_ground(tmp_path_factory.mktemp("regressions")) as ground:
+        yield ground
+
+
+@pytest.fixture
+def policy() -> Any:
+    return load_policy()
+
+
+@pytest.fixture
+def judge(home: Ground, passes: list[Any], packets: Packets, make_build: Callable, policy: Any):
+    """Hold a build that sends these packets against the build that flew."""
+
+    def run(
+        given: Packets | None = None, archives: list[Path] | None = None, **options: Any
+    ) -> RegressionOutcome:
+        baseline = build_of(home, str(make_build("good", packets)))
+        candidate = build_of(home, str(make_build("candidate", given or packets, **options)))
+        return run_regression(
+            home, archives or [one.folder for one in passes], candidate, baseline, policy, workers=2
+        )
+
+    return run
+
+
+def failed(outcome: RegressionOutcome) -> set[str]:
+    return {gate.name for gate in outcome.gates if not gate.counts_as_passed}
+
+
+def test_a_build_that_says_the_same_passes(judge) -> None:
+    outcome = judge()
+    assert (outcome.verdict, outcome.exit_status) == ("pass", 0)
+    assert failed(outcome) == set()
+    recall = next(gate for gate in outcome.gates if gate.name == "detector.recall")
+    # One scored crater in four is left out by the synthetic pass, and some at the edges.
+    assert 0.6 < recall.baseline == recall.candidate < 0.76
+    bias = next(gate for gate in outcome.gates if gate.name == "detector.bias")
+    assert bias.baseline == pytest.approx(np.hypot(0.5, 1.25), abs=0.02)
+    errors = next(gate for gate in outcome.gates if gate.name == "navigation.spherical.p50")
+    assert errors.baseline == pytest.approx(130.0, abs=0.5)
+
+
+def test_a_bias_of_three_tenths_of_a_pixel_fails_as_a_bias(judge, packets: Packets) -> None:
+    outcome = judge(with_detections(packets, lambda items: items | {"u_px": items["u_px"] + 0.3}))
+    assert outcome.exit_status == 1
+    assert "detector.bias" in failed(outcome)
+    assert not any(name.startswith("navigation") for name in failed(outcome))
+
+
+def test_lost_detections_fail_as_recall(judge, packets: Packets) -> None:
+    def thinned(items: dict[str, Any]) -> dict[str, Any]:
+        kept = np.arange(len(items["u_px"])) % 8 != 0
+        return {name: values[kept] for name, values in items.items()}
+
+    assert "detector.recall" in failed(judge(with_detections(packets, thinned)))
+
+
+def test_a_slower_detector_fails_as_its_stage(judge) -> None:
+    assert failed(judge(network_ms=12.0)) == {"latency.network"}
+
+
+def test_another_packet_layout_fails_as_telemetry(judge, packets: Packets) -> None:
+    outcome = judge(altered(packets, longer))
+    assert "telemetry.undecodable" in failed(outcome)
+    gate = next(gate for gate in outcome.gates if gate.name == "telemetry.undecodable")
+    assert gate.candidate == sum(
+        DICTIONARY.unpack(packet)[0] == "navigation_state" for some in packets.values() for packet in some
+    )
+
+
+def test_a_wrong_position_fails_as_navigation(judge, packets: Packets) -> None:
+    def displaced(name: str, packet: bytes) -> bytes:
+        if name != "navigation_state":
+            return packet
+        decoded = DICTIONARY.unpack_packet(packet)
+        values = {**decoded.values, "altitude_m": decoded.values["altitude_m"] + 400.0}
+        count = int.from_bytes(packet[2:4], "big") & 0x3FFF
+        return DICTIONARY.pack(name, values, ticks=decoded.ticks, sequence_count=count)
+
+    names = failed(judge(altered(packets, displaced)))
+    assert "navigation.spherical.p50" in names
+    assert not any(name.startswith("detector") for name in names)
+
+
+@pytest.mark.parametrize(
+    ("program", "told"),
+    [
+        ("raise SystemExit('no network found')", "candidate crashed: exit status 1: no network found"),
+        ("import time; time.sleep(60)", "candidate hung: stopped at its time limit"),
+        ("import sys, pathlib\npathlib.Path(sys.argv[2], 'downlink.packets').write_bytes(b'garbage' * 900)",
+         "candidate wrote a downlink that is no telemetry"),
+        ("import sys, pathlib\npathlib.Path(sys.argv[2], 'x').write_bytes(bytes(9 << 20))",
+         "candidate wrote more than it is allowed"),
+        ("x = bytearray(1 << 30)", "candidate ran out of the memory it is allowed"),
+        ("pass", "candidate ended without a downlink"),
+    ],
+)  # fmt: skip
+def test_a_build_that_fails_on_a_pass_is_told_so_and_fails(judge, passes, program: str, told: str) -> None:
+    limits = "[limits]\nwall_s = 2\nmemory_mib = 300\nfile_mib = 4\n"
+    outcome = judge(archives=[passes[0].folder], program=program, extra=limits)
+    assert (outcome.verdict, outcome.exit_status) == ("fail", 1)
+    assert outcome.passes[0].state == "candidate failed"
+    assert outcome.passes[0].detail.startswith(told)
+
+
+def test_a_build_that_fails_on_one_pass_is_judged_on_the_others(judge, packets: Packets) -> None:
+    one = {"synthetic pass 41": packets["synthetic pass 41"]}
+    outcome = judge(one)
+    assert [item.state for item in outcome.passes] == ["judged", "candidate failed"]
+    assert "crashed" in outcome.passes[1].detail
+    assert outcome.gates and failed(outcome) == set()
+    assert outcome.verdict == "fail"
+
+
+@pytest.fixture
+def copy(passes: list[Any], tmp_path: Path) -> Path:
+    folder = tmp_path / "copy"
+    shutil.copytree(passes[0].folder, folder)
+    return folder
+
+
+def test_a_tampered_archive_is_told_and_the_rest_goes_on(judge, passes, copy: Path) -> None:
+    (copy / "reference.oem").write_text((copy / "reference.oem").read_text().replace("1", "2", 1))
+    outcome = judge(archives=[copy, passes[1].folder])
+    assert [item.state for item in outcome.passes] == ["unusable", "judged"]
+    assert "SHA-256" in outcome.passes[0].detail and "reference.oem" in outcome.passes[0].detail
+    assert (outcome.verdict, outcome.exit_status) == ("incomplete", 2)
+
+
+def rewritten(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    """Change an archive's manifest, all hashes made right again."""
+    import hashlib
+
+    manifest = json.loads((folder / "manifest.json").read_text())
+    change(manifest)
+    for name in list(manifest["files"]):
+        path = folder / name
+        if path.exists():
+            octets = path.read_bytes()
+            manifest["files"][name] = {"sha256": hashlib.sha256(octets).hexdigest(), "bytes": len(octets)}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+
+
+def test_missing_frames_are_told_with_the_first_of_them(judge, passes, copy: Path) -> None:
+    for number in (7, 9):
+        (copy / f"frames/{number:06d}.png").unlink()
+    rewritten(copy, lambda m: [m["files"].pop(f"frames/{n:06d}.png") for n in (7, 9)])
+    outcome = judge(archives=[copy, passes[1].folder])
+    assert outcome.passes[0].state == "unusable"
+    assert "2 missing, the first 7" in outcome.passes[0].detail
+
+
+def test_an_archive_of_another_camera_is_told(judge, passes, copy: Path) -> None:
+    rewritten(copy, lambda m: m["camera"].update(width_px=1024))
+    outcome = judge(archives=[copy, passes[1].folder])
+    assert "expected an image of the camera of 1024 x 512 px, found 512 x 512 px" in outcome.passes[0].detail
+
+
+def test_a_build_made_for_another_camera_is_not_run(judge, passes) -> None:
+    outcome = judge(archives=[passes[0].folder], extra="[camera]\nfov_deg = 60\n")
+    assert outcome.passes[0].state == "candidate failed"
+    assert "made for another camera: expected fov_deg 60, found 120" in outcome.passes[0].detail
+
+
+def test_something_that_is_no_archive_is_told(judge, passes, tmp_path: Path) -> None:
+    (tmp_path / "note.txt").write_text("hello")
+    outcome = judge(archives=[tmp_path / "note.txt", tmp_path / "gone", passes[0].folder])
+    assert [item.state for item in outcome.passes] == ["unusable", "unusable", "judged"]
+
+
+def test_a_replay_is_done_once_and_one_that_failed_again(
+    home, judge, passes, make_build, packets, policy
+) -> None:
+    outcome = judge()
+    digest = keep_archive(home, passes[0].folder).digest
+    before = find_replay(home, digest, outcome.candidate)
+    flown: list[int] = []
+    run_regression(
+        home,
+        [passes[0].folder],
+        outcome.candidate,
+        outcome.baseline,
+        policy,
+        progress=lambda items, total: (flown.append(total), iter(items))[1],
+    )
+    assert flown == []
+    assert find_replay(home, digest, outcome.candidate) == before
+    broken = build_of(home, str(make_build("broken", program="raise SystemExit(3)")))
+    for _ in range(2):
+        run_regression(
+            home,
+            [passes[0].folder],
+            broken,
+            outcome.baseline,
+            policy,
+            progress=lambda items, total: (flown.append(total), iter(items))[1],
+        )
+    assert flown == [1, 1]
+
+
+def test_the_verdict_is_written_as_json_junit_and_text(judge, packets: Packets, copy: Path, passes) -> None:
+    (copy / "catalogue.csv").write_text("")
+    worse = with_detections(packets, lambda items: items | {"v_px": items["v_px"] - 1.0})
+    outcome = judge(worse, archives=[copy, *(one.folder for one in passes)])
+    figures = json.loads(json.dumps(regression_json(outcome), allow_nan=False))
+    assert figures["verdict"] == "fail"
+    assert {"name", "baseline", "candidate", "limit", "passed"} <= set(figures["gates"][0])
+    assert [one["state"] for one in figures["passes"]] == ["unusable", "judged", "judged"]
+    assert figures["passes"][1]["candidate"]["outcome_shares"]["paper"] == {"multi": 1.0}
+    suite = ET.fromstring(regression_junit(outcome))
+    assert int(suite.attrib["tests"]) == len(suite) == len(outcome.gates) + 3
+    assert int(suite.attrib["errors"]) == 1
+    assert int(suite.attrib["failures"]) == sum(not gate.passed for gate in outcome.gates) > 0
+    told = regression_text(outcome)
+    assert "detector.bias" in told and "unusable" in told
+
+
+def test_the_report_shows_the_frames_that_changed_side_by_side(home, judge, packets: Packets) -> None:
+    def thinned(items: dict[str, Any]) -> dict[str, Any]:
+        return {name: values[::2] for name, values in items.items()}
+
+    outcome = judge(with_detections(packets, thinned))
+    page = regression_html(home, outcome, "0" * 32)
+    assert page == regression_html(home, outcome, "0" * 32)
+    assert "Frames that changed most" in page
+    assert "Left the baseline, right the candidate" in page
+    assert "detector.recall" in page
+    assert len(keep_regression(home, outcome)) == 32
+
+
+def test_passes_are_ordered_by_how_much_the_builds_differ(judge, packets: Packets) -> None:
+    changed = dict(packets)
+    changed["synthetic pass 42"] = with_detections(
+        {"x": packets["synthetic pass 42"]},
+        lambda items: {name: values[::2] for name, values in items.items()},
+    )["x"]
+    found = differences(judge(changed))
+    assert [item.name for item in found] == ["synthetic pass 42", "synthetic pass 41"]
+    assert found[0].frames_changed == 30
+    assert found[1].frames_changed == 0
+
+
+def test_a_zip_of_an_archive_is_the_archive(passes, tmp_path: Path, ground: Ground) -> None:
+    for name in ("a.zip", "b.zip"):
+        pack_archive(passes[0].folder, tmp_path / name)
+    assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
+    kept = keep_archive(ground, tmp_path / "a.zip")
+    assert kept.digest == check_archive(passes[0].folder).digest
+    out = check_out(ground, kept.digest, tmp_path / "out")
+    assert (out.folder / "downlink.cadu").read_bytes() == (passes[0].folder / "downlink.cadu").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["../evil.txt", "/etc/evil", "a/../../evil", "c:\\evil"])
+def test_a_zip_that_leads_out_of_its_folder_is_refused(name: str, tmp_path: Path, ground: Ground) -> None:
+    with zipfile.ZipFile(tmp_path / "evil.zip", "w") as packed:
+        packed.writestr("manifest.json", "{}")
+        packed.writestr(name, "x")
+    with pytest.raises(InvalidInput):
+        keep_archive(ground, tmp_path / "evil.zip")
+    assert not list(tmp_path.rglob("evil.txt")) and not list(tmp_path.rglob("evil"))
+
+
+def test_a_zip_that_would_fill_the_disk_is_refused(tmp_path: Path, ground: Ground) -> None:
+    with zipfile.ZipFile(tmp_path / "bomb.zip", "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr("manifest.json", bytes(64 << 20))
+    with pytest.raises(InvalidInput):
+        keep_archive(ground, tmp_path / "bomb.zip")
+
+
+def test_archives_that_are_pinned_stay_and_shared_files_stay_with_them(
+    passes, ground: Ground, tmp_path: Path
+) -> None:
+    first, second = (keep_archive(ground, one.folder) for one in passes)
+    pin_archive(ground, second.digest, True)
+    assert let_go(ground, unused_for_ns=10**18) == []
+    assert let_go(ground, unused_for_ns=0) == [first.digest]
+    assert [row["digest"] for row in kept_archives(ground)] == [second.digest]
+    # Both hold the same gray image: it is still there for the one that stays.
+    assert check_out(ground, second.digest, tmp_path / "out").frames == 30
+
+
+def test_a_registered_build_is_found_by_the_beginning_of_its_identity(
+    ground: Ground, make_build, packets
+) -> None:
+    build: Build = build_of(ground, str(make_build("kept", packets)))
+    assert build_of(ground, build.digest[:12]).digest == build.digest
+    (build.folder / "fly.py").write_text("changed behind its back")
+    with pytest.raises(InvalidInput, match="it was registered with"):
+        build_of(ground, build.digest)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "schema_version: expected 1"),
+        ("schema_version = 1\nversion = 'x'\nalpha = 0.9", "alpha: expected a number from 1e-06 to 0.2"),
+        ("schema_version = 1\nversoin = 'x'", "versoin: expected one of"),
+    ],
+)
+def test_a_bad_policy_is_told_by_its_key(text: str, told: str, tmp_path: Path) -> None:
+    (tmp_path / "policy.toml").write_text(text)
+    with pytest.raises(InvalidInput) as error:
+        load_policy(tmp_path / "policy.toml")
+    assert told in str(error.value)
+
+
+def test_a_waiver_needs_a_reason_and_a_day(tmp_path: Path) -> None:
+    shipped = load_policy()
+    assert isinstance(shipped.policy, GatePolicy) and shipped.policy.waivers == ()
+    from ground_service.services.regression_policy import SHIPPED
+
+    for waiver in ('reason = ""\nuntil = 2029-01-01', 'reason = "why"\nuntil = "soon"'):
+        (tmp_path / "policy.toml").write_text(f'{SHIPPED.read_text()}\n[[waiver]]\ngate = "x"\n{waiver}\n')
+        with pytest.raises(InvalidInput, match=r"waiver\[0\]"):
+            load_policy(tmp_path / "policy.toml")
