@@ -25,6 +25,9 @@ from tmtc.downlink import DownlinkEncoder, LinkSettings
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
+_LIGHT_S = 1.28
+_LIGHT_NS = 1_500_000_000
+_CONTACT_STEP_NS = 60_000_000_000
 # WGS 84 latitude, east longitude (degrees) and height (m), from the agencies' public station pages, to 0.01 deg.
 STATIONS = {
     "goldstone": (35.43, -116.89, 1000.0),
@@ -184,18 +187,19 @@ def contacts(
 ) -> tuple[BoolArray, NDArray[np.float64]]:
     """Whether any station hears the spacecraft at emission epochs (n,), and the light time in s.
 
-    Without stations it is always heard.
+    Without stations it is always heard. Contacts begin and end on a grid of a minute.
     """
-    heard = np.zeros(utc_ns.size, dtype=np.bool_)
-    light_s = np.full(utc_ns.size, 1.28)
-    if not section.stations:
-        return ~heard, light_s
+    if not section.stations or utc_ns.size == 0:
+        return np.ones(utc_ns.size, dtype=np.bool_), np.full(utc_ns.size, _LIGHT_S)
+    grid = np.arange(utc_ns.min(), utc_ns.max() + 1, _CONTACT_STEP_NS, dtype=np.int64)
+    heard, light_s = np.zeros(grid.size, dtype=np.bool_), np.full(grid.size, _LIGHT_S)
     for name in section.stations:
-        # Reception comes later than emission by the light time: seen from here a second and a half of margin.
-        geometry = link(ephemeris, utc_ns + 1_500_000_000, station(name, section.minimum_elevation_deg))
+        # Reception comes later than emission by the light time, within a third of a second of this.
+        geometry = link(ephemeris, grid + _LIGHT_NS, station(name, section.minimum_elevation_deg))
         heard |= geometry.visible
         light_s = np.where(geometry.visible, geometry.light_time_s, light_s)
-    return heard, light_s
+    at = (utc_ns - grid[0]) // _CONTACT_STEP_NS
+    return heard[at], light_s[at]
 
 
 def _bursts(

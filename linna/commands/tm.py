@@ -80,9 +80,10 @@ def run_check(arguments: argparse.Namespace) -> int:
 
 
 def run_icd(arguments: argparse.Namespace) -> int:
+    from payload_emulator.flight.interfaces import format_interfaces
     from tmtc.icd import format_icd
 
-    return _document(arguments, format_icd())
+    return _document(arguments, f"{format_icd()}\n{format_interfaces()}")
 
 
 def run_xtce(arguments: argparse.Namespace) -> int:

@@ -24,9 +24,7 @@ def packets(count: int, start: int, rng: np.random.Generator) -> list[bytes]:
     for k in range(start, start + count):
         items = {"octet": rng.integers(0, 256, int(rng.integers(0, 900))).tolist()}
         values = {"transaction": 1, "part": 1, "table": 6, "items": items}
-        made.append(
-            DICTIONARY.pack("large_data_middle", values, ticks=65_536 * k, sequence_count=k % 16_384)
-        )
+        made.append(DICTIONARY.pack("large_data_middle", values, ticks=65_536 * k, sequence_count=k % 16_384))
     return made
 
 

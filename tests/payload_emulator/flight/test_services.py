@@ -224,7 +224,9 @@ def test_a_structure_defined_by_telecommand_is_sent_reported_and_deleted(rig: An
     assert not any(rig.named(rig.step(), "housekeeping_report") for _ in range(4))
     for name in ("delete_housekeeping", "report_housekeeping_definition"):
         assert rig.refusals(rig.step(rig.command(name, structure_id=17))) == ["unknown_structure"]
-    assert rig.refusals(rig.step(rig.command("request_housekeeping", structure_id=20))) == ["unknown_structure"]
+    assert rig.refusals(rig.step(rig.command("request_housekeeping", structure_id=20))) == [
+        "unknown_structure"
+    ]
 
 
 def test_only_so_many_structures_can_be_defined(rig: Any) -> None:
@@ -329,7 +331,10 @@ def test_a_table_is_uplinked_in_parts_in_any_order_and_used_after_resets(moon: A
 
 def test_a_damaged_or_unknown_table_is_refused_and_the_old_one_stays(moon: Any, rig: Any) -> None:
     octets = pack_anchor_table([moon.ticks_at(s) for s in (0.0, 30.0, 60.0)], moon.orbit([0.0, 30.0, 60.0]))
-    for table, content, reason in ((1, octets[:-1] + b"\0", "table_corrupt"), (6, b"x", "value_out_of_range")):
+    for table, content, reason in (
+        (1, octets[:-1] + b"\0", "table_corrupt"),
+        (6, b"x", "value_out_of_range"),
+    ):
         (name, values), *_ = split(content, transaction=table, table=table, part_length=4096, link="uplink")
         packets = rig.step(rig.command(name, **values))
         assert rig.refusals(packets) == [reason]

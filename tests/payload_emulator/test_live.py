@@ -1,0 +1,244 @@
+"""The payload as a process: commanded and watched over TCP; and the campaign that breaks it."""
+
+from __future__ import annotations
+
+import base64
+import json
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lunar.datafolder import DataFolder, find_data
+from payload_emulator.campaign import Case, fly_case, load_campaign, table
+from payload_emulator.emulator import load_scenario_payload, new_spacecraft
+from payload_emulator.errors import LinkError, ScenarioError
+from payload_emulator.live import LivePayload, TelecommandBuffer
+from payload_emulator.loading import LoadedPayload
+from payload_emulator.scenario import parse_scenario
+from payload_emulator.world import World, build_world
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import decode
+from tmtc.uplink import UplinkEncoder
+
+SCENARIO = """
+name = "live"
+seed = 3
+[dynamics]
+gravity = "builtin"
+degree = 8
+orientation = "iau"
+[window]
+search = "none"
+start = "2029-08-07T01:40:00Z"
+duration_s = 240.0
+[camera]
+images = "reduced"
+[terrain]
+source = "procedural"
+[navigation]
+estimators = ["spherical"]
+filter_gravity = "builtin"
+filter_degree = 8
+"""
+NO_DATA = find_data(None)
+
+
+@pytest.fixture(scope="module")
+def flown() -> tuple[World, LoadedPayload]:
+    data: DataFolder = NO_DATA
+    world = build_world(parse_scenario(SCENARIO), data)
+    return world, load_scenario_payload(world, data)[0]
+
+
+class Watcher:
+    """A client of the live payload."""
+
+    def __init__(self, live: LivePayload) -> None:
+        self.telemetry = socket.create_connection(("127.0.0.1", live.ports["telemetry"]), timeout=20.0)
+        self.orders = socket.create_connection(("127.0.0.1", live.ports["telecommand"]), timeout=20.0)
+        self.console = socket.create_connection(("127.0.0.1", live.ports["console"]), timeout=20.0)
+        self.lines = self.console.makefile("r")
+        self.octets = b""
+
+    def say(self, word: str) -> None:
+        self.console.sendall(word.encode() + b"\n")
+
+    def until(self, wanted: Any) -> list[dict[str, Any]]:
+        """Messages up to the first that is wanted."""
+        found = []
+        for line in self.lines:
+            found.append(json.loads(line))
+            if wanted(found[-1]):
+                return found
+        raise AssertionError("the console ended")
+
+    def rest_of_telemetry(self) -> bytes:
+        octets = b""
+        while part := self.telemetry.recv(65_536):
+            octets += part
+        return octets
+
+    def close(self) -> None:
+        self.lines.close()
+        for connection in (self.telemetry, self.orders, self.console):
+            connection.close()
+
+
+@pytest.fixture
+def running(flown: tuple[World, LoadedPayload]) -> Iterator[tuple[LivePayload, Watcher]]:
+    world, loaded = flown
+    live = LivePayload(world, new_spacecraft(world, loaded), rate=0.0, paused=True)
+    thread = threading.Thread(target=live.run)
+    watcher = Watcher(live)
+    thread.start()
+    yield live, watcher
+    live.stopping.set()
+    thread.join(20.0)
+    watcher.close()
+    assert not thread.is_alive()
+
+
+def ping(count: int) -> bytes:
+    return DICTIONARY.pack_command("test_connection", {}, sequence_count=count)
+
+
+def test_a_session_of_watching_stepping_and_commanding(running: tuple[LivePayload, Watcher]) -> None:
+    live, watcher = running
+    watcher.say("step")
+    watcher.say("step")
+    first = watcher.until(lambda message: message["kind"] == "frame")[-1]
+    assert first["mode"] == "observing" and first["paused"] and first["frame"] == 0
+    assert base64.b64decode(first["image_png"])[:4] == b"\x89PNG"
+    assert first["catalogue"] and {"id", "u_px", "v_px", "diameter_px"} <= set(first["catalogue"][0])
+    assert first["estimates"]["spherical"]["outcome"] == "anchored"
+    assert first["estimates"]["spherical"]["error_m"] < 50.0
+    # A frame stepped by hand starts the odometry anew.
+    watcher.say("step")
+    second = watcher.until(lambda message: message["kind"] == "frame")[-1]
+    assert second["estimates"]["spherical"]["reset_trigger"] == "manual_step"
+    # Telecommands, as CLTU and bare, in pieces.
+    cltu = UplinkEncoder(0x4C).encode([ping(7)])
+    watcher.orders.sendall(cltu[:11])
+    watcher.orders.sendall(cltu[11:] + ping(8)[:5])
+    watcher.orders.sendall(ping(8)[5:] + ping(8))
+    watcher.say("sideways")
+    watcher.until(lambda message: message["kind"] == "error")
+    watcher.say("run")
+    seen = watcher.until(
+        lambda message: sum(v["stage"] == "not_accepted" for v in message.get("verifications", ())) == 1
+    )
+    stages = [v["stage"] for message in seen for v in message.get("verifications", ())]
+    assert stages.count("completed") >= 2
+    watcher.say("quit")
+    decoded = decode(watcher.rest_of_telemetry(), spacecraft_id=0x4C)
+    assert decoded.complete
+    assert decoded.by_apid[DICTIONARY.packet("connection_report").apid] == 2
+
+
+def test_the_scenario_runs_through_and_the_machine_goes_on(running: tuple[LivePayload, Watcher]) -> None:
+    live, watcher = running
+    watcher.say("run")
+    messages = watcher.until(
+        lambda message: message["kind"] == "turn" and message["mode"] == "standby" and live.sent > 16
+    )
+    frames = [message["frame"] for message in messages if message["kind"] == "frame"]
+    assert frames == list(range(16))
+    assert {
+        message["estimates"]["spherical"]["outcome"] for message in messages if message["kind"] == "frame"
+    } <= {
+        "anchored",
+        "multi",
+        "single",
+        "predicted",
+    }
+    watcher.say("rate 5")
+    watcher.until(lambda message: message.get("rate") == 5.0)
+
+
+def test_a_port_in_use_is_named_and_nothing_stays_open(flown: tuple[World, LoadedPayload]) -> None:
+    world, loaded = flown
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(LinkError, match=f"telecommand port {port}: expected a free port"):
+            LivePayload(world, new_spacecraft(world, loaded), telecommand_port=port)
+
+
+def test_telecommands_come_out_of_any_noise_whole_or_not_at_all() -> None:
+    rng = np.random.default_rng(6)
+    for trial in range(200):
+        orders = [ping(k) for k in range(4)]
+        noise = [bytes(rng.integers(0x30, 0x80, int(rng.integers(0, 9))).astype(np.uint8)) for _ in orders]
+        encoder = UplinkEncoder(0x4C)
+        parts = [
+            quiet + (encoder.encode([order]) if (trial >> k) & 1 else order)
+            for k, (quiet, order) in enumerate(zip(noise, orders, strict=True))
+        ]
+        stream, buffer, found = b"".join(parts), TelecommandBuffer(), []
+        while stream:
+            cut = int(rng.integers(1, 40))
+            found += buffer.take(stream[:cut])
+            stream = stream[cut:]
+        assert found == orders
+        assert buffer.dropped >= sum(map(len, noise))
+
+
+def test_a_flood_of_octets_is_not_kept() -> None:
+    buffer = TelecommandBuffer()
+    for _ in range(40):
+        assert buffer.take(b"\xeb\x90" + b"\x00" * 65_536) == []
+    assert buffer.dropped > 1 << 20
+
+
+# Campaigns
+
+
+def test_faults_are_flown_judged_and_counted(flown: tuple[World, LoadedPayload]) -> None:
+    world, loaded = flown
+    cases = [
+        Case("none"),
+        Case("hang", ("processor_hang at 60",), ("watchdog_reset",)),
+        Case("never told", ("camera_dark at 60 for 30",), ("watchdog_reset",)),
+    ]
+    results = [fly_case(world, loaded, case, seed) for case in cases for seed in (1, 2)]
+    rows = table(results)
+    assert [(row["detected"], row["recovered"], row["lost"]) for row in rows] == [
+        (2, 2, 0),
+        (2, 2, 0),
+        (0, 2, 0),
+    ]
+    assert results[2].resets == 1 and 0.0 < results[2].latency_s <= 60.0
+    assert rows[0]["frames_processed"] == rows[0]["frames_expected"] == 32
+    # The same seed gives the same flight.
+    assert fly_case(world, loaded, cases[1], 1) == results[2]
+
+
+def test_the_shipped_campaign_names_every_kind_of_fault() -> None:
+    from payload_emulator.sim.faults import FAULT_KINDS
+
+    campaign = load_campaign("faults")
+    assert {text.split()[0] for case in campaign.cases for text in case.faults} == set(FAULT_KINDS)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("name = 1\n[[case]]\nfaults = ['meteor at 3']", "expected one of camera_dark"),
+        ("[[case]]\nevents = ['boom']", "case 1: events must be names of the dictionary, found 'boom'"),
+        ("[[case]]\nfault = []", "unknown key 'fault'"),
+        ("seeds = []\n[[case]]\n", "seeds must be a list of whole numbers"),
+        ("seeds = [1]", "expected one .* or more, found none"),
+        ("[[", "not TOML"),
+    ],
+)
+def test_a_campaign_file_that_says_something_else_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    file = tmp_path / "campaign.toml"
+    file.write_text(text)
+    with pytest.raises(ScenarioError, match=message):
+        load_campaign(file)
+    with pytest.raises(ScenarioError, match="no such campaign file; shipped campaigns: faults"):
+        load_campaign(tmp_path / "none.toml")
