@@ -1,0 +1,228 @@
+"""An archived pass flown again: from its frames, from its scenario, by another build, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lunar.datafolder import DataFolder
+from payload_emulator.emulator import emulate
+from payload_emulator.errors import ParameterError, RecordError
+from payload_emulator.flight.payload import FlightParameters
+from payload_emulator.parameter_file import (
+    BuildParameters,
+    flat_parameters,
+    format_parameters,
+    parse_parameters,
+    with_values,
+)
+from payload_emulator.recording import load_image, load_record, missing_frames
+from payload_emulator.replay import (
+    FlightBuild,
+    complete_archive,
+    load_flight_build,
+    names_command,
+    replay,
+    replay_archive,
+    stored_images,
+)
+from payload_emulator.scenario import parse_scenario
+from payload_emulator.suite import SUITE, suite_scenarios
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import decode
+
+FRAMES = 5
+SCENARIO = """
+name = "short"
+seed = 7
+[dynamics]
+gravity = "builtin"
+orientation = "iau"
+[window]
+search = "none"
+start = "2029-08-07T01:40:00Z"
+duration_s = 75.0
+[terrain]
+source = "procedural"
+[navigation]
+filter_gravity = "builtin"
+filter_degree = 8
+[disturbances]
+outage_at_s = 25.0
+outage_duration_s = 15.0
+"""
+NO_IMAGE = 2
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("replay") / "pass"
+    emulate(parse_scenario(SCENARIO), DataFolder(), folder, frames_kept=None)
+    return folder
+
+
+@pytest.fixture
+def copy(archive: Path, tmp_path: Path) -> Path:
+    shutil.copytree(archive, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def no_clock() -> float:
+    """In place of the processor's clock: what a replay says must not hang on it."""
+    return 0.0
+
+
+def packets_of(name: str, octets: bytes) -> list[bytes]:
+    decoded = decode(octets)
+    table = decoded.tables()[name]
+    every = list(decoded.cut.packets(decoded.buffer))
+    return [every[i] for i in table.packet_index.tolist()]
+
+
+def test_the_same_build_gives_the_same_octets(archive: Path, tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        replay_archive(archive, FlightBuild(), tmp_path / name)
+    assert (tmp_path / "one/downlink.cadu").read_bytes() == (tmp_path / "two/downlink.cadu").read_bytes()
+
+
+def test_the_flown_build_says_of_every_frame_what_it_said_in_flight(archive: Path, tmp_path: Path) -> None:
+    """Housekeeping differs: the processor time of the flown board is not the payload's to repeat."""
+    replay_archive(archive, FlightBuild(), tmp_path / "out")
+    flown, again = ((folder / "downlink.cadu").read_bytes() for folder in (archive, tmp_path / "out"))
+    for name in ("detections", "navigation_state", "frame_outcome"):
+        assert packets_of(name, again) == packets_of(name, flown), name
+
+
+def test_a_replay_asks_no_clock_for_what_it_says(archive: Path) -> None:
+    record = load_record(archive)
+    timed, untimed = (
+        replay(record, stored_images(archive, record), cpu_clock=clock)
+        for clock in (lambda: float(np.random.default_rng().random()), no_clock)
+    )
+    assert timed.packets == untimed.packets
+    assert all((values == 0.0).all() for values in untimed.stages_ms.values())
+
+
+def test_costs_are_reported_for_every_frame_and_stay_out_of_the_downlink(
+    archive: Path, tmp_path: Path
+) -> None:
+    summary = replay_archive(archive, FlightBuild(), tmp_path / "out")
+    costs = json.loads((tmp_path / "out/performance.json").read_text())
+    assert set(costs["stages"]) == {"network", "detector", "navigation"}
+    assert all(len(values) == FRAMES for values in costs["stages"].values())
+    assert min(value for i, value in enumerate(costs["stages"]["network"]) if i != NO_IMAGE) > 0.0
+    assert summary["frames"] == FRAMES
+    assert set(summary) >= {"outcomes", "fixes", "truth_reads_after_start", "realtime_factor"}
+
+
+def test_a_frame_that_the_camera_did_not_give_is_recorded_as_such(archive: Path) -> None:
+    record = load_record(archive)
+    frames = [item for item in record.inputs if item.number >= 0]
+    assert [item.image_sha256 == "" for item in frames] == [i == NO_IMAGE for i in range(FRAMES)]
+    assert load_image(archive, frames[NO_IMAGE]).size == 0
+    assert missing_frames(archive, record.inputs) == []
+
+
+def test_an_archive_without_frames_is_rendered_bit_for_bit(copy: Path, archive: Path, tmp_path: Path) -> None:
+    (copy / "frames/000003.png").unlink()
+    with pytest.raises(RecordError, match="1 missing, the first 3"):
+        replay_archive(copy, FlightBuild(), tmp_path / "refused")
+    manifest = complete_archive(copy, tmp_path / "whole", DataFolder())
+    assert (tmp_path / "whole/frames/000003.png").read_bytes() == (archive / "frames/000003.png").read_bytes()
+    assert set(manifest["files"]) == set(json.loads((archive / "manifest.json").read_text())["files"])
+
+
+def test_a_scenario_that_renders_something_else_is_refused(copy: Path, tmp_path: Path) -> None:
+    (copy / "frames/000003.png").unlink()
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["scenario_toml"] = manifest["scenario_toml"].replace("seed = 7", "seed = 8")
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(RecordError, match="frame 3 rendered from the scenario"):
+        replay_archive(copy, FlightBuild(), tmp_path / "out", data=DataFolder())
+
+
+def test_an_image_that_is_another_one_is_refused(copy: Path, tmp_path: Path) -> None:
+    shutil.copy(copy / "frames/000000.png", copy / "frames/000001.png")
+    with pytest.raises(RecordError, match="SHA-256"):
+        replay_archive(copy, FlightBuild(), tmp_path / "out")
+
+
+def test_an_archive_of_before_says_that_it_cannot_be_flown(copy: Path, tmp_path: Path) -> None:
+    shutil.rmtree(copy / "payload")
+    with pytest.raises(RecordError, match=r"expected payload/inputs\.jsonl, found none"):
+        replay_archive(copy, FlightBuild(), tmp_path / "out")
+
+
+def test_a_parameter_of_older_code_is_dropped_and_told(copy: Path, tmp_path: Path) -> None:
+    path = copy / "payload/parameters.toml"
+    path.write_text(path.read_text().replace("[detector]\n", "[detector]\nforgotten = 3\n"))
+    summary = replay_archive(copy, FlightBuild(), tmp_path / "out")
+    assert summary["dropped"] == ["detector.forgotten"]
+
+
+def test_a_build_changes_the_parameters_that_it_names_only(archive: Path, tmp_path: Path) -> None:
+    (tmp_path / "p.toml").write_text("detector.score_threshold = 0.9\n")
+    (tmp_path / "build.toml").write_text('name = "strict"\nparameters = "p.toml"\n')
+    build = load_flight_build(tmp_path / "build.toml")
+    assert not names_command(tmp_path / "build.toml")
+    plain = replay_archive(archive, FlightBuild(), tmp_path / "plain")
+    strict = replay_archive(archive, build, tmp_path / "strict")
+    assert strict["detections"] < plain["detections"]
+
+
+def test_a_build_file_of_a_program_is_not_flown_here(tmp_path: Path) -> None:
+    (tmp_path / "build.toml").write_text('name = "x"\ncommand = ["x", "{archive}", "{out}"]\n')
+    assert names_command(tmp_path / "build.toml")
+    with pytest.raises(ParameterError, match="found one with a command"):
+        load_flight_build(tmp_path / "build.toml")
+
+
+def test_parameters_survive_their_file() -> None:
+    parameters = BuildParameters(flight=FlightParameters())
+    again = parse_parameters(format_parameters(parameters))
+    assert again == parameters
+    assert again.flight.sha256 == parameters.flight.sha256
+
+
+def test_every_parameter_has_a_dotted_name_and_can_be_set_by_it() -> None:
+    names = flat_parameters(BuildParameters())
+    assert names["flight.anchored.gravity_degree"] == 100
+    changed = with_values(BuildParameters(), {"flight.anchored.gravity_degree": 4})
+    assert changed.flight.anchored.gravity_degree == 4
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("flight.anchored.gravity_degre = 3", "did you mean 'gravity_degree'"),
+        ("flight.anchored.gravity_degree = 'x'", "must be a int"),
+        ('flight.modes = ["sideways"]', "must be one of"),
+        ("flight = 3", "must be a table"),
+        ("flight = ", "not TOML"),
+    ],
+)
+def test_a_bad_parameter_is_told_by_its_name(text: str, told: str) -> None:
+    with pytest.raises(ParameterError) as error:
+        parse_parameters(text, source="p.toml")
+    assert told in str(error.value) and str(error.value).startswith("p.toml: ")
+
+
+def test_the_shipped_suite_has_a_pass_of_every_kind() -> None:
+    scenarios = suite_scenarios(frames=10, seeds=2)
+    assert len(scenarios) == 2 * len(list(SUITE.glob("*.toml"))) == 10
+    assert {scenario.light.mode for scenario in scenarios} == {"paper", "real"}
+    assert any(scenario.disturbances.outage_duration_s > 0.0 for scenario in scenarios)
+    assert {scenario.window.duration_s for scenario in scenarios} == {150.0}
+    assert len({scenario.name for scenario in scenarios}) == 10
+
+
+def test_the_dictionary_of_the_archive_decodes_its_downlink(archive: Path) -> None:
+    from tmtc.definitions import parse_dictionary
+
+    dictionary = parse_dictionary((archive / "payload/dictionary.json").read_text())
+    assert dictionary.hash == DICTIONARY.hash
+    assert decode((archive / "downlink.cadu").read_bytes(), dictionary=dictionary).unknown == 0
