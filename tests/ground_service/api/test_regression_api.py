@@ -1,0 +1,104 @@
+"""Builds, archives and regressions over HTTP."""
+
+from __future__ import annotations
+
+import warnings
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ground_service.api.app import create_app
+from ground_service.services.regression_archives import pack_archive
+from ground_service.services.users import add_user
+from ground_service.settings import Settings
+
+with warnings.catch_warnings():
+    # It recommends another HTTP library than the installed one; both serve it.
+    warnings.simplefilter("ignore")
+    from fastapi.testclient import TestClient
+
+V1 = "/api/v1"
+
+
+@pytest.fixture
+def client(tmp_path: Path) -> Iterator[TestClient]:
+    with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as opened:
+        yield opened
+
+
+def zipped(folder: Path, target: Path) -> bytes:
+    with zipfile.ZipFile(target, "w") as packed:
+        for path in sorted(folder.iterdir()):
+            packed.write(path, path.name)
+    return target.read_bytes()
+
+
+def test_a_build_is_registered_held_against_another_and_judged(
+    client: TestClient, make_flyable: Callable, make_build: Callable, tmp_path: Path
+) -> None:
+    flown = make_flyable(frames=12, seed=51)
+    pack_archive(flown.folder, tmp_path / "pass.zip")
+    kept = client.post(f"{V1}/regression-archives?pinned=true", content=(tmp_path / "pass.zip").read_bytes())
+    assert kept.status_code == 201, kept.text
+    assert (kept.json()["frames"], kept.json()["pinned"]) == (12, True)
+    digests = []
+    for name, program in (("good", None), ("broken", "raise SystemExit(4)")):
+        options: dict[str, Any] = {} if program is None else {"program": program}
+        file = make_build(name, {"synthetic pass 51": flown.packets}, **options)
+        answer = client.post(f"{V1}/builds", content=zipped(file.parent, tmp_path / f"{name}.zip"))
+        assert answer.status_code == 201, answer.text
+        assert (answer.json()["name"], answer.json()["kind"]) == (name, "command")
+        digests.append(answer.json()["digest"])
+    assert {item["digest"] for item in client.get(f"{V1}/builds").json()["items"]} == set(digests)
+    for candidate, verdict in zip(digests, ("pass", "fail"), strict=True):
+        job = client.post(f"{V1}/regressions", json={"candidate": candidate, "baseline": digests[0]})
+        assert job.status_code == 202, job.text
+        assert (job.json()["kind"], job.json()["state"]) == ("regression", "done")
+        found = client.get(job.headers["location"]).json()
+        assert found["verdict"] == verdict
+        assert found["result"]["passes"][0]["archive"] == kept.json()["digest"]
+        report = client.get(f"{job.headers['location']}/report")
+        assert "Regression report" in report.text
+    replays = [item for item in client.get(f"{V1}/jobs").json()["items"] if item["kind"] == "replay"]
+    assert len(replays) == 2  # the good build's was not done again
+
+
+@pytest.mark.parametrize(
+    ("body", "status"),
+    [
+        ({"candidate": "../../etc/passwd"}, 422),
+        ({"candidate": "0" * 64}, 422),
+        ({"candidate": "current", "archives": ["0" * 64]}, 422),
+        ({}, 422),
+    ],
+)
+def test_a_regression_of_nothing_known_is_refused(
+    client: TestClient, body: dict[str, Any], status: int
+) -> None:
+    assert client.post(f"{V1}/regressions", json=body).status_code == status
+
+
+def test_a_verdict_that_is_not_there_is_not_found(client: TestClient) -> None:
+    assert client.get(f"{V1}/regressions/{'0' * 32}").status_code == 404
+
+
+def test_something_else_than_a_zip_is_no_build(client: TestClient) -> None:
+    assert client.post(f"{V1}/builds", content=b"name = 'x'").status_code == 422
+
+
+def test_only_an_administrator_registers_a_program(
+    client: TestClient, make_build: Callable, tmp_path: Path
+) -> None:
+    ground = client.app.state.ground  # type: ignore[attr-defined]
+    tokens = {role: add_user(ground, role, role) for role in ("viewer", "operator", "admin")}
+    body = zipped(make_build("program").parent, tmp_path / "b.zip")
+    found = {
+        role: client.post(
+            f"{V1}/builds", content=body, headers={"Authorization": f"Bearer {token}"}
+        ).status_code
+        for role, token in tokens.items()
+    }
+    assert found == {"viewer": 403, "operator": 403, "admin": 201}
