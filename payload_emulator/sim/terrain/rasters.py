@@ -23,7 +23,7 @@ from payload_emulator.errors import TerrainError
 from payload_emulator.sim.terrain.tiles import Floats, Heights
 
 CHUNK_PIXELS = 1024
-CHUNKS_KEPT = 96
+CHUNKS_KEPT = 40
 
 RADIUS_TOLERANCE = 0.01
 """A file whose sphere differs from the Moon's by more is of another body."""
