@@ -20,6 +20,14 @@ from payload_emulator.flight.acquisition import SEARCHABLE_DETECTIONS, Acquisiti
 from payload_emulator.flight.detections import Detections
 from payload_emulator.flight.dynamics import OrbitModel, ProcessNoise, process_noise
 from payload_emulator.flight.identification import Identification, IdentificationParameters, identify
+from payload_emulator.flight.landmark_map import (
+    FIRST_LANDMARK_ID,
+    Landmark,
+    LandmarkMapper,
+    MappingParameters,
+    View,
+    unclaimed,
+)
 from payload_emulator.flight.navigation_filter import CommonErrors, FilterState, Update
 from payload_emulator.flight.outcomes import Outcome
 from payload_emulator.flight.sighting import (
@@ -78,6 +86,8 @@ class AnchoredParameters:
         Position sigma beyond which the estimate counts as lost.
     suspicion_frames
         Frames in a row that must disagree before the search is widened.
+    map_landmarks, mapping
+        Whether craters that the catalogue lacks are mapped and used on later passes, and how.
     crater_limit
         Craters used of one frame: more than these, the surest, say little more, since attitude and catalogue err alike
         for all of them.
@@ -96,6 +106,8 @@ class AnchoredParameters:
     search_radius_m: float = 25_000.0
     divergence_limit_m: float = 5_000.0
     suspicion_frames: int = 4
+    map_landmarks: bool = True
+    mapping: MappingParameters = field(default_factory=MappingParameters)
     crater_limit: int = 32
 
 
@@ -177,6 +189,11 @@ class AnchoredNavigator:
             parameters.errors,
         )
         self.last_fix: Fix | None = None
+        self.new_landmarks: tuple[Landmark, ...] = ()
+        self.mapper = LandmarkMapper(camera, parameters.mapping)
+        self._catalogue = catalogue
+        self._surface_m = 0.0
+        self._image_ticks = initial_state.ticks
         self._camera = camera
         self._disagreements = 0
 
@@ -197,8 +214,15 @@ class AnchoredNavigator:
         if prior is None or mcmf_from_icrf is None or not _usable(prior):
             # Without the Moon's orientation neither dynamics nor catalogue can be used: the old state is all there is.
             return self._report(Outcome.refused, None, 0, 0)
+        self.new_landmarks = ()
         if elapsed_s > _CRATER_MEMORY_S or elapsed_s <= 0.0:
             prior = prior.only_craters(_NO_CRATERS)
+        if found is not None:
+            unseen_s = (ticks - self._image_ticks) / TICKS_PER_SECOND
+            if unseen_s > _CRATER_MEMORY_S or unseen_s < 0.0:
+                prior = prior.only_craters(_NO_CRATERS)
+                self._end_pass()
+            self._image_ticks = ticks
         self.state = prior
         if found is None:
             return self._report(Outcome.no_image, mcmf_from_icrf, 0, 0)
@@ -209,11 +233,14 @@ class AnchoredNavigator:
         self._judge(fix, expected, len(found))
         if fix is None and self._disagreements >= self.parameters.suspicion_frames:
             fix = self._reacquire(prior, pose, found)
+        if fix is not None:
+            self.state, self.last_fix = fix.update.state, fix
+        if self.parameters.map_landmarks:
+            self._map(found, camera_from_icrf, mcmf_from_icrf)
         if fix is None:
             return self._report(
                 Outcome.refused if candidates else Outcome.coasted, mcmf_from_icrf, candidates, expected
             )
-        self.state, self.last_fix = fix.update.state, fix
         return self._report(Outcome.fixed, mcmf_from_icrf, candidates, expected, fix)
 
     def widen(self, sigma_position_m: float, sigma_velocity_m_s: float) -> None:
@@ -224,6 +251,43 @@ class AnchoredNavigator:
     def lost(self) -> bool:
         """Whether the estimate is too uncertain to be of use."""
         return self.state.position_sigma_m > self.parameters.divergence_limit_m
+
+    def _map(self, found: Detections, camera_from_icrf: Float, mcmf_from_icrf: Float) -> None:
+        """Give the map what the catalogue does not explain."""
+        mean, fix = self.state.mean, self.last_fix
+        pose = kalman.pose_of(mean, camera_from_icrf, mcmf_from_icrf)
+        seen = in_view(self.landmarks, pose, self._camera, 20.0)
+        listed = self.landmarks.ids[seen.index] < FIRST_LANDMARK_ID
+        used = _NO_CRATERS
+        if fix is not None:
+            used = fix.identification.detection[self.landmarks.ids[fix.index] < FIRST_LANDMARK_ID]
+        if listed.any():
+            places = self.landmarks.position_mcmf_m[seen.index[listed]]
+            self._surface_m = float(np.median(np.linalg.norm(places, axis=1))) - MOON_RADIUS_M
+        turned = camera_from_icrf - np.cross(mean[kalman.ATTITUDE], camera_from_icrf, axisb=0, axisc=0)
+        position = self.state.covariance[kalman.POSITION, kalman.POSITION]
+        view = View(
+            self.state.ticks,
+            turned @ mcmf_from_icrf.T,
+            mcmf_from_icrf @ mean[kalman.POSITION],
+            mcmf_from_icrf @ position @ mcmf_from_icrf.T,
+            self.parameters.errors.attitude_bias_rad,
+        )
+        free = unclaimed(found, seen.select(listed), used)
+        shifted = replace(
+            found,
+            u_px=found.u_px - mean[kalman.PIXEL][0],
+            v_px=found.v_px - mean[kalman.PIXEL][1],
+        )
+        self.new_landmarks += self.mapper.observe(
+            view, shifted, self._detection_variance(found), free, self._surface_m
+        )
+
+    def _end_pass(self) -> None:
+        """Finish the map of a pass; its landmarks serve from now on."""
+        self.new_landmarks = self.mapper.close()
+        if len(self.mapper):
+            self.landmarks = self.mapper.with_catalogue(self._catalogue)
 
     def _predict(self, ticks: int) -> FilterState | None:
         """Return the state carried to a time over the burns on the way, undoing them on the way back."""

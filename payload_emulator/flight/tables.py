@@ -131,6 +131,16 @@ class CatalogueTable:
     def __len__(self) -> int:
         return int(self.ids.shape[0])
 
+    def select(self, which: NDArray[np.bool_] | Index) -> CatalogueTable:
+        return CatalogueTable(
+            self.ids[which],
+            self.latitude_rad[which],
+            self.longitude_rad[which],
+            self.diameter_m[which],
+            self.rim_height_m[which],
+            self.sigma_m[which],
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GravityTable:
