@@ -67,7 +67,7 @@ class FlightBuild:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replay:
-    """What a replay gave: packets, counts of the payload, CPU milliseconds of every stage by frame and of the yardstick."""
+    """What a replay gave: packets, counts of the payload, CPU milliseconds of stages by frame and of the yardstick."""
 
     packets: list[bytes]
     summary: dict[str, Any]

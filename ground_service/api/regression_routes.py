@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path as FilePath
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Request, Response
@@ -171,9 +169,8 @@ def get_regression_report(ground: GroundOf, _: Viewer, regression_id: Key) -> Re
 
 
 def _register(ground: Ground, stored: StoredFile, caller: Caller) -> BuildOut:
-    with tempfile.TemporaryDirectory(prefix="linna-build-") as folder:
-        archive_service.unpack_archive(stored.path, FilePath(folder))
-        build = load_build(FilePath(folder))
+    with archive_service.opened_archive(stored.path) as folder:
+        build = load_build(folder)
         if build.command and not caller.may("admin"):
             raise Forbidden(
                 f"{caller.name}: expected the role admin to register a program, found {caller.role}"
@@ -195,9 +192,7 @@ def _build(row: repository.Row) -> BuildOut:
         "provenance",
         "registered_by",
     )
-    return BuildOut(
-        **{name: row[name] for name in names}, registered=time_text(row["created_utc_ns"])
-    )
+    return BuildOut(**{name: row[name] for name in names}, registered=time_text(row["created_utc_ns"]))
 
 
 def _archive(row: repository.Row) -> ArchiveOut:

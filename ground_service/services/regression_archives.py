@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import stat
 import struct
 import tempfile
 import tomllib
@@ -16,7 +15,7 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from sqlalchemy import delete, select
@@ -24,15 +23,13 @@ from sqlalchemy import delete, select
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound, storage_error
 from ground_service.services.archive_import import checked_files, read_manifest
+from ground_service.services.archive_zip import unpacked
 from ground_service.services.ground import Ground
 from ground_service.store import repository
 from ground_service.store.files import FileArchive
 
 MANIFEST = "manifest.json"
 INPUTS = "payload/inputs.jsonl"
-ENTRIES_LIMIT = 50_000
-UNPACKED_LIMIT_OCTETS = 8 << 30
-RATIO_LIMIT = 200.0
 _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 _PNG_HEADER = struct.Struct(">8s4x4sII")
 _FLIGHT_FOLDERS = ("payload/", "frames/")
@@ -66,13 +63,20 @@ class PassArchive:
 
 @contextmanager
 def opened_archive(path: Path) -> Iterator[Path]:
-    """The folder of an archive; a zip is unpacked for as long as the context lasts."""
+    """The folder of an archive; a zip is unpacked for as long as the context lasts.
+
+    Raises
+    ------
+    InvalidInput
+        It is neither, or the zip names a place outside itself, holds links, or would grow beyond reason.
+    """
     if path.is_dir():
         yield path
         return
-    with tempfile.TemporaryDirectory(prefix="linna-archive-") as folder:
-        unpack_archive(path, Path(folder))
-        yield Path(folder)
+    if not path.exists():
+        raise InvalidInput(str(path), "", "a pass archive (folder or zip)", "nothing there")
+    with unpacked(path, Path(tempfile.gettempdir()), str(path)) as folder:
+        yield folder
 
 
 def check_archive(folder: Path) -> PassArchive:
@@ -144,45 +148,6 @@ def pack_archive(folder: Path, target: Path) -> None:
         raise storage_error(error, target) from None
     finally:
         partial.unlink(missing_ok=True)
-
-
-def unpack_archive(path: Path, folder: Path) -> None:
-    """Unpack a zipped archive into a folder.
-
-    Raises
-    ------
-    InvalidInput
-        It is no zip, names a place outside the folder, holds links, or would grow beyond reason.
-    """
-    try:
-        with zipfile.ZipFile(path) as packed:
-            entries = [entry for entry in packed.infolist() if not entry.is_dir()]
-            _check_entries(path, entries)
-            left = UNPACKED_LIMIT_OCTETS
-            for entry in entries:
-                target = folder / entry.filename
-                target.parent.mkdir(parents=True, exist_ok=True)
-                with packed.open(entry) as source, target.open("xb") as sink:
-                    octets = source.read(entry.file_size + 1)
-                    left -= len(octets)
-                    if len(octets) != entry.file_size or left < 0:
-                        raise InvalidInput(
-                            str(path),
-                            entry.filename,
-                            f"{entry.file_size} octets as announced",
-                            "another number",
-                        )
-                    sink.write(octets)
-    except FileNotFoundError:
-        raise InvalidInput(str(path), "", "a pass archive (folder or zip)", "nothing there") from None
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
-        raise InvalidInput(
-            str(path), "", "a pass archive (folder or zip)", str(error) or "a damaged zip"
-        ) from None
-    except FileExistsError as error:
-        raise InvalidInput(str(path), Path(error.filename).name, "every file once", "it twice") from None
-    except OSError as error:
-        raise storage_error(error, path) from None
 
 
 def write_flight_view(archive: Path, folder: Path) -> None:
@@ -310,28 +275,6 @@ def _held(files: FileArchive, manifest_sha256: str) -> set[str]:
     """Hashes of the files of an archive, its manifest included."""
     manifest = json.loads(files.get(manifest_sha256))
     return {manifest_sha256, *(entry["sha256"] for entry in manifest["files"].values())}
-
-
-def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
-    if len(entries) > ENTRIES_LIMIT:
-        raise InvalidInput(str(path), "", f"at most {ENTRIES_LIMIT} files", str(len(entries)))
-    total = sum(entry.file_size for entry in entries)
-    if total > UNPACKED_LIMIT_OCTETS:
-        raise InvalidInput(str(path), "", f"at most {UNPACKED_LIMIT_OCTETS} octets unpacked", str(total))
-    packed = sum(entry.compress_size for entry in entries)
-    if total > RATIO_LIMIT * max(packed, 1) and total > 1 << 20:
-        raise InvalidInput(
-            str(path), "", f"at most {RATIO_LIMIT:g} octets for each packed one", f"{total / packed:.0f}"
-        )
-    for entry in entries:
-        name = PurePosixPath(entry.filename)
-        if name.is_absolute() or ".." in name.parts or "\\" in entry.filename or ":" in entry.filename:
-            raise InvalidInput(
-                str(path), entry.filename, "a path inside the archive", "one that leads out of it"
-            )
-        kind = stat.S_IFMT(entry.external_attr >> 16)
-        if kind not in (0, stat.S_IFREG):
-            raise InvalidInput(str(path), entry.filename, "a plain file", "a link or device")
 
 
 def frame_inputs(folder: Path) -> list[dict[str, Any]]:

@@ -339,7 +339,7 @@ def _headline(outcome: RegressionOutcome) -> tuple[HeadlineFigure, ...]:
     figures = []
     for name, label, scale, unit in wanted:
         gate = by_name.get(name)
-        if gate is None:
+        if gate is None or (scale == 0.0 and not gate.baseline > 0.0):
             figures.append(HeadlineFigure(label, None, unit, "not gated"))
         elif scale == 0.0:
             figures.append(

@@ -275,7 +275,8 @@ def _latency(
     if performance is None:
         return {}, {}
     measured = {
-        name: np.array(values, dtype=np.float64)
+        # A stage that took no time did not run: a frame without an image says nothing about the network.
+        name: np.where(np.array(values) > 0.0, np.array(values, dtype=np.float64), np.nan)
         for name, values in performance["stages"].items()
         if len(values) == frames and all(math.isfinite(value) for value in values)
     }

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from sqlalchemy.exc import IntegrityError
 
 from ground_service.clock import utc_now_ns
@@ -293,11 +294,13 @@ def keep_regression(ground: Ground, outcome: RegressionOutcome, *, regression_id
 
 def pass_figures(frames: PassFrames) -> dict[str, Any]:
     """What a pass's own line in a verdict tells beside the gates: outcomes, costs in milliseconds, memory."""
-    import numpy as np
-
     return {
         "outcome_shares": outcome_shares(frames),
-        "stages_ms": {name: float(np.median(values)) for name, values in frames.latency_ms.items()},
+        "stages_ms": {
+            name: float(np.nanmedian(values))
+            for name, values in frames.latency_ms.items()
+            if np.isfinite(values).any()
+        },
         "memory_mib": frames.memory_mib,
         "undecodable": frames.undecodable,
     }
