@@ -365,7 +365,12 @@ class LandmarkMapper:
                 poorest = min(
                     self.landmarks.values(), key=lambda landmark: (landmark.sightings, landmark.ticks)
                 )
+                self._places = np.delete(self._places, list(self.landmarks).index(poorest.identity), axis=0)
                 del self.landmarks[poorest.identity]
+        if new.identity in self.landmarks:
+            self._places[list(self.landmarks).index(new.identity)] = new.position_mcmf_m
+        else:
+            self._places = np.concatenate([self._places, new.position_mcmf_m[None]])
         self.landmarks[new.identity] = new
         return new
 

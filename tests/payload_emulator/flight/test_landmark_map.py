@@ -1,0 +1,217 @@
+"""The map of uncatalogued craters: placed where they are, as uncertain as they are, bounded in number."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
+from lunar.frames import mcmf_from_spherical
+from payload_emulator.flight.detections import Detections, no_detections
+from payload_emulator.flight.landmark_map import (
+    FIRST_LANDMARK_ID,
+    Landmark,
+    LandmarkMapper,
+    MappingParameters,
+    View,
+    intersected,
+    unclaimed,
+)
+from payload_emulator.flight.sighting import Sighting
+from payload_emulator.flight.tables import CatalogueTable
+
+RADIUS_M = 1_737_400.0
+CAMERA = PinholeCamera()
+SECOND = 65_536
+SIGMA_PX = 1.0
+# 1.636 km/s on the ground: 24.5 km, 0.0141 rad, between frames of 15 s.
+STEP_RAD = 24_540.0 / RADIUS_M
+SPACECRAFT_M = 100.0
+
+
+def ground(count: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    latitude, longitude = rng.uniform(-0.02, 0.09, count), rng.uniform(-0.02, 0.02, count)
+    return mcmf_from_spherical(latitude, longitude, 300.0 + 400.0 * rng.standard_normal(count))
+
+
+def fly(
+    mapper: LandmarkMapper,
+    craters: np.ndarray,
+    seed: int,
+    frames: int = 6,
+    start_ticks: int = 0,
+    east_m: float = 0.0,
+    false: int = 0,
+    error_m: np.ndarray | None = None,
+) -> list[Landmark]:
+    """One pass to the north at 30 km, believed to be `error_m` from where it is."""
+    rng = np.random.default_rng(seed)
+    error = np.zeros(3) if error_m is None else error_m
+    made: list[Landmark] = []
+    for k in range(frames):
+        place = mcmf_from_spherical(k * STEP_RAD, east_m / RADIUS_M, 30e3)
+        rotation = nadir_camera_from_mcmf(place)
+        seen = (craters - place) @ rotation.T
+        f = 256.0 / np.tan(np.radians(60.0))
+        uv = 255.5 + f * seen[:, :2] / seen[:, 2:]
+        inside = (seen[:, 2] > 0.0) & np.all(np.abs(uv - 255.5) < 256.0, axis=1)
+        uv = uv[inside] + SIGMA_PX * rng.standard_normal((int(inside.sum()), 2))
+        size = f * 5_000.0 / seen[inside, 2]
+        uv = np.concatenate([uv, rng.uniform(0.0, 511.0, (false, 2))])
+        size = np.concatenate([size, np.full(false, 25.0)])
+        found = Detections(uv[:, 0], uv[:, 1], size, np.ones(len(uv)), np.full(len(uv), SIGMA_PX))
+        view = View(start_ticks + k * 15 * SECOND, rotation, place + error, SPACECRAFT_M**2 * np.eye(3), 1e-4)
+        free = np.ones(len(uv), dtype=bool)
+        made += mapper.observe(view, found, np.full(len(uv), SIGMA_PX**2), free, 300.0)
+    made += mapper.close()
+    return made
+
+
+def nearest_m(landmark: Landmark, craters: np.ndarray) -> float:
+    return float(np.linalg.norm(craters - landmark.position_mcmf_m, axis=1).min())
+
+
+def test_craters_become_landmarks_where_they_are_and_with_errors_as_claimed() -> None:
+    craters = ground(25, 1)
+    mapper = LandmarkMapper(CAMERA)
+    made = fly(mapper, craters, 2)
+    assert len(made) == len(mapper) >= 15
+    errors, nees = [], []
+    for landmark in made:
+        offset = (
+            landmark.position_mcmf_m
+            - craters[np.argmin(np.linalg.norm(craters - landmark.position_mcmf_m, axis=1))]
+        )
+        own = landmark.covariance_m2 - SPACECRAFT_M**2 * np.eye(3)
+        errors.append(float(np.linalg.norm(offset)))
+        nees.append(float(offset @ np.linalg.solve(own, offset)))
+    # One pixel at 30 km is 203 m; three sightings under wide parallax place a crater to about that.
+    assert np.median(errors) < 250.0
+    # Three degrees of freedom each; the mean of 15 and more lies within 1 of 3 at two sigma, prior and gates aside.
+    assert 1.0 < np.mean(nees) < 4.5
+
+
+def test_the_spacecrafts_error_is_in_every_landmark_and_in_its_covariance() -> None:
+    craters = ground(25, 1)
+    wrong = np.array([0.0, 150.0, 120.0])
+    shifted = LandmarkMapper(CAMERA)
+    made = fly(shifted, craters, 2, error_m=wrong)
+    mean = np.mean(
+        [
+            landmark.position_mcmf_m
+            - craters[np.argmin(np.linalg.norm(craters + wrong - landmark.position_mcmf_m, axis=1))]
+            for landmark in made
+        ],
+        axis=0,
+    )
+    # East and north shift as the spacecraft does; the mean of 15 landmarks of 150 m each is good to 40 m.
+    assert mean[1:] == pytest.approx(wrong[1:], abs=90.0)
+    for landmark in made:
+        assert np.linalg.eigvalsh(landmark.covariance_m2).min() >= SPACECRAFT_M**2
+
+
+def test_false_detections_do_not_become_landmarks() -> None:
+    mapper = LandmarkMapper(CAMERA)
+    fly(mapper, np.empty((0, 3)) + RADIUS_M, 3, frames=8, false=12)
+    # Ninety-six of them; chance lines up three now and then.
+    assert len(mapper) <= 3
+
+
+def test_a_second_pass_joins_the_landmarks_of_the_first_without_counting_its_error_twice() -> None:
+    craters = ground(25, 1)
+    mapper = LandmarkMapper(CAMERA)
+    first = fly(mapper, craters, 2)
+    count = len(mapper)
+    second = fly(mapper, craters, 9, start_ticks=7_000 * SECOND, east_m=8_000.0)
+    again = [landmark for landmark in second if landmark.passes == 2]
+    assert len(again) >= 0.6 * min(count, len(second))
+    assert {landmark.identity for landmark in again} <= {landmark.identity for landmark in first}
+    for landmark in again:
+        before = next(item for item in first if item.identity == landmark.identity)
+        assert landmark.sightings > before.sightings
+        # Both passes may have erred alike: the spacecraft's share does not shrink.
+        assert np.linalg.eigvalsh(landmark.covariance_m2).min() >= 0.999 * SPACECRAFT_M**2
+
+
+def test_the_intersection_never_claims_more_than_the_better_of_two_equal_directions() -> None:
+    covariance = np.diag([100.0, 400.0, 900.0])
+    first = Landmark(FIRST_LANDMARK_ID, np.zeros(3), covariance, 5e3, 3, 1, 0)
+    second = replace(first, position_mcmf_m=np.array([1.0, 2.0, 3.0]))
+    joined = intersected(first, second)
+    assert np.allclose(joined.covariance_m2, covariance)
+    assert (joined.sightings, joined.passes) == (6, 2)
+    turned = replace(second, covariance_m2=np.diag([900.0, 400.0, 100.0]))
+    other = intersected(first, turned)
+    assert np.trace(other.covariance_m2) <= np.trace(covariance)
+    # Julier and Uhlmann: for diag(100, 900) and diag(900, 100) the half and half mixture gives 2/(1/100+1/900) = 180.
+    assert np.diag(other.covariance_m2)[[0, 2]] == pytest.approx([180.0, 180.0])
+
+
+def test_memory_is_bounded() -> None:
+    mapper = LandmarkMapper(CAMERA, MappingParameters(tracks=10, landmarks=4))
+    fly(mapper, ground(40, 1), 2, frames=6)
+    assert len(mapper) <= 4
+    best = min(landmark.sightings for landmark in mapper.landmarks.values())
+    assert best >= 3
+
+
+def test_landmarks_stand_beside_the_catalogue_with_identities_of_their_own() -> None:
+    mapper = LandmarkMapper(CAMERA)
+    craters = ground(25, 1)
+    fly(mapper, craters, 2)
+    one = np.ones(1)
+    catalogue = CatalogueTable(
+        np.array([7]), 0.1 * one, 0.2 * one, 6e3 * one, 50.0 * one, 80.0 * np.ones((1, 3))
+    )
+    merged = mapper.with_catalogue(catalogue)
+    assert len(merged) == 1 + len(mapper)
+    assert set(merged.ids[merged.ids < FIRST_LANDMARK_ID].tolist()) == {7}
+    assert np.all(np.diff(merged.latitude_rad) >= 0.0)
+    own = merged.position_mcmf_m[merged.ids >= FIRST_LANDMARK_ID]
+    assert {tuple(np.round(place)) for place in own} == {
+        tuple(np.round(landmark.position_mcmf_m)) for landmark in mapper.landmarks.values()
+    }
+
+
+def test_nothing_is_mapped_while_the_spacecraft_does_not_know_where_it_is_or_sees_nothing() -> None:
+    mapper = LandmarkMapper(CAMERA, MappingParameters(position_limit_m=50.0))
+    assert fly(mapper, ground(25, 1), 2) == []
+    nothing = no_detections()
+    place = mcmf_from_spherical(0.0, 0.0, 30e3)
+    view = View(0, nadir_camera_from_mcmf(place), place, np.eye(3), 1e-4)
+    assert LandmarkMapper(CAMERA).observe(view, nothing, np.empty(0), np.empty(0, dtype=bool), 0.0) == ()
+    lost = replace(view, covariance_m2=np.full((3, 3), np.nan))
+    one = np.ones(1)
+    found = Detections(200.0 * one, 200.0 * one, 20.0 * one, one, one)
+    assert LandmarkMapper(CAMERA).observe(lost, found, one, np.ones(1, dtype=bool), 0.0) == ()
+
+
+def test_detections_that_are_no_numbers_are_left_out() -> None:
+    mapper = LandmarkMapper(CAMERA)
+    place = mcmf_from_spherical(0.0, 0.0, 30e3)
+    view = View(0, nadir_camera_from_mcmf(place), place, np.eye(3), 1e-4)
+    values = np.array([np.nan, 200.0, 300.0])
+    size = np.array([20.0, np.nan, 25.0])
+    found = Detections(values, values, size, np.ones(3), np.ones(3))
+    for k in range(4):
+        mapper.observe(replace(view, ticks=k * SECOND), found, np.ones(3), np.ones(3, dtype=bool), 0.0)
+    assert len(mapper.close()) == 1
+
+
+def test_a_detection_on_a_catalogued_crater_of_its_size_is_not_free() -> None:
+    nothing = np.zeros((1, 2, 3))
+    seen = Sighting(
+        np.arange(1),
+        np.array([[100.0, 100.0]]),
+        np.array([30.0]),
+        nothing,
+        nothing,
+        nothing,
+        nothing[:, :, 0],
+    )
+    u = np.array([105.0, 105.0, 300.0, 400.0])
+    found = Detections(u, np.full(4, 100.0), np.array([28.0, 60.0, 30.0, 30.0]), np.ones(4), np.ones(4))
+    assert unclaimed(found, seen, np.array([3])).tolist() == [False, True, True, False]
