@@ -49,6 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
         made = make_report(ground, pass_id)
     figures = {
         "report": str(made.html),
+        "archive": str(archive),
         "pass_id": pass_id,
         "frames": emulated["frames"],
         **made.summary,
@@ -82,6 +83,7 @@ def describe(figures: dict) -> str:
         f"data: {'; '.join(figures['data'])}",
         f"{figures['wall_s']:.1f} s",
         f"report: {figures['report']}",
+        f"fly this pass again, with any build: linna replay {figures['archive']} --out DIR [--build BUILD]",
     ]
     return "\n".join(lines)
 
