@@ -21,7 +21,7 @@ MATT = Photometry("lambert", phase_slope_per_rad=0.0)
 """What Blender's Principled BSDF at full roughness comes to."""
 
 LIKE_FOR_LIKE = CyclesSettings(
-    pixels_per_polygon=0.25, filter_px=0.01, terminator_offset=0.0, geometry_offset=0.0
+    samples=8, pixels_per_polygon=0.25, filter_px=0.01, terminator_offset=0.0, geometry_offset=0.0
 )
 """Cycles as the other two sample: at pixel centres, crests no lower than the terrain's, shadow where it falls.
 

@@ -7,6 +7,7 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from lunar.camera import ground_point_sphere
 from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
+from lunar.oem import load_oem
 from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.scenario import Scenario
@@ -113,11 +115,7 @@ def world_at(scenario: Scenario, data: DataFolder, epochs_utc_ns: Sequence[int])
         An epoch lies outside the orbit, or the spacecraft is then below the ground.
     """
     first, last = min(epochs_utc_ns), max(epochs_utc_ns)
-    if not scenario.orbit.oem and first < scenario.epoch_utc_ns:
-        raise ScenarioError(
-            f"epoch: expected one at or after the scenario's {format_utc(scenario.epoch_utc_ns)}, "
-            f"found {format_utc(first)}"
-        )
+    _require_covered(scenario, first, last)
     window = replace(
         scenario.window,
         search="none",
@@ -126,14 +124,25 @@ def world_at(scenario: Scenario, data: DataFolder, epochs_utc_ns: Sequence[int])
         latitude_limit_deg=90.0,
     )
     world = build_world(replace(scenario, window=window), data)
-    for utc_ns in (first, last):
-        if not world.truth.start_utc_ns <= utc_ns <= world.truth.stop_utc_ns:
-            raise ScenarioError(
-                f"epoch: expected one from {format_utc(world.truth.start_utc_ns)} to "
-                f"{format_utc(world.truth.stop_utc_ns)}, found {format_utc(utc_ns)}"
-            )
     require_above_ground(world.truth, np.array(sorted(epochs_utc_ns), dtype=np.int64), world.terrain.height_m)
     return world
+
+
+def _require_covered(scenario: Scenario, first_utc_ns: int, last_utc_ns: int) -> None:
+    if not scenario.orbit.oem:
+        if first_utc_ns < scenario.epoch_utc_ns:
+            raise ScenarioError(
+                f"epoch: expected one at or after the scenario's {format_utc(scenario.epoch_utc_ns)}, "
+                f"found {format_utc(first_utc_ns)}"
+            )
+        return
+    ephemeris = load_oem(Path(scenario.orbit.oem))
+    for utc_ns in (first_utc_ns, last_utc_ns):
+        if not ephemeris.start_utc_ns <= utc_ns < ephemeris.stop_utc_ns:
+            raise ScenarioError(
+                f"epoch: expected one from {format_utc(ephemeris.start_utc_ns)} to before "
+                f"{format_utc(ephemeris.stop_utc_ns)} (orbit.oem), found {format_utc(utc_ns)}"
+            )
 
 
 def window_epochs(scenario: Scenario, data: DataFolder, count: int) -> tuple[World, list[int]]:

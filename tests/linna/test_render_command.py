@@ -1,0 +1,158 @@
+"""`linna render`: a frame, sheets, renderers side by side, and what it refuses."""
+
+import json
+
+import cv2
+import pytest
+
+from linna import cli
+
+SMALL = """
+name = "small"
+seed = 5
+[terrain]
+source = "procedural"
+[dynamics]
+degree = 10
+gravity = "builtin"
+[camera]
+width_px = 96
+height_px = 96
+"""
+EPOCHS = ("2029-08-07T00:10:00Z", "2029-08-07T00:20:00Z")
+
+
+@pytest.fixture
+def scenario(tmp_path, monkeypatch):
+    monkeypatch.delenv("LINNA_DATA", raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    file = tmp_path / "small.toml"
+    file.write_text(SMALL)
+    return str(file)
+
+
+def run(capsys, *arguments):
+    status = cli.run(["render", *arguments, "--json"])
+    captured = capsys.readouterr()
+    return status, json.loads(captured.out) if captured.out else None, captured.err
+
+
+def refused(capsys, *arguments):
+    assert cli.run(["render", *arguments]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_a_frame_is_written_with_its_metadata_and_labels(scenario, tmp_path, capsys):
+    out = tmp_path / "a.png"
+    status, figures, _ = run(capsys, scenario, "--epoch", EPOCHS[0], "--out", str(out))
+    assert status == 0 and figures["image"] == str(out)
+    assert cv2.imread(str(out)).shape == (96, 96, 3)
+    assert figures["metadata"]["renderer"] == "fast" and figures["metadata"]["photometry"] == "lunar-lambert"
+    assert figures["labels"] and figures["data"]
+    assert {"u_px", "ellipse", "visible_fraction", "lit_fraction", "sight_fraction"} <= figures["labels"][
+        0
+    ].keys()
+
+
+def test_law_pointing_depth_and_renderer_are_chosen_on_the_command_line(scenario, tmp_path, capsys):
+    out = tmp_path / "b.png"
+    chosen = ("--photometry", "hapke", "--tilt", "4", "--yaw", "90", "--bits", "12", "--renderer", "raymarch")
+    status, figures, _ = run(capsys, scenario, "--epoch", EPOCHS[0], "--out", str(out), *chosen)
+    metadata = figures["metadata"]
+    assert status == 0
+    assert (metadata["photometry"], metadata["tilt_deg"], metadata["azimuth_deg"]) == ("hapke", 4.0, 90.0)
+    assert metadata["camera"]["bits"] == 12 and metadata["renderer"] == "raymarch"
+    assert cv2.imread(str(out), cv2.IMREAD_UNCHANGED).dtype == "uint16"
+
+
+def test_labels_are_drawn_in_the_colours_of_their_classes(scenario, tmp_path, capsys):
+    out = tmp_path / "c.png"
+    status, figures, _ = run(capsys, scenario, "--epoch", EPOCHS[0], "--out", str(out), "--draw-labels")
+    drawn = cv2.imread(str(out))[..., ::-1].astype(int)
+    assert status == 0
+    # Cyan, lime and yellow are the only saturated colours on the Moon.
+    saturated = drawn.max(axis=2) - drawn.min(axis=2) > 120
+    assert saturated.any() == any(
+        label["class"] in (0, 1, 2) and label["inside"] for label in figures["labels"]
+    )
+
+
+def test_a_sheet_holds_the_epochs_named(scenario, tmp_path, capsys):
+    out = tmp_path / "d.png"
+    epochs = [word for epoch in EPOCHS for word in ("--epoch", epoch)]
+    status, figures, _ = run(capsys, scenario, *epochs, "--out", str(out), "--sheet", "--label-rule", "paper")
+    assert status == 0
+    assert [view["epoch"][:16] for view in figures["views"]] == [epoch[:16] for epoch in EPOCHS]
+    assert all(view["label_rule"] == "paper" for view in figures["views"])
+    assert len(figures["instances"]) == 3
+    assert cv2.imread(str(out)).shape[1] > 2 * 96
+
+
+def test_renderers_are_compared_with_figures(scenario, tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("LINNA_BLENDER_PYTHON", raising=False)
+    monkeypatch.setattr("payload_emulator.frame.blender_at_hand", lambda python: False)
+    out = tmp_path / "e.png"
+    status, figures, log = run(capsys, scenario, "--epoch", EPOCHS[0], "--out", str(out), "--compare")
+    assert status == 0 and figures["renderers"] == ["fast", "raymarch"]
+    assert "cycles is left out" in log
+    row = figures["fast_vs_raymarch"]
+    assert row["views"] == 1 and row["radiance_rmse"] <= 0.03 and row["correlation"] > 0.95
+    # Two pictures and the map of their shadows, one under another.
+    assert cv2.imread(str(out)).shape[0] > 3 * 96
+
+
+def test_cycles_without_blender_is_one_line(scenario, tmp_path, capsys, monkeypatch):
+    (tmp_path / "bpy.py").write_text("raise ImportError('none')\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    out = tmp_path / "f.png"
+    line = refused(capsys, scenario, "--epoch", EPOCHS[0], "--out", str(out), "--renderer", "cycles")
+    assert "expected Blender as a module (bpy)" in line and "LINNA_BLENDER_PYTHON" in line
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--epoch", EPOCHS[0], "--out", "x.jpg"), "expected a .png file, found x.jpg"),
+        (("--epoch", EPOCHS[0], "--out", "nowhere/x.png"), "expected an existing folder"),
+        (("--out", "x.png"), "expected one for one frame, found 0"),
+        (("--epoch", "yesterday", "--out", "x.png"), "yesterday"),
+        (("--epoch", "2029-08-06T00:00:00Z", "--out", "x.png"), "at or after the scenario's 2029-08-07"),
+        (("--epoch", EPOCHS[0], "--out", "x.png", "--tilt", "75"), "expected -60 to 60 degrees, found 75"),
+        (("--epoch", EPOCHS[0], "--out", "x.png", "--views", "0"), "expected 1 to 60 frames, found 0"),
+        (("--sheet", "--compare", "--out", "x.png"), "expected one of them, found both"),
+        (("--epoch", EPOCHS[0], "--out", "x.png", "--tilt", "3", "--label-rule", "paper"), "nadir camera"),
+        (("--epoch", EPOCHS[0], "--out", "x.png", "--terrain", "raster"), "height rasters"),
+    ],
+)
+def test_what_cannot_be_rendered_is_one_line(scenario, tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    assert message in refused(capsys, scenario, *arguments)
+    assert not (tmp_path / "x.png").exists()
+
+
+def test_an_unknown_renderer_is_refused_with_the_known_ones(scenario, capsys):
+    assert cli.run(["render", scenario, "--epoch", EPOCHS[0], "--out", "x.png", "--renderer", "magic"]) == 2
+    assert "'fast', 'raymarch', 'cycles'" in capsys.readouterr().err
+
+
+def test_an_ephemeris_below_the_terrain_and_epochs_outside_it_are_one_line(scenario, tmp_path, capsys):
+    oem = tmp_path / "low.oem"
+    states = "\n".join(
+        f"2029-08-07T00:{minute:02d}:00.000 1730.0 {0.1 * minute:.1f} 0.0 0.0 0.0016 0.0"
+        for minute in range(30)
+    )
+    oem.write_text(
+        "CCSDS_OEM_VERS = 2.0\nCREATION_DATE = 2029-01-01T00:00:00\nORIGINATOR = T\nMETA_START\nOBJECT_NAME = A\n"
+        "OBJECT_ID = A\nCENTER_NAME = MOON\nREF_FRAME = ICRF\nTIME_SYSTEM = UTC\nSTART_TIME = 2029-08-07T00:00:00\n"
+        "STOP_TIME = 2029-08-07T00:29:00\nMETA_STOP\n" + states + "\n"
+    )
+    file = tmp_path / "low.toml"
+    file.write_text(SMALL + f'[orbit]\noem = "{oem}"\n')
+    out = str(tmp_path / "x.png")
+    assert "below" in refused(capsys, str(file), "--epoch", EPOCHS[0], "--out", out)
+    assert "2029-08-07T00:29:00" in refused(
+        capsys, str(file), "--epoch", "2029-08-08T00:00:00Z", "--out", out
+    )
