@@ -1,4 +1,4 @@
-"""Renderers: python -m benchmarks render [--poses N] [--every K].
+"""Renderers: python -m benchmarks render [--poses N] [--every K] [--terrain procedural|real].
 
 One JSON object, on the procedural Moon and, where LINNA_DATA names it, on GLD100 terrain no detector was trained on.
 
@@ -199,6 +199,7 @@ def main() -> None:
     parser.add_argument(
         "--every", type=int, default=8, help="march every so-manieth pixel and row (default: 8)"
     )
+    parser.add_argument("--terrain", choices=("procedural", "real"), help="only this one (default: both)")
     arguments = parser.parse_args()
     root = os.environ.get("LINNA_DATA")
     blender = os.environ.get("LINNA_BLENDER_PYTHON", "")
@@ -207,6 +208,8 @@ def main() -> None:
     if root:
         worlds.append(("GLD100, regions never trained on (rung 3)", "raster", root, REAL))
     for name, kind, data, region in worlds:
+        if arguments.terrain and (arguments.terrain == "real") != (kind == "raster"):
+            continue
         terrain = open_terrain(kind, find_data(data), 3)
         results[name] = {
             "speed": speed(terrain, region, blender),
