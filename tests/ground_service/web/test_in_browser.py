@@ -1,9 +1,12 @@
 """What operators do on the pages, done in Chromium."""
 
+import zipfile
+
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import expect
 
+from ground_service.services.regression_archives import pack_archive
 from lunar.ephemeris import ephemeris_from_states
 from lunar.oem import format_oem
 from lunar.timescales import parse_utc
@@ -195,3 +198,38 @@ def test_words_that_could_do_harm_do_not_reach_the_payload(page, console):
     )
     assert [one["kind"] for one in answer] == ["error"] * 4
     assert console.heard == []
+
+
+def zipped(folder, target):
+    with zipfile.ZipFile(target, "w") as packed:
+        for path in sorted(folder.iterdir()):
+            packed.write(path, path.name)
+    return target
+
+
+def test_a_build_is_brought_run_and_judged(page, make_flyable, make_build, tmp_path):
+    flown = make_flyable(frames=12, seed=61)
+    pack_archive(flown.folder, tmp_path / "pass.zip")
+    files = [("regression-archives", tmp_path / "pass.zip")]
+    for name, program in (("good", None), ("broken", "raise SystemExit(4)")):
+        options = {} if program is None else {"program": program}
+        build = make_build(name, {"synthetic pass 61": flown.packets}, **options)
+        files.append(("builds", zipped(build.parent, tmp_path / f"{name}.zip")))
+    settled(page, "/regression")
+    for kind, file in files:
+        page.locator("#zip-kind").select_option(kind)
+        page.locator("#zip").set_input_files(file)
+        page.get_by_role("button", name="Upload").click()
+        expect(page.locator("#notices .good")).to_have_count(1 + files.index((kind, file)))
+    for candidate, verdict in (("good", "passed"), ("broken", "failed")):
+        for select, build in (("#candidate", candidate), ("#baseline", "good")):
+            option = page.locator(f"{select} option", has_text=build)
+            page.locator(select).select_option(option.get_attribute("value"))
+        page.get_by_role("button", name="Run", exact=True).click()
+        latest = page.locator("#regressions tbody tr").first
+        expect(latest).to_contain_text(verdict, timeout=60_000)
+    page.locator("#regressions").get_by_role("button", name="Gates").nth(1).click()
+    expect(page.locator("#regressions table").nth(1)).to_contain_text("recall")
+    with page.expect_popup() as opened:
+        page.locator("#regressions").get_by_role("button", name="Report").first.click()
+    expect(opened.value.get_by_role("heading", level=1)).to_be_visible()
