@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -36,6 +35,8 @@ DAY_NS = 86_400_000_000_000
 NIGHT_NS = 1_800_000_000_000
 """The nightly job is entered at 00:30 UTC."""
 
+SWEEP_S = 15.0
+
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
@@ -53,14 +54,15 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         ground = ground_from_settings(settings)
         app.state.ground = ground
         app.state.dispatcher = dispatcher_for(ground, settings, inline=inline_jobs)
-        app.state.dispatcher.resume()
-        nights = asyncio.create_task(_nights(app, settings))
+        if inline_jobs or settings.resolved_broker_url() is None:
+            app.state.dispatcher.resume()
+        chores = [asyncio.create_task(_nights(app, settings)), asyncio.create_task(_sweeps(app))]
         try:
             yield
         finally:
-            nights.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await nights
+            for chore in chores:
+                chore.cancel()
+            await asyncio.gather(*chores, return_exceptions=True)
             app.state.dispatcher.close()
             ground.close()
 
@@ -111,3 +113,13 @@ async def _nights(app: FastAPI, settings: Settings) -> None:
             )
         except GroundError:
             log.exception("the nightly job could not be entered")
+
+
+async def _sweeps(app: FastAPI) -> None:
+    """Take up, every now and then, jobs that a killed worker, broker or database left unfinished."""
+    while True:
+        await asyncio.sleep(SWEEP_S)
+        try:
+            await run_in_threadpool(app.state.dispatcher.resume)
+        except GroundError as error:
+            log.warning("unfinished jobs could not be taken up: %s", error)

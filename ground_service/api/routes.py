@@ -32,7 +32,8 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.services import ephemerides as ephemeris_service
 from ground_service.services import passes as pass_service
-from ground_service.services.ingest import FLOWN, begin_ingest
+from ground_service.services.ingest import FLOWN
+from ground_service.services.jobs import enter_ingest
 from ground_service.services.passes import STATE_VALUES
 from ground_service.services.plan_schemas import time_of
 from ground_service.services.reports import pass_summary
@@ -127,14 +128,11 @@ async def upload_telemetry(
     dispatcher = request.app.state.dispatcher
 
     def enter() -> tuple[int, str]:
-        if job_id is not None:
-            with ground.database.reading() as connection:
-                known = repository.find(connection, repository.JOBS, id=job_id)
-            if known is not None:
-                return int(known["arguments"]["ingest_id"]), job_id
-        ingest_id = begin_ingest(ground, stored, name)
-        arguments = {"ingest_id": ingest_id, "spacecraft_id": spacecraft_id, "instance": instance}
-        return ingest_id, dispatcher.submit("ingest", arguments, job_id=job_id)
+        ingest_id, job = enter_ingest(
+            ground, stored, name, spacecraft_id=spacecraft_id, instance=instance, job_id=job_id
+        )
+        dispatcher.start(job)
+        return ingest_id, job
 
     ingest_id, job = await run_in_threadpool(enter)
     response.headers["Location"] = f"{API_PREFIX}/ingests/{ingest_id}"

@@ -10,8 +10,10 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from sqlalchemy import Connection
+
 from ground_service.clock import utc_now_ns
-from ground_service.errors import GroundError, InvalidInput
+from ground_service.errors import DatabaseUnavailable, GroundError, InvalidInput
 from ground_service.link.stream import DownlinkReader
 from ground_service.services.ground import Ground
 from ground_service.services.joining import join_with_others
@@ -90,21 +92,26 @@ def ingest_stored(
 
 def begin_ingest(ground: Ground, stored: StoredFile, name: str) -> int:
     """Enter an archived file to be ingested; the id of the ingest."""
-    now = utc_now_ns()
     with ground.database.writing() as connection:
-        repository.register_file(connection, stored, "downlink", name, now)
-        return int(
-            repository.add(
-                connection,
-                repository.INGESTS,
-                vehicle_id=None,
-                file_sha256=stored.sha256,
-                state="queued",
-                dictionary_version=DICTIONARY.version,
-                received_utc_ns=now,
-                accounting={},
-            )
+        return add_ingest(connection, stored, name)
+
+
+def add_ingest(connection: Connection, stored: StoredFile, name: str) -> int:
+    """As `begin_ingest`, within the caller's transaction."""
+    now = utc_now_ns()
+    repository.register_file(connection, stored, "downlink", name, now)
+    return int(
+        repository.add(
+            connection,
+            repository.INGESTS,
+            vehicle_id=None,
+            file_sha256=stored.sha256,
+            state="queued",
+            dictionary_version=DICTIONARY.version,
+            received_utc_ns=now,
+            accounting={},
         )
+    )
 
 
 def run_ingest(
@@ -125,6 +132,8 @@ def run_ingest(
                 "a stream of CADUs or of space packets",
                 f"{result.octets} octets without a single good packet",
             )
+    except DatabaseUnavailable:
+        raise
     except (GroundError, TmtcError) as error:
         with ground.database.writing() as connection:
             repository.change(

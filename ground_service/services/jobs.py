@@ -6,22 +6,27 @@ process, a thread of the server, or a worker on another machine. Doing a finishe
 
 from __future__ import annotations
 
+import hashlib
 import logging
+import threading
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import Connection, select
+from sqlalchemy.exc import IntegrityError
 
 from ground_service.clock import utc_now_ns
-from ground_service.errors import GroundError, InvalidInput
+from ground_service.errors import DatabaseUnavailable, GroundError, InvalidInput
 from ground_service.services.archive_zip import import_zip
 from ground_service.services.feed import publish
 from ground_service.services.ground import Ground
-from ground_service.services.ingest import run_ingest
+from ground_service.services.ingest import add_ingest, run_ingest
 from ground_service.services.reports import make_report
 from ground_service.services.upkeep import nightly
 from ground_service.store import repository
+from ground_service.store.files import StoredFile
 from lunar.errors import LunarError
 from reports.errors import ReportError
 from tmtc.errors import TmtcError
@@ -29,6 +34,9 @@ from tmtc.errors import TmtcError
 log = logging.getLogger(__name__)
 
 FINISHED = ("done", "failed")
+
+ATTEMPTS_LIMIT = 25
+"""A job that ended with its process this often (for want of memory, say) is not tried again."""
 
 Work = Callable[[Ground, Mapping[str, Any], str], dict[str, Any]]
 
@@ -78,11 +86,21 @@ WORK: dict[str, Work] = {
 
 def enter_job(ground: Ground, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
     """Enter a job to be done; its id. Entering the same id again changes nothing."""
+    with ground.database.writing() as connection:
+        return add_job(connection, kind, arguments, job_id=job_id)
+
+
+def add_job(
+    connection: Connection, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None
+) -> str:
+    """As `enter_job`, within the caller's transaction."""
     if kind not in WORK:
         raise InvalidInput("job", "kind", " or ".join(WORK), kind)
     identity = job_id or uuid.uuid4().hex
-    with ground.database.writing() as connection:
-        if repository.find(connection, repository.JOBS, id=identity) is None:
+    if repository.find(connection, repository.JOBS, id=identity) is not None:
+        return identity
+    try:
+        with connection.begin_nested():
             repository.add(
                 connection,
                 repository.JOBS,
@@ -94,12 +112,50 @@ def enter_job(ground: Ground, kind: str, arguments: Mapping[str, Any], *, job_id
                 attempts=0,
                 created_utc_ns=utc_now_ns(),
             )
-            publish(connection, "job", {"id": identity, "kind": kind, "state": "queued"})
+    except IntegrityError:
+        return identity  # another process entered it at the same time
+    publish(connection, "job", {"id": identity, "kind": kind, "state": "queued"})
     return identity
 
 
+def enter_ingest(
+    ground: Ground,
+    stored: StoredFile,
+    name: str,
+    *,
+    spacecraft_id: int | None,
+    instance: str,
+    job_id: str | None = None,
+) -> tuple[int, str]:
+    """Enter an archived file and the job that ingests it, both or neither; their ids. The same job again: the same."""
+    with ground.database.writing() as connection:
+        if job_id is not None:
+            known = repository.find(connection, repository.JOBS, id=job_id)
+            if known is not None:
+                return int(known["arguments"]["ingest_id"]), job_id
+        ingest_id = add_ingest(connection, stored, name)
+        arguments = {"ingest_id": ingest_id, "spacecraft_id": spacecraft_id, "instance": instance}
+        return ingest_id, add_job(connection, "ingest", arguments, job_id=job_id)
+
+
 def run_job(ground: Ground, job_id: str) -> dict[str, Any]:
-    """Do a job that was entered; its row afterwards. A job that fails for its input says why and is not repeated."""
+    """Do a job that was entered; its row afterwards. A job that fails for its input says why and is not repeated.
+
+    A job that somebody else is doing now, here or in another process, is left to that one.
+
+    Raises
+    ------
+    DatabaseUnavailable
+        If the database went away: the job is not at its end, and is to be done again.
+    """
+    with _alone_here(job_id) as here, ground.database.alone(_lock_key(job_id)) as alone:
+        if not (here and alone):
+            with ground.database.reading() as connection:
+                return repository.get(connection, repository.JOBS, job_id, "job")
+        return _run_alone(ground, job_id)
+
+
+def _run_alone(ground: Ground, job_id: str) -> dict[str, Any]:
     with ground.database.writing() as connection:
         job = repository.get(connection, repository.JOBS, job_id, "job")
         if job["state"] in FINISHED:
@@ -113,12 +169,39 @@ def run_job(ground: Ground, job_id: str) -> dict[str, Any]:
             started_utc_ns=utc_now_ns(),
         )
         publish(connection, "job", {"id": job_id, "kind": job["kind"], "state": "running"})
+    if job["attempts"] >= ATTEMPTS_LIMIT:
+        error = f"given up after {ATTEMPTS_LIMIT} attempts that did not come to an end"
+        return _finish(ground, job_id, state="failed", error=error)
     try:
         result = WORK[job["kind"]](ground, job["arguments"], job_id)
+    except DatabaseUnavailable:
+        raise
     except (GroundError, TmtcError, LunarError, ReportError) as error:
         log.warning("job %s (%s) failed: %s", job_id, job["kind"], error)
         return _finish(ground, job_id, state="failed", error=str(error))
     return _finish(ground, job_id, state="done", result=result, progress=1.0, error=None)
+
+
+@contextmanager
+def _alone_here(job_id: str) -> Iterator[bool]:
+    """Whether no other thread of this process does the job."""
+    with _doing_lock:
+        alone = job_id not in _doing
+        _doing.add(job_id)
+    try:
+        yield alone
+    finally:
+        if alone:
+            with _doing_lock:
+                _doing.discard(job_id)
+
+
+_doing: set[str] = set()
+_doing_lock = threading.Lock()
+
+
+def _lock_key(job_id: str) -> int:
+    return int.from_bytes(hashlib.blake2b(job_id.encode(), digest_size=8).digest(), "big", signed=True)
 
 
 def _finish(ground: Ground, job_id: str, **values: Any) -> dict[str, Any]:

@@ -287,7 +287,8 @@ def uplink_window(ground: Ground, window_id: int, *, actor: str) -> list[int]:
         if conflicts:
             raise PlanConflicts(f"window {window_id}", conflicts)
         correlations = load_correlations(connection, row["vehicle_id"])
-        duration_s = (row["stop_utc_ns"] - row["start_utc_ns"]) / NS
+        # The observation ends by the second telecommand; by itself a frame later should that one be lost.
+        duration_s = (row["stop_utc_ns"] - row["start_utc_ns"]) / NS + row["cadence_s"]
         timeout_s = round(max(row["stop_utc_ns"] - utc_now_ns(), 0) / NS) + VERIFICATION_MARGIN_S
         activities = (
             (row["start_utc_ns"], ("start_observation", duration_s, row["cadence_s"])),

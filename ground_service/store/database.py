@@ -6,6 +6,7 @@ write lock at once (BEGIN IMMEDIATE), so that what it reads first is what it cha
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import sqlite3
@@ -66,6 +67,25 @@ class Database:
                 connection.execution_options(linna_write=True)
             with connection.begin():
                 yield connection
+
+    @contextmanager
+    def alone(self, key: int) -> Iterator[bool]:
+        """Whether no other process holds `key` (64 bit, signed) now; it is held until the end, or the process's.
+
+        A SQLite database serves the jobs of one process only, which then is alone anyway.
+        """
+        if self.dialect != "postgresql":
+            yield True
+            return
+        with self._translated(), self.engine.connect() as connection:
+            connection = connection.execution_options(isolation_level="AUTOCOMMIT")
+            held = bool(connection.execute(text("SELECT pg_try_advisory_lock(:key)"), {"key": key}).scalar())
+            try:
+                yield held
+            finally:
+                if held and not connection.invalidated:
+                    with contextlib.suppress(SQLAlchemyError):
+                        connection.execute(text("SELECT pg_advisory_unlock(:key)"), {"key": key})
 
     @contextmanager
     def _translated(self) -> Iterator[None]:

@@ -12,7 +12,7 @@ from celery import Celery
 from celery.schedules import crontab
 
 from ground_service.clock import utc_now_ns
-from ground_service.errors import SettingsError
+from ground_service.errors import DatabaseUnavailable, SettingsError
 from ground_service.services.ground import Ground, ground_from_settings
 from ground_service.services.jobs import enter_job, run_job
 from ground_service.services.upkeep import nightly_job_id
@@ -22,6 +22,7 @@ RUN_JOB = "ground_service.run_job"
 NIGHTLY = "ground_service.nightly"
 TIME_LIMIT_S = 1800
 RETRIES = 5
+QUEUE = "linna"
 VISIBILITY_TIMEOUT_S = 2 * TIME_LIMIT_S
 
 
@@ -42,8 +43,8 @@ def make_app(settings: Settings) -> Celery:
         worker_prefetch_multiplier=1,
         worker_hijack_root_logger=False,
         broker_connection_retry_on_startup=True,
-        broker_transport_options={"visibility_timeout": VISIBILITY_TIMEOUT_S},
-        task_default_queue="linna",
+        broker_transport_options={"visibility_timeout": VISIBILITY_TIMEOUT_S, "socket_timeout": 10.0},
+        task_default_queue=QUEUE,
         worker_max_tasks_per_child=200,
         timezone="UTC",
         beat_schedule={"nightly": {"task": NIGHTLY, "schedule": crontab(minute=30, hour=0)}},
@@ -52,7 +53,7 @@ def make_app(settings: Settings) -> Celery:
     @app.task(
         name=RUN_JOB,
         bind=True,
-        autoretry_for=(OSError,),
+        autoretry_for=(OSError, DatabaseUnavailable),
         retry_backoff=2,
         retry_backoff_max=120,
         max_retries=RETRIES,
@@ -77,7 +78,21 @@ def send_job(settings: Settings, job_id: str) -> None:
     kombu.exceptions.OperationalError
         If the broker cannot be reached.
     """
-    _app_of(settings).send_task(RUN_JOB, args=(job_id,))
+    _app_of(settings).send_task(RUN_JOB, args=(job_id,), retry=False)
+
+
+def queue_length(settings: Settings) -> int:
+    """Jobs that wait at the broker for a worker.
+
+    Raises
+    ------
+    kombu.exceptions.OperationalError
+        If the broker cannot be reached.
+    """
+    app = _app_of(settings)
+    with app.connection_for_read() as connection:
+        connection.ensure_connection(max_retries=1, timeout=5)
+        return int(connection.default_channel._size(QUEUE))
 
 
 def application() -> Celery:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import logging
+import threading
 from collections.abc import Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
 
 from ground_service.services.ground import Ground
 from ground_service.services.jobs import enter_job, run_job, unfinished_jobs
 from ground_service.settings import Settings
+
+log = logging.getLogger(__name__)
 
 
 class Dispatcher(Protocol):
@@ -17,8 +21,11 @@ class Dispatcher(Protocol):
     def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
         """Enter a job and have it done; its id."""
 
+    def start(self, job_id: str) -> None:
+        """Have a job done that was entered already."""
+
     def resume(self) -> None:
-        """Take up jobs that an earlier process left unfinished."""
+        """Take up jobs that somebody left unfinished; may be called as often as one likes."""
 
     def close(self) -> None:
         """Let jobs that run here come to their end."""
@@ -32,8 +39,11 @@ class InlineDispatcher:
 
     def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
         identity = enter_job(self._ground, kind, arguments, job_id=job_id)
-        run_job(self._ground, identity)
+        self.start(identity)
         return identity
+
+    def start(self, job_id: str) -> None:
+        run_job(self._ground, job_id)
 
     def resume(self) -> None:
         for identity in unfinished_jobs(self._ground):
@@ -49,21 +59,33 @@ class ThreadDispatcher:
     def __init__(self, ground: Ground) -> None:
         self._ground = ground
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="job")
-        self.pending: set[Future[Any]] = set()
+        self._waiting: set[str] = set()
+        self._lock = threading.Lock()
 
     def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
         identity = enter_job(self._ground, kind, arguments, job_id=job_id)
-        self._start(identity)
+        self.start(identity)
         return identity
+
+    def start(self, job_id: str) -> None:
+        with self._lock:
+            if job_id in self._waiting:
+                return
+            self._waiting.add(job_id)
+        self._pool.submit(self._run, job_id)
 
     def resume(self) -> None:
         for identity in unfinished_jobs(self._ground):
-            self._start(identity)
+            self.start(identity)
 
-    def _start(self, identity: str) -> None:
-        future = self._pool.submit(run_job, self._ground, identity)
-        self.pending.add(future)
-        future.add_done_callback(self.pending.discard)
+    def _run(self, job_id: str) -> None:
+        try:
+            run_job(self._ground, job_id)
+        except Exception:  # the thread's outermost loop: the job stays unfinished and is taken up again
+            log.exception("job %s came to no end", job_id)
+        finally:
+            with self._lock:
+                self._waiting.discard(job_id)
 
     def close(self) -> None:
         self._pool.shutdown(wait=True)
@@ -77,14 +99,38 @@ class CeleryDispatcher:
         self._settings = settings
 
     def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
-        from ground_service.worker.app import send_job
-
         identity = enter_job(self._ground, kind, arguments, job_id=job_id)
-        send_job(self._settings, identity)
+        self.start(identity)
         return identity
 
+    def start(self, job_id: str) -> None:
+        """Send a job to the workers; a broker that is away gets it from `resume` later."""
+        from kombu.exceptions import OperationalError
+
+        from ground_service.worker.app import send_job
+
+        try:
+            send_job(self._settings, job_id)
+        except (OperationalError, OSError) as error:
+            log.warning("job %s: the broker is away (%s); it will be sent again", job_id, error)
+
     def resume(self) -> None:
-        """The broker keeps what was sent to it; nothing is to be done here."""
+        """Send unfinished jobs again when the queue is empty: a broker or a worker that was killed may have lost them.
+
+        One that a worker is doing is done once all the same: `run_job` leaves it to that worker.
+        """
+        from kombu.exceptions import OperationalError
+
+        from ground_service.worker.app import queue_length
+
+        try:
+            if queue_length(self._settings) > 0:
+                return
+        except (OperationalError, OSError) as error:
+            log.warning("the broker is away: %s", error)
+            return
+        for identity in unfinished_jobs(self._ground):
+            self.start(identity)
 
     def close(self) -> None:
         pass

@@ -141,7 +141,7 @@ def test_an_approved_window_becomes_time_tagged_telecommands(client: TestClient)
         assert packet.values["release_ticks"] == int(ticks_from_utc_ns(START + seconds * NS))
         inner.append(DICTIONARY.unpack_command(bytes(packet.values["items"]["octet"].astype("u1"))))
     assert [one.values["function_id"] for one in inner] == [2, 3]
-    assert (inner[0].values["argument_1"], inner[0].values["argument_2"]) == (300.0, 10.0)
+    assert (inner[0].values["argument_1"], inner[0].values["argument_2"]) == (310.0, 10.0)
     counts = [one.sequence_count for one in (*packets, *inner)]
     assert len(set(counts)) == len(counts)
     assert client.get(f"{V1}/windows/{key}").json()["state"] == "uplinked"

@@ -1,0 +1,1 @@
+"""Campaigns: long trials that are run by hand."""
