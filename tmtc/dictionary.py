@@ -347,6 +347,25 @@ def _second_telemetry() -> tuple[PacketDefinition, ...]:
             ),
         ),
         PacketDefinition(
+            "landmarks", APID_DETECTIONS, 129, 6, "Craters that the payload mapped itself, new or improved",
+            (*_FRAME, Field("count", "u8", "Number of landmarks that follow")),
+            Group(
+                "count",
+                (
+                    Field("landmark_id", "u32", "Identity, as in the pairs of fixes"),
+                    Field("latitude_deg", "f64", "Latitude of the centre, mean-Earth frame", "deg"),
+                    Field("longitude_deg", "f64", "Longitude of the centre, mean-Earth frame", "deg"),
+                    Field("height_m", "f32", "Height of the rim above the 1737.4 km sphere", "m"),
+                    Field("diameter_m", "f32", "Diameter", "m"),
+                    Field("sigma_east_m", "f32", "Standard deviation to the east", "m"),
+                    Field("sigma_north_m", "f32", "Standard deviation to the north", "m"),
+                    Field("sigma_up_m", "f32", "Standard deviation upwards", "m"),
+                    Field("sightings", "u8", "Frames in which it was seen", saturate=True),
+                    Field("passes", "u8", "Passes on which it was mapped", saturate=True),
+                ),
+            ),
+        ),
+        PacketDefinition(
             "performance", APID_PERFORMANCE, 3, 25, "Periodic state of the machine",
             (
                 Field("structure_id", "u16", "Housekeeping structure, always 2", minimum=2, maximum=2),

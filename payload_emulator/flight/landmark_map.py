@@ -15,6 +15,7 @@ Frame: MCMF (ME). Memory is bounded: tracks, sightings per track and landmarks h
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -178,24 +179,17 @@ class LandmarkMapper:
 
     def with_catalogue(self, catalogue: CatalogueTable) -> LandmarkMap:
         """Return the catalogue with the landmarks added, ready for use."""
-        chosen = list(self.landmarks.values())
-        if not chosen:
+        if not self.landmarks:
             return landmark_map(catalogue)
-        places = np.stack([landmark.position_mcmf_m for landmark in chosen])
-        radius = np.linalg.norm(places, axis=1)
-        latitude, longitude = np.arcsin(places[:, 2] / radius), np.arctan2(places[:, 1], places[:, 0])
-        axes = enu_from_mcmf(latitude, longitude)
-        covariance = np.stack([landmark.covariance_m2 for landmark in chosen])
-        local = np.einsum("nij,njk,nlk->nil", axes, covariance, axes)
-        sigma = np.sqrt(np.maximum(np.diagonal(local, axis1=1, axis2=2), 1.0))
+        rows = map_rows(list(self.landmarks.values()))
         return landmark_map(
             CatalogueTable(
-                np.concatenate([catalogue.ids, [landmark.identity for landmark in chosen]]),
-                np.concatenate([catalogue.latitude_rad, latitude]),
-                np.concatenate([catalogue.longitude_rad, longitude]),
-                np.concatenate([catalogue.diameter_m, [landmark.diameter_m for landmark in chosen]]),
-                np.concatenate([catalogue.rim_height_m, radius - MOON_RADIUS_M]),
-                np.concatenate([catalogue.sigma_m, sigma]),
+                np.concatenate([catalogue.ids, rows.identity]),
+                np.concatenate([catalogue.latitude_rad, rows.latitude_rad]),
+                np.concatenate([catalogue.longitude_rad, rows.longitude_rad]),
+                np.concatenate([catalogue.diameter_m, rows.diameter_m]),
+                np.concatenate([catalogue.rim_height_m, rows.height_m]),
+                np.concatenate([catalogue.sigma_m, rows.sigma_m]),
             )
         )
 
@@ -426,6 +420,40 @@ def intersected(first: Landmark, second: Landmark) -> Landmark:
         total,
         first.passes + second.passes,
         max(first.ticks, second.ticks),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapRows:
+    """Landmarks as columns of one length; heights above the sphere of the maps, sigma east, north, up (n, 3)."""
+
+    identity: Index
+    latitude_rad: Float
+    longitude_rad: Float
+    height_m: Float
+    diameter_m: Float
+    sigma_m: Float
+    sightings: Index
+    passes: Index
+
+
+def map_rows(landmarks: Sequence[Landmark]) -> MapRows:
+    """Return landmarks as columns."""
+    places = np.array([landmark.position_mcmf_m for landmark in landmarks]).reshape(-1, 3)
+    radius = np.linalg.norm(places, axis=1)
+    latitude, longitude = np.arcsin(places[:, 2] / radius), np.arctan2(places[:, 1], places[:, 0])
+    axes = enu_from_mcmf(latitude, longitude)
+    covariance = np.array([landmark.covariance_m2 for landmark in landmarks]).reshape(-1, 3, 3)
+    local = axes @ covariance @ np.swapaxes(axes, 1, 2)
+    return MapRows(
+        np.array([landmark.identity for landmark in landmarks], dtype=np.int64),
+        latitude,
+        longitude,
+        radius - MOON_RADIUS_M,
+        np.array([landmark.diameter_m for landmark in landmarks]),
+        np.sqrt(np.maximum(np.diagonal(local, axis1=1, axis2=2), 1.0)),
+        np.array([landmark.sightings for landmark in landmarks], dtype=np.int64),
+        np.array([landmark.passes for landmark in landmarks], dtype=np.int64),
     )
 
 

@@ -16,6 +16,7 @@ from payload_emulator.flight import odometry
 from payload_emulator.flight.anchored import AnchoredNavigator
 from payload_emulator.flight.detections import Detections, Detector, no_detections
 from payload_emulator.flight.housekeeping import StageTimer
+from payload_emulator.flight.landmark_map import map_rows
 from payload_emulator.flight.loads import TABLE_NUMBERS, FlightParameters, FlightTables
 from payload_emulator.flight.odometry import OdometryState
 from payload_emulator.flight.outcomes import Mode, Outcome, ResetTrigger
@@ -40,6 +41,7 @@ _NAN = float("nan")
 _UNKNOWN_VECTOR = (_NAN, _NAN, _NAN)
 _PIXEL_LIMIT = 65_535 / 64.0
 _MILLISECOND_NS = 1e6
+_LANDMARKS_A_PACKET = 40
 
 
 class Observer:
@@ -298,6 +300,21 @@ class Observer:
             }
             self.sightings.update(pairs["crater_id"].tolist())
             self._telemetry.send("identifications", {**frame, "items": pairs})
+        for first in range(0, len(navigator.new_landmarks), _LANDMARKS_A_PACKET):
+            rows = map_rows(navigator.new_landmarks[first : first + _LANDMARKS_A_PACKET])
+            items = {
+                "landmark_id": rows.identity,
+                "latitude_deg": np.degrees(rows.latitude_rad),
+                "longitude_deg": np.degrees(rows.longitude_rad) % 360.0,
+                "height_m": rows.height_m,
+                "diameter_m": rows.diameter_m,
+                "sigma_east_m": rows.sigma_m[:, 0],
+                "sigma_north_m": rows.sigma_m[:, 1],
+                "sigma_up_m": rows.sigma_m[:, 2],
+                "sightings": rows.sightings,
+                "passes": rows.passes,
+            }
+            self._telemetry.send("landmarks", {**frame, "items": items})
 
     def _trouble(self, event: str, present: bool, value_1: float, value_2: float) -> None:
         """Report the beginning of a lasting trouble, once."""

@@ -18,6 +18,7 @@ _CLASSES = {
     "frame_outcome": StoreClass.navigation,
     "filter_state": StoreClass.navigation,
     "identifications": StoreClass.navigation,
+    "landmarks": StoreClass.navigation,
     "large_data_first": StoreClass.bulk,
     "large_data_middle": StoreClass.bulk,
     "large_data_last": StoreClass.bulk,
