@@ -208,7 +208,7 @@ def load_image(folder: Path, item: StepInput) -> Image:
     pixels = cv2.imdecode(octets, cv2.IMREAD_UNCHANGED) if octets.size else None
     if pixels is None:
         raise RecordError(f"{path}: expected a PNG image, found something else")
-    image: Image = np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels)
+    image: Image = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB) if pixels.ndim == 3 else pixels
     check_image(item, image, str(path))
     return image
 
