@@ -1,0 +1,83 @@
+"""The payload as a machine: memory when idle, and a year of housekeeping without growth: python -m benchmarks.machine.
+
+Memory is the resident set of this process, which runs nothing but flight software (with its network loaded) on a board.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from payload_emulator.flight.ports import BareBoard
+
+_MINUTE_TICKS = 60 * 65_536
+_START_TICKS = 61_000_000_000_000
+_CONTACT_EVERY, _CONTACT_OCTETS = 120, 4 << 20
+
+
+class _Board(BareBoard):
+    """A bare board whose link comes and goes."""
+
+    takes = 0
+
+    def downlink_octets(self) -> int:
+        return self.takes
+
+
+def bench(days: float = 60.0) -> dict[str, Any]:
+    """Resident memory idle, and after every month of `days` of one-minute turns, with a contact each two hours."""
+    from payload_emulator.flight.detector import OnnxDetector
+    from payload_emulator.flight.models import load_shipped_model
+    from payload_emulator.flight.payload import Payload, PayloadMode
+    from tmtc.dictionary import DICTIONARY
+
+    model = load_shipped_model()
+    detector = OnnxDetector(model)
+    board = _Board()
+    payload = Payload(
+        detector, model_hash=detector.model_hash, model_octets=model, board=board, mode=PayloadMode.standby
+    )
+    # Checking four megabytes of memory every minute of a year would be all that is measured.
+    hourly = DICTIONARY.pack_command("set_parameter", {"parameter_id": 15, "value": 3600.0}, sequence_count=0)
+    image, attitude = np.zeros((0, 0), np.uint8), np.full(7, np.nan)
+    board.takes = _CONTACT_OCTETS
+    payload.step(image, attitude, _START_TICKS, hourly)
+    idle_mib = _resident_mib()
+    turns = round(days * 1440)
+    packets = octets = 0
+    months: list[float] = []
+    started = time.process_time()
+    for turn in range(1, turns + 1):
+        board.takes = _CONTACT_OCTETS if turn % _CONTACT_EVERY == 0 else 0
+        sent = payload.step(image, attitude, _START_TICKS + turn * _MINUTE_TICKS, b"")
+        packets += len(sent)
+        octets += sum(map(len, sent))
+        if turn % (30 * 1440) == 0:
+            months.append(round(_resident_mib(), 2))
+    seconds = time.process_time() - started
+    return {
+        "idle_resident_mib": round(idle_mib, 1),
+        "days": days,
+        "turns": turns,
+        "packets": packets,
+        "octets": octets,
+        "resident_mib_by_month": months,
+        "growth_mib": round(months[-1] - months[0], 2) if months else 0.0,
+        "waiting": payload.waiting,
+        "cpu_s": round(seconds, 1),
+        "turns_per_cpu_s": round(turns / seconds),
+    }
+
+
+def _resident_mib() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * 4096 / 2**20
+
+
+if __name__ == "__main__":
+    print(json.dumps(bench(float(sys.argv[1]) if len(sys.argv) > 1 else 60.0), indent=1))

@@ -1,0 +1,106 @@
+"""A pass with contacts, losses and faults, without rendering: the archive's own account is what the ground finds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lunar.datafolder import find_data
+from payload_emulator.emulator import emulate
+from payload_emulator.scenario import parse_scenario
+from tmtc.downlink import decode
+
+SCENARIO = """
+name = "lossy"
+seed = 11
+[dynamics]
+gravity = "builtin"
+degree = 8
+orientation = "iau"
+[window]
+search = "none"
+start = "2029-08-08T02:30:00Z"
+duration_s = 6600.0
+[camera]
+images = "reduced"
+frame_interval_s = 30.0
+[terrain]
+source = "procedural"
+[navigation]
+estimators = ["spherical"]
+filter_gravity = "builtin"
+filter_degree = 8
+[link]
+stations = ["goldstone", "madrid", "canberra"]
+minimum_elevation_deg = 5.0
+rate_bps = 16000.0
+frame_loss = 0.02
+burst_start = 0.01
+burst_end = 0.3
+burst_frame_loss = 0.3
+burst_bit_error_rate = 5e-3
+repeat_share = 0.2
+reorder_share = 0.2
+playback = true
+[faults]
+events = ["processor_hang at 600", "camera_dark at 1200 for 120"]
+"""
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    out = tmp_path_factory.mktemp("lossy") / "pass"
+    return emulate(parse_scenario(SCENARIO), find_data(None), out), out
+
+
+def test_every_octet_of_a_lossy_downlink_is_accounted_for(archive: tuple[dict[str, Any], Path]) -> None:
+    summary, out = archive
+    link, octets = summary["link"], (out / "downlink.cadu").read_bytes()
+    found = decode(octets).accounting()
+    for key in ("frames", "frames_bad", "packets", "duplicates"):
+        assert found[key] == link[key], key
+    assert sum(found["octets"].values()) == link["octets"] == len(octets)
+    assert (found["crc_errors"], found["conflicts"], found["unknown"]) == (0, 0, 0)
+    # Late playback and repeated dumps make copies; what is missing by its counts was lost on the link.
+    assert link["duplicates"] > 0 and link["packets_lost"] > 0
+    assert found["packets_missing"] <= link["packets_lost"]
+    assert json.loads((out / "summary.json").read_text())["link"] == link
+
+
+def test_the_machine_tells_of_its_faults_and_finishes_the_window(
+    archive: tuple[dict[str, Any], Path],
+) -> None:
+    summary, out = archive
+    assert summary["resets"] == ["watchdog"]
+    assert summary["mode"] in ("standby", "downlinking")
+    tables = decode((out / "downlink.cadu").read_bytes()).tables()
+    events = {
+        int(code) for name, t in tables.items() if name.startswith("event_") for code in t.columns["event_id"]
+    }
+    # boot, activity released, image dark, watchdog reset, state recovered
+    assert {1, 5, 16, 50, 57} <= events
+    quantities = tables["housekeeping"].columns
+    assert quantities["boot_count"].max() == 2
+    assert 20.0 > quantities["power_w"].max() > quantities["power_w"].min() > 1.0
+    assert 10.0 < quantities["bus_voltage_v"].min() <= quantities["bus_voltage_v"].max() < 13.0
+
+
+def test_no_frame_is_seen_twice_and_none_goes_back_in_time(archive: tuple[dict[str, Any], Path]) -> None:
+    _, out = archive
+    table = decode((out / "downlink.cadu").read_bytes()).tables()["detections"]
+    _, first = np.unique(table.ticks, return_index=True)
+    frames = table.columns["frame_number"][first]
+    assert np.all(np.diff(frames) >= 1)
+
+
+def test_the_dumps_are_listed_with_the_times_they_left(archive: tuple[dict[str, Any], Path]) -> None:
+    summary, out = archive
+    head, *rows = (out / "dumps.csv").read_text().splitlines()
+    assert head == "sent_utc,virtual_channel,packets,octets"
+    assert len(rows) == summary["link"]["dumps"]
+    assert sum(int(row.split(",")[2]) for row in rows) == summary["packets"]
+    assert {row.split(",")[1] for row in rows} == {"0", "1"}
