@@ -264,7 +264,8 @@ def write_shard(folder: Path, name: str, labels: ShardLabels) -> str:
 def load_shard(path: Path) -> ShardLabels:
     """Labels of one shard."""
     try:
-        with np.load(path) as stored:
+        # Opened here: numpy leaves a damaged file open.
+        with path.open("rb") as stream, np.load(stream) as stored:
             craters = {key: stored[f"crater_{key}"] for key in CRATER_COLUMNS}
             count = craters["id"].size
             before = {"major_px": craters["diameter_px"], "minor_px": craters["diameter_px"]}

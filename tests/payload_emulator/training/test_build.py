@@ -1,7 +1,13 @@
 """Rendered data sets: the same frames whatever the order, resumable, kept apart by footprint."""
 
 import dataclasses
+import functools
 import json
+import os
+import resource
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +16,7 @@ import pytest
 from lunar.datafolder import find_data
 from payload_emulator.errors import DatasetError
 from payload_emulator.training import dataset as store
-from payload_emulator.training.build import build, make_shard, plan_shards
+from payload_emulator.training.build import _runs, build, make_shard, plan_shards
 from payload_emulator.training.integrity import check
 from payload_emulator.training.recipe import Recipe, Source, load_recipe
 
@@ -26,6 +32,28 @@ RECIPE = Recipe(
     ),
     frames_per_shard=1,
 )
+
+TOML = """[dataset]
+name = "tiny"
+seed = 7
+frames_per_shard = 1
+[[dataset.source]]
+name = "world"
+split = "train"
+terrain = "procedural"
+share = 0.5
+seeds = [41]
+altitude_km = [14.0, 16.0]
+[[dataset.source]]
+name = "world-test"
+split = "test"
+terrain = "procedural"
+share = 0.5
+seeds = [41]
+light = "low"
+vary = false
+altitude_km = [14.0, 16.0]
+"""
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +87,135 @@ def test_a_finished_data_set_is_not_made_again(built, monkeypatch):
 
     monkeypatch.setattr("payload_emulator.training.build.make_shard", refuse)
     assert list(build(RECIPE, folder, 3, find_data(None))) == [(4, 4)]
+
+
+def test_a_build_killed_at_work_goes_on_to_the_same_bytes(built, tmp_path):
+    """SIGKILL, so that nothing can tidy up."""
+    folder, _ = built
+    recipe = tmp_path / "tiny.toml"
+    recipe.write_text(TOML)
+    assert load_recipe(recipe).digest == RECIPE.digest
+    target = tmp_path / "set"
+    command = [
+        sys.executable,
+        "-m",
+        "linna",
+        "dataset",
+        "build",
+        str(recipe),
+        "--out",
+        str(target),
+        "--frames",
+        "3",
+    ]
+    environment = {key: value for key, value in os.environ.items() if key != "LINNA_DATA"}
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": ROOT, "env": environment}
+    with subprocess.Popen(command, **quiet) as first:
+        while first.poll() is None and not list(target.glob("shards/*.npz")):
+            time.sleep(0.02)
+        first.kill()
+    (target / "images" / ".000002.png.4711").write_bytes(b"half a picture")
+    done = len(list(target.glob("shards/*.npz")))
+    assert 1 <= done < 4
+    list(build(load_recipe(recipe), target, 3, find_data(None)))
+    assert check(target) == []
+    ours, theirs = (
+        {p.relative_to(f): p.read_bytes() for p in f.rglob("*") if p.is_file()} for f in (folder, target)
+    )
+    assert ours == theirs
+
+
+def test_a_full_disk_loses_nothing_that_was_finished(tmp_path):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    folder = tmp_path / "set"
+    steps = build(RECIPE, folder, 3, find_data(None))
+    next(steps), next(steps)
+    try:
+        # A picture has more than a hundred thousand octets.
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+        with pytest.raises(
+            DatasetError, match=r"File too large.*; 1 of 4 frames are kept, the same command goes on"
+        ):
+            list(steps)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [path.name for path in folder.rglob(".*")] == []
+    assert next(build(RECIPE, folder, 3, find_data(None))) == (1, 4)
+
+
+def test_a_dead_worker_is_said_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr("payload_emulator.training.build._follow_parent", functools.partial(os._exit, 9))
+    with pytest.raises(DatasetError, match=r"a worker process died .*; 0 of 4 frames are kept"):
+        list(build(RECIPE, tmp_path / "set", 3, find_data(None), workers=2))
+
+
+def test_two_builds_do_not_write_to_one_folder(tmp_path):
+    steps = build(RECIPE, tmp_path / "set", 3, find_data(None))
+    assert next(steps) == (0, 4)
+    with pytest.raises(DatasetError, match="found another build under way"):
+        next(build(RECIPE, tmp_path / "set", 3, find_data(None)))
+    steps.close()
+    assert next(build(RECIPE, tmp_path / "set", 3, find_data(None))) == (0, 4)
+
+
+def test_neighbouring_shards_go_to_one_worker():
+    recipe = dataclasses.replace(RECIPE, frames_per_shard=1)
+    shards = plan_shards(recipe, 80)
+    runs = list(_runs(shards, 2))
+    assert [shard.number for run in runs for shard in run] == list(range(80))
+    assert max(map(len, runs)) == 8
+    assert all(len({(s.source.name, s.seed) for s in run}) == 1 for run in runs)
+
+
+def test_sixteen_bits_show_what_eight_do(built, tmp_path):
+    import cv2
+
+    folder, _ = built
+    for name in ("images", "metadata", "shards"):
+        (tmp_path / name).mkdir()
+    shard = plan_shards(RECIPE, 3)[-1]
+    make_shard(dataclasses.replace(RECIPE, bits=16), shard, tmp_path, "")
+    name = f"images/{shard.first_frame:06d}.png"
+    deep = cv2.imread(str(tmp_path / name), cv2.IMREAD_UNCHANGED)
+    plain = cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED)
+    assert deep.dtype == np.uint16 and np.unique(deep).size > 2000
+    # One step of eight bits.
+    assert np.abs(deep / 257.0 - plain).max() < 1.5
+
+
+def test_metadata_tell_pose_corners_and_sun(built):
+    folder, _ = built
+    document = json.loads((folder / "metadata" / "000003.json").read_text())
+    for key in ("latitude_deg", "longitude_deg", "altitude_km", "tilt_deg", "azimuth_deg", "corners_deg"):
+        assert key in document
+    rotation = np.array(document["camera_from_mcmf"])
+    np.testing.assert_allclose(rotation @ document["sun_mcmf"], document["sun_camera"], atol=1e-12)
+    assert len(document["corners_deg"]) == 4
+
+
+def test_ellipses_of_coco_lie_in_their_boxes(built):
+    folder, _ = built
+    annotations = json.loads((folder / "coco_train.json").read_text())["annotations"]
+    assert len(annotations) >= 15
+    for a in annotations:
+        u, v, half_major, half_minor, angle_deg = a["ellipse"]
+        angle, around = np.radians(angle_deg), np.linspace(0.0, 2.0 * np.pi, 181)
+        x = (
+            u
+            + half_major * np.cos(around) * np.cos(angle)
+            - half_minor * np.sin(around) * np.sin(angle)
+            + 0.5
+        )
+        y = (
+            v
+            + half_major * np.cos(around) * np.sin(angle)
+            + half_minor * np.sin(around) * np.cos(angle)
+            + 0.5
+        )
+        box = [x.min(), y.min(), np.ptp(x), np.ptp(y)]
+        # Rounded to a hundredth of a pixel and of a degree, and looked at every two degrees.
+        np.testing.assert_allclose(box, a["bbox"], atol=0.03 + 2e-4 * half_major)
+        assert half_major >= half_minor > 0.0 and 0.0 < a["visible"] <= 1.0
 
 
 def test_another_data_set_in_the_folder_is_refused(built):

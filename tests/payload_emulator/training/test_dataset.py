@@ -6,9 +6,12 @@ import shutil
 import numpy as np
 import pytest
 
+from lunar.catalogue import size_class
 from payload_emulator.errors import DatasetError
 from payload_emulator.training import dataset as store
 from payload_emulator.training.integrity import check
+from payload_emulator.training.sheet import CLASS_COLOURS, draw_frame, draw_sheet
+from payload_emulator.training.summary import summarise
 from payload_emulator.training.targets import Tier
 
 
@@ -37,9 +40,97 @@ def test_every_missing_or_damaged_file_is_named(copy):
     (copy / "images" / "000003.png").unlink()
     (copy / "images" / "000004.png").write_bytes(b"\x89PNG broken")
     (copy / "metadata" / "000005.json").unlink()
+    (copy / "coco_val.json").unlink()
+    coco = copy / "coco_train.json"
+    coco.write_bytes(coco.read_bytes().replace(b"2", b"3", 1))
     problems = "\n".join(check(copy))
-    for name in ("000003.png", "000004.png", "000005.json"):
+    for name in ("000003.png", "000004.png", "000005.json", "coco_val.json", "coco_train.json"):
         assert name in problems
+
+
+@pytest.mark.parametrize("missing", [True, False])
+def test_a_lost_shard_does_not_hide_the_rest(copy, missing):
+    (copy / "images" / "000025.png").unlink()
+    path = copy / "shards" / "00000.npz"
+    if missing:
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:-30])
+    problems = check(copy)
+    assert any("00000.npz" in problem and "build again" in problem for problem in problems)
+    assert any("000025.png" in problem for problem in problems)
+
+
+def test_a_changed_index_is_found(copy):
+    path = copy / "dataset.json"
+    index = json.loads(path.read_text())
+    index["camera"]["fov_deg"] = 119.0
+    path.write_text(json.dumps(index))
+    assert any("dataset.json" in problem for problem in check(copy))
+    path.write_text("{")
+    assert any("dataset.json: expected a JSON object" in problem for problem in check(copy))
+
+
+def test_an_unfinished_data_set_is_told_from_none(copy):
+    (copy / "dataset.json").unlink()
+    with pytest.raises(DatasetError, match="found none"):
+        check(copy)
+    (copy / "recipe.json").write_text("{}")
+    for open_it in (check, store.Dataset):
+        with pytest.raises(DatasetError, match="found an unfinished one"):
+            open_it(copy)
+
+
+def test_rims_of_older_data_sets_are_round(copy):
+    frame = store.Dataset(copy).frames()[0]
+    np.testing.assert_array_equal(frame.craters["major_px"], frame.craters["diameter_px"])
+    assert set(frame.craters["visible"]) == {1.0}
+
+
+def test_counts_stand_beside_the_papers(blob_dataset):
+    figures = summarise(blob_dataset.folder)
+    assert figures["frames"] == 34 and figures["split"] == {"train": 24, "val": 6, "test": 4}
+    assert [sum(k) for k in zip(*figures["instances_by_split"].values(), strict=True)] == figures["instances"]
+    # The paper, section V-B.4: 51,924 frames, 72.8, 16.9 and 10.3 per cent.
+    assert figures["paper"]["instances"] == [956_110, 221_860, 135_098]
+    assert [round(100 * share, 1) for share in figures["paper"]["shares"]] == [72.8, 16.9, 10.3]
+    assert figures["paper"]["instances_per_frame"][0] == pytest.approx(18.41, abs=0.01)
+
+
+def test_a_sheet_shows_rims_in_the_papers_colours(blob_dataset):
+    frame = blob_dataset.frames("train")[0]
+    picture = draw_frame(blob_dataset, frame)
+    for k in range(frame.craters["id"].size):
+        u, v, d = (float(frame.craters[name][k]) for name in ("u_px", "v_px", "diameter_px"))
+        colour = CLASS_COLOURS[int(size_class(np.array([frame.craters["diameter_m"][k]]))[0])]
+        top = picture[round(v - d / 2) - 1 : round(v - d / 2) + 2, round(u)].astype(int)
+        # The line is one pixel wide and smoothed: nearest the colour of its class somewhere across it.
+        assert np.abs(top - colour).sum(axis=1).min() < 250
+    sheet = draw_sheet(blob_dataset, "test", columns=2, rows=2, tile_px=128)
+    assert sheet.shape == (2 * 152 + 6, 2 * 134 + 6, 3)
+    with pytest.raises(DatasetError, match="expected frames of split 'night', found none"):
+        draw_sheet(blob_dataset, "night")
+
+
+def test_sixteen_bits_are_stored_and_read_as_eight(tmp_path):
+    deep = (np.arange(64 * 64, dtype=np.uint16) * 16).reshape(64, 64)
+    store.write_gray(tmp_path / "a.png", deep)
+    import cv2
+
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED), deep)
+    # The reader keeps the upper octet, to a rounding.
+    assert np.abs(store.read_gray(tmp_path / "a.png").astype(int) - (deep >> 8)).max() <= 1
+
+
+def test_nothing_half_written_stays_when_the_disk_is_full(tmp_path, monkeypatch):
+    def full(path, octets):
+        path.touch()
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr("pathlib.Path.write_bytes", full)
+    with pytest.raises(OSError, match="No space left"):
+        store.write_json(tmp_path / "a.json", {})
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_changed_labels_are_found_by_their_hash(copy):

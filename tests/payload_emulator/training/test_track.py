@@ -1,0 +1,143 @@
+"""Places along an ephemeris: the paper's rule and its split."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from lunar.camera import PinholeCamera
+from lunar.datafolder import find_data
+from lunar.ephemeris import ephemeris_from_states
+from lunar.frames import IauOrientation, spherical_from_mcmf
+from lunar.oem import save_oem
+from lunar.timescales import parse_utc, tdb_s_from_utc_ns
+from payload_emulator.errors import DatasetError
+from payload_emulator.training.recipe import PAPER_SPLIT, Box, Source, load_recipe
+from payload_emulator.training.shots import pose_at
+from payload_emulator.training.track import lay_track, split_track
+
+START = parse_utc("2029-08-07T00:00:00Z")
+RADIUS_M = 1_737_400.0 + 30_000.0
+PERIOD_S = 2.0 * math.pi * math.sqrt(RADIUS_M**3 / 4.902_800e12)
+CAMERA = PinholeCamera(512, 512, math.radians(120.0))
+
+
+class Everywhere:
+    """A flat Moon at one height."""
+
+    name = "flat"
+
+    def __init__(self, height_m: float = 0.0) -> None:
+        self.height = height_m
+
+    def covers(self, latitude_rad, longitude_rad):
+        return np.ones(np.shape(latitude_rad), dtype=bool)
+
+    def height_m(self, latitude_rad, longitude_rad, level=0):
+        return np.full(np.shape(latitude_rad), self.height)
+
+
+@pytest.fixture(scope="module")
+def polar_orbit(tmp_path_factory):
+    """One revolution over the poles, a state every 30 s."""
+    time_s = np.arange(0.0, PERIOD_S, 30.0)
+    angle = 2.0 * math.pi * time_s / PERIOD_S
+    position = RADIUS_M * np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1)
+    speed = 2.0 * math.pi * RADIUS_M / PERIOD_S
+    velocity = speed * np.stack([-np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=1)
+    # Over the Moon's poles, not over the Earth's; the Moon turns by a degree meanwhile.
+    icrf_from_mcmf = IauOrientation().mcmf_from_icrf(tdb_s_from_utc_ns(START)).T
+    states = position @ icrf_from_mcmf.T, velocity @ icrf_from_mcmf.T
+    path = tmp_path_factory.mktemp("orbit") / "orbit.oem"
+    save_oem(ephemeris_from_states(START + (time_s * 1e9).astype(np.int64), *states), path)
+    return path
+
+
+def source(path, **changes):
+    plain = Source("orbit", PAPER_SPLIT, "procedural", 1.0, ephemeris=str(path), step_s=30.0)
+    return dataclasses.replace(plain, **changes)
+
+
+def test_every_position_within_sixty_degrees_is_taken_and_no_other(polar_orbit):
+    track = lay_track(source(polar_orbit), CAMERA, Everywhere(), find_data(None), 140, 1)
+    latitude, _, altitude = spherical_from_mcmf(track.position_mcmf_m)
+    assert np.abs(np.degrees(latitude)).max() <= 60.0
+    assert np.allclose(altitude, 30_000.0, atol=5.0)
+    # Two thirds of a polar revolution of 110 minutes at two frames a minute: 147.
+    with pytest.raises(DatasetError, match=r"expected 200 places .* found 14\d of 2\d\d"):
+        lay_track(source(polar_orbit), CAMERA, Everywhere(), find_data(None), 200, 1)
+    steps = np.diff(track.utc_ns) / 1e9
+    assert set(np.round(steps[steps < 60.0], 6)) == {30.0}
+    # Once over each pole a third of half a revolution is left out.
+    assert np.count_nonzero(steps > 15 * 60.0) >= 1
+
+
+def test_places_follow_the_ephemeris_and_not_its_step(polar_orbit):
+    fine = lay_track(source(polar_orbit, step_s=15.0), CAMERA, Everywhere(), find_data(None), 40, 1)
+    coarse = lay_track(source(polar_orbit), CAMERA, Everywhere(), find_data(None), 20, 1)
+    np.testing.assert_array_equal(fine.utc_ns[::2], coarse.utc_ns)
+    np.testing.assert_allclose(fine.position_mcmf_m[::2], coarse.position_mcmf_m, atol=1e-3)
+
+
+def test_boxes_and_buffers_hold_along_an_orbit_too(polar_orbit):
+    north = source(polar_orbit, boxes=(Box(0.0, 360.0, 10.0, 60.0),), avoid=(Box(0.0, 360.0, 40.0, 50.0),))
+    track = lay_track(north, CAMERA, Everywhere(), find_data(None), 20, 1)
+    latitude = np.degrees(spherical_from_mcmf(track.position_mcmf_m)[0])
+    # A footprint from 30 km reaches 1.76 degrees to each side at its edge, 2.5 in its corners; the buffer is 60 km.
+    assert latitude.min() > 10.0 + 1.7
+    assert not np.any((latitude > 40.0 - 1.7 - 1.97) & (latitude < 50.0 + 1.7 + 1.97))
+
+
+def test_the_papers_split_keeps_one_arc_for_testing():
+    names = split_track(PAPER_SPLIT, 2000, 7)
+    assert names[-100:] == ("test",) * 100
+    assert {name: names.count(name) for name in ("train", "val", "test")} == {
+        "train": 1600,
+        "val": 300,
+        "test": 100,
+    }
+    # Validation is drawn from all over the rest, by the seed.
+    where = np.flatnonzero(np.array(names) == "val")
+    assert where.min() < 100 and where.max() > 1800
+    assert names == split_track(PAPER_SPLIT, 2000, 7) != split_track(PAPER_SPLIT, 2000, 8)
+    assert split_track("train", 3, 7) == ("train",) * 3
+
+
+def test_an_ephemeris_below_the_ground_is_refused_with_the_place(polar_orbit):
+    along = source(polar_orbit)
+    position = lay_track(along, CAMERA, Everywhere(), find_data(None), 1, 1).position_mcmf_m[0]
+    rng = np.random.default_rng(1)
+    assert pose_at(Everywhere(), CAMERA, along, position, "frame 3", rng).ground_m == 0.0
+    with pytest.raises(
+        DatasetError, match=r"frame 3: expected a place above the ground at .* found the camera at"
+    ):
+        pose_at(Everywhere(31_000.0), CAMERA, along, position, "frame 3", rng)
+
+
+def test_a_recipe_names_an_ephemeris_beside_it_and_only_that_may_split_as_the_paper(tmp_path, polar_orbit):
+    (tmp_path / "orbit.oem").write_bytes(polar_orbit.read_bytes())
+    text = """[dataset]
+name = "a"
+seed = 1
+bits = 16
+[[dataset.source]]
+name = "x"
+split = "80/15/5"
+terrain = "catalogue"
+share = 1.0
+"""
+    path = tmp_path / "recipe.toml"
+    path.write_text(text + 'ephemeris = "orbit.oem"\nstep_s = 30\n')
+    recipe = load_recipe(path)
+    assert recipe.sources[0].ephemeris == str(tmp_path / "orbit.oem")
+    # Where the file lies decides nothing about the frames.
+    assert recipe.to_dict()["sources"][0]["ephemeris"] == "orbit.oem"
+    for wrong, message in (
+        (text, "expected one of train, val, test, found '80/15/5'"),
+        (text + 'ephemeris = "orbit.oem"\nstep_s = 0.0\n', "step_s: expected more than 0"),
+        (text.replace("16", "12"), "dataset.bits: expected 8 or 16, found 12"),
+    ):
+        path.write_text(wrong)
+        with pytest.raises(DatasetError, match=message):
+            load_recipe(path)
