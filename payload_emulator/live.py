@@ -307,7 +307,8 @@ class LivePayload:
         """Telecommands that came since the moment before; and the manual step where time was not continuous."""
         orders = b"".join(self._orders)
         self._orders.clear()
-        if self._discontinuous and moment.frame > 0:
+        observing = self.spacecraft.payload.mode is PayloadMode.observing
+        if self._discontinuous and observing and moment.frame > 0:
             self._discontinuous = False
             orders += DICTIONARY.pack_command(
                 "perform_function",

@@ -143,5 +143,5 @@ def test_contacts_end_behind_the_limb_of_the_moon_once_an_orbit() -> None:
 
 
 def test_a_station_that_there_is_not_is_named() -> None:
-    with pytest.raises(ScenarioError, match="expected names of goldstone, .* found 'atlantis'"):
+    with pytest.raises(ScenarioError, match=r"expected names of goldstone, .* found 'atlantis'"):
         station("atlantis")

@@ -108,7 +108,7 @@ def ping(count: int) -> bytes:
 
 
 def test_a_session_of_watching_stepping_and_commanding(running: tuple[LivePayload, Watcher]) -> None:
-    live, watcher = running
+    _, watcher = running
     watcher.say("step")
     watcher.say("step")
     first = watcher.until(lambda message: message["kind"] == "frame")[-1]
@@ -221,6 +221,8 @@ def test_the_shipped_campaign_names_every_kind_of_fault() -> None:
     from payload_emulator.sim.faults import FAULT_KINDS
 
     campaign = load_campaign("faults")
+    page = (Path(__file__).resolve().parents[2] / "docs" / "payload.md").read_text()
+    assert all(f"`{kind}`" in page for kind in FAULT_KINDS)
     assert {text.split()[0] for case in campaign.cases for text in case.faults} == set(FAULT_KINDS)
 
 
