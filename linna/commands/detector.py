@@ -54,6 +54,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="whose validation split fixes the thresholds",
     )
     export.add_argument("--revision", default="", help="source revision for the model's metadata")
+    export.add_argument("--note", default="", help="a remark on the training for the model's metadata")
     export.add_argument(
         "--paper-classes", action="store_true", help="keep the heatmaps of the paper's three classes"
     )
@@ -227,6 +228,7 @@ def _export(arguments: argparse.Namespace) -> int:
         arguments.out,
         datasets,
         arguments.revision,
+        {"training_note": arguments.note} if arguments.note else None,
         paper_classes=arguments.paper_classes,
         test=arguments.test,
     )

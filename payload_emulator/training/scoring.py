@@ -28,6 +28,7 @@ PAPER_TABLE_2 = (
 )
 MATCH_RADIUS_PX = 10.0  # the pixel rule, as in the project's first studies; the paper does not print its own
 FAIR_DEPTH_RATIO = 0.03
+_LEAST_FOR_PRECISION = 100  # below, one false detection more moves the precision by a hundredth and over
 DEGRADATION_EDGES = (0.0, 0.03, 0.06, 0.10, 1.0)
 
 
@@ -336,11 +337,15 @@ def _f_beta(figures: Figures, beta: float) -> float:
 
 
 def threshold_for_precision(tallied: Tally, precision: float) -> float:
-    """Lowest threshold from which on the precision stays at or above the value asked for; 0.95 where none does."""
+    """Lowest threshold from which on the precision stays at or above the value asked for; 0.95 where none does.
+
+    Thresholds that leave fewer than `_LEAST_FOR_PRECISION` detections say nothing and are passed over.
+    """
     chosen = 0.95
     for threshold in np.arange(0.95, 0.095, -0.01):
         figures = tallied.figures(float(threshold))
-        if np.isfinite(figures.precision) and figures.precision < precision:
+        claimed = figures.detected_true + figures.false_alarms
+        if claimed >= _LEAST_FOR_PRECISION and figures.precision < precision:
             break
         chosen = float(threshold)
     return chosen
