@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,7 @@ from payload_emulator.recording import (
 from tmtc.downlink import encode_cadus
 
 FloatArray = NDArray[np.float64]
-Image = NDArray[np.uint8]
+Image = NDArray[Any]
 Progress = Callable[[Iterable[Any], int], Iterator[Any]]
 CpuClock = Callable[[], float]
 
@@ -393,12 +393,11 @@ def _manifest(archive: Path) -> dict[str, Any]:
     return dict(manifest)
 
 
-def _coding(manifest: dict[str, Any]) -> str:
+def _coding(manifest: dict[str, Any]) -> Literal["rs", "none"]:
     """Coding of the archived downlink, as its manifest or its scenario says."""
-    if "coding" in manifest:
-        return str(manifest["coding"])
     text = str(manifest.get("scenario_toml") or "")
-    return str(tomllib.loads(text).get("link", {}).get("coding", "rs"))
+    said = manifest.get("coding") or tomllib.loads(text).get("link", {}).get("coding", "rs")
+    return "none" if said == "none" else "rs"
 
 
 def _write_json(path: Path, value: dict[str, Any]) -> None:

@@ -63,6 +63,7 @@ def figures_of(passes: Sequence[PassFrames]) -> tuple[Figure, ...]:
         if any(np.isfinite(one.estimators[name].nees).any() for one in passes if name in one.estimators):
             found += [
                 Figure(f"{place}.nees", "", False, True, _nees(name)),
+                Figure(f"{place}.sigma_p95", "m", False, True, _sigma(name)),
                 Figure(f"{place}.fixes", "", True, False, _share(name, "fixed")),
                 Figure(f"{place}.wrong_fixes", "", False, False, _wrong(name)),
             ]
@@ -105,6 +106,7 @@ def joined(passes: Sequence[PassFrames]) -> PassFrames:
         parts = [one.estimators.get(name) or _silent(len(one)) for one in passes]
         return EstimatorFrames(
             np.concatenate([part.error_m for part in parts]),
+            np.concatenate([part.sigma_m for part in parts]),
             np.concatenate([part.nees for part in parts]),
             np.concatenate([part.drift_percent for part in parts]),
             tuple(outcome for part in parts for outcome in part.outcome),
@@ -143,7 +145,7 @@ def joined(passes: Sequence[PassFrames]) -> PassFrames:
 
 def _silent(frames: int) -> EstimatorFrames:
     nothing = np.full(frames, np.nan)
-    return EstimatorFrames(nothing, nothing, nothing, ("",) * frames, nothing)
+    return EstimatorFrames(nothing, nothing, nothing, nothing, ("",) * frames, nothing)
 
 
 def _ratio(numerator: str, denominator: str) -> Compute:
@@ -170,6 +172,10 @@ def _mean_of(values: FloatArray, weights: FloatArray) -> FloatArray:
 
 def _error(estimator: str, level: float) -> Compute:
     return _of(estimator, lambda e, w: weighted_quantile(e.error_m, level, w))
+
+
+def _sigma(estimator: str) -> Compute:
+    return _of(estimator, lambda e, w: weighted_quantile(e.sigma_m, 0.95, w))
 
 
 def _share(estimator: str, *outcomes: str) -> Compute:

@@ -35,8 +35,8 @@ class EstimatorFrames:
 
     Attributes
     ----------
-    error_m
-        Length of the position error.
+    error_m, sigma_m
+        Length of the position error, and of the standard deviations claimed with it.
     nees
         Squared error over variance summed over the three axes: 3 on average for an estimator that knows its errors.
     drift_percent
@@ -48,6 +48,7 @@ class EstimatorFrames:
     """
 
     error_m: FloatArray
+    sigma_m: FloatArray
     nees: FloatArray
     drift_percent: FloatArray
     outcome: tuple[str, ...]
@@ -191,6 +192,7 @@ def _estimator(
     known = np.array([bool(name) for name in outcome], dtype=np.bool_)
     return EstimatorFrames(
         error_m=length,
+        sigma_m=claimed,
         nees=np.where(np.isfinite(nees), nees, np.nan),
         drift_percent=np.where(path_m > 0.0, 100.0 * gained / np.where(path_m > 0.0, path_m, 1.0), np.nan),
         outcome=outcome,

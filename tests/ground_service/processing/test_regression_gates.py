@@ -80,7 +80,12 @@ def simulated(
         octets=np.full(frames, 900.0) + 14.0 * (hits + alarms),
         estimators={
             "anchored": EstimatorFrames(
-                length, (length / 25.0) ** 2, nothing, ("fixed",) * frames, np.zeros(frames)
+                length,
+                np.full(frames, 43.0),
+                (length / 25.0) ** 2,
+                nothing,
+                ("fixed",) * frames,
+                np.zeros(frames),
             )
         },
         latency={"network": slow * (9.0 + 0.5 * rng.standard_exponential(frames))},
