@@ -25,6 +25,7 @@ import numpy as np
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from lunar.timescales import format_utc
 from payload_emulator.errors import LinkError
+from payload_emulator.flight.modes import PayloadMode
 from payload_emulator.flying import (
     SPACECRAFT_ID,
     Flown,

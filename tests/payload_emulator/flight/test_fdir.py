@@ -165,7 +165,7 @@ def test_a_commanded_reset_comes_up_in_standby_with_the_next_boot_count(observin
     assert len(observing.named(packets, "verification_completed")) == 1
     after = observing.step()
     assert observing.payload.mode is PayloadMode.standby
-    assert [v["value_1"] for v in observing.named(after, "event_info")][0] == 2.0
+    assert next(v["value_1"] for v in observing.named(after, "event_info")) == 2.0
 
 
 def test_an_observation_whose_time_is_over_is_not_resumed(rig: Any) -> None:
