@@ -31,12 +31,7 @@ def write_index(
     folder: Path, recipe: Recipe, frames: int, shards: dict[str, str], data_names: Sequence[str]
 ) -> None:
     """Write the COCO files and, last, dataset.json with the hashes of them and of the shards."""
-    files = {
-        f"coco_{split}.json": _write_coco(
-            folder / f"coco_{split}.json", folder, recipe, sorted(shards), split
-        )
-        for split in SPLITS
-    }
+    files = _write_coco(folder, recipe, sorted(shards))
     index = {
         "schema_version": SCHEMA_VERSION,
         "name": recipe.name,
@@ -58,55 +53,69 @@ def index_digest(index: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def _write_coco(path: Path, folder: Path, recipe: Recipe, shards: Sequence[str], split: str) -> str:
-    """Write the annotations of a split piece by piece, as a month of orbit has millions; SHA-256 comes back."""
-    digest = hashlib.sha256()
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+def _write_coco(folder: Path, recipe: Recipe, shards: Sequence[str]) -> dict[str, str]:
+    """Write the annotations of all splits in one reading of the shards; SHA-256 of each file comes back.
+
+    Piece by piece, as a month of orbit has millions of annotations.
+    """
+    writers = {split: _CocoFile(folder / f"coco_{split}.json", recipe) for split in SPLITS}
     try:
-        with unfinished.open("wb") as out:
-            for text in _coco_text(folder, recipe, shards, split):
-                octets = text.encode()
-                digest.update(octets)
-                out.write(octets)
-        unfinished.replace(path)
-    except OSError:
-        unfinished.unlink(missing_ok=True)
-        raise
-    return digest.hexdigest()
-
-
-def _coco_text(folder: Path, recipe: Recipe, shards: Sequence[str], split: str) -> Iterator[str]:
-    """The COCO object of a split as pieces of JSON."""
-
-    def frames() -> Iterator[Frame]:
         for name in shards:
             for frame in shard_frames(load_shard(folder / "shards" / f"{name}.npz")):
-                if frame.split == split:
-                    yield frame
+                writers[frame.split].add(frame)
+        return {writer.path.name: writer.finish() for writer in writers.values()}
+    finally:
+        for writer in writers.values():
+            writer.abandon()
 
-    head = {
-        "info": {"description": recipe.name, "version": str(SCHEMA_VERSION)},
-        "categories": [
-            {"id": number, "name": name, "supercategory": "crater"} for number, name in CATEGORIES
-        ],
-    }
-    yield json.dumps(head)[:-1] + ', "images": ['
-    for n, frame in enumerate(frames()):
-        yield (", " if n else "") + json.dumps(
+
+class _CocoFile:
+    """A COCO object that grows beside its place: annotations as they come, then the images."""
+
+    def __init__(self, path: Path, recipe: Recipe) -> None:
+        self.path = path
+        self._size = recipe.width_px, recipe.height_px
+        self._unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+        self._out = self._unfinished.open("wb")
+        self._digest = hashlib.sha256()
+        self._images: list[int] = []
+        self._count = 0
+        categories = [{"id": number, "name": name, "supercategory": "crater"} for number, name in CATEGORIES]
+        head = {
+            "info": {"description": recipe.name, "version": str(SCHEMA_VERSION)},
+            "categories": categories,
+        }
+        self._write(json.dumps(head)[:-1] + ', "annotations": [')
+
+    def add(self, frame: Frame) -> None:
+        self._images.append(frame.number)
+        for annotation in _annotations(frame, *self._size):
+            self._count += 1
+            self._write((", " if self._count > 1 else "") + json.dumps({"id": self._count} | annotation))
+
+    def finish(self) -> str:
+        images = [
             {
-                "id": frame.number,
-                "file_name": f"images/{frame.number:06d}.png",
-                "width": recipe.width_px,
-                "height": recipe.height_px,
+                "id": number,
+                "file_name": f"images/{number:06d}.png",
+                "width": self._size[0],
+                "height": self._size[1],
             }
-        )
-    yield '], "annotations": ['
-    count = 0
-    for frame in frames():
-        for annotation in _annotations(frame, recipe.width_px, recipe.height_px):
-            yield (", " if count else "") + json.dumps({"id": count + 1} | annotation)
-            count += 1
-    yield "]}"
+            for number in self._images
+        ]
+        self._write(f'], "images": {json.dumps(images)}}}')
+        self._out.close()
+        self._unfinished.replace(self.path)
+        return self._digest.hexdigest()
+
+    def abandon(self) -> None:
+        self._out.close()
+        self._unfinished.unlink(missing_ok=True)
+
+    def _write(self, text: str) -> None:
+        octets = text.encode()
+        self._digest.update(octets)
+        self._out.write(octets)
 
 
 def _annotations(frame: Frame, width_px: int, height_px: int) -> Iterator[dict[str, Any]]:
