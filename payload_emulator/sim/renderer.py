@@ -100,6 +100,8 @@ def render(
 ) -> Rendering:
     """Picture of the terrain from a position (3,) with attitude (3, 3) under a Sun at a unit vector (3,), all MCMF.
 
+    A terrain renders for one thread: others open their own, which gives the same bits.
+
     Raises
     ------
     TerrainError
