@@ -30,6 +30,7 @@ from payload_emulator.link import Reception, save_receptions, transmit
 from payload_emulator.loading import LoadedPayload, load_payload
 from payload_emulator.recording import StepInput, save_frame_times, save_image, save_record, step_input
 from payload_emulator.scenario import Scenario, format_scenario
+from payload_emulator.scoring import score_navigation
 from payload_emulator.sim.faults import parse_fault
 from payload_emulator.spacecraft import Spacecraft, new_board
 from payload_emulator.world import (
@@ -133,10 +134,13 @@ def _emulate_into(
     spacecraft = new_spacecraft(world, loaded)
     sender = Sender(world, LinkSettings(coding=scenario.link.coding))
     inputs: list[StepInput] = []
+    attitudes = np.full((total, 3, 3), np.nan)
     flown = fly(world, spacecraft)
     for moment in progress(flown, len(timeline(world))) if progress else flown:
         sender.take(moment)
         given, number = spacecraft.given, moment.moment.frame
+        if moment.exposure is not None:
+            attitudes[number] = moment.exposure.camera_from_mcmf
         if given is None:
             continue
         inputs.append(step_input(number, given))
@@ -154,6 +158,7 @@ def _emulate_into(
     packets = [packet for dump in sender.transmitter.dumps for packet in dump.packets]
     wall_s = time.monotonic() - started
     summary = _summary(world, loaded, spacecraft, packets, reception, len(kept), wall_s)
+    summary |= score_navigation(world, loaded, catalogue, attitudes, b"".join(packets))
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     (folder / "manifest.json").write_text(json.dumps(_manifest(world, loaded, folder), indent=2) + "\n")
     return summary

@@ -29,7 +29,7 @@ from payload_emulator.flight.tables import (
     unpack_orientation_table,
 )
 from payload_emulator.loading import LoadedPayload
-from payload_emulator.world import World
+from payload_emulator.world import World, clock_ticks
 from tmtc.dictionary import DICTIONARY
 from tmtc.schema import Table
 from tmtc.stream import cut_packets
@@ -38,6 +38,7 @@ Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _NS = 1_000_000_000
+_PACKETS = ("filter_state", "identifications", "navigation_state", "frame_outcome", "detections")
 # Frames further apart than this belong to different arcs: the shortest gap, over a pole, takes 18 minutes.
 _ARC_GAP_NS = 600 * _NS
 # A session of several arcs is judged from the third on, a single one after this many frames.
@@ -96,13 +97,14 @@ def score_navigation(
     octets
         All packets of the payload, end to end.
     """
-    tables = DICTIONARY.unpack_many(octets, cut_packets(octets))
+    tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=_PACKETS)
     if "filter_state" not in tables or not len(tables["filter_state"]):
         return {}
-    outcomes, nis, matched = _outcomes(tables, world.frame_utc_ns.size)
+    frame_ticks = np.array([clock_ticks(world, int(utc_ns)) for utc_ns in world.frame_utc_ns])
+    outcomes, nis, matched = _outcomes(tables, frame_ticks)
     imaging = (outcomes >= 0) & (outcomes != Outcome.no_image)
-    errors = _errors(world, loaded, tables["filter_state"], imaging)
-    pairs = _judged_pairs(world, catalogue, camera_from_mcmf, tables)
+    errors = _errors(world, loaded, tables["filter_state"], frame_ticks, imaging)
+    pairs = _judged_pairs(world, catalogue, camera_from_mcmf, tables, frame_ticks)
     arcs = _arcs(world.frame_utc_ns, imaging)
     rows = [_arc_row(world, errors, outcomes, arc) for arc in arcs]
     first = arcs[_SETTLED_ARC][0] if len(arcs) > _SETTLED_ARC else _SETTLED_FRAMES
@@ -143,23 +145,40 @@ def score_navigation(
     }
 
 
-def _outcomes(tables: dict[str, Table], frames: int) -> tuple[Index, Float, Index]:
+def _first_of_each(table: Table, frame_ticks: Index) -> tuple[Index, Index]:
+    """Rows of a table that speak of frames of the session, each frame once (what is played back comes twice)."""
+    ticks = table.columns["image_ticks"].astype(np.int64)
+    at = np.minimum(np.searchsorted(frame_ticks, ticks), frame_ticks.size - 1)
+    rows = np.flatnonzero(frame_ticks[at] == ticks)
+    frames, first = np.unique(at[rows], return_index=True)
+    return rows[first], frames.astype(np.int64)
+
+
+def _outcomes(tables: dict[str, Table], frame_ticks: Index) -> tuple[Index, Float, Index]:
     """Outcome of each frame (-1: none), and NIS and matched craters of its fix."""
-    outcome = np.full(frames, -1, dtype=np.int64)
-    nis, matched = np.full(frames, np.nan), np.zeros(frames, dtype=np.int64)
+    outcome = np.full(frame_ticks.size, -1, dtype=np.int64)
+    nis, matched = np.full(frame_ticks.size, np.nan), np.zeros(frame_ticks.size, dtype=np.int64)
     for name in ("frame_outcome", "navigation_state"):
-        columns = tables[name].columns
-        mine = columns["estimator"] == int(Mode.anchored)
-        at = columns["frame_number"][mine].astype(np.int64)
-        outcome[at] = columns["outcome"][mine]
+        mine = tables[name].columns["estimator"] == int(Mode.anchored)
+        columns = {key: values[mine] for key, values in tables[name].columns.items()}
+        at = np.minimum(np.searchsorted(frame_ticks, columns["image_ticks"]), frame_ticks.size - 1)
+        known = frame_ticks[at] == columns["image_ticks"]
+        outcome[at[known]] = columns["outcome"][known]
         if name == "navigation_state":
-            nis[at], matched[at] = columns["nis"][mine], columns["matched"][mine]
+            nis[at[known]], matched[at[known]] = columns["nis"][known], columns["matched"][known]
     return outcome, nis, matched
 
 
-def _errors(world: World, loaded: LoadedPayload, states: Table, imaging: NDArray[np.bool_]) -> FlownErrors:
-    columns = states.columns
-    frame, ticks = columns["frame_number"].astype(np.int64), columns["image_ticks"].astype(np.int64)
+def _errors(
+    world: World,
+    loaded: LoadedPayload,
+    states: Table,
+    frame_ticks: Index,
+    imaging: NDArray[np.bool_],
+) -> FlownErrors:
+    which, frame = _first_of_each(states, frame_ticks)
+    columns = {name: values[which] for name, values in states.columns.items()}
+    ticks = frame_ticks[frame]
     orientation = unpack_orientation_table(loaded.tables.orientation)
     burns = unpack_burn_table(loaded.tables.burns) if loaded.tables.burns else no_burns()
     gravity = unpack_gravity_table(loaded.tables.gravity)
@@ -240,7 +259,11 @@ def _propagated(loaded: LoadedPayload, model: OrbitModel, burns: BurnTable, tick
 
 
 def _judged_pairs(
-    world: World, catalogue: CraterCatalogue, camera_from_mcmf: Float, tables: dict[str, Table]
+    world: World,
+    catalogue: CraterCatalogue,
+    camera_from_mcmf: Float,
+    tables: dict[str, Table],
+    frame_ticks: Index,
 ) -> tuple[Index, Index]:
     """Right and wrong pairs of each frame's fix, shape (n, 2), and detections that are catalogued craters (n,).
 
@@ -253,10 +276,10 @@ def _judged_pairs(
     position = world.truth.positions_mcmf(world.frame_utc_ns)
     rim = catalogue.position_mcmf_m
     used = tables.get("identifications")
-    used_frame = None if used is None else used.columns["frame_number"].astype(np.int64)[used.item_owner]
+    used_row = {} if used is None else dict(zip(*_first_of_each(used, frame_ticks)[::-1], strict=True))
     order = np.argsort(catalogue.ids)
     latitude, longitude, altitude = spherical_from_mcmf(position)
-    for row, number in enumerate(seen.columns["frame_number"].astype(np.int64).tolist()):
+    for row, number in zip(*_first_of_each(seen, frame_ticks), strict=True):
         mine = places[_rows_of(seen.item_owner, row)]
         if not len(mine):
             continue
@@ -268,9 +291,9 @@ def _judged_pairs(
             alike = np.abs(np.log(mine[:, None, 2] / diameter[None])) < _LOG_DIAMETER_GATE
         limit = np.maximum(_RIGHT_PX, _RIGHT_OF_DIAMETER * mine[:, 2])
         findable[number] = np.count_nonzero(np.any(alike & (away < limit[:, None]), axis=1))
-        if used is None or used_frame is None:
+        if used is None or number not in used_row:
             continue
-        pairs = _rows_of(used_frame, number)
+        pairs = _rows_of(used.item_owner, used_row[number])
         named = used.items["crater_id"][pairs].astype(np.int64)
         listed = np.isin(named, catalogue.ids)
         detection = used.items["detection"][pairs].astype(np.int64)[listed]
