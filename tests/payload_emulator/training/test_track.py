@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from payload_emulator.training.recipe import PAPER_SPLIT, Box, Source, load_reci
 from payload_emulator.training.shots import pose_at
 from payload_emulator.training.track import lay_track, split_track
 
+ROOT = Path(__file__).parents[3]
 START = parse_utc("2029-08-07T00:00:00Z")
 RADIUS_M = 1_737_400.0 + 30_000.0
 PERIOD_S = 2.0 * math.pi * math.sqrt(RADIUS_M**3 / 4.902_800e12)
@@ -141,3 +143,14 @@ share = 1.0
         path.write_text(wrong)
         with pytest.raises(DatasetError, match=message):
             load_recipe(path)
+
+
+def test_the_shipped_recipe_of_the_papers_data_set_flies_the_shipped_orbit():
+    recipe = load_recipe(ROOT / "scenarios" / "paper-dataset.toml")
+    (along,) = recipe.sources
+    assert (along.split, along.light, along.step_s, along.days) == ("80/15/5", "paper", 30.0, 30.0)
+    day = dataclasses.replace(along, days=0.1, step_s=60.0)
+    track = lay_track(day, CAMERA, Everywhere(), find_data(None), 60, recipe.seed)
+    altitude_km = spherical_from_mcmf(track.position_mcmf_m)[2] / 1e3
+    # The paper's orbit flies between 14.0 and 48.6 km.
+    assert altitude_km.min() > 13.0 and altitude_km.max() < 50.0
