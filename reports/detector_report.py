@@ -58,7 +58,7 @@ def detector_document(report: DetectorReport) -> Document:
             Heading("Training"),
             Picture(
                 "training",
-                "Quantities over the epochs of the training run.",
+                "Quantities over the training run.",
                 "Training curves: " + ", ".join(c.name for c in curves),
                 0.78 + rows * 1.25 + (rows - 1) * 0.75,
                 lambda c: dataset.draw_training(c, curves),

@@ -469,11 +469,12 @@ class SigmaBin:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingCurve:
-    """One quantity over the epochs of a training run, ``epoch`` and ``values`` (n,)."""
+    """One quantity over a training run, ``epoch`` and ``values`` (n,); ``axis`` names what is counted if not epochs."""
 
     name: str
     epoch: FloatArray
     values: FloatArray
+    axis: str = "epoch"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

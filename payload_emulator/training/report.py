@@ -259,7 +259,9 @@ def _curves(run: Path) -> tuple[TrainingCurve, ...]:
     step = np.array([float(row["step"]) for row in rows])
     names = ("total", "heat", "offset", "diameter", "sigma", "f1", "precision", "recall", "loc_px")
     return tuple(
-        TrainingCurve(name, step, np.array([float(row[name]) for row in rows])) for name in names if rows
+        TrainingCurve(name, step, np.array([float(row[name]) for row in rows]), "step")
+        for name in names
+        if rows
     )
 
 

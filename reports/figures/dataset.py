@@ -112,7 +112,7 @@ def draw_training(canvas: Canvas, curves: Sequence[TrainingCurve]) -> None:
         )
         axes.plot(curve.epoch, curve.values, color=color("blue"), linewidth=canvas.pt(1.3))
         axes.set_title(curve.name, fontsize="small")
-        axes.set_xlabel("epoch")
+        axes.set_xlabel(curve.axis)
         axes.locator_params(axis="both", nbins=4)
 
 
