@@ -82,8 +82,9 @@ class _Ring:
 
     def room_for(self, need: int) -> list[_Record]:
         """The records that must go for `need` octets to be written next; may move the head to the beginning."""
-        behind = self.head if self.head + need > self.memory.size else self.memory.size
-        if behind < self.memory.size:
+        wraps = self.head + need > self.memory.size
+        behind = self.head if wraps else self.memory.size
+        if wraps:
             self.head = 0
         going = []
         for record in self.records:

@@ -65,6 +65,15 @@ def test_a_full_class_overwrites_its_oldest_and_leaves_the_others_alone() -> Non
     assert kept.take(1 << 20) == [packet(0), *(packet(k) for k in range(3, room + 3))]
 
 
+def test_a_class_that_is_full_to_the_last_octet_begins_anew() -> None:
+    # Four packets of 29 octets and their headers fill the class of the most important packets exactly.
+    kept = store(round(4 * (29 + HEADER) / SHARES[0]))
+    packets = [packet(k) for k in range(9)]
+    assert all(kept.append(octets, StoreClass.critical) for octets in packets)
+    assert kept.take(1 << 20) == packets[-4:]
+    assert kept.overwritten == 5
+
+
 def test_a_full_class_refuses_the_new_where_nothing_may_be_overwritten() -> None:
     kept = store(overwrite=False)
     room = int(SHARES[StoreClass.bulk] * 4000) // (HEADER + len(packet(0)))
