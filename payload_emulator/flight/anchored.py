@@ -7,6 +7,7 @@ only grows less certain, and says so. If the map keeps disagreeing with what is 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -28,6 +29,7 @@ from payload_emulator.flight.landmark_map import (
     View,
     unclaimed,
 )
+from payload_emulator.flight.lost_in_space import LostParameters, PlaceIndex, find_place, place_index
 from payload_emulator.flight.navigation_filter import CommonErrors, FilterState, Update
 from payload_emulator.flight.outcomes import Outcome
 from payload_emulator.flight.sighting import (
@@ -86,6 +88,8 @@ class AnchoredParameters:
         Position sigma beyond which the estimate counts as lost.
     suspicion_frames
         Frames in a row that must disagree before the search is widened.
+    lost_frames, lost
+        Frames in a row that must disagree before the place is searched without any prior, and how.
     map_landmarks, mapping
         Whether craters that the catalogue lacks are mapped and used on later passes, and how.
     crater_limit
@@ -106,6 +110,8 @@ class AnchoredParameters:
     search_radius_m: float = 25_000.0
     divergence_limit_m: float = 5_000.0
     suspicion_frames: int = 4
+    lost_frames: int = 6
+    lost: LostParameters = field(default_factory=LostParameters)
     map_landmarks: bool = True
     mapping: MappingParameters = field(default_factory=MappingParameters)
     crater_limit: int = 32
@@ -196,6 +202,8 @@ class AnchoredNavigator:
         self._image_ticks = initial_state.ticks
         self._camera = camera
         self._disagreements = 0
+        self._markov_sigma_m_s2 = noise.markov_sigma_m_s2
+        self._places: PlaceIndex | None = None
 
     def step(self, ticks: int, found: Detections | None, camera_from_icrf: Float | None) -> AnchoredReport:
         """Return what became of one frame.
@@ -233,6 +241,8 @@ class AnchoredNavigator:
         self._judge(fix, expected, len(found))
         if fix is None and self._disagreements >= self.parameters.suspicion_frames:
             fix = self._reacquire(prior, pose, found)
+            if fix is None and self._disagreements >= self.parameters.lost_frames:
+                fix = self._found_anywhere(prior, pose, found)
         if fix is not None:
             self.state, self.last_fix = fix.update.state, fix
         if self.parameters.map_landmarks:
@@ -288,6 +298,7 @@ class AnchoredNavigator:
         self.new_landmarks = self.mapper.close()
         if len(self.mapper):
             self.landmarks = self.mapper.with_catalogue(self._catalogue)
+            self._places = None
 
     def _predict(self, ticks: int) -> FilterState | None:
         """Return the state carried to a time over the burns on the way, undoing them on the way back."""
@@ -405,6 +416,37 @@ class AnchoredNavigator:
         # A jump of position by Kepler motion comes with one of velocity: 1e-3 rad/s times the distance.
         wide[3:6, 3:6] += np.eye(3) * (1e-3 * extra) ** 2
         return self._acquired(replace(prior, covariance=wide), pose, found, extra)
+
+    def _found_anywhere(self, prior: FilterState, pose: Pose, found: Detections) -> Fix | None:
+        """Return a fix from a search over the whole map by a camera that looks down; the orbit turns with the place."""
+        if self._places is None:
+            self._places = place_index(self.landmarks)
+        sigma_px = np.sqrt(self._detection_variance(found))
+        place = find_place(found, sigma_px, self._places, self._camera, self.parameters.lost)
+        if place is None:
+            return None
+        old, new = prior.mean[kalman.POSITION], pose.mcmf_from_icrf.T @ place.position_mcmf_m
+        # The shortest turn from the old place to the new one; a plane of the orbit that has turned is in the sigma.
+        axis = np.cross(old, new) / (np.linalg.norm(old) * np.linalg.norm(new))
+        velocity = prior.mean[kalman.VELOCITY]
+        cosine = math.sqrt(max(1.0 - float(axis @ axis), 0.0))
+        velocity = (
+            velocity + np.cross(axis, velocity) + np.cross(axis, np.cross(axis, velocity)) / (1.0 + cosine)
+        )
+        fresh = kalman.initial_filter_state(
+            prior.ticks,
+            new,
+            velocity,
+            3.0 * float(place.sigma_m.max()) + 200.0,
+            1e-3 * float(np.linalg.norm(new - old)) + 1.0,
+            self._markov_sigma_m_s2,
+            self.parameters.errors,
+        )
+        there = replace(pose, position_icrf_m=new)
+        sighting = look(self.landmarks, place.index, there, self._camera)
+        everything = np.arange(place.index.size)
+        identification = Identification(place.detection, everything, len(found), len(place))
+        return self._updated(fresh, there, found, identification, sighting, reacquired=True)
 
     def _judge(self, fix: Fix | None, expected: int, detections: int) -> None:
         """Count frames in a row in which the map and the image disagree."""
