@@ -19,7 +19,7 @@ from payload_emulator.flight.detections import Detections, no_detections
 from payload_emulator.flight.modes import PayloadMode
 from payload_emulator.flight.ports import UNLIMITED
 from payload_emulator.flight.preprocess import ImageQuality
-from payload_emulator.link import Transmitter, contacts
+from payload_emulator.link import LIGHT_S, Transmitter, contacts
 from payload_emulator.spacecraft import Spacecraft
 from payload_emulator.world import Exposure, World, clock_ticks, exposures, orders_before, sample_truth
 from tmtc.dictionary import DICTIONARY
@@ -47,13 +47,17 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """One step of the spacecraft; `frame` is -1 where none is taken, `heard` whether a station listens."""
+    """One step of the spacecraft.
+
+    `frame` is -1 where none is taken; `heard` tells whether a station listens, `light_s` how long it takes to there.
+    """
 
     utc_ns: int
     frame: int
     sunlit: float
     heard: bool
     downlink_octets: int
+    light_s: float = LIGHT_S
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,7 +143,7 @@ def timeline(world: World) -> list[Moment]:
     number[np.searchsorted(utc_ns, frames)] = np.arange(frames.size)
     position, _ = world.truth.states(utc_ns)
     sunlit = sunlit_fraction(position, sun_position_icrf_m(np.asarray(tdb_s_from_utc_ns(utc_ns))))
-    heard, _ = contacts(sample_truth(world.truth, utc_ns), utc_ns, section)
+    heard, light_s = contacts(sample_truth(world.truth, utc_ns), utc_ns, section)
     seconds = np.diff(utc_ns, prepend=utc_ns[:1]) / _NS
     allowed = np.floor(section.rate_bps / 8.0 * seconds).astype(np.int64)
     return [
@@ -149,6 +153,7 @@ def timeline(world: World) -> list[Moment]:
             float(sunlit[k]),
             bool(heard[k]),
             (int(allowed[k]) if section.stations else UNLIMITED) if heard[k] else 0,
+            float(light_s[k]),
         )
         for k in range(utc_ns.size)
     ]
@@ -293,13 +298,14 @@ class Sender:
     transmitter: Transmitter = field(init=False)
     _waiting: dict[int, list[bytes]] = field(default_factory=dict)
     _utc_ns: int = 0
+    _light_s: float = LIGHT_S
 
     def __post_init__(self) -> None:
         self.transmitter = Transmitter(SPACECRAFT_ID, self.settings)
 
     def take(self, flown: Flown) -> None:
         """Take the packets of a moment, and send what is complete."""
-        self._utc_ns = flown.moment.utc_ns
+        self._utc_ns, self._light_s = flown.moment.utc_ns, flown.moment.light_s
         stations = bool(self.world.scenario.link.stations)
         now = clock_ticks(self.world, flown.moment.utc_ns)
         for packet in flown.packets:
@@ -312,5 +318,5 @@ class Sender:
     def flush(self) -> None:
         """Send everything."""
         for channel, packets in sorted(self._waiting.items()):
-            self.transmitter.send(packets, self._utc_ns, channel)
+            self.transmitter.send(packets, self._utc_ns, channel, self._light_s)
         self._waiting = {}

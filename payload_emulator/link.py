@@ -25,7 +25,7 @@ from tmtc.downlink import DownlinkEncoder, LinkSettings
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-_LIGHT_S = 1.28
+LIGHT_S = 1.28
 _LIGHT_NS = 1_500_000_000
 _CONTACT_STEP_NS = 60_000_000_000
 # WGS 84 latitude, east longitude (degrees) and height (m), from the agencies' public station pages, to 0.01 deg.
@@ -43,7 +43,7 @@ STATIONS = {
 class Dump:
     """CADUs that were encoded together, when they left, and where each packet lies in them.
 
-    `first`, `last` (n,) are the frames that packet n begins and ends in.
+    `light_s` is their way to the station; `first`, `last` (n,) are the frames that packet n begins and ends in.
     """
 
     cadus: bytes
@@ -52,6 +52,7 @@ class Dump:
     packets: tuple[bytes, ...]
     first: IntArray
     last: IntArray
+    light_s: float = LIGHT_S
 
 
 @dataclass(slots=True, eq=False)
@@ -66,7 +67,13 @@ class Transmitter:
     def __post_init__(self) -> None:
         self._encoder = DownlinkEncoder(self.spacecraft_id, self.settings)
 
-    def send(self, packets: Sequence[bytes], utc_ns: int, virtual_channel: int = 0) -> bytes:
+    def send(
+        self,
+        packets: Sequence[bytes],
+        utc_ns: int,
+        virtual_channel: int = 0,
+        light_s: float = LIGHT_S,
+    ) -> bytes:
         """The CADUs of these packets."""
         octets = self._encoder.encode(packets, virtual_channel)
         if not packets:
@@ -77,7 +84,13 @@ class Transmitter:
         stop = np.cumsum(lengths)
         self.dumps.append(
             Dump(
-                octets, virtual_channel, utc_ns, tuple(packets), (stop - lengths) // zone, (stop - 1) // zone
+                octets,
+                virtual_channel,
+                utc_ns,
+                tuple(packets),
+                (stop - lengths) // zone,
+                (stop - 1) // zone,
+                light_s,
             )
         )
         assert int(self.dumps[-1].last[-1]) < frames
@@ -154,12 +167,14 @@ def transmit(dumps: Sequence[Dump], settings: LinkSettings, section: LinkSection
 
 
 def save_receptions(folder: Path, dumps: Sequence[Dump]) -> None:
-    """Write when each dump left, on which channel and with how many frames, into an archive `folder`."""
+    """Write when each dump left and came, on which channel and with how many packets, into an archive `folder`."""
     rows = [
-        f"{format_utc(dump.utc_ns)},{dump.virtual_channel},{len(dump.packets)},{len(dump.cadus)}\n"
+        f"{format_utc(dump.utc_ns)},{format_utc(dump.utc_ns + round(dump.light_s * 1e9))},"
+        f"{dump.virtual_channel},{len(dump.packets)},{len(dump.cadus)}\n"
         for dump in dumps
     ]
-    (folder / "dumps.csv").write_text("sent_utc,virtual_channel,packets,octets\n" + "".join(rows))
+    head = "sent_utc,received_utc,virtual_channel,packets,octets\n"
+    (folder / "dumps.csv").write_text(head + "".join(rows))
 
 
 def station(name: str, minimum_elevation_deg: float = 10.0) -> GroundStation:
@@ -190,9 +205,9 @@ def contacts(
     Without stations it is always heard. Contacts begin and end on a grid of a minute.
     """
     if not section.stations or utc_ns.size == 0:
-        return np.ones(utc_ns.size, dtype=np.bool_), np.full(utc_ns.size, _LIGHT_S)
+        return np.ones(utc_ns.size, dtype=np.bool_), np.full(utc_ns.size, LIGHT_S)
     grid = np.arange(utc_ns.min(), utc_ns.max() + 1, _CONTACT_STEP_NS, dtype=np.int64)
-    heard, light_s = np.zeros(grid.size, dtype=np.bool_), np.full(grid.size, _LIGHT_S)
+    heard, light_s = np.zeros(grid.size, dtype=np.bool_), np.full(grid.size, LIGHT_S)
     for name in section.stations:
         # Reception comes later than emission by the light time, within a third of a second of this.
         geometry = link(ephemeris, grid + _LIGHT_NS, station(name, section.minimum_elevation_deg))

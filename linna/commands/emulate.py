@@ -159,13 +159,16 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
 
 def describe(summary: dict, out: Path) -> str:
     """A few lines about an emulated window, for people."""
-    altitude = summary["altitude_km"]
+    altitude, link = summary["altitude_km"], summary["link"]
     outcomes = ", ".join(f"{name} {count}" for name, count in summary["outcomes"].items() if count)
     return "\n".join(
         [
             f"{summary['frames']} frames, {summary['start_utc']} to {summary['stop_utc']}, altitude "
             f"{altitude['min']:.1f} to {altitude['max']:.1f} km",
             f"{summary['packets']} packets, {summary['downlink_octets']} octets of downlink",
+            f"link: {link['frames_sent']} frames sent, {link['frames_lost_on_link']} lost, "
+            f"{link['frames_bad']} came beyond repair; of {link['packets_made']} packets "
+            f"{link['packets_lost']} lost, {link['duplicates']} came again",
             f"outcomes: {outcomes}",
             f"data: {'; '.join(summary['data'])}",
             f"archive: {out}",

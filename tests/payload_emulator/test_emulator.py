@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from lunar.datafolder import find_data
+from lunar.timescales import parse_utc
 from payload_emulator.emulator import emulate
 from payload_emulator.scenario import parse_scenario
 from tmtc.downlink import decode
@@ -100,7 +101,10 @@ def test_no_frame_is_seen_twice_and_none_goes_back_in_time(archive: tuple[dict[s
 def test_the_dumps_are_listed_with_the_times_they_left(archive: tuple[dict[str, Any], Path]) -> None:
     summary, out = archive
     head, *rows = (out / "dumps.csv").read_text().splitlines()
-    assert head == "sent_utc,virtual_channel,packets,octets"
+    assert head == "sent_utc,received_utc,virtual_channel,packets,octets"
     assert len(rows) == summary["link"]["dumps"]
-    assert sum(int(row.split(",")[2]) for row in rows) == summary["packets"]
-    assert {row.split(",")[1] for row in rows} == {"0", "1"}
+    assert sum(int(row.split(",")[3]) for row in rows) == summary["packets"]
+    assert {row.split(",")[2] for row in rows} == {"0", "1"}
+    # The Moon is 1.2 to 1.4 light seconds away.
+    ways_s = [(parse_utc(b) - parse_utc(a)) / 1e9 for a, b in (row.split(",")[:2] for row in rows)]
+    assert all(1.15 < way_s < 1.4 for way_s in ways_s)
