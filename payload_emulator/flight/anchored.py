@@ -32,6 +32,13 @@ from payload_emulator.flight.landmark_map import (
 from payload_emulator.flight.lost_in_space import LostParameters, PlaceIndex, find_place, place_index
 from payload_emulator.flight.navigation_filter import CommonErrors, FilterState, Update
 from payload_emulator.flight.outcomes import Outcome
+from payload_emulator.flight.relative import (
+    RelativeParameters,
+    Remembered,
+    tie,
+    with_clone,
+    without_clone,
+)
 from payload_emulator.flight.sighting import (
     LandmarkMap,
     Pose,
@@ -92,6 +99,8 @@ class AnchoredParameters:
         Frames in a row that must disagree before the place is searched without any prior, and how.
     map_landmarks, mapping
         Whether craters that the catalogue lacks are mapped and used on later passes, and how.
+    relative
+        Whether the move between two frames is measured on detections that no catalogue names, and how.
     crater_limit
         Craters used of one frame: more than these, the surest, say little more, since attitude and catalogue err alike
         for all of them.
@@ -115,6 +124,7 @@ class AnchoredParameters:
     map_landmarks: bool = True
     mapping: MappingParameters = field(default_factory=MappingParameters)
     crater_limit: int = 32
+    relative: RelativeParameters = field(default_factory=RelativeParameters)
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,6 +210,8 @@ class AnchoredNavigator:
         self._catalogue = catalogue
         self._surface_m = 0.0
         self._image_ticks = initial_state.ticks
+        self.ties = 0
+        self._before: Remembered | None = None
         self._camera = camera
         self._disagreements = 0
         self._markov_sigma_m_s2 = noise.markov_sigma_m_s2
@@ -236,6 +248,8 @@ class AnchoredNavigator:
             return self._report(Outcome.no_image, mcmf_from_icrf, 0, 0)
         if camera_from_icrf is None or not len(found):
             return self._report(Outcome.coasted, mcmf_from_icrf, 0, 0)
+        if self.parameters.relative.enabled:
+            prior = self.state = self._tied(prior, found, camera_from_icrf, mcmf_from_icrf)
         pose = kalman.pose_of(prior.mean, camera_from_icrf, mcmf_from_icrf)
         fix, candidates, expected = self._fix(prior, pose, found)
         self._judge(fix, expected, len(found))
@@ -247,11 +261,41 @@ class AnchoredNavigator:
             self.state, self.last_fix = fix.update.state, fix
         if self.parameters.map_landmarks:
             self._map(found, camera_from_icrf, mcmf_from_icrf)
+        if self.parameters.relative.enabled:
+            self._remember(found, camera_from_icrf, mcmf_from_icrf)
         if fix is None:
             return self._report(
                 Outcome.refused if candidates else Outcome.coasted, mcmf_from_icrf, candidates, expected
             )
         return self._report(Outcome.fixed, mcmf_from_icrf, candidates, expected, fix)
+
+    def _tied(
+        self, prior: FilterState, found: Detections, camera_from_icrf: Float, mcmf_from_icrf: Float
+    ) -> FilterState:
+        """Return the prediction after the move since the frame before was measured."""
+        before, self._before, self.ties = self._before, None, 0
+        if before is None or prior.position_sigma_m > self.parameters.tracking_limit_m:
+            return without_clone(prior)
+        now = Remembered(found, self._detection_variance(found), camera_from_icrf, mcmf_from_icrf)
+        tied, self.ties = tie(
+            prior,
+            before,
+            now,
+            self._camera,
+            self._surface_m,
+            self.parameters.errors.attitude_noise_rad,
+            self.parameters.relative,
+        )
+        return tied if _usable(tied) else without_clone(prior)
+
+    def _remember(self, found: Detections, camera_from_icrf: Float, mcmf_from_icrf: Float) -> None:
+        """Keep the detections that no catalogue explains, and the position that they were seen from."""
+        free = np.ones(len(found), dtype=bool)
+        if self.last_fix is not None:
+            free[self.last_fix.identification.detection] = False
+        left = found.select(free)
+        self._before = Remembered(left, self._detection_variance(left), camera_from_icrf, mcmf_from_icrf)
+        self.state = with_clone(self.state)
 
     def widen(self, sigma_position_m: float, sigma_velocity_m_s: float) -> None:
         """Widen the estimate after something that neither dynamics nor burns know of: a restart, an old state."""

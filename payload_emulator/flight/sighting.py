@@ -204,7 +204,7 @@ def look(
     `shift_enu_m`, shape (n, 3), moves each crater from its catalogued place.
     """
     axes = landmarks.enu_from_mcmf[index]
-    turned = pose.camera_from_icrf - _cross_matrix(pose.attitude_rad) @ pose.camera_from_icrf
+    turned = pose.camera_from_icrf - cross_matrix(pose.attitude_rad) @ pose.camera_from_icrf
     camera_from_mcmf = turned @ pose.mcmf_from_icrf.T
     shift = pose.catalogue_offset_m if shift_enu_m is None else shift_enu_m + pose.catalogue_offset_m
     point = landmarks.position_mcmf_m[index] + np.einsum(
@@ -236,6 +236,6 @@ def look(
     )
 
 
-def _cross_matrix(vector: Float) -> Float:
+def cross_matrix(vector: Float) -> Float:
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
