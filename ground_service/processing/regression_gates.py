@@ -34,6 +34,7 @@ FloatArray = NDArray[np.float64]
 BIAS = "detector.bias"
 UNDECODABLE = "telemetry.undecodable"
 MEMORY = "memory"
+_LARGEST_LOG = 50.0
 POWER_MISS = 0.1
 """The resolution of a gate is the worsening that it sees with a probability of nine in ten."""
 
@@ -221,7 +222,7 @@ def _test(
     sign = -1.0 if figure.higher_is_better else 1.0
     ends = sorted((sign * low, sign * high))
     if figure.relative:
-        ends = [math.expm1(end) for end in ends]
+        ends = [_ratio(end) - 1.0 for end in ends]
     return _Test(
         figure.name,
         figure.unit,
@@ -304,7 +305,7 @@ def _gate(test: _Test, level: float) -> Gate:
     spread = test.error if math.isfinite(test.error) else 0.0
     reach = test.margin + (student_quantile(level, test.freedom) * spread if test.freedom > 0 else 0.0)
     if test.relative:
-        limit = test.baseline * math.exp(test.sign * reach)
+        limit = test.baseline * _ratio(test.sign * reach)
     elif test.name == BIAS:
         limit = max(test.candidate - test.worsening + reach, reach)
     else:
@@ -322,8 +323,13 @@ def _gate(test: _Test, level: float) -> Gate:
         test.high,
         test.p_value,
         level,
-        math.expm1(seen) if test.relative else seen,
+        _ratio(seen) - 1.0 if test.relative else seen,
     )
+
+
+def _ratio(logarithm: float) -> float:
+    """The ratio of a logarithm; infinite where too few blocks leave everything open."""
+    return math.inf if logarithm > _LARGEST_LOG else math.exp(logarithm)
 
 
 def _fixed(before: Sequence[PassFrames], after: Sequence[PassFrames], policy: GatePolicy) -> list[Gate]:

@@ -221,3 +221,12 @@ def test_one_pass_of_a_few_frames_says_how_little_it_sees() -> None:
 
 def test_without_passes_there_are_no_gates() -> None:
     assert judge({}, {}, POLICY) == []
+
+
+def test_two_blocks_of_frames_leave_everything_open_and_nothing_breaks() -> None:
+    before, after = {"only": simulated(1, 1, frames=6)}, {"only": simulated(1, 2, frames=6, error=9.0)}
+    gates = judge(before, after, POLICY)
+    assert failed(gates) <= {"navigation.anchored.p50", "navigation.anchored.p95"}
+    assert all(
+        gate.resolution > 0.0 for gate in gates if gate.name.startswith("navigation") and gate.unit == "m"
+    )
