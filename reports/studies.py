@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +61,37 @@ def save_fov_study(
         axes.set_xlabel("full field of view, degrees")
         axes.set_title(f"Probability of craters in the footprint; at least {needed} are needed")
         axes.legend(loc="lower right", bbox_to_anchor=(0.995, 0.02) if selected_fov_deg < 90 else None)
+        _caption(figure, caption)
+
+
+def save_anchoring_study(path: Path, scores: Sequence[Mapping[str, Any]], caption: str) -> None:
+    """Median and 95th percentile of the position error over the number of craters on board, by how they were chosen."""
+    with _sheet(path, 7.2, 4.4) as figure:
+        axes = figure.add_axes((0.11, 0.21, 0.85, 0.68))
+        whole = [
+            score for score in scores if not any(other["craters"] > score["craters"] for other in scores)
+        ]
+        styles = (("random", "sky", "o"), ("largest", "vermillion", "^"), ("spread", "green", "s"))
+        for choice, role, marker in styles:
+            # However they are chosen, all craters are the same craters.
+            mine = [score for score in scores if score["choice"] == choice]
+            mine = sorted(
+                mine + [score for score in whole if score not in mine], key=lambda one: one["craters"]
+            )
+            count = [score["craters"] for score in mine]
+            axes.plot(
+                count, [score["median_m"] for score in mine], "-", color=color(role), marker=marker,
+                markersize=4, label=f"{choice}: median",
+            )  # fmt: skip
+            axes.plot(
+                count, [score["p95_m"] for score in mine], ":", color=color(role), label=f"{choice}: 95 %"
+            )
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_xlabel("craters in the on-board catalogue")
+        axes.set_ylabel("position error with images, m")
+        axes.set_title("Navigation error over the size of the anchoring catalogue")
+        axes.legend(loc="upper right", ncols=3)
         _caption(figure, caption)
 
 

@@ -37,6 +37,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
             "curate", help="make the on-board anchoring catalogue from a crater list and terrain"
         )
     )
+    from linna.commands._catalogue_minimum import configure as configure_minimum
+
+    configure_minimum(
+        commands.add_parser("minimum", help="how few landmarks keep the error of navigation bounded")
+    )
 
 
 def _configure_curate(curate: argparse.ArgumentParser) -> None:
