@@ -11,6 +11,7 @@ once, undisturbed, into SQLite. Exit status 1 where that does not hold.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import random
@@ -69,20 +70,30 @@ class Part:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        with self._log.open("ab") as log:
-            self._process = subprocess.Popen(
-                self._command, stdout=log, stderr=log, start_new_session=True, **self._options
-            )
-        wait_until(self._ready, self._command[0])
+        """Start it, again when it gives up at once (what it was killed with may not be gone yet)."""
+        until = time.monotonic() + 120.0
+        while time.monotonic() < until:
+            with self._log.open("ab") as log:
+                self._process = subprocess.Popen(
+                    self._command, stdout=log, stderr=log, start_new_session=True, **self._options
+                )
+            while time.monotonic() < until and self._process.poll() is None:
+                if self._ready():
+                    return
+                time.sleep(0.1)
+            time.sleep(0.5)
+        raise SystemExit(f"{' '.join(self._command[:4])}: did not start; {self._log.read_text()[-500:]}")
 
     def kill(self) -> None:
         assert self._process is not None
-        for pid in [self._process.pid, *descendants(self._process.pid)]:
-            try:
+        family = [self._process.pid, *descendants(self._process.pid)]
+        for pid in family:
+            with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-            except ProcessLookupError:
-                continue
         self._process.wait()
+        until = time.monotonic() + 10.0
+        while any(Path(f"/proc/{pid}").exists() for pid in family) and time.monotonic() < until:
+            time.sleep(0.05)
 
 
 def descendants(pid: int) -> list[int]:
@@ -215,7 +226,15 @@ def campaign(
         killed: Counter[str] = Counter()
         stop = threading.Event()
 
+        broken: list[BaseException] = []
+
         def harass() -> None:
+            try:
+                kill_some()
+            except BaseException as error:
+                broken.append(error)
+
+        def kill_some() -> None:
             while sum(killed.values()) < kills and not stop.is_set():
                 time.sleep(rng.uniform(0.0, 2.0 * pause_s))
                 part = rng.choice(list(deployment.parts))
@@ -241,6 +260,8 @@ def campaign(
             jobs += [ask(deployment.api, "POST", f"/passes/{pass_id}/reports", b"", f"report {k}")["id"]
                      for k in range(reports)]  # fmt: skip
             thread.join()
+            if broken:
+                raise broken[0]
             states: Counter[str] = Counter()
             attempts = 0
             for job in jobs:
@@ -293,6 +314,7 @@ def main() -> int:
     parser.add_argument("--pieces", type=int, default=60)
     parser.add_argument("--reports", type=int, default=6)
     given = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was started is ended
     figures = campaign(given.kills, given.seed, given.pause, given.packets, given.pieces, given.reports)
     print(json.dumps(figures, indent=2))
     good = (

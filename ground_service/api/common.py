@@ -24,6 +24,7 @@ API_PREFIX = "/api/v1"
 PROBLEMS: dict[int | str, dict[str, Any]] = {
     status: {"model": schemas.Problem, "content": {"application/problem+json": {}}, "description": text_}
     for status, text_ in (
+        (400, "Malformed request"),
         (401, "No valid token"),
         (403, "The role does not allow it"),
         (404, "Not found"),

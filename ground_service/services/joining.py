@@ -39,6 +39,9 @@ def join_with_others(
 
     Returns how many packets that gave.
     """
+    # One file at a time: of two that are ingested at once, the later has to see the edges of the earlier.
+    vehicles = repository.VEHICLES
+    connection.execute(select(vehicles.c.id).where(vehicles.c.id == vehicle).with_for_update())
     table = repository.STREAM_EDGES
     known = connection.execute(select(table).where(table.c.vehicle_id == vehicle)).mappings()
     others = [dict(row) for row in known]

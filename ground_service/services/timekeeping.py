@@ -17,11 +17,11 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.processing.correlation import CorrelationFit, fit_correlation
 from ground_service.services.ground import Ground
+from ground_service.services.plan_schemas import time_of
 from ground_service.services.users import audit
 from ground_service.services.window_progress import advance_windows
 from ground_service.store import repository
 from lunar.errors import LunarError
-from lunar.timescales import parse_utc
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +121,7 @@ def time_points(given: Sequence[Mapping[str, Any]]) -> list[TimePoint]:
             points.append(
                 TimePoint(
                     ticks=int(one["ticks"]),
-                    earth_utc_ns=parse_utc(str(one["received"])),
+                    earth_utc_ns=time_of(str(one["received"]), f"points.{number}.received"),
                     light_time_ns=round(float(one["light_time_s"]) * 1e9),
                     boot_count=int(one.get("boot_count") or 0),
                 )
