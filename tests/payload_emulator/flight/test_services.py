@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from payload_emulator.flight.loads import TABLE_NUMBERS
 from payload_emulator.flight.parameters import PARAMETERS, find_parameter
@@ -375,3 +377,22 @@ def test_standby_sends_what_is_small_and_keeps_the_rest(make_rig: Callable[..., 
     assert packets and not rig.named(packets, "detections")
     assert "observation_stopped" in rig.events(packets)
     assert rig.payload.waiting > 0
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.tuples(st.integers(0, 11), st.booleans()), max_size=40))
+def test_whatever_order_and_repetition_no_telecommand_executes_twice(
+    make_rig: Callable[..., Any], arrivals: list[tuple[int, bool]]
+) -> None:
+    rig = make_rig()
+    pings = [rig.command("test_connection") for _ in range(12)]
+    done: list[int] = []
+    for which, reset in arrivals:
+        if reset:
+            rig.boot(ResetCause.watchdog)
+        packets = rig.step(pings[which], seconds=4_000.0, image=None)
+        executed = len(rig.named(packets, "connection_report"))
+        assert executed == (which not in done and which > max(done, default=-1))
+        assert bool(rig.refusals(packets)) is not bool(executed)
+        done += [which] * executed
+    assert len(set(done)) == len(done)
