@@ -37,7 +37,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
             "curate", help="make the on-board anchoring catalogue from a crater list and terrain"
         )
     )
+    from linna.commands._catalogue_landmarks import configure as configure_landmarks
     from linna.commands._catalogue_minimum import configure as configure_minimum
+
+    configure_landmarks(
+        commands.add_parser("landmarks", help="the map that the payload made itself, beside a catalogue")
+    )
 
     configure_minimum(
         commands.add_parser("minimum", help="how few landmarks keep the error of navigation bounded")

@@ -50,7 +50,8 @@ def run_lost(arguments: argparse.Namespace) -> int:
     from payload_emulator.flight.lost_in_space import place_index
     from payload_emulator.identification_study import KINDS, study_lost, study_lost_in_frames
 
-    world, model = _world(arguments), _model(arguments)
+    model = _model(arguments)
+    world = _world(arguments)
     attitude_rad = math.radians(arguments.attitude_deg)
     hostile = max(arguments.frames // 3, 1)
     scores = []
@@ -93,7 +94,8 @@ def run_lost(arguments: argparse.Namespace) -> int:
 def run_tracking(arguments: argparse.Namespace) -> int:
     from payload_emulator.identification_study import KINDS, study_tracking
 
-    world, model = _world(arguments), _model(arguments)
+    model = _model(arguments)
+    world = _world(arguments)
     hostile = max(arguments.frames // 10, 1)
     scores = []
     for kind in KINDS:

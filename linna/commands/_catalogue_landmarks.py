@@ -1,0 +1,64 @@
+"""`linna catalogue landmarks`: the payload's own map, from a downlink, beside a catalogue."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from linna.output import add_json_flag, emit
+
+
+def configure(landmarks: argparse.ArgumentParser) -> None:
+    landmarks.add_argument("downlink", type=Path, metavar="FILE", help="downlink (CADUs or packets)")
+    landmarks.add_argument(
+        "--catalogue", metavar="F", help="catalogue to compare with (default: the one at hand)"
+    )
+    add_json_flag(landmarks)
+    landmarks.set_defaults(handler=run, seed=1)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    import numpy as np
+
+    from ground_service.processing.landmarks import MappedCraters, compare_map, latest
+    from linna.commands.catalogue import open_catalogue
+    from tmtc.dictionary import DICTIONARY
+    from tmtc.downlink import decode
+
+    decoded = decode(arguments.downlink.read_bytes())
+    table = DICTIONARY.unpack_many(decoded.buffer, decoded.cut, only=("landmarks",)).get("landmarks")
+    catalogue = open_catalogue(arguments.catalogue, arguments.seed)
+    columns = {} if table is None else table.items
+
+    def column(name: str):
+        return columns.get(name, np.empty(0))
+
+    sigma_m = np.stack([column(f"sigma_{axis}_m") for axis in ("east", "north", "up")], axis=1)
+    reports = MappedCraters(
+        column("landmark_id").astype(np.int64),
+        column("latitude_deg"),
+        column("longitude_deg"),
+        column("height_m"),
+        column("diameter_m"),
+        sigma_m,
+    )
+    mapped = latest(reports)
+    result = compare_map(mapped, catalogue)
+    figures = {
+        "landmarks": len(mapped),
+        "reports": len(reports),
+        "in_catalogue": result.known,
+        "new": len(mapped) - result.known,
+        "median_horizontal_m": result.median_horizontal_m,
+        "median_offset_m": dict(zip(("east", "north", "up"), result.median_offset_m, strict=True)),
+        "normalised_square": result.normalised_square,
+        "catalogue": catalogue.source,
+    }
+    text = f"{len(mapped)} landmarks mapped on board; {result.known} of them in {catalogue.source}"
+    if result.known:
+        text += (
+            f", {result.median_horizontal_m:.0f} m from it (median); east and north squared over the claimed sigma: "
+            f"{result.normalised_square:.2f}"
+        )
+    emit(arguments, figures, text=text)
+    return 0

@@ -1,0 +1,109 @@
+"""Commands about catalogues and identification: figures as JSON, bad input in one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from linna.cli import run
+from lunar.catalogue import make_catalogue, save_catalogue
+from payload_emulator.flight.tables import CatalogueTable, pack_catalogue_table
+from tmtc.dictionary import DICTIONARY
+
+
+def landmarks_packet(latitude: list[float], identity: int = 3_000_000_000) -> bytes:
+    one = np.ones(len(latitude))
+    items = {
+        "landmark_id": identity + np.arange(len(latitude)),
+        "latitude_deg": np.array(latitude),
+        "longitude_deg": 300.0 * one,
+        "height_m": 50.0 * one,
+        "diameter_m": 6_000.0 * one,
+        "sigma_east_m": 100.0 * one,
+        "sigma_north_m": 100.0 * one,
+        "sigma_up_m": 100.0 * one,
+        "sightings": 3 * one.astype(int),
+        "passes": one.astype(int),
+    }
+    values = {"frame_number": 1, "image_ticks": 5, "items": items}
+    return DICTIONARY.pack("landmarks", values, ticks=0, sequence_count=0)
+
+
+def test_a_downlinked_map_is_compared_with_a_catalogue(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, downlink = tmp_path / "list.csv", tmp_path / "map.bin"
+    listed = make_catalogue(
+        np.radians([10.0]), np.radians([300.0]), [6_000.0], source="one", rim_height_m=[50.0]
+    )
+    save_catalogue(listed, path)
+    # 0.01 degrees are 303 m on the ground; the other landmark is far from any crater.
+    downlink.write_bytes(landmarks_packet([10.01, 20.0]))
+    assert run(["catalogue", "landmarks", str(downlink), "--catalogue", str(path), "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert (figures["landmarks"], figures["in_catalogue"], figures["new"]) == (2, 1, 1)
+    assert figures["median_horizontal_m"] == pytest.approx(303.2, abs=1.0)
+
+
+def test_a_downlink_without_a_map_has_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, downlink = tmp_path / "list.csv", tmp_path / "other.bin"
+    save_catalogue(make_catalogue([0.1], [0.2], [6_000.0], source="one"), path)
+    time_report = {"reported_ticks": 1, "rate_exponent": 0}
+    downlink.write_bytes(DICTIONARY.pack("time_report", time_report, ticks=0, sequence_count=0))
+    assert run(["catalogue", "landmarks", str(downlink), "--catalogue", str(path), "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert (figures["landmarks"], figures["median_horizontal_m"]) == (0, None)
+
+
+def test_tracking_identification_is_measured_on_an_anchoring_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(3)
+    count = 400
+    path = tmp_path / "anchors.tbl"
+    table = CatalogueTable(
+        np.arange(count), rng.uniform(-0.1, 0.1, count), rng.uniform(1.0, 1.2, count),
+        rng.uniform(5e3, 15e3, count), rng.normal(0.0, 200.0, count), np.full((count, 3), 80.0),
+    )  # fmt: skip
+    path.write_bytes(pack_catalogue_table(table))
+    assert run(["identify", "tracking", str(path), "--frames", "60", "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["craters"] == count
+    assert figures["frames"] == 60
+    assert figures["wrong_fixes"] == 0
+    assert figures["rung"].startswith("rung 1-2")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["catalogue", "curate", "none.csv", "--out", "x", "--region", "5"], "--region"),
+        (["catalogue", "curate", "none.csv", "--out", "x", "--min-diameter", "40"], "--min-diameter"),
+        (["catalogue", "minimum", "--shares", "2"], "--shares"),
+        (["catalogue", "minimum", "--hours", "0"], "--hours"),
+        (["identify", "tracking", "--recall", "2"], "--recall"),
+        (["identify", "lost", "--frames", "0"], "--frames"),
+    ],
+)
+def test_bad_input_is_one_line_that_names_it(
+    arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("LINNA_DATA", raising=False)
+    assert run(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert expected in error
+
+
+def test_a_damaged_anchoring_table_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "anchors.tbl"
+    one = np.ones(3)
+    octets = pack_catalogue_table(
+        CatalogueTable(np.arange(3), 0.1 * one, 0.1 * one, 5e3 * one, one, np.ones((3, 3)))
+    )
+    path.write_bytes(octets[:-1] + bytes([octets[-1] ^ 1]))
+    assert run(["identify", "tracking", str(path), "--frames", "5"]) == 2
+    assert "CRC-32" in capsys.readouterr().err
