@@ -180,7 +180,12 @@ class Payload:
         board, telemetry = machine.board, machine.telemetry
         machine.start_housekeeping(machine.parameters["housekeeping_interval_s"])
         recovery, kept = machine.settings.read()
-        before = machine.restore(kept) if kept else None
+        before = None
+        try:
+            before = machine.restore(kept) if kept else None
+        except (KeyError, TypeError, ValueError):
+            # Whole, but of another build: worth no more than lost ones.
+            recovery = Recovery.lost
         stored = machine.store.recover()
         if stored:
             telemetry.resume()

@@ -14,6 +14,7 @@ from payload_emulator.flight.parameters import PARAMETERS
 from payload_emulator.flight.payload import PayloadMode
 from payload_emulator.flight.ports import ResetCause
 from payload_emulator.flight.preprocess import ImageQuality
+from payload_emulator.flight.settings import Settings
 
 NUMBERS = {parameter.name: parameter.number for parameter in PARAMETERS}
 NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)
@@ -181,6 +182,14 @@ def test_settings_lost_in_both_copies_end_in_safe(observing: Any) -> None:
     packets = observing.step()
     assert "state_lost" in observing.events(packets)
     assert observing.payload.mode is PayloadMode.safe
+
+
+@pytest.mark.parametrize("values", [{"boot_count": 3}, {"boot_count": "many"}, {"mode": 9, "boot_count": 1}])
+def test_settings_that_another_build_wrote_count_as_lost(rig: Any, values: dict[str, Any]) -> None:
+    Settings(rig.board.settings).write(values)
+    packets = rig.step()
+    assert "state_lost" in rig.events(packets)
+    assert rig.payload.mode is PayloadMode.safe
 
 
 def test_settings_damaged_in_one_copy_are_recovered_from_the_other(observing: Any) -> None:
