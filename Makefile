@@ -25,6 +25,8 @@ check: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(PYTHON) -m pip --python $(BIN)/python check
+	$(BIN)/python -m pytest -q tests/test_dependencies.py
 
 bench: $(VENV)/.bench
 	$(BIN)/python -m benchmarks

@@ -14,7 +14,7 @@ from ground_service.errors import DatabaseNotMigrated, SettingsError
 from ground_service.services.archive_import import import_archive
 from ground_service.services.ground import Ground, open_ground
 from ground_service.services.ingest import ingest_file
-from ground_service.services.jobs import enter_job
+from ground_service.services.jobs import _lock_key, enter_job, run_job
 from ground_service.services.reports import pass_summary
 from ground_service.settings import Settings
 from ground_service.store import repository
@@ -138,3 +138,59 @@ def test_a_job_entered_twice_is_one_job(ground: Ground) -> None:
 def test_a_worker_without_a_broker_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="LINNA_BROKER_URL: expected a broker"):
         run_worker(Settings(home=tmp_path))
+
+
+def test_jobs_that_the_broker_lost_are_sent_again(
+    ground_on_postgres: Ground, redis_url: str, upgraded: str
+) -> None:
+    """The queue is emptied as if the broker had been killed; a job that somebody is doing is left to him."""
+    import redis
+
+    from ground_service.worker.app import queue_length
+
+    ground = ground_on_postgres
+    settings = Settings(home=ground.home, database_url=upgraded, broker_url=redis_url)
+    dispatcher = dispatcher_for(ground, settings)
+    lost = dispatcher.submit("report", {"pass_id": 4712})
+    with redis.Redis.from_url(redis_url) as broker:
+        broker.flushdb()
+    assert queue_length(settings) == 0
+    key = _lock_key(lost)
+    with ground.database.alone(key) as mine, ground.database.alone(key) as second:
+        assert (mine, second) == (True, False)
+        assert run_job(ground, lost)["state"] == "queued"
+    dispatcher.resume()
+    waiting = queue_length(settings)
+    assert waiting >= 1
+    dispatcher.resume()  # it waits already: nothing is added
+    assert queue_length(settings) == waiting
+    assert run_job(ground, lost)["error"] == "pass 4712: not found"
+
+
+def test_a_broker_that_is_away_refuses_nothing(ground: Ground, tmp_path: Path) -> None:
+    settings = Settings(home=tmp_path, broker_url="redis://127.0.0.1:1/0")
+    dispatcher = dispatcher_for(ground, settings)
+    job = dispatcher.submit("report", {"pass_id": 1})
+    dispatcher.resume()
+    assert job_row(ground, job)["state"] == "queued"
+
+
+def test_two_files_that_are_ingested_at_once_are_joined(
+    ground_on_postgres: Ground, synthetic_pass: Any
+) -> None:
+    """The packets that the cut between them goes through belong to neither, and come to light in any order."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    octets = (synthetic_pass.folder / "downlink.cadu").read_bytes()
+    cadu = 1279
+    pieces = [octets[k : k + 2 * cadu] for k in range(0, len(octets), 2 * cadu)]
+    folder = ground_on_postgres.home / "pieces"
+    folder.mkdir()
+    for number, piece in enumerate(pieces):
+        (folder / f"{number}.cadu").write_bytes(piece)
+    with ThreadPoolExecutor(4) as pool:
+        list(
+            pool.map(lambda path: ingest_file(ground_on_postgres, path, instance="pieces"), folder.iterdir())
+        )
+    whole = ingest_file(ground_on_postgres, synthetic_pass.folder / "downlink.cadu", instance="pieces")
+    assert whole.packets_new == 0
