@@ -48,7 +48,8 @@ def test_detect_takes_any_size_and_depth(write_image, capsys, name, image):
     assert item["file"] == str(path)
     assert item["quality"] == "ok"
     for detection in item["detections"]:
-        assert set(detection) >= {"u_px", "v_px", "diameter_px", "score", "class"}
+        assert set(detection) >= {"u_px", "v_px", "diameter_px", "score", "class", "depth_ratio"}
+        assert detection["state"] in ("fresh", "worn", "degraded")
         assert -1 <= detection["class"] <= 3
 
 

@@ -1,6 +1,7 @@
 """The flight detector with the shipped network: coordinates, bad input, bad models."""
 
 import hashlib
+import json
 
 import numpy as np
 import pytest
@@ -125,8 +126,18 @@ def test_the_shipped_network_is_small_and_tells_what_it_is(detector):
     assert len(detector.model_octets) <= 6_000_000
     assert detector.model_hash == int(hashlib.sha256(detector.model_octets).hexdigest()[:8], 16)
     assert 0.1 <= detector.score_threshold <= 0.9
-    for key in ("input", "outputs", "score_threshold", "navigation_threshold", "data", "validation"):
+    for key in (
+        "input",
+        "outputs",
+        "navigation_threshold",
+        "data",
+        "validation",
+        "git_revision",
+        "training_seed",
+    ):
         assert detector.metadata[key]
+    tested = json.loads(detector.metadata["test_figures"])
+    assert set(tested) == {"real-strip", "real-block", "procedural-world"}
 
 
 def test_a_network_of_another_hash_is_refused():
