@@ -27,13 +27,13 @@ SHARE_OF_MOVE = 0.2
 
 @dataclass(frozen=True, slots=True)
 class PassDifference:
-    """How much two builds differ on a pass."""
+    """How much two builds differ on a pass; `error_m` is the median change of the length of the position error."""
 
     name: str
     frames: int
     frames_changed: int
     craters_changed: int
-    position_m: float
+    error_m: float
     score: float
 
 
@@ -60,8 +60,8 @@ class Bisection:
 def differences(outcome: RegressionOutcome) -> list[PassDifference]:
     """Passes by how much the builds differ on them, the most different first.
 
-    The score is the share of frames whose detections changed plus the median distance between the builds' positions of
-    the last estimator over a hundred metres.
+    The score is the share of frames whose detections changed plus the median change of the position error over a
+    hundred metres.
     """
     found = []
     for one in outcome.passes:
@@ -70,15 +70,16 @@ def differences(outcome: RegressionOutcome) -> list[PassDifference]:
         old, new = one.baseline_read.frames, one.candidate_read.frames
         craters = np.abs(new.hits - old.hits) + np.abs(new.alarms - old.alarms)
         changed = (craters > 0.0) | (new.shift_u_px != old.shift_u_px) | (new.shift_v_px != old.shift_v_px)
-        apart = [
-            float(np.nanmedian(np.abs(new.estimators[name].error_m - estimator.error_m)))
+        apart = {
+            name: float(np.nanmedian(np.abs(new.estimators[name].error_m - estimator.error_m)))
             for name, estimator in old.estimators.items()
             if name in new.estimators and np.isfinite(new.estimators[name].error_m - estimator.error_m).any()
-        ]
-        position_m = apart[0] if apart else float("nan")
-        score = float(changed.mean()) + (position_m / 100.0 if apart else 0.0)
+        }
+        # The estimator that claims an accuracy is the one that navigates; the others drift by kilometres anyway.
+        error_m = apart.get("anchored", min(apart.values(), default=float("nan")))
+        score = float(changed.mean()) + (error_m / 100.0 if apart else 0.0)
         found.append(
-            PassDifference(one.name, len(old), int(changed.sum()), int(craters.sum()), position_m, score)
+            PassDifference(one.name, len(old), int(changed.sum()), int(craters.sum()), error_m, score)
         )
     return sorted(found, key=lambda item: (-item.score, item.name))
 

@@ -217,7 +217,7 @@ def _search(arguments: argparse.Namespace) -> int:
     found = differences(outcome)[: arguments.top]
     lines = [
         f"{item.name}: {item.frames_changed} of {item.frames} frames changed, {item.craters_changed} craters, "
-        f"positions {item.position_m:.1f} m apart"
+        f"position error changed by {item.error_m:.1f} m"
         for item in found
     ]
     emit(
