@@ -485,7 +485,14 @@ def _check(scenario: Scenario, source: str) -> None:
         require(name in ESTIMATORS, "navigation.estimators", f"of {', '.join(ESTIMATORS)}", name)
     require(len(scenario.navigation.estimators) > 0, "navigation.estimators", "at least one estimator", ())
     link = scenario.link
-    for key in ("frame_loss", "burst_start", "burst_end", "burst_frame_loss", "repeat_share", "reorder_share"):
+    for key in (
+        "frame_loss",
+        "burst_start",
+        "burst_end",
+        "burst_frame_loss",
+        "repeat_share",
+        "reorder_share",
+    ):
         share = getattr(link, key)
         require(0.0 <= share <= 1.0, f"link.{key}", "from 0 to 1", share)
     for key in ("bit_error_rate", "burst_bit_error_rate"):
