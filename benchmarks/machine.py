@@ -16,8 +16,9 @@ import numpy as np
 from payload_emulator.flight.ports import BareBoard
 
 _MINUTE_TICKS = 60 * 65_536
+_MINUTES_A_DAY = 1440
 _START_TICKS = 61_000_000_000_000
-_CONTACT_EVERY, _CONTACT_OCTETS = 120, 4 << 20
+_CONTACT_TURNS, _CONTACT_OCTETS = 12, 4 << 20
 
 
 class _Board(BareBoard):
@@ -29,8 +30,8 @@ class _Board(BareBoard):
         return self.takes
 
 
-def bench(days: float = 60.0) -> dict[str, Any]:
-    """Resident memory idle, and after every month of `days` of one-minute turns, with a contact each two hours."""
+def bench(days: float = 365.0, minutes: int = 10) -> dict[str, Any]:
+    """Resident memory idle and after every month of `days`, with a packet of housekeeping every so many minutes."""
     from payload_emulator.flight.detector import OnnxDetector
     from payload_emulator.flight.models import load_shipped_model
     from payload_emulator.flight.payload import Payload, PayloadMode
@@ -42,22 +43,25 @@ def bench(days: float = 60.0) -> dict[str, Any]:
     payload = Payload(
         detector, model_hash=detector.model_hash, model_octets=model, board=board, mode=PayloadMode.standby
     )
-    # Checking four megabytes of memory every minute of a year would be all that is measured.
-    hourly = DICTIONARY.pack_command("set_parameter", {"parameter_id": 15, "value": 3600.0}, sequence_count=0)
+    # Checking four megabytes of memory every ten minutes of a year would be all that is measured.
+    orders = b"".join(
+        DICTIONARY.pack_command("set_parameter", {"parameter_id": number, "value": value}, sequence_count=k)
+        for k, (number, value) in enumerate(((1, 60.0 * min(minutes, 60)), (2, 3600.0), (15, 86_400.0)))
+    )
     image, attitude = np.zeros((0, 0), np.uint8), np.full(7, np.nan)
     board.takes = _CONTACT_OCTETS
-    payload.step(image, attitude, _START_TICKS, hourly)
+    payload.step(image, attitude, _START_TICKS, orders)
     idle_mib = _resident_mib()
-    turns = round(days * 1440)
+    turns = round(days * _MINUTES_A_DAY / minutes)
     packets = octets = 0
     months: list[float] = []
     started = time.process_time()
     for turn in range(1, turns + 1):
-        board.takes = _CONTACT_OCTETS if turn % _CONTACT_EVERY == 0 else 0
-        sent = payload.step(image, attitude, _START_TICKS + turn * _MINUTE_TICKS, b"")
+        board.takes = _CONTACT_OCTETS if turn % _CONTACT_TURNS == 0 else 0
+        sent = payload.step(image, attitude, _START_TICKS + turn * minutes * _MINUTE_TICKS, b"")
         packets += len(sent)
         octets += sum(map(len, sent))
-        if turn % (30 * 1440) == 0:
+        if turn % (30 * _MINUTES_A_DAY // minutes) == 0:
             months.append(round(_resident_mib(), 2))
     seconds = time.process_time() - started
     return {
@@ -80,4 +84,4 @@ def _resident_mib() -> float:
 
 
 if __name__ == "__main__":
-    print(json.dumps(bench(float(sys.argv[1]) if len(sys.argv) > 1 else 60.0), indent=1))
+    print(json.dumps(bench(float(sys.argv[1]) if len(sys.argv) > 1 else 365.0), indent=1))
