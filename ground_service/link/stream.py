@@ -20,7 +20,7 @@ from tmtc.packets import PACKET_MAX_LENGTH
 from tmtc.schema import Dictionary
 from tmtc.stream import PacketCut, cut_packets
 
-WINDOW_OCTETS = 8 << 20
+WINDOW_OCTETS = 4 << 20
 """Octets decoded and stored at a time: large enough to spread the cost of a transaction, small against memory."""
 
 PROBE_OCTETS = 256 << 10
