@@ -255,7 +255,9 @@ class AnchoredNavigator:
         self._judge(fix, expected, len(found))
         if fix is None and self._disagreements >= self.parameters.suspicion_frames:
             fix = self._reacquire(prior, pose, found)
-            if fix is None and self._disagreements >= self.parameters.lost_frames:
+            since = self._disagreements - self.parameters.lost_frames
+            # A search takes up to a second: one frame in three is tried.
+            if fix is None and since >= 0 and since % 3 == 0:
                 fix = self._found_anywhere(prior, pose, found)
         if fix is not None:
             self.state, self.last_fix = fix.update.state, fix

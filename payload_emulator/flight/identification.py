@@ -37,7 +37,7 @@ class IdentificationParameters:
         0.1 to 0.15.
     false_set_limit
         Largest expected number of sets that chance makes up per frame, for a set to be believed while tracking. It
-        holds for up to three detections and falls with the cube of those beyond two: a frame full of detections
+        holds for up to three detections and falls with the square of those beyond two: a frame full of detections
         that hardly any crater explains speaks against the set, a mirrored image for example.
     hypothesis_limit
         Pairs tried as hypotheses.
@@ -116,7 +116,7 @@ def identify(
     chosen = _consistent(
         chosen, sighted, offset, prior_px2, crater_noise_px2, detection_variance_px2[detection]
     )
-    limit = parameters.false_set_limit / max(1, len(found) - 2) ** 3
+    limit = parameters.false_set_limit / max(1, len(found) - 2) ** 2
     needed = minimum_members(float(chance.sum()), tight_chance, limit)
     return Identification(detection[chosen], sighted[chosen], count, needed)
 

@@ -10,7 +10,7 @@ import pytest
 
 from payload_emulator.flight.anchored import AnchoredParameters
 from payload_emulator.flight.lost_in_space import LostParameters
-from payload_emulator.montecarlo import Kidnap, NavigationCase, NavigationRun, fly
+from payload_emulator.montecarlo import CatalogueErrors, Kidnap, NavigationCase, NavigationRun, fly
 
 FRAME = 20
 PARAMETERS = AnchoredParameters(gravity_degree=50)
@@ -69,3 +69,21 @@ def about_deg(case: NavigationCase) -> tuple[float, float]:
 def turn_deg(case: NavigationCase, rows: np.ndarray) -> np.ndarray:
     longitude = np.degrees(case.craters.longitude_rad[rows]) - about_deg(case)[1]
     return np.abs(np.mod(longitude + 180.0, 360.0) - 180.0)
+
+
+@pytest.mark.parametrize("wrong_share", [0.3, 1.0])
+def test_a_stale_catalogue_misleads_nobody(
+    navigation_case: Callable[..., NavigationCase], wrong_share: float
+) -> None:
+    errors = CatalogueErrors(wrong_share=wrong_share)
+    # Without the search of the whole Moon, which takes a second a frame on this map.
+    parameters = replace(PARAMETERS, lost_frames=10_000)
+    run = fly(navigation_case(40, catalogue_errors=errors, parameters=parameters), 3)
+    assert np.all(np.isfinite(run.error_rtn_m))
+    late = slice(20, None)
+    if wrong_share < 1.0:
+        assert np.median(run.error_m[late]) < 200.0
+    else:
+        # Nothing on board is where it should be: hardly a fix is believed, and the claimed sigma grows past the error.
+        assert np.mean(run.fixed) < 0.2
+        assert np.median(run.error_m[late]) < 4.0 * np.median(np.linalg.norm(run.sigma_rtn_m[late], axis=1))
