@@ -310,10 +310,14 @@ def integrate(
                 rates[count, d] = k[0, d + 3]
             wait = 0.0
             if status == EVENT:  # the dense output gave the time to some ms: Newton's rule on radial speed
-                rate = y[3] * y[3] + y[4] * y[4] + y[5] * y[5] + y[0] * k[0, 3] + y[1] * k[0, 4] + y[2] * k[0, 5]
+                rate = (
+                    y[3] * y[3] + y[4] * y[4] + y[5] * y[5] + y[0] * k[0, 3] + y[1] * k[0, 4] + y[2] * k[0, 5]
+                )
                 wait = -_radial(y) / rate
             elif count > 0:
-                status, fraction = _events(times, states, rates, count - 1, sign, ground_m, event, event_radius_m, work)
+                status, fraction = _events(
+                    times, states, rates, count - 1, sign, ground_m, event, event_radius_m, work
+                )
                 if status == EVENT:
                     wait = (fraction - 1.0) * (t - times[count - 1])
             if abs(wait) > 1e-6 and tries < 5:  # take the step again, as far as the event

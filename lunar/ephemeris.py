@@ -342,7 +342,9 @@ def _interpolate(
     origin_ns = nodes[needed]
     half_s = (nodes[needed + 1] - origin_ns) / (2 * NS)
     node = ((nodes[window] - origin_ns[:, None]) / NS / half_s[:, None] - 1.0).T
-    states = np.concatenate([segment.position_m[window], segment.velocity_m_s[window]], axis=2).transpose(1, 2, 0)
+    states = np.concatenate([segment.position_m[window], segment.velocity_m_s[window]], axis=2).transpose(
+        1, 2, 0
+    )
     if hermite:
         table = _hermite_polynomials(node, states[:, :3], states[:, 3:] * half_s)
     else:

@@ -30,7 +30,7 @@ def test_the_quantile_of_students_t_is_that_of_scipy(upper_tail: float, freedom:
 
 
 def test_holm_steps_down_as_in_the_textbook_example() -> None:
-    """Four p-values at 0.05: 0.005 and 0.01 are refused (limits 0.0125, 0.0167), 0.03 is kept at 0.025, all after it too."""
+    """Four p-values at 0.05: 0.005 and 0.01 are refused (0.0125, 0.0167), 0.03 is kept at 0.025, all after it too."""
     p_values = [0.01, 0.04, 0.03, 0.005]
     levels = holm_levels(p_values, 0.05)
     assert [p <= level for p, level in zip(p_values, levels, strict=True)] == [True, False, False, True]

@@ -194,7 +194,9 @@ class Rig:
         """Let time pass, then take a step; `image` None: none is taken."""
         self.second += seconds
         self.board.advance(seconds, 1.0)
-        picture = np.zeros((0, 0), np.uint8) if image is None else self.image if isinstance(image, str) else image
+        picture = (
+            np.zeros((0, 0), np.uint8) if image is None else self.image if isinstance(image, str) else image
+        )
         packets = self.payload.step(picture, self.attitude, self.ticks, orders)
         if self.board.reset_requested is not None:
             self.boot(self.board.reset_requested)
