@@ -13,7 +13,9 @@ def main(wanted: list[str]) -> int:
     unknown = set(wanted) - {file.stem for file in files}
     if unknown:
         known = ", ".join(file.stem for file in files)
-        print(f"benchmarks: no benchmark named {', '.join(sorted(unknown))}; there are {known}", file=sys.stderr)
+        print(
+            f"benchmarks: no benchmark named {', '.join(sorted(unknown))}; there are {known}", file=sys.stderr
+        )
         return 2
     failed = 0
     for file in files:

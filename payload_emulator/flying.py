@@ -36,6 +36,7 @@ _DUMP_OCTETS = 64_000
 _BEFORE_ARC_NS = 60 * _NS
 _IDLE_STEP_NS = 60 * _NS
 _STANDBY_BEFORE_TICKS = 20 * 65_536
+_PATIENCE_NS = 600 * _NS
 _AHEAD_NS = 12 * 3_600 * _NS
 _NO_ATTITUDE = np.full(7, np.nan)
 # A detector as the one that flies, roughly: what is drawn where no image is rendered.
@@ -179,6 +180,7 @@ class Operator:
     _last_contact: tuple[int, int] | None = None
     _contact_start: int = 0
     _started: bool = False
+    _idle_since_ns: int | None = None
 
     def command(self, name: str, **values: object) -> bytes:
         """The next telecommand packet."""
@@ -199,7 +201,7 @@ class Operator:
         if not (moment.heard or first):
             self._end_contact(moment)
             return b""
-        orders = [*self._windows(moment)]
+        orders = [*self._windows(moment), *self._resumed(moment, mode)]
         if self.world.scenario.link.stations:
             orders += self._contact(moment, mode)
         if moment.frame >= 0:
@@ -225,6 +227,20 @@ class Operator:
             if world.scenario.link.stations:
                 yield self._at(ticks - _STANDBY_BEFORE_TICKS, self.function("set_mode", PayloadMode.standby))
             yield self._at(ticks, self.function("start_observation", duration_s))
+
+    def _resumed(self, moment: Moment, mode: PayloadMode) -> Iterator[bytes]:
+        """A payload found waiting in a window, as after a camera that it gave up, is told to observe again."""
+        if moment.frame < 0 or mode is not PayloadMode.standby:
+            self._idle_since_ns = None
+            return
+        if self._idle_since_ns is None:
+            self._idle_since_ns = moment.utc_ns
+        if moment.utc_ns - self._idle_since_ns < _PATIENCE_NS:
+            return
+        self._idle_since_ns = None
+        last = next(stop for start, stop in arcs(self.world) if start <= moment.frame <= stop)
+        left_s = (int(self.world.frame_utc_ns[last]) - moment.utc_ns) / _NS
+        yield self.function("start_observation", left_s + 0.5 * self.world.scenario.camera.frame_interval_s)
 
     def _at(self, ticks: int, packet: bytes) -> bytes:
         octets = np.frombuffer(packet, dtype=np.uint8)

@@ -286,7 +286,7 @@ def load_scenario(path: Path | str) -> Scenario:
         The file is missing, no TOML, has unknown keys, values of a wrong type or an impossible orbit.
     """
     where = Path(path)
-    if not where.exists() and where.suffix == "" and (SHIPPED / f"{where.name}.toml").exists():
+    if not where.is_file() and where.suffix == "" and (SHIPPED / f"{where.name}.toml").exists():
         where = SHIPPED / f"{where.name}.toml"
     try:
         text = where.read_text(encoding="utf-8")
