@@ -30,8 +30,10 @@ def at(seconds: float) -> str:
 
 
 @pytest.fixture
-def client(synthetic_pass: Any, tmp_path: Path) -> Iterator[TestClient]:
-    """A service with the reference ephemeris of the synthetic pass and nothing else."""
+def client(synthetic_pass: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TestClient]:
+    """A service with the reference ephemeris of the synthetic pass and nothing else, not even public data."""
+    monkeypatch.delenv("LINNA_DATA", raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "nothing"))
     with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as opened:
         octets = (synthetic_pass.folder / "reference.oem").read_bytes()
         assert opened.post(f"{V1}/ephemerides", content=octets).status_code == 201
