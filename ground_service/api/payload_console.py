@@ -50,6 +50,7 @@ async def watch_payload(socket: WebSocket) -> None:
             socket, f"no payload answers at {address[0]}:{address[1]}; start it with linna emulate --live"
         )
         return
+    await socket.send_json({"kind": "connected"})
     try:
         await _relay(socket, reader, writer, may_steer=caller.may("operator"))
     finally:

@@ -18,7 +18,7 @@ function connect() {
   const url = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/v1/payload`;
   socket = token() ? new WebSocket(url, ["bearer", token()]) : new WebSocket(url);
   let ready = true; // until a refusal says why
-  socket.onopen = () => say("connected");
+  socket.onopen = () => say("connecting");
   socket.onmessage = (event) => {
     const message = JSON.parse(event.data);
     ready = message.kind !== "error";
@@ -37,6 +37,10 @@ const say = (text) => {
 function take(message) {
   if (message.kind === "error") {
     say(message.text);
+    return;
+  }
+  if (message.kind === "connected") {
+    say("connected");
     return;
   }
   if (message.kind === "end") {

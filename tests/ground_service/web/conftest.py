@@ -60,7 +60,11 @@ class Console:
             self._clients.remove(client)
 
     def say(self, message: dict[str, object]) -> None:
-        """One message to everyone connected."""
+        """One message to everyone connected, of whom there is at least one in time."""
+        for _ in range(100):
+            if self._clients:
+                break
+            time.sleep(0.1)
         for client in list(self._clients):
             client.sendall(json.dumps(message).encode() + b"\n")
 
