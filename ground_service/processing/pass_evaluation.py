@@ -539,7 +539,7 @@ def _frame_accounting(inputs: PassInputs) -> FrameAccounting:
 
 
 def _imaging_arcs(inputs: PassInputs) -> tuple[TimeSpan, ...]:
-    """Stretches in which downlinked frames follow one another without a silence."""
+    """Stretches in which downlinked frames follow one another without a silence, their last frame included."""
     times = inputs.detections.utc_ns
     if len(times) == 0:
         return ()
@@ -548,7 +548,7 @@ def _imaging_arcs(inputs: PassInputs) -> tuple[TimeSpan, ...]:
         *(t for gap in _gaps(inputs) for t in (gap.start_utc_ns, gap.stop_utc_ns)),
         int(times[-1]),
     ]
-    return tuple(TimeSpan(a, b, "frames") for a, b in zip(edges[::2], edges[1::2], strict=True))
+    return tuple(TimeSpan(a, b + 1, "frames") for a, b in zip(edges[::2], edges[1::2], strict=True))
 
 
 def _gaps(inputs: PassInputs) -> tuple[TimeSpan, ...]:

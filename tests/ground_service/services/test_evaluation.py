@@ -92,6 +92,14 @@ def test_frames_and_packets_are_accounted_for(
     assert len(report.events) == 1
 
 
+def test_the_first_and_the_last_frame_lie_inside_the_imaging_arc(
+    imported: tuple[Ground, int, PassReport],
+) -> None:
+    (arc,) = imported[2].imaging_arcs
+    times = np.asarray(series(imported[2], "paper").utc_ns)
+    assert arc.start_utc_ns <= times[0] and times[-1] < arc.stop_utc_ns
+
+
 def test_importing_again_gives_the_same_pass_and_the_same_archive(
     imported: tuple[Ground, int, PassReport], synthetic_pass: Any
 ) -> None:
