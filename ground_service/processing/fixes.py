@@ -91,7 +91,7 @@ def wrong_fixes(pairs: Pairs, camera: PinholeCamera, utc_ns: IntArray, position_
             or not np.isfinite(position_mcmf_m[at, 0])
         ):
             continue
-        uv = _projected(camera, position_mcmf_m[at], pairs.crater_mcmf_m[rows])
+        uv = _projected(camera, position_mcmf_m[at][None], pairs.crater_mcmf_m[rows])[0]
         allowed = np.minimum(CENTRE_TOLERANCE_RADII * pairs.diameter_px[rows] / 2.0, CENTRE_TOLERANCE_PX)
         right = np.hypot(*(uv - pairs.uv_px[rows]).T) <= allowed
         wrong += int(2 * np.count_nonzero(right) <= len(rows))
@@ -124,22 +124,15 @@ def _solved(
     """Gauss-Newton on the position of a nadir camera; NaN where it does not settle."""
     nothing = np.full(3, np.nan)
     position = start_m.astype(np.float64)
+    steps = STEP_M * np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     for _ in range(ROUNDS):
-        residual = (uv_px - _projected(camera, position, crater_m)).ravel()
-        slope = np.column_stack(
-            [
-                (
-                    _projected(camera, position + step, crater_m)
-                    - _projected(camera, position - step, crater_m)
-                ).ravel()
-                / (2.0 * STEP_M)
-                for step in STEP_M * np.eye(3)
-            ]
-        )
+        projected = _projected(camera, position + steps, crater_m)
+        residual = (uv_px - projected[0]).ravel()
+        slope = ((projected[1:4] - projected[4:]) / (2.0 * STEP_M)).reshape(3, -1).T
         if not np.isfinite(residual).all() or not np.isfinite(slope).all():
             return nothing
         move, _, rank, _ = np.linalg.lstsq(slope, residual, rcond=None)
-        position = position + move
+        position += move
         if rank < 3 or np.linalg.norm(position - start_m) > LIMIT_M:
             return nothing
         if np.linalg.norm(move) < CONVERGED_M:
@@ -147,6 +140,7 @@ def _solved(
     return nothing
 
 
-def _projected(camera: PinholeCamera, position_m: FloatArray, crater_m: FloatArray) -> FloatArray:
-    rotation = nadir_camera_from_mcmf(position_m)
-    return np.asarray(camera.project((crater_m - position_m) @ rotation.T))
+def _projected(camera: PinholeCamera, positions_m: FloatArray, crater_m: FloatArray) -> FloatArray:
+    """Pixels (k, n, 2) of craters (n, 3) from nadir cameras at positions (k, 3)."""
+    rotations = nadir_camera_from_mcmf(positions_m)
+    return np.asarray(camera.project((crater_m - positions_m[:, None]) @ rotations.swapaxes(-1, -2)))
