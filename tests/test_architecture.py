@@ -1,5 +1,6 @@
 """The import contracts of pyproject.toml hold, and they refuse what they are there to refuse."""
 
+import ast
 import shutil
 import subprocess
 import sys
@@ -63,3 +64,32 @@ def test_a_planted_import_across_a_wall_is_refused(copy_of_the_tree: Path, modul
     result = lint_imports(copy_of_the_tree)
     assert result.returncode == 1, result.stdout
     assert "BROKEN" in result.stdout
+
+
+def compiled_functions() -> list[tuple[Path, ast.FunctionDef]]:
+    """Functions of the product that numba compiles."""
+    found = []
+    for package in PACKAGES:
+        for file in sorted((ROOT / package).rglob("*.py")):
+            text = file.read_text(encoding="utf-8")
+            if "njit" not in text:
+                continue
+            for node in ast.walk(ast.parse(text)):
+                if isinstance(node, ast.FunctionDef) and any(
+                    "njit" in ast.unparse(one) for one in node.decorator_list
+                ):
+                    found.append((file, node))
+    return found
+
+
+def test_compiled_functions_use_no_linear_algebra_of_numba_which_asks_for_scipy() -> None:
+    functions = compiled_functions()
+    assert len(functions) > 20
+    asking = [
+        f"{file.relative_to(ROOT)}:{part.lineno}"
+        for file, function in functions
+        for part in ast.walk(function)
+        if (isinstance(part, ast.BinOp) and isinstance(part.op, ast.MatMult))
+        or (isinstance(part, ast.Attribute) and ast.unparse(part) in ("np.linalg", "np.dot", "np.vdot"))
+    ]
+    assert asking == []

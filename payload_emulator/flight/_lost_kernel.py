@@ -170,6 +170,37 @@ def _insert(
 
 
 @njit
+def _solved(normal: Float, right: Float) -> Float:
+    """Solution of symmetric positive definite equations by Cholesky's factors; NaN where they are not definite.
+
+    Numba's own linear algebra would ask for SciPy, which does not fly.
+    """
+    n = right.size
+    factor = np.zeros((n, n))
+    result = right.copy()
+    for i in range(n):
+        for j in range(i + 1):
+            total = normal[i, j]
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i > j:
+                factor[i, j] = total / factor[j, j]
+            elif total > 0.0:
+                factor[i, i] = math.sqrt(total)
+            else:
+                return np.full(n, math.nan)
+    for i in range(n):
+        for k in range(i):
+            result[i] -= factor[i, k] * result[k]
+        result[i] /= factor[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            result[i] -= factor[k, i] * result[k]
+        result[i] /= factor[i, i]
+    return result
+
+
+@njit
 def fit_place(
     start: Float,
     camera_from_enu: Float,
@@ -352,7 +383,7 @@ def fit_place(
                     right[k] += weight * row[axis, k] * residual
                     for q in range(6):
                         normal[k, q] += weight * row[axis, k] * row[axis, q]
-        change = np.linalg.solve(normal + 1e-18 * np.eye(6), right)
+        change = _solved(normal, right)
         for a in range(3):
             place[a] += enu[0, a] * change[0] + enu[1, a] * change[1] + enu[2, a] * change[2]
             theta[a] += change[3 + a]
