@@ -133,8 +133,11 @@ class Payload:
             (H, W) or (H, W, 3); an image without pixels stands for a camera that gave none.
         attitude
             Message of the ADCS, shape (7,): q_wxyz of camera_from_icrf, then the unit Sun vector in the
-            camera frame; NaN where absent. clock_ticks On-board time of the image, units of 2^-16 s.
-            telecommand_octets Telecommand packets that arrived since the frame before, one after another.
+            camera frame; NaN where absent.
+        clock_ticks
+            On-board time of the image, units of 2^-16 s.
+        telecommand_octets
+            Telecommand packets that arrived since the frame before, one after another.
         """
         machine = self._machine
         machine.timer.enter(Stage.commands)
