@@ -34,10 +34,12 @@ async function add() {
 }
 
 async function load() {
-  const passes = await get("passes", { limit: 200 });
+  const passes = await get("passes", { limit: 1000 });
+  const wanted = new URLSearchParams(location.search);
+  const asked = Number(wanted.get("pass"));
+  if (asked && !passes.items.some((one) => one.id === asked)) passes.items.unshift(await get(`passes/${asked}`));
   show("pass", passes.items.map((one) => element("option", { value: one.id }, `${one.name}, ${timeText(one.start)}`)));
   show("parameter", dictionary.parameters.map((one) => element("option", { value: one.name }, words(one.name))));
-  const wanted = new URLSearchParams(location.search);
   if (wanted.get("pass")) byId("pass").value = wanted.get("pass");
   if (wanted.get("parameter") in definition) byId("parameter").value = wanted.get("parameter");
   if (passes.items.length) await add();
