@@ -1,0 +1,182 @@
+"""The service as separate processes on private ports, each of which can be killed and started again."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ground_service.store.database import prepare_database
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def wait_until(ready: Callable[[], bool], what: str, seconds: float = 120.0) -> None:
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        if ready():
+            return
+        time.sleep(0.2)
+    raise SystemExit(f"{what}: not ready within {seconds:.0f} s")
+
+
+def listens(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+class Part:
+    """A process of the deployment that can be killed with all its children and started again."""
+
+    def __init__(self, command: list[str], log: Path, ready: Callable[[], bool], **options: Any) -> None:
+        self._command, self._log, self._ready, self._options = command, log, ready, options
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """Start it, again when it gives up at once (what it was killed with may not be gone yet)."""
+        until = time.monotonic() + 120.0
+        while time.monotonic() < until:
+            with self._log.open("ab") as log:
+                self._process = subprocess.Popen(
+                    self._command, stdout=log, stderr=log, start_new_session=True, **self._options
+                )
+            while time.monotonic() < until and self._process.poll() is None:
+                if self._ready():
+                    return
+                time.sleep(0.1)
+            time.sleep(0.5)
+        raise SystemExit(f"{' '.join(self._command[:4])}: did not start; {self._log.read_text()[-500:]}")
+
+    def kill(self) -> None:
+        assert self._process is not None
+        family = [self._process.pid, *descendants(self._process.pid)]
+        for pid in family:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        self._process.wait()
+        until = time.monotonic() + 10.0
+        while any(Path(f"/proc/{pid}").exists() for pid in family) and time.monotonic() < until:
+            time.sleep(0.05)
+
+
+def service_environment(**settings: str) -> dict[str, str]:
+    """The environment with these settings of the service and none that it had before."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("LINNA_")}
+    return {**kept, **settings}
+
+
+def descendants(pid: int) -> list[int]:
+    """Processes below another, by what the kernel says."""
+    found: list[int] = []
+    for entry in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = entry.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[1]) == pid:
+            child = int(entry.parent.name)
+            found += [child, *descendants(child)]
+    return found
+
+
+class Laptop:
+    """The API alone, which does its jobs itself, on SQLite."""
+
+    def __init__(self, folder: Path) -> None:
+        port = free_port()
+        self.api = f"http://127.0.0.1:{port}"
+        self.home = folder / "home"
+        self.url: str | None = None
+        command = [sys.executable, "-m", "linna", "serve", "--port", str(port)]
+        environment = service_environment(LINNA_HOME=str(self.home), LINNA_RATE_LIMIT_PER_S="0")
+        self.parts = {"api": Part(command, folder / "api.log", lambda: listens(port), env=environment)}
+        self.parts["api"].start()
+
+    def stop(self) -> None:
+        for part in self.parts.values():
+            part.kill()
+
+
+class Deployment:
+    """PostgreSQL, Redis, the API and two workers."""
+
+    def __init__(self, folder: Path) -> None:
+        binaries = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
+        if not binaries or shutil.which("redis-server") is None:
+            raise SystemExit("the campaign needs PostgreSQL and redis-server on this machine")
+        bin_ = binaries[-1].parent
+        user = ["runuser", "-u", "postgres", "--"] if os.geteuid() == 0 else []
+        database = folder / "postgres"
+        database.mkdir()
+        if user:
+            folder.chmod(0o755)
+            shutil.chown(database, "postgres", "postgres")
+        ports = [free_port() for _ in range(3)]
+        self.api = f"http://127.0.0.1:{ports[2]}"
+        self.url = f"postgresql+psycopg://linna@127.0.0.1:{ports[0]}/linna"
+        data = database / "data"
+        subprocess.run(
+            [*user, str(bin_ / "initdb"), "-D", str(data), "-U", "linna", "-A", "trust", "--no-sync"],
+            check=True, cwd=database, stdout=subprocess.DEVNULL,
+        )  # fmt: skip
+        self.home = folder / "home"
+        self.broker_url = f"redis://127.0.0.1:{ports[1]}/0"
+        environment = service_environment(
+            LINNA_HOME=str(self.home),
+            LINNA_DATABASE_URL=self.url,
+            LINNA_BROKER_URL=self.broker_url,
+            LINNA_RATE_LIMIT_PER_S="0",
+        )
+        linna = [sys.executable, "-m", "linna"]
+        worker = {"env": environment}
+        server = [
+            str(bin_ / "postgres"), "-D", str(data), "-p", str(ports[0]), "-k", str(database), "-h", "127.0.0.1",
+            "-c", "fsync=off",
+        ]  # fmt: skip
+        self.parts = {
+            "database": Part(
+                [*user, *server], folder / "postgres.log", lambda: self._answers(bin_, ports[0]), cwd=database
+            ),
+            "broker": Part(
+                ["redis-server", "--port", str(ports[1]), "--bind", "127.0.0.1", "--dir", str(folder),
+                 "--save", "", "--appendonly", "no"],
+                folder / "redis.log", lambda: listens(ports[1]),
+            ),
+            "api": Part(
+                [*linna, "serve", "--port", str(ports[2])], folder / "api.log", lambda: listens(ports[2]), **worker
+            ),
+            "worker 1": Part([*linna, "worker"], folder / "worker1.log", lambda: True, **worker),
+            "worker 2": Part([*linna, "worker"], folder / "worker2.log", lambda: True, **worker),
+        }  # fmt: skip
+        for name in ("database", "broker"):
+            self.parts[name].start()
+        subprocess.run(
+            [str(bin_ / "createdb"), "-h", "127.0.0.1", "-p", str(ports[0]), "-U", "linna", "linna"],
+            check=True,
+        )
+        prepare_database(self.url, upgrade=True).engine.dispose()
+        for name in ("api", "worker 1", "worker 2"):
+            self.parts[name].start()
+
+    @staticmethod
+    def _answers(bin_: Path, port: int) -> bool:
+        done = subprocess.run(
+            [str(bin_ / "pg_isready"), "-h", "127.0.0.1", "-p", str(port), "-q"], check=False
+        )
+        return done.returncode == 0
+
+    def stop(self) -> None:
+        for part in self.parts.values():
+            part.kill()
