@@ -19,7 +19,7 @@ from reports.sections.opening import (
     settings,
 )
 from reports.text import count_text, number_text
-from reports.values import DetectorReport, NamedScore, ResidualSeries, SigmaBin
+from reports.values import BiasBin, DetectorReport, NamedScore, ResidualSeries, SigmaBin
 
 
 def detector_document(report: DetectorReport) -> Document:
@@ -27,7 +27,9 @@ def detector_document(report: DetectorReport) -> Document:
     blocks: list[Block] = [*judgement(report), Heading("Scores")]
     found = detector_blocks(report.score) if report.score is not None else []
     blocks += found or [absent(report, "score", "Scores", "the detector was not evaluated")]
-    if report.score is not None and report.score.residuals is not None:
+    if report.bias:
+        blocks.append(_signed_bias(report.bias))
+    elif report.score is not None and report.score.residuals is not None:
         table = _bias_table(report.score.residuals)
         blocks += [table] if table is not None else []
     blocks += missing_and_remarks(report)
@@ -131,6 +133,38 @@ def _sigma_table(bins: Sequence[SigmaBin]) -> Table:
         ),
         note="1, 0.683 and 0.997 would be perfect for Gaussian errors of each axis.",
     )  # fmt: skip
+
+
+def _signed_bias(bins: Sequence[BiasBin]) -> Table:
+    def part(value: tuple[float, float, float]) -> str:
+        mean, low, high = (f"{x:+.2f}".replace("-", "−") for x in value)
+        return f"{mean} [{low}, {high}]"
+
+    return Table(
+        "Mean signed error of matched craters by azimuth of the Sun in the image, detected minus catalogued.",
+        (
+            Column("Sun from the top, clockwise", numeric=False),
+            Column("craters"),
+            Column("right", unit="px"),
+            Column("down", unit="px"),
+            Column("toward the Sun", unit="px"),
+            Column("across", unit="px, to its right"),
+            Column("length", unit="px"),
+        ),
+        tuple(
+            (
+                row.label,
+                count_text(row.pairs),
+                part(row.right_px),
+                part(row.down_px),
+                part(row.sunward_px),
+                part(row.across_px),
+                number_text(float(np.hypot(row.right_px[0], row.down_px[0])), 2),
+            )
+            for row in bins
+        ),
+        note="In brackets the 95 % interval over resampled frames.",
+    )
 
 
 def _bias_table(residuals: ResidualSeries) -> Table | None:

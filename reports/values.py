@@ -467,6 +467,18 @@ class SigmaBin:
     inside_three_sigma: float
 
 
+@dataclass(frozen=True, slots=True)
+class BiasBin:
+    """Mean signed centre errors, px, each with the ends of its 95 % interval: (mean, low, high)."""
+
+    label: str
+    pairs: int
+    right_px: tuple[float, float, float]
+    down_px: tuple[float, float, float]
+    sunward_px: tuple[float, float, float]
+    across_px: tuple[float, float, float]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingCurve:
     """One quantity over a training run, ``epoch`` and ``values`` (n,); ``axis`` names what is counted if not epochs."""
@@ -487,6 +499,7 @@ class DetectorReport:
     by_degradation: tuple[NamedScore, ...] = ()
     by_source: tuple[NamedScore, ...] = ()
     groups: tuple[ScoreGroup, ...] = ()
+    bias: tuple[BiasBin, ...] = ()
     sigma: tuple[SigmaBin, ...] = ()
     training: tuple[TrainingCurve, ...] = ()
     cost: Mapping[str, str] = field(default_factory=dict)

@@ -6,10 +6,17 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-_TRAIN_MODULE_MISSING = "training needs torch: install the extra 'train' (pip install 'linna[train]')"
+from linna.commands._detector_common import (
+    add_model,
+    model_octets,
+    need_torch,
+    restart_for_training,
+    write_text,
+)
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
+    from linna.commands import _detector_make, _detector_studies
     from linna.output import add_json_flag
 
     verbs = parser.add_subparsers(title="verbs", required=True)
@@ -65,7 +72,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     export.set_defaults(handler=_export)
 
     evaluate = verbs.add_parser("evaluate", help="precision, recall and localisation on a data set")
-    _add_model(evaluate)
+    add_model(evaluate)
     evaluate.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
     evaluate.add_argument("--split", choices=("train", "val", "test"), default="test")
     evaluate.add_argument("--source", default="", help="only the frames of this source")
@@ -75,52 +82,24 @@ def configure(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="the paper's design: the class from its own heatmap instead of diameter and altitude",
     )
+    evaluate.add_argument(
+        "--rims",
+        type=Path,
+        default=None,
+        metavar="TABLE",
+        help="rims from `linna catalogue curate`: distances from these beside the catalogue's places",
+    )
     evaluate.add_argument("--report", type=Path, default=None, metavar="F.html", help="write one HTML report")
     evaluate.add_argument("--run", type=Path, default=None, help="training run whose curves the report shows")
     add_json_flag(evaluate)
     evaluate.set_defaults(handler=_evaluate)
 
-    quantise = verbs.add_parser(
-        "quantise", help="the network in 8-bit integers, beside the one it comes from"
-    )
-    _add_model(quantise)
-    quantise.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
-    quantise.add_argument("--out", type=Path, required=True, metavar="M.onnx")
-    add_json_flag(quantise)
-    quantise.set_defaults(handler=_quantise)
-
-    landmarks = verbs.add_parser(
-        "landmarks", help="places that are found again and again under different Suns and no catalogue lists"
-    )
-    _add_model(landmarks)
-    landmarks.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
-    landmarks.add_argument("--split", choices=("train", "val", "test"), default="train")
-    landmarks.add_argument("--source", default="", help="only the frames of this source")
-    landmarks.add_argument("--threshold", type=float, default=None, help="instead of the model's own")
-    landmarks.add_argument("--sightings", type=int, default=3, help="frames that must show it")
-    landmarks.add_argument(
-        "--hide",
-        type=float,
-        default=0.0,
-        metavar="SHARE",
-        help="hide this share of the catalogue first and tell how many landmarks were hidden craters",
-    )
-    landmarks.add_argument("--out", type=Path, default=None, metavar="F.csv")
-    add_json_flag(landmarks)
-    landmarks.set_defaults(handler=_landmarks)
-
-    trials = verbs.add_parser(
-        "trials", help="ways of showing frames to the network, each with its effect on held-out frames"
-    )
-    _add_model(trials)
-    trials.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
-    trials.add_argument("--source", default="", help="only the test frames of this source")
-    add_json_flag(trials)
-    trials.set_defaults(handler=_trials)
+    _detector_studies.configure(verbs)
+    _detector_make.configure(verbs)
 
     detect = verbs.add_parser("detect", help="craters in any PNG, TIFF or JPEG")
     detect.add_argument("images", type=Path, nargs="+", metavar="IMAGE")
-    _add_model(detect)
+    add_model(detect)
     detect.add_argument(
         "--altitude-km", type=float, default=None, help="above the ground; gives size classes"
     )
@@ -133,56 +112,28 @@ def configure(parser: argparse.ArgumentParser) -> None:
     detect.set_defaults(handler=_detect)
 
     bench = verbs.add_parser("bench", help="latency and memory on this machine")
-    _add_model(bench)
+    add_model(bench)
     bench.add_argument("--threads", type=int, default=1)
     bench.add_argument("--frames", type=int, default=100)
     add_json_flag(bench)
     bench.set_defaults(handler=_bench)
 
     info = verbs.add_parser("info", help="what a model says of itself")
-    _add_model(info)
+    add_model(info)
     add_json_flag(info)
     info.set_defaults(handler=_info)
 
 
-def _add_model(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--model", type=Path, default=None, metavar="M.onnx", help="instead of the shipped one"
-    )
-
-
-def _model_octets(path: Path | None) -> bytes:
-    from payload_emulator.flight.models import load_shipped_model
-
-    return load_shipped_model() if path is None else path.read_bytes()
-
-
 def _train(arguments: argparse.Namespace) -> int:
-    import importlib.util
-    import os
-    import sys
-
-    from linna.errors import UsageError
     from linna.output import emit, log
 
-    if importlib.util.find_spec("torch") is None:
-        raise UsageError(_TRAIN_MODULE_MISSING)
+    need_torch()
     from payload_emulator.training.dataset import Dataset
     from payload_emulator.training.feeder import TrainParameters
     from payload_emulator.training.landmarks import load_landmarks
-    from payload_emulator.training.train import ENVIRONMENT, set_environment, train
+    from payload_emulator.training.train import train
 
-    if (
-        any(os.environ.get(name) is None for name in ENVIRONMENT)
-        and sys.argv
-        and os.environ.get("LINNA_TRAIN_CHILD") is None
-    ):
-        # The allocator reads its settings when the process starts, so start once more with them.
-        os.execve(
-            sys.executable,
-            [sys.executable, "-m", "linna", *sys.argv[1:]],
-            set_environment() | {"LINNA_TRAIN_CHILD": "1"},
-        )
+    restart_for_training()
     parameters = TrainParameters(
         minutes=0.0 if arguments.steps else arguments.minutes,
         steps=arguments.steps,
@@ -208,13 +159,9 @@ def _train(arguments: argparse.Namespace) -> int:
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    import importlib.util
-
-    from linna.errors import UsageError
     from linna.output import emit
 
-    if importlib.util.find_spec("torch") is None:
-        raise UsageError(_TRAIN_MODULE_MISSING)
+    need_torch()
     from payload_emulator.training.dataset import Dataset
     from payload_emulator.training.export import export
 
@@ -240,9 +187,11 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from linna.output import emit, progress
     from payload_emulator.training.dataset import Dataset
     from payload_emulator.training.evaluate import format_figures, open_for_evaluation, run, summary
+    from payload_emulator.training.refits import load_refitted
 
     datasets = [Dataset(folder) for folder in arguments.dataset]
-    detector = open_for_evaluation(_model_octets(arguments.model))
+    rims = None if arguments.rims is None else load_refitted(arguments.rims)
+    detector = open_for_evaluation(model_octets(arguments.model))
     scored = run(
         detector,
         datasets,
@@ -252,112 +201,15 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         lambda frames: progress(frames, len(frames), "evaluate", "frames"),
         paper_classes=arguments.paper_classes,
     )
-    figures = summary(detector, datasets, scored, arguments.split, arguments.source)
+    figures = summary(detector, datasets, scored, arguments.split, arguments.source, rims)
     if arguments.report is not None:
         from payload_emulator.training.report import detector_report
         from reports.render import render_html
 
         report = detector_report(detector, scored, figures, arguments.run)
-        _write_text(arguments.report, render_html(report))
+        write_text(arguments.report, render_html(report))
     emit(arguments, figures, format_figures(figures))
     return 0
-
-
-def _quantise(arguments: argparse.Namespace) -> int:
-    import importlib.util
-
-    from linna.errors import UsageError
-    from linna.output import emit
-    from payload_emulator.training.dataset import Dataset
-    from payload_emulator.training.evaluate import evaluate
-    from payload_emulator.training.quantise import latency_ratio, quantise
-
-    if importlib.util.find_spec("onnx") is None:
-        raise UsageError("quantisation needs onnx: install the extra 'train' (pip install 'linna[train]')")
-    datasets = [Dataset(folder) for folder in arguments.dataset]
-    octets = _model_octets(arguments.model)
-    small = quantise(octets, datasets)
-    unfinished = arguments.out.with_name(f".{arguments.out.name}.unfinished")
-    unfinished.write_bytes(small)
-    unfinished.replace(arguments.out)
-    full_ms, small_ms, ratio = latency_ratio(octets, small)
-    kept = ("precision", "recall", "f1", "loc_px")
-    scores = {
-        name: {key: figures["micro"][key] for key in kept}
-        for name, figures in (
-            ("float32", evaluate(octets, datasets)),
-            ("int8", evaluate(small, datasets)),
-        )
-    }
-    emit(
-        arguments,
-        {
-            "model": str(arguments.out),
-            "bytes": {"float32": len(octets), "int8": len(small)},
-            "network_ms": {"float32": full_ms, "int8": small_ms},
-            "latency_ratio": ratio,
-            "strict": scores,
-        },
-    )
-    return 0
-
-
-def _landmarks(arguments: argparse.Namespace) -> int:
-    from linna.errors import UsageError
-    from linna.output import emit, progress
-    from payload_emulator.training.dataset import Dataset
-    from payload_emulator.training.evaluate import open_for_evaluation, run
-    from payload_emulator.training.landmarks import RecurrenceRule, format_landmarks, study
-
-    if not 0.0 <= arguments.hide < 1.0:
-        raise UsageError(f"--hide: expected a share from 0 to below 1, found {arguments.hide:g}")
-    if arguments.sightings < 2:
-        raise UsageError(f"--sightings: expected 2 or more, found {arguments.sightings}")
-    detector = open_for_evaluation(_model_octets(arguments.model))
-    scored = run(
-        detector,
-        [Dataset(folder) for folder in arguments.dataset],
-        arguments.split,
-        arguments.source,
-        arguments.threshold,
-        lambda frames: progress(frames, len(frames), "detect", "frames"),
-    )
-    landmarks, figures = study(
-        scored.frames,
-        scored.found,
-        scored.thresholds.on_board,
-        arguments.hide,
-        RecurrenceRule(sightings=arguments.sightings),
-    )
-    if arguments.out is not None:
-        _write_text(arguments.out, format_landmarks(landmarks))
-    emit(arguments, {**figures, "model_sha256": detector.sha256})
-    return 0
-
-
-def _trials(arguments: argparse.Namespace) -> int:
-    from linna.output import emit, progress
-    from payload_emulator.training.dataset import Dataset
-    from payload_emulator.training.evaluate import open_for_evaluation
-    from payload_emulator.training.trials import format_trials, run_trials
-
-    detector = open_for_evaluation(_model_octets(arguments.model))
-    datasets = [Dataset(folder) for folder in arguments.dataset]
-    rows = run_trials(
-        detector,
-        datasets,
-        source=arguments.source,
-        progress=lambda frames: progress(frames, len(frames), "trial", "frames"),
-    )
-    emit(arguments, {"trials": rows, "model_sha256": detector.sha256}, format_trials(rows))
-    return 0
-
-
-def _write_text(path: Path, text: str) -> None:
-    unfinished = path.with_name(f".{path.name}.unfinished")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished.write_text(text, encoding="utf-8")
-    unfinished.replace(path)
 
 
 def _detect(arguments: argparse.Namespace) -> int:
@@ -378,7 +230,7 @@ def _detect(arguments: argparse.Namespace) -> int:
     if not 0.0 < arguments.fov_deg < 180.0:
         raise UsageError(f"--fov-deg: expected an angle between 0 and 180, found {arguments.fov_deg:g}")
     detector = OnnxDetector(
-        _model_octets(arguments.model), DetectorParameters(score_threshold=arguments.threshold)
+        model_octets(arguments.model), DetectorParameters(score_threshold=arguments.threshold)
     )
     sun = None
     if arguments.sun_azimuth_deg is not None:
@@ -437,7 +289,7 @@ def _bench(arguments: argparse.Namespace) -> int:
     from linna.output import emit
     from payload_emulator.training.bench import bench
 
-    emit(arguments, bench(_model_octets(arguments.model), arguments.threads, arguments.frames))
+    emit(arguments, bench(model_octets(arguments.model), arguments.threads, arguments.frames))
     return 0
 
 
@@ -447,7 +299,7 @@ def _info(arguments: argparse.Namespace) -> int:
     from linna.output import emit
     from payload_emulator.flight.detector import OnnxDetector
 
-    octets = _model_octets(arguments.model)
+    octets = model_octets(arguments.model)
     detector = OnnxDetector(octets)
     metadata = {
         key: json.loads(text) if text[:1] in ("{", "[") else text for key, text in detector.metadata.items()

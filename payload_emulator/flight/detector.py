@@ -168,7 +168,12 @@ class OnnxDetector:
         return replace(found, u_px=found.u_px + left, v_px=found.v_px + top)
 
 
-def decode(heatmap: NDArray[np.float32], geometry: NDArray[np.float32], score_threshold: float) -> Detections:
+def decode(
+    heatmap: NDArray[np.float32],
+    geometry: NDArray[np.float32],
+    score_threshold: float,
+    stride_px: int = STRIDE_PX,
+) -> Detections:
     """Detections of one image from heatmap (h, w) and geometry (4 or 5, h, w): see the head of this module.
 
     A peak is a cell not below its eight neighbours. Its centre and diameter are the score-weighted means of what the
@@ -200,10 +205,10 @@ def decode(heatmap: NDArray[np.float32], geometry: NDArray[np.float32], score_th
         averaged: NDArray[np.float64] = (values * weight).sum(axis=(1, 2)) / total
         return averaged
 
-    centre_of_cell = (STRIDE_PX - 1) / 2.0
+    centre_of_cell = (stride_px - 1) / 2.0
     return Detections(
-        STRIDE_PX * mean(centre_column) + centre_of_cell,
-        STRIDE_PX * mean(centre_row) + centre_of_cell,
+        stride_px * mean(centre_column) + centre_of_cell,
+        stride_px * mean(centre_row) + centre_of_cell,
         REFERENCE_DIAMETER_PX * np.exp(mean(log_diameter)),
         score,
         np.exp(mean(log_sigma)),

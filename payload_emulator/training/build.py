@@ -247,18 +247,19 @@ def _camera(recipe: Recipe) -> PinholeCamera:
     return PinholeCamera(recipe.width_px, recipe.height_px, math.radians(recipe.fov_deg))
 
 
-_open_terrains: dict[tuple[str, int, str], Any] = {}
+_open_terrains: dict[tuple[str, int, str, bool], Any] = {}
 
 
 def _terrain(source: Source, seed: int, data_root: str) -> Any:
     """The terrain of a shard; a worker keeps the last one it used."""
     from payload_emulator.sim.terrain.opening import open_terrain
 
-    key = (source.terrain, seed, data_root)
+    key = (source.terrain, seed, data_root, source.sharpen)
     if key not in _open_terrains:
         _open_terrains.clear()
         data = find_data(Path(data_root) if data_root else None)
-        _open_terrains[key] = open_terrain(_TERRAIN_KINDS[source.terrain], data, seed)
+        options = {} if source.sharpen else {"sharpen": False}
+        _open_terrains[key] = open_terrain(_TERRAIN_KINDS[source.terrain], data, seed, **options)
     return _open_terrains[key]
 
 

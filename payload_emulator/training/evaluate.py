@@ -20,6 +20,8 @@ from payload_emulator.flight.detector import (
 from payload_emulator.flight.preprocess import prepare_image, sun_up_turns, turn_back
 from payload_emulator.training.dataset import Dataset, Frame, diameter_on_ground_m, frame_truth
 from payload_emulator.training.figures import Scene, Thresholds, score
+from payload_emulator.training.localisation import against_rims
+from payload_emulator.training.refits import RefittedRims
 from payload_emulator.training.scoring import FrameDetections, FrameTruth
 
 SCORE_FLOOR = 0.10  # detections are kept down to this for curves; figures are given at the threshold
@@ -50,6 +52,7 @@ def detect_with_network(network: Any, dataset: Dataset, frame: Frame, device: st
         torch.sigmoid(heat)[0, 0].cpu().contiguous().numpy(),
         geometry[0].cpu().contiguous().numpy(),
         SCORE_FLOOR,
+        network.config.stride_px,
     )
     found = drop_duplicates(found.select(np.argsort(-found.score, kind="stable")), DetectorParameters())
     u_px, v_px = turn_back(found.u_px, found.v_px, turns, *gray.shape)
@@ -165,20 +168,30 @@ def evaluate(
     progress: Callable[[Sequence[Any]], Any] = iter,
     *,
     paper_classes: bool = False,
+    rims: RefittedRims | None = None,
 ) -> dict[str, Any]:
     """Figures of a model on a split of one or several data sets; see `run` for what is refused."""
     datasets = [datasets] if isinstance(datasets, Dataset) else list(datasets)
     detector = open_for_evaluation(model_octets)
     scored = run(detector, datasets, split, source, threshold, progress, paper_classes=paper_classes)
-    return summary(detector, datasets, scored, split, source)
+    return summary(detector, datasets, scored, split, source, rims)
 
 
 def summary(
-    detector: OnnxDetector, datasets: Sequence[Dataset], scored: Scored, split: str, source: str = ""
+    detector: OnnxDetector,
+    datasets: Sequence[Dataset],
+    scored: Scored,
+    split: str,
+    source: str = "",
+    rims: RefittedRims | None = None,
 ) -> dict[str, Any]:
-    """Figures of scored frames with what they rest on."""
+    """Figures of scored frames with what they rest on; `rims` measured on the terrain give distances from those too."""
     frames = [f for _, f in scored.frames]
     figures = score(scored.truths, scored.found, scored.thresholds, scored.scenes)
+    if rims is not None:
+        figures["against_rims"] = against_rims(
+            scored.frames, scored.truths, scored.found, scored.thresholds.on_board, rims
+        )
     return {
         "model_sha256": detector.sha256,
         "dataset": ", ".join(sorted({str(d.index["name"]) for d in datasets})),
@@ -234,6 +247,22 @@ def format_figures(figures: dict[str, Any]) -> str:
         for item in figures["recall_by_degradation"]
     )
     lines.append(f"recall by depth/diameter (craters): {recalls}")
+    clear = "; ".join(
+        f"above {row['depth_ratio']:g} strict {_share(row['strict'])}, ignore-aware {_share(row['ignore_aware'])}"
+        for row in figures["recall_of_clear_craters"]
+    )
+    lines.append(f"recall by depth/diameter {clear}")
+    if figures["recall_by_third_of_degradation"]:
+        lines.append(
+            f"recall of the most degraded third {_share(figures['recall_by_third_of_degradation'][0])}, of the "
+            f"freshest {_share(figures['recall_by_third_of_degradation'][-1])} (strict)"
+        )
+    lines += _bias_lines(figures)
+    again = figures["repeatability"]
+    lines.append(
+        f"found again in another frame {again['value']:.2f} ({again['pairs']} pairs), in the next frame "
+        f"{again['next_frame']['value']:.2f} ({again['next_frame']['pairs']})"
+    )
     average, scale = figures["average_precision_half_radius"], figures["radial_scale"]
     lines.append(
         f"AP within 0.5 R: strict {average['strict']:.3f}, ignore-aware {average['ignore_aware']:.3f}; scale about "
@@ -252,6 +281,46 @@ def _row(name: str, row: dict[str, float]) -> str:
         + "".join(f"{v:7.3f}" for v in values)
         + f"{row['loc_px']:8.2f}{row['loc_median_px']:8.2f}"
     )
+
+
+def _share(row: dict[str, Any]) -> str:
+    low, high = row["recall_interval_95"]
+    return f"{row['recall']:.2f} [{low:.2f}, {high:.2f}] of {row['expected']}"
+
+
+def _bias_lines(figures: dict[str, Any]) -> list[str]:
+    """Signed bias by octant of the Sun's azimuth in the image, and distances from measured rims."""
+    bias = figures["bias_px"]
+    lines = [
+        f"bias px: right {bias['du_px']:+.2f}, down {bias['dv_px']:+.2f}, toward the Sun {bias['toward_sun_px']:+.2f}, "
+        f"across {bias['across_sun_px']:+.2f}; longest by Sun octant {bias['worst_octant_px']:.2f} "
+        f"(noise {bias['worst_octant_noise_px']:.2f})"
+    ]
+    lines += [
+        f"  Sun at {row['sun_azimuth_image_deg'][0]:3d}-{row['sun_azimuth_image_deg'][1]:d} deg: "
+        f"{row['pairs']:4d} pairs, "
+        + ", ".join(
+            f"{name} {row[key]:+.2f} [{row['interval_95'][key][0]:+.2f}, {row['interval_95'][key][1]:+.2f}]"
+            for name, key in (
+                ("right", "du_px"),
+                ("down", "dv_px"),
+                ("sunward", "toward_sun_px"),
+                ("across", "across_sun_px"),
+            )
+        )
+        + f", length {row['length_px']:.2f}"
+        for row in figures["bias_px_by_sun_octant"]
+        if row["pairs"]
+    ]
+    rims = figures.get("against_rims")
+    if rims is not None:
+        lines.append(
+            f"{rims['refitted']['pairs']} craters with a measured rim: median {rims['refitted']['median_px']:.2f}, "
+            f"mean {rims['refitted']['mean_px']:.2f} px from it; {rims['catalogue']['median_px']:.2f}, "
+            f"{rims['catalogue']['mean_px']:.2f} px from the catalogue's place; bias longest by Sun octant "
+            f"{rims['bias_px']['worst_octant_px']:.2f} px (noise {rims['bias_px']['worst_octant_noise_px']:.2f})"
+        )
+    return lines
 
 
 def _interval(row: dict[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,6 +26,8 @@ class TrainParameters:
 
     minutes : wall-clock budget; the learning rate falls to zero over it (0: `steps` counts instead).
     micro_batch : crops that a replica sees at once; more does not pay on a CPU, whose cache they must share.
+    soft_labels : the weight of a label grows with its depth/diameter; else all weigh the same.
+    backbone, stride_px : as in `model.ModelConfig`.
     """
 
     minutes: float = 15.0
@@ -46,6 +49,9 @@ class TrainParameters:
     pyramid_channels: int = 48
     detail_blocks: int = 1
     detail_channels: int = 24
+    backbone: str = "small"
+    stride_px: int = 4
+    soft_labels: bool = True
     augment: AugmentParameters = field(default_factory=AugmentParameters)
 
 
@@ -54,7 +60,7 @@ class Feeder:
 
     def __init__(
         self,
-        frames: list[tuple[Dataset, Frame]],
+        frames: Sequence[tuple[Dataset, Frame]],
         images: list[NDArray[np.uint8]],
         parameters: TrainParameters,
     ) -> None:
@@ -97,6 +103,8 @@ class Feeder:
         inside = (crop.u_px > 1) & (crop.u_px < p.crop_px - 2) & (crop.v_px > 1) & (crop.v_px < p.crop_px - 2)
         tier = np.where(inside & (crop.diameter_px >= 8.0), tiers, Tier.IGNORE).astype(np.int8)[near]
         emphasis = np.clip(crop.diameter_px / EVEN_DIAMETER_PX, *EMPHASIS_LIMITS)
+        if not p.soft_labels:
+            weights = np.ones_like(weights)
         weights = weights * np.where(craters["id"] < 0, STAMPED_EMPHASIS, 1.0) * emphasis
         targets = make_targets(
             p.crop_px,
@@ -108,6 +116,7 @@ class Feeder:
             weights[near],
             size_class(craters["diameter_m"].astype(np.float64))[near] if p.paper_classes else None,
             np.nan_to_num(craters["depth_ratio"].astype(np.float64))[near],
+            p.stride_px,
         )
         return {
             "image": crop.image[None],

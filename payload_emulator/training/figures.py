@@ -11,6 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from payload_emulator.flight.detections import DEGRADED_DEPTH_RATIO, FRESH_DEPTH_RATIO
+from payload_emulator.training.localisation import (
+    bias_by_octant,
+    bias_map,
+    bias_overall,
+    middle,
+    radial_scale,
+    right,
+)
 from payload_emulator.training.scoring import (
     DEGRADATION_EDGES,
     PAPER_TABLE_2,
@@ -20,6 +28,7 @@ from payload_emulator.training.scoring import (
     Tally,
     average_precision,
     bootstrap_f1,
+    bootstrap_recall,
     tally,
 )
 
@@ -32,8 +41,8 @@ _ALTITUDE_EDGES_KM = (12.0, 20.0, 30.0, 40.0, 50.0)
 _ELEVATION_EDGES_DEG = (3.0, 6.0, 9.0, 12.0, 15.0, 30.0, 60.0)
 _RADIUS_EDGES_PX = (0.0, 90.0, 150.0, 210.0, 270.0, 370.0)
 _DIAMETER_EDGES_PX = (10.0, 16.0, 24.0, 32.0, 48.0, 96.0, 400.0)
+_CLEAR_DEPTH_RATIOS = (0.06, 0.10)
 _CURVE_THRESHOLDS = tuple(round(0.10 + 0.05 * k, 2) for k in range(17))
-_BIAS_CELLS = 4  # per side of the bias map: finer cells hold too few craters for a tenth of a pixel
 RADIUS_RULE = MatchRule(radii=0.5)
 
 
@@ -71,6 +80,7 @@ def score(
     strict_radius = tally(truths, found, rule=RADIUS_RULE)
     fair_radius = tally(truths, found, rule=RADIUS_RULE, ignore_aware=True)
     pair = (strict, fair)
+    octants = bias_by_octant(strict, threshold, truths)
     return {
         "threshold": threshold,
         "per_class": [_class(truths, found, k, threshold) for k in range(4)][:3],
@@ -94,6 +104,11 @@ def score(
             strict, strict.crater_depth_ratio, DEGRADATION_EDGES, threshold, "depth_ratio"
         ),
         "recall_by_third_of_degradation": _recall_by_thirds(strict, threshold),
+        "recall_of_clear_craters": [
+            {"depth_ratio": low, "strict": _recall_above(strict, low, threshold)}
+            | {"ignore_aware": _recall_above(fair, low, threshold)}
+            for low in _CLEAR_DEPTH_RATIOS
+        ],
         "recall_by_diameter_px": _recall_by(
             fair, fair.crater_diameter_px, _DIAMETER_EDGES_PX, threshold, "diameter_px"
         ),
@@ -115,9 +130,10 @@ def score(
         ),
         "by_source": _by_name(pair, threshold, [s.source for s in scenes]),
         "by_image_radius_px": _by_radius(pair, threshold, truths),
-        "bias_px_by_sun_octant": _bias_by_octant(strict, threshold),
-        "bias_map": _bias_map(strict, threshold, truths),
-        "radial_scale": _radial_scale(fair, threshold, truths),
+        "bias_px_by_sun_octant": octants,
+        "bias_px": bias_overall(strict, threshold, truths, octants),
+        "bias_map": bias_map(strict, threshold, truths),
+        "radial_scale": radial_scale(fair, threshold, truths),
         "sigma_calibration": {
             **_calibration(fair, threshold),
             "by_altitude_km": _calibration_by_altitude(fair, threshold, scenes),
@@ -136,7 +152,9 @@ def repeatability(tallied: Tally, threshold: float) -> dict[str, float | int]:
     """P(found in one frame | found in another that shows the same crater), over ordered pairs of frames.
 
     The frames of a data set differ in Sun and pose, so this is harder than from one exposure to the next of a pass;
-    `chance` is what independent detections of the same recall would give.
+    `chance` is what independent detections of the same recall would give. `next_frame` is over neighbours in the data
+    set only: from one exposure to the next where the frames follow an orbit, neighbouring ground under another Sun
+    where they are drawn.
     """
     with np.errstate(invalid="ignore"):
         hit = tallied.crater_score >= threshold
@@ -150,7 +168,21 @@ def repeatability(tallied: Tally, threshold: float) -> dict[str, float | int]:
         "pairs": int(pairs),
         "value": again / pairs if pairs else float("nan"),
         "chance": float(times[several].sum() / seen[several].sum()) if several.any() else float("nan"),
+        "next_frame": _found_next(tallied, hit, place),
     }
+
+
+def _found_next(tallied: Tally, hit: NDArray[np.bool_], place: NDArray[np.int64]) -> dict[str, float | int]:
+    """P(found at t+1 | found at t, visible in both) over neighbouring frames."""
+    frame = tallied.crater_frame.astype(np.int64)
+    step = int(frame.max()) + 2 if frame.size else 1
+    key = place * step + frame
+    order = np.argsort(key)
+    after = np.searchsorted(key[order], key[hit] + 1)
+    there = after < key.size
+    there[there] = key[order][after[there]] == key[hit][there] + 1
+    again = hit[order][after[there]]
+    return {"pairs": int(again.size), "value": float(again.mean()) if again.size else float("nan")}
 
 
 def _class(
@@ -232,14 +264,10 @@ def _by_name(pair: tuple[Tally, Tally], threshold: float, names: Sequence[str]) 
 
 def _radii(part: Tally, truths: Sequence[FrameTruth]) -> tuple[Floats, Floats]:
     """Distance from the middle of the image of detections and of craters, px."""
-    u, v = _middle(truths)
+    u, v = middle(truths)
     return np.hypot(part.detection_u - u, part.detection_v - v), np.hypot(
         part.crater_u - u, part.crater_v - v
     )
-
-
-def _middle(truths: Sequence[FrameTruth]) -> tuple[float, float]:
-    return 0.5 * (truths[0].width_px - 1), 0.5 * (truths[0].height_px - 1)
 
 
 def _by_radius(
@@ -269,9 +297,16 @@ def _recall_by(
                 "high": high,
                 "expected": count,
                 "recall": float(found[chosen].mean()) if count else float("nan"),
+                "recall_interval_95": list(bootstrap_recall(found[chosen], tallied.crater_block[chosen])),
             }
         )
     return rows
+
+
+def _recall_above(tallied: Tally, depth_ratio: float, threshold: float) -> dict[str, Any]:
+    """Recall of the craters above a depth/diameter."""
+    row = _recall_by(tallied, -tallied.crater_depth_ratio, (-np.inf, -depth_ratio), threshold, "")[0]
+    return {key: row[key] for key in ("expected", "recall", "recall_interval_95")}
 
 
 def _recall_by_thirds(tallied: Tally, threshold: float) -> list[dict[str, Any]]:
@@ -303,82 +338,15 @@ def _state(tallied: Tally, threshold: float) -> dict[str, Any]:
     }
 
 
-def _right(tallied: Tally, threshold: float) -> NDArray[np.bool_]:
-    right: NDArray[np.bool_] = (tallied.score >= threshold) & (tallied.outcome == 1)
-    return right
-
-
-def _bias_by_octant(tallied: Tally, threshold: float) -> list[dict[str, Any]]:
-    right = _right(tallied, threshold)
-    rows = []
-    for octant in range(8):
-        chosen = right & (tallied.detection_octant == octant)
-        rows.append(
-            {
-                "octant": octant,
-                "sun_azimuth_image_deg": [45 * octant, 45 * (octant + 1)],
-                **_mean_error(tallied, chosen),
-            }
-        )
-    return rows
-
-
-def _mean_error(tallied: Tally, chosen: NDArray[np.bool_]) -> dict[str, float | int]:
-    count = int(chosen.sum())
-    if not count:
-        nan = float("nan")
-        return {"pairs": 0, "du_px": nan, "dv_px": nan, "standard_error_px": nan}
-    return {
-        "pairs": count,
-        "du_px": float(np.mean(tallied.error_u[chosen])),
-        "dv_px": float(np.mean(tallied.error_v[chosen])),
-        "standard_error_px": float(np.std(tallied.error_u[chosen]) / np.sqrt(count)),
-    }
-
-
-def _bias_map(tallied: Tally, threshold: float, truths: Sequence[FrameTruth]) -> list[dict[str, Any]]:
-    """Mean signed error in cells of the image, row by row from the top left."""
-    right = _right(tallied, threshold)
-    width, height = truths[0].width_px, truths[0].height_px
-    column = np.clip(tallied.detection_u * _BIAS_CELLS // width, 0, _BIAS_CELLS - 1)
-    row = np.clip(tallied.detection_v * _BIAS_CELLS // height, 0, _BIAS_CELLS - 1)
-    return [
-        {
-            "u_px": (j + 0.5) * width / _BIAS_CELLS - 0.5,
-            "v_px": (i + 0.5) * height / _BIAS_CELLS - 0.5,
-            **_mean_error(tallied, right & (row == i) & (column == j)),
-        }
-        for i in range(_BIAS_CELLS)
-        for j in range(_BIAS_CELLS)
-    ]
-
-
-def _radial_scale(tallied: Tally, threshold: float, truths: Sequence[FrameTruth]) -> dict[str, float]:
-    """Scale of the detections about the middle of the image, percent: -0.1 makes 30 km of altitude 30 m too high."""
-    right = _right(tallied, threshold)
-    u, v = _middle(truths)
-    lever = np.concatenate([tallied.detection_u[right] - u, tallied.detection_v[right] - v])
-    error = np.concatenate([tallied.error_u[right], tallied.error_v[right]])
-    weight = np.tile(1.0 / np.maximum(tallied.sigma_px[right], 0.3) ** 2, 2)
-    inner = np.abs(error) < 4.0 / np.sqrt(weight)
-    lever, error, weight = lever[inner], error[inner], weight[inner]
-    moment = float((weight * lever * lever).sum())
-    if moment == 0.0:
-        return {"percent": float("nan"), "standard_error_percent": float("nan")}
-    slope = float((weight * lever * error).sum()) / moment
-    spread = float(np.sqrt((weight**2 * lever**2 * (error - slope * lever) ** 2).sum())) / moment
-    return {"percent": 100.0 * slope, "standard_error_percent": 100.0 * spread}
-
-
 def _calibration(
     tallied: Tally, threshold: float, chosen: NDArray[np.bool_] | None = None
 ) -> dict[str, float]:
     """How the errors compare with the predicted sigma: 1 and 0.683 would be perfect for a Gaussian."""
-    right = _right(tallied, threshold)
+    hit = right(tallied, threshold)
     if chosen is not None:
-        right &= chosen
-    sigma = tallied.sigma_px[right]
-    scaled = np.concatenate([tallied.error_u[right] / sigma, tallied.error_v[right] / sigma])
+        hit &= chosen
+    sigma = tallied.sigma_px[hit]
+    scaled = np.concatenate([tallied.error_u[hit] / sigma, tallied.error_v[hit] / sigma])
     nan = float("nan")
     if scaled.size == 0:
         return {
@@ -390,7 +358,7 @@ def _calibration(
             "inside_three_sigma": nan,
         }
     return {
-        "pairs": int(right.sum()),
+        "pairs": int(hit.sum()),
         "mean_sigma_px": float(sigma.mean()),
         "rms": float(np.sqrt(np.mean(scaled**2))),
         "median_ratio": float(np.median(np.abs(scaled)) / 0.6745),

@@ -49,6 +49,7 @@ def crater_loss(
     regressed: Tensor,
     incomplete: Tensor,
     weights: LossWeights,
+    stride_px: int = STRIDE_PX,
 ) -> LossTerms:
     """Loss of a batch; tensors as `targets.Targets` stacked; `incomplete` (B,) bool: its catalogue lacks craters."""
     probability = torch.sigmoid(heat_logit)
@@ -71,7 +72,7 @@ def crater_loss(
     diameter = (regressed * (geometry[:, 2] - target_geometry[:, 2]).abs()).sum() / mass
     # Laplace likelihood per axis: scale b = sigma / sqrt 2; the error is held fixed, only its size is learned here.
     log_b = geometry[:, 3].clamp(-4.0, 4.0) - 0.5 * float(torch.log(torch.tensor(2.0)))
-    error_px = STRIDE_PX * error.detach().mean(1)
+    error_px = stride_px * error.detach().mean(1)
     sigma = (regressed * (error_px * torch.exp(-log_b) + log_b)).sum() / mass
     depth = torch.zeros_like(sigma)
     if geometry.shape[1] > 4:

@@ -1,4 +1,4 @@
-"""The crater network: MobileNetV3-small backbone, depthwise feature pyramid, CenterNet heads at stride 4.
+"""The crater network: MobileNetV3 backbone, depthwise feature pyramid, CenterNet heads at stride 4.
 
 Input (B, 1, H, W), H and W multiples of 32, as `payload_emulator.flight.preprocess` makes it. Outputs at (H/4, W/4):
 heatmap logits (B, 1 or 4, h, w): any crater, then the three classes of the paper; geometry (B, 4 or 5, h, w):
@@ -7,7 +7,7 @@ for ten times the depth/diameter, by which a crater is fresh or degraded.
 
 References
 ----------
-A. Howard et al., "Searching for MobileNetV3", 2019, table 2. X. Zhou et al., "Objects as Points", 2019.
+A. Howard et al., "Searching for MobileNetV3", 2019, tables 1 and 2. X. Zhou et al., "Objects as Points", 2019.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ from dataclasses import asdict, dataclass
 import torch
 from torch import Tensor, nn
 
-# kernel, expanded channels, output channels, squeeze-excite, hard-swish (else ReLU), stride: MobileNetV3-small
-_BLOCKS = (
+from payload_emulator.errors import ModelError
+
+# kernel, expanded channels, output channels, squeeze-excite, hard-swish (else ReLU), stride
+_SMALL = (
     (3, 16, 16, True, False, 2),
     (3, 72, 24, False, False, 2),
     (3, 88, 24, False, False, 1),
@@ -32,7 +34,27 @@ _BLOCKS = (
     (5, 576, 96, True, True, 1),
     (5, 576, 96, True, True, 1),
 )
-_TAPS = (0, 2, 7, 10)  # last block of strides 4, 8, 16, 32
+_LARGE = (
+    (3, 16, 16, False, False, 1),
+    (3, 64, 24, False, False, 2),
+    (3, 72, 24, False, False, 1),
+    (5, 72, 40, True, False, 2),
+    (5, 120, 40, True, False, 1),
+    (5, 120, 40, True, False, 1),
+    (3, 240, 80, False, True, 2),
+    (3, 200, 80, False, True, 1),
+    (3, 184, 80, False, True, 1),
+    (3, 184, 80, False, True, 1),
+    (3, 480, 112, True, True, 1),
+    (3, 672, 112, True, True, 1),
+    (5, 672, 160, True, True, 2),
+    (5, 960, 160, True, True, 1),
+    (5, 960, 160, True, True, 1),
+)
+# Blocks, and the last of them at strides 4, 8, 16 and 32.
+_BACKBONES = {"small": (_SMALL, (0, 2, 7, 10)), "large": (_LARGE, (2, 5, 11, 14))}
+_STEM_CHANNELS = 16
+STRIDES_PX = (2, 4)
 _PRIOR_LOGIT = -4.0  # about one cell in fifty before training: keeps the first focal losses finite
 _INITIAL_LOG_SIGMA = 0.3
 _INITIAL_TENFOLD_DEPTH = 0.8  # depth/diameter 0.08, the middle of the catalogue
@@ -40,15 +62,27 @@ _INITIAL_TENFOLD_DEPTH = 0.8  # depth/diameter 0.08, the middle of the catalogue
 
 @dataclass(frozen=True, slots=True)
 class ModelConfig:
-    """Shape of the network. `detail_blocks` adds blocks at stride 4, where small craters live."""
+    """Shape of the network. `detail_blocks` adds blocks at stride 4, where small craters live.
+
+    backbone : "small" or "large" of MobileNetV3; stride_px : of the output maps, 4 or (for studies: flight reads
+        stride 4) 2.
+    """
 
     pyramid_channels: int = 64
     detail_blocks: int = 1
     detail_channels: int = 24
     paper_classes: bool = False
     depth: bool = False
+    backbone: str = "small"
+    stride_px: int = 4
 
-    def to_dict(self) -> dict[str, int | bool]:
+    def __post_init__(self) -> None:
+        if self.backbone not in _BACKBONES:
+            raise ModelError(f"backbone: expected one of {', '.join(_BACKBONES)}, found {self.backbone!r}")
+        if self.stride_px not in STRIDES_PX:
+            raise ModelError(f"stride: expected 2 or 4 pixels, found {self.stride_px}")
+
+    def to_dict(self) -> dict[str, int | bool | str]:
         return asdict(self)
 
 
@@ -58,14 +92,15 @@ class CraterNet(nn.Module):
     def __init__(self, config: ModelConfig | None = None) -> None:
         super().__init__()
         self.config = config or ModelConfig()
-        self.stem = _conv_norm(1, 16, 3, stride=2, activation=nn.Hardswish())
+        table, self._taps = _BACKBONES[self.config.backbone]
+        self.stem = _conv_norm(1, _STEM_CHANNELS, 3, stride=2, activation=nn.Hardswish())
         blocks: list[nn.Module] = []
         tapped: list[int] = []
-        channels = 16
-        for index, (kernel, expanded, out, squeeze, swish, stride) in enumerate(_BLOCKS):
+        channels = _STEM_CHANNELS
+        for index, (kernel, expanded, out, squeeze, swish, stride) in enumerate(table):
             blocks.append(_InvertedResidual(channels, expanded, out, kernel, stride, squeeze, swish))
             channels = out
-            if index in _TAPS:
+            if index in self._taps:
                 tapped.append(out)
         self.blocks = nn.ModuleList(blocks)
         detail = self.config.detail_channels
@@ -77,6 +112,8 @@ class CraterNet(nn.Module):
         )
         if self.config.detail_blocks:
             tapped[0] = detail
+        if self.config.stride_px == 2:
+            tapped.insert(0, _STEM_CHANNELS)
         width = self.config.pyramid_channels
         self.lateral = nn.ModuleList(nn.Conv2d(c, width, 1) for c in tapped)
         self.smooth = nn.ModuleList(_separable(width, width) for _ in tapped[:-1])
@@ -99,12 +136,14 @@ class CraterNet(nn.Module):
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
         features: list[Tensor] = []
-        x = self.stem(image)
+        x = stem = self.stem(image)
         for index, block in enumerate(self.blocks):
             x = block(x)
-            if index in _TAPS:
+            if index in self._taps:
                 features.append(x)
         features[0] = self.detail(features[0])
+        if self.config.stride_px == 2:
+            features.insert(0, stem)
         merged = self.lateral[-1](features[-1])
         for level in range(len(features) - 2, -1, -1):
             merged = nn.functional.interpolate(merged, scale_factor=2.0, mode="nearest")

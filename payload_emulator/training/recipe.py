@@ -56,6 +56,7 @@ class Source:
     ephemeris : an OEM or STK file, or a scenario whose orbit is flown for `days`: frames are taken in turn at every
         `step_s` where the sub-satellite latitude is within `latitude_limit_deg` (the paper, section V-B.4) and the
         footprint is on the terrain. `altitude_km` does not apply.
+    sharpen : real terrain gets seeded craters and roughness below what its rasters resolve.
     """
 
     name: str
@@ -73,6 +74,7 @@ class Source:
     step_s: float = 15.0
     days: float = 1.0
     latitude_limit_deg: float = 60.0
+    sharpen: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +105,7 @@ class Recipe:
 
 def _source_dict(source: dict[str, Any]) -> dict[str, Any]:
     """A source's values; of an ephemeris only the name, as its folder says nothing about the frames."""
+    source = _without_defaults(source, {"sharpen": True})
     if source["ephemeris"]:
         return source | {"ephemeris": Path(source["ephemeris"]).name}
     return {
@@ -175,6 +178,11 @@ def _source(path: Path, number: int, table: Mapping[str, Any]) -> Source:
             raise DatasetError(
                 f"{path}: {where}: {key}: expected one of {', '.join(allowed)}, found {values[key]!r}"
             )
+    if "sharpen" in values and (values["terrain"] != "real" or not isinstance(values["sharpen"], bool)):
+        raise DatasetError(
+            f"{path}: {where}: sharpen: expected true or false on real terrain, found {values['sharpen']!r} "
+            f"on {values['terrain']} terrain"
+        )
     for key in ("boxes", "avoid"):
         if key in values:
             values[key] = tuple(_box(path, f"{where}: {key}", item) for item in values[key])

@@ -12,8 +12,10 @@ import numpy as np
 from lunar.catalogue import size_class
 from payload_emulator.flight.detector import OnnxDetector
 from payload_emulator.training.evaluate import Scored
+from payload_emulator.training.localisation import FEWEST_PAIRS
 from payload_emulator.training.scoring import MatchRule, Tally, match, tally
 from reports.values import (
+    BiasBin,
     BinScore,
     CalibrationBin,
     ClassScore,
@@ -59,6 +61,7 @@ def detector_report(
         ),
         by_source=_named(figures["by_source"], lambda row: str(row["name"])),
         groups=_groups(figures),
+        bias=_bias(figures),
         sigma=_sigma(figures["sigma_calibration"]),
         training=() if run is None else _curves(run),
         cost={"Model": f"{len(detector.model_octets) / 1e6:.2f} MB"},
@@ -229,6 +232,27 @@ def _groups(figures: dict[str, Any]) -> tuple[ScoreGroup, ...]:
     )
 
 
+def _bias(figures: dict[str, Any]) -> tuple[BiasBin, ...]:
+    rows = [("any azimuth", figures["bias_px"])]
+    rows += [
+        (f"{low}–{high}°", row)
+        for row in figures["bias_px_by_sun_octant"]
+        for low, high in (row["sun_azimuth_image_deg"],)
+    ]
+    return tuple(
+        BiasBin(
+            label,
+            row["pairs"],
+            *(
+                (row[key], *row["interval_95"][key])
+                for key in ("du_px", "dv_px", "toward_sun_px", "across_sun_px")
+            ),
+        )
+        for label, row in rows
+        if row["pairs"]
+    )
+
+
 def _sigma(calibration: dict[str, Any]) -> tuple[SigmaBin, ...]:
     rows = [("all", calibration)]
     rows += [(f"{row['low']:g}–{row['high']:g} km up", row) for row in calibration["by_altitude_km"]]
@@ -268,11 +292,7 @@ def _curves(run: Path) -> tuple[TrainingCurve, ...]:
 def _headline(figures: dict[str, Any]) -> tuple[HeadlineFigure, ...]:
     micro, fair = figures["micro"], figures["ignore_aware"]
     low, high = micro["f1_interval_95"]
-    biases = [
-        float(np.hypot(row["du_px"], row["dv_px"]))
-        for row in figures["bias_px_by_sun_octant"]
-        if row["pairs"] >= 20
-    ]
+    bias = figures["bias_px"]
     return (
         HeadlineFigure("Precision", micro["precision"], "", f"strict; ignore-aware {fair['precision']:.2f}"),
         HeadlineFigure("Recall", micro["recall"], "", f"strict; ignore-aware {fair['recall']:.2f}"),
@@ -284,7 +304,10 @@ def _headline(figures: dict[str, Any]) -> tuple[HeadlineFigure, ...]:
         ),
         HeadlineFigure("Localisation", micro["loc_px"], "px", f"mean; median {micro['loc_median_px']:.2f}"),
         HeadlineFigure(
-            "Bias, worst octant", max(biases) if biases else None, "px", "of Sun azimuth, 20 craters at least"
+            "Bias, worst octant",
+            None if bias["worst_octant"] is None else bias["worst_octant_px"],
+            "px",
+            f"of Sun azimuth, {FEWEST_PAIRS} craters at least; noise alone gives {bias['worst_octant_noise_px']:.2f}",
         ),
     )
 
@@ -319,7 +342,8 @@ def _remarks(figures: dict[str, Any]) -> tuple[str, ...]:
         f"{scale['standard_error_percent']:.3f} %; −0.1 % reads as 30 m too high at 30 km.",
         f"Repeatability: a crater found in one frame is found in another that shows it in "
         f"{100 * again['value']:.0f} % of {again['pairs']} pairs of frames, which differ in Sun and pose "
-        f"({100 * again['chance']:.0f} % if detections were independent).",
+        f"({100 * again['chance']:.0f} % if detections were independent); in the frame that follows in the data set in "
+        f"{100 * again['next_frame']['value']:.0f} % of {again['next_frame']['pairs']}.",
         f"Craters of 3 to 5 km: precision {figures['class_3_to_5_km']['precision']:.2f}, recall "
         f"{figures['class_3_to_5_km']['recall']:.2f} strict, "
         f"{figures['class_3_to_5_km']['ignore_aware']['recall']:.2f} ignore-aware.",
@@ -331,13 +355,35 @@ def _remarks(figures: dict[str, Any]) -> tuple[str, ...]:
             f"{100 * state['agreement']:.0f} % of {state['craters']} matched craters; median error of depth/diameter "
             f"{state['depth_ratio_median_error']:.3f}."
         )
+    clear = figures["recall_of_clear_craters"]
+    remarks.append(
+        "Recall of clear craters, strict (ignore-aware): "
+        + "; ".join(
+            f"above a depth/diameter of {row['depth_ratio']:g} {_with_interval(row['strict'])} "
+            f"({_with_interval(row['ignore_aware'])})"
+            for row in clear
+        )
+        + "."
+    )
+    if "against_rims" in figures:
+        fitted, listed = figures["against_rims"]["refitted"], figures["against_rims"]["catalogue"]
+        remarks.append(
+            f"{fitted['pairs']} matched craters have a rim measured on the terrain: {fitted['median_px']:.2f} px "
+            f"median and {fitted['mean_px']:.2f} px mean from it, {listed['median_px']:.2f} and "
+            f"{listed['mean_px']:.2f} px from the catalogue's place."
+        )
     thirds = figures["recall_by_third_of_degradation"]
     if thirds:
         remarks.append(
-            f"Recall of the most degraded third of the craters {thirds[0]['recall']:.2f}, of the freshest "
-            f"{thirds[-1]['recall']:.2f} (strict)."
+            f"Recall of the most degraded third of the craters {_with_interval(thirds[0])}, of the freshest "
+            f"{_with_interval(thirds[-1])} (strict)."
         )
     return tuple(remarks)
+
+
+def _with_interval(row: dict[str, Any]) -> str:
+    low, high = row["recall_interval_95"]
+    return f"{row['recall']:.2f} [{low:.2f} to {high:.2f}]"
 
 
 def _frame_order(strict: Tally, threshold: float, frames: int) -> list[int]:

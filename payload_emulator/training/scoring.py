@@ -129,8 +129,8 @@ class Tally:
 
     Detections: score, outcome (1 right, 0 wrong, -1 not counted); where right error_u, error_v (detection minus
     crater) and log_diameter_ratio (detection over crater). Craters: score at which each was found (NaN: never).
-    Places in the image (u, v) and numbers of the frames say where and when; matched_depth_ratio is the crater's,
-    detection_depth_ratio what the network says (NaN: it does not).
+    Places in the image (u, v) and numbers of the frames say where and when; matched_depth_ratio and matched_id are the
+    crater's (NaN, -1: none), detection_depth_ratio what the network says (NaN: it does not).
     """
 
     score: Floats
@@ -146,6 +146,7 @@ class Tally:
     detection_frame: NDArray[np.int64]
     detection_depth_ratio: Floats
     matched_depth_ratio: Floats
+    matched_id: NDArray[np.int64]
     crater_score: Floats
     crater_depth_ratio: Floats
     crater_diameter_px: Floats
@@ -277,6 +278,7 @@ def tally(
                 np.full(d.size, number),
                 np.full(d.size, np.nan) if found.depth_ratio is None else found.depth_ratio[d],
                 np.where(hit >= 0, truth.depth_ratio[w][hit] if w.size else np.nan, np.nan),
+                np.where(hit >= 0, truth.ids[w][hit] if w.size else -1, -1),
             )
         )
         score = np.full(w.size, np.nan)
@@ -294,7 +296,7 @@ def tally(
                 np.full(w.size, number),
             )
         )
-    return Tally(*_columns(parts, 13), *_columns(craters, 9))
+    return Tally(*_columns(parts, 14), *_columns(craters, 9))
 
 
 def match_any(
@@ -389,6 +391,20 @@ def bootstrap_f1(tallied: Tally, threshold: float, seed: int = 0, rounds: int = 
     drawn = counts[rng.integers(0, len(blocks), (rounds, len(blocks)))].sum(axis=1)
     f1 = 2.0 * drawn[:, 0] / np.maximum(drawn[:, 0] + drawn[:, 2] + drawn[:, 1], 1.0)
     return float(np.percentile(f1, 2.5)), float(np.percentile(f1, 97.5))
+
+
+def bootstrap_recall(
+    found: NDArray[np.bool_], block: NDArray[np.int64], seed: int = 0, rounds: int = 400
+) -> tuple[float, float]:
+    """95 % interval of the share of craters found (n,), over resampled blocks of ground (n,)."""
+    if found.size == 0:
+        return float("nan"), float("nan")
+    _, place = np.unique(block, return_inverse=True)
+    total = np.bincount(place).astype(float)
+    hits = np.bincount(place, weights=found)
+    drawn = np.random.default_rng(seed).integers(0, total.size, (rounds, total.size))
+    recall = hits[drawn].sum(axis=1) / total[drawn].sum(axis=1)
+    return float(np.percentile(recall, 2.5)), float(np.percentile(recall, 97.5))
 
 
 def _columns(parts: list[tuple[NDArray[np.generic], ...]], count: int) -> list[NDArray[np.generic]]:

@@ -54,14 +54,15 @@ def make_targets(
     weight: NDArray[np.float64],
     size_class: NDArray[np.int8] | None = None,
     depth_ratio: NDArray[np.float64] | None = None,
+    stride_px: int = STRIDE_PX,
 ) -> Targets:
     """Targets of craters (n,) in an image; `size_class` given: three class heatmaps follow the common one.
 
-    `depth_ratio` (n,) is depth/diameter; None leaves that target zero.
+    `depth_ratio` (n,) is depth/diameter; None leaves that target zero. `stride_px` is the size of a cell.
     """
     from payload_emulator.training._target_kernel import paint
 
-    rows, columns = height_px // STRIDE_PX, width_px // STRIDE_PX
+    rows, columns = height_px // stride_px, width_px // stride_px
     channels = 1 if size_class is None else 4
     targets = Targets(
         np.zeros((channels, rows, columns), np.float32),
@@ -70,13 +71,13 @@ def make_targets(
         np.zeros((4, rows, columns), np.float32),
         np.zeros((rows, columns), np.float32),
     )
-    centre_of_cell = (STRIDE_PX - 1) / 2.0
+    centre_of_cell = (stride_px - 1) / 2.0
     tenfold_depth = 10.0 * np.asarray(np.zeros(np.shape(u_px)) if depth_ratio is None else depth_ratio, float)
     classes = np.full(np.shape(u_px), -1, np.int8) if size_class is None else np.asarray(size_class, np.int8)
     paint(
-        (np.asarray(u_px, np.float64) - centre_of_cell) / STRIDE_PX,
-        (np.asarray(v_px, np.float64) - centre_of_cell) / STRIDE_PX,
-        np.asarray(diameter_px, np.float64) / (2.0 * STRIDE_PX),
+        (np.asarray(u_px, np.float64) - centre_of_cell) / stride_px,
+        (np.asarray(v_px, np.float64) - centre_of_cell) / stride_px,
+        np.asarray(diameter_px, np.float64) / (2.0 * stride_px),
         np.asarray(tier, np.int8) == Tier.LABEL,
         np.asarray(weight, np.float64),
         classes,

@@ -53,11 +53,13 @@ def train(
     *,
     start_from: Path | None = None,
     landmarks: Landmarks | None = None,
+    train_frames: Sequence[tuple[Dataset, Frame]] | None = None,
     report: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
     """Train (or resume) a run; the best validation figures come back.
 
-    `start_from` gives the first weights, `landmarks` further labels that no catalogue lists.
+    `start_from` gives the first weights, `landmarks` further labels that no catalogue lists, `train_frames` the frames
+    to learn from where it is not the split "train" as it stands.
 
     Raises
     ------
@@ -69,7 +71,8 @@ def train(
 
     from payload_emulator.training.model import CraterNet, ModelConfig
 
-    train_frames = [(d, f) for d in datasets for f in d.frames("train")]
+    if train_frames is None:
+        train_frames = [(d, f) for d in datasets for f in d.frames("train")]
     validation = [(d, f) for d in datasets for f in d.frames("val")]
     if landmarks is not None:
         train_frames = [(d, with_landmarks(d, f, landmarks)) for d, f in train_frames]
@@ -90,6 +93,8 @@ def train(
         parameters.detail_channels,
         parameters.paper_classes,
         parameters.depth,
+        parameters.backbone,
+        parameters.stride_px,
     )
     network = CraterNet(config).to(device, memory_format=torch.channels_last)
     average = copy.deepcopy(network).eval()
@@ -263,6 +268,7 @@ class _Team:
                 tensors["regressed"],
                 tensors["incomplete"],
                 LossWeights(),
+                p.stride_px,
             )
             (terms.total * (size / count)).backward()
             values = (
@@ -365,7 +371,7 @@ def _validate(
 
 
 def _load_images(
-    frames: list[tuple[Dataset, Frame]], report: Callable[[str], None]
+    frames: Sequence[tuple[Dataset, Frame]], report: Callable[[str], None]
 ) -> list[NDArray[np.uint8]]:
     began = time.monotonic()
     images = [dataset.image(frame) for dataset, frame in frames]

@@ -1,0 +1,64 @@
+"""What the verbs of `linna detector` share: the model option, torch, files written whole."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def add_model(parser: argparse.ArgumentParser) -> None:
+    """Add --model."""
+    parser.add_argument(
+        "--model", type=Path, default=None, metavar="M.onnx", help="instead of the shipped one"
+    )
+
+
+def model_octets(path: Path | None) -> bytes:
+    """The network of a file, or the shipped one."""
+    from payload_emulator.flight.models import load_shipped_model
+
+    return load_shipped_model() if path is None else path.read_bytes()
+
+
+def need_torch() -> None:
+    """Refuse in clear words where torch is missing.
+
+    Raises
+    ------
+    UsageError
+        There is no torch.
+    """
+    import importlib.util
+
+    from linna.errors import UsageError
+
+    if importlib.util.find_spec("torch") is None:
+        raise UsageError("training needs torch: install the extra 'train' (pip install 'linna[train]')")
+
+
+def restart_for_training() -> None:
+    """Start this process once more with the allocator and thread settings of training, where it lacks them."""
+    import os
+    import sys
+
+    from payload_emulator.training.train import ENVIRONMENT, set_environment
+
+    if (
+        any(os.environ.get(name) is None for name in ENVIRONMENT)
+        and sys.argv
+        and os.environ.get("LINNA_TRAIN_CHILD") is None
+    ):
+        # The allocator reads its settings when the process starts, so start once more with them.
+        os.execve(
+            sys.executable,
+            [sys.executable, "-m", "linna", *sys.argv[1:]],
+            set_environment() | {"LINNA_TRAIN_CHILD": "1"},
+        )
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file in one move."""
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished.write_text(text, encoding="utf-8")
+    unfinished.replace(path)

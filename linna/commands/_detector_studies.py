@@ -1,0 +1,227 @@
+"""Studies of the detector: `linna detector quantise|landmarks|trials|ablate`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from linna.commands._detector_common import (
+    add_model,
+    model_octets,
+    need_torch,
+    restart_for_training,
+    write_text,
+)
+
+
+def configure(verbs: Any) -> None:
+    """Add the verbs."""
+    from linna.output import add_json_flag
+
+    quantise = verbs.add_parser(
+        "quantise", help="the network in 8-bit integers, beside the one it comes from"
+    )
+    add_model(quantise)
+    quantise.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
+    quantise.add_argument("--out", type=Path, required=True, metavar="M.onnx")
+    add_json_flag(quantise)
+    quantise.set_defaults(handler=_quantise)
+
+    landmarks = verbs.add_parser(
+        "landmarks", help="places that are found again and again under different Suns and no catalogue lists"
+    )
+    add_model(landmarks)
+    landmarks.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
+    landmarks.add_argument("--split", choices=("train", "val", "test"), default="train")
+    landmarks.add_argument("--source", default="", help="only the frames of this source")
+    landmarks.add_argument("--threshold", type=float, default=None, help="instead of the model's own")
+    landmarks.add_argument("--sightings", type=int, default=3, help="frames that must show it")
+    landmarks.add_argument(
+        "--hide",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="hide this share of the catalogue first and tell how many landmarks were hidden craters",
+    )
+    landmarks.add_argument("--out", type=Path, default=None, metavar="F.csv")
+    add_json_flag(landmarks)
+    landmarks.set_defaults(handler=_landmarks)
+
+    trials = verbs.add_parser(
+        "trials", help="ways of showing frames to the network, each with its effect on held-out frames"
+    )
+    add_model(trials)
+    trials.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
+    trials.add_argument("--source", default="", help="only the test frames of this source")
+    add_json_flag(trials)
+    trials.set_defaults(handler=_trials)
+
+    ablate = verbs.add_parser(
+        "ablate", help="train the recipe with one thing changed at a time, at equal small budgets"
+    )
+    ablate.add_argument("datasets", type=Path, nargs="+", metavar="DATASET")
+    ablate.add_argument(
+        "--out", type=Path, required=True, metavar="RUNS", help="a run folder for each variant"
+    )
+    ablate.add_argument("--only", nargs="+", default=None, metavar="NAME", help="variants (default: all)")
+    ablate.add_argument("--steps", type=int, default=600, help="of 8 crops, for every variant (default: 600)")
+    ablate.add_argument("--crop", type=int, default=256, metavar="PX")
+    ablate.add_argument(
+        "--frames",
+        type=int,
+        nargs=2,
+        default=[480, 240],
+        metavar=("REAL", "PROCEDURAL"),
+        help="training frames of every variant (default: 480 240)",
+    )
+    ablate.add_argument("--test-frames", type=int, default=160, help="at most, of each kind of terrain")
+    ablate.add_argument(
+        "--seeds", type=int, nargs="+", default=[1, 2], help="of the baseline; the others take the first"
+    )
+    ablate.add_argument("--every-seed", action="store_true", help="train the variants with every seed too")
+    ablate.add_argument(
+        "--plain", type=Path, default=None, metavar="DATASET", help="real terrain with `sharpen = false`"
+    )
+    ablate.add_argument(
+        "--rims", type=Path, default=None, metavar="TABLE", help="rims from `linna catalogue curate`"
+    )
+    add_json_flag(ablate)
+    ablate.set_defaults(handler=_ablate)
+
+
+def _ablate(arguments: argparse.Namespace) -> int:
+    from linna.errors import UsageError
+    from linna.output import emit, log
+
+    need_torch()
+    from payload_emulator.training.ablation import (
+        VARIANTS,
+        AblationParameters,
+        Material,
+        ablate,
+        format_ablation,
+    )
+    from payload_emulator.training.dataset import Dataset
+    from payload_emulator.training.refits import load_refitted
+
+    known = {variant.name: variant for variant in VARIANTS}
+    wanted = list(known) if arguments.only is None else arguments.only
+    unknown = [name for name in wanted if name not in known]
+    if unknown:
+        raise UsageError(f"--only: expected names among {', '.join(known)}, found {', '.join(unknown)}")
+    if arguments.steps < 1:
+        raise UsageError(f"--steps: expected 1 or more, found {arguments.steps}")
+    restart_for_training()
+    rows = ablate(
+        Material(
+            [Dataset(folder) for folder in arguments.datasets],
+            None if arguments.plain is None else Dataset(arguments.plain),
+            None if arguments.rims is None else load_refitted(arguments.rims),
+        ),
+        arguments.out,
+        [known[name] for name in wanted],
+        AblationParameters(
+            steps=arguments.steps,
+            crop_px=arguments.crop,
+            real_frames=arguments.frames[0],
+            procedural_frames=arguments.frames[1],
+            validation_frames=arguments.test_frames,
+            test_frames=arguments.test_frames,
+            seeds=tuple(arguments.seeds),
+            every_seed=arguments.every_seed,
+        ),
+        log,
+    )
+    emit(arguments, {"variants": rows}, format_ablation(rows))
+    return 0
+
+
+def _quantise(arguments: argparse.Namespace) -> int:
+    import importlib.util
+
+    from linna.errors import UsageError
+    from linna.output import emit
+    from payload_emulator.training.dataset import Dataset
+    from payload_emulator.training.evaluate import evaluate
+    from payload_emulator.training.quantise import latency_ratio, quantise
+
+    if importlib.util.find_spec("onnx") is None:
+        raise UsageError("quantisation needs onnx: install the extra 'train' (pip install 'linna[train]')")
+    datasets = [Dataset(folder) for folder in arguments.dataset]
+    octets = model_octets(arguments.model)
+    small = quantise(octets, datasets)
+    unfinished = arguments.out.with_name(f".{arguments.out.name}.unfinished")
+    unfinished.write_bytes(small)
+    unfinished.replace(arguments.out)
+    full_ms, small_ms, ratio = latency_ratio(octets, small)
+    kept = ("precision", "recall", "f1", "loc_px")
+    scores = {
+        name: {key: figures["micro"][key] for key in kept}
+        for name, figures in (
+            ("float32", evaluate(octets, datasets)),
+            ("int8", evaluate(small, datasets)),
+        )
+    }
+    emit(
+        arguments,
+        {
+            "model": str(arguments.out),
+            "bytes": {"float32": len(octets), "int8": len(small)},
+            "network_ms": {"float32": full_ms, "int8": small_ms},
+            "latency_ratio": ratio,
+            "strict": scores,
+        },
+    )
+    return 0
+
+
+def _landmarks(arguments: argparse.Namespace) -> int:
+    from linna.errors import UsageError
+    from linna.output import emit, progress
+    from payload_emulator.training.dataset import Dataset
+    from payload_emulator.training.evaluate import open_for_evaluation, run
+    from payload_emulator.training.landmarks import RecurrenceRule, format_landmarks, study
+
+    if not 0.0 <= arguments.hide < 1.0:
+        raise UsageError(f"--hide: expected a share from 0 to below 1, found {arguments.hide:g}")
+    if arguments.sightings < 2:
+        raise UsageError(f"--sightings: expected 2 or more, found {arguments.sightings}")
+    detector = open_for_evaluation(model_octets(arguments.model))
+    scored = run(
+        detector,
+        [Dataset(folder) for folder in arguments.dataset],
+        arguments.split,
+        arguments.source,
+        arguments.threshold,
+        lambda frames: progress(frames, len(frames), "detect", "frames"),
+    )
+    landmarks, figures = study(
+        scored.frames,
+        scored.found,
+        scored.thresholds.on_board,
+        arguments.hide,
+        RecurrenceRule(sightings=arguments.sightings),
+    )
+    if arguments.out is not None:
+        write_text(arguments.out, format_landmarks(landmarks))
+    emit(arguments, {**figures, "model_sha256": detector.sha256})
+    return 0
+
+
+def _trials(arguments: argparse.Namespace) -> int:
+    from linna.output import emit, progress
+    from payload_emulator.training.dataset import Dataset
+    from payload_emulator.training.evaluate import open_for_evaluation
+    from payload_emulator.training.trials import format_trials, run_trials
+
+    detector = open_for_evaluation(model_octets(arguments.model))
+    datasets = [Dataset(folder) for folder in arguments.dataset]
+    rows = run_trials(
+        detector,
+        datasets,
+        source=arguments.source,
+        progress=lambda frames: progress(frames, len(frames), "trial", "frames"),
+    )
+    emit(arguments, {"trials": rows, "model_sha256": detector.sha256}, format_trials(rows))
+    return 0
