@@ -51,6 +51,8 @@ _SEARCH_CHUNK_DAYS = 15.0
 _CATALOGUE_MARGIN_M = 15_000.0
 # What stands for an image where none is rendered.
 _REDUCED_PX = 8
+# No ground of the Moon reaches so far above the sphere of the maps: its highest point lies at 10.8 km (LOLA).
+_HIGHEST_GROUND_M = 12_000.0
 # With the Sun this far below the horizon of the sub-satellite point no ground in view is lit, mountains included.
 _NIGHT_RAD = np.radians(12.0)
 
@@ -133,7 +135,7 @@ def build_world(scenario: Scenario, data: DataFolder) -> World:
             f"{scenario.window.latitude_limit_deg} deg of latitude"
         )
     truth, burns = _disturbed(scenario, truth, burns, int(frame_utc_ns[0]), model)
-    require_above_ground(truth, frame_utc_ns, terrain.height_m)
+    require_above_ground(truth, frame_utc_ns, terrain.height_m, _HIGHEST_GROUND_M)
     names = (
         *terrain.data_names,
         f"gravity {gravity.name} to degree {model.degree}",

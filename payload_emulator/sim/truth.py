@@ -5,6 +5,7 @@ Everything here is truth: it reaches flight software as images, attitude reading
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -129,9 +130,14 @@ def attitude_message(camera_from_icrf: FloatArray, sun_direction_camera: FloatAr
 
 
 def require_above_ground(
-    truth: Truth, utc_ns: IntArray, height_m: Callable[[FloatArray, FloatArray], FloatArray]
+    truth: Truth,
+    utc_ns: IntArray,
+    height_m: Callable[[FloatArray, FloatArray], FloatArray],
+    highest_m: float = math.inf,
 ) -> None:
     """Refuse a trajectory that dips below the terrain at any of the instants.
+
+    The terrain is looked up only below `highest_m`, above which none of it reaches: to look is to make it.
 
     Raises
     ------
@@ -139,7 +145,11 @@ def require_above_ground(
         With the epoch, the place and the depth.
     """
     latitude, longitude, altitude = spherical_from_mcmf(truth.positions_mcmf(utc_ns))
-    clearance = altitude - height_m(latitude, longitude)
+    low = np.flatnonzero(altitude < highest_m)
+    if not low.size:
+        return
+    utc_ns, latitude, longitude = utc_ns[low], latitude[low], longitude[low]
+    clearance = altitude[low] - height_m(latitude, longitude)
     lowest = int(np.argmin(clearance))
     if clearance[lowest] <= 0.0:
         raise ScenarioError(

@@ -119,6 +119,20 @@ def test_a_pointing_error_turns_the_camera_by_its_size() -> None:
     assert perturbed(camera, np.zeros(3)) is camera
 
 
+def test_the_terrain_is_not_looked_up_from_above_its_highest_point(polar_truth: Truth) -> None:
+    asked: list[int] = []
+
+    def height_m(latitude: np.ndarray, longitude: np.ndarray) -> np.ndarray:
+        asked.append(latitude.size)
+        return np.zeros(latitude.shape)
+
+    # The orbit of this flight keeps 30 km.
+    require_above_ground(polar_truth, np.array([START_NS]), height_m, highest_m=25_000.0)
+    assert not asked
+    require_above_ground(polar_truth, np.array([START_NS]), height_m, highest_m=35_000.0)
+    assert asked == [1]
+
+
 def test_a_trajectory_below_the_terrain_is_refused_with_epoch_and_depth(polar_truth: Truth) -> None:
     times = np.array([START_NS, START_NS + 60 * NS])
     require_above_ground(polar_truth, times, lambda latitude, longitude: np.full(latitude.shape, 29_000.0))
