@@ -160,6 +160,23 @@ class Client:
         """Time correlations of a spacecraft, the newest first."""
         return self._json("GET", f"/spacecraft/{spacecraft_id}/correlations", query={"instance": instance})
 
+    def correlate_again(self, spacecraft_id: int, instance: str) -> View:
+        """Fit the time correlation of a spacecraft from its received time reports."""
+        return self._json(
+            "POST", f"/spacecraft/{spacecraft_id}/correlations/run", query={"instance": instance}
+        )
+
+    def enter_receptions(self, spacecraft_id: int, instance: str, receptions: list[View]) -> View:
+        """Tell when time reports were received; the correlations then in force."""
+        return self._json(
+            "POST", f"/spacecraft/{spacecraft_id}/receptions", query={"instance": instance},
+            body={"receptions": receptions},
+        )  # fmt: skip
+
+    def time_reports(self, spacecraft_id: int, instance: str) -> View:
+        """Received time reports with their residuals."""
+        return self._json("GET", f"/spacecraft/{spacecraft_id}/time-reports", query={"instance": instance})
+
     # Plan
 
     def search_windows(self, request: Mapping[str, Any]) -> View:

@@ -15,6 +15,7 @@ from ground_service.services.views import (
     pass_view,
     search_view,
     telecommand_view,
+    time_report_view,
     window_view,
 )
 
@@ -131,6 +132,26 @@ class LocalOperations:
 
         rows = spacecraft_correlations(self.ground, spacecraft_id, instance)
         return {"items": [correlation_view(row) for row in rows], "total": len(rows)}
+
+    def correlate_again(self, spacecraft_id: int, instance: str) -> View:
+        from ground_service.services.timekeeping import correlate_again
+
+        rows = correlate_again(self.ground, spacecraft_id, instance, actor=self._actor)
+        return {"items": [correlation_view(row) for row in rows], "total": len(rows)}
+
+    def enter_receptions(self, spacecraft_id: int, instance: str, receptions: list[View]) -> View:
+        from ground_service.services.recorrelation import enter_receptions, received_reports
+
+        rows = enter_receptions(
+            self.ground, spacecraft_id, instance, received_reports(receptions), actor=self._actor
+        )
+        return {"items": [correlation_view(row) for row in rows], "total": len(rows)}
+
+    def time_reports(self, spacecraft_id: int, instance: str) -> View:
+        from ground_service.services.timekeeping import spacecraft_time_reports
+
+        rows = spacecraft_time_reports(self.ground, spacecraft_id, instance)
+        return {"items": [time_report_view(row) for row in rows], "total": len(rows)}
 
     def search_windows(self, request: Mapping[str, Any]) -> View:
         from ground_service.services.plan_requests import search

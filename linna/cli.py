@@ -35,6 +35,7 @@ GROUPS: dict[str, tuple[str, str]] = {
     "ingest": ("ingest", "ingest downlink files or pass archives into the ground database"),
     "pass": ("pass_", "list and show passes"),
     "report": ("report", "write the report of a pass"),
+    "correlate": ("correlate", "time correlation of a spacecraft: segments, residuals, run"),
     "plan": ("plan", "observation windows: search, enter, approve, uplink, exchange"),
     "trajectory": ("trajectory", "solutions of a pass as TUM files, absolute and relative errors"),
     "command": ("command", "telecommands: queue, release, uplink, verification"),

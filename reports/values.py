@@ -322,6 +322,7 @@ class PassEvent:
     severity: str
     name: str
     detail: str = ""
+    correlation_id: int = 0
 
 
 @dataclass(frozen=True, slots=True)

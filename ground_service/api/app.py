@@ -21,6 +21,7 @@ from ground_service.api.planning import planning
 from ground_service.api.regression_routes import REGRESSION_UPLOAD_PATHS, regressions
 from ground_service.api.routes import UPLOAD_PATHS, router
 from ground_service.api.telecommands import telecommands
+from ground_service.api.timekeeping import timekeeping
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError
 from ground_service.services.ground import ground_from_settings
@@ -78,7 +79,7 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
     app.state.open_without_users = settings.host in LOOPBACK
     app.state.live_console = settings.resolved_live_console()
     app.state.upload_limit_octets = settings.upload_limit_mib << 20
-    for one in (router, planning, telecommands, regressions):
+    for one in (router, timekeeping, planning, telecommands, regressions):
         app.include_router(one)
     app.include_router(operations)
     app.include_router(live)

@@ -37,14 +37,8 @@ from ground_service.services.jobs import enter_ingest
 from ground_service.services.passes import STATE_VALUES
 from ground_service.services.plan_schemas import time_of
 from ground_service.services.reports import pass_summary
-from ground_service.services.timekeeping import (
-    correlate_spacecraft,
-    spacecraft_correlations,
-    time_points,
-)
 from ground_service.services.upkeep import spacecraft_trends, trend_view
 from ground_service.services.views import (
-    correlation_view,
     ephemeris_view,
     ingest_view,
     job_view,
@@ -262,6 +256,7 @@ def get_detections(
                 diameter_px=item.diameter_px,
                 score=item.score,
                 size_class=item.size_class,
+                correlation_id=item.correlation_id,
             )
             for item in items
         ],
@@ -297,6 +292,7 @@ def get_events(ground: GroundOf, _: Viewer, pass_id: PassId, limit: Limit = 100,
                 severity=event.severity,
                 name=event.name,
                 detail=event.detail,
+                correlation_id=event.correlation_id,
             )
             for event in found[offset : offset + limit]
         ],
@@ -433,30 +429,3 @@ def get_report_summary(ground: GroundOf, _: Viewer, report_id: Key) -> dict[str,
 def get_trends(ground: GroundOf, _: Viewer, spacecraft_id: SpacecraftId, instance: Instance = FLOWN) -> Any:
     """Housekeeping parameters over the last 30 days of on-board time: statistics, slope, worst limit state."""
     return [trend_view(trend) for trend in spacecraft_trends(ground, spacecraft_id, instance)]
-
-
-@router.get("/spacecraft/{spacecraft_id}/correlations", response_model=schemas.PageOf[schemas.Correlation])
-def list_correlations(
-    ground: GroundOf, _: Viewer, spacecraft_id: SpacecraftId, instance: Instance = FLOWN
-) -> Any:
-    """Time correlations that a spacecraft ever had, the newest first."""
-    rows = spacecraft_correlations(ground, spacecraft_id, instance)
-    return page_of([correlation_view(row) for row in rows], len(rows), max(len(rows), 1), 0)
-
-
-@router.post(
-    "/spacecraft/{spacecraft_id}/correlations",
-    status_code=201,
-    response_model=schemas.PageOf[schemas.Correlation],
-)
-def add_correlations(
-    ground: GroundOf,
-    caller: Operator,
-    spacecraft_id: SpacecraftId,
-    given: schemas.TimePoints,
-    instance: Instance = FLOWN,
-) -> Any:
-    """Correlate on-board time with UTC from time reports; what is derived from ticks follows at once."""
-    points = time_points([point.model_dump() for point in given.points])
-    rows = correlate_spacecraft(ground, spacecraft_id, instance, points, actor=caller.name)
-    return page_of([correlation_view(row) for row in rows], len(rows), max(len(rows), 1), 0)

@@ -134,6 +134,7 @@ class DetectionItem(Schema):
     diameter_px: float
     score: float
     size_class: int = Field(description="0: 5-10 km, 1: 10-15 km, 2: 15-30 km, 3: 3-5 km, -1: none")
+    correlation_id: int = Field(description="Time correlation used; 0 is an ideal clock")
 
 
 class Bucket(Schema):
@@ -172,6 +173,7 @@ class EventItem(Schema):
     severity: str = Field(examples=["info"])
     name: str = Field(examples=["observation_stopped"])
     detail: str
+    correlation_id: int = Field(description="Time correlation used; 0 is an ideal clock")
 
 
 class CommandEntry(Schema):
@@ -274,6 +276,35 @@ class TimePoints(Schema):
     points: list[TimePointIn] = Field(min_length=1, max_length=10_000)
 
 
+class ReceptionIn(Schema):
+    """When a time report came to the Earth; its packet may come in before or after this."""
+
+    packet_ticks: int = Field(ge=0, lt=2**48, description="On-board time in the packet's header, 2^-16 s")
+    sequence_count: int = Field(ge=0, lt=2**14, description="Count in the packet's header")
+    received: str = Field(max_length=40, examples=["2029-08-07T06:00:01.3Z"])
+    station: str = Field(default="", max_length=64, description="Empty: light time to the Earth's centre")
+
+
+class Receptions(Schema):
+    """Receptions of time reports of one spacecraft."""
+
+    receptions: list[ReceptionIn] = Field(min_length=1, max_length=10_000)
+
+
+class TimeReportItem(Schema):
+    """A received time report, and what the correlation in force leaves of it."""
+
+    packet_ticks: int
+    sequence_count: int
+    reported_ticks: int
+    received: str
+    station: str
+    light_time_s: float = Field(examples=[1.28])
+    boot_count: int
+    correlation_id: int = Field(description="0 is an ideal clock")
+    residual_ns: int
+
+
 class Correlation(Schema):
     """A straight line from on-board time to UTC over one run of the clock."""
 
@@ -285,7 +316,10 @@ class Correlation(Schema):
     reference: str = Field(description="UTC of reference_ticks")
     drift_ppb: float
     residual_rms_ns: float | None
+    residual_max_ns: float | None
     points: int
+    rejected: int = Field(description="Time reports left out as not believable")
+    method: str = Field(examples=["time reports, light time"])
     in_force: bool
     created: str
 

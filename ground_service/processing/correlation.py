@@ -37,6 +37,15 @@ RESOLUTION_NS = 2 * 15_259.0
 
 MAX_ROUNDS = 10
 
+JUMP_NS = 20e6
+"""A clock that is off by so much more from one time report to the next has been set; delays on board are smaller."""
+
+JUMP_RATE = 200e-6
+"""As `JUMP_NS`, per time between the reports: no oscillator drifts that fast."""
+
+SIGNIFICANT = 3.0
+"""A drift of fewer standard deviations than that is taken for none."""
+
 
 @dataclass(frozen=True, slots=True)
 class TimeCorrelation:
@@ -131,6 +140,7 @@ def fit_correlation(
         if (still == kept).all() or not still.any():
             break
         kept = still
+    offset, slope = _without_chance(nominal[kept], deviation[kept], offset, slope)
     residual = (deviation - offset - slope * nominal)[kept]
     reference_tai = int(sent_tai[middle]) + round(offset)
     return CorrelationFit(
@@ -152,3 +162,48 @@ def _line(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]
     square = float(centre @ centre)
     slope = float(centre @ y) / square if square > 0.0 else 0.0
     return float(y.mean() - slope * x.mean()), slope
+
+
+def _without_chance(
+    nominal: IntArray, deviation: NDArray[np.float64], offset: float, slope: float
+) -> tuple[float, float]:
+    """The line, level where its slope may be no more than the chance of the points and of the clock's resolution."""
+    centre = nominal - nominal.mean()
+    square = float(centre @ centre)
+    if square == 0.0:
+        return offset, slope
+    free = max(len(nominal) - 2, 1)
+    residual = deviation - offset - slope * nominal
+    resolution = 0.5 * RESOLUTION_NS / np.sqrt(12.0)
+    deviation_ns = max(float(np.sqrt(residual @ residual / free)), resolution)
+    if abs(slope) >= SIGNIFICANT * deviation_ns / np.sqrt(square):
+        return offset, slope
+    return float(deviation.mean()), 0.0
+
+
+def clock_runs(
+    ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntArray, boot: IntArray
+) -> list[IntArray]:
+    """Indices of the time reports (n,) of each run of the clock, in the order in which they were sent.
+
+    A run ends with a boot, and where the clock was set: where it is off by `JUMP_NS` and `JUMP_RATE` more than at the
+    report before, and the next report says so too. A report that stands alone with what it says stays in the run, where
+    the fit leaves it out.
+    """
+    sent = np.asarray(tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - light_time_ns
+    order = np.lexsort((ticks, sent))
+    runs: list[IntArray] = []
+    for number in np.unique(boot[order]):
+        mine = order[boot[order] == number]
+        nominal = ticks[mine] * _NS_NUMERATOR // _NS_DENOMINATOR
+        off = (nominal - nominal[0] - (sent[mine] - sent[mine[0]])).astype(np.float64)
+        allowed = JUMP_NS + JUMP_RATE * np.abs(np.diff(sent[mine]))
+        start, level = 0, 0
+        for k in range(1, len(mine)):
+            if abs(off[k] - off[level]) <= JUMP_NS + JUMP_RATE * (sent[mine[k]] - sent[mine[level]]):
+                level = k
+            elif k + 1 < len(mine) and abs(off[k + 1] - off[k]) <= allowed[k]:
+                runs.append(mine[start:k])
+                start = level = k
+        runs.append(mine[start:])
+    return runs

@@ -45,7 +45,8 @@ class DetectionSamples:
     """Detections of all frames, in time order.
 
     Frame arrays are (f,); the detections of frame ``i`` are rows ``offsets[i]`` to ``offsets[i + 1]`` of the item
-    arrays (n,). `usable` is False where the payload judged the image unfit.
+    arrays (n,). `usable` is False where the payload judged the image unfit; `correlation_id` (f,) tells which time
+    correlation gave `utc_ns`, where that is known.
     """
 
     frame_number: IntArray
@@ -58,6 +59,7 @@ class DetectionSamples:
     diameter_px: FloatArray
     score: FloatArray
     size_class: IntArray
+    correlation_id: IntArray | None = None
 
     def __len__(self) -> int:
         return len(self.frame_number)

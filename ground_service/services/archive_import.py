@@ -12,6 +12,7 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, storage_error
 from ground_service.services.ground import Ground
 from ground_service.services.ingest import ingest_stored
+from ground_service.services.recorrelation import enter_receptions, read_receptions
 from ground_service.store import repository
 from ground_service.store.files import StoredFile
 from lunar.catalogue import load_catalogue
@@ -20,6 +21,7 @@ from lunar.errors import LunarError
 from lunar.timescales import parse_utc
 
 SCHEMA_VERSION = 1
+RECEPTIONS_FILE = "receptions.csv"
 MANIFEST_LIMIT_OCTETS = 16 << 20
 
 FRAMES_KEPT = 200
@@ -58,6 +60,14 @@ def import_archive(ground: Ground, folder: Path, progress: Callable[[str], None]
     stored = {name: ground.files.put_file(folder / name) for name in names if not name.startswith("frames/")}
     images = {number: ground.files.put_file(folder / name) for number, name in _chosen_frames(names)}
     pass_id = _register(ground, folder, manifest, digest, start_utc_ns, stop_utc_ns, stored, images)
+    if RECEPTIONS_FILE in stored:
+        enter_receptions(
+            ground,
+            int(manifest["spacecraft_id"]),
+            instance_of(manifest, digest),
+            read_receptions(folder / RECEPTIONS_FILE),
+            actor="archive",
+        )
     if "downlink.cadu" in stored:
         say("ingesting the downlink")
         ingest_stored(

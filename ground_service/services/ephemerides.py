@@ -5,6 +5,7 @@ from __future__ import annotations
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput
 from ground_service.services.ground import Ground
+from ground_service.services.recorrelation import recorrelate_all
 from ground_service.services.users import audit
 from ground_service.store import repository
 from ground_service.store.files import StoredFile
@@ -49,4 +50,6 @@ def add_ephemeris(
             created_utc_ns=now,
         )
         audit(connection, actor, "add ephemeris", name, {"id": key, "sha256": stored.sha256})
-        return repository.get(connection, repository.EPHEMERIDES, key, "ephemeris")
+        row = repository.get(connection, repository.EPHEMERIDES, key, "ephemeris")
+    recorrelate_all(ground)
+    return row

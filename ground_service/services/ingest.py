@@ -17,6 +17,7 @@ from ground_service.errors import DatabaseUnavailable, GroundError, InvalidInput
 from ground_service.link.stream import DownlinkReader
 from ground_service.services.ground import Ground
 from ground_service.services.joining import join_with_others
+from ground_service.services.recorrelation import recorrelate
 from ground_service.services.window_progress import advance_windows
 from ground_service.store import repository
 from ground_service.store.files import StoredFile, read_blocks
@@ -190,8 +191,8 @@ def _store_stream(
                 joined += join_with_others(
                     connection, ground.files, vehicle, spacecraft_id, sha256, reader.edges
                 )
-    if new + joined:
-        for vehicle in vehicles.values():
+    for vehicle in vehicles.values():
+        if not recorrelate(ground, vehicle) and new + joined:
             advance_windows(ground, vehicle)
     found = reader.accounting
     return IngestResult(

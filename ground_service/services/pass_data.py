@@ -319,9 +319,13 @@ def detection_samples(connection: Connection, span: PassSpan) -> DetectionSample
     ]
     items, offsets = unpack_detections([bytes(rows["items"][i]) for i in chosen])
     quality = [rows["image_quality"][i] for i in chosen]
+    utc_ns, correlation_ids = utc_ns_of_ticks(
+        np.array([rows["ticks"][i] for i in chosen], dtype=np.int64), span.correlations
+    )
     return DetectionSamples(
         frame_number=np.array([rows["frame_number"][i] for i in chosen], dtype=np.int64),
-        utc_ns=span.utc_ns([rows["ticks"][i] for i in chosen]),
+        utc_ns=utc_ns,
+        correlation_id=correlation_ids,
         usable=np.array([code == 0 for code in quality], dtype=np.bool_),
         quality=_labels(DICTIONARY.labels("detections", "image_quality"), np.array(quality)),
         offsets=offsets,
@@ -496,14 +500,16 @@ def event_list(connection: Connection, span: PassSpan) -> tuple[PassEvent, ...]:
         connection, "events", span.vehicle, span.start_ticks, span.stop_ticks, DICTIONARY.version, names
     )
     labels = DICTIONARY.labels("event_info", "event_id")
+    utc_ns, correlation_ids = utc_ns_of_ticks(np.array(rows["ticks"], dtype=np.int64), span.correlations)
     events = [
         PassEvent(
             utc_ns=int(utc),
             severity=_SEVERITIES.get(rows["severity"][i], str(rows["severity"][i])),
             name=labels.get(rows["event_id"][i], str(rows["event_id"][i])),
             detail=_event_detail(rows["frame_number"][i], rows["value_1"][i], rows["value_2"][i]),
+            correlation_id=int(correlation_ids[i]),
         )
-        for i, utc in enumerate(span.utc_ns(rows["ticks"]))
+        for i, utc in enumerate(utc_ns)
     ]
     return tuple(sorted(events, key=lambda event: (event.utc_ns, event.name, event.detail)))
 

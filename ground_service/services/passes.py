@@ -40,6 +40,7 @@ class Detection:
     diameter_px: float
     score: float
     size_class: int
+    correlation_id: int
 
 
 def list_passes(ground: Ground, *, limit: int = 100, offset: int = 0) -> repository.Page:
@@ -124,6 +125,7 @@ def detections(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tupl
             diameter_px=float(samples.diameter_px[row]),
             score=float(samples.score[row]),
             size_class=int(samples.size_class[row]),
+            correlation_id=0 if samples.correlation_id is None else int(samples.correlation_id[frame]),
         )
         for row, frame in zip(rows.tolist(), frames.tolist(), strict=True)
     ], total

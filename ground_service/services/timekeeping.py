@@ -18,6 +18,7 @@ from ground_service.errors import InvalidInput, NotFound
 from ground_service.processing.correlation import CorrelationFit, fit_correlation
 from ground_service.services.ground import Ground
 from ground_service.services.plan_schemas import time_of
+from ground_service.services.recorrelation import in_force, recorrelate, residuals
 from ground_service.services.users import audit
 from ground_service.services.window_progress import advance_windows
 from ground_service.store import repository
@@ -74,7 +75,9 @@ def correlate(
                 reference_utc_ns=fit.reference_utc_ns,
                 drift_ppb=fit.drift_ppb,
                 residual_rms_ns=fit.residual_rms_ns,
+                residual_max_ns=fit.residual_max_ns,
                 points=fit.points,
+                rejected=fit.rejected,
                 superseded=0,
                 created_utc_ns=now,
             )
@@ -105,6 +108,20 @@ def correlate_spacecraft(
 def spacecraft_correlations(ground: Ground, spacecraft_id: int, instance: str) -> list[repository.Row]:
     """All correlations that a spacecraft ever had, the newest first."""
     return correlations_on_record(ground, _vehicle(ground, spacecraft_id, instance))
+
+
+def correlate_again(ground: Ground, spacecraft_id: int, instance: str, *, actor: str) -> list[repository.Row]:
+    """Correlate a spacecraft from its received time reports, also over what was entered; the correlations in force."""
+    vehicle = _vehicle(ground, spacecraft_id, instance)
+    if recorrelate(ground, vehicle, over_manual=True):
+        with ground.database.writing() as connection:
+            audit(connection, actor, "correlate time", str(vehicle), {"from": "time reports"})
+    return in_force(ground, vehicle)
+
+
+def spacecraft_time_reports(ground: Ground, spacecraft_id: int, instance: str) -> list[dict[str, Any]]:
+    """The received time reports of a spacecraft with what the correlations in force leave of them."""
+    return residuals(ground, _vehicle(ground, spacecraft_id, instance))
 
 
 def time_points(given: Sequence[Mapping[str, Any]]) -> list[TimePoint]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -218,10 +219,17 @@ def _time_texts(utc_ns: Any) -> list[str]:
     return [f"{text}Z" for text in texts.tolist()]
 
 
+def time_report_view(report: Mapping[str, Any]) -> View:
+    """A received time report."""
+    rest = {name: value for name, value in report.items() if name != "received_utc_ns"}
+    return {**rest, "received": time_text(report["received_utc_ns"])}
+
+
 def correlation_view(row: Row) -> View:
     """A time correlation."""
     kept = (
-        "id", "boot_count", "start_ticks", "stop_ticks", "reference_ticks", "drift_ppb", "residual_rms_ns", "points",
+        "id", "boot_count", "start_ticks", "stop_ticks", "reference_ticks", "drift_ppb", "residual_rms_ns",
+        "residual_max_ns", "points", "rejected", "method",
     )  # fmt: skip
     return {
         **{name: row[name] for name in kept},

@@ -325,9 +325,26 @@ class Correlation(Base):
     reference_utc_ns: Mapped[int] = mapped_column(BigInteger)
     drift_ppb: Mapped[float] = mapped_column(Double)
     residual_rms_ns: Mapped[float | None] = mapped_column(Double)
+    residual_max_ns: Mapped[float | None] = mapped_column(Double)
     points: Mapped[int] = mapped_column(Integer)
+    rejected: Mapped[int] = mapped_column(Integer, default=0, server_default="0")
     superseded: Mapped[int] = mapped_column(Flag, default=0)
     created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+
+
+class Reception(Base):
+    """When a station on the Earth received a time report, whether or not the report itself has come in yet.
+
+    The report is the packet of time reports with these `ticks` in its header and this count. `station` is empty where
+    only the Earth is known; of several times at one station the first counts, as later ones are played back.
+    """
+
+    __tablename__ = "receptions"
+    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"), primary_key=True)
+    ticks: Mapped[int] = mapped_column(BigInteger, primary_key=True)
+    sequence_count: Mapped[int] = mapped_column(SmallInteger, primary_key=True)
+    station: Mapped[str] = mapped_column(String(64), primary_key=True)
+    earth_utc_ns: Mapped[int] = mapped_column(BigInteger)
 
 
 class EphemerisRecord(Base):
