@@ -142,9 +142,10 @@ def _quantise(arguments: argparse.Namespace) -> int:
 
     from linna.errors import UsageError
     from linna.output import emit
+    from payload_emulator.training.bench import beside
     from payload_emulator.training.dataset import Dataset
     from payload_emulator.training.evaluate import evaluate
-    from payload_emulator.training.quantise import latency_ratio, quantise
+    from payload_emulator.training.quantise import quantise
 
     if importlib.util.find_spec("onnx") is None:
         raise UsageError("quantisation needs onnx: install the extra 'train' (pip install 'linna[train]')")
@@ -154,7 +155,7 @@ def _quantise(arguments: argparse.Namespace) -> int:
     unfinished = arguments.out.with_name(f".{arguments.out.name}.unfinished")
     unfinished.write_bytes(small)
     unfinished.replace(arguments.out)
-    full_ms, small_ms, ratio = latency_ratio(octets, small)
+    times = beside({"float32": octets, "int8": small})
     kept = ("precision", "recall", "f1", "loc_px")
     scores = {
         name: {key: figures["micro"][key] for key in kept}
@@ -168,8 +169,8 @@ def _quantise(arguments: argparse.Namespace) -> int:
         {
             "model": str(arguments.out),
             "bytes": {"float32": len(octets), "int8": len(small)},
-            "network_ms": {"float32": full_ms, "int8": small_ms},
-            "latency_ratio": ratio,
+            "network_ms": {name: row["network_ms"] for name, row in times.items()},
+            "latency_ratio": times["int8"]["of_first"],
             "strict": scores,
         },
     )

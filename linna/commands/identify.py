@@ -1,4 +1,4 @@
-"""`linna identify`: how often craters are found and taken for others, on simulated detections."""
+"""`linna identify`: how often craters are found and taken for others, on simulated detections or rendered frames."""
 
 from __future__ import annotations
 
@@ -40,6 +40,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="error of nadir and heading, 1 sigma per axis (default: 0.5)",
     )
     lost.add_argument("--sets", type=int, help="sets of four frames (default: a third of the frames)")
+    rendered = lost.add_argument_group("rendered", "frames along a scenario and the detector that flies")
+    rendered.add_argument(
+        "--scenario",
+        metavar="FILE",
+        help="render frames of a scenario in sets of four; its terrain's craters are the map, FILE is not used",
+    )
+    rendered.add_argument(
+        "--min-diameter-km", type=float, default=5.0, help="smallest craters of the map (default: 5)"
+    )
+    rendered.add_argument(
+        "--detections", type=Path, metavar="F.npz", help="keep the detections here, or take those kept here"
+    )
     lost.set_defaults(handler=run_lost)
     tracking.set_defaults(handler=run_tracking)
 
@@ -50,6 +62,10 @@ def run_lost(arguments: argparse.Namespace) -> int:
     from payload_emulator.flight.lost_in_space import place_index
     from payload_emulator.identification_study import KINDS, study_lost, study_lost_in_frames
 
+    if arguments.scenario is not None:
+        from linna.commands._identify_rendered import run as run_rendered
+
+        return run_rendered(arguments)
     model = _model(arguments)
     world = _world(arguments)
     attitude_rad = math.radians(arguments.attitude_deg)

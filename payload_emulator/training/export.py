@@ -86,7 +86,7 @@ def export(
     exported = ExportedCraterNet(
         network, calibration.geometry_shift, network.heat_channels if paper_classes else 1
     ).eval()
-    model = _onnx_model(exported)
+    model = keep_blocked(onnx_model(exported))
     metadata = _metadata(stored, calibration, checkpoint, datasets) | {
         "git_revision": revision,
         **(notes or {}),
@@ -123,7 +123,8 @@ def export(
     }
 
 
-def _onnx_model(exported: Any) -> Any:
+def onnx_model(exported: Any) -> Any:
+    """The ONNX model of an `ExportedCraterNet`."""
     import torch
 
     example = torch.zeros(1, 1, INPUT_SIZE_PX, INPUT_SIZE_PX)
@@ -145,6 +146,58 @@ def _onnx_model(exported: Any) -> Any:
         del node.metadata_props[:]
         node.doc_string = ""
     return model
+
+
+def keep_blocked(model: Any) -> Any:
+    """The model with squeeze-excite gates in a form that ONNX Runtime runs without leaving its blocked layout.
+
+    It knows the mean over the image as a pooling, and products only of maps of one size: means become poolings and
+    gates are enlarged to the size of what they weigh. The same values, and two changes of layout fewer per gate.
+    """
+    import onnx
+    from onnx import helper, numpy_helper
+
+    inferred = onnx.shape_inference.infer_shapes(model).graph
+    shape = {
+        value.name: [size.dim_value for size in value.type.tensor_type.shape.dim]
+        for value in (*inferred.value_info, *inferred.input, *inferred.output)
+    }
+    nodes = []
+    for node in list(model.graph.node):
+        if node.op_type == "ReduceMean" and _spatial_mean(node, shape):
+            node.op_type = "GlobalAveragePool"
+            del node.input[1:]
+            del node.attribute[:]
+        elif node.op_type == "Mul":
+            for k, (gate, picture) in enumerate((node.input, (node.input[1], node.input[0]))):
+                small, large = shape.get(gate, []), shape.get(picture, [])
+                spread = len(small) == len(large) == 4 and small[2:] == [1, 1] and small[:2] == large[:2]
+                if spread and small != large:
+                    name = f"{gate}_enlarged"
+                    scales = np.array([1.0, 1.0, *large[2:]], np.float32)
+                    model.graph.initializer.append(numpy_helper.from_array(scales, f"{name}_scales"))
+                    nodes.append(
+                        helper.make_node(
+                            "Resize",
+                            [gate, "", f"{name}_scales"],
+                            [name],
+                            mode="nearest",
+                            coordinate_transformation_mode="asymmetric",
+                            nearest_mode="floor",
+                        )
+                    )
+                    node.input[k] = name
+                    break
+        nodes.append(node)
+    del model.graph.node[:]
+    model.graph.node.extend(nodes)
+    return model
+
+
+def _spatial_mean(node: Any, shape: dict[str, list[int]]) -> bool:
+    """Whether a mean is taken over height and width and leaves them as 1."""
+    before, after = shape.get(node.input[0], []), shape.get(node.output[0], [])
+    return len(before) == len(after) == 4 and before[:2] == after[:2] and after[2:] == [1, 1]
 
 
 def _with_metadata(model: Any, metadata: dict[str, str]) -> bytes:

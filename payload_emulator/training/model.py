@@ -12,6 +12,7 @@ A. Howard et al., "Searching for MobileNetV3", 2019, tables 1 and 2. X. Zhou et 
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import asdict, dataclass
 
@@ -135,6 +136,11 @@ class CraterNet(nn.Module):
         return 5 if self.config.depth else 4
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        out = self.maps(image)
+        return out[:, : self.heat_channels], out[:, self.heat_channels :]
+
+    def maps(self, image: Tensor) -> Tensor:
+        """Heatmap logits and geometry as one stack of maps."""
         features: list[Tensor] = []
         x = stem = self.stem(image)
         for index, block in enumerate(self.blocks):
@@ -153,13 +159,14 @@ class CraterNet(nn.Module):
             out.requires_grad
         ):  # a gradient of another memory layout makes the backward pass several times slower
             out.register_hook(lambda gradient: gradient.contiguous(memory_format=torch.channels_last))
-        return out[:, : self.heat_channels], out[:, self.heat_channels :]
+        return out
 
 
 class ExportedCraterNet(nn.Module):
     """The network as flight runs it: probabilities, and geometry with the corrections of `calibrate.calibrate`.
 
-    `heat_channels` 1 leaves the paper's class heatmaps out.
+    `heat_channels` 1 leaves the paper's class heatmaps out. Corrections are part of the last layer's biases, and what
+    is left out is not computed.
     """
 
     def __init__(
@@ -169,15 +176,23 @@ class ExportedCraterNet(nn.Module):
         heat_channels: int = 1,
     ) -> None:
         super().__init__()
-        self.network = network
+        self.network = copy.deepcopy(network)
         self.heat_channels = heat_channels
-        shift = torch.zeros(1, network.geometry_channels, 1, 1)
-        shift[0, :4, 0, 0] = torch.tensor(geometry_shift)
-        self.register_buffer("shift", shift)
+        whole = network.head
+        assert whole.bias is not None
+        first = network.heat_channels
+        kept = [*range(heat_channels), *range(first, first + network.geometry_channels)]
+        head = nn.Conv2d(whole.in_channels, len(kept), 1)
+        assert head.bias is not None
+        with torch.no_grad():
+            head.weight.copy_(whole.weight[kept])
+            head.bias.copy_(whole.bias[kept])
+            head.bias[heat_channels : heat_channels + 4] += torch.tensor(geometry_shift)
+        self.network.head = head
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        heat, geometry = self.network(image)
-        return torch.sigmoid(heat[:, : self.heat_channels]), geometry + self.shift
+        out = self.network.maps(image)
+        return torch.sigmoid(out[:, : self.heat_channels]), out[:, self.heat_channels :]
 
 
 def count_parameters(network: nn.Module) -> int:

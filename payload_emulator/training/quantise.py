@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from payload_emulator.errors import DatasetError
-from payload_emulator.flight.detector import INPUT_NAME, INPUT_SIZE_PX, OnnxDetector
+from payload_emulator.flight.detector import INPUT_NAME
 from payload_emulator.flight.preprocess import prepare_image, sun_up_turns
 from payload_emulator.training.dataset import Dataset
 
@@ -68,18 +67,3 @@ def quantise(model_octets: bytes, datasets: Sequence[Dataset], frames: int = 48)
     onnx.helper.set_model_props(quantised, metadata | {"quantised": "8-bit, per channel, head in float32"})
     octets: bytes = quantised.SerializeToString()
     return octets
-
-
-def latency_ratio(first: bytes, second: bytes, rounds: int = 30) -> tuple[float, float, float]:
-    """Median network latency of two models in ms, measured in turn so that a neighbour hits both, and their ratio."""
-    detectors = [OnnxDetector(first), OnnxDetector(second)]
-    image = np.random.default_rng(0).standard_normal((1, 1, INPUT_SIZE_PX, INPUT_SIZE_PX)).astype(np.float32)
-    times: list[list[float]] = [[], []]
-    for count in range(rounds + 3):
-        for detector, kept in zip(detectors, times, strict=True):
-            began = time.perf_counter()
-            detector.run_network(image)
-            if count >= 3:
-                kept.append(time.perf_counter() - began)
-    one, two = (1e3 * float(np.median(kept)) for kept in times)
-    return one, two, two / one

@@ -1,0 +1,128 @@
+"""`linna identify lost --scenario`: lost in space on rendered frames and what the network finds in them."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from linna.output import emit, log, progress
+
+if TYPE_CHECKING:
+    from payload_emulator.lost_frames import Share
+
+LEAST_CATALOGUED = 6
+
+
+def run(arguments: argparse.Namespace) -> int:
+    import math
+
+    import numpy as np
+
+    from linna.data import data_folder
+    from linna.errors import UsageError
+    from payload_emulator import lost_frames as study
+    from payload_emulator.flight.detector import DetectorParameters, OnnxDetector
+    from payload_emulator.flight.lost_in_space import FRAMES_COMBINED, LostParameters
+    from payload_emulator.flight.models import load_shipped_model
+    from payload_emulator.scenario import format_scenario, load_scenario
+    from payload_emulator.world import build_world
+
+    if arguments.frames < FRAMES_COMBINED:
+        raise UsageError(f"--frames: expected at least {FRAMES_COMBINED}, found {arguments.frames}")
+    if not 1.0 <= arguments.min_diameter_km <= 20.0:
+        raise UsageError(f"--min-diameter-km: expected 1 to 20, found {arguments.min_diameter_km:g}")
+    if not 0.0 < arguments.attitude_deg <= 2.0:
+        raise UsageError(f"--attitude-deg: expected above 0 and up to 2, found {arguments.attitude_deg:g}")
+    scenario = study.pointed(load_scenario(arguments.scenario), arguments.attitude_deg)
+    world = build_world(scenario, data_folder())
+    numbers = study.frames_in_sets(world, math.ceil(arguments.frames / FRAMES_COMBINED))
+    if not numbers.size:
+        raise UsageError(
+            f"--scenario {arguments.scenario}: expected {FRAMES_COMBINED} frames in a row, found none"
+        )
+    camera = world.camera
+    detector = OnnxDetector(
+        load_shipped_model(), DetectorParameters(width_px=camera.width_px, height_px=camera.height_px)
+    )
+    key = _key(format_scenario(scenario), numbers.tobytes(), detector.sha256)
+    if arguments.detections is not None and arguments.detections.exists():
+        seen = study.load_seen(arguments.detections, key)
+    else:
+        seen = study.see_frames(
+            world, detector, numbers, lambda frames, total: progress(frames, total, "frames", "frame")
+        )
+        if arguments.detections is not None:
+            study.save_seen(arguments.detections, seen, key)
+    log("map of the search")
+    true, board = study.search_map(world, numbers, 1e3 * arguments.min_diameter_km)
+    parameters = LostParameters(attitude_sigma_rad=math.radians(arguments.attitude_deg))
+    single, sets = study.search_frames(
+        world, seen, true, board, parameters, lambda rows, total: progress(rows, total, "searches", "frame")
+    )
+    rows = {
+        "all frames": study.share(single),
+        f"frames, {LEAST_CATALOGUED} known": study.share(single, LEAST_CATALOGUED),
+        "all sets of four": study.share(sets),
+        f"sets, {LEAST_CATALOGUED} known in each": study.share(sets, LEAST_CATALOGUED),
+    }
+    errors = np.array([row.error_m for row in single])
+    right = errors[errors <= study.WRONG_PLACE_M]
+    spent = np.array([row.cpu_s for row in single])
+    made = world.terrain.catalogue.source.startswith("synthetic")
+    moon = "rung 2, procedural Moon" if made else "rung 3, real terrain"
+    rung = f"{moon}: frames rendered along {scenario.name}, the shipped detector"
+    figures: dict[str, Any] = {
+        "single_correct_share": rows[f"frames, {LEAST_CATALOGUED} known"].correct_share,
+        "four_frames_correct_share": rows[f"sets, {LEAST_CATALOGUED} known in each"].correct_share,
+        "wrong": rows["all frames"].wrong + rows["all sets of four"].wrong,
+        "searches": len(single) + len(sets),
+        "scores": {name: _as_json(row) for name, row in rows.items()},
+        "by_altitude": [
+            {"from_km": low, "to_km": None if math.isinf(high) else high, **_as_json(row)}
+            for low, high, row in study.by_altitude(single, LEAST_CATALOGUED)
+        ],
+        "median_error_m": float(np.median(right)) if right.size else None,
+        "p95_error_m": float(np.percentile(right, 95.0)) if right.size else None,
+        "median_cpu_s": float(np.median(spent)),
+        "largest_cpu_s": float(np.max(spent)),
+        "catalogued_per_frame": float(np.mean([row.catalogued for row in single])),
+        "detections_per_frame": float(np.mean([row.detections for row in single])),
+        "craters": len(board),
+        "min_diameter_km": arguments.min_diameter_km,
+        "attitude_sigma_deg": arguments.attitude_deg,
+        "least_true_detections": LEAST_CATALOGUED,
+        "wrong_beyond_m": study.WRONG_PLACE_M,
+        "scenario": scenario.name,
+        "seed": scenario.seed,
+        "model_sha256": detector.sha256,
+        "rung": rung,
+        "data": list(world.data_names),
+    }
+    lines = [f"{'':<24}{'searches':>9}{'correct':>9}{'share':>8}{'wrong':>7}"]
+    lines += [
+        f"{name:<24}{row.searches:>9}{row.correct:>9}{100 * row.correct_share:>7.1f}%{row.wrong:>7}"
+        for name, row in rows.items()
+    ]
+    lines += [
+        f"  {low:.0f} to {high:.0f} km".ljust(24)
+        + f"{row.searches:>9}{row.correct:>9}{100 * row.correct_share:>7.1f}%{row.wrong:>7}"
+        for low, high, row in study.by_altitude(single, LEAST_CATALOGUED)
+    ]
+    lines.append(
+        f"{figures['catalogued_per_frame']:.1f} of {figures['detections_per_frame']:.1f} detections a frame are of the "
+        f"{len(board)} craters of the map; {figures['median_cpu_s']:.2f} s (largest {figures['largest_cpu_s']:.2f}) a search"
+    )
+    emit(arguments, figures, text="\n".join([*lines, rung]))
+    return 0
+
+
+def _as_json(row: Share) -> dict[str, Any]:
+    return asdict(row) | {"correct_share": row.correct_share if row.searches else None}
+
+
+def _key(scenario: str, numbers: bytes, model_sha256: str) -> str:
+    """What detections depend on, as one hash."""
+    import hashlib
+
+    return hashlib.sha256(b"|".join([scenario.encode(), numbers, model_sha256.encode()])).hexdigest()
