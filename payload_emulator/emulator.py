@@ -26,7 +26,7 @@ from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.flight.ports import ResetCause
 from payload_emulator.flying import SPACECRAFT_ID, CatalogueDetector, Sender, fly, timeline
-from payload_emulator.link import Reception, save_receptions, transmit
+from payload_emulator.link import Reception, save_receptions, save_time_receptions, transmit
 from payload_emulator.loading import LoadedPayload, load_payload
 from payload_emulator.recording import StepInput, save_frame_times, save_image, save_record, step_input
 from payload_emulator.scenario import Scenario, format_scenario
@@ -155,6 +155,10 @@ def _emulate_into(
     save_catalogue(catalogue, folder / "catalogue.csv")
     (folder / "downlink.cadu").write_bytes(reception.octets)
     save_receptions(folder, sender.transmitter.dumps)
+    emitted = np.array([utc_ns for _, utc_ns in sender.time_reports], dtype=np.int64)
+    save_time_receptions(
+        folder, [packet for packet, _ in sender.time_reports], emitted, world.truth.states(emitted)[0]
+    )
     packets = [packet for dump in sender.transmitter.dumps for packet in dump.packets]
     wall_s = time.monotonic() - started
     summary = _summary(world, loaded, spacecraft, packets, reception, len(kept), wall_s)

@@ -20,9 +20,10 @@ from payload_emulator.flight.modes import PayloadMode
 from payload_emulator.flight.ports import UNLIMITED
 from payload_emulator.flight.preprocess import ImageQuality
 from payload_emulator.link import LIGHT_S, Transmitter, contacts
+from payload_emulator.scenario import ClockSection
 from payload_emulator.spacecraft import Spacecraft
 from payload_emulator.world import Exposure, World, clock_ticks, exposures, orders_before, sample_truth
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary import APID_TIME_REPORT, DICTIONARY
 from tmtc.downlink import LinkSettings
 
 SPACECRAFT_ID = 0x4C
@@ -31,6 +32,7 @@ _NS = 1_000_000_000
 _PLAYBACK_CHANNEL = 1
 # Source of the planned telecommands; whoever commands by hand has another one, with counts of its own.
 _PLANNING_SOURCE = 1
+_TIME_RATE_EXPONENT = 1  # a clock known to be off is watched: a time report every second frame of telemetry
 _LATE_TICKS = 120 * 65_536
 _DUMP_OCTETS = 64_000
 _BEFORE_ARC_NS = 60 * _NS
@@ -202,6 +204,8 @@ class Operator:
             self._end_contact(moment)
             return b""
         orders = [*self._windows(moment), *self._resumed(moment, mode)]
+        if first and self.world.scenario.clock != ClockSection():
+            orders.append(self.command("set_time_report_rate", rate_exponent=_TIME_RATE_EXPONENT))
         if self.world.scenario.link.stations:
             orders += self._contact(moment, mode)
         if moment.frame >= 0:
@@ -306,12 +310,14 @@ def fly_moment(
 class Sender:
     """Puts what the payload hands over into dumps: one for all without stations, else several a contact.
 
-    Packets older than `_LATE_TICKS` travel on the channel for playback.
+    Packets older than `_LATE_TICKS` travel on the channel for playback. `time_reports` keeps when each was emitted
+    (UTC), whenever their dump goes out: they tell the clock at that instant.
     """
 
     world: World
     settings: LinkSettings
     transmitter: Transmitter = field(init=False)
+    time_reports: list[tuple[bytes, int]] = field(default_factory=list)
     _waiting: dict[int, list[bytes]] = field(default_factory=dict)
     _utc_ns: int = 0
     _light_s: float = LIGHT_S
@@ -327,6 +333,8 @@ class Sender:
         for packet in flown.packets:
             late = stations and now - int.from_bytes(packet[14:20], "big") > _LATE_TICKS
             self._waiting.setdefault(_PLAYBACK_CHANNEL if late else 0, []).append(packet)
+            if not late and int.from_bytes(packet[:2], "big") & 0x7FF == APID_TIME_REPORT:
+                self.time_reports.append((packet, flown.moment.utc_ns))
         waiting = sum(len(packet) for packets in self._waiting.values() for packet in packets)
         if stations and (not flown.moment.heard or waiting > _DUMP_OCTETS):
             self.flush()

@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.constants import SPEED_OF_LIGHT_M_S
 from lunar.ephemeris import Ephemeris
-from lunar.timescales import format_utc
+from lunar.third_bodies import earth_position_icrf_m
+from lunar.timescales import format_utc, tdb_s_from_utc_ns
 from lunar.visibility import GroundStation, link
 from payload_emulator.errors import ScenarioError
 from payload_emulator.scenario import LinkSection
@@ -175,6 +177,20 @@ def save_receptions(folder: Path, dumps: Sequence[Dump]) -> None:
     ]
     head = "sent_utc,received_utc,virtual_channel,packets,octets\n"
     (folder / "dumps.csv").write_text(head + "".join(rows))
+
+
+def save_time_receptions(
+    folder: Path, packets: Sequence[bytes], emitted_utc_ns: IntArray, position_icrf_m: NDArray[np.float64]
+) -> None:
+    """Write when time reports (n,), emitted at positions (n, 3) from the Moon, came to the Earth's centre."""
+    earth = np.asarray(earth_position_icrf_m(np.asarray(tdb_s_from_utc_ns(emitted_utc_ns)))).reshape(-1, 3)
+    light_s = np.linalg.norm(position_icrf_m - earth, axis=1) / SPEED_OF_LIGHT_M_S
+    received = emitted_utc_ns + np.rint(light_s * 1e9).astype(np.int64)
+    rows = [
+        f"{int.from_bytes(packet[14:20], 'big')},{int.from_bytes(packet[2:4], 'big') & 0x3FFF},{format_utc(utc)}\n"
+        for packet, utc in zip(packets, received.tolist(), strict=True)
+    ]
+    (folder / "receptions.csv").write_text("packet_ticks,sequence_count,received_utc\n" + "".join(rows))
 
 
 def station(name: str, minimum_elevation_deg: float = 10.0) -> GroundStation:

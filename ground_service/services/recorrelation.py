@@ -277,7 +277,7 @@ def residuals(ground: Ground, vehicle: int) -> list[dict[str, Any]]:
 
 
 def time_reports(ground: Ground, connection: Connection, vehicle: int) -> TimeReports:
-    """The time reports of a vehicle that are there and whose reception is known."""
+    """The time reports of a vehicle that are there, and whose reception and light time are known."""
     table, packets, receptions = repository.SAMPLES["time_reports"], repository.PACKETS, repository.RECEPTIONS
     # Every dictionary version tells the same of a report: one row each is enough.
     query = (
@@ -310,15 +310,17 @@ def time_reports(ground: Ground, connection: Connection, vehicle: int) -> TimeRe
     rows = connection.execute(query).all()
     numbers = np.array([tuple(row)[:4] for row in rows], dtype=np.int64).reshape(-1, 4)
     stations = tuple(str(row[4]) for row in rows)
-    earth_utc_ns = numbers[:, 3]
+    light_time_ns = _light_time_ns(ground, connection, vehicle, numbers[:, 3], stations)
+    known = np.flatnonzero(light_time_ns >= 0)
+    numbers, light_time_ns = numbers[known], light_time_ns[known]
     return TimeReports(
         packet_ticks=numbers[:, 0],
         sequence_count=numbers[:, 1],
         ticks=numbers[:, 2],
-        earth_utc_ns=earth_utc_ns,
-        light_time_ns=_light_time_ns(ground, connection, vehicle, earth_utc_ns, stations),
+        earth_utc_ns=numbers[:, 3],
+        light_time_ns=light_time_ns,
         boot=_boots(connection, vehicle, numbers[:, 2]),
-        station=stations,
+        station=tuple(stations[k] for k in known.tolist()),
     )
 
 
@@ -358,7 +360,8 @@ def _light_time_ns(
 ) -> IntArray:
     """Light time (n,) from the spacecraft to the station, or to the Earth's centre where none is named.
 
-    From the reference ephemerides; from the Moon's centre (wrong by at most 6 ms near the Moon) where none covers.
+    From the reference ephemerides, -1 where none covers; where none covers any report, from the Moon's centre, which is
+    wrong by at most 6 ms in a low orbit.
     """
     if len(earth_utc_ns) == 0:
         return np.zeros(0, dtype=np.int64)
@@ -373,11 +376,11 @@ def _light_time_ns(
             here = np.flatnonzero(covered & np.isnan(light_s) & (names == name))
             if len(here):
                 light_s[here] = link(ephemeris, earth_utc_ns[here], known.get(name)).light_time_s
-    left = np.isnan(light_s)
-    if left.any():
-        away = np.asarray(earth_position_icrf_m(np.asarray(tdb_s_from_utc_ns(earth_utc_ns[left]))))
-        light_s[left] = np.linalg.norm(away, axis=-1) / SPEED_OF_LIGHT_M_S
-    return np.rint(light_s * 1e9).astype(np.int64)
+    unknown = np.isnan(light_s)
+    if unknown.all():
+        away = np.asarray(earth_position_icrf_m(np.asarray(tdb_s_from_utc_ns(earth_utc_ns))))
+        return np.rint(np.linalg.norm(away, axis=-1) / SPEED_OF_LIGHT_M_S * 1e9).astype(np.int64)
+    return np.where(unknown, -1, np.rint(np.where(unknown, 0.0, light_s) * 1e9)).astype(np.int64)
 
 
 def _references(

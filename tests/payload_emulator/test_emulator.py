@@ -35,6 +35,9 @@ source = "procedural"
 estimators = ["spherical"]
 filter_gravity = "builtin"
 filter_degree = 8
+[clock]
+offset_s = 0.4
+drift_ppm = 3.0
 [link]
 stations = ["goldstone", "madrid", "canberra"]
 minimum_elevation_deg = 5.0
@@ -108,3 +111,24 @@ def test_the_dumps_are_listed_with_the_times_they_left(archive: tuple[dict[str, 
     # The Moon is 1.2 to 1.4 light seconds away.
     ways_s = [(parse_utc(b) - parse_utc(a)) / 1e9 for a, b in (row.split(",")[:2] for row in rows)]
     assert all(1.15 < way_s < 1.4 for way_s in ways_s)
+
+
+def test_the_ground_finds_the_time_of_every_frame_from_time_reports(
+    archive: tuple[dict[str, Any], Path], tmp_path: Path
+) -> None:
+    from ground_service.services.archive_import import import_archive
+    from ground_service.services.ground import open_ground
+    from ground_service.services.pass_data import load_pass_inputs
+    from ground_service.services.recorrelation import in_force
+
+    _, out = archive
+    true = np.loadtxt(out / "frame_times.csv", delimiter=",", skiprows=1, dtype=np.int64)
+    with open_ground(tmp_path / "home") as ground:
+        key = import_archive(ground, out)
+        found = load_pass_inputs(ground, key).detections
+        lines = in_force(ground, 1)
+    assert [line["boot_count"] for line in lines] == [1, 2]
+    assert lines[1]["drift_ppb"] == pytest.approx(-3000.0, abs=200.0)
+    nearest = np.abs(found.utc_ns[:, None] - true[None, :, 1]).min(axis=1)
+    # 0.4 s off without the correlation; a tick is 15 us, and the first line is carried on to the boot.
+    assert nearest.max() < 1_000_000
