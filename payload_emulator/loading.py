@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from payload_emulator.flight.anchored import AnchoredParameters
 from payload_emulator.flight.detections import Detector
 from payload_emulator.flight.detector import DetectorParameters, OnnxDetector
 from payload_emulator.flight.models import load_shipped_model
+from payload_emulator.flight.navigation_filter import CommonErrors
 from payload_emulator.flight.odometry import OdometryParameters
 from payload_emulator.flight.outcomes import Mode
 from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload, PayloadMode
@@ -127,7 +128,7 @@ def load_payload(
             camera=camera,
             modes=tuple(Mode[name] for name in navigation.estimators),
             odometry=OdometryParameters(safety_timeout_s=navigation.safety_timeout_s or None),
-            anchored=AnchoredParameters(gravity_degree=field.degree),
+            anchored=AnchoredParameters(gravity_degree=field.degree, errors=_attitude_errors(scenario)),
         ),
     )
     # Flight is given what the parameter file of the archive says, so that a replay is given the same.
@@ -179,11 +180,21 @@ def load_payload(
     )
 
 
+def _attitude_errors(scenario: Scenario) -> CommonErrors:
+    """How well the ADCS knows the attitude, by its data sheet: as flown, no better than flight believes as shipped."""
+    errors, attitude = CommonErrors(), scenario.attitude
+    return replace(
+        errors,
+        attitude_noise_rad=max(errors.attitude_noise_rad, float(np.radians(attitude.knowledge_noise_deg))),
+        attitude_bias_rad=max(errors.attitude_bias_rad, float(np.radians(attitude.knowledge_bias_deg))),
+    )
+
+
 def _catalogue_octets(scenario: Scenario, catalogue: CraterCatalogue) -> bytes:
     """The anchoring catalogue as uploaded: the table the scenario names, else one of the terrain's craters."""
     named = scenario.navigation.anchoring_catalogue
     if not named:
-        return pack_catalogue_table(_catalogue_table(scenario, catalogue))
+        return pack_catalogue_table(onboard_catalogue(scenario, catalogue))
     try:
         octets = Path(named).read_bytes()
     except OSError as error:
@@ -195,7 +206,7 @@ def _catalogue_octets(scenario: Scenario, catalogue: CraterCatalogue) -> bytes:
     return octets
 
 
-def _catalogue_table(scenario: Scenario, catalogue: CraterCatalogue) -> CatalogueTable:
+def onboard_catalogue(scenario: Scenario, catalogue: CraterCatalogue) -> CatalogueTable:
     """The anchoring catalogue: craters deep enough to be seen, with their errors' sizes and (seeded) their errors."""
     with np.errstate(invalid="ignore"):
         depth_ratio = catalogue.depth_m / catalogue.diameter_m

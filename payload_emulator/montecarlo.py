@@ -128,6 +128,8 @@ class NavigationCase:
         Of the ADCS message, per axis, one sigma; the bias is drawn once per run.
     on_board
         Craters that the uploaded catalogue holds, a mask; None for all.
+    any_node
+        Each run turns the orbit about the Moon's axis by an angle of its own.
     """
 
     epoch_utc_ns: int
@@ -150,6 +152,7 @@ class NavigationCase:
     attitude_bias_rad: float = float(np.radians(0.01))
     kidnap: Kidnap | None = None
     on_board: NDArray[np.bool_] | None = None
+    any_node: bool = False
     parameters: AnchoredParameters = field(default_factory=AnchoredParameters)
 
 
@@ -235,6 +238,8 @@ def fly(case: NavigationCase, seed: int) -> NavigationRun:
     """Return one run of a case: the same seed, the same run."""
     rng = np.random.default_rng(seed)
     case = _with_drawn_biases(case, np.random.default_rng((seed, 1)))
+    if case.any_node:
+        case = _with_drawn_node(case, np.random.default_rng((seed, 2)))
     true_map = landmark_map(catalogue_table(case.craters))
     table = _with_errors(catalogue_table(case.craters), case.catalogue_errors, rng)
     if case.on_board is not None:
@@ -352,6 +357,17 @@ def _with_drawn_biases(case: NavigationCase, rng: np.random.Generator) -> Naviga
         case,
         detector=replace(detector, bias_px=(float(bias[0]), float(bias[1])), scale=scale),
         catalogue_errors=replace(errors, offset_enu_m=(float(offset[0]), float(offset[1]), float(offset[2]))),
+    )
+
+
+def _with_drawn_node(case: NavigationCase, rng: np.random.Generator) -> NavigationCase:
+    """The case with its orbit turned about the Moon's axis."""
+    axis = case.orientation.mcmf_from_icrf(float(tdb_s_from_utc_ns(case.epoch_utc_ns)))[2]
+    turn = _rotation(rng.uniform(0.0, 2.0 * np.pi) * axis)
+    return replace(
+        case,
+        position_icrf_m=turn @ case.position_icrf_m,
+        velocity_icrf_m_s=turn @ case.velocity_icrf_m_s,
     )
 
 

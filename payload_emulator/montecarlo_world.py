@@ -60,6 +60,9 @@ def crater_world(seed: int = 11) -> CraterCatalogue:
 def standard_case(data: DataFolder, track: Track, hours: float, noise_factor: float = 1.0) -> NavigationCase:
     """The paper's orbit from 5 km and 5 m/s off, a frame each 15 s, images within 60 degrees of latitude.
 
+    Each run flies it with another node: over the same ground every run would meet the same errors of the gravity field,
+    and however many there were, their average would tell of one draw.
+
     Truth flies GRAIL to degree 150, the filter Lunar Prospector's field to 100, where both are at hand; else a rough
     field and the same cut. Every error that the filter allows for is drawn with the size that it allows.
 
@@ -97,6 +100,7 @@ def standard_case(data: DataFolder, track: Track, hours: float, noise_factor: fl
         filter_gravity=other.truncated(_FILTER_DEGREE),
         filter_orientation=IauOrientation(),
         craters=crater_world(),
+        any_node=True,
         detector=SimulatedDetector(
             persistence=parameters.detection_persistence,
             bias_sigma_px=errors.pixel_bias_px,
@@ -107,14 +111,20 @@ def standard_case(data: DataFolder, track: Track, hours: float, noise_factor: fl
         start_velocity_m_s=5.0,
         attitude_noise_rad=errors.attitude_noise_rad,
         attitude_bias_rad=errors.attitude_bias_rad,
-        parameters=replace(parameters, noise=_scaled(process_noise(_FILTER_DEGREE), noise_factor)),
+        parameters=replace(
+            parameters, noise=_scaled(process_noise(_FILTER_DEGREE, other.name), noise_factor)
+        ),
     )
 
 
 def _scaled(noise: ProcessNoise, factor: float) -> ProcessNoise:
-    r, t, n = noise.white_psd_m2_s3
-    a, b, c = noise.markov_sigma_m_s2
-    root = float(np.sqrt(factor))
+    def times(values: tuple[float, float, float], by: float) -> tuple[float, float, float]:
+        return by * values[0], by * values[1], by * values[2]
+
+    far = noise.far_side_psd_m2_s3
     return ProcessNoise(
-        (factor * r, factor * t, factor * n), (root * a, root * b, root * c), noise.correlation_s
+        times(noise.white_psd_m2_s3, factor),
+        times(noise.markov_sigma_m_s2, float(np.sqrt(factor))),
+        noise.correlation_s,
+        None if far is None else times(far, factor),
     )

@@ -47,6 +47,7 @@ from payload_emulator.flight.sighting import (
     inside_image,
     landmark_map,
     look,
+    turned_by,
 )
 from payload_emulator.flight.tables import (
     TICKS_PER_SECOND,
@@ -82,7 +83,7 @@ class AnchoredParameters:
     gravity_degree
         Degree to which the gravity table is used.
     noise
-        Process noise; None takes the one that goes with the degree.
+        Process noise; None takes the one that goes with the gravity table and the degree.
     detection_sigma_px, detection_sigma_floor_px, detection_sigma_scale
         Sigma per axis of a detection where the detector gives none; smallest believed; factor on what it gives.
     detection_persistence
@@ -193,7 +194,7 @@ class AnchoredNavigator:
         self.burns = no_burns() if burns is None else burns
         self.landmarks: LandmarkMap = landmark_map(catalogue)
         degree = min(parameters.gravity_degree, gravity.c_bar.shape[0] - 1)
-        noise = process_noise(degree) if parameters.noise is None else parameters.noise
+        noise = process_noise(degree, gravity.name) if parameters.noise is None else parameters.noise
         self.model = OrbitModel(gravity, orientation, degree, noise)
         self.state: FilterState = kalman.initial_filter_state(
             initial_state.ticks,
@@ -320,14 +321,21 @@ class AnchoredNavigator:
         if listed.any():
             places = self.landmarks.position_mcmf_m[seen.index[listed]]
             self._surface_m = float(np.median(np.linalg.norm(places, axis=1))) - MOON_RADIUS_M
-        turned = camera_from_icrf - np.cross(mean[kalman.ATTITUDE], camera_from_icrf, axisb=0, axisc=0)
+        errors = self.parameters.errors
+        turn_rad, sigma_rad = (
+            mean[kalman.ATTITUDE],
+            math.hypot(errors.attitude_bias_rad, errors.attitude_noise_rad),
+        )
+        if fix is not None:
+            turn_rad, sigma_rad = turn_rad + fix.update.attitude_rad, fix.update.attitude_sigma_rad
+        turned = turned_by(-turn_rad) @ camera_from_icrf
         position = self.state.covariance[kalman.POSITION, kalman.POSITION]
         view = View(
             self.state.ticks,
             turned @ mcmf_from_icrf.T,
             mcmf_from_icrf @ mean[kalman.POSITION],
             mcmf_from_icrf @ position @ mcmf_from_icrf.T,
-            self.parameters.errors.attitude_bias_rad,
+            sigma_rad,
         )
         free = unclaimed(found, seen.select(listed), used)
         shifted = replace(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lunar.constants import GM_EARTH_M3_S2, GM_SUN_M3_S2
 from lunar.gravity import GravityField, packed, packed_gradient
-from lunar.gravity_omission import omission_psd_m2_s3
+from lunar.gravity_omission import field_psd_m2_s3
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns, utc_ns_from_ticks
 from payload_emulator.flight.tables import TICKS_PER_SECOND, BurnTable, GravityTable, OrientationTable
@@ -27,6 +27,9 @@ _ARC_S = 60.0
 _STEP_S = 5.0
 # The gradient of a field of degree 12 is right to a few parts in a thousand at 15 km.
 _GRADIENT_DEGREE = 12
+# Cosine of the angle from the middle of the near side beyond which no orbiter of old was in sight of the Earth: errors
+# of LP165P at 30 km grow from 6 mGal at 97 degrees of longitude to 30 at 127.
+_FAR_SIDE = float(np.cos(np.radians(105.0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,20 +39,24 @@ class ProcessNoise:
     Attributes
     ----------
     white_psd_m2_s3
-        Spectral density of white acceleration: gravity beyond the degree of the table, whose correlation
-        (about a minute) is short against any arc that matters.
+        Spectral density of white acceleration: gravity that the table lacks or has wrong.
     markov_sigma_m_s2, correlation_s
-        First-order Gauss-Markov acceleration: errors of the coefficients that are in the table.
+        First-order Gauss-Markov acceleration: what lasts, like the pressure of light.
+    far_side_psd_m2_s3
+        White acceleration over the far side in place of the other, for a field that was made without tracking there;
+        None where the field knows both sides alike.
     """
 
     white_psd_m2_s3: tuple[float, float, float] = (6e-8, 3e-8, 3e-8)
     markov_sigma_m_s2: tuple[float, float, float] = (2e-6, 2e-6, 2e-6)
     correlation_s: float = 900.0
+    far_side_psd_m2_s3: tuple[float, float, float] | None = None
 
 
-def process_noise(degree: int) -> ProcessNoise:
-    """Return the process noise that goes with a gravity table used to a degree."""
-    return ProcessNoise(white_psd_m2_s3=omission_psd_m2_s3(degree))
+def process_noise(degree: int, field: str = "") -> ProcessNoise:
+    """Return the process noise that goes with a gravity table, by its name, used to a degree."""
+    near, far = field_psd_m2_s3(field, degree)
+    return ProcessNoise(white_psd_m2_s3=near, far_side_psd_m2_s3=None if far == near else far)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,12 +127,19 @@ class OrbitModel:
                 _third_bodies((edges[k] + edges[k + 1]) // 2),
                 _THIRD_BODY_GMS,
                 self._noise.correlation_s,
-                np.array(self._noise.white_psd_m2_s3),
+                np.array(self._white_psd(start @ state[:3])),
                 np.array(self._noise.markov_sigma_m_s2),
             )
             total = transition @ total
             noise = transition @ noise @ transition.T + added
         return Prediction(state, total, noise)
+
+    def _white_psd(self, position_mcmf_m: Float) -> tuple[float, float, float]:
+        """Return the spectral density of white acceleration over a place."""
+        far = self._noise.far_side_psd_m2_s3
+        if far is None or position_mcmf_m[0] > _FAR_SIDE * float(np.linalg.norm(position_mcmf_m)):
+            return self._noise.white_psd_m2_s3
+        return far
 
 
 def flown(model: OrbitModel, state: Float, from_ticks: int, to_ticks: int, burns: BurnTable) -> Float | None:

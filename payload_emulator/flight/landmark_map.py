@@ -106,7 +106,7 @@ class View:
     position_mcmf_m, covariance_m2
         Of the camera, shapes (3,) and (3, 3).
     attitude_sigma_rad
-        Of errors that last, per axis.
+        What is uncertain of the attitude, per axis.
     """
 
     ticks: int

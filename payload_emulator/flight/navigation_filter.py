@@ -4,12 +4,13 @@ The first 18 states are position and velocity (ICRF), empirical acceleration (ra
 bias (camera axes), pixel bias, catalogue offset (east, north, up) and image scale. Behind them stand three for each
 crater that was used and is still in view: how far it lies from its catalogued place, east, north, up. A crater is
 seen several times on a pass and errs the same way each time; its error is a state, not fresh noise, and goes when it
-does.
+does. The noise of the attitude, one rotation for all detections of a frame, is a state for the time of an update: a
+wide field of view sees it, and projection bends too much over a degree for it to be noise about the measured attitude.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +27,12 @@ SIZE = 18
 POSITION, VELOCITY, ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)
 ATTITUDE, PIXEL, OFFSET, SCALE = slice(9, 12), slice(12, 14), slice(14, 17), 17
 ORBIT = slice(0, 9)
+# Stands among the craters of a state for the rotation that the attitude of this one frame is off by.
+_TURN = np.array([-2], dtype=np.int64)
 # Projection bends by the square of a move over the altitude: after one this small another iteration gains millimetres.
 _LINEAR_M = 10.0
+# The same for a turn: at the corner of the image 1e-3 rad bend by a twentieth of a pixel.
+_LINEAR_RAD = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,12 +141,17 @@ class Update:
         Mean of detection minus prediction, right and down, over its standard deviation, shape (2,).
     residual_px
         Detection minus prediction after the update, shape (n, 2).
+    attitude_rad, attitude_sigma_rad
+        Rotation that the attitude of the frame is off by beyond what lasts, shape (3,), and what is left uncertain of
+        it and of what lasts about the worst axis.
     """
 
     state: FilterState
     nis: float
     mean_innovation: Float
     residual_px: Float
+    attitude_rad: Float
+    attitude_sigma_rad: float
 
 
 def initial_filter_state(
@@ -245,6 +255,9 @@ def design_matrix(sighting: Sighting, state: FilterState) -> Float:
     known = np.flatnonzero(slots >= 0)
     for axis in range(3):
         matrix[known, :, slots[known] + axis] = sighting.by_offset[known, :, axis]
+    turn = int(state.slots(_TURN)[0])
+    if turn >= 0:
+        matrix[:, :, turn : turn + 3] = sighting.by_attitude
     return matrix
 
 
@@ -269,17 +282,23 @@ def update(
     index, uv_px
         Craters (into the map) and where they were detected, shapes (n,) and (n, 2).
     variance_px2
-        Variance of each detection, per axis, shape (n,). The attitude noise, common to the frame, is added here.
+        Variance of each detection, per axis, shape (n,). The attitude noise, common to the frame, comes from `errors`.
     """
-    count, size = 2 * index.size, prior.mean.size
+    count = 2 * index.size
+    prior = prior.with_craters(_TURN, np.full((1, 3), errors.attitude_noise_rad))
+    turn = int(prior.slots(_TURN)[0])
+    noise = np.diag(np.repeat(variance_px2, 2))
     mean = prior.mean
     for step in range(iterations):
         current = FilterState(prior.ticks, mean, prior.covariance, prior.craters)
-        pose = pose_of(mean, camera_from_icrf, mcmf_from_icrf)
-        sighting = look(landmarks, index, pose, camera, current.shifts(index))
-        design = design_matrix(sighting, current).reshape(count, size)
-        tilt = sighting.by_attitude.reshape(count, 3) * errors.attitude_noise_rad
-        noise = np.diag(np.repeat(variance_px2, 2)) + tilt @ tilt.T
+        sighting = look(
+            landmarks,
+            index,
+            _pose_with_turn(current, turn, camera_from_icrf, mcmf_from_icrf),
+            camera,
+            current.shifts(index),
+        )
+        design = design_matrix(sighting, current).reshape(count, mean.size)
         crossed = design @ prior.covariance
         spread = crossed @ design.T + noise
         innovation = (uv_px - sighting.uv_px).reshape(count) - design @ (prior.mean - mean)
@@ -291,12 +310,31 @@ def update(
             mean_innovation = innovation.reshape(-1, 2).sum(axis=0) / np.sqrt(np.diag(spread_of_sum))
         gain = np.linalg.solve(spread, crossed).T
         previous, mean = mean, prior.mean + gain @ innovation
-        if np.linalg.norm(mean[POSITION] - previous[POSITION]) < _LINEAR_M:
+        turned = float(np.linalg.norm(mean[turn : turn + 3] - previous[turn : turn + 3]))
+        moved = float(np.linalg.norm(mean[POSITION] - previous[POSITION]))
+        if moved < _LINEAR_M and turned < _LINEAR_RAD:
             break
     # Joseph's form, (1 - K H) P (1 - K H)' + K R K', multiplied out: products of n x n by n x m only.
     taken = gain @ crossed
     covariance = prior.covariance - taken - taken.T + gain @ spread @ gain.T
     state = FilterState(prior.ticks, mean, 0.5 * (covariance + covariance.T), prior.craters)
-    pose = pose_of(mean, camera_from_icrf, mcmf_from_icrf)
+    pose = _pose_with_turn(state, turn, camera_from_icrf, mcmf_from_icrf)
     after = look(landmarks, index, pose, camera, state.shifts(index))
-    return Update(state, nis, mean_innovation, uv_px - after.uv_px) if state.finite else None
+    attitude = np.r_[ATTITUDE, turn : turn + 3]
+    both = np.tile(np.eye(3), 2)
+    left = both @ state.covariance[np.ix_(attitude, attitude)] @ both.T
+    if not state.finite:
+        return None
+    return Update(
+        state.only_craters(state.craters[state.craters != _TURN[0]]),
+        nis,
+        mean_innovation,
+        uv_px - after.uv_px,
+        mean[turn : turn + 3],
+        float(np.sqrt(np.max(np.linalg.eigvalsh(left)))),
+    )
+
+
+def _pose_with_turn(state: FilterState, turn: int, camera_from_icrf: Float, mcmf_from_icrf: Float) -> Pose:
+    pose = pose_of(state.mean, camera_from_icrf, mcmf_from_icrf)
+    return replace(pose, attitude_rad=pose.attitude_rad + state.mean[turn : turn + 3])

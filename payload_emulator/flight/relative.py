@@ -20,7 +20,7 @@ from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.flight.detections import Detections
 from payload_emulator.flight.navigation_filter import ATTITUDE, PIXEL, POSITION, FilterState
-from payload_emulator.flight.sighting import cross_matrix
+from payload_emulator.flight.sighting import turned_by
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -141,7 +141,7 @@ def _predicted(
     height_sigma_m: float,
 ) -> tuple[Float, Float, Float, Float, Float]:
     """Return pixels (n, 2), derivatives by both positions (n, 2, 3), noise (n, 2, 2), derivatives by attitude."""
-    turn = np.eye(3) - cross_matrix(state.mean[ATTITUDE])
+    turn = turned_by(-state.mean[ATTITUDE])
     bias = state.mean[PIXEL]
     uv = np.stack([before.found.u_px, before.found.v_px], axis=1) - bias
     mcmf_from_camera = before.mcmf_from_icrf @ (turn @ before.camera_from_icrf).T

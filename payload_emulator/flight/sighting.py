@@ -2,7 +2,7 @@
 
 Errors that are common to a frame or last over many frames are parameters of the projection, next to the position:
 
-- attitude: a small rotation of the camera, axes of the camera, C_true = (1 - [theta x]) C_measured;
+- attitude: a rotation of the camera by a vector theta in its own axes, C_true = exp(-[theta x]) C_measured;
 - pixel bias: a shift of every detection, as an uneven response to slanting light would cause;
 - catalogue offset: a shift of the whole catalogue east, north and up;
 - scale: all detections drawn towards the image centre or away from it, as a focal length in error or a detector that
@@ -204,7 +204,7 @@ def look(
     `shift_enu_m`, shape (n, 3), moves each crater from its catalogued place.
     """
     axes = landmarks.enu_from_mcmf[index]
-    turned = pose.camera_from_icrf - cross_matrix(pose.attitude_rad) @ pose.camera_from_icrf
+    turned = turned_by(-pose.attitude_rad) @ pose.camera_from_icrf
     camera_from_mcmf = turned @ pose.mcmf_from_icrf.T
     shift = pose.catalogue_offset_m if shift_enu_m is None else shift_enu_m + pose.catalogue_offset_m
     point = landmarks.position_mcmf_m[index] + np.einsum(
@@ -220,7 +220,7 @@ def look(
     by_point = np.zeros((count, 2, 3))
     by_point[:, 0, 0] = by_point[:, 1, 1] = scale
     by_point[:, 0, 2], by_point[:, 1, 2] = -scale * x, -scale * y
-    # From d(seen)/d(theta) = [seen x].
+    # From d(seen)/d(theta) = [seen x], for theta well below a radian.
     by_attitude = np.empty((count, 2, 3))
     by_attitude[:, 0, 0], by_attitude[:, 0, 1], by_attitude[:, 0, 2] = f * x * y, -f * (1.0 + x * x), f * y
     by_attitude[:, 1, 0], by_attitude[:, 1, 1], by_attitude[:, 1, 2] = f * (1.0 + y * y), -f * x * y, -f * x
@@ -239,3 +239,12 @@ def look(
 def cross_matrix(vector: Float) -> Float:
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def turned_by(vector_rad: Float) -> Float:
+    """Return the rotation matrix of a rotation vector (3,), by Rodrigues' formula."""
+    angle = float(np.linalg.norm(vector_rad))
+    if not angle > 0.0:
+        return np.eye(3)
+    cross = cross_matrix(vector_rad / angle)
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross))
