@@ -35,12 +35,14 @@ from reports.document import (
     rung_text,
 )
 from reports.figures.canvas import Canvas
-from reports.figures.theme import color, drawing
+from reports.figures.theme import LIGHT, color, drawing
 from reports.html_page import VERDICT_WORDS
 from reports.text import significant_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from reports.figures.print import Print
 
 _PAPER_IN = (8.27, 11.69)
 _LEFT, _TOP, _FOOT = 0.66, 0.62, 0.78
@@ -51,44 +53,42 @@ _LEADING = 1.42
 _TEXT_WIDTH = 6.1
 _MOST_LISTING_LINES = 400
 _WHOLE_TABLE_ROWS = 14
+_ALIGNED = {"center": 0.5, "right": 1.0}
 _VERDICT_ROLES = {"good": "green", "caution": "orange", "bad": "vermillion"}
 
 
 @dataclass(frozen=True, slots=True)
 class _Page:
-    """One sheet being drawn."""
+    """One sheet being drawn: figures on the figure, all else on the print."""
 
     figure: Figure
+    print: Print
 
-    def text(self, x: float, y: float, text: str, size: float, **style: Any) -> None:
-        """Text whose first line has its top at ``y``."""
-        baseline = y + 0.80 * size / 72
-        settings: dict[str, Any] = {
-            "color": color("ink"),
-            "va": "baseline",
-            "ha": "left",
-            "fontsize": size,
-            **style,
-        }
-        self.figure.text(x / _PAPER_IN[0], 1 - baseline / _PAPER_IN[1], _known(text), **settings)
+    def text(
+        self,
+        x: float,
+        y: float,
+        text: str,
+        size: float,
+        *,
+        color: str = LIGHT["ink"],
+        weight: str = "normal",
+        family: str = "DejaVu Sans",
+        ha: str = "left",
+    ) -> None:
+        """Text whose first line has its top at ``y``; ``ha`` says which end or the centre of it stands at ``x``."""
+        known = _known(text)
+        left = x - _ALIGNED[ha] * _width(known, size, weight) if ha != "left" else x
+        baseline = _PAPER_IN[1] - y - 0.80 * size / 72
+        self.print.word(72 * left, 72 * baseline, known, size, color, family, weight)
 
     def rule(self, x0: float, x1: float, y: float, role: str = "ink", width: float = 0.6) -> None:
-        """A horizontal line."""
-        from matplotlib.lines import Line2D
-
-        height = 1 - y / _PAPER_IN[1]
-        self.figure.add_artist(
-            Line2D([x0 / _PAPER_IN[0], x1 / _PAPER_IN[0]], [height] * 2, color=color(role), linewidth=width)
-        )
+        """A horizontal line, ``width`` points thick."""
+        self.box(x0, y - width / 144, x1 - x0, width / 72, role)
 
     def box(self, x: float, y: float, width: float, height: float, role: str) -> None:
         """A filled rectangle from its upper left corner."""
-        from matplotlib.patches import Rectangle
-
-        corner = (x / _PAPER_IN[0], 1 - (y + height) / _PAPER_IN[1])
-        self.figure.add_artist(
-            Rectangle(corner, width / _PAPER_IN[0], height / _PAPER_IN[1], facecolor=color(role), linewidth=0)
-        )
+        self.print.box(72 * x, 72 * (_PAPER_IN[1] - y - height), 72 * width, 72 * height, color(role))
 
     def picture(self, block: Picture, y: float, scale: float) -> None:
         """A figure over the width of the text."""
@@ -123,6 +123,8 @@ def pdf_pages(document: Document) -> bytes:
     from matplotlib.backends.backend_pdf import PdfPages
     from matplotlib.figure import Figure
 
+    from reports.figures.print import Print
+
     pages = _paginated(_pieces(document))
     footer = " · ".join(t for t in ("LINNA", document.kicker, document.identity) if t)
     buffer = io.BytesIO()
@@ -135,7 +137,8 @@ def pdf_pages(document: Document) -> bytes:
     with drawing(), PdfPages(buffer, metadata=about) as sheets:
         for number, pieces in enumerate(pages, 1):
             figure = Figure(figsize=_PAPER_IN)
-            page = _Page(figure)
+            page = _Page(figure, Print())
+            figure.add_artist(page.print)
             for y, piece in pieces:
                 piece.draw(page, y)
             foot = _PAPER_IN[1] - 0.52
@@ -218,9 +221,9 @@ def _characters() -> frozenset[int]:
 
 
 def _known(text: str) -> str:
-    """Text with a question mark for each character that the type does not have; no mathematics is meant by a dollar."""
+    """Text with a question mark for each character that the type does not have."""
     characters = _characters()
-    return "".join(c if ord(c) in characters or c == "\n" else "?" for c in text).replace("$", r"\$")
+    return "".join(c if ord(c) in characters or c == "\n" else "?" for c in text)
 
 
 def _width(text: str, size: float, weight: str = "normal") -> float:

@@ -165,14 +165,21 @@ def arcs_differ(time: TimeScale, arcs: Iterable[TimeSpan]) -> bool:
 
 def shade_arcs(axes: Axes, time: TimeScale, arcs: Iterable[TimeSpan]) -> None:
     """Tint the imaging arcs, where there is anything else to tell them from."""
+    from matplotlib.collections import PolyCollection
+
     if not arcs_differ(time, arcs):
         return
-    for arc in arcs:
-        left, right = time.x(arc.start_utc_ns), time.x(arc.stop_utc_ns)
-        if right > 0 and left < time.length_s:
-            axes.axvspan(
-                max(left, 0.0), min(right, time.length_s), color=color("sunlit"), linewidth=0, zorder=0
-            )
+    edges = [(float(time.x(arc.start_utc_ns)), float(time.x(arc.stop_utc_ns))) for arc in arcs]
+    kept = [(max(a, 0.0), min(b, time.length_s)) for a, b in edges if b > 0.0 and a < time.length_s]
+    # One artist for all arcs: a day has twenty and more in every panel.
+    boxes = PolyCollection(
+        [[(a, 0.0), (a, 1.0), (b, 1.0), (b, 0.0)] for a, b in kept],
+        facecolor=color("sunlit"),
+        linewidth=0,
+        zorder=0,
+        transform=axes.get_xaxis_transform(),
+    )
+    axes.add_collection(boxes, autolim=False)
 
 
 def thinned(x: FloatArray, y: FloatArray, buckets: int = 600) -> tuple[FloatArray, FloatArray]:
