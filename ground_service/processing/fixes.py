@@ -82,8 +82,7 @@ def join_pairs(
 def wrong_fixes(pairs: Pairs, camera: PinholeCamera, utc_ns: IntArray, position_mcmf_m: FloatArray) -> int:
     """How many frames were identified wrongly; the reference (m, 3), MCMF, at the ascending times `utc_ns` (m,)."""
     wrong = 0
-    for frame in np.unique(pairs.frame):
-        rows = np.flatnonzero(pairs.frame == frame)
+    for rows in _by_frame(pairs):
         at = int(np.searchsorted(utc_ns, pairs.utc_ns[rows[0]]))
         if (
             at >= len(utc_ns)
@@ -109,13 +108,19 @@ def snapshot_positions(
         Ascending epochs (m,) and where to begin (m, 3): what the payload itself believed.
     """
     result = np.full((len(utc_ns), 3), np.nan)
-    for frame in np.unique(pairs.frame):
-        rows = np.flatnonzero(pairs.frame == frame)
+    for rows in _by_frame(pairs):
         at = int(np.searchsorted(utc_ns, pairs.utc_ns[rows[0]]))
         if len(rows) < PAIRS_NEEDED or at >= len(utc_ns) or utc_ns[at] != pairs.utc_ns[rows[0]]:
             continue
         result[at] = _solved(camera, start_mcmf_m[at], pairs.crater_mcmf_m[rows], pairs.uv_px[rows])
     return result
+
+
+def _by_frame(pairs: Pairs) -> list[IntArray]:
+    """Rows of the pairs of every frame that has any, in the order of frames."""
+    order = np.argsort(pairs.frame, kind="stable")
+    starts = np.flatnonzero(np.diff(pairs.frame[order])) + 1
+    return np.split(order, starts) if len(order) else []
 
 
 def _solved(

@@ -253,7 +253,8 @@ def _with_extras(
 ) -> list[NavigationSeries]:
     """Series with the Sun and the wrong fixes, and the snapshot baseline, where there is what they need."""
     if inputs.sun_known:
-        series = [with_sun(one, track) for one in series]
+        sun = sun_angles(track)
+        series = [with_sun(one, track, sun) for one in series]
     if inputs.identifications is None or inputs.catalogue is None:
         return series
     pairs = join_pairs(inputs.identifications, inputs.detections, inputs.catalogue)

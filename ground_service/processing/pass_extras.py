@@ -41,10 +41,10 @@ def sun_angles(track: ReferenceStates) -> SunAngles:
     return SunAngles(np.degrees(elevation), np.degrees(azimuth))
 
 
-def with_sun(series: NavigationSeries, track: ReferenceStates) -> NavigationSeries:
-    """The series with the Sun's elevation at its samples, which are all times of the track."""
+def with_sun(series: NavigationSeries, track: ReferenceStates, sun: SunAngles) -> NavigationSeries:
+    """The series with the Sun's elevation at its samples, which are all times of the track that `sun` is of."""
     rows = np.searchsorted(track.utc_ns, series.utc_ns)
-    return replace(series, sun_elevation_deg=sun_angles(track).elevation_deg[rows])
+    return replace(series, sun_elevation_deg=sun.elevation_deg[rows])
 
 
 def with_wrong_fixes(

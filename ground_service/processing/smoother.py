@@ -107,71 +107,100 @@ def smooth(filtered: FilterStates, model: SmootherModel) -> FilterStates:
     3.28 to 3.30.
     """
     state, covariance = filtered.state.copy(), filtered.covariance.copy()
-    for k in range(len(filtered) - 2, -1, -1):
-        if filtered.utc_ns[k + 1] <= filtered.utc_ns[k]:
-            continue
-        predicted, transition, noise = _carried(
-            filtered.state[k], int(filtered.utc_ns[k]), int(filtered.utc_ns[k + 1]), model
-        )
-        prior = transition @ filtered.covariance[k] @ transition.T + noise
-        jump = filtered.state[k + 1] - predicted
-        if not float(_divided(jump[None, :], prior)[0] @ jump) < _BROKEN:
-            continue
-        gain = _divided(filtered.covariance[k] @ transition.T, prior)
-        state[k] = filtered.state[k] + gain @ (state[k + 1] - predicted)
-        smoothed = filtered.covariance[k] + gain @ (covariance[k + 1] - prior) @ gain.T
+    before = np.flatnonzero(np.diff(filtered.utc_ns) > 0)
+    known, known_covariance = filtered.state[before], filtered.covariance[before]
+    predicted, transition, noise = _carried(
+        known, filtered.utc_ns[before], filtered.utc_ns[before + 1], model
+    )
+    moved = transition @ known_covariance
+    prior = moved @ _turned(transition) + noise
+    jump = (filtered.state[before + 1] - predicted)[:, None, :]
+    surprise = (_divided(jump, prior) @ _turned(jump))[:, 0, 0]
+    gain = _divided(_turned(moved), prior)
+    for row in np.flatnonzero(surprise < _BROKEN)[::-1]:
+        k = before[row]
+        state[k] = filtered.state[k] + gain[row] @ (state[k + 1] - predicted[row])
+        smoothed = filtered.covariance[k] + gain[row] @ (covariance[k + 1] - prior[row]) @ gain[row].T
         covariance[k] = 0.5 * (smoothed + smoothed.T)
     return FilterStates(filtered.utc_ns, state, covariance)
 
 
+def _turned(matrices: FloatArray) -> FloatArray:
+    return np.swapaxes(matrices, -1, -2)
+
+
 def _carried(
-    state: FloatArray, from_utc_ns: int, to_utc_ns: int, model: SmootherModel
+    state: FloatArray, from_utc_ns: IntArray, to_utc_ns: IntArray, model: SmootherModel
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """State (9,), transition (9, 9) and process noise (9, 9) from one instant to a later one."""
-    total, noise = np.eye(SIZE), np.zeros((SIZE, SIZE))
-    burns = [burn for burn in model.burns if from_utc_ns < burn.utc_ns <= to_utc_ns]
-    at = from_utc_ns
-    for stop, burn in [*((burn.utc_ns, burn) for burn in burns), (to_utc_ns, None)]:
-        steps = max(1, int(np.ceil((stop - at) / (_LONGEST_STEP_S * NANOSECONDS_PER_SECOND))))
-        step_s = (stop - at) / NANOSECONDS_PER_SECOND / steps
-        start_s = float(tdb_s_from_utc_ns(at))
-        for number in range(steps if step_s > 0.0 else 0):
-            state, transition, added = _step(state, start_s + number * step_s, step_s, model)
-            total = transition @ total
-            noise = transition @ noise @ transition.T + added
-        if burn is not None:
-            state = state.copy()
-            state[_VELOCITY] += burn.delta_v_m_s
-            noise[_VELOCITY, _VELOCITY] += np.eye(3) * burn.sigma_m_s**2
-        at = stop
+    """States (n, 9), transitions (n, 9, 9) and process noise (n, 9, 9) from each of n instants to a later one."""
+    state = state.copy()
+    total = np.tile(np.eye(SIZE), (len(state), 1, 1))
+    noise = np.zeros((len(state), SIZE, SIZE))
+    legs = [
+        _legs(int(start), int(stop), model.burns) for start, stop in zip(from_utc_ns, to_utc_ns, strict=True)
+    ]
+    for number in range(max((len(one) for one in legs), default=0)):
+        rows = np.array([row for row, one in enumerate(legs) if len(one) > number])
+        starts, steps, burns = zip(*(legs[row][number] for row in rows), strict=True)
+        state[rows], transition, added = _step(state[rows], np.array(starts), np.array(steps), model)
+        total[rows] = transition @ total[rows]
+        noise[rows] = transition @ noise[rows] @ _turned(transition) + added
+        for row, burn in zip(rows, burns, strict=True):
+            if burn is not None:
+                state[row, _VELOCITY] += burn.delta_v_m_s
+                noise[row, _VELOCITY, _VELOCITY] += np.eye(3) * burn.sigma_m_s**2
     return state, total, noise
 
 
+def _legs(
+    from_utc_ns: int, to_utc_ns: int, burns: tuple[CommandedBurn, ...]
+) -> list[tuple[float, float, CommandedBurn | None]]:
+    """Start (TDB seconds), length (s) and the burn at the end, if any, of every step from one instant to a later."""
+    legs: list[tuple[float, float, CommandedBurn | None]] = []
+    at = from_utc_ns
+    between = [burn for burn in burns if from_utc_ns < burn.utc_ns <= to_utc_ns]
+    for stop, burn in [*((burn.utc_ns, burn) for burn in between), (to_utc_ns, None)]:
+        count = max(1, int(np.ceil((stop - at) / (_LONGEST_STEP_S * NANOSECONDS_PER_SECOND))))
+        step_s = (stop - at) / NANOSECONDS_PER_SECOND / count
+        if step_s > 0.0 or burn is not None:
+            start_s = float(tdb_s_from_utc_ns(at))
+            legs += [(start_s + i * step_s, step_s, burn if i == count - 1 else None) for i in range(count)]
+        at = stop
+    return legs
+
+
 def _step(
-    state: FloatArray, tdb_s: float, step_s: float, model: SmootherModel
+    state: FloatArray, tdb_s: FloatArray, step_s: FloatArray, model: SmootherModel
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    position, velocity, moved = propagate_with_stm(
-        tdb_s, state[_POSITION], state[_VELOCITY], step_s, model.forces, step_s=_LONGEST_STEP_S / 2.0
+    """States (n, 9) after steps of their own (n,), with transitions and process noise (n, 9, 9)."""
+    position, velocity = np.empty((len(state), 3)), np.empty((len(state), 3))
+    transition = np.zeros((len(state), SIZE, SIZE))
+    for row, (one, start, length) in enumerate(zip(state, tdb_s.tolist(), step_s.tolist(), strict=True)):
+        position[row], velocity[row], transition[row, :6, :6] = propagate_with_stm(
+            start, one[_POSITION], one[_VELOCITY], length, model.forces, step_s=_LONGEST_STEP_S / 2.0
+        )
+    axes = _turned(rtn_from_inertial(position, velocity))
+    decay = np.exp(-step_s / model.correlation_s)
+    length = step_s[:, None, None]
+    push = np.concatenate([0.5 * length**2 * axes, length * axes], axis=1)
+    transition[:, :6, _ACCELERATION] = push
+    transition[:, _ACCELERATION, _ACCELERATION] = decay[:, None, None] * np.eye(3)
+    carried = np.concatenate([position, velocity, decay[:, None] * state[:, _ACCELERATION]], axis=1)
+    carried[:, :6] += (push @ state[:, _ACCELERATION, None])[..., 0]
+    density = axes @ np.diag(model.white_psd_m2_s3) @ _turned(axes)
+    noise = np.zeros((len(state), SIZE, SIZE))
+    noise[:, _POSITION, _POSITION] = density * length**3 / 3.0
+    noise[:, _POSITION, _VELOCITY] = noise[:, _VELOCITY, _POSITION] = density * length**2 / 2.0
+    noise[:, _VELOCITY, _VELOCITY] = density * length
+    noise[:, _ACCELERATION, _ACCELERATION] = np.diag(model.markov_sigma_m_s2) ** 2 * (
+        1.0 - decay[:, None, None] ** 2
     )
-    axes = rtn_from_inertial(position, velocity).T
-    decay = float(np.exp(-step_s / model.correlation_s))
-    push = np.concatenate([0.5 * step_s**2 * axes, step_s * axes])
-    transition = np.zeros((SIZE, SIZE))
-    transition[:6, :6], transition[:6, _ACCELERATION] = moved, push
-    transition[_ACCELERATION, _ACCELERATION] = decay * np.eye(3)
-    carried = np.concatenate([position, velocity, decay * state[_ACCELERATION]])
-    carried[:6] += push @ state[_ACCELERATION]
-    density = axes @ np.diag(model.white_psd_m2_s3) @ axes.T
-    noise = np.zeros((SIZE, SIZE))
-    noise[_POSITION, _POSITION] = density * step_s**3 / 3.0
-    noise[_POSITION, _VELOCITY] = noise[_VELOCITY, _POSITION] = density * step_s**2 / 2.0
-    noise[_VELOCITY, _VELOCITY] = density * step_s
-    noise[_ACCELERATION, _ACCELERATION] = np.diag(model.markov_sigma_m_s2) ** 2 * (1.0 - decay**2)
     return carried, transition, noise
 
 
 def _divided(left: FloatArray, covariance: FloatArray) -> FloatArray:
-    """left covariance^-1, scaled so that metres and micrometres per second squared are of one size."""
-    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
-    correlation = covariance / np.outer(scale, scale)
-    return np.asarray(np.linalg.solve(correlation, (left / scale).T).T / scale, dtype=np.float64)
+    """left covariance^-1 of stacks, scaled so that metres and micrometres per second squared are of one size."""
+    scale = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 1e-30))
+    correlation = covariance / (scale[:, :, None] * scale[:, None, :])
+    solved = np.linalg.solve(correlation, _turned(left / scale[:, None, :]))
+    return np.asarray(_turned(solved) / scale[:, None, :], dtype=np.float64)
