@@ -11,14 +11,10 @@ from numpy.typing import NDArray
 
 from payload_emulator.frame import View, render_view
 from payload_emulator.sim.cycles_scene import CyclesSettings
-from payload_emulator.sim.photometry import Photometry
 from payload_emulator.sim.renderer import Rendering
 from payload_emulator.world import World
 
 Progress = Callable[[Sequence[tuple[str, View]], int], Iterable[tuple[str, View]]]
-
-MATT = Photometry("lambert", phase_slope_per_rad=0.0)
-"""What Blender's Principled BSDF at full roughness comes to."""
 
 LIKE_FOR_LIKE = CyclesSettings(
     samples=8, pixels_per_polygon=0.25, filter_px=0.01, terminator_offset=0.0, geometry_offset=0.0
@@ -66,11 +62,7 @@ def compare_on_views(
     blender_python: str,
     progress: Progress,
 ) -> tuple[dict[str, list[Rendering]], dict[str, Agreement]]:
-    """Renderings of views by renderers, and how fast agrees with each of the others.
-
-    Blender's regolith is a matt Lambert surface: Cycles is compared with the fast renderer under the scenario's law and
-    under that one.
-    """
+    """Renderings of views by renderers under the scenario's photometric law, and how they agree."""
     jobs = [(name, view) for name in names for view in views]
     made: dict[str, list[Rendering]] = {name: [] for name in names}
     for name, view in progress(jobs, len(jobs)):
@@ -79,9 +71,7 @@ def compare_on_views(
     if "raymarch" in names:
         figures["fast_vs_raymarch"] = compare_renderings(made["raymarch"], made["fast"])
     if "cycles" in names:
-        matt = [render_view(world, view, "fast", photometry=MATT)[0] for view in views]
         figures["cycles_vs_fast"] = compare_renderings(made["fast"], made["cycles"])
-        figures["cycles_vs_matt_fast"] = compare_renderings(matt, made["cycles"])
     return made, figures
 
 

@@ -173,12 +173,12 @@ def render_view(
     ``photometry`` stands in for the scenario's, ``settings`` for the paper's in Cycles.
     """
     pose = (world.terrain, world.true_camera, view.position_mcmf_m, view.camera_from_mcmf, view.sun_mcmf)
+    law = photometry or Photometry(world.scenario.light.photometry)
     if renderer_name == "cycles":
         from payload_emulator.sim.cycles import render_scene
 
-        picture = render_scene(describe_scene(*pose), settings or CyclesSettings(), blender_python)
+        picture = render_scene(describe_scene(*pose, law), settings or CyclesSettings(), blender_python)
         return picture.rendering, picture.filmic_png
-    law = photometry or Photometry(world.scenario.light.photometry)
     return {"fast": renderer.render, "raymarch": raymarch.render}[renderer_name](*pose, law), b""
 
 

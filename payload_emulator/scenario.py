@@ -124,7 +124,7 @@ class LightSection:
     """
 
     mode: Literal["paper", "real"] = "paper"
-    photometry: Literal["lunar-lambert", "lambert", "hapke"] = "lunar-lambert"
+    photometry: Literal["lunar-lambert", "lambert", "hapke", "matt"] = "lunar-lambert"
     elevation_min_deg: float = 5.0
     elevation_max_deg: float = 15.0
     azimuth_min_deg: float = -45.0

@@ -10,7 +10,7 @@ from typing import Any
 from linna.output import add_json_flag, emit, log, progress
 
 RENDERERS = ("fast", "raymarch", "cycles")
-LAWS = ("lunar-lambert", "lambert", "hapke")
+LAWS = ("lunar-lambert", "lambert", "hapke", "matt")
 TERRAINS = ("auto", "raster", "procedural")
 SHEET_VIEWS = 6
 SHEET_COLUMNS = 3
@@ -55,7 +55,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="exact rims, or the paper's local equirectangular map (default: exact)",
     )
     parser.add_argument("--terrain", choices=TERRAINS, help="instead of the scenario's")
-    parser.add_argument("--photometry", choices=LAWS, help="instead of the scenario's")
+    parser.add_argument(
+        "--photometry", choices=LAWS, help="instead of the scenario's; matt is the paper's Principled BSDF"
+    )
     parser.add_argument(
         "--tilt", type=float, metavar="DEG", help="from nadir toward image up, instead of the scenario's"
     )

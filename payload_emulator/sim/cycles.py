@@ -67,8 +67,8 @@ def render(
 ) -> Rendering:
     """Picture of the terrain, as `renderer.render`, by Cycles.
 
-    The regolith is Blender's Principled BSDF whatever law ``photometry`` names; of that only the albedo's contrast is
-    taken.  ``python`` is an interpreter that can import ``bpy``.
+    The regolith is Blender's Principled BSDF, its base colour bent to the law of ``photometry`` (``matt`` leaves it as
+    the paper has it).  ``python`` is an interpreter that can import ``bpy``.
 
     Raises
     ------
@@ -77,8 +77,7 @@ def render(
     TerrainError
         The camera is in the ground or sees ground the terrain does not hold.
     """
-    contrast = (photometry or Photometry()).albedo_contrast
-    scene = describe_scene(terrain, camera, position_mcmf_m, camera_from_mcmf, sun_direction_mcmf, contrast)
+    scene = describe_scene(terrain, camera, position_mcmf_m, camera_from_mcmf, sun_direction_mcmf, photometry)
     return render_scene(scene, settings or CyclesSettings(), python).rendering
 
 

@@ -19,6 +19,7 @@ from lunar.constants import MOON_RADIUS_M
 from lunar.frames import enu_from_mcmf, mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.errors import RendererError, TerrainError
 from payload_emulator.sim.light import SUN_ANGULAR_RADIUS_RAD
+from payload_emulator.sim.photometry import Photometry
 from payload_emulator.sim.raymarch import rays_window
 from payload_emulator.sim.terrain.tiles import (
     ALBEDO_SHIFT,
@@ -41,6 +42,7 @@ LARGEST_HALF_EXTENT_RAD = math.radians(20.0)
 """Bounds of the cap, against degenerate footprints and views along the horizon (paper V-A.2)."""
 
 LARGEST_TEXTURE = 8192
+_ROWS_AT_ONCE = 128
 
 FLAT_GROUND_BRIGHTNESS = 0.35
 """Filmic exposure brings flat ground of mean albedo to this scene brightness (0.18 is its middle gray)."""
@@ -99,7 +101,8 @@ class CyclesScene:
     displacement_range_km
         Height of 1 over 0.
     albedo
-        Normal albedo (rows, columns), south first.
+        Base colour of a matt surface (rows, columns), south first: the normal albedo times what the photometric law
+        makes of it over Lambert's under this Sun from this place.
     camera_to_world, sun_to_world
         4 x 4; Blender's cameras and lamps look along their own -z, y up.
     fov_rad, width_px, height_px
@@ -137,9 +140,12 @@ def describe_scene(
     position_mcmf_m: npt.ArrayLike,
     camera_from_mcmf: npt.ArrayLike,
     sun_direction_mcmf: npt.ArrayLike,
-    albedo_contrast: float = 1.0,
+    photometry: Photometry | None = None,
 ) -> CyclesScene:
     """The scene of one picture; arguments as those of `renderer.render`.
+
+    Blender's regolith is matt Lambert, which the law ``matt`` leaves as it is (the paper's look).  Of the other laws
+    the ratio to it goes into the base colour, texel by texel: Sun and camera are the same for the whole picture.
 
     Raises
     ------
@@ -164,7 +170,11 @@ def describe_scene(
         )
     south, north, west, east = _bounds(terrain, camera, position, rotation, sun, longitude)
     level = terrain.level_for((altitude - ground) / camera.focal_px)
+    photometry = photometry or Photometry()
     heights, albedo = _textures(terrain, south, north, west, east, level)
+    albedo = MEAN_ALBEDO + photometry.albedo_contrast * (albedo - MEAN_ALBEDO)
+    if photometry.law != "matt":
+        albedo *= _law_over_lambert(heights, (south, north, west, east), position, sun, photometry)
     low, high = float(heights.min()), float(heights.max())
     span = max(high - low, 1.0)
     middle = 0.5 * (high + low)
@@ -180,9 +190,7 @@ def describe_scene(
         uv=np.stack(np.broadcast_arrays(share[None, :], share[:, None]), axis=-1),
         displacement=np.asarray((heights - middle) / span + 0.5, dtype=np.float32),
         displacement_range_km=span / 1e3,
-        albedo=np.asarray(
-            np.clip(MEAN_ALBEDO + albedo_contrast * (albedo - MEAN_ALBEDO), 0.0, 1.0), dtype=np.float32
-        ),
+        albedo=np.asarray(np.clip(albedo, 0.0, 1.0), dtype=np.float32),
         camera_to_world=_camera_to_world(enu @ rotation.T, altitude),
         sun_to_world=_sun_to_world(enu @ sun),
         fov_rad=camera.fov_rad,
@@ -248,6 +256,54 @@ def _textures(
     heights = np.empty(rows * columns)
     kernels.sample_pool(patch.heights, patch.table, TILE_SHIFT, r.ravel(), c.ravel(), heights)
     return heights.reshape(rows, columns), _albedo(patch, r, c)
+
+
+def _law_over_lambert(
+    heights: Floats,
+    bounds: tuple[float, float, float, float],
+    position: Floats,
+    sun: Floats,
+    photometry: Photometry,
+) -> Image:
+    """What the law makes of each texel over a matt Lambert surface; slopes over two texels, as elsewhere."""
+    south, north, west, east = bounds
+    rows, columns = heights.shape
+    latitude = south + (np.arange(rows) + 0.5) / rows * (north - south)
+    longitude = west + (np.arange(columns) + 0.5) / columns * (east - west)
+    ratio = np.empty((rows, columns), np.float32)
+    for first in range(0, rows, _ROWS_AT_ONCE):
+        block = slice(first, min(first + _ROWS_AT_ONCE, rows))
+        with_edges = slice(max(first - 1, 0), min(block.stop + 1, rows))
+        radius = MOON_RADIUS_M + heights[block]
+        inner = slice(block.start - with_edges.start, block.stop - with_edges.start)
+        to_north = np.gradient(heights[with_edges], (north - south) / rows, axis=0)[inner] / radius
+        to_east = np.gradient(heights[block], (east - west) / columns, axis=1) / radius
+        cos_latitude, sin_latitude = np.cos(latitude[block])[:, None], np.sin(latitude[block])[:, None]
+        to_east /= cos_latitude
+        norm = 1.0 / np.sqrt(1.0 + to_north**2 + to_east**2)
+        axes = _local_axes(cos_latitude, sin_latitude, longitude)
+        local = [x * sun[0] + y * sun[1] + z * sun[2] for x, y, z in axes]
+        seen = [x * position[0] + y * position[1] + z * position[2] for x, y, z in axes]
+        seen[2] = seen[2] - radius
+        reach = 1.0 / np.sqrt(seen[0] ** 2 + seen[1] ** 2 + seen[2] ** 2)
+        mu0 = (local[2] - to_east * local[0] - to_north * local[1]) * norm
+        mu = (seen[2] - to_east * seen[0] - to_north * seen[1]) * norm * reach
+        cos_phase = (local[0] * seen[0] + local[1] * seen[1] + local[2] * seen[2]) * reach
+        ratio[block] = photometry.over_lambert(mu0, mu, cos_phase)
+    return ratio
+
+
+def _local_axes(
+    cos_latitude: Floats, sin_latitude: Floats, longitude: Floats
+) -> tuple[tuple[Floats, Floats, Floats], ...]:
+    """East, north and up at latitudes (n, 1) and longitudes (m,) as MCMF components that broadcast to (n, m)."""
+    cos_longitude, sin_longitude = np.cos(longitude)[None, :], np.sin(longitude)[None, :]
+    zero = np.zeros((1, 1))
+    return (
+        (-sin_longitude, cos_longitude, zero),
+        (-sin_latitude * cos_longitude, -sin_latitude * sin_longitude, cos_latitude),
+        (cos_latitude * cos_longitude, cos_latitude * sin_longitude, sin_latitude),
+    )
 
 
 def _albedo(patch: TerrainPatch, rows: Floats, columns: Floats) -> Floats:

@@ -1,5 +1,7 @@
 """How the regolith scatters: Lambert, Lunar-Lambert and Hapke, as tables over the phase angle.
 
+A fourth law, ``matt``, is Lambert without any fall of brightness with phase: what the paper's Principled BSDF comes to.
+
 Radiance is in units of a white Lambert surface under a perpendicular Sun; the reflectance of every law is
 ``albedo * phase(g) * [2 w(g) mu0 / (mu0 + mu) + (1 - w(g)) mu0]``, Hapke's with an added multiple-scattering term.
 """
@@ -14,8 +16,12 @@ import numpy.typing as npt
 
 from payload_emulator.errors import PayloadError
 
-LAWS = ("lunar-lambert", "lambert", "hapke")
+Cosines = npt.NDArray[np.float32]
+
+LAWS = ("lunar-lambert", "lambert", "hapke", "matt")
 TABLE_SIZE = 512
+SMALLEST_EMISSION = 0.02
+"""Ground is taken to face the camera with at least this cosine, by the renderers' kernels as well."""
 
 HAPKE_SINGLE_SCATTERING = 0.21
 HAPKE_SURGE = 2.01
@@ -30,7 +36,7 @@ class Photometry:
     Attributes
     ----------
     law
-        ``lunar-lambert`` (McEwen 1996 limb darkening), ``lambert`` or ``hapke``.
+        ``lunar-lambert`` (McEwen 1996 limb darkening), ``lambert``, ``hapke`` or ``matt``.
     phase_slope_per_rad
         Exponential fall of brightness with phase angle of the first two laws; 0.7 follows Hapke's lunar phase
         curve from 20 to 100 degrees.
@@ -64,8 +70,8 @@ class Photometry:
                 ),
                 dtype=np.float32,
             )
-        phase = np.exp(-self.phase_slope_per_rad * g)
-        if self.law == "lambert":
+        phase = np.ones_like(g) if self.law == "matt" else np.exp(-self.phase_slope_per_rad * g)
+        if self.law in ("lambert", "matt"):
             weight = np.zeros_like(g)
         else:
             degrees = np.degrees(g)
@@ -74,3 +80,21 @@ class Photometry:
         return np.asarray(
             np.stack([2.0 * weight * phase, (1.0 - weight) * phase, np.zeros_like(g)]), dtype=np.float32
         )
+
+    def over_lambert(self, mu0: Cosines, mu: Cosines, cos_phase: Cosines) -> Cosines:
+        """Reflectance of this law over that of a matt Lambert surface of the same albedo, per place.
+
+        ``mu0``, ``mu``: cosines of incidence and emission, those below 0 and ``SMALLEST_EMISSION`` taken as these;
+        ``cos_phase``: cosine of the phase angle.  The bound on ``mu`` bounds the ratio.
+        """
+        place = np.clip((cos_phase + 1.0) * (TABLE_SIZE / 2), 0.0, TABLE_SIZE)
+        seeliger, lambert, multiple = (
+            np.interp(place, np.arange(TABLE_SIZE + 2), row).astype(np.float32) for row in self.tables()
+        )
+        mu0, mu = np.maximum(mu0, 0.0), np.maximum(mu, SMALLEST_EMISSION)
+        if self.law == "hapke":
+            gamma = math.sqrt(1.0 - HAPKE_SINGLE_SCATTERING)
+            seeliger = seeliger + multiple * (
+                (1.0 + 2.0 * mu0) / (1.0 + 2.0 * gamma * mu0) * (1.0 + 2.0 * mu) / (1.0 + 2.0 * gamma * mu)
+            )
+        return np.asarray(lambert + seeliger / (mu0 + mu), dtype=np.float32)

@@ -22,6 +22,8 @@ Floats = NDArray[np.float64]
 
 _ATTEMPTS = 4000
 _LOWEST_FLIGHT_M = 9_000.0  # above the ground: lower, a 5 km crater fills more than a sixth of the frame
+_LAWS = ("lunar-lambert", "lambert", "hapke")
+_LAW_SHARES = (0.5, 0.25, 0.25)
 _SHARD_REACH_DEG = 2.5  # frames of a shard look at neighbouring ground, so that its terrain is made once
 
 
@@ -213,20 +215,16 @@ def draw_pointing(vary: bool, rng: np.random.Generator) -> Floats:
 
 def draw_photometry(vary: bool, rng: np.random.Generator) -> Any:
     """A `Photometry`: nominal, or another law, phase curve and albedo contrast for each frame."""
-    from payload_emulator.sim.photometry import LAWS, Photometry
+    from payload_emulator.sim.photometry import Photometry
 
     if not vary:
         return Photometry()
-    law = LAWS[int(rng.choice(len(LAWS), p=_law_shares(LAWS)))]
+    law = _LAWS[int(rng.choice(len(_LAWS), p=_LAW_SHARES))]
     return Photometry(
         law=law,
         phase_slope_per_rad=float(rng.uniform(0.2, 1.0)),
         albedo_contrast=float(rng.uniform(0.0, 1.6)),
     )
-
-
-def _law_shares(laws: tuple[str, ...]) -> list[float]:
-    return [0.5 if law == "lunar-lambert" else 0.5 / (len(laws) - 1) for law in laws]
 
 
 def draw_sensor(vary: bool, rng: np.random.Generator) -> Any:

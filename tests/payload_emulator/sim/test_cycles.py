@@ -13,12 +13,13 @@ import pytest
 
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.constants import MOON_RADIUS_M
-from lunar.frames import axis_rotation, mcmf_from_spherical
+from lunar.frames import axis_rotation, enu_from_mcmf, mcmf_from_spherical
 from payload_emulator.errors import RendererError, TerrainError
-from payload_emulator.sim import cycles, cycles_worker
+from payload_emulator.sim import cycles, cycles_worker, renderer
 from payload_emulator.sim.cycles_scene import GRID, CyclesSettings, describe_scene
 from payload_emulator.sim.lens import BrownCamera
 from payload_emulator.sim.light import sun_direction_mcmf
+from payload_emulator.sim.photometry import Photometry
 from tests.payload_emulator.sim.exr_file import exr_octets
 
 CAMERA = PinholeCamera()
@@ -98,6 +99,55 @@ def test_camera_and_sun_are_in_blenders_axes(scene):
         scene.sun_to_world[:3, :3] @ scene.sun_to_world[:3, :3].T, np.eye(3), atol=1e-12
     )
     assert math.degrees(scene.sun_angle_rad) == pytest.approx(0.533, abs=0.001)
+
+
+def test_the_base_colour_of_a_matt_surface_is_its_albedo_and_of_other_laws_bent_to_them(formula_terrain):
+    """On flat ground Lambert's ratio falls with phase alone; Lunar-Lambert is brightest looking away from the Sun."""
+    flat = formula_terrain(lambda latitude, longitude: 0.0 * latitude)
+    matt, lambert, lunar = (
+        describe_scene(flat, CAMERA, *pose(), SUN, Photometry(law, albedo_contrast=0.0))
+        for law in ("matt", "lambert", "lunar-lambert")
+    )
+    assert np.ptp(matt.albedo) == 0.0
+    # The texel below the camera: the phase angle of nadir is the Sun's distance from the zenith, 80 degrees.
+    x, y = matt.vertices_km[32, :, 0], matt.vertices_km[:, 32, 1]
+    high, wide = matt.albedo.shape
+    row = int(np.interp(0.0, y, np.linspace(0.0, 1.0, GRID)) * high)
+    column = int(np.interp(0.0, x, np.linspace(0.0, 1.0, GRID)) * wide)
+    below = lambert.albedo[row, column] / matt.albedo[row, column]
+    assert below == pytest.approx(math.exp(-0.7 * math.radians(80.0)), rel=0.01)
+    degrees = 80.0
+    weight = 1.0 - 0.019 * degrees + 0.242e-3 * degrees**2 - 1.46e-6 * degrees**3
+    mcewen = 2.0 * weight / (1.0 + math.sin(math.radians(10.0))) + 1.0 - weight
+    assert lunar.albedo[row, column] / lambert.albedo[row, column] == pytest.approx(mcewen, rel=0.01)
+    # Ground 40 km off, away from the Sun and toward it.
+    step = round(40.0 / 50.0 * row / 2)
+    assert lunar.albedo[row - step, column] > 1.3 * lunar.albedo[row + step, column]
+
+
+def test_slopes_bend_the_base_colour_as_the_fast_renderer_shades_them(hilly):
+    """Base colour times the cosine of incidence is the fast renderer's radiance, where nothing is shaded."""
+    sun = sun_direction_mcmf(math.radians(40.0), math.radians(30.0), *PLACE)
+    position, rotation = pose()
+    law = Photometry("lunar-lambert")
+    scene = describe_scene(hilly, CAMERA, position, rotation, sun, law)
+    matt = describe_scene(hilly, CAMERA, position, rotation, sun, Photometry("matt"))
+    ratio = renderer.render(hilly, CAMERA, position, rotation, sun, law).radiance
+    ratio = ratio / renderer.render(hilly, CAMERA, position, rotation, sun, Photometry("matt")).radiance
+    for v, u in ((100, 120), (256, 256), (400, 90), (300, 450)):
+        ray = rotation.T @ CAMERA.rays(np.array([[float(u), float(v)]]))[0]
+        reach = 25e3
+        for _ in range(20):
+            point = position + reach * ray
+            latitude, longitude = math.asin(point[2] / np.linalg.norm(point)), math.atan2(point[1], point[0])
+            above = np.linalg.norm(point) - MOON_RADIUS_M - float(hilly.height_m(latitude, longitude))
+            reach += above / -float(ray @ point / np.linalg.norm(point))
+        east, north = enu_from_mcmf(*PLACE)[:2] @ (point - position) / 1e3
+        x, y = scene.vertices_km[32, :, 0], scene.vertices_km[:, 32, 1]
+        high, wide = scene.albedo.shape
+        row = int(np.interp(north, y, np.linspace(0.0, 1.0, GRID)) * high)
+        column = int(np.interp(east, x, np.linspace(0.0, 1.0, GRID)) * wide)
+        assert scene.albedo[row, column] / matt.albedo[row, column] == pytest.approx(ratio[v, u], rel=0.03)
 
 
 def test_a_tilted_camera_tilts(hilly):

@@ -31,15 +31,45 @@ def test_lunar_lambert_shares_follow_mcewen():
     assert lambert == pytest.approx(0.392, abs=0.004)
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", [law for law in LAWS if law != "matt"])
 def test_brightness_falls_with_phase(law):
     table = Photometry(law).tables()
     whole = [float(entry(table, phase)[:2].sum()) for phase in (5, 30, 60, 90, 110)]
     assert np.all(np.diff(whole) < 0.0)
 
 
+def test_a_matt_surface_is_as_bright_at_any_phase():
+    np.testing.assert_array_equal(Photometry("matt").tables()[1], 1.0)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_law_over_lambert_is_what_the_renderers_make_of_it(formula_terrain, law):
+    """Of a smooth sphere, whose cosines are known everywhere, at the pixel below the camera."""
+    terrain = formula_terrain(lambda latitude, longitude: 0.0 * latitude)
+    place, elevation = (0.2, 1.0), math.radians(25.0)
+    position = mcmf_from_spherical(*place, 30e3)
+    rotation = pointed_camera_from_mcmf(position, 0.0, 0.0)
+    sun = sun_direction_mcmf(elevation, 1.0, *place)
+    camera = PinholeCamera(33, 33)
+    one, matt = (
+        renderer.render(terrain, camera, position, rotation, sun, Photometry(name)) for name in (law, "matt")
+    )
+    ratio = Photometry(law).over_lambert(
+        np.float32(math.sin(elevation)), np.float32(1.0), math.sin(elevation)
+    )
+    assert one.radiance[16, 16] / matt.radiance[16, 16] == pytest.approx(float(ratio), rel=2e-3)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_law_over_lambert_is_bounded_on_ground_in_profile(law):
+    grid = np.linspace(-1.0, 1.0, 21, dtype=np.float32)
+    ratio = Photometry(law).over_lambert(grid[:, None, None], grid[None, :, None], grid[None, None, :])
+    # Lommel-Seeliger over Lambert is 2 / (mu0 + mu), with mu no less than 0.02; Hapke's surge and bounces treble it.
+    assert np.isfinite(ratio).all() and ratio.min() >= 0.0 and ratio.max() <= 300.0
+
+
 def test_an_unknown_law_is_refused_by_name():
-    with pytest.raises(PayloadError, match="lunar-lambert, lambert, hapke, found 'phong'"):
+    with pytest.raises(PayloadError, match="lunar-lambert, lambert, hapke, matt, found 'phong'"):
         Photometry("phong")
 
 
