@@ -25,6 +25,7 @@ from ground_service.api.timekeeping import timekeeping
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError
 from ground_service.services.ground import ground_from_settings
+from ground_service.services.jobs import enter_redecoding
 from ground_service.services.upkeep import nightly_job_id
 from ground_service.settings import Settings
 from ground_service.web.pages import pages
@@ -55,6 +56,9 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         ground = ground_from_settings(settings)
         app.state.ground = ground
         app.state.dispatcher = dispatcher_for(ground, settings, inline=inline_jobs)
+        for job in enter_redecoding(ground):
+            log.warning("decoding the archive again with a newer dictionary: job %s", job)
+            app.state.dispatcher.start(job)
         if inline_jobs or settings.resolved_broker_url() is None:
             app.state.dispatcher.resume()
         chores = [asyncio.create_task(_nights(app, settings)), asyncio.create_task(_sweeps(app))]

@@ -36,6 +36,7 @@ from ground_service.services.ingest import FLOWN
 from ground_service.services.jobs import enter_ingest
 from ground_service.services.passes import STATE_VALUES
 from ground_service.services.plan_schemas import time_of
+from ground_service.services.report_overview import report_overview
 from ground_service.services.reports import pass_summary
 from ground_service.services.upkeep import spacecraft_trends, trend_view
 from ground_service.services.views import (
@@ -423,6 +424,17 @@ def get_report_summary(ground: GroundOf, _: Viewer, report_id: Key) -> dict[str,
             "summary"
         ]
     return summary
+
+
+@router.get("/reports/{report_id}/overview", response_model=schemas.ReportOverview)
+def get_report_overview(
+    ground: GroundOf,
+    _: Viewer,
+    report_id: Key,
+    max_points: Annotated[int, Query(ge=1, le=10_000)] = 600,
+) -> Any:
+    """What a page shows of a report: verdict, headline figures, and the 3-D error of every solution made short."""
+    return JSONResponse(report_overview(ground, report_id, max_points))
 
 
 @router.get("/spacecraft/{spacecraft_id}/trends", response_model=list[schemas.Trend])

@@ -335,3 +335,29 @@ class Trend(Schema):
     mean: float
     slope_per_day: float | None
     limit_state: str = Field(description="Worst met: within, warning or alarm", examples=["within"])
+
+
+class ReportErrors(Schema):
+    """The 3-D error of one navigation solution in columns of one length; see `min_m` to `max_m` as a band."""
+
+    name: str = Field(examples=["anchored"])
+    kind: str = Field(description="estimate, smoothed or baseline", examples=["estimate"])
+    time_s: list[float] = Field(description="UTC, POSIX seconds at the middle of each stretch")
+    min_m: list[float]
+    max_m: list[float]
+    mean_m: list[float]
+    after_gap: list[bool] = Field(description="A silence lies before the stretch: no line over it")
+
+
+class ReportOverview(Schema):
+    """The head of a report and its error series made short."""
+
+    report_id: str
+    title: str
+    verdict: str
+    verdict_level: str = Field(examples=["good"])
+    evidence_rung: str
+    created_utc: str
+    headline: list[dict[str, Any]]
+    not_available: dict[str, str]
+    navigation: list[ReportErrors]

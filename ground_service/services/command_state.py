@@ -9,8 +9,8 @@ from sqlalchemy import Connection, func, select
 
 from ground_service.clock import utc_now_ns
 from ground_service.processing.verification import CommandFate, SentCommand, VerificationReport, fate_of
+from ground_service.services.pass_data import readable_version
 from ground_service.store import repository
-from tmtc.dictionary import DICTIONARY
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ def command_view(connection: Connection, row: repository.Row) -> CommandView:
                 table.c.subtype, table.c.request_id, table.c.ticks, table.c.step, table.c.failure_code
             ).where(
                 table.c.vehicle_id == row["vehicle_id"],
-                table.c.dictionary_version == DICTIONARY.version,
+                table.c.dictionary_version == readable_version(connection, row["vehicle_id"]),
                 table.c.ticks > row["sent_after_ticks"],
                 table.c.request_id == row["request_id"],
             )

@@ -18,6 +18,7 @@ from ground_service.services.command_state import CommandView, command_view
 from ground_service.services.feed import publish
 from ground_service.services.ground import Ground
 from ground_service.services.ingest import FLOWN
+from ground_service.services.pass_data import readable_version
 from ground_service.services.users import audit
 from ground_service.services.window_progress import advance_windows
 from ground_service.store import repository
@@ -310,7 +311,7 @@ def _newest_ticks(connection: Connection, vehicle: int) -> int:
     table = repository.SAMPLES["verifications"]
     newest = connection.execute(
         select(func.max(table.c.ticks)).where(
-            table.c.vehicle_id == vehicle, table.c.dictionary_version == DICTIONARY.version
+            table.c.vehicle_id == vehicle, table.c.dictionary_version == readable_version(connection, vehicle)
         )
     ).scalar()
     return int(newest) if newest is not None else -1

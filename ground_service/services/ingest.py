@@ -18,6 +18,7 @@ from ground_service.link.stream import DownlinkReader
 from ground_service.services.ground import Ground
 from ground_service.services.joining import join_with_others
 from ground_service.services.recorrelation import recorrelate
+from ground_service.services.redecode import catch_up, note_dictionary
 from ground_service.services.window_progress import advance_windows
 from ground_service.store import repository
 from ground_service.store.files import StoredFile, read_blocks
@@ -177,9 +178,9 @@ def _store_stream(
             raise InvalidInput("downlink of bare packets", "", "the id of their spacecraft", "none given")
         with ground.database.writing() as connection:
             if batch.spacecraft_id not in vehicles:
-                vehicles[batch.spacecraft_id] = repository.vehicle_id(
-                    connection, batch.spacecraft_id, instance
-                )
+                vehicle = repository.vehicle_id(connection, batch.spacecraft_id, instance)
+                note_dictionary(connection, vehicle)
+                vehicles[batch.spacecraft_id] = vehicle
             stored = store_batch(connection, vehicles[batch.spacecraft_id], batch)
         new += stored.new
         samples += stored.samples
@@ -192,6 +193,7 @@ def _store_stream(
                     connection, ground.files, vehicle, spacecraft_id, sha256, reader.edges
                 )
     for vehicle in vehicles.values():
+        catch_up(ground, vehicle)
         if not recorrelate(ground, vehicle) and new + joined:
             advance_windows(ground, vehicle)
     found = reader.accounting

@@ -23,6 +23,7 @@ from ground_service.services.archive_zip import import_zip
 from ground_service.services.feed import publish
 from ground_service.services.ground import Ground
 from ground_service.services.ingest import add_ingest, run_ingest
+from ground_service.services.redecode import catch_up, redecode_job_id, vehicles_behind
 from ground_service.services.reports import make_report
 from ground_service.services.upkeep import nightly
 from ground_service.store import repository
@@ -61,6 +62,10 @@ def _archive(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict
     return {"pass_id": import_zip(ground, path, str(arguments["name"]))}
 
 
+def _redecode(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[str, Any]:
+    return {"rows": catch_up(ground, int(arguments["vehicle_id"]))}
+
+
 def _replay(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
     from ground_service.services.regression_jobs import replay_job
 
@@ -80,6 +85,7 @@ WORK: dict[str, Work] = {
     "replay": _replay,
     "regression": _regression,
     "nightly": nightly,
+    "redecode": _redecode,
 }
 """What can be asked for, by kind. Each may be run twice with the same arguments and job without harm."""
 
@@ -136,6 +142,14 @@ def enter_ingest(
         ingest_id = add_ingest(connection, stored, name)
         arguments = {"ingest_id": ingest_id, "spacecraft_id": spacecraft_id, "instance": instance}
         return ingest_id, add_job(connection, "ingest", arguments, job_id=job_id)
+
+
+def enter_redecoding(ground: Ground) -> list[str]:
+    """Enter a job for every vehicle that an older dictionary decoded; their ids. Once each, however often asked."""
+    return [
+        enter_job(ground, "redecode", {"vehicle_id": vehicle}, job_id=redecode_job_id(vehicle))
+        for vehicle in vehicles_behind(ground)
+    ]
 
 
 def run_job(ground: Ground, job_id: str) -> dict[str, Any]:

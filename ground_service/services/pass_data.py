@@ -65,12 +65,13 @@ _TRENDS = (
 
 @dataclass(frozen=True, slots=True)
 class PassSpan:
-    """The stretch of on-board time that belongs to a pass, and how it maps to UTC."""
+    """The stretch of on-board time that belongs to a pass, how it maps to UTC, the dictionary version to read it in."""
 
     vehicle: int
     start_ticks: int
     stop_ticks: int
     correlations: tuple[TimeCorrelation, ...]
+    dictionary_version: int
 
     def utc_ns(self, ticks: Sequence[int]) -> IntArray:
         """Correlated UTC (n,) of on-board ticks."""
@@ -176,7 +177,13 @@ def pass_span(connection: Connection, record: Mapping[str, Any]) -> PassSpan:
         start_ticks=ticks_of_utc_ns(record["start_utc_ns"] - PASS_MARGIN_NS, correlations),
         stop_ticks=ticks_of_utc_ns(record["stop_utc_ns"] + PASS_MARGIN_NS, correlations),
         correlations=correlations,
+        dictionary_version=readable_version(connection, record["vehicle_id"]),
     )
+
+
+def readable_version(connection: Connection, vehicle: int) -> int:
+    """The dictionary version that a vehicle is to be read in: an older one until all is decoded with this one."""
+    return repository.decoded_version(connection, vehicle, DICTIONARY.version)
 
 
 def load_correlations(connection: Connection, vehicle: int) -> tuple[TimeCorrelation, ...]:
@@ -256,7 +263,7 @@ def identification_samples(connection: Connection, span: PassSpan) -> Identifica
         span.vehicle,
         span.start_ticks,
         span.stop_ticks,
-        DICTIONARY.version,
+        span.dictionary_version,
         ("ticks", "items"),
     )
     if not rows["ticks"]:
@@ -301,7 +308,7 @@ def detection_samples(connection: Connection, span: PassSpan) -> DetectionSample
         span.vehicle,
         span.start_ticks,
         span.stop_ticks,
-        DICTIONARY.version,
+        span.dictionary_version,
         ("ticks", "frame_number", "image_quality", "items"),
     )
     if not rows["ticks"]:
@@ -412,7 +419,7 @@ def _columns(
 ) -> dict[str, NDArray[Any]]:
     """Samples as arrays: whole numbers as int64, all else as float64 with NaN for NULL."""
     return repository.sample_arrays(
-        connection, kind, span.vehicle, span.start_ticks, span.stop_ticks, DICTIONARY.version, names
+        connection, kind, span.vehicle, span.start_ticks, span.stop_ticks, span.dictionary_version, names
     )
 
 
@@ -497,7 +504,7 @@ def event_list(connection: Connection, span: PassSpan) -> tuple[PassEvent, ...]:
     """Event reports of a pass, in time order."""
     names = ("ticks", "severity", "event_id", "frame_number", "value_1", "value_2")
     rows = repository.samples(
-        connection, "events", span.vehicle, span.start_ticks, span.stop_ticks, DICTIONARY.version, names
+        connection, "events", span.vehicle, span.start_ticks, span.stop_ticks, span.dictionary_version, names
     )
     labels = DICTIONARY.labels("event_info", "event_id")
     utc_ns, correlation_ids = utc_ns_of_ticks(np.array(rows["ticks"], dtype=np.int64), span.correlations)
@@ -571,7 +578,7 @@ def _provenance(
         if "truth" in gravity
         else "",
         "lunar orientation on the ground": ground.orientation.name,
-        "dictionary": f"version {DICTIONARY.version}, {DICTIONARY.hash[:16]}",
+        "dictionary": _dictionary_text(span.dictionary_version),
         "time correlation": ", ".join(str(c.id) for c in span.correlations) or "0 (ideal clock)",
         "reference ephemeris": (
             f"{ephemeris['object_name']}, {ephemeris['frame']}, SHA-256 {ephemeris['file_sha256'][:16]}"
@@ -582,6 +589,12 @@ def _provenance(
         "archive": str(record["archive_digest"] or "")[:16],
     }
     return {name: value for name, value in entries.items() if value}
+
+
+def _dictionary_text(version: int) -> str:
+    if version != DICTIONARY.version:
+        return f"version {version}, until the archive is decoded again with version {DICTIONARY.version}"
+    return f"version {version}, {DICTIONARY.hash[:16]}"
 
 
 def _configuration(manifest: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

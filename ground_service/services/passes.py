@@ -20,6 +20,7 @@ from ground_service.services.pass_data import (
     load_correlations,
     packet_accounting,
     pass_span,
+    readable_version,
 )
 from ground_service.services.series import PARAMETERS, STATE_VALUES, Series, SeriesReading
 from ground_service.store import repository
@@ -196,6 +197,7 @@ def trend_series(
             0 if start_utc_ns is None else ticks_of_utc_ns(start_utc_ns, correlations),
             LAST_TICKS if stop_utc_ns is None else ticks_of_utc_ns(stop_utc_ns, correlations),
             correlations,
+            readable_version(connection, vehicle["id"]),
         )
         reading = SeriesReading(connection, span, "housekeeping", 0, max_points)
         return reading.series(parameter, DICTIONARY.packet("housekeeping").field(parameter).unit)

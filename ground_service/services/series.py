@@ -20,7 +20,6 @@ from ground_service.services.pass_data import PassSpan
 from ground_service.store import repository, rollups
 from ground_service.store.rollups import HOUSEKEEPING_VALUES as PARAMETERS
 from ground_service.store.rollups import STATE_VALUES
-from tmtc.dictionary import DICTIONARY
 
 __all__ = ["PARAMETERS", "STATE_VALUES", "Series", "SeriesReading"]
 
@@ -67,7 +66,7 @@ class SeriesReading:
 
     def _level(self) -> int | None:
         """The coarsest level of roll-ups that is fine enough; None where samples should be read."""
-        key = (self.kind, self.span.vehicle, DICTIONARY.version, self.part)
+        key = (self.kind, self.span.vehicle, self.span.dictionary_version, self.part)
         count, first, last = rollups.rolled_extent(
             self.connection, *key, self.span.start_ticks, self.span.stop_ticks
         )
@@ -88,7 +87,7 @@ class SeriesReading:
             self.connection,
             self.kind,
             self.span.vehicle,
-            DICTIONARY.version,
+            self.span.dictionary_version,
             self.part,
             level,
             first,
@@ -118,7 +117,7 @@ class SeriesReading:
             self.span.vehicle,
             start,
             stop,
-            DICTIONARY.version,
+            self.span.dictionary_version,
             ("ticks", name),
             **equal,
         )

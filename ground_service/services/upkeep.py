@@ -19,7 +19,7 @@ from ground_service.errors import NotFound
 from ground_service.processing.trends import Trend, trend_of
 from ground_service.services.feed import publish
 from ground_service.services.ground import Ground
-from ground_service.services.pass_data import PassSpan, load_correlations
+from ground_service.services.pass_data import PassSpan, load_correlations, readable_version
 from ground_service.services.series import PARAMETERS, SeriesReading
 from ground_service.store import repository, rollups
 from lunar.timescales import format_utc
@@ -85,13 +85,12 @@ def spacecraft_trends(ground: Ground, spacecraft_id: int, instance: str) -> list
 def vehicle_trends(ground: Ground, vehicle: int) -> list[Trend]:
     """Trends of the last `TREND_DAYS` days of on-board time in which there is housekeeping."""
     with ground.database.reading() as connection:
-        _, _, last = rollups.rolled_extent(
-            connection, "housekeeping", vehicle, DICTIONARY.version, 0, 0, (1 << 48) - 1
-        )
+        version = readable_version(connection, vehicle)
+        _, _, last = rollups.rolled_extent(connection, "housekeeping", vehicle, version, 0, 0, (1 << 48) - 1)
         if last == 0:
             return []
         first = max(last - (TREND_DAYS * 86_400 << 16), 0)
-        span = PassSpan(vehicle, first, last, load_correlations(connection, vehicle))
+        span = PassSpan(vehicle, first, last, load_correlations(connection, vehicle), version)
         reading = SeriesReading(connection, span, "housekeeping", 0, TREND_POINTS)
         definition = DICTIONARY.packet("housekeeping")
         found = []

@@ -18,10 +18,10 @@ from ground_service.processing.window_states import WindowFacts, state_of
 from ground_service.services.command_state import command_view
 from ground_service.services.feed import publish
 from ground_service.services.ground import Ground
-from ground_service.services.pass_data import load_correlations
+from ground_service.services.pass_data import load_correlations, readable_version
 from ground_service.store import repository
 from lunar.constants import NANOSECONDS_PER_SECOND
-from tmtc.dictionary import DICTIONARY, EVENTS
+from tmtc.dictionary import EVENTS
 
 MARGIN_NS = 60 * NANOSECONDS_PER_SECOND
 """Reports of the start and the stop may be this far from the planned times."""
@@ -81,7 +81,7 @@ def _facts(
     start = ticks_of_utc_ns(row["start_utc_ns"] - MARGIN_NS, correlations)
     stop = ticks_of_utc_ns(row["stop_utc_ns"] + MARGIN_NS, correlations)
     events = repository.samples(
-        connection, "events", vehicle, start, stop, DICTIONARY.version, ("event_id",)
+        connection, "events", vehicle, start, stop, readable_version(connection, vehicle), ("event_id",)
     )["event_id"]
     commands = [
         command_view(connection, dict(command))
@@ -130,7 +130,7 @@ def _frames(connection: Connection, vehicle: int, start: int, stop: int) -> int:
             connection.execute(
                 select(func.count(func.distinct(table.c.ticks))).where(
                     table.c.vehicle_id == vehicle,
-                    table.c.dictionary_version == DICTIONARY.version,
+                    table.c.dictionary_version == readable_version(connection, vehicle),
                     table.c.ticks.between(start, stop),
                 )
             ).scalar_one(),
@@ -146,7 +146,7 @@ def _heard(connection: Connection, vehicle: int, after_ticks: int) -> bool:
             select(table.c.ticks)
             .where(
                 table.c.vehicle_id == vehicle,
-                table.c.dictionary_version == DICTIONARY.version,
+                table.c.dictionary_version == readable_version(connection, vehicle),
                 table.c.ticks > after_ticks,
                 table.c.ticks <= after_ticks + HEARD_TICKS,
             )

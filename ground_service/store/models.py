@@ -63,13 +63,22 @@ class File(Base):
 
 
 class Vehicle(Base):
-    """A spacecraft in one instance: a domain of time, boots and sequence counts."""
+    """A spacecraft in one instance: a domain of time, boots and sequence counts.
+
+    `decoded_version` is the dictionary version that has decoded all of its packets, the one to read; NULL before the
+    first. While a newer one decodes them again, `redecoded_to` is the last packet that it has done and `redecode_until`
+    the last that it has to do.
+    """
 
     __tablename__ = "vehicles"
     __table_args__ = (UniqueConstraint("ccsds_id", "instance"),)
     id: Mapped[int] = mapped_column(Integer, primary_key=True)
     ccsds_id: Mapped[int] = mapped_column(Integer)
     instance: Mapped[str] = mapped_column(String(96))
+    decoded_version: Mapped[int | None] = mapped_column(SmallInteger)
+    redecoding_version: Mapped[int | None] = mapped_column(SmallInteger)
+    redecoded_to: Mapped[int | None] = mapped_column(BigInteger)
+    redecode_until: Mapped[int | None] = mapped_column(BigInteger)
 
 
 class Ingest(Base):

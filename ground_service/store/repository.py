@@ -137,6 +137,12 @@ def vehicle_id(connection: Connection, ccsds_id: int, instance: str) -> int:
         return int(again["id"])
 
 
+def decoded_version(connection: Connection, vehicle: int, newest: int) -> int:
+    """The dictionary version to read a vehicle in: the newest that all of its packets are decoded with."""
+    found = connection.execute(select(VEHICLES.c.decoded_version).where(VEHICLES.c.id == vehicle)).scalar()
+    return newest if found is None else int(found)
+
+
 def register_file(connection: Connection, stored: StoredFile, kind: str, name: str, now_utc_ns: int) -> None:
     """Enter a file of the archive into the database; entering it again changes nothing."""
     if find(connection, FILES, sha256=stored.sha256) is not None:

@@ -41,21 +41,29 @@ function showReport(report, id) {
   );
 }
 
-// Errors against the reference: the report has them, estimators and baselines on one axis.
+// Errors against the reference, estimators and baselines on one axis: mean within the band of each stretch.
 function showErrors(report) {
   const series = report.navigation
-    .filter((one) => one.error_rtn_m?.length)
+    .filter((one) => one.time_s.length)
     .map((one, index) => ({
       label: one.name,
       colour: colour(index),
       dash: one.kind === "baseline" ? [6, 4] : undefined,
-      times: one.utc_ns.map((time) => time / 1e9),
-      mean: one.error_rtn_m.map((error) => {
-        const size = Math.hypot(...error.map((part) => (part === null ? NaN : part)));
-        return size > 0 ? size : null;
-      }),
+      ...columns(
+        one.time_s.map((time, row) => ({
+          start: time,
+          stop: time,
+          // A logarithmic axis has no zero, which is the error at a reset.
+          min: one.min_m[row] || null,
+          max: one.max_m[row] || null,
+          mean: one.mean_m[row] || null,
+          after_gap: one.after_gap[row],
+        })),
+        (time) => time,
+      ),
     }));
-  if (series.length) chart(byId("navigation"), "distance from the reference", "m", series, { logarithmic: true, group: "pass", height: 300 });
+  show("errors");
+  if (series.length) chart(byId("errors"), "distance from the reference", "m", series, { logarithmic: true, group: "pass", height: 300 });
 }
 
 function showCompleteness(found) {
@@ -89,11 +97,10 @@ function showCompleteness(found) {
 }
 
 async function showStates(estimators) {
-  const found = [];
-  for (const name of estimators) {
-    const answer = await get(`passes/${passId}/states`, { estimator: name, value: STATES, max_points: 2000 }).catch(() => null);
-    if (answer?.series[0].samples) found.push(answer);
-  }
+  const answers = await Promise.all(
+    estimators.map((name) => get(`passes/${passId}/states`, { estimator: name, value: STATES, max_points: 1000 }).catch(() => null)),
+  );
+  const found = answers.filter((answer) => answer?.series[0].samples);
   const map = moonMap(byId("map"));
   const bounds = [];
   found.forEach((one, index) => {
@@ -117,7 +124,7 @@ async function showStates(estimators) {
 
 async function showParameter() {
   const name = byId("parameter").value;
-  const series = await get(`passes/${passId}/telemetry/${name}`, { max_points: 2000 });
+  const series = await get(`passes/${passId}/telemetry/${name}`, { max_points: 1000 });
   show("housekeeping");
   chart(byId("housekeeping"), words(name), series.unit, [{ label: words(name), ...columns(series.buckets, seconds) }], { group: "pass" });
 }
@@ -146,7 +153,7 @@ async function showLatestReport(ids) {
     show("verdict", element("p", { class: "hint" }, "No report has been made of this pass yet."));
     return;
   }
-  const report = await get(`reports/${ids[0]}`, { format: "json" });
+  const report = await get(`reports/${ids[0]}/overview`);
   showReport(report, ids[0]);
   showErrors(report);
 }
@@ -160,8 +167,7 @@ byId("make-report").addEventListener(
     await finished(job.id, (now) => (bar.value = now.progress));
     notice("The report is made.");
     const { reports } = await get(`passes/${passId}`);
-    const report = await get(`reports/${reports[0]}`, { format: "json" });
-    showReport(report, reports[0]);
+    await showLatestReport(reports);
   }),
 );
 byId("parameter").append(...dictionary.parameters.map((one) => element("option", { value: one.name }, words(one.name))));
@@ -186,8 +192,8 @@ async function load() {
       showEvents();
     }),
     showParameter(),
+    showStates(dictionary.estimators),
   ]);
-  await showStates(dictionary.estimators);
 }
 
 load().catch((error) => error.status === 401 || trouble(error));

@@ -1,0 +1,137 @@
+"""An archive that an older dictionary decoded: never empty, decoded again by itself, whatever happens meanwhile."""
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import select, update
+
+from ground_service.api.app import create_app
+from ground_service.link.packets import batch_of_cut
+from ground_service.services import redecode as redecoding
+from ground_service.services.ground import Ground, open_ground
+from ground_service.services.ingest import ingest_file
+from ground_service.services.passes import define_pass, events, parameter_series, state_series
+from ground_service.services.redecode import catch_up, redecode, vehicles_behind
+from ground_service.settings import Settings
+from ground_service.store import repository
+from ground_service.store.canonical import archive_hash
+from ground_service.store.database import downgrade_database, open_database, prepare_database
+from ground_service.store.packets import store_batch
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import decode
+
+with warnings.catch_warnings():
+    # The test client's next version wants another HTTP library.
+    warnings.simplefilter("ignore")
+    from fastapi.testclient import TestClient
+
+NS = 1_000_000_000
+OLD = replace(DICTIONARY, version=DICTIONARY.version - 1)
+
+
+def fill_with_the_old(home: Path, made: Any) -> None:
+    """What the program before this one left: all packets, decoded by its dictionary."""
+    found = decode((made.folder / "downlink.cadu").read_bytes())
+    with open_ground(home) as ground:
+        with ground.database.writing() as connection:
+            vehicle = repository.vehicle_id(connection, 76, "flight")
+            store_batch(connection, vehicle, batch_of_cut(found.buffer, found.cut, OLD, 76))
+            repository.change(connection, repository.VEHICLES, vehicle, decoded_version=OLD.version)
+        define_pass(
+            ground, name="p", start_utc_ns=int(made.utc_ns[0]) - NS, stop_utc_ns=int(made.utc_ns[-1]) + NS,
+            spacecraft_id=76,
+        )  # fmt: skip
+
+
+@pytest.fixture
+def old(tmp_path: Path, synthetic_pass: Any) -> Iterator[Ground]:
+    fill_with_the_old(tmp_path / "home", synthetic_pass)
+    with open_ground(tmp_path / "home") as ground:
+        yield ground
+
+
+def looked_at(ground: Ground) -> tuple[int, int, int]:
+    return (
+        len(events(ground, 1)),
+        parameter_series(ground, 1, "power_w", 1000).samples,
+        state_series(ground, 1, "spherical", ("altitude_m",), 100)[0].samples,
+    )
+
+
+def versions(ground: Ground) -> set[int]:
+    table = repository.SAMPLES["housekeeping"]
+    with ground.database.reading() as connection:
+        return set(connection.execute(select(table.c.dictionary_version).distinct()).scalars())
+
+
+def test_an_archive_of_the_old_dictionary_is_read_and_then_decoded_again(old: Ground) -> None:
+    before = looked_at(old)
+    assert before == (1, 40, 40)
+    assert vehicles_behind(old) == [1]
+    assert catch_up(old, 1) > 0
+    assert looked_at(old) == before
+    assert vehicles_behind(old) == []
+    assert versions(old) == {OLD.version, DICTIONARY.version}
+    assert catch_up(old, 1) == 0
+
+
+def test_serving_enters_the_job_that_decodes_again(tmp_path: Path, synthetic_pass: Any) -> None:
+    fill_with_the_old(tmp_path / "home", synthetic_pass)
+    with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as client:
+        (job,) = client.get("/api/v1/jobs").json()["items"]
+        assert (job["kind"], job["state"]) == ("redecode", "done")
+        assert len(client.get("/api/v1/passes/1/events").json()["items"]) == 1
+    with open_ground(tmp_path / "home") as ground:
+        assert vehicles_behind(ground) == []
+
+
+def test_what_comes_in_meanwhile_and_a_kill_in_the_middle_change_nothing(
+    old: Ground, tmp_path: Path, make_pass: Any, synthetic_pass: Any, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr(redecoding, "BLOCK_PACKETS", 50)
+    more = make_pass(frames=3, seed=5).folder / "downlink.cadu"
+    whole_block = redecoding._block
+    blocks = 0
+
+    def killed(*given: Any) -> Any:
+        nonlocal blocks
+        blocks += 1
+        if blocks == 3:
+            raise KeyboardInterrupt
+        return whole_block(*given)
+
+    monkeypatch.setattr(redecoding, "_block", killed)
+    with pytest.raises(KeyboardInterrupt):
+        ingest_file(old, more)
+    assert looked_at(old)[0] >= 1  # still as the old dictionary decoded it
+    ingest_file(old, more)
+    with open_ground(tmp_path / "fresh") as fresh:
+        for path in (more, synthetic_pass.folder / "downlink.cadu"):
+            ingest_file(fresh, path)
+        redecode(fresh, 1, OLD)
+        redecode(old, 1, OLD)
+        hashes = []
+        for ground in (old, fresh):
+            with ground.database.reading() as connection:
+                hashes.append(archive_hash(connection, 1))
+    assert hashes[0] == hashes[1]
+
+
+def test_a_database_of_the_schema_before_knows_what_it_was_decoded_with(
+    tmp_path: Path, synthetic_pass: Any
+) -> None:
+    fill_with_the_old(tmp_path / "home", synthetic_pass)
+    with open_ground(tmp_path / "home") as ground, ground.database.writing() as connection:
+        connection.execute(update(repository.VEHICLES).values(decoded_version=None))
+    url = Settings(home=tmp_path / "home").resolved_database_url()
+    database = open_database(url)
+    downgrade_database(database, "0009")
+    database.engine.dispose()
+    prepare_database(url).engine.dispose()
+    with open_ground(tmp_path / "home") as ground:
+        assert vehicles_behind(ground) == [1]
+        assert looked_at(ground) == (1, 40, 40)
