@@ -110,8 +110,9 @@ def run(arguments: argparse.Namespace) -> int:
         for low, high, row in study.by_altitude(single, LEAST_CATALOGUED)
     ]
     lines.append(
-        f"{figures['catalogued_per_frame']:.1f} of {figures['detections_per_frame']:.1f} detections a frame are of the "
-        f"{len(board)} craters of the map; {figures['median_cpu_s']:.2f} s (largest {figures['largest_cpu_s']:.2f}) a search"
+        f"{figures['catalogued_per_frame']:.1f} of {figures['detections_per_frame']:.1f} detections a frame are of "
+        f"the {len(board)} craters of the map; {figures['median_cpu_s']:.2f} s "
+        f"(largest {figures['largest_cpu_s']:.2f}) a search"
     )
     emit(arguments, figures, text="\n".join([*lines, rung]))
     return 0

@@ -29,8 +29,9 @@ def vote(
     bin_start: Index,
     bin_height: Float,
     log_diameter: Float,
-    sin_latitude: Float,
-    cos_latitude: Float,
+    latitude_rad: Float,
+    tangent: Float,
+    secant: Float,
     longitude: Float,
     extent: Float,
     cell: float,
@@ -55,6 +56,8 @@ def vote(
         Logarithm of crater diameter over depth, shape (k,).
     bin_start, bin_height
         Craters are sorted by bins of rim height and by diameter inside them: first of each bin (b + 1,), height (b,).
+    latitude_rad, tangent, secant
+        Latitude of the craters, its tangent and one over its cosine.
     extent
         South, north, west, east and area (sr) of the map; longitudes of the craters are west to west + 2 pi.
     cell
@@ -68,6 +71,10 @@ def vote(
     board[:] = 255
     south, west, area = extent[0], extent[2], extent[4]
     at = np.empty((_LISTED, 2), dtype=np.int64)
+    # Columns to a radian of longitude, per row.
+    columns_per_rad = np.empty(rows)
+    for r in range(rows):
+        columns_per_rad[r] = math.cos(south + (r + 1.0) * cell) / cell
     count, threshold = 0, 6
     if int(listed[0, 0]) == kept:
         threshold = max(threshold, int(listed[kept, 0]) + 1)
@@ -102,19 +109,25 @@ def vote(
             east = math.sin(gamma) * math.sin(azimuth[i])
             length = math.sqrt(math.cos(gamma) ** 2 + north * north)
             turn = math.atan2(north, math.cos(gamma))
+            longer = 1.0 / length - 1.0
             for j in range(first, stop):
-                s = sin_latitude[j] / length
-                t = east / cos_latitude[j]
-                if abs(s) >= 1.0 or abs(t) >= 1.0:
-                    continue
-                latitude = math.asin(s) - turn
+                t = east * secant[j]
+                # Series of both arcs: they are off by less than 1e-4 rad, a tenth of a cell.
+                if abs(tangent[j]) < 4.0 and abs(t) < 0.2:
+                    latitude = latitude_rad[j] + tangent[j] * longer - turn
+                    aside = t + t * t * t / 6.0
+                else:
+                    s = math.sin(latitude_rad[j]) / length
+                    if abs(s) >= 1.0 or abs(t) >= 1.0:
+                        continue
+                    latitude, aside = math.asin(s) - turn, math.asin(t)
                 y = (latitude - south) / cell
                 row = math.floor(y)
                 if row < 1 or row >= rows:
                     continue
-                away = longitude[j] - math.asin(t) - west
+                away = longitude[j] - aside - west
                 for r in range(row - 1, row + 1):
-                    x = away * math.cos(south + (r + 1.0) * cell) / cell
+                    x = away * columns_per_rad[r]
                     column = math.floor(x)
                     if column < 1 or column >= columns:
                         continue

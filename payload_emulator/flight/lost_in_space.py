@@ -34,6 +34,9 @@ NADIR_NORTH_UP: Float = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 
 
 FRAMES_COMBINED = 4
 
+# Candidates of each frame that take part in a search over several.
+_CANDIDATES_COMBINED = 12
+
 # Bins of rim height: half a bin moves a place by 350 m at the edge of the image.
 _HEIGHT_BIN_M = 400.0
 # The vote leaves out places this far from any crater.
@@ -102,16 +105,18 @@ class PlaceIndex:
     bin_start: Index
     bin_height_m: Float
     log_diameter: Float
-    sin_latitude: Float
-    cos_latitude: Float
+    latitude_rad: Float
+    tangent: Float
+    secant: Float
     longitude_rad: Float
     extent: Float
 
     @property
     def octets(self) -> int:
         """Size of what is kept beside the map."""
-        arrays = (self.bin_start, self.bin_height_m, self.log_diameter, self.sin_latitude, self.cos_latitude)
-        return int(sum(array.nbytes for array in arrays) + self.longitude_rad.nbytes)
+        bins = self.bin_start.nbytes + self.bin_height_m.nbytes
+        arrays = (self.log_diameter, self.latitude_rad, self.tangent, self.secant, self.longitude_rad)
+        return int(bins + sum(array.nbytes for array in arrays))
 
     def __len__(self) -> int:
         return int(self.log_diameter.size)
@@ -179,8 +184,9 @@ def place_index(landmarks: LandmarkMap) -> PlaceIndex:
         np.append(first, order.size).astype(np.int64),
         (values + 0.5) * _HEIGHT_BIN_M,
         log_diameter[order],
-        np.sin(latitude[order]),
-        np.cos(latitude[order]),
+        latitude[order],
+        np.tan(latitude[order]),
+        1.0 / np.cos(latitude[order]),
         west + np.mod(longitude[order] - west, 2.0 * math.pi),
         np.array([south, north, west, width, area]),
     )
@@ -236,9 +242,17 @@ def find_place(
     camera_from_enu: Float = NADIR_NORTH_UP,
 ) -> Place | None:
     """Return the place of a single frame, None where none is safe."""
-    return _believed(
+    return believed_place(
         candidate_places(found, sigma_px, index, camera, parameters, camera_from_enu), parameters
     )
+
+
+def believed_place(places: Sequence[Place], parameters: LostParameters = LostParameters()) -> Place | None:
+    """Return the best of candidate places if chance and all others leave it, None where none is safe."""
+    if not places or places[0].log_false > math.log(parameters.false_fix_limit):
+        return None
+    rival = places[1].log_false if len(places) > 1 else math.inf
+    return places[0] if rival - places[0].log_false > math.log(parameters.rival_ratio) else None
 
 
 def find_place_in_frames(
@@ -250,15 +264,27 @@ def find_place_in_frames(
 ) -> tuple[Place, ...] | None:
     """Return the places of frames seconds to a minute apart, one per frame that takes part; None where none is safe.
 
-    Places of different frames support each other if an orbit leads from one to the next: the distance is that of a
-    circular orbit to five per cent, altitude changes little, the heading stays. The last `FRAMES_COMBINED` frames
-    are used, each with its best places.
+    The last `FRAMES_COMBINED` frames are used, see `place_of_frames`.
     """
     frames = sorted(frames, key=lambda frame: frame.elapsed_s)[-FRAMES_COMBINED:]
-    per_frame = [
-        candidate_places(frame.found, frame.sigma_px, index, camera, parameters, camera_from_enu)[:12]
+    candidates = [
+        candidate_places(frame.found, frame.sigma_px, index, camera, parameters, camera_from_enu)
         for frame in frames
     ]
+    return place_of_frames(candidates, frames, parameters)
+
+
+def place_of_frames(
+    candidates: Sequence[Sequence[Place]],
+    frames: Sequence[LostFrame],
+    parameters: LostParameters = LostParameters(),
+) -> tuple[Place, ...] | None:
+    """Return the places of frames in order of time from the candidate places of each; None where none is safe.
+
+    Places of different frames support each other if an orbit leads from one to the next: the distance is that of a
+    circular orbit to five per cent, altitude changes little, the heading stays.
+    """
+    per_frame = [places[:_CANDIDATES_COMBINED] for places in candidates]
     chains: list[tuple[float, tuple[tuple[int, Place], ...]]] = []
     for number, places in enumerate(per_frame):
         grown: list[tuple[float, tuple[tuple[int, Place], ...]]] = []
@@ -327,8 +353,9 @@ def _voted(
             index.bin_start,
             index.bin_height_m,
             index.log_diameter,
-            index.sin_latitude,
-            index.cos_latitude,
+            index.latitude_rad,
+            index.tangent,
+            index.secant,
             index.longitude_rad,
             index.extent,
             cell,
@@ -444,14 +471,6 @@ def _log_trials(
     tilts = (1.0 + swing * edge_px**2 / camera.focal_px) ** 2
     turns = 1.0 + swing * edge_px
     return math.log(places * altitudes * tilts * turns)
-
-
-def _believed(places: list[Place], parameters: LostParameters) -> Place | None:
-    """Return the best place if chance and all others leave it, else None."""
-    if not places or places[0].log_false > math.log(parameters.false_fix_limit):
-        return None
-    rival = places[1].log_false if len(places) > 1 else math.inf
-    return places[0] if rival - places[0].log_false > math.log(parameters.rival_ratio) else None
 
 
 def _log_false_of_chain(chain: tuple[tuple[int, Place], ...], parameters: LostParameters) -> float:
