@@ -272,6 +272,13 @@ class Operator:
         return int(self.world.frame_utc_ns[after]) - moment.utc_ns < 2 * _BEFORE_ARC_NS
 
 
+class Nobody:
+    """Stands in for the operator where the ground commands."""
+
+    def orders(self, _moment: Moment, _mode: PayloadMode) -> bytes:
+        return b""
+
+
 def fly(world: World, spacecraft: Spacecraft) -> Generator[Flown]:
     """Fly the moments of a scenario in order."""
     operator = Operator(world)
@@ -285,7 +292,7 @@ def fly(world: World, spacecraft: Spacecraft) -> Generator[Flown]:
 def fly_moment(
     world: World,
     spacecraft: Spacecraft,
-    operator: Operator,
+    operator: Operator | Nobody,
     moment: Moment,
     exposure: Exposure | None,
     by_hand: bytes = b"",

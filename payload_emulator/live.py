@@ -30,6 +30,7 @@ from payload_emulator.flying import (
     SPACECRAFT_ID,
     Flown,
     Moment,
+    Nobody,
     Operator,
     craters_in_view,
     fly_moment,
@@ -154,6 +155,9 @@ class LivePayload:
         Simulated seconds in a second of the wall clock; 0: as quick as it goes.
     paused
         Whether time stands still until `run` or `step`.
+    has_operator
+        Whether the scenario's own operator commands, too; without it, telecommands come over TCP only, whose counts its
+        own would collide with.
     """
 
     world: World
@@ -165,6 +169,7 @@ class LivePayload:
     rate: float = 1.0
     paused: bool = False
     stop_at_end: bool = False
+    has_operator: bool = True
     stopping: threading.Event = field(default_factory=threading.Event)
     sent: int = 0
     _servers: dict[str, Server] = field(init=False)
@@ -211,7 +216,8 @@ class LivePayload:
             server.close()
 
     def _fly(self) -> None:
-        operator, frames = Operator(self.world), exposures(self.world)
+        operator = Operator(self.world) if self.has_operator else Nobody()
+        frames = exposures(self.world)
         moments = timeline(self.world)
         interval_ns = round(self.world.scenario.camera.frame_interval_s * _NS)
         last = moments[-1]

@@ -15,6 +15,7 @@ and ends the kills of the one under way.
 from __future__ import annotations
 
 import argparse
+import http.client
 import itertools
 import json
 import os
@@ -62,7 +63,7 @@ def ask(api: str, method: str, path: str, body: bytes | None = None, key: str = 
         except urllib.error.HTTPError as error:
             if error.code < 500:
                 raise SystemExit(f"{method} {path}: {error.code} {error.read()[:300]!r}") from None
-        except (OSError, ValueError):
+        except (OSError, ValueError, http.client.HTTPException):  # cut off in the middle of an answer
             pass
         if time.monotonic() > until:
             raise SystemExit(f"{method} {path}: no answer within {PATIENCE_S:.0f} s")

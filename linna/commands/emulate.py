@@ -48,6 +48,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="simulated seconds a second, 0: as quick as it goes (default: 1)",
     )
     live.add_argument("--paused", action="store_true", help="wait for run or step on the console")
+    live.add_argument(
+        "--no-operator",
+        action="store_true",
+        help="the ground commands: the scenario's own operator is silent",
+    )
     live.add_argument("--stop-at-end", action="store_true", help="end with the scenario")
     parser.add_argument(
         "--campaign", metavar="FILE", help="fly the fault campaign of a file, or a shipped one by name"
@@ -143,6 +148,7 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
         arguments.rate,
         arguments.paused,
         arguments.stop_at_end,
+        not arguments.no_operator,
     )
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: live.stopping.set())
