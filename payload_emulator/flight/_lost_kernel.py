@@ -31,7 +31,6 @@ def vote(
     log_diameter: Float,
     latitude_rad: Float,
     tangent: Float,
-    secant: Float,
     longitude: Float,
     extent: Float,
     cell: float,
@@ -56,8 +55,8 @@ def vote(
         Logarithm of crater diameter over depth, shape (k,).
     bin_start, bin_height
         Craters are sorted by bins of rim height and by diameter inside them: first of each bin (b + 1,), height (b,).
-    latitude_rad, tangent, secant
-        Latitude of the craters, its tangent and one over its cosine.
+    latitude_rad, tangent
+        Latitude of the craters and its tangent.
     extent
         South, north, west, east and area (sr) of the map; longitudes of the craters are west to west + 2 pi.
     cell
@@ -111,7 +110,7 @@ def vote(
             turn = math.atan2(north, math.cos(gamma))
             longer = 1.0 / length - 1.0
             for j in range(first, stop):
-                t = east * secant[j]
+                t = east * math.sqrt(1.0 + tangent[j] * tangent[j])
                 # Series of both arcs: they are off by less than 1e-4 rad, a tenth of a cell.
                 if abs(tangent[j]) < 4.0 and abs(t) < 0.2:
                     latitude = latitude_rad[j] + tangent[j] * longer - turn

@@ -107,7 +107,6 @@ class PlaceIndex:
     log_diameter: Float
     latitude_rad: Float
     tangent: Float
-    secant: Float
     longitude_rad: Float
     extent: Float
 
@@ -115,7 +114,7 @@ class PlaceIndex:
     def octets(self) -> int:
         """Size of what is kept beside the map."""
         bins = self.bin_start.nbytes + self.bin_height_m.nbytes
-        arrays = (self.log_diameter, self.latitude_rad, self.tangent, self.secant, self.longitude_rad)
+        arrays = (self.log_diameter, self.latitude_rad, self.tangent, self.longitude_rad)
         return int(bins + sum(array.nbytes for array in arrays))
 
     def __len__(self) -> int:
@@ -186,7 +185,6 @@ def place_index(landmarks: LandmarkMap) -> PlaceIndex:
         log_diameter[order],
         latitude[order],
         np.tan(latitude[order]),
-        1.0 / np.cos(latitude[order]),
         west + np.mod(longitude[order] - west, 2.0 * math.pi),
         np.array([south, north, west, width, area]),
     )
@@ -355,7 +353,6 @@ def _voted(
             index.log_diameter,
             index.latitude_rad,
             index.tangent,
-            index.secant,
             index.longitude_rad,
             index.extent,
             cell,
