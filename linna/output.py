@@ -23,12 +23,17 @@ def add_json_flag(parser: argparse.ArgumentParser) -> None:
 def emit(arguments: argparse.Namespace, figures: Mapping[str, Any], text: str | None = None) -> None:
     """Print `figures` as one JSON object if --json was given, else `text` (or the figures, a line each)."""
     if getattr(arguments, "json", False):
-        print(json.dumps(_plain(figures), allow_nan=False))
+        print(as_json(figures))
     elif text is not None:
         print(text)
     else:
         for key, value in figures.items():
             print(f"{key}: {value}")
+
+
+def as_json(figures: Mapping[str, Any]) -> str:
+    """`figures` as one JSON object; NaN and infinity are null."""
+    return json.dumps(_plain(figures), allow_nan=False)
 
 
 def log(message: str) -> None:

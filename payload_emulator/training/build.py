@@ -39,17 +39,20 @@ _TERRAIN_KINDS = {"real": "raster", "procedural": "procedural", "catalogue": "ca
 
 @dataclass(frozen=True, slots=True)
 class Shard:
-    """A run of frames of one source; along an ephemeris with their epochs, places in MCMF m and splits."""
+    """Frames of one source by their numbers; along an ephemeris with their epochs, places in MCMF m and splits."""
 
     name: str
     source: Source
     seed: int
     number: int
-    first_frame: int
-    frames: int
+    frame_numbers: tuple[int, ...]
     utc_ns: tuple[int, ...] = ()
     position_mcmf_m: tuple[tuple[float, float, float], ...] = ()
     split: tuple[str, ...] = ()
+
+    @property
+    def frames(self) -> int:
+        return len(self.frame_numbers)
 
 
 def plan_shards(recipe: Recipe, frames: int, tracks: Mapping[str, Track] | None = None) -> list[Shard]:
@@ -65,9 +68,12 @@ def plan_shards(recipe: Recipe, frames: int, tracks: Mapping[str, Track] | None 
             count = min(wanted - done, recipe.frames_per_shard)
             # Runs of one seed, so that a worker seldom has to open another terrain.
             seed = source.seeds[done * len(source.seeds) // wanted]
-            along = _along(track, slice(done, done + count)) if track is not None else {}
-            shards.append(Shard(f"{len(shards):05d}", source, seed, len(shards), first, count, **along))
-            first += count
+            # Along an ephemeris neighbours on the ground share a shard; frames keep their numbers by time.
+            places = range(done, done + count) if track is None else track.order[done : done + count].tolist()
+            numbers = tuple(first + place for place in places)
+            along = _along(track, places) if track is not None else {}
+            shards.append(Shard(f"{len(shards):05d}", source, seed, len(shards), numbers, **along))
+        first += wanted
     return shards
 
 
@@ -123,8 +129,7 @@ def make_shard(recipe: Recipe, shard: Shard, folder: Path, data_root: str) -> No
     camera = _camera(recipe)
     place = None if source.ephemeris else Place(draw_box(source, rng))
     shots, hashes = [], []
-    for k in range(shard.frames):
-        number = shard.first_frame + k
+    for k, number in enumerate(shard.frame_numbers):
 
         def pose_of(generator: np.random.Generator, k: int = k, number: int = number) -> Any:
             if place is not None:
@@ -235,11 +240,12 @@ def _lay_tracks(recipe: Recipe, frames: int, data: DataFolder) -> dict[str, Trac
     }
 
 
-def _along(track: Track, span: slice) -> dict[str, Any]:
+def _along(track: Track, places: Sequence[int]) -> dict[str, Any]:
+    chosen = list(places)
     return {
-        "utc_ns": tuple(int(value) for value in track.utc_ns[span]),
-        "position_mcmf_m": tuple((float(x), float(y), float(z)) for x, y, z in track.position_mcmf_m[span]),
-        "split": track.split[span],
+        "utc_ns": tuple(int(value) for value in track.utc_ns[chosen]),
+        "position_mcmf_m": tuple((float(x), float(y), float(z)) for x, y, z in track.position_mcmf_m[chosen]),
+        "split": tuple(track.split[place] for place in chosen),
     }
 
 

@@ -138,6 +138,7 @@ class Dataset:
         self._frames: list[Frame] = []
         for name in sorted(self.index["shards"]):
             self._frames.extend(shard_frames(load_shard(folder / "shards" / f"{name}.npz")))
+        self._frames.sort(key=lambda frame: frame.number)
 
     @property
     def width_px(self) -> int:

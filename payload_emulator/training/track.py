@@ -21,21 +21,26 @@ from payload_emulator.training.shots import allowed, edge_pixels
 _NS = 1_000_000_000
 _BATCH = 4096  # places looked at together: their footprints take a few MB
 _DAY_S = 86_400.0
+_STRIP_RAD = np.radians(10.0)  # a few footprints wide: the tiles of one crossing fit the terrain's cache
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """Frames along an ephemeris in order of time: epochs (n,), places (n, 3) in MCMF m, split of each (n,)."""
+    """Frames along an ephemeris in order of time: epochs (n,), places (n, 3) in MCMF m, split of each (n,).
+
+    order : indices (n,) in the order in which the frames are best made: neighbours on the ground follow each other.
+    """
 
     utc_ns: NDArray[np.int64]
     position_mcmf_m: NDArray[np.float64]
     split: tuple[str, ...]
+    order: NDArray[np.int64]
 
     @property
     def digest(self) -> str:
-        """Hash of the epochs and the places to the millimetre."""
+        """Hash of the epochs, the places to the millimetre and the order."""
         octets = self.utc_ns.tobytes() + np.rint(self.position_mcmf_m * 1e3).astype(np.int64).tobytes()
-        return hashlib.sha256(octets).hexdigest()
+        return hashlib.sha256(octets + self.order.tobytes()).hexdigest()
 
 
 def lay_track(
@@ -68,7 +73,22 @@ def lay_track(
             f"a longer ephemeris, a shorter step or fewer frames"
         )
     taken = np.array(kept[:wanted], dtype=np.int64)
-    return Track(utc_ns[taken], position[taken], split_track(source.split, wanted, seed))
+    order = order_by_ground(position[taken], camera, terrain)
+    return Track(utc_ns[taken], position[taken], split_track(source.split, wanted, seed), order)
+
+
+def order_by_ground(
+    position_mcmf_m: NDArray[np.float64], camera: PinholeCamera, terrain: Any
+) -> NDArray[np.int64]:
+    """Indices (n,) of places (n, 3) such that those over the same tiles of the terrain come together.
+
+    By level of the terrain, which follows from the altitude, then by strips along meridians, north and south in turn.
+    """
+    latitude, longitude, altitude_m = spherical_from_mcmf(position_mcmf_m)
+    level = np.array([terrain.level_for(above / camera.focal_px) for above in altitude_m], dtype=np.int64)
+    strip = (longitude % (2.0 * np.pi) // _STRIP_RAD).astype(np.int64)
+    northward = np.where((level + strip) % 2 == 0, latitude, -latitude)
+    return np.lexsort((northward, strip, level)).astype(np.int64)
 
 
 def split_track(split: str, count: int, seed: int) -> tuple[str, ...]:

@@ -75,7 +75,7 @@ def test_a_shard_does_not_depend_on_what_was_made_before(built, tmp_path):
         (tmp_path / name).mkdir()
     for shard in reversed(plan_shards(RECIPE, 3)[-2:]):
         make_shard(RECIPE, shard, tmp_path, "")
-        for path in (f"images/{shard.first_frame:06d}.png", f"shards/{shard.name}.npz"):
+        for path in (f"images/{shard.frame_numbers[0]:06d}.png", f"shards/{shard.name}.npz"):
             assert (tmp_path / path).read_bytes() == (folder / path).read_bytes(), path
 
 
@@ -175,7 +175,7 @@ def test_sixteen_bits_show_what_eight_do(built, tmp_path):
         (tmp_path / name).mkdir()
     shard = plan_shards(RECIPE, 3)[-1]
     make_shard(dataclasses.replace(RECIPE, bits=16), shard, tmp_path, "")
-    name = f"images/{shard.first_frame:06d}.png"
+    name = f"images/{shard.frame_numbers[0]:06d}.png"
     deep = cv2.imread(str(tmp_path / name), cv2.IMREAD_UNCHANGED)
     plain = cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED)
     assert deep.dtype == np.uint16 and np.unique(deep).size > 2000

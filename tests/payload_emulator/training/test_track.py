@@ -10,13 +10,13 @@ import pytest
 from lunar.camera import PinholeCamera
 from lunar.datafolder import find_data
 from lunar.ephemeris import ephemeris_from_states
-from lunar.frames import IauOrientation, spherical_from_mcmf
+from lunar.frames import IauOrientation, mcmf_from_spherical, spherical_from_mcmf
 from lunar.oem import save_oem
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.errors import DatasetError
 from payload_emulator.training.recipe import PAPER_SPLIT, Box, Source, load_recipe
 from payload_emulator.training.shots import pose_at
-from payload_emulator.training.track import lay_track, split_track
+from payload_emulator.training.track import lay_track, order_by_ground, split_track
 
 ROOT = Path(__file__).parents[3]
 START = parse_utc("2029-08-07T00:00:00Z")
@@ -38,6 +38,9 @@ class Everywhere:
 
     def height_m(self, latitude_rad, longitude_rad, level=0):
         return np.full(np.shape(latitude_rad), self.height)
+
+    def level_for(self, sample_m):
+        return int(sample_m > 200.0)
 
 
 @pytest.fixture(scope="module")
@@ -154,3 +157,27 @@ def test_the_shipped_recipe_of_the_papers_data_set_flies_the_shipped_orbit():
     altitude_km = spherical_from_mcmf(track.position_mcmf_m)[2] / 1e3
     # The paper's orbit flies between 14.0 and 48.6 km.
     assert altitude_km.min() > 13.0 and altitude_km.max() < 50.0
+
+
+def test_places_are_ordered_so_that_neighbours_on_the_ground_follow_each_other():
+    """A polar orbit of 250 revolutions, each 1.1 degrees west of the one before, passing 14 and 48 km in turn."""
+    step = np.arange(20_000)
+    latitude = 0.8 * np.sin(step / 12.0)
+    longitude = -step / 80.0 * math.radians(1.1)
+    altitude_m = np.where(np.cos(step / 12.0) > 0.0, 14e3, 48e3)
+    position = np.asarray(mcmf_from_spherical(latitude, longitude, altitude_m))
+    order = order_by_ground(position, CAMERA, Everywhere())
+    assert np.array_equal(np.sort(order), step)
+
+    def tiles(order):
+        """Squares of 3 degrees and levels within the last 100 frames, newly entered, per frame."""
+        degrees = np.degrees(latitude) // 3.0, np.degrees(longitude) % 360.0 // 3.0
+        keys = list(zip(degrees[0][order], degrees[1][order], altitude_m[order] > 30e3, strict=True))
+        return np.mean([key not in keys[max(0, n - 100) : n] for n, key in enumerate(keys)])
+
+    assert tiles(order) < 0.25 * tiles(step)
+
+
+def test_the_order_of_making_is_part_of_the_digest(polar_orbit):
+    track = lay_track(source(polar_orbit), CAMERA, Everywhere(), find_data(None), 40, 7)
+    assert dataclasses.replace(track, order=track.order[::-1]).digest != track.digest
