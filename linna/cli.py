@@ -27,6 +27,7 @@ GROUPS: dict[str, tuple[str, str]] = {
     "data": ("data", "the public data products: list, fetch, verify"),
     "catalogue": ("catalogue", "crater catalogues: statistics and on-board curation"),
     "camera": ("camera", "camera studies (field of view)"),
+    "navigation": ("navigation", "navigation of several pass archives side by side"),
     "identify": ("identify", "how often craters are found and taken for others"),
     "render": ("render", "render one frame of a scenario"),
     "dataset": ("dataset", "build, check and summarise detector data sets"),

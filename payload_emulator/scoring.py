@@ -48,6 +48,8 @@ _RIGHT_PX, _RIGHT_OF_DIAMETER = 6.0, 0.25
 _LOG_DIAMETER_GATE = 0.4
 # A fix that leaves the position further off than this is wrong, whatever it was made of.
 _WRONG_FIX_M = 1_000.0
+# After a disturbance the estimate is back once it is this close, and stays so for as many frames with an image.
+_BACK_M, _BACK_FRAMES = 500.0, 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,6 +142,7 @@ def score_navigation(
             "wrong_pairs_share": _ratio(float(right[:, 1].sum()), float(right.sum())),
             "wrong_fixes": int(np.sum(fixed & (wrong_share > 0.5))),
             "fixes_off_by_1_km": int(np.sum(fixed & off & (np.arange(outcomes.size) >= first))),
+            "recovery": _recovery(world, errors, imaging),
             "per_arc": rows,
         }
     }
@@ -352,6 +355,37 @@ def _arc_row(world: World, errors: FlownErrors, outcomes: Index, arc: tuple[int,
         "radial_bias_m": _means(errors.state_error_rtn[mine, :1])[0],
         "propagate_only_m": _percentile(errors.only_error_m[mine], 50.0),
     }
+
+
+def frames_to_recover(error_m: Float) -> int | None:
+    """Return which frame with an image is the first to be back (1: the first of all), None where none is.
+
+    Parameters
+    ----------
+    error_m
+        Position errors after the frames with an image since the disturbance, shape (n,).
+    """
+    close = error_m < _BACK_M
+    for first in np.flatnonzero(close).tolist():
+        if close[first : first + _BACK_FRAMES].all():
+            return first + 1
+    return None
+
+
+def _recovery(world: World, errors: FlownErrors, imaging: NDArray[np.bool_]) -> dict[str, Any] | None:
+    """How many frames with an image it took to be back after a kidnap or an outage; None without either."""
+    section = world.scenario.disturbances
+    if section.kidnap_distance_km > 0.0:
+        event = "kidnap told" if section.kidnap_told else "silent kidnap"
+        after_s = section.kidnap_at_s
+    elif section.outage_duration_s > 0.0:
+        event, after_s = "camera outage", section.outage_at_s + section.outage_duration_s
+    else:
+        return None
+    utc_ns = world.frame_utc_ns
+    since = (utc_ns[errors.frame] >= utc_ns[0] + round(after_s * _NS)) & imaging[errors.frame]
+    frames = frames_to_recover(errors.position_m[since])
+    return {"after": event, "frames_with_image": int(np.sum(since)), "frames_until_below_500_m": frames}
 
 
 def _statistics(values: Float) -> dict[str, Any]:

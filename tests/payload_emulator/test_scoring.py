@@ -1,0 +1,25 @@
+"""What the scores of a session count, on errors made by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from payload_emulator.scoring import frames_to_recover
+
+
+@pytest.mark.parametrize(
+    ("error_m", "frames"),
+    [
+        ([20_000.0, 300.0, 80.0, 60.0, 50.0, 40.0], 2),
+        ([100.0, 90.0, 80.0, 70.0], 1),
+        # One frame that happens to be close is no recovery.
+        ([5_000.0, 400.0, 5_000.0, 5_000.0, 300.0, 200.0, 100.0, 90.0], 5),
+        ([5_000.0, 5_000.0], None),
+        ([], None),
+    ],
+)
+def test_a_recovery_is_the_first_frame_from_which_the_error_stays_small(
+    error_m: list[float], frames: int | None
+) -> None:
+    assert frames_to_recover(np.array(error_m)) == frames
