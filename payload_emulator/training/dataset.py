@@ -28,7 +28,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.camera import PinholeCamera, intersect_sphere
 from lunar.catalogue import size_class
+from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import DatasetError
 from payload_emulator.training.scoring import FrameTruth
 from payload_emulator.training.targets import Tier
@@ -153,6 +155,12 @@ class Dataset:
         return self.width_px / 2.0 / math.tan(math.radians(self.index["camera"]["fov_deg"]) / 2.0)
 
     @property
+    def camera(self) -> PinholeCamera:
+        return PinholeCamera(
+            self.width_px, self.height_px, math.radians(self.index["camera"]["fov_deg"])
+        )
+
+    @property
     def digest(self) -> str:
         """Hash over the labels of all shards."""
         shards = self.index["shards"]
@@ -227,17 +235,21 @@ def diameter_on_ground_m(
     diameter_px: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Diameters that a payload knowing its altitude above the mean ground gives to detections of the frame."""
-    from lunar.camera import PinholeCamera, intersect_sphere
-    from lunar.constants import MOON_RADIUS_M
-
-    camera = PinholeCamera(
-        dataset.width_px, dataset.height_px, math.radians(dataset.index["camera"]["fov_deg"])
-    )
+    camera = dataset.camera
     rays = camera.rays(np.stack([u_px, v_px], axis=-1))
     heading = rays @ frame.camera_from_mcmf
     ground = MOON_RADIUS_M + frame.values["ground_m"]
     reach = intersect_sphere(frame.position_mcmf_m, heading, ground)
     return np.asarray(diameter_px * reach * rays[..., 2] / camera.focal_px)
+
+
+def ground_points(
+    dataset: Dataset, frame: Frame, u_px: NDArray[np.float64], v_px: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Points (n, 3) of the mean ground that pixels of a frame look at, MCMF m; NaN beside the Moon."""
+    heading = dataset.camera.rays(np.stack([u_px, v_px], axis=-1)) @ frame.camera_from_mcmf
+    reach = intersect_sphere(frame.position_mcmf_m, heading, MOON_RADIUS_M + frame.values["ground_m"])
+    return np.asarray(frame.position_mcmf_m + reach[:, None] * heading)
 
 
 def write_shard(folder: Path, name: str, labels: ShardLabels) -> str:

@@ -149,8 +149,8 @@ def _exposed(
     if bits == 8:
         image = gray_levels(expose(radiance, sensor, rng))
         return image, image
-    colours = expose_deep(radiance, replace(sensor, bits=bits), rng)
-    total = colours.astype(np.uint32).sum(axis=-1)
+    red, green, blue = np.moveaxis(expose_deep(radiance, replace(sensor, bits=bits), rng), -1, 0)
+    total = red.astype(np.uint32) + green + blue  # a sum along an axis of three is ten times slower
     deep = ((total + 1) // 3).astype(np.uint16)
     return deep, (deep >> 8).astype(np.uint8)
 
