@@ -94,6 +94,18 @@ class RegressionOut(schemas.Schema):
     result: dict[str, Any] = Field(description="As printed by `linna regress run --json`")
 
 
+class RegressionItem(schemas.Schema):
+    """One line of the list of verdicts."""
+
+    id: str
+    verdict: str = Field(description="pass, fail or incomplete", examples=["pass"])
+    candidate: str = Field(description="Identity of the build that was judged")
+    baseline: str = Field(description="Identity of the build it was held against")
+    gates: int = Field(description="Gates that were judged")
+    gates_failed: int
+    created: str
+
+
 @regressions.get("/builds", response_model=schemas.PageOf[BuildOut])
 def list_builds(ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Offset = 0) -> Any:
     """Registered builds, the newest first."""
@@ -145,6 +157,26 @@ def start_regression(
     identity = dispatcher.submit("regression", arguments, job_id=job_id)
     response.headers["Location"] = f"{API_PREFIX}/regressions/{identity}"
     return get_job(ground, caller, identity)
+
+
+@regressions.get("/regressions", response_model=schemas.PageOf[RegressionItem])
+def list_regressions(ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Offset = 0) -> Any:
+    """Verdicts, the newest first."""
+    with ground.database.reading() as connection:
+        page = repository.page(connection, repository.REGRESSIONS, limit=limit, offset=offset)
+    items = [
+        RegressionItem(
+            id=row["id"],
+            verdict=row["verdict"],
+            candidate=row["candidate_digest"],
+            baseline=row["baseline_digest"],
+            gates=len(row["result"]["gates"]),
+            gates_failed=sum(not gate["passed"] for gate in row["result"]["gates"]),
+            created=time_text(row["created_utc_ns"]),
+        )
+        for row in page.rows
+    ]
+    return page_of(items, page.total, limit, offset)
 
 
 @regressions.get("/regressions/{regression_id}", response_model=RegressionOut)

@@ -34,10 +34,10 @@ from ground_service.services import ephemerides as ephemeris_service
 from ground_service.services import passes as pass_service
 from ground_service.services.ingest import FLOWN
 from ground_service.services.jobs import enter_ingest
-from ground_service.services.passes import STATE_VALUES
 from ground_service.services.plan_schemas import time_of
 from ground_service.services.report_overview import report_overview
 from ground_service.services.reports import pass_summary
+from ground_service.services.series import STATE_VALUES
 from ground_service.services.upkeep import spacecraft_trends, trend_view
 from ground_service.services.views import (
     ephemeris_view,
@@ -361,10 +361,17 @@ def request_report(
 
 
 @router.get("/jobs", response_model=schemas.PageOf[schemas.Job])
-def list_jobs(ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Offset = 0) -> Any:
-    """Jobs, the newest first."""
+def list_jobs(
+    ground: GroundOf,
+    _: Viewer,
+    kind: Annotated[str | None, Query(max_length=40, examples=["regression"])] = None,
+    limit: Limit = 100,
+    offset: Offset = 0,
+) -> Any:
+    """Jobs, the newest first; those of one kind where it is named."""
+    equal: dict[str, Any] = {} if kind is None else {"kind": kind}
     with ground.database.reading() as connection:
-        page = repository.page(connection, repository.JOBS, limit=limit, offset=offset)
+        page = repository.page(connection, repository.JOBS, limit=limit, offset=offset, **equal)
     return page_of([job_view(row) for row in page.rows], page.total, limit, offset)
 
 

@@ -13,7 +13,7 @@ from ground_service.errors import NotFound
 from ground_service.processing.downsampling import downsample
 from ground_service.services.ground import Ground
 from ground_service.store import repository
-from ground_service.store.files import FileStore
+from ground_service.store.files import FileArchive
 
 _TEXTS = ("title", "verdict", "verdict_level", "evidence_rung", "created_utc", "headline", "not_available")
 
@@ -37,7 +37,7 @@ def report_overview(ground: Ground, report_id: str, max_points: int) -> dict[str
 
 
 @lru_cache(maxsize=64)
-def _overview(files: FileStore, sha256: str, max_points: int) -> dict[str, Any]:
+def _overview(files: FileArchive, sha256: str, max_points: int) -> dict[str, Any]:
     """The document of a hash never changes, so neither does what was made of it."""
     document = json.loads(files.get(sha256))
     return {

@@ -97,11 +97,11 @@ function showCompleteness(found) {
 }
 
 async function showStates(estimators) {
+  const map = moonMap(byId("map"));
   const answers = await Promise.all(
-    estimators.map((name) => get(`passes/${passId}/states`, { estimator: name, value: STATES, max_points: 1000 }).catch(() => null)),
+    estimators.map((name) => get(`passes/${passId}/states`, { estimator: name, value: STATES, max_points: 600 }).catch(() => null)),
   );
   const found = answers.filter((answer) => answer?.series[0].samples);
-  const map = moonMap(byId("map"));
   const bounds = [];
   found.forEach((one, index) => {
     const [latitude, longitude] = one.series.map((series) => columns(series.buckets, seconds).mean);
@@ -124,7 +124,7 @@ async function showStates(estimators) {
 
 async function showParameter() {
   const name = byId("parameter").value;
-  const series = await get(`passes/${passId}/telemetry/${name}`, { max_points: 1000 });
+  const series = await get(`passes/${passId}/telemetry/${name}`, { max_points: 600 });
   show("housekeeping");
   chart(byId("housekeeping"), words(name), series.unit, [{ label: words(name), ...columns(series.buckets, seconds) }], { group: "pass" });
 }

@@ -16,10 +16,7 @@ async function openReport(id) {
   window.open(URL.createObjectURL(await answer.blob()), "_blank", "noopener");
 }
 
-function verdictOf(job, regression) {
-  if (!regression) return stateMark(job.state);
-  return stateMark({ pass: "passed", fail: "failed" }[regression.verdict] ?? regression.verdict);
-}
+const verdictMark = (verdict) => stateMark({ pass: "passed", fail: "failed" }[verdict] ?? verdict);
 
 function gateRows(regression) {
   const failed = regression.result.gates.filter((gate) => !gate.passed);
@@ -37,29 +34,45 @@ function gateRows(regression) {
   );
 }
 
+// Verdicts that are there, and above them the jobs that have none: on their way, or failed.
+async function regressionRows() {
+  const [verdicts, jobs] = await Promise.all([get("regressions", { limit: LATEST }), get("jobs", { kind: "regression", limit: LATEST })]);
+  const waiting = jobs.items.filter((job) => job.state !== "done");
+  const rows = [
+    ...waiting.map((job) => ({ created: job.created, candidate: job.arguments.candidate, baseline: job.arguments.baseline, job })),
+    ...verdicts.items.map((item) => ({ ...item, verdict: item })),
+  ];
+  return { rows: rows.sort((a, b) => b.created.localeCompare(a.created)), total: verdicts.total };
+}
+
+function outcomeOf({ job, verdict }) {
+  if (verdict) return `${figure(verdict.gates - verdict.gates_failed)} of ${figure(verdict.gates)} gates passed`;
+  return job.state === "running" ? element("progress", { max: 1, value: job.progress, "aria-label": "regression" }) : (job.error ?? "");
+}
+
 async function loadRegressions() {
-  const jobs = (await get("jobs", { limit: 500 })).items.filter((job) => job.kind === "regression").slice(0, LATEST);
-  const found = await Promise.all(
-    jobs.map(async (job) => ({ job, regression: job.state === "done" ? await get(`regressions/${job.id}`).catch(() => null) : null })),
-  );
+  const { rows, total } = await regressionRows();
   show(
     "regressions",
     table(
       "Regressions",
       [
-        ["Entered", (row) => timeText(row.job.created)],
-        ["Candidate", (row) => String(row.job.arguments.candidate ?? "").slice(0, 12)],
-        ["Baseline", (row) => String(row.job.arguments.baseline ?? "").slice(0, 12)],
-        ["Verdict", (row) => verdictOf(row.job, row.regression)],
-        ["", (row) => (row.job.state === "running" ? element("progress", { max: 1, value: row.job.progress, "aria-label": "regression" }) : (row.job.error ?? ""))],
-        ["", (row) => (row.regression ? element("span", { class: "actions" }, element("button", { type: "button", onclick: () => toggle(row.job.id) }, "Gates"), element("button", { type: "button", onclick: acting(() => openReport(row.job.id)) }, "Report")) : "")],
+        ["Entered", (row) => timeText(row.created)],
+        ["Candidate", (row) => String(row.candidate ?? "").slice(0, 12)],
+        ["Baseline", (row) => String(row.baseline ?? "").slice(0, 12)],
+        ["Verdict", (row) => (row.verdict ? verdictMark(row.verdict.verdict) : stateMark(row.job.state))],
+        ["Outcome", outcomeOf],
+        ["", ({ verdict }) => (verdict ? element("span", { class: "actions" }, element("button", { type: "button", onclick: () => toggle(verdict.id) }, "Gates"), element("button", { type: "button", onclick: acting(() => openReport(verdict.id)) }, "Report")) : "")],
       ],
-      found,
+      rows,
       "No regression has been run.",
     ),
   );
-  const shown = found.find((row) => row.job.id === open)?.regression;
-  if (shown) byId("regressions").append(element("h3", {}, `Gates of ${timeText(shown.created)}`), gateRows(shown));
+  if (total > LATEST) byId("regressions").append(element("p", { class: "hint" }, `The ${LATEST} newest of ${figure(total)} verdicts.`));
+  if (rows.some((row) => row.verdict?.id === open)) {
+    const shown = await get(`regressions/${open}`);
+    byId("regressions").append(element("h3", {}, `Gates of ${timeText(shown.created)}`), gateRows(shown));
+  }
 }
 
 function toggle(id) {

@@ -1,6 +1,7 @@
 """The HTTP interface: operations, problem documents, authorisation, limits."""
 
 import json
+import math
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -126,6 +127,30 @@ def test_series_are_made_short_with_their_extremes(client: TestClient) -> None:
     assert is_problem(client.get(f"{V1}/passes/1/states", params={"value": "salary"}), 422)
 
 
+def test_a_page_gets_the_head_of_a_report_and_its_errors_made_short(client: TestClient) -> None:
+    job = client.get(client.post(f"{V1}/passes/1/reports").headers["location"]).json()
+    address = f"{V1}/reports/{job['result']['report_id']}"
+    whole = client.get(address, params={"format": "json"}).json()
+    answer = client.get(f"{address}/overview", params={"max_points": 7})
+    short = answer.json()
+    assert short["verdict"] == whole["verdict"]
+    assert short["headline"] == whole["headline"]
+    assert [one["name"] for one in short["navigation"]] == [one["name"] for one in whole["navigation"]]
+    for brief, full in zip(short["navigation"], whole["navigation"], strict=True):
+        known = [math.hypot(*error) for error in full["error_rtn_m"] if None not in error]
+        assert len(brief["time_s"]) == min(7, len(known))
+        assert min(brief["min_m"]) == pytest.approx(min(known), abs=1e-3)
+        assert max(brief["max_m"]) == pytest.approx(max(known), abs=1e-3)
+        columns = ("min_m", "max_m", "mean_m", "after_gap")
+        assert all(len(brief[column]) == len(brief["time_s"]) for column in columns)
+    again = client.get(
+        f"{address}/overview", params={"max_points": 7}, headers={"if-none-match": answer.headers["etag"]}
+    )
+    assert (again.status_code, again.content) == (304, b"")
+    assert is_problem(client.get(f"{V1}/reports/{'0' * 32}/overview"), 404)
+    assert is_problem(client.get(f"{address}/overview", params={"max_points": 0}), 422)
+
+
 def test_a_report_is_made_and_read_as_html_and_json(client: TestClient) -> None:
     asked = client.post(f"{V1}/passes/1/reports")
     assert asked.status_code == 202
@@ -237,6 +262,7 @@ MATRIX = [
     ("GET", f"/jobs/{'0' * 32}", "viewer"),
     ("GET", f"/reports/{'0' * 32}", "viewer"),
     ("GET", f"/reports/{'0' * 32}/summary", "viewer"),
+    ("GET", f"/reports/{'0' * 32}/overview", "viewer"),
 ]
 
 

@@ -62,6 +62,21 @@ def test_a_build_is_registered_held_against_another_and_judged(
         assert found["result"]["passes"][0]["archive"] == kept.json()["digest"]
         report = client.get(f"{job.headers['location']}/report")
         assert "Regression report" in report.text
+    listed = client.get(f"{V1}/regressions").json()
+    assert [(one["verdict"], one["candidate"], one["baseline"]) for one in listed["items"]] == [
+        ("fail", digests[1], digests[0]),
+        ("pass", digests[0], digests[0]),
+    ]
+    failed, passed = listed["items"]
+    assert failed["gates_failed"] > 0
+    assert (passed["gates_failed"], passed["gates"]) == (
+        0,
+        len(client.get(f"{V1}/regressions/{passed['id']}").json()["result"]["gates"]),
+    )
+    second = client.get(f"{V1}/regressions", params={"limit": 1, "offset": 1}).json()
+    assert (second["items"], second["total"]) == ([passed], 2)
+    kinds = {one["kind"] for one in client.get(f"{V1}/jobs", params={"kind": "regression"}).json()["items"]}
+    assert kinds == {"regression"}
     replays = [item for item in client.get(f"{V1}/jobs").json()["items"] if item["kind"] == "replay"]
     assert len(replays) == 2  # the good build's was not done again
 
@@ -83,6 +98,10 @@ def test_a_regression_of_nothing_known_is_refused(
 
 def test_a_verdict_that_is_not_there_is_not_found(client: TestClient) -> None:
     assert client.get(f"{V1}/regressions/{'0' * 32}").status_code == 404
+
+
+def test_the_list_of_verdicts_is_empty_at_first(client: TestClient) -> None:
+    assert client.get(f"{V1}/regressions").json() == {"items": [], "total": 0, "limit": 100, "offset": 0}
 
 
 def test_something_else_than_a_zip_is_no_build(client: TestClient) -> None:

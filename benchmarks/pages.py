@@ -1,0 +1,197 @@
+"""Time to interactive of every page over a full database: python -m benchmarks.pages [--passes N] [--rows N].
+
+A service with so many passes of one spacecraft and so many rows of housekeeping is seeded and served, and every page is
+opened in Chromium with an empty cache, three times. A page is interactive when it has handled the last answer it asked
+for and its main thread is idle; the middle of the three is printed, with the processor time that the page's main thread
+took, which a busy machine does not stretch. `--home` opens the pages of an existing service's home instead.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ground_service.services.ground import open_ground
+from ground_service.services.passes import define_pass
+from ground_service.store import repository
+from ground_service.store.rollups import HOUSEKEEPING_VALUES, add_to_rollups
+from lunar.timescales import parse_utc, ticks_from_utc_ns
+from tmtc.dictionary import DICTIONARY
+
+SPACECRAFT = 76
+START = parse_utc("2029-08-07T00:00:00Z")
+TICKS_A_SECOND = 65_536
+PASS_S = 7_200
+_CHUNK = 500_000
+_TIMES = 3
+_QUIET_MS = 400
+_LIMIT_MS = 60_000
+_CHROMIUM = "/usr/bin/chromium"
+_FLAGS = ("--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update")
+
+# Notes when nothing that was asked for is missing any more and the main thread has come to rest.
+_WATCH = """
+(() => {
+  const asked = window.fetch;
+  const state = (window.linnaBench = { open: 0, idle: null });
+  const rest = () => requestIdleCallback(() => { if (state.open === 0) state.idle = performance.now(); });
+  window.fetch = async (...words) => {
+    state.open += 1;
+    state.idle = null;
+    try {
+      const answer = await asked(...words);
+      await answer.clone().arrayBuffer();
+      return answer;
+    } finally {
+      state.open -= 1;
+      setTimeout(rest, 0);
+    }
+  };
+  window.addEventListener("load", () => setTimeout(rest, 0));
+})();
+"""
+
+
+def seed(home: Path, passes: int, rows: int) -> None:
+    """A database of passes one after another, and a housekeeping report every second from the first on."""
+    with open_ground(home) as ground:
+        for number in range(passes):
+            start = START + number * 3 * PASS_S * 1_000_000_000
+            define_pass(
+                ground,
+                name=f"pass {number + 1}",
+                start_utc_ns=start,
+                stop_utc_ns=start + PASS_S * 1_000_000_000,
+                spacecraft_id=SPACECRAFT,
+            )
+        first = int(ticks_from_utc_ns(START))
+        for begin in range(0, rows, _CHUNK):
+            with ground.database.writing() as connection:
+                vehicle = repository.vehicle_id(connection, SPACECRAFT, "flown")
+                _housekeeping(connection, vehicle, first, begin, min(_CHUNK, rows - begin))
+
+
+def _housekeeping(connection: Any, vehicle: int, first: int, begin: int, count: int) -> None:
+    """Rows and roll-ups of so many seconds; the temperature goes up and down with the orbit, all else stands."""
+    version = DICTIONARY.version
+    names = ", ".join(HOUSEKEEPING_VALUES)
+    values = ", ".join(
+        "abs(i % 7000 - 3500) / 100.0" if n == "temperature_c" else "1" for n in HOUSEKEEPING_VALUES
+    )
+    connection.exec_driver_sql(
+        f"WITH RECURSIVE n(i) AS (SELECT {begin} UNION ALL SELECT i + 1 FROM n WHERE i + 1 < {begin + count}) "
+        f"INSERT INTO housekeeping (vehicle_id, dictionary_version, ticks, packet_id, {names}) "
+        f"SELECT {vehicle}, {version}, {first} + i * {TICKS_A_SECOND}, i + 1, {values} FROM n"
+    )
+    i = np.arange(begin, begin + count)
+    columns = {name: np.ones(count) for name in HOUSEKEEPING_VALUES}
+    columns["temperature_c"] = np.abs(i % 7000 - 3500) / 100.0
+    add_to_rollups(
+        connection, vehicle, version, "housekeeping", {**columns, "ticks": first + i * TICKS_A_SECOND}
+    )
+
+
+@contextmanager
+def served(home: Path) -> Iterator[str]:
+    """The address of `linna serve` over a home."""
+    log = home / "serve.log"
+    command = [sys.executable, "-m", "linna", "serve", "--port", "0", "--home", str(home)]
+    with log.open("wb") as stream:
+        process = subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT)
+    try:
+        for _ in range(1200):
+            text = log.read_text(errors="replace")
+            if "startup complete" in text:
+                break
+            if process.poll() is not None:
+                raise RuntimeError(f"the service did not start:\n{text}")
+            time.sleep(0.1)
+        yield text.split("ground service on ", 1)[1].split()[0].rstrip("/")
+    finally:
+        process.terminate()
+        process.wait(30)
+
+
+def measure(url: str, paths: Sequence[str]) -> dict[str, dict[str, int]]:
+    """Milliseconds to interactive, and of the main thread's processor, of each page."""
+    from playwright.sync_api import sync_playwright
+
+    found: dict[str, dict[str, int]] = {}
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=_CHROMIUM, args=list(_FLAGS))
+        for path in paths:
+            opened = [_opened(chromium, url + path) for _ in range(_TIMES)]
+            clock, processor = (round(statistics.median(one)) for one in zip(*opened, strict=True))
+            found[path] = {"clock": clock, "main_thread": processor}
+        chromium.close()
+    return found
+
+
+def _opened(chromium: Any, address: str) -> tuple[float, float]:
+    context = chromium.new_context(viewport={"width": 1280, "height": 900})
+    page = context.new_page()
+    page.add_init_script(_WATCH)
+    session = context.new_cdp_session(page)
+    session.send("Performance.enable", {"timeDomain": "threadTicks"})
+    page.goto(address)
+    page.wait_for_function(
+        f"() => linnaBench.open === 0 && linnaBench.idle !== null && performance.now() - linnaBench.idle > {_QUIET_MS}",
+        timeout=_LIMIT_MS,
+    )
+    at = float(page.evaluate("() => linnaBench.idle"))
+    metrics = {one["name"]: one["value"] for one in session.send("Performance.getMetrics")["metrics"]}
+    context.close()
+    return at, 1e3 * metrics["TaskDuration"]
+
+
+def bench(passes: int, rows: int, home: Path | None) -> dict[str, Any]:
+    """Milliseconds to interactive of every page, and what the database held."""
+    pages = [
+        "/",
+        "/planner",
+        "/passes",
+        "/passes/1",
+        "/telemetry",
+        "/commands",
+        "/regression",
+        "/live",
+        "/licences",
+    ]
+    if home is not None:
+        with served(home) as url:
+            return {"interactive_ms": measure(url, pages)}
+    folder = Path(tempfile.mkdtemp(prefix="linna-pages-"))
+    try:
+        clock = time.perf_counter()
+        seed(folder, passes, rows)
+        seeded = time.perf_counter() - clock
+        with served(folder) as url:
+            found = measure(url, [*pages, f"/telemetry?pass={passes}"])
+        return {"passes": passes, "rows": rows, "seed_s": round(seeded), "interactive_ms": found}
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--passes", type=int, default=1_000)
+    parser.add_argument("--rows", type=int, default=10_000_000)
+    parser.add_argument("--home", type=Path, help="open the pages of this home; nothing is seeded")
+    arguments = parser.parse_args()
+    print(json.dumps(bench(arguments.passes, arguments.rows, arguments.home), indent=2))
+
+
+if __name__ == "__main__":
+    main()
