@@ -50,6 +50,8 @@ _BUFFER_LIMIT = 1 << 20
 _SHOWN_CRATERS = 200
 _SMALLEST_SHOWN_PX = 6.0
 _CONSOLE_SOURCE = 2
+_CONSOLE_COUNTS = 1 << 13
+"""The console counts from here on: reports name a telecommand by its count, and the ground's begin at 0."""
 
 
 @dataclass(slots=True)
@@ -178,7 +180,7 @@ class LivePayload:
     _words: bytes = b""
     _steps: int = 0
     _discontinuous: bool = False
-    _console_count: int = 0
+    _console_count: int = _CONSOLE_COUNTS
     _transmitter: Transmitter = field(init=False)
 
     def __post_init__(self) -> None:
@@ -315,6 +317,7 @@ class LivePayload:
         orders = b"".join(self._orders)
         self._orders.clear()
         observing = self.spacecraft.payload.mode is PayloadMode.observing
+        self._discontinuous &= observing
         if self._discontinuous and observing and moment.frame > 0:
             self._discontinuous = False
             orders += DICTIONARY.pack_command(
@@ -323,7 +326,7 @@ class LivePayload:
                 sequence_count=self._console_count,
                 source=_CONSOLE_SOURCE,
             )
-            self._console_count = (self._console_count + 1) & 0x3FFF
+            self._console_count = _CONSOLE_COUNTS | (self._console_count + 1) & (_CONSOLE_COUNTS - 1)
         return orders
 
     def _tell(self, flown: Flown) -> None:

@@ -37,6 +37,12 @@ def listens(port: int) -> bool:
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
+def connected(port: int) -> bool:
+    """Whether somebody is connected to a port of this machine, by what the kernel says."""
+    rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    return any(row[1].endswith(f":{port:04X}") and row[3] == "01" for row in rows)
+
+
 class Part:
     """A process of the deployment that can be killed with all its children and started again."""
 

@@ -1,0 +1,288 @@
+"""A day's operations against a payload that flies live: plan, uplink, execution, downlink, ingest, report.
+
+    python -m benchmarks.campaigns.operations_day [SCENARIO] [--minutes M] [--distributed] [--json]
+
+Starts the ground service (SQLite; `--distributed`: PostgreSQL, Redis and two workers) and `linna emulate SCENARIO
+--live --no-operator` on private ports, works as the operators would, with `linna` and over HTTP, and prints what was
+typed and what was answered. Nothing commands the payload but the ground. Exit status 1 where the day does not end as
+planned: window processed, every telecommand completed, no packet lost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from benchmarks.campaigns._deployment import (
+    Deployment,
+    Laptop,
+    connected,
+    free_port,
+    listens,
+    service_environment,
+    wait_until,
+)
+from ground_service.client import Client
+from linna.cli import run
+from lunar.timescales import format_utc, parse_utc
+from payload_emulator.flying import SPACECRAFT_ID
+from payload_emulator.scenario import load_scenario
+
+NS = 1_000_000_000
+DAY_NS = 86_400 * NS
+LEAD_S = 180
+"""From the payload's first moment to the first planned one: time for the telecommands to take effect."""
+
+AFTER_S = 90
+SLOW_RATE = 3
+"""While the operators look; a pause would have the payload's odometries start anew."""
+PATIENCE_S = 300.0
+
+
+@dataclass(slots=True)
+class Transcript:
+    """What the operators type, and what they are told."""
+
+    where: list[str]
+    echo: bool = True
+    lines: list[str] = field(default_factory=list)
+
+    def say(self, text: str) -> None:
+        self.lines.append(text)
+        if self.echo:
+            print(text, flush=True)
+
+    def linna(self, *words: object) -> None:
+        """One command of the operators, at the server."""
+        typed = [str(word) for word in words]
+        self.say("$ linna " + " ".join(typed))
+        printed, told = io.StringIO(), io.StringIO()
+        remote = [] if typed[0] == "orbit" else self.where
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(told):
+            code = run([*typed, *remote])
+        for line in printed.getvalue().rstrip().splitlines():
+            self.say(f"  {line}")
+        if code:
+            raise SystemExit(f"linna {' '.join(typed)}: exit status {code}: {told.getvalue().strip()}")
+
+
+class Payload:
+    """`linna emulate --live`, watched on its console."""
+
+    def __init__(self, scenario: str, log: Path) -> None:
+        self.telemetry, self.telecommands, console = free_port(), free_port(), free_port()
+        command = [
+            sys.executable, "-m", "linna", "emulate", scenario, "--live", "--no-operator", "--paused", "--rate", "0",
+            "--port", str(self.telemetry), "--tc-port", str(self.telecommands), "--console-port", str(console),
+        ]  # fmt: skip
+        with log.open("ab") as stream:
+            self.process = subprocess.Popen(command, stdout=stream, stderr=stream)
+        wait_until(
+            lambda: listens(console) or self.process.poll() is not None, f"payload ({log.read_text()[-300:]})"
+        )
+        self._console = socket.create_connection(("127.0.0.1", console), timeout=PATIENCE_S)
+        self._messages = self._console.makefile("r")
+
+    def order(self, word: str) -> None:
+        """A word to the console."""
+        self._console.sendall(word.encode() + b"\n")
+
+    def fly(self, until_utc_ns: int | None = None) -> tuple[int, str]:
+        """Go on until a time, and slowly from then on (one moment without a time); the payload's time and mode."""
+        for word in ["step"] if until_utc_ns is None else ["rate 0", "run"]:
+            self.order(word)
+        for line in self._messages:
+            message = json.loads(line)
+            if "utc" not in message:
+                continue
+            now = parse_utc(message["utc"])
+            if until_utc_ns is None or now >= until_utc_ns:
+                if until_utc_ns is not None:
+                    self.order(f"rate {SLOW_RATE}")
+                return now, str(message["mode"])
+        raise SystemExit("the payload's console ended")
+
+    def stop(self) -> None:
+        with contextlib.suppress(OSError):
+            self.order("quit")
+            self._console.close()
+        try:
+            self.process.wait(30)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+
+@contextmanager
+def station(port: int, server: str, home: Path, log: Path) -> Iterator[None]:
+    """`linna ingest --tcp`: what comes from the payload goes into the archive as it comes."""
+    command = [
+        sys.executable,
+        "-m",
+        "linna",
+        "ingest",
+        "--tcp",
+        f"127.0.0.1:{port}",
+        "--follow",
+        "--server",
+        server,
+    ]
+    with log.open("ab") as stream:
+        process = subprocess.Popen(
+            command, stdout=stream, stderr=stream, env=service_environment(LINNA_HOME=str(home))
+        )
+    try:
+        wait_until(lambda: connected(port), "the station's connection to the payload")
+        yield
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(60)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def rehearse(
+    scenario: str, folder: Path, *, distributed: bool, minutes: float, echo: bool
+) -> tuple[list[str], dict[str, Any]]:
+    """Do it; the transcript, and how it ended."""
+    started = time.monotonic()
+    service = Deployment(folder) if distributed else Laptop(folder)
+    desk = Transcript(["--server", service.api], echo)
+    payload: Payload | None = None
+    try:
+        payload = Payload(scenario, folder / "payload.log")
+        now, mode = payload.fly()
+        desk.say(
+            f"# the payload is alive at {format_utc(now)[:19]}Z, mode {mode}; telemetry and telecommands over TCP"
+        )
+        with Client(service.api) as api:
+            window = plan(desk, api, scenario, folder, now, minutes)
+            with station(payload.telemetry, service.api, folder / "station", folder / "station.log"):
+                execute(desk, api, payload, window)
+            payload.stop()
+            figures = evaluate(desk, api, window, folder)
+    finally:
+        if payload is not None:
+            payload.stop()
+        service.stop()
+    figures |= {"distributed": distributed, "scenario": scenario, "wall_s": round(time.monotonic() - started)}
+    return desk.lines, figures
+
+
+def plan(desk: Transcript, api: Client, scenario: str, folder: Path, now_utc_ns: int, minutes: float) -> int:
+    """Reference ephemeris, search, window, approval, telecommands; the window."""
+    given = load_scenario(scenario)
+    start = now_utc_ns + LEAD_S * NS
+    stop = start + round(minutes * 60) * NS
+    epoch = parse_utc(given.orbit.epoch)
+    days = math.ceil(10 * ((stop + 3600 * NS - epoch) / DAY_NS)) / 10
+    reference = folder / "reference.oem"
+    desk.linna("orbit", "propagate", scenario, "--days", days, "--step", 60, "--out", reference)
+    desk.linna("plan", "ephemeris", reference)
+    desk.linna(
+        "plan", "search", "--start", format_utc(start), "--stop", format_utc(stop), "--step-s", 10,
+        "--minimum-duration-s", 60, "--maximum-duration-s", round(minutes * 60),
+    )  # fmt: skip
+    desk.linna(
+        "plan", "add", "--start", format_utc(start), "--stop", format_utc(stop), "--spacecraft-id", SPACECRAFT_ID,
+        "--name", "observation of the day",
+    )  # fmt: skip
+    window = int(api.list_windows(1)["items"][0]["id"])
+    desk.linna("plan", "approve", window)
+    desk.linna("plan", "uplink", window)
+    return window
+
+
+def execute(desk: Transcript, api: Client, payload: Payload, window: int) -> None:
+    """Uplink to the payload, and its flight through the window, followed by its telemetry."""
+    planned = api.get_window(window)
+    start, stop = parse_utc(planned["start"]), parse_utc(planned["stop"])
+    desk.linna(
+        "command", "uplink", "--spacecraft-id", SPACECRAFT_ID, "--tcp", f"127.0.0.1:{payload.telecommands}"
+    )
+    for until, state in (((start + stop) // 2, "executing"), (stop + AFTER_S * NS, "downlinked")):
+        now, mode = payload.fly(until)
+        desk.say(f"# the payload at {format_utc(now)[:19]}Z: mode {mode}")
+        wait_until(
+            lambda wanted=state: api.get_window(window)["state"] == wanted,  # type: ignore[misc]
+            f"window {state}, found {api.get_window(window)['state']}",
+            PATIENCE_S,
+        )
+        desk.linna("plan", "show", window)
+
+
+def evaluate(desk: Transcript, api: Client, window: int, folder: Path) -> dict[str, Any]:
+    """Verification of the telecommands, completeness, report; how the day ended."""
+    desk.linna("command", "list")
+    pass_id = int(api.get_window(window)["pass_id"])
+    desk.linna("report", pass_id, "--out", folder / "report")
+    desk.linna("plan", "show", window)
+    desk.linna("pass", "show", pass_id)
+    summary = api.pass_summary(pass_id)
+    done = api.get_window(window)
+    commands = Counter(row["state"] for row in api.list_commands(100)["items"])
+    return {
+        "window": done["state"],
+        "frames": summary["frames"],
+        "frames_planned": done["predicted"]["frames"],
+        "packets": summary["packets"],
+        "packets_lost": summary["packets_lost"],
+        "telecommands": dict(commands),
+        "report": sorted(path.name for path in (folder / "report").iterdir()),
+    }
+
+
+def went_well(figures: dict[str, Any]) -> bool:
+    """Whether the day ended as planned."""
+    return (
+        figures["window"] == "processed"
+        and figures["packets_lost"] == 0
+        and set(figures["telecommands"]) == {"completed"}
+        and abs(figures["frames"] - figures["frames_planned"]) <= 1
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenario", nargs="?", default="selenita")
+    parser.add_argument("--minutes", type=float, default=5.0, help="length of the window (default: 5)")
+    parser.add_argument("--distributed", action="store_true", help="PostgreSQL, Redis and two workers")
+    parser.add_argument("--json", action="store_true", help="the figures instead of the transcript")
+    given = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was started is ended
+    for name in [name for name in os.environ if name.startswith("LINNA_") and name != "LINNA_DATA"]:
+        del os.environ[name]
+    with tempfile.TemporaryDirectory() as name:
+        _, figures = rehearse(
+            given.scenario,
+            Path(name),
+            distributed=given.distributed,
+            minutes=given.minutes,
+            echo=not given.json,
+        )
+    print(json.dumps(figures, indent=2))
+    return 0 if went_well(figures) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,42 @@
+"""A day against a payload that flies live, as the campaign rehearses it: separate processes and TCP all the way."""
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.campaigns.operations_day import rehearse, went_well
+
+SCENARIO = """
+name = "live"
+seed = 3
+[dynamics]
+gravity = "builtin"
+degree = 8
+orientation = "iau"
+[window]
+search = "none"
+start = "2029-08-07T01:40:00Z"
+duration_s = 360.0
+[camera]
+images = "reduced"
+[terrain]
+source = "procedural"
+[navigation]
+estimators = ["spherical"]
+filter_gravity = "builtin"
+filter_degree = 8
+"""
+
+
+def test_a_day_is_planned_flown_live_and_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("LINNA_DATA", raising=False)
+    (tmp_path / "live.toml").write_text(SCENARIO)
+    lines, figures = rehearse(
+        str(tmp_path / "live.toml"), tmp_path, distributed=False, minutes=1.5, echo=False
+    )
+    assert went_well(figures), figures
+    assert figures["telecommands"] == {"completed": 5}
+    assert "report.pdf" in figures["report"]
+    assert any(line.startswith("$ linna command uplink") for line in lines)
+    assert not went_well({**figures, "packets_lost": 1})
+    assert not went_well({**figures, "telecommands": {"completed": 4, "sent": 1}})
