@@ -18,9 +18,7 @@ def configure(landmarks: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    import numpy as np
-
-    from ground_service.processing.landmarks import MappedCraters, compare_map, latest
+    from ground_service.processing.landmarks import compare_map, latest, mapped_craters
     from linna.commands.catalogue import open_catalogue
     from tmtc.dictionary import DICTIONARY
     from tmtc.downlink import decode
@@ -28,20 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
     decoded = decode(arguments.downlink.read_bytes())
     table = DICTIONARY.unpack_many(decoded.buffer, decoded.cut, only=("landmarks",)).get("landmarks")
     catalogue = open_catalogue(arguments.catalogue, arguments.seed)
-    columns = {} if table is None else table.items
-
-    def column(name: str):
-        return columns.get(name, np.empty(0))
-
-    sigma_m = np.stack([column(f"sigma_{axis}_m") for axis in ("east", "north", "up")], axis=1)
-    reports = MappedCraters(
-        column("landmark_id").astype(np.int64),
-        column("latitude_deg"),
-        column("longitude_deg"),
-        column("height_m"),
-        column("diameter_m"),
-        sigma_m,
-    )
+    reports = mapped_craters(table)
     mapped = latest(reports)
     result = compare_map(mapped, catalogue)
     figures = {

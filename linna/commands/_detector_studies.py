@@ -54,6 +54,11 @@ def configure(verbs: Any) -> None:
     add_model(trials)
     trials.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
     trials.add_argument("--source", default="", help="only the test frames of this source")
+    trials.add_argument(
+        "--two-suns",
+        action="store_true",
+        help="instead of the other ways: pairs of frames that show the same ground under different Suns",
+    )
     add_json_flag(trials)
     trials.set_defaults(handler=_trials)
 
@@ -213,16 +218,25 @@ def _landmarks(arguments: argparse.Namespace) -> int:
 def _trials(arguments: argparse.Namespace) -> int:
     from linna.output import emit, progress
     from payload_emulator.training.dataset import Dataset
-    from payload_emulator.training.evaluate import open_for_evaluation
-    from payload_emulator.training.trials import format_trials, run_trials
+    from payload_emulator.training.evaluate import open_for_evaluation, run
+    from payload_emulator.training.trials import TRIALS, format_trials, run_trials
+    from payload_emulator.training.two_suns import format_two_suns, study_two_suns
 
     detector = open_for_evaluation(model_octets(arguments.model))
     datasets = [Dataset(folder) for folder in arguments.dataset]
     rows = run_trials(
         detector,
         datasets,
+        TRIALS[:1] if arguments.two_suns else TRIALS,
         source=arguments.source,
         progress=lambda frames: progress(frames, len(frames), "trial", "frames"),
     )
-    emit(arguments, {"trials": rows, "model_sha256": detector.sha256}, format_trials(rows))
+    text = format_trials(rows)
+    figures = {"trials": rows, "model_sha256": detector.sha256}
+    if arguments.two_suns:
+        figures["two_suns"] = study_two_suns(
+            run(detector, datasets, "val"), run(detector, datasets, "test", arguments.source)
+        )
+        text = f"{text}\n{format_two_suns(figures['two_suns'])}"
+    emit(arguments, figures, text)
     return 0

@@ -48,7 +48,7 @@ def _build(arguments: argparse.Namespace) -> int:
     import resource
     import time
 
-    from linna.data import data_folder
+    from linna.data import blender_python, data_folder
     from linna.output import emit, log
     from payload_emulator.training.build import build
     from payload_emulator.training.recipe import load_recipe
@@ -62,7 +62,7 @@ def _build(arguments: argparse.Namespace) -> int:
     first: int | None = None
     done = 0
     for done, total in build(
-        recipe, arguments.out, arguments.frames, data_folder(), max(1, arguments.workers)
+        recipe, arguments.out, arguments.frames, data_folder(), max(1, arguments.workers), blender_python()
     ):
         first = done if first is None else first
         elapsed = max(time.monotonic() - began, 1e-9)

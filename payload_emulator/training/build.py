@@ -12,6 +12,7 @@ import json
 import math
 import multiprocessing
 import os
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -78,15 +79,24 @@ def plan_shards(recipe: Recipe, frames: int, tracks: Mapping[str, Track] | None 
 
 
 def build(
-    recipe: Recipe, folder: Path, frames: int, data: DataFolder, workers: int = 1
+    recipe: Recipe,
+    folder: Path,
+    frames: int,
+    data: DataFolder,
+    workers: int = 1,
+    blender_python: str = sys.executable,
 ) -> Iterator[tuple[int, int]]:
     """Make or finish a data set; yields (frames done, frames in all) after every shard.
+
+    `blender_python` is the interpreter that has Blender, for the renderer cycles.
 
     Raises
     ------
     DatasetError
         The folder holds another data set or is being written, the recipe needs data that are not there, a file cannot
         be written, or a worker died; what was finished before is kept.
+    RendererError
+        There is no Blender, or it failed.
     """
     find_renderer(recipe.renderer)
     _check_data(recipe, data)
@@ -100,7 +110,7 @@ def build(
         done = total - sum(shard.frames for shard in todo)
         yield done, total
         try:
-            for shard in _make(recipe, todo, folder, str(data.root or ""), workers):
+            for shard in _make(recipe, todo, folder, str(data.root or ""), workers, blender_python):
                 done += shard.frames
                 yield done, total
             hashes = {
@@ -121,9 +131,12 @@ def build(
             ) from None
 
 
-def make_shard(recipe: Recipe, shard: Shard, folder: Path, data_root: str) -> None:
+def make_shard(
+    recipe: Recipe, shard: Shard, folder: Path, data_root: str, blender_python: str = sys.executable
+) -> None:
     """Render the frames of one shard and write them with their labels."""
     source = shard.source
+    render = find_renderer(recipe.renderer, blender_python)
     terrain = _terrain(source, shard.seed, data_root)
     rng = np.random.Generator(np.random.Philox(key=[recipe.seed, shard.number]))
     camera = _camera(recipe)
@@ -137,7 +150,7 @@ def make_shard(recipe: Recipe, shard: Shard, folder: Path, data_root: str) -> No
             position = np.array(shard.position_mcmf_m[k])
             return pose_at(terrain, camera, source, position, f"frame {number}", generator)
 
-        shot = take_frame(terrain, camera, source, pose_of, number, recipe.bits, recipe.renderer, rng)
+        shot = take_frame(terrain, camera, source, pose_of, number, recipe.bits, render, rng)
         split = shard.split[k] if shard.split else source.split
         utc_ns = shard.utc_ns[k] if shard.utc_ns else None
         document = describe(camera, shot, source, split, terrain, utc_ns)
@@ -166,12 +179,12 @@ def make_shard(recipe: Recipe, shard: Shard, folder: Path, data_root: str) -> No
 
 
 def _make(
-    recipe: Recipe, todo: Sequence[Shard], folder: Path, data_root: str, workers: int
+    recipe: Recipe, todo: Sequence[Shard], folder: Path, data_root: str, workers: int, blender_python: str
 ) -> Iterator[Shard]:
     """Make shards; yields each when it is on disk."""
     if workers <= 1:
         for shard in todo:
-            make_shard(recipe, shard, folder, data_root)
+            make_shard(recipe, shard, folder, data_root, blender_python)
             yield shard
         return
     if not todo:
@@ -180,7 +193,8 @@ def _make(
     pool = ProcessPoolExecutor(min(workers, len(todo)), mp_context=context, initializer=_follow_parent)
     try:
         running: dict[Future[None], Sequence[Shard]] = {
-            pool.submit(_make_run, recipe, run, folder, data_root): run for run in _runs(todo, workers)
+            pool.submit(_make_run, recipe, run, folder, data_root, blender_python): run
+            for run in _runs(todo, workers)
         }
         for finished in as_completed(running):
             finished.result()
@@ -198,9 +212,11 @@ def _runs(todo: Sequence[Shard], workers: int) -> Iterator[Sequence[Shard]]:
         yield from (shards[first : first + longest] for first in range(0, len(shards), longest))
 
 
-def _make_run(recipe: Recipe, shards: Sequence[Shard], folder: Path, data_root: str) -> None:
+def _make_run(
+    recipe: Recipe, shards: Sequence[Shard], folder: Path, data_root: str, blender_python: str
+) -> None:
     for shard in shards:
-        make_shard(recipe, shard, folder, data_root)
+        make_shard(recipe, shard, folder, data_root, blender_python)
 
 
 def _follow_parent() -> None:

@@ -156,9 +156,7 @@ class Dataset:
 
     @property
     def camera(self) -> PinholeCamera:
-        return PinholeCamera(
-            self.width_px, self.height_px, math.radians(self.index["camera"]["fov_deg"])
-        )
+        return PinholeCamera(self.width_px, self.height_px, math.radians(self.index["camera"]["fov_deg"]))
 
     @property
     def digest(self) -> str:

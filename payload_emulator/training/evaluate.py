@@ -132,7 +132,7 @@ def run(
         where = f"split {split!r}" + (f", source {source!r}" if source else "")
         raise DatasetError(f"{names}: expected frames of {where}, found none")
     for dataset in datasets:
-        _refuse_other_camera(detector, dataset)
+        refuse_other_camera(detector, dataset)
     own = float(detector.metadata.get("score_threshold", "0.4"))
     if paper_classes:
         own = float(detector.metadata.get("paper_threshold", str(own)))
@@ -328,7 +328,8 @@ def _interval(row: dict[str, Any]) -> str:
     return f"[{low:.2f}, {high:.2f}]"
 
 
-def _refuse_other_camera(detector: OnnxDetector, dataset: Dataset) -> None:
+def refuse_other_camera(detector: OnnxDetector, dataset: Dataset) -> None:
+    """Raise DatasetError where a data set's camera is not that of the detector's frames."""
     size = (dataset.width_px, dataset.height_px)
     fov_deg = float(dataset.index["camera"]["fov_deg"])
     trained = float(detector.metadata.get("camera_fov_deg", fov_deg))

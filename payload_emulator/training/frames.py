@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -38,17 +40,21 @@ class Shot:
     sun_mcmf: Floats
 
 
-def find_renderer(name: str) -> Callable[..., Any]:
-    """The renderer of a name."""
+def find_renderer(name: str, blender_python: str = sys.executable) -> Callable[..., Any]:
+    """The renderer of a name, called as `sim.renderer.render`; `blender_python` is the interpreter that has Blender."""
     if name == "fast":
         from payload_emulator.sim.renderer import render
 
         return render
-    from payload_emulator.frame import RENDERERS
+    if name == "raymarch":
+        from payload_emulator.sim import raymarch
 
-    if name not in RENDERERS:
-        raise DatasetError(f"renderer: expected one of {', '.join(RENDERERS)}, found {name!r}")
-    return RENDERERS[name]
+        return raymarch.render
+    if name == "cycles":
+        from payload_emulator.sim import cycles
+
+        return partial(cycles.render, python=blender_python)
+    raise DatasetError(f"renderer: expected one of fast, raymarch, cycles, found {name!r}")
 
 
 def take_frame(
@@ -58,14 +64,13 @@ def take_frame(
     pose_of: Callable[[np.random.Generator], Pose],
     number: int,
     bits: int,
-    renderer: str,
+    render: Callable[..., Any],
     rng: np.random.Generator,
 ) -> Shot:
     """A frame whose picture is usable; pose, light, surface and sensor are drawn again where it is not."""
     from payload_emulator.flight.preprocess import ImageQuality, prepare_image
     from payload_emulator.sim.light import sun_direction_mcmf
 
-    render = find_renderer(renderer)
     for _ in range(_TRIES_OF_LIGHT):
         pose = pose_of(rng)
         elevation, azimuth = draw_sun(source.light, rng)

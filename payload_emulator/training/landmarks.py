@@ -18,11 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar.camera import PinholeCamera, intersect_sphere
-from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.errors import DatasetError
-from payload_emulator.training.dataset import Dataset, Frame, frame_truth
+from payload_emulator.training.dataset import Dataset, Frame, frame_truth, ground_points
 from payload_emulator.training.scoring import FrameDetections, MatchRule, match_any, tally
 
 Floats = NDArray[np.float64]
@@ -77,7 +75,7 @@ def find_landmarks(
     ground, diameter, score, owner = [], [], [], []
     for number, ((dataset, frame), detections) in enumerate(zip(frames, found, strict=True)):
         free = np.flatnonzero(_unexplained(frame, detections) & (detections.score >= threshold))
-        ground.append(_on_ground(dataset, frame, detections.u_px[free], detections.v_px[free]))
+        ground.append(ground_points(dataset, frame, detections.u_px[free], detections.v_px[free]))
         diameter.append(detections.diameter_m[free])
         score.append(detections.score[free])
         owner.append(np.full(free.size, number))
@@ -280,24 +278,11 @@ def _unexplained(frame: Frame, found: FrameDetections) -> NDArray[np.bool_]:
     return ~on_any
 
 
-def _camera(dataset: Dataset) -> PinholeCamera:
-    return PinholeCamera(
-        dataset.width_px, dataset.height_px, math.radians(dataset.index["camera"]["fov_deg"])
-    )
-
-
-def _on_ground(dataset: Dataset, frame: Frame, u_px: Floats, v_px: Floats) -> Floats:
-    """Points (n, 3) of the mean ground that pixels of a frame look at, MCMF."""
-    heading = _camera(dataset).rays(np.stack([u_px, v_px], axis=-1)) @ frame.camera_from_mcmf
-    reach = intersect_sphere(frame.position_mcmf_m, heading, MOON_RADIUS_M + frame.values["ground_m"])
-    return np.asarray(frame.position_mcmf_m + reach[:, None] * heading)
-
-
 def _project(
     dataset: Dataset, frame: Frame, landmarks: Landmarks
 ) -> tuple[Floats, Floats, NDArray[np.int64]]:
     """Places (k, 2) and diameters (k,) in pixels of the landmarks in view, and which they are."""
-    camera = _camera(dataset)
+    camera = dataset.camera
     points = (landmarks.position_mcmf_m - frame.position_mcmf_m) @ frame.camera_from_mcmf.T
     near = np.linalg.norm(points, axis=1) < 400_000.0
     uv = camera.project(points)

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from payload_emulator.errors import DatasetError
-from payload_emulator.flight.detector import INPUT_NAME
+from payload_emulator.flight.detector import INPUT_NAME, OnnxDetector
 from payload_emulator.flight.preprocess import prepare_image, sun_up_turns
 from payload_emulator.training.dataset import Dataset
+from payload_emulator.training.evaluate import refuse_other_camera
 
 
 def quantise(model_octets: bytes, datasets: Sequence[Dataset], frames: int = 48) -> bytes:
@@ -23,12 +24,15 @@ def quantise(model_octets: bytes, datasets: Sequence[Dataset], frames: int = 48)
     Raises
     ------
     DatasetError
-        There are no validation frames.
+        There are no validation frames, or the frames are of another camera than the detector's.
     """
     import onnx
     from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
     from onnxruntime.quantization.shape_inference import quant_pre_process
 
+    detector = OnnxDetector(model_octets)
+    for dataset in datasets:
+        refuse_other_camera(detector, dataset)
     every = [(d, f) for d in datasets for f in d.frames("val")]
     if not every:
         raise DatasetError("quantisation: expected frames of the split 'val', found none")

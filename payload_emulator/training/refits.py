@@ -7,14 +7,12 @@ ratio of the two; all others stay where the catalogue puts them.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar.camera import PinholeCamera
 from lunar.frames import mcmf_from_spherical
 from payload_emulator.errors import DatasetError, TableError
 from payload_emulator.flight.tables import unpack_catalogue_table
@@ -72,13 +70,10 @@ def refitted_frame(dataset: Dataset, frame: Frame, rims: RefittedRims) -> tuple[
     if rows.size == 0:
         return frame, known
     of = place[rows]
-    camera = PinholeCamera(
-        dataset.width_px, dataset.height_px, math.radians(dataset.index["camera"]["fov_deg"])
-    )
 
     def project(latitude_rad: Floats, longitude_rad: Floats) -> Floats:
         ground = np.asarray(mcmf_from_spherical(latitude_rad, longitude_rad, rims.rim_height_m[of]))
-        return np.asarray(camera.project((ground - frame.position_mcmf_m) @ frame.camera_from_mcmf.T))
+        return np.asarray(dataset.camera.project((ground - frame.position_mcmf_m) @ frame.camera_from_mcmf.T))
 
     shift = project(rims.latitude_rad[of], rims.longitude_rad[of]) - project(
         np.radians(craters["latitude_deg"][rows].astype(np.float64)),

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lunar.catalogue import size_class
+from payload_emulator.errors import DatasetError
 from payload_emulator.flight.detections import Detections
 from payload_emulator.flight.detector import DetectorParameters, OnnxDetector, decode, drop_duplicates
 from payload_emulator.flight.preprocess import prepare_image, sun_up_turns, turn_back
 from payload_emulator.training.dataset import Dataset, Frame, diameter_on_ground_m, frame_truth
-from payload_emulator.training.evaluate import SCORE_FLOOR
+from payload_emulator.training.evaluate import SCORE_FLOOR, refuse_other_camera
 from payload_emulator.training.figures import RADIUS_RULE
 from payload_emulator.training.scoring import (
     FrameDetections,
@@ -47,7 +48,15 @@ def run_trials(
     source: str = "",
     progress: Callable[[Sequence[Any]], Any] = iter,
 ) -> list[dict[str, Any]]:
-    """Figures of each trial on the real frames of the test split (all of them where none is real)."""
+    """Figures of each trial on the real frames of the test split (all of them where none is real).
+
+    Raises
+    ------
+    DatasetError
+        The validation or the test split is empty, or the frames are of another camera than the detector's.
+    """
+    for dataset in datasets:
+        refuse_other_camera(detector, dataset)
     chosen = {split: _frames(datasets, split, source if split == "test" else "") for split in ("val", "test")}
     truths = {split: [frame_truth(d, f) for d, f in frames] for split, frames in chosen.items()}
     rows = []
@@ -82,6 +91,9 @@ def _row(
 
 def _frames(datasets: Sequence[Dataset], split: str, source: str) -> list[tuple[Dataset, Frame]]:
     every = [(d, f) for d in datasets for f in d.frames(split, source)]
+    if not every:
+        where = f"split {split!r}" + (f", source {source!r}" if source else "")
+        raise DatasetError(f"trials: expected frames of {where}, found none")
     real = [(d, f) for d, f in every if not f.complete]
     return real or every
 

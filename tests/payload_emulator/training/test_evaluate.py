@@ -1,7 +1,9 @@
 """Evaluation from data set to figures and report: what is refused, what every answer holds."""
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from payload_emulator.errors import DatasetError, ModelError
@@ -15,7 +17,9 @@ from payload_emulator.training.evaluate import (
     summary,
 )
 from payload_emulator.training.report import detector_report
+from payload_emulator.training.scoring import FrameDetections
 from payload_emulator.training.trials import TRIALS, format_trials, run_trials
+from payload_emulator.training.two_suns import format_two_suns, fuse, study_two_suns
 from reports.json_form import to_json
 from reports.render import render_html
 
@@ -105,3 +109,68 @@ def test_trials_give_places_in_the_frame_as_it_came(detector, blob_dataset):
     for name in ("averaged with its mirror image", "enlarged 1.5 times, four tiles"):
         assert by_name[name]["strict"]["loc_median_px"] < plain["loc_median_px"] + 0.5
     assert "as flown" in format_trials(rows)
+
+
+def test_trials_need_frames_to_choose_on_and_to_judge_by(detector, make_blob_dataset, tmp_path):
+    unvalidated = make_blob_dataset(tmp_path / "set", {"test": 1})
+    with pytest.raises(DatasetError, match="trials: expected frames of split 'val', found none"):
+        run_trials(detector, [unvalidated])
+
+
+def test_trials_and_eight_bits_refuse_frames_of_another_camera(detector, make_blob_dataset, tmp_path):
+    other = make_blob_dataset(tmp_path / "set", {"val": 1, "test": 1})
+    other.index["camera"]["fov_deg"] = 90.0
+    with pytest.raises(DatasetError, match="expected frames of the detector's camera"):
+        run_trials(detector, [other])
+    pytest.importorskip("onnx")
+    from payload_emulator.training.quantise import quantise
+
+    detector.metadata["camera_fov_deg"] = "120"
+    with pytest.raises(DatasetError, match="expected frames of the detector's camera"):
+        quantise(load_shipped_model(), [other])
+
+
+def detections(u, score):
+    """Detections of 8 km at the height of the middle of the picture, 30 km up."""
+    v, size = np.full(len(u), 255.5), np.full(len(u), 40.0)
+    metres = size * 30_000.0 / 147.8
+    return FrameDetections(np.array(u, float), v, size, metres, np.array(score, float), np.ones(len(u)))
+
+
+def test_a_crater_seen_under_both_suns_gains_on_one_seen_under_one(blob_dataset):
+    dataset = blob_dataset
+    first = dataset.frames("test")[0]
+    second = replace(first, values={**first.values, "sun_azimuth_deg": 120.0})
+    found = [detections([100, 300], [0.6, 0.6]), detections([100, 400], [0.4, 0.4])]
+    fused = fuse(dataset, first, found[0], dataset, second, found[1])
+    # Seen in both: the mean. Seen in one: half. What only the other saw is added.
+    assert fused.u_px == pytest.approx([100, 300, 400], abs=1e-6)
+    assert fused.score == pytest.approx([0.5, 0.3, 0.2])
+    # 29 km off the ground lies 0.25 km lower, so 8 km are 0.8 % smaller there.
+    assert fused.diameter_px == pytest.approx([40, 40, 40 * (1 - 0.0083)], rel=1e-3)
+
+
+def test_where_only_one_frame_looks_scores_stay(blob_dataset):
+    first = blob_dataset.frames("test")[0]
+    away = replace(first, position_mcmf_m=first.position_mcmf_m + np.array([0.0, 40_000.0, 0.0]))
+    fused = fuse(
+        blob_dataset, first, detections([100, 500], [0.6, 0.6]), blob_dataset, away, detections([], [])
+    )
+    # 40 km east at 203 m per pixel: the left 197 pixels of the first frame are outside the second.
+    assert fused.u_px.tolist() == [100, 500]
+    assert fused.score == pytest.approx([0.6, 0.3])
+
+
+def test_pairs_are_judged_on_frames_that_have_a_partner(detector, make_blob_dataset, tmp_path):
+    dataset = make_blob_dataset(tmp_path / "set", {"val": 2, "test": 3})
+    for k, frame in enumerate(dataset.frames()):
+        frame.values["sun_azimuth_deg"] = 90.0 * (k % 2)
+    parts = [run(detector, [dataset], split) for split in ("val", "test")]
+    figures = study_two_suns(*parts)
+    assert figures["frames"] == figures["of_frames"] == 3 and figures["validation_frames"] == 2
+    assert figures["one_sun"]["strict"]["expected"] == figures["two_suns"]["strict"]["expected"] > 0
+    assert "both frames" in format_two_suns(figures)
+    for frame in dataset.frames():
+        frame.values["sun_azimuth_deg"] = 0.0
+    with pytest.raises(DatasetError, match="two Suns: expected frames of the split 'val'"):
+        study_two_suns(*parts)
