@@ -89,6 +89,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="TABLE",
         help="rims from `linna catalogue curate`: distances from these beside the catalogue's places",
     )
+    evaluate.add_argument(
+        "--rims-shift",
+        type=float,
+        nargs=2,
+        default=(0.0, 0.0),
+        metavar=("EAST_M", "NORTH_M"),
+        help="of the terrain in the pictures beside the table (default: 0 0)",
+    )
     evaluate.add_argument("--report", type=Path, default=None, metavar="F.html", help="write one HTML report")
     evaluate.add_argument("--run", type=Path, default=None, help="training run whose curves the report shows")
     add_json_flag(evaluate)
@@ -190,7 +198,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from payload_emulator.training.refits import load_refitted
 
     datasets = [Dataset(folder) for folder in arguments.dataset]
-    rims = None if arguments.rims is None else load_refitted(arguments.rims)
+    rims = None if arguments.rims is None else load_refitted(arguments.rims, *arguments.rims_shift)
     detector = open_for_evaluation(model_octets(arguments.model))
     scored = run(
         detector,

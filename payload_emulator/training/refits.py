@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical
 from payload_emulator.errors import DatasetError, TableError
 from payload_emulator.flight.tables import unpack_catalogue_table
@@ -35,8 +36,11 @@ class RefittedRims:
         return int(self.ids.size)
 
 
-def load_refitted(path: Path) -> RefittedRims:
-    """The rims of a table that `linna catalogue curate` wrote.
+def load_refitted(path: Path, east_m: float = 0.0, north_m: float = 0.0) -> RefittedRims:
+    """The rims of a table that `linna catalogue curate` wrote, moved by so much.
+
+    The table is in the frame of the crater list. The terrain in the pictures may lie tens of metres beside that:
+    by what the curation took out plus what the terrain is shifted by when it is drawn.
 
     Raises
     ------
@@ -50,10 +54,11 @@ def load_refitted(path: Path) -> RefittedRims:
             f"{path}: expected a table of rims (`linna catalogue curate`), found: {error}"
         ) from error
     order = np.argsort(table.ids, kind="stable")
+    latitude = table.latitude_rad[order] + north_m / MOON_RADIUS_M
     return RefittedRims(
         table.ids[order],
-        table.latitude_rad[order],
-        table.longitude_rad[order],
+        latitude,
+        table.longitude_rad[order] + east_m / (MOON_RADIUS_M * np.cos(latitude)),
         table.diameter_m[order],
         table.rim_height_m[order],
     )

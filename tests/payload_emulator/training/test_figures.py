@@ -134,6 +134,28 @@ def test_repeatability_is_counted_over_ordered_pairs_of_frames():
     assert value["chance"] == pytest.approx(2 / 3)
 
 
+def test_repeatability_from_one_frame_to_the_next_counts_neighbours_only():
+    # Found, found, missed, found: of the two followed by a frame that shows it, one is found again.
+    parts = [scene([100], [100], found=[hit]) for hit in (True, True, False, True)]
+    following = repeatability(tally([t for t, _ in parts], [d for _, d in parts]), 0.5)["next_frame"]
+    assert following == {"pairs": 2, "value": pytest.approx(0.5)}
+
+
+def test_recall_of_clear_craters_leaves_worn_ones_out_and_names_its_interval():
+    parts = [
+        scene([100, 200], [100, 200], depth=0.08, found=[True, False]),
+        scene([100, 200], [100, 200], depth=0.15),
+        scene([100], [100], depth=0.01, found=[False]),
+    ]
+    above_006, above_010 = figures_of(parts, [LOW] * 3)["recall_of_clear_craters"]
+    assert above_006["strict"]["expected"] == 4 and above_006["strict"]["recall"] == pytest.approx(0.75)
+    assert above_010["strict"]["recall"] == 1.0
+    low, high = above_010["strict"]["recall_interval_95"]
+    assert low == high == 1.0
+    low, high = above_006["strict"]["recall_interval_95"]
+    assert low <= 0.75 <= high
+
+
 def test_average_precision_of_a_ranking_done_by_hand():
     # Ranked right, wrong, right over 2 craters: areas 0.5 * 1 + 0.5 * 2/3.
     truth, _ = scene([100, 200], [100, 200])

@@ -98,3 +98,20 @@ def test_shards_hold_every_frame_once_and_each_source_its_share():
     assert numbers == list(range(300))
     train = sum(s.frames for s in shards if s.source.split == "train")
     assert train == 240
+
+
+def test_real_terrain_may_be_taken_without_what_is_stamped_on_it(tmp_path):
+    path = tmp_path / "r.toml"
+    text = '[dataset]\nname = "a"\nseed = 1\n[[dataset.source]]\nname = "x"\nsplit = "train"\nshare = 1.0\n'
+    path.write_text(text + 'terrain = "real"\n')
+    sharpened = load_recipe(path)
+    path.write_text(text + 'terrain = "real"\nsharpen = false\n')
+    plain = load_recipe(path)
+    assert sharpened.sources[0].sharpen and not plain.sources[0].sharpen
+    # What is as it always was keeps the identity that data sets carry.
+    assert "sharpen" not in sharpened.to_dict()["sources"][0]
+    assert plain.digest != sharpened.digest
+    for terrain, value in (("procedural", "false"), ("real", "3")):
+        path.write_text(f'{text}terrain = "{terrain}"\nsharpen = {value}\n')
+        with pytest.raises(DatasetError, match="sharpen: expected true or false on real terrain"):
+            load_recipe(path)

@@ -150,6 +150,13 @@ def test_a_data_set_without_training_frames_is_refused(make_blob_dataset, tmp_pa
         train([empty], tmp_path / "run", SHORT)
 
 
+def test_data_sets_of_two_cameras_are_refused(blob_dataset, make_blob_dataset, tmp_path):
+    other = make_blob_dataset(tmp_path / "set", {"train": 1})
+    other.index["camera"]["fov_deg"] = 90.0
+    with pytest.raises(DatasetError, match="data sets of one camera, found several"):
+        train([blob_dataset, other], tmp_path / "run", SHORT)
+
+
 def test_a_damaged_checkpoint_is_refused(tmp_path):
     (tmp_path / "x.pt").write_bytes(b"damaged")
     with pytest.raises(ModelError, match="expected a checkpoint"):
