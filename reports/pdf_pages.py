@@ -391,7 +391,7 @@ def _headline(block: Headline) -> list[_Piece]:
                 page.text(x, y + 0.10 + k * 7.2 * 1.35 / 72, line, 7.2, color=color("muted"))
             value = significant_text(figure.value)
             value = "not available" if value == "–" else value
-            size = 18.0 if len(value) <= 9 else 9.0
+            size = _headline_size(value, figure.unit, inner)
             page.text(x, y + 0.12 + above + (18 - size) / 72 * 0.8, value, size, weight="bold")
             if figure.unit and size > 10:
                 offset = _width(value, size, "bold") + 0.05
@@ -414,6 +414,14 @@ def _headline(block: Headline) -> list[_Piece]:
     text = f"{stands} Rungs of evidence: {ladder}."
     note = _lines(_wrapped(text, _WIDTH, 6.8), 6.8, before=0.06, after=0.06, color=color("muted"))
     return [_Piece(height, draw, keep=True), *note]
+
+
+def _headline_size(value: str, unit: str, width: float) -> float:
+    """The largest size at which a value and its unit stand beside one another; 9 for words."""
+    if len(value) > 9:
+        return 9.0
+    room = width - (_width(unit, 8) + 0.05 if unit else 0.0)
+    return next((size for size in (18.0, 16.0, 14.0, 12.0) if _width(value, size, "bold") <= room), 11.0)
 
 
 def _facts(pairs: Sequence[tuple[str, str]]) -> list[_Piece]:

@@ -16,7 +16,7 @@ from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns
 from lunar.visibility import sun_elevation_azimuth
-from reports.values import NavigationSeries
+from reports.values import NavigationSeries, TerrainMap
 
 FloatArray = NDArray[np.float64]
 
@@ -45,6 +45,46 @@ def with_sun(series: NavigationSeries, track: ReferenceStates, sun: SunAngles) -
     """The series with the Sun's elevation at its samples, which are all times of the track that `sun` is of."""
     rows = np.searchsorted(track.utc_ns, series.utc_ns)
     return replace(series, sun_elevation_deg=sun.elevation_deg[rows])
+
+
+def with_terrain(series: NavigationSeries, track: ReferenceStates, surface: TerrainMap) -> NavigationSeries:
+    """The series with the kind of ground under its samples, "" where the reference does not cover.
+
+    Mare is what is darker than the grey value that best parts the whole map in two (Otsu 1979, by area).
+    """
+    rows = np.searchsorted(track.utc_ns, series.utc_ns)
+    latitude, longitude = track.latitude_deg[rows], track.longitude_deg[rows]
+    known = np.isfinite(latitude) & np.isfinite(longitude)
+    height, width = surface.image.shape
+    down = (surface.north_deg - latitude[known]) / (surface.north_deg - surface.south_deg) * height
+    right = (longitude[known] - surface.west_deg) % 360.0 / (surface.east_deg - surface.west_deg) * width
+    grey = surface.image[
+        np.clip(down.astype(np.int64), 0, height - 1), np.clip(right.astype(np.int64), 0, width - 1)
+    ]
+    kinds = np.full(len(rows), "", dtype="<U8")
+    kinds[known] = np.where(grey < dark_limit(surface), "mare", "highland")
+    return replace(series, terrain=tuple(kinds.tolist()))
+
+
+def dark_limit(surface: TerrainMap) -> float:
+    """The grey value that parts a map in two with the least spread on either side, each pixel weighed by its area.
+
+    References
+    ----------
+    Otsu (1979), A threshold selection method from gray-level histograms, IEEE Trans. SMC 9, equation 18.
+    """
+    rows = surface.image.shape[0]
+    step = (surface.north_deg - surface.south_deg) / rows
+    area = np.cos(np.radians(surface.north_deg - (np.arange(rows) + 0.5) * step))
+    share = np.zeros(256)
+    for row, weight in zip(surface.image, area, strict=True):
+        share += weight * np.bincount(row, minlength=256)
+    share /= share.sum()
+    dark = np.cumsum(share)
+    below = np.cumsum(share * np.arange(256))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        between = (below[-1] * dark - below) ** 2 / (dark * (1.0 - dark))
+    return float(np.nanargmax(np.where(np.isfinite(between), between, -1.0)) + 1)
 
 
 def with_wrong_fixes(

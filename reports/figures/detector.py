@@ -159,7 +159,7 @@ def _octants(canvas: Canvas, axes: Axes, residuals: ResidualSeries) -> None:
     mean, _ = octant_bias(residuals)
     finite = np.isfinite(mean[:, 0])
     reach = float(np.nanmax(np.hypot(mean[:, 0], mean[:, 1]))) if finite.any() else 1.0
-    limit = _nice(max(reach * 1.35, 0.05))
+    limit = max(reach * 1.4, 0.05)
     axes.set_aspect("equal")
     axes.set_xlim(-limit, limit)
     axes.set_ylim(limit, -limit)
@@ -171,7 +171,7 @@ def _octants(canvas: Canvas, axes: Axes, residuals: ResidualSeries) -> None:
         axes.annotate(
             "", (u, v), (0, 0),
             arrowprops={"arrowstyle": "-|>", "color": color("blue"), "linewidth": canvas.pt(1.3),
-                        "shrinkA": 0, "shrinkB": 0,                        "mutation_scale": canvas.pt(8)},
+                        "shrinkA": 0, "shrinkB": 0, "mutation_scale": canvas.pt(8)},
         )  # fmt: skip
         out = np.hypot(u, v)
         nudge = limit * 0.09 / max(out, 1e-9)

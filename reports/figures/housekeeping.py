@@ -12,12 +12,22 @@ from reports.values import HousekeepingParameter, TimeSpan
 
 COLUMNS = 3
 _PANEL_IN = 1.05
+_SUFFIXES = {"°C": "c", "V": "v", "W": "w", "KiB": "kib", "‰": "permille"}
+"""Last words of parameter names that say nothing but the unit."""
 
 
 def housekeeping_height_in(count: int) -> float:
     """Height of a sheet for so many parameters."""
     rows = -(-count // COLUMNS)
     return rows * (_PANEL_IN + 0.42) + 0.42
+
+
+def parameter_title(parameter: HousekeepingParameter) -> str:
+    """Name and unit as a reader expects them: "bus voltage, V" for bus_voltage_v in V."""
+    words = parameter.name.split("_")
+    if len(words) > 1 and words[-1] == _SUFFIXES.get(parameter.unit):
+        words = words[:-1]
+    return " ".join(words) + (f", {parameter.unit}" if parameter.unit else "")
 
 
 def draw_housekeeping(
@@ -33,8 +43,7 @@ def draw_housekeeping(
         last = i + COLUMNS >= len(parameters)
         time_axis(axes, time, labelled=last, most=4)
         shade_arcs(axes, time, arcs)
-        unit = f", {parameter.unit}" if parameter.unit else ""
-        axes.set_title(f"{parameter.name.replace('_', ' ')}{unit}", fontsize="small")
+        axes.set_title(parameter_title(parameter), fontsize="small")
         finite = np.isfinite(parameter.values)
         alone = int(finite.sum()) == 1
         axes.plot(

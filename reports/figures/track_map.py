@@ -27,6 +27,7 @@ Styles = Mapping[str, tuple[str, tuple[float, ...] | None]]
 
 _STRIPS = 4
 _MOST_CRATERS = 220
+_SILENT_STEPS = 5.0
 
 
 def draw_globe(
@@ -149,7 +150,12 @@ def _found(craters: CraterMap) -> BoolArray:
 def _line(canvas: Canvas, axes: Axes, track: TrackSeries, keep: BoolArray, tint: str, width: float) -> None:
     longitude = np.where(keep, track.longitude_deg % 360.0, np.nan)
     latitude = np.where(keep, track.latitude_deg, np.nan)
-    jump = np.abs(np.diff(longitude, prepend=longitude[:1])) > 180.0
+    step = np.diff(track.utc_ns, prepend=track.utc_ns[:1])
+    silent = (
+        step > _SILENT_STEPS * float(np.median(step[1:])) if len(step) > 1 else np.zeros(len(step), np.bool_)
+    )
+    # No line over the edge of the map, and none through places that nobody sampled.
+    jump = (np.abs(np.diff(longitude, prepend=longitude[:1])) > 180.0) | silent
     axes.plot(
         np.insert(longitude, np.flatnonzero(jump), np.nan), np.insert(latitude, np.flatnonzero(jump), np.nan),
         color=tint, linewidth=canvas.pt(width), solid_capstyle="butt",

@@ -25,7 +25,9 @@ def ground_track(view: PassView) -> list[Block]:
     several = len(arcs) > 1
     under = f" over {report.terrain.source}" if report.terrain is not None and report.terrain.source else ""
     imaging = (
-        "Vermillion: imaging; thin: between imaging arcs" if arcs else "Vermillion: the track of the pass"
+        "Vermillion: imaging; thin: sampled between imaging arcs"
+        if arcs
+        else "Vermillion: the track of the pass"
     )
     blocks.append(
         Picture(

@@ -46,6 +46,7 @@ async function regressionRows() {
 }
 
 function outcomeOf({ job, verdict }) {
+  if (verdict && !verdict.gates) return "no gate could be judged";
   if (verdict) return `${figure(verdict.gates - verdict.gates_failed)} of ${figure(verdict.gates)} gates passed`;
   return job.state === "running" ? element("progress", { max: 1, value: job.progress, "aria-label": "regression" }) : (job.error ?? "");
 }
