@@ -1,0 +1,111 @@
+"""Every operation of the API asked with what its schema allows and with what it does not: no server error, and every
+answer is one that the schema tells of."""
+
+import json
+import warnings
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import pytest
+import schemathesis
+from hypothesis import HealthCheck, Phase, given, settings
+from schemathesis import GenerationMode
+from schemathesis.checks import not_a_server_error
+from schemathesis.specs.openapi.checks import (
+    content_type_conformance,
+    response_headers_conformance,
+    response_schema_conformance,
+    status_code_conformance,
+)
+
+from ground_service.api.app import create_app
+from ground_service.services.archive_import import import_archive
+from ground_service.services.ground import ground_from_settings
+from ground_service.services.jobs import enter_job
+from ground_service.settings import Settings
+
+with warnings.catch_warnings():
+    # The test client's next version wants another HTTP library.
+    warnings.simplefilter("ignore")
+    from fastapi.testclient import TestClient
+
+V1 = "/api/v1"
+CHECKS = [
+    not_a_server_error, status_code_conformance, content_type_conformance, response_headers_conformance,
+    response_schema_conformance,
+]  # fmt: skip
+EXAMPLES = 5
+
+
+@schemathesis.serializer("application/zip")
+def _as_octets(_context: Any, value: Any) -> bytes:
+    """Bodies of archives: whatever octets were made up."""
+    octets = getattr(value, "data", value)
+    return octets if isinstance(octets, bytes) else json.dumps(octets).encode()
+
+
+class Queue:
+    """Enters jobs and has none of them done: making hundreds of reports is not what is looked at here."""
+
+    def __init__(self, ground: Any) -> None:
+        self._ground = ground
+
+    def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
+        return enter_job(self._ground, kind, arguments, job_id=job_id)
+
+    def start(self, job_id: str) -> None:
+        pass
+
+    def resume(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def client(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    deployment = Settings(home=tmp_path_factory.mktemp("fuzz"), rate_limit_per_s=0)
+    with ground_from_settings(deployment) as ground:
+        import_archive(ground, synthetic_pass.folder)
+    with TestClient(create_app(deployment, inline_jobs=True), raise_server_exceptions=False) as opened:
+        opened.app.state.dispatcher = Queue(opened.app.state.ground)  # type: ignore[attr-defined]
+        yield opened
+
+
+@pytest.mark.parametrize("mode", [GenerationMode.POSITIVE, GenerationMode.NEGATIVE])
+def test_every_operation_answers_as_its_schema_says(client: TestClient, mode: GenerationMode) -> None:
+    document = client.get(f"{V1}/openapi.json").json()
+    schema = schemathesis.openapi.from_dict(document)
+    asked = set()
+    for found in schema.get_all_operations():
+        operation = found.ok()
+
+        @settings(
+            max_examples=EXAMPLES, deadline=None, database=None, derandomize=True,
+            phases=[Phase.generate], suppress_health_check=list(HealthCheck),
+        )  # fmt: skip
+        @given(case=operation.as_strategy(generation_mode=mode))
+        def ask(case: Any) -> None:
+            asked.add((case.method, case.operation.path))
+            wanted = case.as_transport_kwargs(base_url="http://testserver")
+            answer = client.request(
+                wanted["method"], wanted["url"], **{
+                    name: wanted[name] for name in ("params", "headers", "json", "content", "files")
+                    if wanted.get(name) is not None
+                },
+                **({"content": wanted["data"]} if isinstance(wanted.get("data"), (bytes, str)) else {}),
+            )  # fmt: skip
+            case.validate_response(answer, checks=CHECKS)
+
+        try:
+            ask()
+        except schemathesis.errors.SchemathesisError as error:
+            if mode is GenerationMode.POSITIVE:
+                raise
+            # Nothing that this operation is asked with could be wrong.
+            assert not operation.body, error
+    described = {(m.upper(), p) for p, one in document["paths"].items() for m in one}
+    if mode is GenerationMode.POSITIVE:
+        assert asked == described
+    assert len(asked) > len(described) // 2
