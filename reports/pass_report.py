@@ -17,6 +17,7 @@ from reports.sections.detection import detector_section, galleries
 from reports.sections.matching import matching
 from reports.sections.navigation import altitude, consistency_section, dependence, drift, errors
 from reports.sections.opening import about, provenance_and_data
+from reports.sections.payload_map import payload_map
 from reports.sections.records import configuration, ledger
 from reports.sections.summary import summary
 from reports.sections.surroundings import ground_track, housekeeping_and_events
@@ -45,6 +46,7 @@ def pass_document(report: PassReport) -> Document:
         dependence,
         detector_section,
         galleries,
+        payload_map,
         ground_track,
         housekeeping_and_events,
         ledger,

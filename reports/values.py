@@ -292,6 +292,36 @@ class CraterMap:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class PayloadMap:
+    """The map of craters that the payload made itself, beside the ground's catalogue.
+
+    ``mapped_again`` were mapped on a later pass too, ``used`` served in fixes, in ``pairs`` of ``pairs_of_all``
+    detections. ``catalogued`` are known to the catalogue: ``offset_m`` and ``sigma_m`` (k, 2) are landmark minus
+    catalogue, east and north, and what the payload claims; ``median_offset_m`` is east, north, up. The mean of the
+    squares of offset over claim is ``normalised_square``, 1 where the claims hold.
+    """
+
+    mapped: int
+    mapped_again: int
+    used: int
+    pairs: int
+    pairs_of_all: int
+    catalogued: int
+    offset_m: FloatArray
+    sigma_m: FloatArray
+    median_offset_m: tuple[float, float, float]
+    normalised_square: float
+    source: str = ""
+
+    @property
+    def horizontal_rms_m(self) -> float:
+        """Root mean square of the horizontal distance from the catalogue; NaN where that knows none."""
+        if not len(self.offset_m):
+            return float("nan")
+        return float(np.sqrt(np.mean(np.sum(self.offset_m**2, axis=1))))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class TerrainMap:
     """A gray shaded relief (H, W) uint8, row 0 north, as the ground of the track map; bounds in degrees, east
     longitudes."""
@@ -379,6 +409,7 @@ class PassReport:
     worst_frames: tuple[GalleryFrame, ...] = ()
     craters: CraterMap | None = None
     terrain: TerrainMap | None = None
+    payload_map: PayloadMap | None = None
     housekeeping: tuple[HousekeepingParameter, ...] = ()
     events: tuple[PassEvent, ...] = ()
     truth_ledger: tuple[AnchorRead, ...] = ()
@@ -470,7 +501,10 @@ class SigmaBin:
 
 @dataclass(frozen=True, slots=True)
 class BiasBin:
-    """Mean signed centre errors, px, each with the ends of its 95 % interval: (mean, low, high)."""
+    """Mean signed centre errors, px, each with the ends of its 95 % interval: (mean, low, high).
+
+    ``median_length_px`` is the length of the two medians, which a few wrong pairs hardly move.
+    """
 
     label: str
     pairs: int
@@ -478,6 +512,7 @@ class BiasBin:
     down_px: tuple[float, float, float]
     sunward_px: tuple[float, float, float]
     across_px: tuple[float, float, float]
+    median_length_px: float = float("nan")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,8 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ground_service.processing.fixes import IdentificationSamples
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
+from reports.values import PayloadMap
+from tmtc.schema import Table
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -23,10 +26,16 @@ LOG_DIAMETER_GATE = 0.4
 SIGMAS = 5.0
 """A catalogued crater is looked for within so many sigma, and at least half a radius."""
 
+FIRST_LANDMARK_ID = 3_000_000_000
+"""In the pairs of fixes the payload's own landmarks have identities from here on."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappedCraters:
-    """Landmarks as they came down, the last report of each: arrays of one length, sigma east, north, up (n, 3)."""
+    """Landmarks as they came down: arrays of one length, sigma east, north, up (n, 3).
+
+    `passes` is on how many passes each had been mapped by then.
+    """
 
     landmark_id: Index
     latitude_deg: Float
@@ -34,6 +43,7 @@ class MappedCraters:
     height_m: Float
     diameter_m: Float
     sigma_m: Float
+    passes: Index
 
     def __len__(self) -> int:
         return len(self.landmark_id)
@@ -66,6 +76,24 @@ class MapComparison:
         return int(np.count_nonzero(self.crater >= 0))
 
 
+def mapped_craters(reports: Table | None) -> MappedCraters:
+    """Return all reports of landmarks in the order in which they came; none without packets."""
+    items = {} if reports is None else reports.items
+
+    def column(name: str) -> Float:
+        return np.asarray(items.get(name, np.empty(0)), dtype=np.float64)
+
+    return MappedCraters(
+        column("landmark_id").astype(np.int64),
+        column("latitude_deg"),
+        column("longitude_deg"),
+        column("height_m"),
+        column("diameter_m"),
+        np.stack([column(f"sigma_{axis}_m") for axis in ("east", "north", "up")], axis=1),
+        column("passes").astype(np.int64),
+    )
+
+
 def latest(mapped: MappedCraters) -> MappedCraters:
     """Return the last report of each landmark; reports are in the order in which they were made."""
     _, first = np.unique(mapped.landmark_id[::-1], return_index=True)
@@ -77,6 +105,7 @@ def latest(mapped: MappedCraters) -> MappedCraters:
         mapped.height_m[rows],
         mapped.diameter_m[rows],
         mapped.sigma_m[rows],
+        mapped.passes[rows],
     )
 
 
@@ -120,4 +149,39 @@ def compare_map(mapped: MappedCraters, catalogue: CraterCatalogue) -> MapCompari
             float(np.median(heights)) if heights.size else float("nan"),
         ),
         float(np.mean(ratio**2)),
+    )
+
+
+def payload_map(
+    reports: MappedCraters | None,
+    identifications: IdentificationSamples | None,
+    catalogue: CraterCatalogue | None,
+) -> PayloadMap | None:
+    """Return what a report says of the payload's map; None where nothing of it came down."""
+    if reports is None or not len(reports):
+        return None
+    mapped = latest(reports)
+    pairs = np.empty(0, dtype=np.int64) if identifications is None else identifications.crater_id
+    own = pairs[pairs >= FIRST_LANDMARK_ID]
+    offset = sigma = np.empty((0, 2))
+    nan = float("nan")
+    median, ratio = (nan, nan, nan), nan
+    known = 0
+    if catalogue is not None:
+        result = compare_map(mapped, catalogue)
+        found = result.crater >= 0
+        known, median, ratio = result.known, result.median_offset_m, result.normalised_square
+        offset, sigma = result.offset_m[found, :2], mapped.sigma_m[found, :2]
+    return PayloadMap(
+        mapped=len(mapped),
+        mapped_again=int(np.count_nonzero(mapped.passes >= 2)),
+        used=int(np.unique(own).size),
+        pairs=int(own.size),
+        pairs_of_all=int(pairs.size),
+        catalogued=known,
+        offset_m=offset,
+        sigma_m=sigma,
+        median_offset_m=median,
+        normalised_square=ratio,
+        source="" if catalogue is None else catalogue.source,
     )

@@ -23,11 +23,13 @@ from ground_service.processing.fixes import (
     IdentificationSamples,
     join_pairs,
 )
+from ground_service.processing.landmarks import MappedCraters, payload_map
 from ground_service.processing.pass_extras import (
     FILTER,
     snapshot_series,
     sun_angles,
     with_sun,
+    with_terrain,
     with_wrong_fixes,
 )
 from ground_service.processing.recall import (
@@ -60,6 +62,7 @@ from reports.values import (
     PacketAccounting,
     PassEvent,
     PassReport,
+    TerrainMap,
     TimeSpan,
     TrackSeries,
 )
@@ -109,6 +112,7 @@ class PassInputs:
     start_state: StartState | None = None
     filter_states: FilterStates | None = None
     identifications: IdentificationSamples | None = None
+    landmarks: MappedCraters | None = None
     sun_known: bool = False
     burns: tuple[CommandedBurn, ...] = ()
     gravity: GravityField | None = None
@@ -125,6 +129,7 @@ class PassInputs:
     scenario_text: str = ""
     generated_for: str = ""
     created_utc: str = ""
+    surface: TerrainMap | None = None
 
 
 def evaluate_pass(inputs: PassInputs) -> PassReport:
@@ -167,6 +172,7 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
         gallery=gallery,
         worst_frames=worst,
         craters=craters,
+        payload_map=payload_map(inputs.landmarks, inputs.identifications, inputs.catalogue),
         housekeeping=inputs.housekeeping,
         events=inputs.events,
         truth_ledger=_anchor_reads(inputs.outcomes),
@@ -255,6 +261,8 @@ def _with_extras(
     if inputs.sun_known:
         sun = sun_angles(track)
         series = [with_sun(one, track, sun) for one in series]
+    if inputs.surface is not None:
+        series = [with_terrain(one, track, inputs.surface) for one in series]
     if inputs.identifications is None or inputs.catalogue is None:
         return series
     pairs = join_pairs(inputs.identifications, inputs.detections, inputs.catalogue)

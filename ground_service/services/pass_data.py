@@ -16,6 +16,7 @@ from ground_service.errors import InvalidInput
 from ground_service.processing.baseline import StartState
 from ground_service.processing.correlation import TimeCorrelation, ticks_of_utc_ns, utc_ns_of_ticks
 from ground_service.processing.fixes import IdentificationSamples
+from ground_service.processing.landmarks import MappedCraters, mapped_craters
 from ground_service.processing.pass_evaluation import PassInputs
 from ground_service.processing.samples import (
     DetectionSamples,
@@ -40,7 +41,7 @@ from reports.values import (
     PacketAccounting,
     PassEvent,
 )
-from tmtc.dictionary import APID_NAVIGATION_STATE, DICTIONARY
+from tmtc.dictionary import APID_DETECTIONS, APID_NAVIGATION_STATE, DICTIONARY
 from tmtc.stream import cut_packets
 
 IntArray = NDArray[np.int64]
@@ -150,6 +151,7 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             start_state=start_state_of(manifest),
             filter_states=filter_states(connection, span),
             identifications=identification_samples(connection, span),
+            landmarks=landmark_reports(connection, span),
             sun_known=manifest.get("light", "real") == "real",
             burns=burns_of(manifest),
             gravity=ground.gravity,
@@ -276,6 +278,15 @@ def identification_samples(connection: Connection, span: PassSpan) -> Identifica
         detection=items["detection"].astype(np.int64),
         crater_id=items["crater_id"].astype(np.int64),
     )
+
+
+def landmark_reports(connection: Connection, span: PassSpan) -> MappedCraters:
+    """Every report of a crater that the payload mapped itself, in time order, out of the packets."""
+    octets = repository.packet_octets(
+        connection, span.vehicle, APID_DETECTIONS, span.start_ticks, span.stop_ticks
+    )
+    tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=("landmarks",))
+    return mapped_craters(tables.get("landmarks"))
 
 
 def outcome_samples(connection: Connection, span: PassSpan) -> tuple[OutcomeSamples, ...]:

@@ -39,6 +39,7 @@ from reports.values import (
     PacketAccounting,
     PassEvent,
     PassReport,
+    PayloadMap,
     PrecisionRecallCurve,
     RegressionGate,
     RegressionReport,
@@ -533,6 +534,19 @@ def pass_report(
             seen_often,
             rng.binomial(seen_often, 0.66),
             "LU1319381",
+        ),
+        payload_map=PayloadMap(
+            mapped=64,
+            mapped_again=17,
+            used=12,
+            pairs=230,
+            pairs_of_all=4_100,
+            catalogued=40,
+            offset_m=rng.normal(0.0, 90.0, (40, 2)),
+            sigma_m=np.full((40, 2), 90.0),
+            median_offset_m=(4.0, -9.0, float("nan")),
+            normalised_square=1.04,
+            source="LU1319381",
         ),
         terrain=TerrainMap(
             np.clip(stripes, 0, 255).astype(np.uint8), 0.0, 360.0, -90.0, 90.0, "synthetic stripes"
