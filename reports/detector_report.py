@@ -150,6 +150,7 @@ def _signed_bias(bins: Sequence[BiasBin]) -> Table:
             Column("toward the Sun", unit="px"),
             Column("across", unit="px, to its right"),
             Column("length", unit="px"),
+            Column("length of medians", unit="px"),
         ),
         tuple(
             (
@@ -160,6 +161,7 @@ def _signed_bias(bins: Sequence[BiasBin]) -> Table:
                 part(row.sunward_px),
                 part(row.across_px),
                 number_text(float(np.hypot(row.right_px[0], row.down_px[0])), 2),
+                number_text(row.median_length_px, 2),
             )
             for row in bins
         ),

@@ -308,7 +308,7 @@ def _bias_lines(figures: dict[str, Any]) -> list[str]:
                 ("across", "across_sun_px"),
             )
         )
-        + f", length {row['length_px']:.2f}"
+        + f", length {row['length_px']:.2f} (of the medians {row['median_length_px']:.2f})"
         for row in figures["bias_px_by_sun_octant"]
         if row["pairs"]
     ]

@@ -247,6 +247,7 @@ def _bias(figures: dict[str, Any]) -> tuple[BiasBin, ...]:
                 (row[key], *row["interval_95"][key])
                 for key in ("du_px", "dv_px", "toward_sun_px", "across_sun_px")
             ),
+            row["median_length_px"],
         )
         for label, row in rows
         if row["pairs"]
