@@ -172,6 +172,7 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
         gallery=gallery,
         worst_frames=worst,
         craters=craters,
+        terrain=inputs.surface,
         payload_map=payload_map(inputs.landmarks, inputs.identifications, inputs.catalogue),
         housekeeping=inputs.housekeeping,
         events=inputs.events,

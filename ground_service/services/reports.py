@@ -6,7 +6,7 @@ import json
 import math
 import uuid
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,15 @@ from ground_service.errors import storage_error
 from ground_service.processing.pass_evaluation import evaluate_pass, summary_of
 from ground_service.services.ground import Ground
 from ground_service.services.pass_data import load_pass_inputs
+from ground_service.services.surface import surface_map
 from ground_service.services.window_progress import advance_windows
 from ground_service.store import repository
 from lunar.timescales import format_utc
+from reports.document import rung_number
 from reports.values import PassReport
+
+REAL_TERRAIN_RUNG = 3
+"""From this rung of the evidence ladder on, what was flown over is the real Moon."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +40,12 @@ class MadeReport:
 
 def evaluate(ground: Ground, pass_id: int, *, created_utc: str = "") -> PassReport:
     """The report of a pass as a value; the same archive gives the same value."""
-    return evaluate_pass(load_pass_inputs(ground, pass_id, created_utc=created_utc))
+    inputs = load_pass_inputs(ground, pass_id, created_utc=created_utc)
+    # The face of the real Moon belongs under tracks over the real Moon only.
+    rung = rung_number(inputs.evidence_rung)
+    if ground.data.albedo is not None and rung is not None and rung >= REAL_TERRAIN_RUNG:
+        inputs = replace(inputs, surface=surface_map(ground.data.albedo))
+    return evaluate_pass(inputs)
 
 
 def pass_summary(ground: Ground, pass_id: int) -> dict[str, Any]:

@@ -53,6 +53,6 @@ def draw_housekeeping(
         axes.locator_params(axis="y", nbins=4)
         if finite.any():
             low, high = float(parameter.values[finite].min()), float(parameter.values[finite].max())
-            room = max((high - low) * 0.12, abs(high) * 0.01, 1e-6)
+            room = (high - low) * 0.12 if high > low else max(abs(high) * 0.01, 0.5)
             axes.set_ylim(low - room, high + room)
         axes.ticklabel_format(axis="y", style="plain", useOffset=False)

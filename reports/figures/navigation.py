@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 Styles = Mapping[str, tuple[str, tuple[float, ...] | None]]
 
-_LEFT, _RIGHT, _BOTTOM, _TOP = 0.72, 1.85, 0.50, 0.28
+_LEFT, _RIGHT, _BOTTOM, _TOP = 0.72, 2.0, 0.50, 0.28
 _MOST_NAMED_RESETS = 9
 _DENSE = 900
 _AXES_OF_RTN = ("radial", "along-track", "cross-track")
@@ -371,9 +371,11 @@ def draw_drift(canvas: Canvas, series: Sequence[NavigationSeries], styles: Style
                 np.arange(1, len(shown) + 1), shown, marker="o", markersize=canvas.pt(3.5),
                 linewidth=canvas.pt(0.7), color=styles[one.name][0],
             )  # fmt: skip
-        axes.locator_params(axis="x", integer=True)
+        most = max(int(np.isfinite(value).sum()) for value in values)
+        axes.set_xlim(0.5, most + 0.5)
+        axes.set_xticks(np.arange(1, most + 1, max(1, -(-most // 8))))
         axes.set_xlabel("reset, in order of time")
-        axes.set_title("horizontal error just before each reset")
+        axes.set_title("horizontal error before each reset")
         last = axes
     names = [s.name for s in series if s in swept or s in reset]
     _legend(canvas, last if last is not None else axes, height, names, styles)
