@@ -16,7 +16,7 @@ from linna.commands._detector_common import (
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    from linna.commands import _detector_make, _detector_studies
+    from linna.commands import _detector_domain, _detector_make, _detector_studies
     from linna.output import add_json_flag
 
     verbs = parser.add_subparsers(title="verbs", required=True)
@@ -104,6 +104,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
     _detector_studies.configure(verbs)
     _detector_make.configure(verbs)
+    _detector_domain.configure(verbs)
 
     detect = verbs.add_parser("detect", help="craters in any PNG, TIFF or JPEG")
     detect.add_argument("images", type=Path, nargs="+", metavar="IMAGE")

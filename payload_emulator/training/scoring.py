@@ -371,6 +371,26 @@ def average_precision(tallied: Tally) -> float:
 def bootstrap_f1(tallied: Tally, threshold: float, seed: int = 0, rounds: int = 400) -> tuple[float, float]:
     """95 % interval of F1 over resampled blocks of ground."""
     blocks = np.unique(np.concatenate([tallied.crater_block, tallied.detection_block]))
+    f1 = _resampled_f1(tallied, threshold, blocks, seed, rounds)
+    return float(np.percentile(f1, 2.5)), float(np.percentile(f1, 97.5))
+
+
+def bootstrap_f1_difference(
+    tallied: Tally, reference: Tally, threshold: float, seed: int = 0, rounds: int = 400
+) -> tuple[float, float]:
+    """95 % interval of F1 less the reference's, both of the same frames, over the same resampled blocks of ground."""
+    both = (tallied, reference)
+    blocks = np.unique(np.concatenate([c for t in both for c in (t.crater_block, t.detection_block)]))
+    one, other = (_resampled_f1(t, threshold, blocks, seed, rounds) for t in both)
+    return float(np.percentile(one - other, 2.5)), float(np.percentile(one - other, 97.5))
+
+
+def _resampled_f1(
+    tallied: Tally, threshold: float, blocks: NDArray[np.int64], seed: int, rounds: int
+) -> Floats:
+    """F1 (rounds,) of blocks drawn with replacement; NaN without any."""
+    if blocks.size == 0:
+        return np.full(rounds, np.nan)
     with np.errstate(invalid="ignore"):
         found = tallied.crater_score >= threshold
         wrong = (tallied.score >= threshold) & (tallied.outcome == 0)
@@ -385,12 +405,9 @@ def bootstrap_f1(tallied: Tally, threshold: float, seed: int = 0, rounds: int = 
         ],
         dtype=np.float64,
     )
-    if counts.size == 0:
-        return float("nan"), float("nan")
     rng = np.random.default_rng(seed)
     drawn = counts[rng.integers(0, len(blocks), (rounds, len(blocks)))].sum(axis=1)
-    f1 = 2.0 * drawn[:, 0] / np.maximum(drawn[:, 0] + drawn[:, 2] + drawn[:, 1], 1.0)
-    return float(np.percentile(f1, 2.5)), float(np.percentile(f1, 97.5))
+    return np.asarray(2.0 * drawn[:, 0] / np.maximum(drawn[:, 0] + drawn[:, 2] + drawn[:, 1], 1.0))
 
 
 def bootstrap_recall(

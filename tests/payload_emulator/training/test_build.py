@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from lunar.datafolder import find_data
-from payload_emulator.errors import DatasetError
+from payload_emulator.errors import DatasetError, RendererError
 from payload_emulator.training import dataset as store
 from payload_emulator.training.build import _runs, build, make_shard, plan_shards
 from payload_emulator.training.integrity import check
@@ -261,7 +261,8 @@ def test_training_frames_keep_sixty_kilometres_from_every_held_out_box(tmp_path,
     recipe = load_recipe(ROOT / "scenarios" / "detector-dataset.toml")
     for name in ("images", "metadata", "shards"):
         (tmp_path / name).mkdir()
-    shard = dataclasses.replace(plan_shards(recipe, 400)[0], frames=2)
+    shard = plan_shards(recipe, 400)[0]
+    shard = dataclasses.replace(shard, frame_numbers=shard.frame_numbers[:2])
     make_shard(recipe, shard, tmp_path, str(data_path))
     km_per_degree = 1737.4 * np.pi / 180.0
     for path in (tmp_path / "metadata").glob("*.json"):
@@ -276,3 +277,26 @@ def test_training_frames_keep_sixty_kilometres_from_every_held_out_box(tmp_path,
                 north = max(box.south_deg - corner["latitude"], corner["latitude"] - box.north_deg, 0.0)
                 # A parallel is no great circle: up to 1 % short over such distances.
                 assert np.hypot(east_km, north * km_per_degree) >= 59.4
+
+
+def test_the_renderers_of_a_recipe_get_the_same_scenes_and_an_unknown_one_is_refused(tmp_path):
+    shard = plan_shards(RECIPE, 3)[-1]
+    frames = {}
+    for name in ("fast", "raymarch"):
+        folder = tmp_path / name
+        for part in ("images", "metadata", "shards"):
+            (folder / part).mkdir(parents=True)
+        make_shard(dataclasses.replace(RECIPE, renderer=name), shard, folder, "")
+        frames[name] = store.load_shard(folder / "shards" / f"{shard.name}.npz")
+    fast, slow = frames["fast"], frames["raymarch"]
+    np.testing.assert_array_equal(fast.position_mcmf_m, slow.position_mcmf_m)
+    np.testing.assert_array_equal(fast.sun_camera, slow.sun_camera)
+    assert fast.image_sha256 != slow.image_sha256
+    with pytest.raises(DatasetError, match="expected one of fast, raymarch, cycles, found 'pov'"):
+        list(build(dataclasses.replace(RECIPE, renderer="pov"), tmp_path / "x", 3, find_data(None)))
+
+
+def test_a_build_by_cycles_without_blender_says_what_is_missing(tmp_path):
+    recipe = dataclasses.replace(RECIPE, renderer="cycles")
+    with pytest.raises(RendererError, match="expected a Python interpreter with Blender"):
+        list(build(recipe, tmp_path / "x", 3, find_data(None), 1, str(tmp_path / "none")))
