@@ -242,6 +242,13 @@ def format_made(document: Mapping[str, Any]) -> str:
                 f"{row['loc_px']:10.2f}{row['loc_median_px']:8.2f}"
                 f"{format(figures['bias_px']['worst_octant_px'], '.2f') if first else '':>7}"
             )
+        lines += [
+            f"{'':18}class {k}: P / R / loc px {_class(row)}; paper's design {_class(theirs)}; published "
+            f"{_class(row['paper'])}"
+            for k, (row, theirs) in enumerate(
+                zip(figures["per_class"], both["paper"]["per_class"], strict=True)
+            )
+        ]
         lines.append(f"{'':18}evidence rung {figures['rung']}")
     model = document["model"]
     lines.append(
@@ -249,3 +256,7 @@ def format_made(document: Mapping[str, Any]) -> str:
         f"{model['f1_threshold']:.2f} balanced, {model['navigation_threshold']:.2f} navigation (fixed on validation)"
     )
     return "\n".join(lines)
+
+
+def _class(row: Mapping[str, float]) -> str:
+    return f"{row['precision']:.2f} / {row['recall']:.2f} / {row['loc_px']:.2f}"
