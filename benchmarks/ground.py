@@ -1,14 +1,16 @@
-"""Ingest into the ground database and a query over it: python -m benchmarks.ground [--packets N] [--database-url URL].
+"""The ground service measured: python -m benchmarks.ground [--only sqlite postgresql states api stream] [--packets N].
 
-A mixed downlink as CADUs (housekeeping, detections of 20 craters, navigation states, events in equal numbers), stored
-packet by packet and decoded. Rates are by processor time and by the clock: on a quiet machine they are alike.
+`sqlite`, `postgresql`: a mixed downlink as CADUs (housekeeping, detections of 20 craters, navigation states, events in
+equal numbers) stored packet by packet and decoded; rates are by processor time (of this process: not of a database
+server) and by the clock. `states`: down-sampled reads over one parameter, beside reading rows. `api`: ordinary reads at
+a steady rate. `stream`: memory of the service while a long downlink comes in.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import resource
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -16,15 +18,23 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks._ground_service import answers_under_load, memory_of_a_stream
+from benchmarks.campaigns._deployment import PostgresServer
 from ground_service.services.ground import open_ground
 from ground_service.services.ingest import ingest_file
 from ground_service.services.passes import define_pass, state_series
+from ground_service.store import repository
 from ground_service.store.database import prepare_database
-from lunar.timescales import parse_utc, ticks_from_utc_ns
+from ground_service.store.packets import store_samples
+from ground_service.store.rollups import STATE_VALUES
+from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 from tmtc.packets import PacketSequencer
 
+PARTS = ("sqlite", "postgresql", "states", "api", "stream")
+STATE_BLOCK = 200_000
+API_PACKETS = 20_000
 VALUES_PER_PACKET = (24 + 4 + 20 * 6 + 17 + 5) / 4
 START = parse_utc("2029-08-07T00:00:00Z")
 STEP_NS = 100_000_000
@@ -70,8 +80,8 @@ def mixed_downlink(count: int) -> bytes:
     return encode_cadus(packets, spacecraft_id=76)
 
 
-def measure(packets: int, database_url: str | None) -> dict[str, Any]:
-    """Figures of one ingest into an empty archive, of the same ingest again, and of a query over it."""
+def ingest(packets: int, database_url: str | None) -> dict[str, Any]:
+    """Rates of one ingest into an empty archive, and of the same ingest again."""
     with tempfile.TemporaryDirectory() as folder:
         stream = Path(folder) / "mixed.cadu"
         stream.write_bytes(mixed_downlink(packets))
@@ -81,7 +91,7 @@ def measure(packets: int, database_url: str | None) -> dict[str, Any]:
             prepare_database(database_url, upgrade=True).engine.dispose()
         with open_ground(Path(folder) / "home", database_url=database_url) as ground:
             ingest_file(ground, warm, instance="warm")
-            figures: dict[str, Any] = {"database": ground.database.dialect, "packets": packets}
+            figures: dict[str, Any] = {"packets": packets}
             for name in ("new", "repeated"):
                 clock, processor = time.perf_counter(), time.process_time()
                 result = ingest_file(ground, stream)
@@ -89,30 +99,120 @@ def measure(packets: int, database_url: str | None) -> dict[str, Any]:
                 figures[f"{name}_packets_per_s"] = round(result.packets / clock)
                 figures[f"{name}_packets_per_cpu_s"] = round(result.packets / processor)
                 figures[f"{name}_values_per_s"] = round(result.packets * VALUES_PER_PACKET / clock)
-            pass_id = define_pass(
-                ground,
-                name="all",
-                start_utc_ns=START,
-                stop_utc_ns=START + packets * STEP_NS // 4,
-                spacecraft_id=76,
-            )
-            times = []
-            for _ in range(20):
-                clock = time.perf_counter()
-                state_series(ground, pass_id, "paper", ("altitude_m",), 2000)
-                times.append(time.perf_counter() - clock)
-            figures["states_p95_ms"] = round(1e3 * float(np.percentile(times, 95)), 1)
-            figures["states_rows"] = packets // 4
-            figures["peak_rss_mib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+                figures[f"{name}_values_per_cpu_s"] = round(result.packets * VALUES_PER_PACKET / processor)
     return figures
+
+
+def definition(packets: int) -> dict[str, Any]:
+    """A pass over all of `mixed_downlink(packets)`."""
+    stop = format_utc(START + packets * STEP_NS // 4)
+    return {"name": "all", "start": format_utc(START), "stop": stop, "spacecraft_id": 76}
+
+
+def states(rows: int, queries: int = 40) -> dict[str, Any]:
+    """Times of down-sampled reads over a parameter of so many rows, whole and in part, beside reading all of a part."""
+    ticks_a_row = 6_554  # ten a second
+    with tempfile.TemporaryDirectory() as folder, open_ground(Path(folder)) as ground:
+        with ground.database.writing() as connection:
+            vehicle = repository.vehicle_id(connection, 76, "flight")
+        first = int(ticks_from_utc_ns(START))
+        rng = np.random.default_rng(1)
+        for start in range(0, rows, STATE_BLOCK):
+            count = min(STATE_BLOCK, rows - start)
+            number = np.arange(start, start + count)
+            columns: dict[str, Any] = {name: rng.normal(size=count) for name in STATE_VALUES}
+            columns["matched"] = np.full(count, 5)
+            columns |= {
+                "packet": np.arange(count),
+                "ticks": first + number * ticks_a_row,
+                "packet_ticks": first + number * ticks_a_row,
+                "frame_number": number,
+                "estimator": np.zeros(count, dtype=np.int64),
+                "outcome": np.ones(count, dtype=np.int64),
+            }
+            with ground.database.writing() as connection:
+                store_samples(
+                    connection, vehicle, DICTIONARY.version, {"navigation_states": columns}, number + 1
+                )
+        span_ns = rows * STEP_NS
+        keys = []
+        for part in range(queries):
+            # From the whole down to a thousandth, somewhere.
+            length = span_ns / 10 ** (3.0 * part / max(queries - 1, 1))
+            begin = START + int(rng.uniform(0.0, span_ns - length)) if part else START - STEP_NS
+            keys.append(
+                define_pass(
+                    ground,
+                    name=str(part),
+                    start_utc_ns=begin,
+                    stop_utc_ns=begin + int(length) + 2 * STEP_NS,
+                    spacecraft_id=76,
+                )
+            )
+        times, processor = [], []
+        for key in keys:
+            clock, cpu = time.perf_counter(), time.process_time()
+            state_series(ground, key, "paper", ("altitude_m",), 2000)
+            times.append(1e3 * (time.perf_counter() - clock))
+            processor.append(1e3 * (time.process_time() - cpu))
+        with ground.database.reading() as connection:
+            clock = time.perf_counter()
+            stop = first + rows // 10 * ticks_a_row
+            repository.sample_arrays(
+                connection,
+                "navigation_states",
+                vehicle,
+                first,
+                stop,
+                DICTIONARY.version,
+                ("ticks", "altitude_m"),
+            )
+            all_of_a_tenth = time.perf_counter() - clock
+    return {
+        "states_rows": rows,
+        "states_whole_ms": round(times[0], 1),
+        "states_p50_ms": round(float(np.percentile(times, 50)), 1),
+        "states_p95_ms": round(float(np.percentile(times, 95)), 1),
+        "states_p95_cpu_ms": round(float(np.percentile(processor, 95)), 1),
+        "every_row_of_a_tenth_ms": round(1e3 * all_of_a_tenth, 1),
+    }
+
+
+def postgres(packets: int, url: str | None) -> dict[str, Any]:
+    """As `ingest`, into PostgreSQL: at `url`, or a server of its own where PostgreSQL is installed."""
+    if url:
+        return ingest(packets, url)
+    with tempfile.TemporaryDirectory() as folder, PostgresServer(Path(folder)) as server:
+        return ingest(packets, server.url)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--packets", type=int, default=100_000)
-    parser.add_argument("--database-url", help="an empty database; default: SQLite")
-    arguments = parser.parse_args()
-    print(json.dumps(measure(arguments.packets, arguments.database_url), indent=2))
+    parser.add_argument("--rows", type=int, default=10_000_000, help="rows of the parameter that is queried")
+    parser.add_argument("--rate", type=float, default=100.0, help="requests a second")
+    parser.add_argument("--seconds", type=float, default=20.0, help="of requests")
+    parser.add_argument("--stream-mb", type=int, default=2000, help="size of the downlink that streams in")
+    parser.add_argument("--database-url", help="an empty PostgreSQL database; default: a server of its own")
+    parser.add_argument(
+        "--only", nargs="+", choices=PARTS, default=PARTS, metavar="PART", help=" ".join(PARTS)
+    )
+    given = parser.parse_args()
+    figures: dict[str, Any] = {}
+    for name in given.only:
+        print(f"{name} ...", file=sys.stderr, flush=True)
+        if name == "sqlite":
+            figures[name] = ingest(given.packets, None)
+        elif name == "postgresql":
+            figures[name] = postgres(given.packets, given.database_url)
+        elif name == "states":
+            figures[name] = states(given.rows)
+        elif name == "api":
+            stream = mixed_downlink(API_PACKETS)
+            figures[name] = answers_under_load(stream, definition(API_PACKETS), given.rate, given.seconds)
+        else:
+            figures[name] = memory_of_a_stream(mixed_downlink(given.packets), given.stream_mb)
+    print(json.dumps(figures, indent=2))
 
 
 if __name__ == "__main__":

@@ -65,6 +65,12 @@ class Part:
             time.sleep(0.5)
         raise SystemExit(f"{' '.join(self._command[:4])}: did not start; {self._log.read_text()[-500:]}")
 
+    @property
+    def pid(self) -> int:
+        """Its process."""
+        assert self._process is not None
+        return self._process.pid
+
     def kill(self) -> None:
         assert self._process is not None
         family = [self._process.pid, *descendants(self._process.pid)]
@@ -100,13 +106,13 @@ def descendants(pid: int) -> list[int]:
 class Laptop:
     """The API alone, which does its jobs itself, on SQLite."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, **settings: str) -> None:
         port = free_port()
         self.api = f"http://127.0.0.1:{port}"
         self.home = folder / "home"
         self.url: str | None = None
         command = [sys.executable, "-m", "linna", "serve", "--port", str(port)]
-        environment = service_environment(LINNA_HOME=str(self.home), LINNA_RATE_LIMIT_PER_S="0")
+        environment = service_environment(LINNA_HOME=str(self.home), LINNA_RATE_LIMIT_PER_S="0", **settings)
         self.parts = {"api": Part(command, folder / "api.log", lambda: listens(port), env=environment)}
         self.parts["api"].start()
 
@@ -115,73 +121,94 @@ class Laptop:
             part.kill()
 
 
+class PostgresServer:
+    """A PostgreSQL server on a private port, with an empty database and its files under `folder`."""
+
+    def __init__(self, folder: Path) -> None:
+        found = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
+        if not found:
+            raise SystemExit("expected PostgreSQL on this machine, found none under /usr/lib/postgresql")
+        self._bin = found[-1].parent
+        user = ["runuser", "-u", "postgres", "--"] if os.geteuid() == 0 else []
+        place = folder / "postgres"
+        place.mkdir()
+        if user:
+            folder.chmod(0o755)
+            shutil.chown(place, "postgres", "postgres")
+        self._port = free_port()
+        self.url = f"postgresql+psycopg://linna@127.0.0.1:{self._port}/linna"
+        data = place / "data"
+        subprocess.run(
+            [*user, str(self._bin / "initdb"), "-D", str(data), "-U", "linna", "-A", "trust", "--no-sync"],
+            check=True, cwd=place, stdout=subprocess.DEVNULL,
+        )  # fmt: skip
+        server = [
+            str(self._bin / "postgres"), "-D", str(data), "-p", str(self._port), "-k", str(place), "-h", "127.0.0.1",
+            "-c", "fsync=off",
+        ]  # fmt: skip
+        self.part = Part([*user, *server], folder / "postgres.log", self._answers, cwd=place)
+        self.part.start()
+        create = [
+            str(self._bin / "createdb"),
+            "-h",
+            "127.0.0.1",
+            "-p",
+            str(self._port),
+            "-U",
+            "linna",
+            "linna",
+        ]
+        subprocess.run(create, check=True)
+
+    def __enter__(self) -> PostgresServer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.part.kill()
+
+    def _answers(self) -> bool:
+        ask = [str(self._bin / "pg_isready"), "-h", "127.0.0.1", "-p", str(self._port), "-q"]
+        return subprocess.run(ask, check=False).returncode == 0
+
+
 class Deployment:
     """PostgreSQL, Redis, the API and two workers."""
 
     def __init__(self, folder: Path) -> None:
-        binaries = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
-        if not binaries or shutil.which("redis-server") is None:
-            raise SystemExit("the campaign needs PostgreSQL and redis-server on this machine")
-        bin_ = binaries[-1].parent
-        user = ["runuser", "-u", "postgres", "--"] if os.geteuid() == 0 else []
-        database = folder / "postgres"
-        database.mkdir()
-        if user:
-            folder.chmod(0o755)
-            shutil.chown(database, "postgres", "postgres")
-        ports = [free_port() for _ in range(3)]
-        self.api = f"http://127.0.0.1:{ports[2]}"
-        self.url = f"postgresql+psycopg://linna@127.0.0.1:{ports[0]}/linna"
-        data = database / "data"
-        subprocess.run(
-            [*user, str(bin_ / "initdb"), "-D", str(data), "-U", "linna", "-A", "trust", "--no-sync"],
-            check=True, cwd=database, stdout=subprocess.DEVNULL,
-        )  # fmt: skip
+        if shutil.which("redis-server") is None:
+            raise SystemExit("expected redis-server on this machine, found none")
+        database = PostgresServer(folder)
+        self.parts = {"database": database.part}
+        self.url = database.url
         self.home = folder / "home"
-        self.broker_url = f"redis://127.0.0.1:{ports[1]}/0"
+        broker, port = free_port(), free_port()
+        self.api = f"http://127.0.0.1:{port}"
         environment = service_environment(
             LINNA_HOME=str(self.home),
             LINNA_DATABASE_URL=self.url,
-            LINNA_BROKER_URL=self.broker_url,
+            LINNA_BROKER_URL=f"redis://127.0.0.1:{broker}/0",
             LINNA_RATE_LIMIT_PER_S="0",
         )
         linna = [sys.executable, "-m", "linna"]
-        worker = {"env": environment}
-        server = [
-            str(bin_ / "postgres"), "-D", str(data), "-p", str(ports[0]), "-k", str(database), "-h", "127.0.0.1",
-            "-c", "fsync=off",
+        redis = [
+            "redis-server", "--port", str(broker), "--bind", "127.0.0.1", "--dir", str(folder), "--save", "",
+            "--appendonly", "no",
         ]  # fmt: skip
-        self.parts = {
-            "database": Part(
-                [*user, *server], folder / "postgres.log", lambda: self._answers(bin_, ports[0]), cwd=database
-            ),
-            "broker": Part(
-                ["redis-server", "--port", str(ports[1]), "--bind", "127.0.0.1", "--dir", str(folder),
-                 "--save", "", "--appendonly", "no"],
-                folder / "redis.log", lambda: listens(ports[1]),
-            ),
-            "api": Part(
-                [*linna, "serve", "--port", str(ports[2])], folder / "api.log", lambda: listens(ports[2]), **worker
-            ),
-            "worker 1": Part([*linna, "worker"], folder / "worker1.log", lambda: True, **worker),
-            "worker 2": Part([*linna, "worker"], folder / "worker2.log", lambda: True, **worker),
-        }  # fmt: skip
-        for name in ("database", "broker"):
-            self.parts[name].start()
-        subprocess.run(
-            [str(bin_ / "createdb"), "-h", "127.0.0.1", "-p", str(ports[0]), "-U", "linna", "linna"],
-            check=True,
-        )
-        prepare_database(self.url, upgrade=True).engine.dispose()
-        for name in ("api", "worker 1", "worker 2"):
-            self.parts[name].start()
+        try:
+            prepare_database(self.url, upgrade=True).engine.dispose()
+            self._add("broker", Part(redis, folder / "redis.log", lambda: listens(broker)))
+            serve = [*linna, "serve", "--port", str(port)]
+            self._add("api", Part(serve, folder / "api.log", lambda: listens(port), env=environment))
+            for number in (1, 2):
+                log = folder / f"worker{number}.log"
+                self._add(f"worker {number}", Part([*linna, "worker"], log, lambda: True, env=environment))
+        except BaseException:
+            self.stop()
+            raise
 
-    @staticmethod
-    def _answers(bin_: Path, port: int) -> bool:
-        done = subprocess.run(
-            [str(bin_ / "pg_isready"), "-h", "127.0.0.1", "-p", str(port), "-q"], check=False
-        )
-        return done.returncode == 0
+    def _add(self, name: str, part: Part) -> None:
+        part.start()
+        self.parts[name] = part
 
     def stop(self) -> None:
         for part in self.parts.values():
