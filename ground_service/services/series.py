@@ -26,8 +26,8 @@ __all__ = ["PARAMETERS", "STATE_VALUES", "Series", "SeriesReading"]
 FEW_ROWS = 50_000
 """Up to this many samples are read one by one, which is exact to the sample and quick enough."""
 
-COARSE = 8
-"""Roll-ups are used where they give at least an eighth of the points that were asked for."""
+COARSE = 16
+"""Roll-ups are used where they give at least a sixteenth of the points that were asked for."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
