@@ -37,7 +37,7 @@ from payload_emulator.flight.lost_in_space import (
 )
 from payload_emulator.flight.sighting import LandmarkMap, landmark_map
 from payload_emulator.loading import onboard_catalogue
-from payload_emulator.scenario import Scenario
+from payload_emulator.scenario import DisturbancesSection, Scenario
 from payload_emulator.world import World, expose_frame
 
 Float = NDArray[np.float64]
@@ -135,7 +135,8 @@ def frames_in_sets(world: World, sets: int) -> Index:
 
 def pointed(scenario: Scenario, attitude_deg: float) -> Scenario:
     """Return the scenario with a camera that points as well as this, 1 sigma per axis, and no disturbances."""
-    return replace(scenario, attitude=replace(scenario.attitude, pointing_error_deg=attitude_deg))
+    attitude = replace(scenario.attitude, pointing_error_deg=attitude_deg)
+    return replace(scenario, attitude=attitude, disturbances=DisturbancesSection())
 
 
 def see_frames(
