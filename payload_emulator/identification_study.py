@@ -435,6 +435,7 @@ def _tracked(
         frame.found.sigma_px**2,
         float(camera.width_px * camera.height_px),
         parameters,
+        sighting.by_position @ prior.covariance[:3, :3] @ np.swapaxes(sighting.by_position, 1, 2),
     )
     return (result.detection, sighting.index[result.sighted]) if result.believed else None
 

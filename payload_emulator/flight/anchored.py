@@ -395,6 +395,11 @@ class AnchoredNavigator:
         design = kalman.design_matrix(sighting, prior).reshape(2 * count, prior.mean.size)
         tilt = sighting.by_attitude.reshape(2 * count, 3) * self.parameters.errors.attitude_noise_rad
         spread = (design @ prior.covariance @ design.T + tilt @ tilt.T).reshape(count, 2, count, 2)
+        place = (
+            sighting.by_position
+            @ prior.covariance[kalman.POSITION, kalman.POSITION]
+            @ np.swapaxes(sighting.by_position, 1, 2)
+        )
         # Craters among the states bring their own uncertainty with them, the others that of the catalogue.
         scaled = sighting.by_offset * self._crater_sigma_m(sighting.index)[:, None, :]
         own = scaled @ np.swapaxes(scaled, 1, 2)
@@ -407,6 +412,7 @@ class AnchoredNavigator:
             self._fresh_variance(found),
             float(self._camera.width_px * self._camera.height_px),
             self.parameters.identification,
+            place,
         )
 
     def _updated(

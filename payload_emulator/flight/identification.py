@@ -6,7 +6,8 @@ hypothesis that explains most of the other detections wins (consensus of one pai
 explains is then tested as a whole, and each member against all the others.
 
 How many members a set needs follows from how easily chance would make it up: from the number of detections, the
-density of the map and the size of the search. Around a good prediction one crater is enough.
+density of the map and the size of the search. A pair by chance does harm only where the prediction is worth less than
+the pair: around a good prediction one crater is enough, around a poor one a lone pair by chance would be a wrong fix.
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ Index = NDArray[np.int64]
 
 # Chi-square of 2 degrees of freedom at 0.999: a true pair is lost once in a thousand.
 GATE = 13.8
+# A wrong fix contradicts the truth by more than its claim allows once in 1e5 (25.9, three degrees of freedom); half of
+# that is left to the error that the prediction had before.
+_HARMLESS = 12.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +43,15 @@ class IdentificationParameters:
         Largest expected number of sets that chance makes up per frame, for a set to be believed while tracking. It
         holds for up to three detections and falls with the square of those beyond two: a frame full of detections
         that hardly any crater explains speaks against the set, a mirrored image for example.
+    harmful_set_limit
+        The same for sets that would move the estimate farther than it then claims.
     hypothesis_limit
         Pairs tried as hypotheses.
     """
 
     log_diameter_gate: float = 0.4
     false_set_limit: float = 0.03
+    harmful_set_limit: float = 1e-4
     hypothesis_limit: int = 200
 
 
@@ -87,6 +94,7 @@ def identify(
     detection_variance_px2: Float,
     image_area_px2: float,
     parameters: IdentificationParameters,
+    place_px2: Float | None = None,
 ) -> Identification:
     """Return the pairs of detections and craters that agree on one correction of the prediction.
 
@@ -102,9 +110,19 @@ def identify(
         Covariance of each crater's own place, shape (m, 2, 2).
     detection_variance_px2
         Variance of each detection, per axis, shape (n,).
+    place_px2
+        The part of the prediction's covariance that the camera's place is behind, shape (m, 2, 2); None for all of it.
     """
-    detection, sighted, offset, spread, chance = _candidates(
-        found, sighting, prior_px2, crater_noise_px2, detection_variance_px2, image_area_px2, parameters
+    place_px2 = np.einsum("jajb->jab", prior_px2) if place_px2 is None else place_px2
+    detection, sighted, offset, spread, chance, harm = _candidates(
+        found,
+        sighting,
+        prior_px2,
+        crater_noise_px2,
+        detection_variance_px2,
+        image_area_px2,
+        parameters,
+        place_px2,
     )
     count = int(detection.size)
     if not count:
@@ -117,7 +135,10 @@ def identify(
         chosen, sighted, offset, prior_px2, crater_noise_px2, detection_variance_px2[detection]
     )
     limit = parameters.false_set_limit / max(1, len(found) - 2) ** 2
-    needed = minimum_members(float(chance.sum()), tight_chance, limit)
+    needed = max(
+        minimum_members(float(chance.sum()), tight_chance, limit),
+        minimum_members(float(harm), tight_chance, parameters.harmful_set_limit),
+    )
     return Identification(detection[chosen], sighted[chosen], count, needed)
 
 
@@ -148,11 +169,14 @@ def _candidates(
     detection_variance_px2: Float,
     image_area_px2: float,
     parameters: IdentificationParameters,
-) -> tuple[Index, Index, Float, Float, Float]:
-    """Return detection, crater, offset (k, 2), spread (k, 2, 2) of gated pairs, and the chance of each pair.
+    place_px2: Float,
+) -> tuple[Index, Index, Float, Float, Float, float]:
+    """Return detection, crater, offset (k, 2), spread (k, 2, 2) of gated pairs, the chance of each, and of all harm.
 
-    The last covers every pair that the diameters allow, gated or not: the area of its gate over that of the image
-    is the probability that a detection lying anywhere falls into it.
+    Chances cover every pair that the diameters allow, gated or not: the area of its gate over that of the image is the
+    probability that a detection lying anywhere falls into it. Let the place bring the covariance P to a pair and all
+    else R. A detection that lies f from where the crater is moves the place to a normalised error of
+    f^2 P / (R (P + R)): the part of the gate where that exceeds a limit is the harmful one, none where P is below R.
     """
     uv = np.stack([found.u_px, found.v_px], axis=1)
     own = np.einsum("jajb->jab", prior_px2) + crater_noise_px2
@@ -162,10 +186,13 @@ def _candidates(
     rows, columns = np.nonzero(alike & np.all(np.isfinite(sighting.uv_px), axis=1)[None, :])
     spread = own[columns] + detection_variance_px2[rows, None, None] * np.eye(2)
     offset = uv[rows] - sighting.uv_px[columns]
-    determinant = spread[:, 0, 0] * spread[:, 1, 1] - spread[:, 0, 1] * spread[:, 1, 0]
+    determinant = _determinant(spread)
     inside = _distance(offset, spread, determinant) < GATE
     chance = np.minimum(np.pi * GATE * np.sqrt(determinant) / image_area_px2, 1.0)
-    return rows[inside], columns[inside], offset[inside], spread[inside], chance
+    rest = spread - place_px2[columns]
+    ratio = np.sqrt(_determinant(rest) / np.maximum(_determinant(place_px2[columns]), 1e-12))
+    harm = float(np.sum(chance * np.maximum(1.0 - _HARMLESS / GATE * ratio, 0.0)))
+    return rows[inside], columns[inside], offset[inside], spread[inside], chance, harm
 
 
 def _consensus(
@@ -185,7 +212,7 @@ def _consensus(
     gain = np.einsum("hlab,hbc->hlac", between, np.linalg.inv(spread[tried]))
     left = offset[None] - np.einsum("hlab,hb->hla", gain, offset[tried])
     narrowed = spread[None] - np.einsum("hlab,hlcb->hlac", gain, between)
-    determinant = narrowed[..., 0, 0] * narrowed[..., 1, 1] - narrowed[..., 0, 1] * narrowed[..., 1, 0]
+    determinant = _determinant(narrowed)
     distance = _distance(left, narrowed, np.maximum(determinant, 1e-9))
     # One vote per detection: its nearest crater under the hypothesis. Pairs are ordered by detection.
     starts = np.flatnonzero(np.r_[True, detection[1:] != detection[:-1]])
@@ -206,7 +233,7 @@ def _consensus(
             taken_detection.add(int(detection[k]))
             taken_crater.add(int(sighted[k]))
             chosen.append(int(k))
-    before = np.sqrt(spread[:, 0, 0] * spread[:, 1, 1] - spread[:, 0, 1] * spread[:, 1, 0])
+    before = np.sqrt(_determinant(spread))
     shrink = float(np.median(np.sqrt(np.maximum(determinant[best], 0.0)) / before))
     return np.array(sorted(chosen), dtype=np.int64), float(chance.sum()) * shrink
 
@@ -236,6 +263,12 @@ def _consistent(
             break
         chosen = np.delete(chosen, worst)
     return chosen
+
+
+def _determinant(matrix: Float) -> Float:
+    """Return determinants of (..., 2, 2); zero where rounding makes them negative."""
+    value = matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0]
+    return np.asarray(np.maximum(value, 0.0), dtype=np.float64)
 
 
 def _distance(offset: Float, spread: Float, determinant: Float) -> Float:

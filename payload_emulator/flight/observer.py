@@ -40,6 +40,8 @@ Table = TypeVar("Table")
 _NAN = float("nan")
 _UNKNOWN_VECTOR = (_NAN, _NAN, _NAN)
 _PIXEL_LIMIT = 65_535 / 64.0
+# No camera has a detection out there: what the network gives beyond, or as no number, is passed over.
+_FARTHEST_PX = 1e5
 _MILLISECOND_NS = 1e6
 _LANDMARKS_A_PACKET = 40
 
@@ -118,8 +120,9 @@ class Observer:
         if camera_from_icrf is None:
             telemetry.event("low", "attitude_missing")
         quality, found = self._detect(image, sun, timeout_s)
-        finite = np.isfinite(found.u_px) & np.isfinite(found.v_px) & np.isfinite(found.diameter_px)
-        found = found.select(finite & ~(found.score < score_floor))
+        numbers = np.stack([found.u_px, found.v_px, found.diameter_px])
+        somewhere = np.all(np.abs(numbers) < _FARTHEST_PX, axis=0)
+        found = found.select(somewhere & ~(found.score < score_floor))
         self.last_quality = quality
         if quality is not ImageQuality.OK:
             self.counts["frames_bad"] += 1

@@ -149,6 +149,29 @@ def test_frames_without_image_attitude_or_detections_are_coasted_over_and_named(
     assert outcomes[9:] == [Outcome.fixed] * (FRAMES - 9)
 
 
+def test_detections_with_numbers_that_are_none_are_passed_over_and_nothing_becomes_nan(
+    flight: Flight,
+) -> None:
+    bad = np.array([np.nan, np.inf, -np.inf, -5.0, 0.0, 1e300])
+    for k in range(4, 9):
+        found = flight.frames[k][1]
+        columns = {}
+        for shift, name in enumerate(("u_px", "v_px", "diameter_px", "score", "sigma_px")):
+            column = getattr(found, name).copy()
+            # Each kind of number in each column, in a third of the detections.
+            rows = np.arange(shift, len(found), 15)
+            column[rows] = np.resize(np.roll(bad, k + shift), rows.size)
+            columns[name] = column
+        flight.frames[k] = (ImageQuality.OK, Detections(**columns))
+    packets = flight.fly(flight.payload())
+    assert {values["outcome"] for values in named(packets, "frame_outcome")} == {int(Outcome.fixed)}
+    for values in named(packets, "filter_state"):
+        assert np.all(np.isfinite(values["position_icrf_m"])) and np.all(np.isfinite(values["covariance"]))
+    position = flight.rotations[-1] @ flight.states[-1, :3]
+    altitude_m = named(packets, "navigation_state")[-1]["altitude_m"]
+    assert altitude_m == pytest.approx(float(np.linalg.norm(position)) - 1_737_400.0, abs=60.0)
+
+
 @pytest.mark.parametrize("turn", ["mirrored", "rotated"])
 def test_a_mirrored_or_rotated_image_is_no_fix_and_moves_nothing(flight: Flight, turn: str) -> None:
     for k in range(6, FRAMES):

@@ -94,8 +94,18 @@ def test_no_detections_and_no_craters_make_no_set() -> None:
 
 def test_a_frame_full_of_detections_that_craters_hardly_explain_is_believed_less() -> None:
     places = np.random.default_rng(5).uniform(20.0, 490.0, (25, 2))
-    pair = places[:2] + 0.5
+    few = places[:4] + 0.5
     clutter = np.random.default_rng(6).uniform(0.0, 511.0, (20, 2))
-    assert run(found(pair), sighting(places), sigma_px=3.0) == [(0, 0), (1, 1)]
-    crowded = found(np.concatenate([pair, clutter]))
-    assert not {(0, 0), (1, 1)} <= set(run(crowded, sighting(places), sigma_px=3.0))
+    assert run(found(few), sighting(places), sigma_px=3.0) == [(k, k) for k in range(4)]
+    crowded = found(np.concatenate([few, clutter]))
+    assert not {(k, k) for k in range(4)} <= set(run(crowded, sighting(places), sigma_px=3.0))
+
+
+def test_a_lone_pair_is_refused_where_it_would_move_the_place_farther_than_it_then_claims() -> None:
+    places = np.random.default_rng(3).uniform(20.0, 490.0, (4, 2))
+    lone = found(places[:1] + 0.5)
+    # Chance puts a detection into one of four gates less than once in a hundred frames either way; where the prediction
+    # is worth three times less than the pair, the place would then follow the wrong one and believe it.
+    assert run(lone, sighting(places), sigma_px=1.0) == [(0, 0)]
+    assert run(lone, sighting(places), sigma_px=3.5) == []
+    assert run(found(places[:3] + 0.5), sighting(places), sigma_px=3.5) == [(0, 0), (1, 1), (2, 2)]
