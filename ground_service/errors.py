@@ -86,6 +86,10 @@ class StorageReadOnly(StoreError):
         )
 
 
+PASSING = (DatabaseUnavailable, StorageFull, StorageReadOnly)
+"""What is no fault of the work that meets it: the same work, later, may well succeed."""
+
+
 class FileDamaged(StoreError):
     """A stored file no longer has the octets it was stored with."""
 

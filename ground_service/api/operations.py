@@ -19,9 +19,11 @@ def healthz() -> schemas.Health:
 
 @operations.get("/readyz")
 def readyz(ground: GroundOf) -> schemas.Health:
-    """The service can be used: its database answers."""
+    """The service can be used: its database answers and takes what is written, and so does the archive of files."""
     with ground.database.reading() as connection:
         repository.page(connection, repository.JOBS, limit=1)
+    ground.database.require_writable()
+    ground.files.require_writable()
     return schemas.Health(status="ok")
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from sqlalchemy import Connection
 
 from ground_service.clock import utc_now_ns
-from ground_service.errors import DatabaseUnavailable, GroundError, InvalidInput
+from ground_service.errors import PASSING, GroundError, InvalidInput
 from ground_service.link.stream import DownlinkReader
 from ground_service.services.ground import Ground
 from ground_service.services.joining import join_with_others
@@ -134,7 +134,7 @@ def run_ingest(
                 "a stream of CADUs or of space packets",
                 f"{result.octets} octets without a single good packet",
             )
-    except DatabaseUnavailable:
+    except PASSING:
         raise
     except (GroundError, TmtcError) as error:
         with ground.database.writing() as connection:

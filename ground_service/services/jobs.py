@@ -18,7 +18,7 @@ from sqlalchemy import Connection, select
 from sqlalchemy.exc import IntegrityError
 
 from ground_service.clock import utc_now_ns
-from ground_service.errors import DatabaseUnavailable, GroundError, InvalidInput
+from ground_service.errors import PASSING, GroundError, InvalidInput
 from ground_service.services.archive_zip import import_zip
 from ground_service.services.feed import publish
 from ground_service.services.ground import Ground
@@ -159,8 +159,8 @@ def run_job(ground: Ground, job_id: str) -> dict[str, Any]:
 
     Raises
     ------
-    DatabaseUnavailable
-        If the database went away: the job is not at its end, and is to be done again.
+    DatabaseUnavailable, StorageFull, StorageReadOnly
+        If the database went away, or nothing can be written: the job is not at its end, and is to be done again.
     """
     with _alone_here(job_id) as here, ground.database.alone(_lock_key(job_id)) as alone:
         if not (here and alone):
@@ -188,7 +188,7 @@ def _run_alone(ground: Ground, job_id: str) -> dict[str, Any]:
         return _finish(ground, job_id, state="failed", error=error)
     try:
         result = WORK[job["kind"]](ground, job["arguments"], job_id)
-    except DatabaseUnavailable:
+    except PASSING:
         raise
     except (GroundError, TmtcError, LunarError, ReportError) as error:
         log.warning("job %s (%s) failed: %s", job_id, job["kind"], error)

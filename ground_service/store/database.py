@@ -68,6 +68,18 @@ class Database:
             with connection.begin():
                 yield connection
 
+    def require_writable(self) -> None:
+        """Refuse a SQLite file that may not be written to; nobody who writes now is waited for.
+
+        Raises
+        ------
+        StorageReadOnly
+            If it may not.
+        """
+        path = self.engine.url.database
+        if self.dialect == "sqlite" and path and Path(path).exists() and not os.access(path, os.W_OK):
+            raise StorageReadOnly(self.label)
+
     @contextmanager
     def alone(self, key: int) -> Iterator[bool]:
         """Whether no other process holds `key` (64 bit, signed) now; it is held until the end, or the process's.

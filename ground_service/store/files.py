@@ -64,6 +64,21 @@ class FileArchive:
                 with contextlib.suppress(OSError):
                     temporary.unlink()
 
+    def require_writable(self) -> None:
+        """Store nothing, to see that something could be stored.
+
+        Raises
+        ------
+        StorageFull, StorageReadOnly
+            If it could not.
+        """
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self.root, prefix=".incoming-") as stream:
+                stream.write(bytes(4096))
+        except OSError as error:
+            raise storage_error(error, self.root) from None
+
     def put_file(self, path: Path) -> StoredFile:
         """Store a copy of the file at `path`."""
         return self.put(read_blocks(path))

@@ -12,7 +12,7 @@ from celery import Celery
 from celery.schedules import crontab
 
 from ground_service.clock import utc_now_ns
-from ground_service.errors import DatabaseUnavailable, SettingsError
+from ground_service.errors import PASSING, SettingsError
 from ground_service.services.ground import Ground, ground_from_settings
 from ground_service.services.jobs import enter_job, run_job
 from ground_service.services.upkeep import nightly_job_id
@@ -53,7 +53,7 @@ def make_app(settings: Settings) -> Celery:
     @app.task(
         name=RUN_JOB,
         bind=True,
-        autoretry_for=(OSError, DatabaseUnavailable),
+        autoretry_for=(OSError, *PASSING),
         retry_backoff=2,
         retry_backoff_max=120,
         max_retries=RETRIES,

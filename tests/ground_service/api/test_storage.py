@@ -1,0 +1,98 @@
+"""A disk that is full or read-only: clear words, nothing lost, and the service says that it is not ready."""
+
+import errno
+import os
+import tempfile
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ground_service.api.app import create_app
+from ground_service.errors import StorageFull
+from ground_service.services import ingest as ingesting
+from ground_service.services.jobs import enter_ingest, run_job
+from ground_service.settings import Settings
+from ground_service.store import repository
+from ground_service.store.canonical import archive_hash
+
+with warnings.catch_warnings():
+    # The test client's next version wants another HTTP library.
+    warnings.simplefilter("ignore")
+    from fastapi.testclient import TestClient
+
+V1 = "/api/v1"
+
+
+@pytest.fixture
+def client(tmp_path: Path) -> Iterator[TestClient]:
+    with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as opened:
+        yield opened
+
+
+def full(*_: Any, **__: Any) -> Any:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def read_only(*_: Any, **__: Any) -> Any:
+    raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+
+@pytest.mark.parametrize(
+    ("failing", "status", "words"), [(full, 507, "no space left"), (read_only, 503, "cannot be written")]
+)
+def test_an_upload_that_cannot_be_kept_is_refused_and_readiness_tells(
+    client: TestClient, synthetic_pass: Any, monkeypatch: Any, failing: Any, status: int, words: str
+) -> None:
+    stream = (synthetic_pass.folder / "downlink.cadu").read_bytes()
+    assert client.get("/readyz").status_code == 200
+    with monkeypatch.context() as disk:
+        disk.setattr(tempfile, "mkstemp", failing)
+        disk.setattr(tempfile, "TemporaryFile", failing)
+        answers = [client.post(f"{V1}/telemetry", content=stream), client.get("/readyz")]
+        assert client.get("/healthz").status_code == 200
+        assert client.get(f"{V1}/passes").status_code == 200
+    for answer in answers:
+        assert answer.status_code == status
+        assert words in answer.json()["detail"]
+        assert answer.headers["content-type"] == "application/problem+json"
+    assert client.get(f"{V1}/ingests").json()["total"] == 0
+    assert client.get("/readyz").status_code == 200
+    assert client.post(f"{V1}/telemetry", content=stream).status_code == 202
+    assert client.get(f"{V1}/ingests/1").json()["state"] == "done"
+
+
+def test_a_database_that_may_not_be_written_is_not_ready(client: TestClient, monkeypatch: Any) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)
+    answer = client.get("/readyz")
+    assert answer.status_code == 503
+    assert "cannot be written" in answer.json()["detail"]
+
+
+def test_an_ingest_that_a_full_disk_stops_is_done_when_there_is_space(
+    client: TestClient, synthetic_pass: Any, monkeypatch: Any
+) -> None:
+    ground = client.app.state.ground  # type: ignore[attr-defined]
+    stored = ground.files.put_file(synthetic_pass.folder / "downlink.cadu")
+    _, job = enter_ingest(ground, stored, "d", spacecraft_id=76, instance="flight")
+
+    def no_space(*_: Any) -> Any:
+        raise StorageFull("database")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(ingesting, "store_batch", no_space)
+        with pytest.raises(StorageFull):
+            run_job(ground, job)
+    assert client.get(f"{V1}/jobs/{job}").json()["state"] == "running"
+    assert client.get(f"{V1}/ingests/1").json()["state"] == "running"
+    client.app.state.dispatcher.resume()  # type: ignore[attr-defined]
+    assert client.get(f"{V1}/jobs/{job}").json()["state"] == "done"
+    with ground.database.reading() as connection:
+        found = archive_hash(connection, 1)
+        packets = repository.page(connection, repository.PACKETS, limit=1).total
+    assert packets == len(synthetic_pass.packets)
+    client.post(f"{V1}/telemetry", content=(synthetic_pass.folder / "downlink.cadu").read_bytes())
+    with ground.database.reading() as connection:
+        assert archive_hash(connection, 1) == found
