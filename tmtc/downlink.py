@@ -493,6 +493,9 @@ def _blocks(stream: OctetArray, offsets: IntArray, length: int) -> OctetArray:
     return np.ascontiguousarray(windows[offsets][:, cadu.ASM_LENGTH :])
 
 
+_LATE_FRAMES = 64
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rebuilt:
     buffer: OctetArray
@@ -510,9 +513,9 @@ def _rebuild(zones: OctetArray, count: IntArray, pointer: IntArray) -> _Rebuilt:
     """
     zone = zones.shape[1]
     step = np.diff(count) % 256
-    lost = (step - 1) % 256
     run = np.concatenate((np.zeros(1, dtype=np.int64), np.cumsum(step != 1)))
     idle = pointer == ONLY_IDLE_DATA
+    lost = 0 if (step == 1).all() else _frames_lost(zones, count, idle)
     zones, pointer, run = zones[~idle], pointer[~idle], run[~idle]
     begins = np.flatnonzero(pointer < zone)
     runs, first = np.unique(run[begins], return_index=True)
@@ -526,8 +529,29 @@ def _rebuild(zones: OctetArray, count: IntArray, pointer: IntArray) -> _Rebuilt:
         segments=segments,
         idle_octets=int(np.count_nonzero(idle)) * zone,
         orphaned=buffer.size - used,
-        frames_lost=int(lost.sum()),
+        frames_lost=lost,
     )
+
+
+def _frames_lost(zones: OctetArray, count: IntArray, idle: npt.NDArray[np.bool_]) -> int:
+    """Frames of one virtual channel that are missing by their counts of 8 bits.
+
+    What came before, octet for octet, is sent again and not counted; a count up to `_LATE_FRAMES` behind the one before
+    is of a frame that comes late. Losses of whole rounds of the count cannot be seen.
+    """
+    seen: set[tuple[int, bytes]] = set()
+    kept = []
+    for k, (number, is_idle) in enumerate(zip(count.tolist(), idle.tolist(), strict=True)):
+        if not is_idle:
+            key = (number, zones[k].tobytes())
+            if key in seen:
+                continue
+            seen.add(key)
+        kept.append(k)
+    step = np.diff(count[kept]) % 256
+    unwrapped = np.cumsum(np.where(step >= 256 - _LATE_FRAMES, step - 256, step), dtype=np.int64)
+    numbers = np.unique(np.concatenate((np.zeros(1, dtype=np.int64), unwrapped)))
+    return int(numbers[-1] - numbers[0]) + 1 - numbers.size
 
 
 def _octet_account(total: int, cut: PacketCut) -> dict[str, int]:

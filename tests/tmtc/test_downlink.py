@@ -209,6 +209,17 @@ def test_a_lost_frame_costs_the_packets_that_touch_it_and_no_other():
     assert_all_octets_are_accounted_for(damaged, decoded)
 
 
+def test_frames_that_come_twice_or_late_are_not_lost():
+    settings = LinkSettings()
+    octets = encode_cadus(PACKETS, spacecraft_id=76)
+    frames = [octets[k : k + settings.cadu_length] for k in range(0, len(octets), settings.cadu_length)]
+    again = frames[:20] + frames[:10] + frames[20:40] + frames[5:15] + frames[40:]
+    assert decode(b"".join(again)).frames_lost == 0
+    late = frames[:10] + frames[12:20] + frames[10:12] + frames[20:]
+    assert decode(b"".join(late)).frames_lost == 0
+    assert decode(b"".join(late[:30] + late[33:] + late[:5])).frames_lost == 3
+
+
 def test_an_uncorrectable_frame_is_counted_and_its_damage_located():
     octets = bytearray(encode_cadus(PACKETS, spacecraft_id=76))
     octets[5 * 1279 + 10 : 5 * 1279 + 10 + 17 * 5 : 5] = bytes(17)
