@@ -62,6 +62,15 @@ def configure(verbs: Any) -> None:
     add_json_flag(trials)
     trials.set_defaults(handler=_trials)
 
+    choose = verbs.add_parser(
+        "choose",
+        help="which of several models flies, by the validation split alone (shipped: the one that does)",
+    )
+    choose.add_argument("models", nargs="+", metavar="M.onnx", help='files, or "shipped"')
+    choose.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
+    add_json_flag(choose)
+    choose.set_defaults(handler=_choose)
+
     ablate = verbs.add_parser(
         "ablate", help="train the recipe with one thing changed at a time, at equal small budgets"
     )
@@ -93,6 +102,20 @@ def configure(verbs: Any) -> None:
     )
     add_json_flag(ablate)
     ablate.set_defaults(handler=_ablate)
+
+
+def _choose(arguments: argparse.Namespace) -> int:
+    from linna.output import emit, progress
+    from payload_emulator.training.choice import choose, format_choice
+    from payload_emulator.training.dataset import Dataset
+
+    document = choose(
+        {name: model_octets(None if name == "shipped" else Path(name)) for name in arguments.models},
+        [Dataset(folder) for folder in arguments.dataset],
+        lambda frames: progress(frames, len(frames), "validate", "frames"),
+    )
+    emit(arguments, document, format_choice(document))
+    return 0
 
 
 def _ablate(arguments: argparse.Namespace) -> int:

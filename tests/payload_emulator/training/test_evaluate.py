@@ -8,7 +8,11 @@ import pytest
 
 from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.flight.models import load_shipped_model
+from payload_emulator.training import choice
+from payload_emulator.training.choice import choose, format_choice
+from payload_emulator.training.dataset import frame_truth
 from payload_emulator.training.evaluate import (
+    Scored,
     detect_by_class,
     evaluate,
     format_figures,
@@ -16,6 +20,7 @@ from payload_emulator.training.evaluate import (
     run,
     summary,
 )
+from payload_emulator.training.figures import Scene, Thresholds
 from payload_emulator.training.report import detector_report
 from payload_emulator.training.scoring import FrameDetections
 from payload_emulator.training.trials import TRIALS, format_trials, run_trials
@@ -128,6 +133,33 @@ def test_trials_and_eight_bits_refuse_frames_of_another_camera(detector, make_bl
     detector.metadata["camera_fov_deg"] = "120"
     with pytest.raises(DatasetError, match="expected frames of the detector's camera"):
         quantise(load_shipped_model(), [other])
+
+
+def test_the_network_with_the_greater_validation_f1_is_chosen(blob_dataset, monkeypatch):
+    frames = [(blob_dataset, frame) for frame in blob_dataset.frames("val")]
+    truths = [frame_truth(*item) for item in frames]
+    scenes = [Scene(30.0, 10.0, 0.0, "val")] * len(frames)
+
+    def answered(model, datasets, split, progress):
+        """The first model finds every crater of the validation frames, the second half of them."""
+        assert split == "val"
+        step = {b"good": 1, b"poor": 2}[model]
+        found = []
+        for truth in truths:
+            kept = [part[::step] for part in (truth.u_px, truth.v_px, truth.diameter_px, truth.diameter_m)]
+            found.append(FrameDetections(*kept, np.full(kept[0].size, 0.8), np.ones(kept[0].size)))
+        return Scored(frames, truths, found, scenes, Thresholds(0.4, 0.4, 0.4))
+
+    class Model(bytes):
+        sha256 = "0"
+
+    monkeypatch.setattr(choice, "open_for_evaluation", Model)
+    monkeypatch.setattr(choice, "run", answered)
+    document = choose({"a": b"poor", "b": b"good"}, [blob_dataset])
+    assert document["chosen"] == "b"
+    assert document["models"]["b"]["f1"] == 1.0 and document["models"]["a"]["precision"] == 1.0
+    assert document["models"]["a"]["frames"] == len(frames)
+    assert "chosen: b" in format_choice(document)
 
 
 def detections(u, score):
