@@ -27,8 +27,11 @@ from payload_emulator.sim.terrain.tiles import Terrain
 
 WORKER = Path(__file__).with_name("cycles_worker.py")
 NO_BLENDER = 3
-GRAZING = 0.01
-"""Ground whose cosine to the Sun is smaller counts as shadow: what little light it has says nothing of shadows."""
+GRAZING = 0.001
+"""Ground whose cosine to the Sun is smaller counts as shadow, as ground that faces away does in the other renderers.
+
+Not larger: ground of cosine 0.01, which the Sun still sees whole, edges every broad shadow, and is a pixel wide.
+"""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
