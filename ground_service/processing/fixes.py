@@ -108,11 +108,15 @@ def snapshot_positions(
         Ascending epochs (m,) and where to begin (m, 3): what the payload itself believed.
     """
     result = np.full((len(utc_ns), 3), np.nan)
+    frames: dict[int, list[tuple[int, IntArray]]] = {}
     for rows in _by_frame(pairs):
         at = int(np.searchsorted(utc_ns, pairs.utc_ns[rows[0]]))
-        if len(rows) < PAIRS_NEEDED or at >= len(utc_ns) or utc_ns[at] != pairs.utc_ns[rows[0]]:
-            continue
-        result[at] = _solved(camera, start_mcmf_m[at], pairs.crater_mcmf_m[rows], pairs.uv_px[rows])
+        if len(rows) >= PAIRS_NEEDED and at < len(utc_ns) and utc_ns[at] == pairs.utc_ns[rows[0]]:
+            frames.setdefault(len(rows), []).append((at, rows))
+    for alike in frames.values():
+        where = np.array([at for at, _ in alike])
+        chosen = np.array([rows for _, rows in alike])
+        result[where] = _solved(camera, start_mcmf_m[where], pairs.crater_mcmf_m[chosen], pairs.uv_px[chosen])
     return result
 
 
@@ -126,26 +130,31 @@ def _by_frame(pairs: Pairs) -> list[IntArray]:
 def _solved(
     camera: PinholeCamera, start_m: FloatArray, crater_m: FloatArray, uv_px: FloatArray
 ) -> FloatArray:
-    """Gauss-Newton on the position of a nadir camera; NaN where it does not settle."""
-    nothing = np.full(3, np.nan)
+    """Gauss-Newton on the positions (f, 3) of nadir cameras that see n craters each; NaN where it does not settle."""
+    result = np.full(start_m.shape, np.nan)
     position = start_m.astype(np.float64)
+    going = np.flatnonzero(np.isfinite(position).all(axis=1))
     steps = STEP_M * np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    coordinates = 2 * crater_m.shape[1]
     for _ in range(ROUNDS):
-        projected = _projected(camera, position + steps, crater_m)
-        residual = (uv_px - projected[0]).ravel()
-        slope = ((projected[1:4] - projected[4:]) / (2.0 * STEP_M)).reshape(3, -1).T
-        if not np.isfinite(residual).all() or not np.isfinite(slope).all():
-            return nothing
-        move, _, rank, _ = np.linalg.lstsq(slope, residual, rcond=None)
-        position += move
-        if rank < 3 or np.linalg.norm(position - start_m) > LIMIT_M:
-            return nothing
-        if np.linalg.norm(move) < CONVERGED_M:
-            return position
-    return nothing
+        projected = _projected(camera, position[going, None] + steps, crater_m[going, None])
+        residual = (uv_px[going] - projected[:, 0]).reshape(-1, coordinates)
+        slope = ((projected[:, 1:4] - projected[:, 4:]) / (2.0 * STEP_M)).reshape(-1, 3, coordinates)
+        known = np.isfinite(residual).all(axis=1) & np.isfinite(slope).all(axis=(1, 2))
+        going, residual, slope = going[known], residual[known], slope[known].swapaxes(1, 2)
+        if len(going) == 0:
+            break  # none is left, or none was known
+        rank = np.linalg.matrix_rank(slope)
+        move = (np.linalg.pinv(slope) @ residual[..., None])[..., 0]
+        position[going] += move
+        good = (rank == 3) & (np.linalg.norm(position[going] - start_m[going], axis=1) <= LIMIT_M)
+        settled = good & (np.linalg.norm(move, axis=1) < CONVERGED_M)
+        result[going[settled]] = position[going[settled]]
+        going = going[good & ~settled]
+    return result
 
 
 def _projected(camera: PinholeCamera, positions_m: FloatArray, crater_m: FloatArray) -> FloatArray:
-    """Pixels (k, n, 2) of craters (n, 3) from nadir cameras at positions (k, 3)."""
+    """Pixels (..., n, 2) of craters (..., n, 3) from nadir cameras at positions (..., 3)."""
     rotations = nadir_camera_from_mcmf(positions_m)
-    return np.asarray(camera.project((crater_m - positions_m[:, None]) @ rotations.swapaxes(-1, -2)))
+    return np.asarray(camera.project((crater_m - positions_m[..., None, :]) @ rotations.swapaxes(-1, -2)))

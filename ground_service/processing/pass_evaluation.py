@@ -49,6 +49,7 @@ from lunar.ephemeris import Ephemeris
 from lunar.errors import LunarError
 from lunar.frames import Orientation
 from lunar.gravity import GravityField
+from reports.text import count_text
 from reports.values import (
     AnchorRead,
     CraterMap,
@@ -612,13 +613,13 @@ def _headline(
             "Median position error",
             best.statistics.median_3d_m if best else None,
             "m",
-            f"{best.name}; 95 % below {best.statistics.p95_3d_m:.0f} m" if best else "",
+            f"{best.name}; 95 % below {_length(best.statistics.p95_3d_m)}" if best else "",
         ),
         HeadlineFigure(
             "Propagation alone, same start",
             only.statistics.median_3d_m if only else None,
             "m",
-            f"95 % below {only.statistics.p95_3d_m:.0f} m" if only else "no start state",
+            f"95 % below {_length(only.statistics.p95_3d_m)}" if only else "no start state",
         ),
         HeadlineFigure(
             "Drift",
@@ -634,7 +635,7 @@ def _headline(
             if micro
             else "",
         ),
-        HeadlineFigure("Packets lost", lost, "", f"of {inputs.packets.packets + lost}"),
+        HeadlineFigure("Packets lost", lost, "", f"of {count_text(inputs.packets.packets + lost)}"),
     )
 
 
