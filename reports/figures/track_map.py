@@ -68,7 +68,7 @@ def draw_strips(
     span: TimeSpan,
 ) -> None:
     """One pass cut into strips of equal time, read from left to right: craters, reference track and estimates."""
-    keep = inside(track.utc_ns, (span,))
+    keep = inside(track.utc_ns, (span,)) & np.isfinite(track.latitude_deg)
     latitude, longitude, utc_ns = track.latitude_deg[keep], track.longitude_deg[keep], track.utc_ns[keep]
     if not len(latitude):
         return
