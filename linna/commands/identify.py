@@ -47,7 +47,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="render frames of a scenario in sets of four; its terrain's craters are the map, FILE is not used",
     )
     rendered.add_argument(
-        "--min-diameter-km", type=float, default=5.0, help="smallest craters of the map (default: 5)"
+        "--min-diameter-km", type=float, default=3.0, help="smallest craters of the map (default: 3)"
     )
     rendered.add_argument(
         "--detections", type=Path, metavar="F.npz", help="keep the detections here, or take those kept here"

@@ -60,7 +60,8 @@ class LostParameters:
     log_diameter_gate
         Largest difference of the logarithms of measured and catalogued diameter.
     detections
-        The strongest so many detections are used.
+        The strongest so many detections are used: all that a detector gives. Those smaller than any crater of the map
+        cost no evidence, since no crater is like them, and the strongest alone are not those that the map holds.
     places
         Best places of the vote that are fitted.
     gate
@@ -80,7 +81,7 @@ class LostParameters:
     block_px: float = 14.0
     altitude_step: float = 0.045
     log_diameter_gate: float = 0.2
-    detections: int = 30
+    detections: int = 120
     places: int = 48
     gate: float = 10.6
     false_fix_limit: float = 1e-4
@@ -297,10 +298,11 @@ def place_of_frames(
     if not chains or chains[0][0] > math.log(parameters.false_fix_limit):
         return None
     best = chains[0][1]
-    margin = math.log(parameters.rival_ratio)
+    # A rival is what comes near the best, and a place of one frame that would be safe if it were alone.
+    near, alone = chains[0][0] + math.log(parameters.rival_ratio), math.log(parameters.false_fix_limit)
     for log_false, chain in chains[1:]:
-        if log_false > chains[0][0] + margin:
-            break
+        if log_false > near and (len(chain) > 1 or log_false > alone):
+            continue
         if not _one_orbit(tuple(sorted((*best, *chain), key=lambda item: item[0])), frames):
             return None
     return tuple(place for _, place in best)
