@@ -533,7 +533,8 @@ def event_list(connection: Connection, span: PassSpan) -> tuple[PassEvent, ...]:
 
 
 def _event_detail(frame_number: int, *values: float | None) -> str:
-    given = ", ".join(f"{value:.6g}" for value in values if value is not None)
+    known = [value for value in values if value is not None]
+    given = ", ".join(f"{value:.0f}" if float(value).is_integer() else f"{value:.6g}" for value in known)
     return f"frame {frame_number}: {given}" if given else f"frame {frame_number}"
 
 

@@ -1,10 +1,21 @@
 // Series on a time axis: mean line in a band from least to greatest value, silences left open.
 /* global uPlot */
-import { element } from "./page.js";
+import { element, figure } from "./page.js";
 
 const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 export const COLOURS = ["--blue", "--vermillion", "--green", "--purple", "--orange", "--sky", "--gray1"];
 export const colour = (index) => style(COLOURS[index % COLOURS.length]);
+
+// Solutions look as in the reports: flown ones in their colour wherever they are shown, baselines gray and dashed.
+const FLOWN = { anchored: "--blue", paper: "--vermillion", spherical: "--purple", smoothed: "--green" };
+const BASELINES = [["--gray1", [6, 3]], ["--gray1", [2, 3]], ["--faint", [8, 3, 2, 3]], ["--muted", [3, 2]], ["--faint", [12, 4]]];
+export function solutionStyle(name, kind = "estimate", index = 0) {
+  if (kind === "baseline") {
+    const [role, dash] = BASELINES[index % BASELINES.length];
+    return { colour: style(role), dash };
+  }
+  return { colour: FLOWN[name] ? style(FLOWN[name]) : colour(4 + index) };
+}
 
 // Buckets of the API as columns; a gap becomes a point without a value just before the bucket after it.
 export function columns(buckets, seconds) {
@@ -74,12 +85,13 @@ export function chart(place, title, unit, series, { logarithmic = false, group =
     {
       width: box.clientWidth,
       height,
+      padding: [null, 40, null, null], // the date under the last tick
       tzDate: (time) => uPlot.tzDate(new Date(1000 * time), "Etc/UTC"),
       // What is nearer than a metre is drawn at the edge: zeros at a reset would rule the axis.
       scales: { y: logarithmic ? { distr: 3, range: (_, low, high) => [Math.max(1, 10 ** Math.floor(Math.log10(Math.max(low, 1)))), 10 ** Math.ceil(Math.log10(Math.max(high, 10)))] } : {} },
       axes: [
         { stroke: ink, grid, ticks: grid, values: clockTexts, space: 80 },
-        { stroke: ink, grid, ticks: grid, size: 70 },
+        { stroke: ink, grid, ticks: grid, size: 86, values: (_, values) => values.map((value) => (value === null ? null : figure(value, 6))) },
       ],
       series: lines,
       bands,

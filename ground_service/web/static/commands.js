@@ -21,7 +21,7 @@ function input(field, id) {
 
 function showArguments() {
   const chosen = definition[byId("name").value];
-  byId("description").textContent = `${chosen.description} Service ${chosen.service}, subtype ${chosen.subtype}.${chosen.critical ? " Critical: somebody else has to release it." : ""}`;
+  byId("description").textContent = `${chosen.description.replace(/\.?$/, ".")} Service ${chosen.service}, subtype ${chosen.subtype}.${chosen.critical ? " Critical: somebody else has to release it." : ""}`;
   const fields = chosen.fields.filter((field) => field.name !== chosen.count);
   const inputs = fields.map((field) => input(field, `argument-${field.name}`));
   if (chosen.repeats.length) {

@@ -1,5 +1,5 @@
 // A payload flown live: what its camera sees, what it finds, where it believes to be.
-import { chart, colour } from "./charts.js";
+import { chart, solutionStyle } from "./charts.js";
 import { dot, legendItem, moonMap, track } from "./moon.js";
 import { token } from "./api.js";
 import { byId, element, figure, notice, show, timeText } from "./page.js";
@@ -10,6 +10,7 @@ const history = { times: [], names: [], errors: {}, altitude: [] };
 let socket = null;
 let map = null;
 let lines = {};
+let dots = {};
 let plots = [];
 let shown = 0;
 let shownSince = performance.now();
@@ -133,6 +134,8 @@ function remember(message) {
     if (place?.latitude_deg === undefined || place.latitude_deg === null) continue;
     const longitude = ((((place.longitude_deg + 180) % 360) + 360) % 360) - 180;
     lines[name]?.addLatLng([place.latitude_deg, longitude]);
+    dots[name]?.setLatLng([place.latitude_deg, longitude]);
+    if (name === "reference" && !map.getBounds().pad(-0.15).contains([place.latitude_deg, longitude])) map.panTo([place.latitude_deg, longitude], { animate: false });
   }
   plots[0]?.setData([history.times, ...history.names.map((name) => history.errors[name])]);
   plots[1]?.setData([history.times, history.altitude]);
@@ -145,18 +148,20 @@ function begin(names, reference) {
   map?.remove();
   map = moonMap(byId("map"));
   lines = {};
+  dots = {};
   show("map-legend");
   for (const [index, name] of ["reference", ...names].entries()) {
-    const css = name === "reference" ? "#ffffff" : colour(index - 1);
-    lines[name] = track(map, [reference.latitude_deg], [reference.longitude_deg], { color: css });
+    const css = name === "reference" ? "#ffffff" : solutionStyle(name, "estimate", index).colour;
+    const first = [[reference.latitude_deg], [reference.longitude_deg]];
+    lines[name] = track(map, ...first, { color: css, weight: name === "reference" ? 5 : 2 });
+    dots[name] = dot(map, ...first.flat(), { color: css });
     byId("map-legend").append(legendItem(name, css));
   }
-  dot(map, reference.latitude_deg, reference.longitude_deg, { color: "#ffffff" });
-  map.setView([reference.latitude_deg, ((reference.longitude_deg + 180) % 360) - 180], 2);
+  map.setView([reference.latitude_deg, ((reference.longitude_deg + 180) % 360) - 180], 4);
   show("charts");
   const times = history.times;
   plots = [
-    chart(byId("charts"), "distance from the reference", "m", names.map((name) => ({ label: name, times, mean: times.map(() => null) })), { logarithmic: true }).plot,
+    chart(byId("charts"), "distance from the reference", "m", names.map((name, index) => ({ label: name, ...solutionStyle(name, "estimate", index + 1), times, mean: times.map(() => null) })), { logarithmic: true }).plot,
     chart(byId("charts"), "altitude", "km", [{ label: "altitude", times, mean: history.altitude }], { height: 160 }).plot,
   ];
 }

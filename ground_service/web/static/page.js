@@ -99,6 +99,11 @@ export function figure(value, digits = 3) {
   return Math.abs(value) >= 1000 ? Math.round(value).toLocaleString("en").replaceAll(",", " ") : String(+value.toPrecision(digits));
 }
 
+// Names of parameters end in their unit, which stands beside them anyway: "bus voltage, V" for bus_voltage_v.
+const UNIT_SUFFIX = { degC: "_c", V: "_v", W: "_w", KiB: "_kib", permille: "_permille", deg: "_deg", m: "_m" };
+export const parameterName = (name, unit) => (unit in UNIT_SUFFIX && name.endsWith(UNIT_SUFFIX[unit]) ? name.slice(0, -UNIT_SUFFIX[unit].length) : name).replaceAll("_", " ");
+export const unitText = (unit) => ({ degC: "°C", deg: "°", permille: "‰" })[unit] ?? unit;
+
 export const stateMark = (state) => element("span", { class: `state ${state}` }, state);
 
 export function pager(load, size = 25) {

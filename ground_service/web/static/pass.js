@@ -1,7 +1,7 @@
 import { finished, get, request, send } from "./api.js";
-import { chart, colour, columns } from "./charts.js";
+import { chart, columns, solutionStyle } from "./charts.js";
 import { legendItem, moonMap, track } from "./moon.js";
-import { acting, byId, dictionary, element, figure, lengthText, notice, seconds, show, stateMark, table, timeText, trouble } from "./page.js";
+import { acting, byId, dictionary, element, figure, lengthText, notice, parameterName, seconds, show, stateMark, table, timeText, trouble, unitText } from "./page.js";
 
 const passId = Number(location.pathname.split("/").at(-1));
 const STATES = ["latitude_deg", "longitude_deg", "altitude_m"];
@@ -31,7 +31,7 @@ function showReport(report, id) {
         ),
       ),
     ),
-    element("p", { class: "hint" }, `Evidence: ${report.evidence_rung || "no rung stated"}.`),
+    element("p", { class: "hint" }, `Evidence: ${report.evidence_rung ? `rung ${report.evidence_rung}` : "no rung stated"}.`),
   );
   show(
     "report-links",
@@ -47,8 +47,7 @@ function showErrors(report) {
     .filter((one) => one.time_s.length)
     .map((one, index) => ({
       label: one.name,
-      colour: colour(index),
-      dash: one.kind === "baseline" ? [6, 4] : undefined,
+      ...solutionStyle(one.name, one.kind, index),
       ...columns(
         one.time_s.map((time, row) => ({
           start: time,
@@ -103,21 +102,21 @@ async function showStates(estimators) {
   );
   const found = answers.filter((answer) => answer?.series[0].samples);
   const bounds = [];
-  found.forEach((one, index) => {
+  found.forEach((one) => {
     const [latitude, longitude] = one.series.map((series) => columns(series.buckets, seconds).mean);
-    const line = track(map, latitude, longitude, { color: colour(index) });
+    const line = track(map, latitude, longitude, { color: solutionStyle(one.estimator).colour });
     if (line.getLatLngs().length) bounds.push(line.getBounds());
-    byId("map-legend").append(legendItem(one.estimator, colour(index)));
+    byId("map-legend").append(legendItem(one.estimator, solutionStyle(one.estimator).colour));
   });
   if (bounds.length) map.fitBounds(bounds.reduce((all, one) => all.extend(one)), { maxZoom: 4, padding: [20, 20] });
   STATES.forEach((value, which) => {
     const unit = found[0]?.series[which].unit ?? "";
-    const series = found.map((one, index) => ({
+    const series = found.map((one) => ({
       label: one.estimator,
-      colour: colour(index),
+      ...solutionStyle(one.estimator),
       ...columns(one.series[which].buckets, seconds),
     }));
-    if (series.length) chart(byId("navigation"), words(value.replace(/_(deg|m)$/, "")), unit, series, { group: "pass" });
+    if (series.length) chart(byId("navigation"), parameterName(value, unit), unitText(unit), series, { group: "pass" });
   });
   if (!found.length) show("navigation", element("p", { class: "hint" }, "No navigation states of this pass have come."));
 }
@@ -126,7 +125,7 @@ async function showParameter() {
   const name = byId("parameter").value;
   const series = await get(`passes/${passId}/telemetry/${name}`, { max_points: 600 });
   show("housekeeping");
-  chart(byId("housekeeping"), words(name), series.unit, [{ label: words(name), ...columns(series.buckets, seconds) }], { group: "pass" });
+  chart(byId("housekeeping"), parameterName(name, series.unit), unitText(series.unit), [{ label: parameterName(name, series.unit), ...columns(series.buckets, seconds) }], { group: "pass" });
 }
 
 let events = [];
@@ -170,7 +169,7 @@ byId("make-report").addEventListener(
     await showLatestReport(reports);
   }),
 );
-byId("parameter").append(...dictionary.parameters.map((one) => element("option", { value: one.name }, words(one.name))));
+byId("parameter").append(...dictionary.parameters.map((one) => element("option", { value: one.name }, parameterName(one.name, one.unit))));
 byId("parameter").value = dictionary.parameters.some((one) => one.name === "temperature_c") ? "temperature_c" : dictionary.parameters[0].name;
 byId("parameter").addEventListener("change", acting(showParameter));
 byId("only-alarms").addEventListener("change", showEvents);

@@ -1,8 +1,7 @@
 import { get } from "./api.js";
 import { chart, columns } from "./charts.js";
-import { acting, byId, dictionary, element, figure, seconds, show, timeText, trouble } from "./page.js";
+import { acting, byId, dictionary, element, figure, parameterName, seconds, show, timeText, trouble, unitText } from "./page.js";
 
-const words = (name) => name.replaceAll("_", " ");
 const definition = Object.fromEntries(dictionary.parameters.map((one) => [one.name, one]));
 
 function csv(series) {
@@ -16,7 +15,7 @@ function csv(series) {
 async function add() {
   const [passId, name] = [byId("pass").value, byId("parameter").value];
   const series = await get(`passes/${passId}/telemetry/${name}`, { max_points: byId("points").value });
-  const { box } = chart(byId("charts"), words(name), series.unit, [{ label: words(name), ...columns(series.buckets, seconds) }], { group: "telemetry" });
+  const { box } = chart(byId("charts"), parameterName(name, series.unit), unitText(series.unit), [{ label: parameterName(name, series.unit), ...columns(series.buckets, seconds) }], { group: "telemetry" });
   const about = definition[name];
   const limits = [
     about.warning ? `warning outside ${about.warning.join(" to ")}` : null,
@@ -39,8 +38,9 @@ async function load() {
   const asked = Number(wanted.get("pass"));
   if (asked && !passes.items.some((one) => one.id === asked)) passes.items.unshift(await get(`passes/${asked}`));
   show("pass", passes.items.map((one) => element("option", { value: one.id }, `${one.name}, ${timeText(one.start)}`)));
-  show("parameter", dictionary.parameters.map((one) => element("option", { value: one.name }, words(one.name))));
+  show("parameter", dictionary.parameters.map((one) => element("option", { value: one.name }, parameterName(one.name, one.unit))));
   if (wanted.get("pass")) byId("pass").value = wanted.get("pass");
+  if ("temperature_c" in definition) byId("parameter").value = "temperature_c";
   if (wanted.get("parameter") in definition) byId("parameter").value = wanted.get("parameter");
   if (passes.items.length) await add();
   else show("charts", element("p", { class: "hint" }, "No pass yet."));

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from ground_service.errors import InvalidInput
-from ground_service.web.basemap import WIDTH_PX, basemap_jpeg
+from ground_service.services.surface import WIDTH_PX
+from ground_service.web.basemap import basemap_jpeg
 from ground_service.web.pages import PAGES, POLICY
 
 PATHS = [page.path.replace("{pass_id}", "1") for page in PAGES]
