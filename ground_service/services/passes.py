@@ -22,6 +22,7 @@ from ground_service.services.pass_data import (
     pass_span,
     readable_version,
 )
+from ground_service.services.remembered import remembered
 from ground_service.services.series import PARAMETERS, STATE_VALUES, Series, SeriesReading
 from ground_service.store import repository
 from reports.values import PacketAccounting, PassEvent
@@ -99,14 +100,24 @@ def completeness(ground: Ground, pass_id: int) -> PacketAccounting:
     """Packets of a pass that came and that did not."""
     with ground.database.reading() as connection:
         record = repository.get(connection, repository.PASSES, pass_id, "pass")
-        return packet_accounting(connection, record, pass_span(connection, record))
+        return remembered(
+            ground,
+            connection,
+            ("completeness", pass_id),
+            lambda: packet_accounting(connection, record, pass_span(connection, record)),
+        )
 
 
 def events(ground: Ground, pass_id: int) -> tuple[PassEvent, ...]:
     """Event reports of a pass, in time order."""
     with ground.database.reading() as connection:
         record = repository.get(connection, repository.PASSES, pass_id, "pass")
-        return event_list(connection, pass_span(connection, record))
+        return remembered(
+            ground,
+            connection,
+            ("events", pass_id),
+            lambda: event_list(connection, pass_span(connection, record)),
+        )
 
 
 def detections(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tuple[list[Detection], int]:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from sqlalchemy import delete, select
+from sqlalchemy import Connection, delete, select
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import NotFound
@@ -20,6 +20,7 @@ from ground_service.processing.trends import Trend, trend_of
 from ground_service.services.feed import publish
 from ground_service.services.ground import Ground
 from ground_service.services.pass_data import PassSpan, load_correlations, readable_version
+from ground_service.services.remembered import remembered
 from ground_service.services.series import PARAMETERS, SeriesReading
 from ground_service.store import repository, rollups
 from lunar.timescales import format_utc
@@ -85,21 +86,25 @@ def spacecraft_trends(ground: Ground, spacecraft_id: int, instance: str) -> list
 def vehicle_trends(ground: Ground, vehicle: int) -> list[Trend]:
     """Trends of the last `TREND_DAYS` days of on-board time in which there is housekeeping."""
     with ground.database.reading() as connection:
-        version = readable_version(connection, vehicle)
-        _, _, last = rollups.rolled_extent(connection, "housekeeping", vehicle, version, 0, 0, (1 << 48) - 1)
-        if last == 0:
-            return []
-        first = max(last - (TREND_DAYS * 86_400 << 16), 0)
-        span = PassSpan(vehicle, first, last, load_correlations(connection, vehicle), version)
-        reading = SeriesReading(connection, span, "housekeeping", 0, TREND_POINTS)
-        definition = DICTIONARY.packet("housekeeping")
-        found = []
-        for name in PARAMETERS:
-            field = definition.field(name)
-            trend = trend_of(field, reading.series(name, field.unit).buckets)
-            if trend is not None:
-                found.append(trend)
-        return found
+        return remembered(ground, connection, ("trends", vehicle), lambda: _trends(connection, vehicle))
+
+
+def _trends(connection: Connection, vehicle: int) -> list[Trend]:
+    version = readable_version(connection, vehicle)
+    _, _, last = rollups.rolled_extent(connection, "housekeeping", vehicle, version, 0, 0, (1 << 48) - 1)
+    if last == 0:
+        return []
+    first = max(last - (TREND_DAYS * 86_400 << 16), 0)
+    span = PassSpan(vehicle, first, last, load_correlations(connection, vehicle), version)
+    reading = SeriesReading(connection, span, "housekeeping", 0, TREND_POINTS)
+    definition = DICTIONARY.packet("housekeeping")
+    found = []
+    for name in PARAMETERS:
+        field = definition.field(name)
+        trend = trend_of(field, reading.series(name, field.unit).buckets)
+        if trend is not None:
+            found.append(trend)
+    return found
 
 
 def trend_view(trend: Trend) -> dict[str, Any]:

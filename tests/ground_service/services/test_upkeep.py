@@ -64,3 +64,26 @@ def test_what_is_old_goes_and_the_record_stays(ground: Ground) -> None:
     assert [item["id"] for item in read_feed(ground, 0)] == [3]
     with ground.database.reading() as connection:
         assert repository.page(connection, repository.AUDIT).total == 1
+
+
+def test_answers_are_kept_until_telemetry_is_new(
+    ground: Ground, synthetic_pass: Any, monkeypatch: Any, tmp_path: Any
+) -> None:
+    from ground_service.services import upkeep
+    from ground_service.services.ingest import ingest_file
+    from tmtc.downlink import encode_cadus
+
+    half = len(synthetic_pass.packets) // 2
+    (tmp_path / "a.cadu").write_bytes(encode_cadus(synthetic_pass.packets[:half], spacecraft_id=76))
+    vehicle = ingest_file(ground, tmp_path / "a.cadu").vehicle_id
+    assert vehicle is not None
+    made = []
+    read = upkeep._trends
+    monkeypatch.setattr(upkeep, "_trends", lambda *given: made.append(1) or read(*given))
+    first = upkeep.vehicle_trends(ground, vehicle)
+    assert upkeep.vehicle_trends(ground, vehicle) == first
+    assert len(made) == 1
+    ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
+    second = upkeep.vehicle_trends(ground, vehicle)
+    assert len(made) == 2
+    assert {one.parameter: one.samples for one in second} != {one.parameter: one.samples for one in first}
