@@ -49,11 +49,12 @@ class Part:
     def __init__(self, command: list[str], log: Path, ready: Callable[[], bool], **options: Any) -> None:
         self._command, self._log, self._ready, self._options = command, log, ready, options
         self._process: subprocess.Popen[bytes] | None = None
+        self._ended = False
 
     def start(self) -> None:
         """Start it, again when it gives up at once (what it was killed with may not be gone yet)."""
         until = time.monotonic() + 120.0
-        while time.monotonic() < until:
+        while time.monotonic() < until and not self._ended:
             with self._log.open("ab") as log:
                 self._process = subprocess.Popen(
                     self._command, stdout=log, stderr=log, start_new_session=True, **self._options
@@ -63,6 +64,8 @@ class Part:
                     return
                 time.sleep(0.1)
             time.sleep(0.5)
+        if self._ended:
+            return
         raise SystemExit(f"{' '.join(self._command[:4])}: did not start; {self._log.read_text()[-500:]}")
 
     @property
@@ -71,8 +74,16 @@ class Part:
         assert self._process is not None
         return self._process.pid
 
+    def end(self) -> None:
+        """Kill it for good: it is not started again."""
+        self._ended = True
+        if self._process is not None:
+            self.kill()
+
     def kill(self) -> None:
         assert self._process is not None
+        if self._process.poll() is not None:
+            return  # its number may be somebody else's by now
         family = [self._process.pid, *descendants(self._process.pid)]
         for pid in family:
             with contextlib.suppress(ProcessLookupError):
@@ -118,7 +129,7 @@ class Laptop:
 
     def stop(self) -> None:
         for part in self.parts.values():
-            part.kill()
+            part.end()
 
 
 class PostgresServer:
@@ -164,7 +175,7 @@ class PostgresServer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.part.kill()
+        self.part.end()
 
     def _answers(self) -> bool:
         ask = [str(self._bin / "pg_isready"), "-h", "127.0.0.1", "-p", str(self._port), "-q"]
@@ -212,4 +223,4 @@ class Deployment:
 
     def stop(self) -> None:
         for part in self.parts.values():
-            part.kill()
+            part.end()

@@ -150,8 +150,9 @@ def one_run(
                     rows = repository.page(connection, repository.INGESTS, limit=100_000).rows
         finally:
             harassment.enough.set()
-            harassment.join()
             service.stop()
+            harassment.join()
+            service.stop()  # what was being started meanwhile
     return {
         "seed": seed,
         "kills": dict(harassment.killed),

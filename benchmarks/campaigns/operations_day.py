@@ -94,7 +94,9 @@ class Payload:
         with log.open("ab") as stream:
             self.process = subprocess.Popen(command, stdout=stream, stderr=stream)
         wait_until(
-            lambda: listens(console) or self.process.poll() is not None, f"payload ({log.read_text()[-300:]})"
+            lambda: listens(console) or self.process.poll() is not None,
+            f"payload ({log.read_text()[-300:]})",
+            PATIENCE_S,
         )
         self._console = socket.create_connection(("127.0.0.1", console), timeout=PATIENCE_S)
         self._messages = self._console.makefile("r")
