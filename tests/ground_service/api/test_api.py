@@ -249,6 +249,7 @@ MATRIX = [
     ("POST", "/builds", "operator"),
     ("GET", "/regression-archives", "viewer"),
     ("POST", "/regression-archives", "operator"),
+    ("GET", "/regressions", "viewer"),
     ("POST", "/regressions", "operator"),
     ("GET", f"/regressions/{'0' * 32}", "viewer"),
     ("GET", f"/regressions/{'0' * 32}/report", "viewer"),
