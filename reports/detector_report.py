@@ -18,7 +18,7 @@ from reports.sections.opening import (
     provenance_and_data,
     settings,
 )
-from reports.text import count_text, number_text
+from reports.text import NOT_A_VALUE, count_text, number_text
 from reports.values import BiasBin, DetectorReport, NamedScore, ResidualSeries, SigmaBin
 
 
@@ -38,7 +38,8 @@ def detector_document(report: DetectorReport) -> Document:
             "By state of degradation",
             "degradation",
             report.by_degradation,
-            "Precision and recall by state of degradation.",
+            "Scores by state of degradation. A false alarm is no crater and has no state, so that precision may be "
+            "missing.",
         ),
         (
             "By source of the images",
@@ -91,24 +92,29 @@ def detector_document(report: DetectorReport) -> Document:
 
 
 def _named(key: str, scores: Sequence[NamedScore], caption: str) -> list[Block]:
-    both = any(np.isfinite(s.fair_precision) or np.isfinite(s.fair_recall) for s in scores)
+    columns = tuple(
+        (column, shown)
+        for column, shown in (
+            (Column("precision"), [number_text(s.precision, 3) for s in scores]),
+            (Column("recall"), [number_text(s.recall, 3) for s in scores]),
+            (Column("localisation", unit="px"), [number_text(s.localisation_px, 2) for s in scores]),
+            (Column("precision, ignore-aware"), [number_text(s.fair_precision, 3) for s in scores]),
+            (Column("recall, ignore-aware"), [number_text(s.fair_recall, 3) for s in scores]),
+        )
+        if any(text != NOT_A_VALUE for text in shown)
+    )
     table = Table(
         caption,
         (
             Column("group", numeric=False),
             Column("expected", unit="craters"),
-            Column("precision"),
-            Column("recall"),
-            Column("localisation", unit="px"),
-            *((Column("precision, ignore-aware"), Column("recall, ignore-aware")) if both else ()),
+            *(column for column, _ in columns),
         ),
         tuple(
-            (s.label, count_text(s.expected), number_text(s.precision, 3), number_text(s.recall, 3),
-             number_text(s.localisation_px, 2),
-             *((number_text(s.fair_precision, 3), number_text(s.fair_recall, 3)) if both else ()))
-            for s in scores
+            (s.label, count_text(s.expected), *(shown[row] for _, shown in columns))
+            for row, s in enumerate(scores)
         ),
-    )  # fmt: skip
+    )
     picture = Picture(
         key, caption, caption, 0.85 + 0.3 * len(scores), lambda c: dataset.draw_named_scores(c, scores)
     )

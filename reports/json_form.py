@@ -11,13 +11,19 @@ from typing import Any
 
 import numpy as np
 
+from reports.values import FloatArray
+
 SCHEMA_VERSION = 1
+DIGITS = 9
+_POWERS = np.array([float(f"1e{k}") for k in range(-12, 23)])
 
 
 def to_json(report: Any) -> str:
     """JSON text of any value of `reports.values`.
 
-    NaN and infinities become null; times stay integers; an image becomes its shape and the SHA-256 of its octets.
+    NaN and infinities become null; times stay integers; numbers with a fraction are rounded to `DIGITS` significant
+    digits (0.03 m of the Moon's longitude), which halves the text, whole numbers stay as they are; an image becomes
+    its shape and the SHA-256 of its octets.
     """
     body = {"kind": type(report).__name__, "schema_version": SCHEMA_VERSION, **_fields(report)}
     return json.dumps(body, ensure_ascii=False, allow_nan=False, separators=(",", ":")) + "\n"
@@ -37,7 +43,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, int):
         return value
     if isinstance(value, float):
-        return value if math.isfinite(value) else None
+        return float(_rounded(np.asarray(value))) if math.isfinite(value) else None
     if dataclasses.is_dataclass(value):
         return _fields(value)
     if isinstance(value, Mapping):
@@ -52,9 +58,23 @@ def _array(array: np.ndarray[Any, Any]) -> Any:
         octets = np.ascontiguousarray(array).tobytes()
         return {"shape": list(array.shape), "sha256": hashlib.sha256(octets).hexdigest()}
     if array.dtype.kind == "f":
-        values = array.astype(np.float64).tolist()
+        values = _rounded(array.astype(np.float64)).tolist()
         return values if np.isfinite(array).all() else _without_nan(values)
     return array.tolist()
+
+
+def _rounded(values: FloatArray) -> FloatArray:
+    """Numbers to so many significant digits; as they are where whole, not finite, or outside 1e-12 to 1e22.
+
+    A whole number of at most `DIGITS` digits over an exact power of ten is the float nearest to that decimal, so the
+    text is as short as the decimal.
+    """
+    size = np.abs(values)
+    place = np.searchsorted(_POWERS, size, side="right") - 1  # 10^(place - 12) <= size
+    away = DIGITS - 1 - (place - 12)  # decimals that are kept
+    fraction = np.isfinite(values) & (values != np.rint(values)) & (place >= 0) & (away >= 0)
+    scale = _POWERS[np.where(fraction, away, 0) + 12]
+    return np.where(fraction, np.rint(np.where(fraction, values, 0.0) * scale) / scale, values)
 
 
 def _without_nan(nested: Any) -> Any:

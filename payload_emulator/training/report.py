@@ -91,7 +91,7 @@ def detector_report(
         remarks=_remarks(figures),
         not_available={
             "cost": "latency depends on the machine: `linna detector bench` measures it",
-            "training": "no training run was given",
+            **({"training": "no training run was given"} if run is None else {}),
         },
     )
 
@@ -313,6 +313,10 @@ def _headline(figures: dict[str, Any]) -> tuple[HeadlineFigure, ...]:
     )
 
 
+def _signed(value: float) -> str:
+    return f"{value:+.3f}".replace("-", "−")
+
+
 def _verdict(figures: dict[str, Any]) -> tuple[str, str]:
     beaten = [
         k
@@ -339,7 +343,7 @@ def _remarks(figures: dict[str, Any]) -> tuple[str, ...]:
             f"{label} {value:.3f}" for label, value in zip(_CLASS_LABELS, average["per_class"], strict=True)
         )
         + ".",
-        f"Scale of the detections about the middle of the image: {scale['percent']:+.3f} ± "
+        f"Scale of the detections about the middle of the image: {_signed(scale['percent'])} ± "
         f"{scale['standard_error_percent']:.3f} %; −0.1 % reads as 30 m too high at 30 km.",
         f"Repeatability: a crater found in one frame is found in another that shows it in "
         f"{100 * again['value']:.0f} % of {again['pairs']} pairs of frames, which differ in Sun and pose "

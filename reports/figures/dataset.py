@@ -117,7 +117,8 @@ def draw_training(canvas: Canvas, curves: Sequence[TrainingCurve]) -> None:
 
 
 def draw_named_scores(canvas: Canvas, scores: Sequence[NamedScore]) -> None:
-    """Precision (square) and recall (dot) of each group."""
+    """Precision (square) and recall (dot) of each group; recall alone where no precision is known."""
+    both = any(np.isfinite(s.precision) for s in scores)
     axes = canvas.axes(1.9, 0.50, canvas.width_in - 3.1, canvas.height_in - 0.62)
     places = np.arange(len(scores))[::-1]
     for place, one in zip(places, scores, strict=True):
@@ -132,4 +133,4 @@ def draw_named_scores(canvas: Canvas, scores: Sequence[NamedScore]) -> None:
     axes.grid(True, axis="x")
     axes.grid(False, axis="y")
     axes.spines["left"].set_visible(False)
-    axes.set_xlabel("precision (square), recall (dot)")
+    axes.set_xlabel("precision (square), recall (dot)" if both else "recall")

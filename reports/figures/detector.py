@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 CLASS_ROLES = {0: "blue", 1: "orange", 2: "purple", 3: "gray2"}
-OCTANTS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
+OCTANTS = tuple(f"{low}–{low + 45}°" for low in range(0, 360, 45))
 
 
 def draw_class_scores(canvas: Canvas, scores: Sequence[ClassScore]) -> None:
@@ -140,12 +140,15 @@ def draw_residuals(canvas: Canvas, residuals: ResidualSeries) -> None:
 
 
 def octant_bias(residuals: ResidualSeries) -> tuple[FloatArray, FloatArray]:
-    """Mean (du, dv) in pixels for each octant of Sun azimuth (8, 2), and the samples in each (8,)."""
+    """Mean (du, dv) in pixels for each octant of Sun azimuth (8, 2), and the samples in each (8,).
+
+    Octants begin at the top of the image, as those of the tables do.
+    """
     azimuth = residuals.sun_azimuth_deg
     mean, count = np.full((8, 2), np.nan), np.zeros(8)
     if azimuth is None:
         return mean, count
-    octant = np.floor(((azimuth + 22.5) % 360.0) / 45.0).astype(np.int64)
+    octant = np.floor((azimuth % 360.0) / 45.0).astype(np.int64) % 8
     good = np.isfinite(residuals.du_px) & np.isfinite(residuals.dv_px) & np.isfinite(azimuth)
     for k in range(8):
         chosen = good & (octant == k)
@@ -173,13 +176,17 @@ def _octants(canvas: Canvas, axes: Axes, residuals: ResidualSeries) -> None:
             arrowprops={"arrowstyle": "-|>", "color": color("blue"), "linewidth": canvas.pt(1.3),
                         "shrinkA": 0, "shrinkB": 0, "mutation_scale": canvas.pt(8)},
         )  # fmt: skip
-        out = np.hypot(u, v)
-        nudge = limit * 0.09 / max(out, 1e-9)
-        axes.text(
-            u * (1 + nudge), v * (1 + nudge), OCTANTS[k], ha="center", va="center", fontsize="small",
-            color=color("ink"),
-        )  # fmt: skip
-    axes.set_title("mean residual by Sun azimuth")
+    ends = mean[finite]
+    out = np.maximum(np.hypot(ends[:, 0], ends[:, 1]), 1e-9)
+    right = ends[:, 0] >= 0
+    for side, align in ((True, "left"), (False, "right")):
+        mine = np.flatnonzero(right == side)
+        mine = mine[np.argsort(ends[mine, 1])]
+        nudged = ends[mine] * (1 + 0.06 * limit / out[mine, None])
+        heights = spread(nudged[:, 1].tolist(), 0.115 * limit)
+        for k, across, down in zip(np.flatnonzero(finite)[mine], nudged[:, 0], heights, strict=True):
+            axes.text(across, down, OCTANTS[k], ha=align, va="center", fontsize="x-small", color=color("ink"))
+    axes.set_title("mean residual by Sun azimuth from the top")
     axes.set_xlabel("du, px (right)")
     axes.set_ylabel("dv, px (down)")
 

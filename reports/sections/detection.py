@@ -168,7 +168,7 @@ def gallery_picture(key: str, frames: tuple[GalleryFrame, ...], columns: int, le
         key,
         f"{lead} Crosses: detections in the colour of their class; vermillion: of 5–30 km with no crater of the "
         "catalogue; gray dots: other sizes, not matched and not scored. Dashed circles: craters of the catalogue at "
-        "their own size; dotted: not detected. Cyan: 5–10 km, yellow: 10–15 km, pink: 15–30 km, gray: smaller.",
+        "their own size; dotted: not detected. Cyan: 5–10 km, yellow: 10–15 km, pink: 15–30 km, white: others.",
         f"{len(frames)} image frames with detections and catalogue craters.",
         gallery.gallery_height_in(len(frames), columns, WIDTH_IN),
         lambda c: gallery.draw_gallery(c, frames, columns),
