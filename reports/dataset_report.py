@@ -14,7 +14,7 @@ from reports.sections.opening import (
     provenance_and_data,
     settings,
 )
-from reports.text import count_text, number_text, percent_text
+from reports.text import count_text, percent_text
 from reports.values import DatasetReport
 
 
@@ -109,7 +109,7 @@ def _classes(report: DatasetReport) -> list[Block]:
             count_text(sum(c.by_part.values())),
             percent_text(sum(c.by_part.values()), total),
             count_text(LABELS.get(c.size_class)),
-            f"{number_text(LABEL_SHARES.get(c.size_class), 1)} %" if c.size_class in LABEL_SHARES else "–",
+            percent_text(LABEL_SHARES[c.size_class] / 100.0, 1.0) if c.size_class in LABEL_SHARES else "–",
         )
         for c in report.classes
     )
