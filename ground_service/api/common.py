@@ -60,7 +60,7 @@ Instance = Annotated[str, Query(min_length=1, max_length=96, pattern=r"^[A-Za-z0
 Name = Annotated[str, Query(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
 
 
-def ground_of(request: Request) -> Ground:
+async def ground_of(request: Request) -> Ground:
     """The opened service."""
     ground: Ground = request.app.state.ground
     return ground
@@ -71,7 +71,7 @@ GroundOf = Annotated[Ground, Depends(ground_of)]
 
 async def stored_body(request: Request) -> StoredFile:
     """The body, streamed into the archive of files with bounded memory."""
-    ground = ground_of(request)
+    ground: Ground = request.app.state.ground
     limit: int = request.app.state.upload_limit_octets
     blocks: queue.Queue[bytes | BaseException | None] = queue.Queue(maxsize=8)
     stopped = threading.Event()

@@ -278,8 +278,8 @@ def get_states(
 ) -> Any:
     """Series of one estimator's states, made short: least, greatest and mean value per stretch, gaps marked."""
     names = tuple(value) if value else ("latitude_deg", "longitude_deg", "altitude_m")
-    found = pass_service.state_series(ground, pass_id, estimator, names, max_points)
-    return JSONResponse({"estimator": estimator, "series": [series_view(one) for one in found]})
+    document = pass_service.states_document(ground, pass_id, estimator, names, max_points)
+    return Response(document, media_type="application/json")
 
 
 @router.get("/passes/{pass_id}/events", response_model=schemas.PageOf[schemas.EventItem])
@@ -312,7 +312,8 @@ def get_parameter(
     max_points: Annotated[int, Query(ge=1, le=10_000)] = 1000,
 ) -> Any:
     """The series of one housekeeping parameter."""
-    return JSONResponse(series_view(pass_service.parameter_series(ground, pass_id, parameter, max_points)))
+    document = pass_service.parameter_document(ground, pass_id, parameter, max_points)
+    return Response(document, media_type="application/json")
 
 
 @router.get("/spacecraft/{spacecraft_id}/telemetry/{parameter}", response_model=schemas.SeriesOut)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Annotated
+from collections.abc import Callable, Coroutine
+from typing import Annotated, Any
 
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
@@ -27,10 +27,10 @@ def caller_of(
     return authenticate(ground, given.credentials)
 
 
-def requires(role: str) -> Callable[..., Caller]:
+def requires(role: str) -> Callable[..., Coroutine[Any, Any, Caller]]:
     """A dependency that lets only callers of this role or a higher one pass."""
 
-    def check(caller: Annotated[Caller, Depends(caller_of)]) -> Caller:
+    async def check(caller: Annotated[Caller, Depends(caller_of)]) -> Caller:
         if not caller.may(role):
             raise Forbidden(f"{caller.name}: expected the role {role} or higher, found {caller.role}")
         return caller

@@ -324,17 +324,7 @@ def detection_samples(connection: Connection, span: PassSpan) -> DetectionSample
     )
     if not rows["ticks"]:
         return no_detections()
-    order = sorted(
-        range(len(rows["ticks"])),
-        key=lambda i: (rows["ticks"][i], rows["frame_number"][i], bytes(rows["items"][i])),
-    )
-    chosen = [
-        i
-        for place, i in enumerate(order)
-        if place == 0
-        or (rows["ticks"][i], rows["frame_number"][i])
-        != (rows["ticks"][order[place - 1]], rows["frame_number"][order[place - 1]])
-    ]
+    chosen = _first_reports(rows)
     items, offsets = unpack_detections([bytes(rows["items"][i]) for i in chosen])
     quality = [rows["image_quality"][i] for i in chosen]
     utc_ns, correlation_ids = utc_ns_of_ticks(
@@ -353,6 +343,39 @@ def detection_samples(connection: Connection, span: PassSpan) -> DetectionSample
         score=items["score"].astype(np.float64),
         size_class=items["size_class"].astype(np.int64),
     )
+
+
+def _first_reports(rows: Mapping[str, list[Any]]) -> list[int]:
+    """Numbers of the rows to count, in time order: of those on one image the first by content."""
+    order = sorted(
+        range(len(rows["ticks"])),
+        key=lambda i: (rows["ticks"][i], rows["frame_number"][i], bytes(rows["items"][i])),
+    )
+    return [
+        i
+        for place, i in enumerate(order)
+        if place == 0
+        or (rows["ticks"][i], rows["frame_number"][i])
+        != (rows["ticks"][order[place - 1]], rows["frame_number"][order[place - 1]])
+    ]
+
+
+def detection_frames(connection: Connection, span: PassSpan) -> tuple[IntArray, IntArray]:
+    """On-board time of every frame (n,), ascending, and where its detections begin among all of the span (n + 1,)."""
+    rows = repository.samples(
+        connection,
+        "detections",
+        span.vehicle,
+        span.start_ticks,
+        span.stop_ticks,
+        span.dictionary_version,
+        ("ticks", "frame_number", "items"),
+    )
+    if not rows["ticks"]:
+        return np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)
+    chosen = _first_reports(rows)
+    _, offsets = unpack_detections([bytes(rows["items"][i]) for i in chosen])
+    return np.array([rows["ticks"][i] for i in chosen], dtype=np.int64), offsets
 
 
 def packet_accounting(connection: Connection, record: Mapping[str, Any], span: PassSpan) -> PacketAccounting:

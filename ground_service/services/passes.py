@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from sqlalchemy import Connection
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound
@@ -15,6 +17,7 @@ from ground_service.services.ground import Ground
 from ground_service.services.ingest import FLOWN
 from ground_service.services.pass_data import (
     PassSpan,
+    detection_frames,
     detection_samples,
     event_list,
     load_correlations,
@@ -24,6 +27,7 @@ from ground_service.services.pass_data import (
 )
 from ground_service.services.remembered import remembered
 from ground_service.services.series import PARAMETERS, STATE_VALUES, Series, SeriesReading
+from ground_service.services.views import series_view
 from ground_service.store import repository
 from reports.values import PacketAccounting, PassEvent
 from tmtc.dictionary import DICTIONARY
@@ -124,9 +128,17 @@ def detections(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tupl
     """Detections of a pass, a page of them in time order, and how many there are."""
     with ground.database.reading() as connection:
         record = repository.get(connection, repository.PASSES, pass_id, "pass")
-        samples = detection_samples(connection, pass_span(connection, record))
-    total = len(samples.u_px)
-    rows = np.arange(min(offset, total), min(offset + limit, total))
+        span = pass_span(connection, record)
+        ticks, offsets = remembered(
+            ground, connection, ("frames", pass_id), lambda: detection_frames(connection, span)
+        )
+        total = int(offsets[-1])
+        rows = np.arange(min(offset, total), min(offset + limit, total))
+        if len(rows) == 0:
+            return [], total
+        first, last = ticks[np.searchsorted(offsets, rows[[0, -1]], side="right") - 1].tolist()
+        samples = detection_samples(connection, replace(span, start_ticks=first, stop_ticks=last))
+    rows -= offsets[np.searchsorted(ticks, first)]
     frames = np.searchsorted(samples.offsets, rows, side="right") - 1
     return [
         Detection(
@@ -155,26 +167,50 @@ def state_series(
     NotFound
         If there is no such pass or no such estimator.
     """
+    with ground.database.reading() as connection:
+        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        return _state_series(connection, record, estimator, values, max_points)
+
+
+def states_document(
+    ground: Ground, pass_id: int, estimator: str, values: tuple[str, ...], max_points: int
+) -> bytes:
+    """As `state_series`, as JSON, kept until something is new."""
+    with ground.database.reading() as connection:
+        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+
+        def make() -> bytes:
+            found = _state_series(connection, record, estimator, values, max_points)
+            return _json({"estimator": estimator, "series": [series_view(one) for one in found]})
+
+        return remembered(ground, connection, ("states", pass_id, estimator, values, max_points), make)
+
+
+def _state_series(
+    connection: Connection,
+    record: Mapping[str, Any],
+    estimator: str,
+    values: tuple[str, ...],
+    max_points: int,
+) -> list[Series]:
     unknown = [value for value in values if value not in STATE_VALUES]
     if unknown:
         raise InvalidInput("states", "value", ", ".join(STATE_VALUES), unknown[0][:80])
     codes = {name: code for code, name in DICTIONARY.labels("navigation_state", "estimator").items()}
     if estimator not in codes:
         raise NotFound("estimator", estimator[:80])
-    definition = DICTIONARY.packet("navigation_state")
-    units = {field.name: field.unit for field in definition.fields}
-    with ground.database.reading() as connection:
-        record = repository.get(connection, repository.PASSES, pass_id, "pass")
-        reading = SeriesReading(
-            connection, pass_span(connection, record), "navigation_states", codes[estimator], max_points
-        )
-        return [
-            reading.series(
-                value,
-                units.get(value, "m/s" if "_m_s" in value else "m" if value.endswith("_m") else ""),
-            )
+    units = {field.name: field.unit for field in DICTIONARY.packet("navigation_state").fields}
+    reading = SeriesReading(
+        connection, pass_span(connection, record), "navigation_states", codes[estimator], max_points
+    )
+    found = reading.series(
+        {
+            value: units.get(value, "m/s" if "_m_s" in value else "m" if value.endswith("_m") else "")
             for value in values
-        ]
+        }
+    )
+    by_name = {one.name: one for one in found}
+    return [by_name[value] for value in values]
 
 
 def parameter_series(ground: Ground, pass_id: int, parameter: str, max_points: int) -> Series:
@@ -182,8 +218,29 @@ def parameter_series(ground: Ground, pass_id: int, parameter: str, max_points: i
     _check_parameter(parameter)
     with ground.database.reading() as connection:
         record = repository.get(connection, repository.PASSES, pass_id, "pass")
-        reading = SeriesReading(connection, pass_span(connection, record), "housekeeping", 0, max_points)
-        return reading.series(parameter, DICTIONARY.packet("housekeeping").field(parameter).unit)
+        return _parameter_series(connection, pass_span(connection, record), parameter, max_points)
+
+
+def parameter_document(ground: Ground, pass_id: int, parameter: str, max_points: int) -> bytes:
+    """As `parameter_series`, as JSON, kept until something is new."""
+    _check_parameter(parameter)
+    with ground.database.reading() as connection:
+        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+
+        def make() -> bytes:
+            span = pass_span(connection, record)
+            return _json(series_view(_parameter_series(connection, span, parameter, max_points)))
+
+        return remembered(ground, connection, ("parameter", pass_id, parameter, max_points), make)
+
+
+def _parameter_series(connection: Connection, span: PassSpan, parameter: str, max_points: int) -> Series:
+    reading = SeriesReading(connection, span, "housekeeping", 0, max_points)
+    return reading.series({parameter: DICTIONARY.packet("housekeeping").field(parameter).unit})[0]
+
+
+def _json(document: Mapping[str, Any]) -> bytes:
+    return json.dumps(document, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
 
 
 def trend_series(
@@ -210,8 +267,7 @@ def trend_series(
             correlations,
             readable_version(connection, vehicle["id"]),
         )
-        reading = SeriesReading(connection, span, "housekeeping", 0, max_points)
-        return reading.series(parameter, DICTIONARY.packet("housekeeping").field(parameter).unit)
+        return _parameter_series(connection, span, parameter, max_points)
 
 
 def _check_parameter(parameter: str) -> None:

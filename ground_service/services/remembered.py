@@ -16,6 +16,9 @@ from ground_service.store import repository
 KEPT = 64
 """Answers kept of a database."""
 
+LONGEST_OCTETS = 1 << 20
+"""Answers in octets longer than that are made each time."""
+
 T = TypeVar("T")
 
 _answers: WeakKeyDictionary[Engine, OrderedDict[Hashable, tuple[Hashable, Any]]] = WeakKeyDictionary()
@@ -36,6 +39,8 @@ def remembered(ground: Ground, connection: Connection, key: Hashable, make: Call
             known.move_to_end(key)
             return found[1]  # type: ignore[no-any-return]
     made = make()
+    if isinstance(made, bytes) and len(made) > LONGEST_OCTETS:
+        return made
     with _lock:
         known[key] = (state, made)
         known.move_to_end(key)
@@ -44,19 +49,23 @@ def remembered(ground: Ground, connection: Connection, key: Hashable, make: Call
     return made
 
 
-def _state(connection: Connection) -> Hashable:
-    """What answers depend on: everything else of the archive is never changed."""
-    vehicles, correlations = repository.VEHICLES, repository.CORRELATIONS
-    newest = [
-        connection.execute(select(value)).scalar()
+_NEWEST = select(
+    *(
+        select(value).scalar_subquery()
         for value in (
             func.max(repository.PACKETS.c.id),
             func.max(repository.INGESTS.c.finished_utc_ns),
-            func.max(correlations.c.id),
-            func.sum(correlations.c.superseded),
+            func.max(repository.CORRELATIONS.c.id),
+            func.sum(repository.CORRELATIONS.c.superseded),
         )
-    ]
-    decoded = connection.execute(
-        select(vehicles.c.id, vehicles.c.decoded_version).order_by(vehicles.c.id)
-    ).all()
-    return (*newest, *(tuple(row) for row in decoded))
+    )
+)
+_DECODED = select(repository.VEHICLES.c.id, repository.VEHICLES.c.decoded_version).order_by(
+    repository.VEHICLES.c.id
+)
+
+
+def _state(connection: Connection) -> Hashable:
+    """What answers depend on: everything else of the archive is never changed."""
+    newest = tuple(connection.execute(_NEWEST).one())
+    return (*newest, *(tuple(row) for row in connection.execute(_DECODED)))

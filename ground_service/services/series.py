@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,14 +52,26 @@ class SeriesReading:
     part: int
     max_points: int
 
-    def series(self, name: str, unit: str) -> Series:
-        """One value of the samples."""
+    def series(self, units: Mapping[str, str]) -> list[Series]:
+        """Values of the samples, named with their units, all read at once."""
         level = self._level()
         if level is None:
-            ticks, values = self._samples(name, self.span.start_ticks, self.span.stop_ticks)
-            utc_ns, used = utc_ns_of_ticks(ticks, self.span.correlations)
+            columns = self._samples(tuple(units), self.span.start_ticks, self.span.stop_ticks)
+            utc_ns, used = utc_ns_of_ticks(columns["ticks"], self.span.correlations)
             correlation = int(used[-1]) if len(used) else IDEAL_CLOCK
-            return Series(name, unit, len(utc_ns), correlation, downsample(utc_ns, values, self.max_points))
+            return [
+                Series(
+                    name,
+                    unit,
+                    len(utc_ns),
+                    correlation,
+                    downsample(utc_ns, columns[name].astype(np.float64), self.max_points),
+                )
+                for name, unit in units.items()
+            ]
+        return [self._long_series(name, unit, level) for name, unit in units.items()]
+
+    def _long_series(self, name: str, unit: str, level: int) -> Series:
         found, correlation = self._aggregates(name, level)
         return Series(
             name, unit, int(found.rows.sum()), correlation, downsample_aggregates(found, self.max_points)
@@ -106,19 +119,19 @@ class SeriesReading:
         return join(pieces), int(used[-1]) if len(used) else IDEAL_CLOCK
 
     def _edge(self, name: str, start: int, stop: int) -> Aggregates:
-        ticks, values = self._samples(name, start, stop)
-        return aggregate(utc_ns_of_ticks(ticks, self.span.correlations)[0], values)
+        columns = self._samples((name,), start, stop)
+        utc_ns = utc_ns_of_ticks(columns["ticks"], self.span.correlations)[0]
+        return aggregate(utc_ns, columns[name].astype(np.float64))
 
-    def _samples(self, name: str, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
+    def _samples(self, names: tuple[str, ...], start: int, stop: int) -> dict[str, np.ndarray]:
         equal = {} if rollups.KINDS[self.kind][1] is None else {"estimator": self.part}
-        columns = repository.sample_arrays(
+        return repository.sample_arrays(
             self.connection,
             self.kind,
             self.span.vehicle,
             start,
             stop,
             self.span.dictionary_version,
-            ("ticks", name),
+            ("ticks", *names),
             **equal,
         )
-        return columns["ticks"], columns[name].astype(np.float64)

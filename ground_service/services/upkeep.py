@@ -98,13 +98,9 @@ def _trends(connection: Connection, vehicle: int) -> list[Trend]:
     span = PassSpan(vehicle, first, last, load_correlations(connection, vehicle), version)
     reading = SeriesReading(connection, span, "housekeeping", 0, TREND_POINTS)
     definition = DICTIONARY.packet("housekeeping")
-    found = []
-    for name in PARAMETERS:
-        field = definition.field(name)
-        trend = trend_of(field, reading.series(name, field.unit).buckets)
-        if trend is not None:
-            found.append(trend)
-    return found
+    read = reading.series({name: definition.field(name).unit for name in PARAMETERS})
+    trends = (trend_of(definition.field(one.name), one.buckets) for one in read)
+    return [trend for trend in trends if trend is not None]
 
 
 def trend_view(trend: Trend) -> dict[str, Any]:

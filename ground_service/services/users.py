@@ -8,7 +8,7 @@ import secrets
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, func, select
+from sqlalchemy import Connection, select
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, InvalidInput, NotAuthorised, NotFound
@@ -20,6 +20,7 @@ ROLES = ("viewer", "operator", "admin")
 
 TOKEN_OCTETS = 32
 TOKEN_MINIMUM = 24
+_ANYBODY = select(repository.USERS.c.id).limit(1)
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
 
 
@@ -117,7 +118,7 @@ def list_users(ground: Ground) -> list[dict[str, Any]]:
 def has_users(ground: Ground) -> bool:
     """Whether anybody has been added."""
     with ground.database.reading() as connection:
-        return bool(connection.execute(select(func.count()).select_from(repository.USERS)).scalar_one())
+        return connection.execute(_ANYBODY).first() is not None
 
 
 def authenticate(ground: Ground, token: str) -> Caller:

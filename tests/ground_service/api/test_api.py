@@ -111,6 +111,30 @@ def test_what_is_in_a_pass_can_be_read(client: TestClient, synthetic_pass: Any) 
     assert client.get(f"{V1}/passes/1/events").json()["items"][0]["name"] == "observation_stopped"
 
 
+def test_pages_of_detections_put_together_are_all_of_them_once(client: TestClient) -> None:
+    def page(limit: int, offset: int) -> list[Any]:
+        answer = client.get(f"{V1}/passes/1/detections", params={"limit": limit, "offset": offset}).json()
+        items: list[Any] = answer["items"]
+        return items
+
+    total = client.get(f"{V1}/passes/1/detections", params={"limit": 1}).json()["total"]
+    large = [item for offset in range(0, total, 1000) for item in page(1000, offset)]
+    small = [item for offset in range(0, 300, 7) for item in page(7, offset)]
+    assert len(large) == total
+    assert small == large[: len(small)]
+    assert page(10, total - 3) == large[-3:]
+    assert page(10, total) == []
+    assert sorted(large, key=lambda item: item["time"]) == large
+
+
+def test_a_series_asked_for_twice_is_the_same(client: TestClient) -> None:
+    path = f"{V1}/passes/1/states?estimator=spherical&value=altitude_m&value=nis&max_points=5"
+    first, second = client.get(path), client.get(path)
+    assert first.content == second.content
+    assert [one["name"] for one in first.json()["series"]] == ["altitude_m", "nis"]
+    assert first.headers["content-type"] == "application/json"
+
+
 def test_series_are_made_short_with_their_extremes(client: TestClient) -> None:
     states = client.get(
         f"{V1}/passes/1/states", params={"estimator": "spherical", "value": "altitude_m", "max_points": 7}

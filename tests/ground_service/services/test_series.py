@@ -62,7 +62,7 @@ def read(ground: Ground, vehicle: int, name: str, start: int, stop: int, points:
     with ground.database.reading() as connection:
         return series.SeriesReading(
             connection, PassSpan(vehicle, start, stop, (), DICTIONARY.version), "navigation_states", 1, points
-        ).series(name, "")
+        ).series({name: ""})[0]
 
 
 def rollup_statistics(ground: Ground) -> tuple[list[Any], np.ndarray]:
