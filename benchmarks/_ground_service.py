@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import os
 import tempfile
 import time
 from collections import Counter
@@ -37,7 +38,11 @@ def answers_under_load(
                 wait_for_job(client, job)
                 client.post("/passes", json=definition).raise_for_status()
             asyncio.run(_ask(base, rate_per_s, 3.0))  # warms what is compiled and cached
-            return asyncio.run(_ask(base, rate_per_s, seconds))
+            before = processor_s(service.parts["api"])
+            figures = asyncio.run(_ask(base, rate_per_s, seconds))
+            spent = processor_s(service.parts["api"]) - before
+            answers = max(figures["api_requests"], 1)
+            return figures | {"api_server_cpu_ms_an_answer": round(1e3 * spent / answers, 2)}
         finally:
             service.stop()
 
@@ -117,6 +122,12 @@ def memory_of_a_stream(different: bytes, megabytes: int) -> dict[str, Any]:
             }
         finally:
             service.stop()
+
+
+def processor_s(part: Part) -> float:
+    """Processor time of a part so far, s."""
+    fields = Path(f"/proc/{part.pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def resident_mib(part: Part, name: str) -> int:

@@ -27,8 +27,8 @@ __all__ = ["PARAMETERS", "STATE_VALUES", "Series", "SeriesReading"]
 FEW_ROWS = 50_000
 """Up to this many samples are read one by one, which is exact to the sample and quick enough."""
 
-COARSE = 16
-"""Roll-ups are used where they give at least a sixteenth of the points that were asked for."""
+COARSE = 8
+"""Roll-ups are used where they give at least an eighth of the points that were asked for."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,8 +54,8 @@ class SeriesReading:
 
     def series(self, units: Mapping[str, str]) -> list[Series]:
         """Values of the samples, named with their units, all read at once."""
-        level = self._level()
-        if level is None:
+        level, length = self._level()
+        if length is None:
             columns = self._samples(tuple(units), self.span.start_ticks, self.span.stop_ticks)
             utc_ns, used = utc_ns_of_ticks(columns["ticks"], self.span.correlations)
             correlation = int(used[-1]) if len(used) else IDEAL_CLOCK
@@ -69,27 +69,49 @@ class SeriesReading:
                 )
                 for name, unit in units.items()
             ]
-        return [self._long_series(name, unit, level) for name, unit in units.items()]
+        return [self._long_series(name, unit, level, length) for name, unit in units.items()]
 
-    def _long_series(self, name: str, unit: str, level: int) -> Series:
-        found, correlation = self._aggregates(name, level)
+    def _long_series(self, name: str, unit: str, level: int | None, length: float) -> Series:
+        found, correlation = self._grouped(name, length) if level is None else self._aggregates(name, level)
         return Series(
             name, unit, int(found.rows.sum()), correlation, downsample_aggregates(found, self.max_points)
         )
 
-    def _level(self) -> int | None:
-        """The coarsest level of roll-ups that is fine enough; None where samples should be read."""
+    def _level(self) -> tuple[int | None, float | None]:
+        """The coarsest level of roll-ups that is fine enough, None where there is none; on-board ticks to a point.
+
+        No ticks to a point where samples are few.
+        """
         key = (self.kind, self.span.vehicle, self.span.dictionary_version, self.part)
         count, first, last = rollups.rolled_extent(
             self.connection, *key, self.span.start_ticks, self.span.stop_ticks
         )
         if count <= FEW_ROWS:
-            return None
+            return None, None
         wanted = (min(last, self.span.stop_ticks) - max(first, self.span.start_ticks)) / self.max_points
         if rollups.width_ticks(0) > COARSE * wanted:
-            return None
+            return None, wanted
         fine = [level for level in range(rollups.LEVELS) if rollups.width_ticks(level) <= wanted]
-        return fine[-1] if fine else 0
+        return (fine[-1] if fine else 0), wanted
+
+    def _grouped(self, name: str, length: float) -> tuple[Aggregates, int]:
+        """Stretches of half the length (ticks), put together by the database from the samples."""
+        found = repository.sample_aggregates(
+            self.connection,
+            self.kind,
+            self.span.vehicle,
+            self.span.start_ticks,
+            self.span.stop_ticks,
+            self.span.dictionary_version,
+            name,
+            max(int(length / 2.0), 1),
+            **self._equal,
+        )
+        first, last, rows, count = found[:, :4].astype(np.int64).T
+        begin, used = utc_ns_of_ticks(first, self.span.correlations)
+        end, _ = utc_ns_of_ticks(last, self.span.correlations)
+        grouped = Aggregates(begin, end, rows, count, *found[:, 4:].T)
+        return grouped, int(used[-1]) if len(used) else IDEAL_CLOCK
 
     def _aggregates(self, name: str, level: int) -> tuple[Aggregates, int]:
         """Whole buckets from the roll-ups; the samples of the two that the span cuts."""
@@ -124,7 +146,6 @@ class SeriesReading:
         return aggregate(utc_ns, columns[name].astype(np.float64))
 
     def _samples(self, names: tuple[str, ...], start: int, stop: int) -> dict[str, np.ndarray]:
-        equal = {} if rollups.KINDS[self.kind][1] is None else {"estimator": self.part}
         return repository.sample_arrays(
             self.connection,
             self.kind,
@@ -133,5 +154,10 @@ class SeriesReading:
             stop,
             self.span.dictionary_version,
             ("ticks", *names),
-            **equal,
+            **self._equal,
         )
+
+    @property
+    def _equal(self) -> dict[str, int]:
+        column = rollups.KINDS[self.kind][1]
+        return {} if column is None else {column: self.part}

@@ -80,8 +80,12 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("few")
+@pytest.mark.parametrize("coarse", [0, 10**9], ids=["by the database", "roll-ups"])
 @pytest.mark.parametrize(("skip", "drop"), [(0, 0), (333, 200)])
-def test_a_series_from_roll_ups_holds_every_sample_once(ground: Ground, skip: int, drop: int) -> None:
+def test_a_series_put_together_ahead_or_by_the_database_holds_every_sample_once(
+    ground: Ground, skip: int, drop: int, coarse: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(series, "COARSE", coarse)
     columns = states()
     vehicle = stored(ground, columns, [np.arange(COUNT)])
     start, stop = int(columns["ticks"][skip]), int(columns["ticks"][-1 - drop])
@@ -99,6 +103,19 @@ def test_a_series_from_roll_ups_holds_every_sample_once(ground: Ground, skip: in
         assert np.sum(buckets.mean * buckets.count) == pytest.approx(known.sum(), abs=1e-6)
         assert np.all(buckets.start_utc_ns <= buckets.stop_utc_ns)
         assert np.all(np.diff(buckets.start_utc_ns) > 0)
+
+
+@pytest.mark.usefixtures("few")
+@pytest.mark.parametrize("coarse", [0, 10**9], ids=["by the database", "roll-ups"])
+def test_a_series_of_all_time_is_as_fine_as_asked_for(
+    ground: Ground, coarse: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(series, "COARSE", coarse)
+    columns = states()
+    vehicle = stored(ground, columns, [np.arange(COUNT)])
+    found = read(ground, vehicle, "altitude_m", 0, (1 << 48) - 1).buckets
+    span = (columns["ticks"][-1] - columns["ticks"][0]) / 65536e-9
+    assert (found.stop_utc_ns - found.start_utc_ns).max() < span / 10
 
 
 @pytest.mark.usefixtures("few")
