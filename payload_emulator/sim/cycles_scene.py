@@ -47,6 +47,9 @@ _ROWS_AT_ONCE = 128
 FLAT_GROUND_BRIGHTNESS = 0.35
 """Filmic exposure brings flat ground of mean albedo to this scene brightness (0.18 is its middle gray)."""
 
+MATT_SPECULAR_IOR = 1.05
+"""Index of refraction of the paper's look: its Principled BSDF keeps a little gloss."""
+
 
 @dataclass(frozen=True, slots=True)
 class CyclesSettings:
@@ -60,8 +63,8 @@ class CyclesSettings:
         Size of the micropolygons that adaptive subdivision makes in view (paper: 0.5).
     offscreen_dicing
         Ground out of view, which only casts shadows, is this many times coarser.
-    roughness, specular_ior
-        Of the Principled BSDF: matt, and an index of refraction barely over 1 so that next to nothing is mirrored.
+    roughness
+        Of the Principled BSDF: matt.
     terminator_offset
         Cycles' shadow terminator offset, against facets at the edge of shadow.
     diffuse_bounces
@@ -77,7 +80,6 @@ class CyclesSettings:
     pixels_per_polygon: float = 0.5
     offscreen_dicing: float = 4.0
     roughness: float = 1.0
-    specular_ior: float = 1.05
     terminator_offset: float = 0.05
     geometry_offset: float = 0.1
     diffuse_bounces: int = 3
@@ -111,6 +113,9 @@ class CyclesScene:
         Diameter of the Sun's disc.
     exposure_stops
         Of the Filmic picture.
+    specular_ior
+        Index of refraction of the Principled BSDF. The paper's look has one barely over 1, which still mirrors a quarter
+        of the light of a Sun 6 deg up (Fresnel) onward into the picture; 1 mirrors nothing.
     """
 
     vertices_km: Floats
@@ -125,6 +130,7 @@ class CyclesScene:
     height_px: int
     sun_angle_rad: float
     exposure_stops: float
+    specular_ior: float = 1.0
 
     def save(self, path: Path, settings: CyclesSettings) -> None:
         """Write the scene and how to render it for the process that runs Blender, one ``.npz``."""
@@ -198,6 +204,7 @@ def describe_scene(
         height_px=camera.height_px,
         sun_angle_rad=2.0 * SUN_ANGULAR_RADIUS_RAD,
         exposure_stops=math.log2(FLAT_GROUND_BRIGHTNESS / (MEAN_ALBEDO * max(sine, 0.02))),
+        specular_ior=MATT_SPECULAR_IOR if photometry.law == "matt" else 1.0,
     )
 
 

@@ -139,7 +139,7 @@ def _regolith(bpy: Any, told: Any) -> Any:
     nodes, links = material.node_tree.nodes, material.node_tree.links
     surface = nodes["Principled BSDF"]
     surface.inputs["Roughness"].default_value = float(told["set_roughness"])
-    surface.inputs["IOR"].default_value = float(told["set_specular_ior"])
+    surface.inputs["IOR"].default_value = float(told["specular_ior"])
     links.new(_texture(bpy, nodes, "albedo", told["albedo"]).outputs["Color"], surface.inputs["Base Color"])
     relief = nodes.new("ShaderNodeDisplacement")
     relief.space = "OBJECT"

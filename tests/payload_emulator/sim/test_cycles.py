@@ -109,6 +109,7 @@ def test_the_base_colour_of_a_matt_surface_is_its_albedo_and_of_other_laws_bent_
         for law in ("matt", "lambert", "lunar-lambert")
     )
     assert np.ptp(matt.albedo) == 0.0
+    assert matt.specular_ior > 1.0 and lambert.specular_ior == lunar.specular_ior == 1.0
     # The texel below the camera: the phase angle of nadir is the Sun's distance from the zenith, 80 degrees.
     x, y = matt.vertices_km[32, :, 0], matt.vertices_km[:, 32, 1]
     high, wide = matt.albedo.shape
