@@ -114,8 +114,8 @@ class CyclesScene:
     exposure_stops
         Of the Filmic picture.
     specular_ior
-        Index of refraction of the Principled BSDF. The paper's look has one barely over 1, which still mirrors a quarter
-        of the light of a Sun 6 deg up (Fresnel) onward into the picture; 1 mirrors nothing.
+        Index of refraction of the Principled BSDF. The paper's look has one barely over 1, which still mirrors a
+        quarter of the light of a Sun 6 deg up (Fresnel) onward into the picture; 1 mirrors nothing.
     """
 
     vertices_km: Floats

@@ -7,6 +7,7 @@ benchmark run it where it is at hand.
 import math
 import sys
 import types
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from lunar.constants import MOON_RADIUS_M
 from lunar.frames import axis_rotation, enu_from_mcmf, mcmf_from_spherical
 from payload_emulator.errors import RendererError, TerrainError
 from payload_emulator.sim import cycles, cycles_worker, renderer
-from payload_emulator.sim.cycles_scene import GRID, CyclesSettings, describe_scene
+from payload_emulator.sim.cycles_scene import GRID, MATT_SPECULAR_IOR, CyclesSettings, describe_scene
 from payload_emulator.sim.lens import BrownCamera
 from payload_emulator.sim.light import sun_direction_mcmf
 from payload_emulator.sim.photometry import Photometry
@@ -206,7 +207,7 @@ def blender(monkeypatch):
 
 
 def test_blender_is_told_what_the_paper_says(tmp_path, scene, blender):
-    scene.save(tmp_path / "scene.npz", CyclesSettings(samples=16))
+    replace(scene, specular_ior=MATT_SPECULAR_IOR).save(tmp_path / "scene.npz", CyclesSettings(samples=16))
     files = [str(tmp_path / name) for name in ("scene.npz", "out.exr", "picture.png", "cost.json")]
     assert cycles_worker.main(*files) == 0
     told = blender.context.scene
