@@ -366,17 +366,6 @@ class AnchorRead:
     frame_number: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Sensitivity:
-    """What one changed setting does to the figures."""
-
-    name: str
-    setting: str
-    median_3d_m: float
-    p95_3d_m: float
-    nees: float = float("nan")
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PassReport:
     """Everything the report of one pass says.
@@ -413,7 +402,6 @@ class PassReport:
     housekeeping: tuple[HousekeepingParameter, ...] = ()
     events: tuple[PassEvent, ...] = ()
     truth_ledger: tuple[AnchorRead, ...] = ()
-    sensitivities: tuple[Sensitivity, ...] = ()
     configuration: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     scenario_text: str = ""
     remarks: tuple[str, ...] = ()

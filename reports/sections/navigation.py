@@ -230,7 +230,7 @@ def consistency_section(view: PassView) -> list[Block]:
         if (s.nees is not None and np.isfinite(s.nees).any())
         or (s.nis is not None and s.nis_dof is not None and np.isfinite(s.nis).any())
     )
-    if not series and not view.report.sensitivities:
+    if not series:
         if not view.estimates:
             return []
         return [Heading("Filter consistency"), view.absent("consistency", "NEES and NIS")]
@@ -292,29 +292,6 @@ def consistency_section(view: PassView) -> list[Block]:
                     Column("inside 95 % bounds", unit="% of samples"),
                 ),
                 tuple(rows),
-            )
-        )
-    if view.report.sensitivities:
-        blocks.append(
-            Table(
-                "What a change of one setting does.",
-                (
-                    Column("setting", numeric=False),
-                    Column("value", numeric=False),
-                    Column("median", group="3-D error, m"),
-                    Column("95 %", group="3-D error, m"),
-                    Column("NEES"),
-                ),
-                tuple(
-                    (
-                        s.name,
-                        s.setting,
-                        number_text(s.median_3d_m, 0),
-                        number_text(s.p95_3d_m, 0),
-                        number_text(s.nees, 1),
-                    )
-                    for s in view.report.sensitivities
-                ),
             )
         )
     return blocks

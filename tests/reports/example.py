@@ -45,7 +45,6 @@ from reports.values import (
     RegressionReport,
     ResidualSeries,
     ScoreGroup,
-    Sensitivity,
     SigmaBin,
     TerrainMap,
     TimeSpan,
@@ -573,11 +572,6 @@ def pass_report(
             for name, triggers in (("paper", trigger), ("spherical", round_trigger))
             for i in range(n)
             if triggers[i] not in ("none", "")
-        ),
-        sensitivities=(
-            Sensitivity("process noise", "× 0.1", 47.0, 171.0, 9.8),
-            Sensitivity("process noise", "× 1", 51.2, 148.0, 3.4),
-            Sensitivity("process noise", "× 10", 66.0, 156.0, 1.1),
         ),
         configuration={
             "camera": {"width_px": 512, "height_px": 512, "fov_deg": 120.0},

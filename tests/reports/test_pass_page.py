@@ -179,6 +179,25 @@ def test_a_pass_without_a_reference_shows_what_the_estimators_said() -> None:
     assert "Fixed on the catalogue" in text and "75.0 %" in text
 
 
+def test_a_pass_without_frames_says_so_and_shows_the_rest(whole_pass: PassReport) -> None:
+    report = dataclasses.replace(
+        whole_pass, accounting=None, gallery=(), worst_frames=(), detector=None, craters=None
+    )
+    page = Page(render_html(report))
+    assert page.left_open == []
+    assert "Frame accounting not available: the frames of the pass were not counted" in page.text
+    assert "Recall, precision, localisation not available" in page.text
+    assert "Gallery of detections not available: the pass has no images on the ground" in page.text
+    assert "Filter consistency" in page.text and "worst 5 frames" not in page.text
+
+
+def test_a_pass_without_navigation_says_so_and_shows_the_rest(whole_pass: PassReport) -> None:
+    page = Page(render_html(dataclasses.replace(whole_pass, navigation=(), truth_ledger=())))
+    assert page.left_open == []
+    assert "Navigation not available: no navigation telemetry was received" in page.text
+    assert "Detection by size class" in page.text and "Filter consistency" not in page.text
+
+
 def test_a_pass_of_one_frame_is_reported() -> None:
     report = example.pass_report(hours=15.0 / 3600.0, gallery=1, worst=0)
     assert len(report.navigation[0].utc_ns) == 1
