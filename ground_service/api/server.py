@@ -35,6 +35,8 @@ def serve(settings: Settings) -> None:
         create_app(settings),
         log_config=logging_config(settings.log_format),
         timeout_graceful_shutdown=20,
+        # Longer than clients and proxies keep idle connections, so that none is closed under a request of theirs.
+        timeout_keep_alive=75,
         server_header=False,
     )
     host, port = listener.getsockname()[:2]
