@@ -47,6 +47,7 @@ from tmtc.uplink import CLTU_START, CLTU_TAIL, UplinkDecoder
 _NS = 1_000_000_000
 _POLL_S = 0.05
 _BUFFER_LIMIT = 1 << 20
+_JPEG_QUALITY = 92
 _SHOWN_CRATERS = 200
 _SMALLEST_SHOWN_PX = 6.0
 _CONSOLE_SOURCE = 2
@@ -408,7 +409,7 @@ def snapshot(world: World, spacecraft: Spacecraft, flown: Flown, paused: bool, r
             },
             "altitude_km": altitude / 1e3,
             "catalogue": _catalogue(world, flown),
-            "image_png": _png(flown.exposure.image),
+            "image_jpeg": _jpeg(flown.exposure.image),
         }
         for estimate in estimates.values():
             if "altitude_m" in estimate:
@@ -439,12 +440,14 @@ def _catalogue(world: World, flown: Flown) -> list[dict[str, float]]:
     ]
 
 
-def _png(image: Any) -> str:
+def _jpeg(image: Any) -> str:
+    """A picture for the eye in base64, at a fifth of a PNG's time and size; "" without one."""
     if not image.size:
         return ""
     import cv2
 
-    good, encoded = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
+    shown = image[..., ::-1] if image.ndim == 3 else image
+    good, encoded = cv2.imencode(".jpg", shown, (cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY))
     return base64.b64encode(encoded.tobytes()).decode() if good else ""
 
 

@@ -113,7 +113,7 @@ def test_a_session_of_watching_stepping_and_commanding(running: tuple[LivePayloa
     watcher.say("step")
     first = watcher.until(lambda message: message["kind"] == "frame")[-1]
     assert first["mode"] == "observing" and first["paused"] and first["frame"] == 0
-    assert base64.b64decode(first["image_png"])[:4] == b"\x89PNG"
+    assert base64.b64decode(first["image_jpeg"])[:3] == b"\xff\xd8\xff"
     assert first["catalogue"] and {"id", "u_px", "v_px", "diameter_px"} <= set(first["catalogue"][0])
     assert first["estimates"]["spherical"]["outcome"] == "anchored"
     assert first["estimates"]["spherical"]["error_m"] < 50.0

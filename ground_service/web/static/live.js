@@ -64,7 +64,7 @@ function drawFrame(message) {
     rings(message);
     count();
   };
-  if (message.image_png) picture.src = `data:image/png;base64,${message.image_png}`;
+  if (message.image_jpeg) picture.src = `data:image/jpeg;base64,${message.image_jpeg}`;
   numbers(message);
   remember(message);
 }

@@ -76,7 +76,7 @@ class Console:
 
 def live_frame(number: int) -> dict[str, object]:
     """A frame as the console of the emulator tells it."""
-    _, png = cv2.imencode(".png", np.full((512, 512), 20 + number, np.uint8))
+    _, jpeg = cv2.imencode(".jpg", np.full((512, 512), 20 + number, np.uint8))
     return {
         "kind": "frame",
         "utc": f"2029-08-07T06:{number // 4:02d}:{15 * (number % 4):02d}.000Z",
@@ -102,7 +102,7 @@ def live_frame(number: int) -> dict[str, object]:
                 "error_m": 80.0 + number,
             }
         },
-        "image_png": base64.b64encode(png.tobytes()).decode(),
+        "image_jpeg": base64.b64encode(jpeg.tobytes()).decode(),
     }
 
 
