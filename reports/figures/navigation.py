@@ -251,15 +251,17 @@ def draw_altitude(
     time: TimeScale,
     arcs: Sequence[TimeSpan],
 ) -> None:
-    """Estimated altitude over the reference, and the error of each below (paper, Fig. 10)."""
-    gap, low_height = 0.38, 1.15
+    """Estimated altitude over the reference, and the error of each below where there are any (paper, Fig. 10)."""
+    gap, low_height = (0.38, 1.15) if series else (0.0, 0.0)
     high = canvas.height_in - _BOTTOM - _TOP - gap - low_height
     width = canvas.width_in - _LEFT - _RIGHT
     axes = canvas.axes(_LEFT, _BOTTOM + low_height + gap, width, high)
-    below = canvas.axes(_LEFT, _BOTTOM, width, low_height)
+    below = canvas.axes(_LEFT, _BOTTOM, width, low_height) if series else None
     resets = resets_of(series, time)
     for panel in (axes, below):
-        time_axis(panel, time, labelled=panel is below)
+        if panel is None:
+            continue
+        time_axis(panel, time, labelled=panel is below or below is None)
         shade_arcs(panel, time, arcs)
         mark_resets(canvas, panel, time, resets, named=panel is axes)
     axes.set_title("altitude over the 1737.4 km sphere")
@@ -284,6 +286,8 @@ def draw_altitude(
     low, top = axes.get_ylim()
     axes.set_ylim(max(0.0, low) if low > -1e6 else 0.0, top)
     _name_lines(canvas, axes, high, entries, with_reference)
+    if below is None:
+        return
     log_length_axis(below, "y", [error for _, _, error in errors])
     below.set_title("altitude error, magnitude")
     for one, x, error in errors:

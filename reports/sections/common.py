@@ -19,6 +19,7 @@ _USUAL_REASON = {
     "packets": "no account of the downlink came with the pass",
     "reference": "no reference ephemeris covers the pass",
     "navigation": "no navigation telemetry was received",
+    "error": "no state that came down has a number and a reference to compare it with",
     "outcomes": "no estimator reported what its matcher did",
     "detector": "detections, catalogue and reference orbit were not all at hand",
     "gallery": "the pass has no images on the ground",

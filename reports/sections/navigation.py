@@ -119,7 +119,10 @@ def drift(view: PassView) -> list[Block]:
         return []
     blocks: list[Block] = [Heading("Odometry: drift and resets")]
     track = report.reference
-    if track is not None and len(track.utc_ns):
+    placed = any(np.isfinite(s.latitude_deg).any() for s in odometry)
+    if track is not None and len(track.utc_ns) and not placed:
+        blocks.append(view.absent("error", "Error in latitude and longitude"))
+    elif track is not None and len(track.utc_ns):
         spans = [("ground-error", view.time, "")]
         zoom = navigation.zoom_span(view.time, report.imaging_arcs)
         if zoom is not None:
@@ -207,14 +210,19 @@ def altitude(view: PassView) -> list[Block]:
         if math.isfinite(low)
         else "The reference has no altitude."
     )
+    what = (
+        "Estimated altitude over the reference (wide green line), and the magnitude of its error (form of the "
+        "paper's Fig. 10)."
+        if series
+        else "Altitude of the reference; no estimate of it came down."
+    )
     for key, time, extra in spans:
         blocks.append(
             Picture(
                 key,
-                "Estimated altitude over the reference (wide green line), and the magnitude of its error "
-                f"(form of the paper's Fig. 10).{extra} {runs_from}",
+                f"{what}{extra} {runs_from}",
                 f"Altitude over time. {runs_from}",
-                3.9,
+                3.9 if series else 2.4,
                 lambda c, time=time: navigation.draw_altitude(  # type: ignore[misc]
                     c, series, track, view.styles, time, report.imaging_arcs
                 ),

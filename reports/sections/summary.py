@@ -20,7 +20,10 @@ def summary(view: PassView) -> list[Block]:
         blocks.append(error_picture(view, "glance", 2.75, view.time))
         blocks.append(_statistics_table(view))
     else:
-        blocks.append(view.absent("navigation", "Navigation"))
+        if not view.report.navigation:
+            blocks.append(view.absent("navigation", "Navigation"))
+        else:
+            blocks.append(view.absent("error" if view.report.reference else "reference", "Position error"))
     return [*blocks, *missing_and_remarks(view.report)]
 
 
