@@ -63,6 +63,12 @@ class PassView:
         why = self.report.not_available.get(field) or _USUAL_REASON.get(field, "not given")
         return Absent(what, why)
 
+    def no_error(self) -> Absent:
+        """The block that says why no error can be shown."""
+        if not self.report.navigation:
+            return self.absent("navigation", "Navigation")
+        return self.absent("error" if self.report.reference else "reference", "Position error")
+
 
 def role_of(tint: str) -> str:
     """Role of a light colour."""

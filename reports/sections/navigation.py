@@ -19,8 +19,7 @@ def errors(view: PassView) -> list[Block]:
     report = view.report
     blocks: list[Block] = [Heading("Position error")]
     if not view.with_error:
-        field = "navigation" if not report.navigation else "reference"
-        blocks.append(view.absent(field, "Position error"))
+        blocks.append(view.no_error())
         return blocks
     zoom = navigation.zoom_span(view.time, report.imaging_arcs)
     if zoom is not None:

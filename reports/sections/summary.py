@@ -20,10 +20,7 @@ def summary(view: PassView) -> list[Block]:
         blocks.append(error_picture(view, "glance", 2.75, view.time))
         blocks.append(_statistics_table(view))
     else:
-        if not view.report.navigation:
-            blocks.append(view.absent("navigation", "Navigation"))
-        else:
-            blocks.append(view.absent("error" if view.report.reference else "reference", "Position error"))
+        blocks.append(view.no_error())
     return [*blocks, *missing_and_remarks(view.report)]
 
 
