@@ -441,7 +441,7 @@ def _catalogue(world: World, flown: Flown) -> list[dict[str, float]]:
 
 
 def _jpeg(image: Any) -> str:
-    """A picture for the eye in base64, at a fifth of a PNG's time and size; "" without one."""
+    """A picture for the eye in base64, at a third of a PNG's time and half its size; "" without one."""
     if not image.size:
         return ""
     import cv2
