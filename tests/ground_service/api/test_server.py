@@ -29,3 +29,8 @@ def test_an_address_of_another_machine_cannot_be_bound() -> None:
 def test_binding_beyond_this_machine_needs_users(tmp_path: Path) -> None:
     with pytest.raises(ServerError, match=r"0\.0\.0\.0: expected users before binding beyond this machine"):
         serve(Settings(home=tmp_path, host="0.0.0.0", port=0))
+
+
+def test_the_listener_names_its_protocol_so_that_answers_are_not_held_back_by_nagle() -> None:
+    with bind("127.0.0.1", 0) as listener:
+        assert listener.proto == socket.IPPROTO_TCP
