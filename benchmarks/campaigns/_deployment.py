@@ -68,6 +68,11 @@ class Part:
             return
         raise SystemExit(f"{' '.join(self._command[:4])}: did not start; {self._log.read_text()[-500:]}")
 
+    def revive(self) -> None:
+        """Start it where it has ended by itself, as a supervisor would."""
+        if not self._ended and self._process is not None and self._process.poll() is not None:
+            self.start()
+
     @property
     def pid(self) -> int:
         """Its process."""

@@ -45,7 +45,9 @@ from lunar.timescales import format_utc
 CADU_OCTETS = 1279
 SPACECRAFT = 76
 PATIENCE_S = 900.0
+ROUND_S = 10.0
 TARGETS = ("api", "worker", "database", "broker")
+ENDS = ("done", "failed")
 COUNTS = ("uploads", "attempts", "lost", "doubled", "seconds")
 
 Figures = dict[str, Any]
@@ -143,6 +145,8 @@ def one_run(
             harassment.join()
             if harassment.broken:
                 raise harassment.broken
+            for part in service.parts.values():
+                part.revive()
             states, attempts = ends_of(service.api, jobs)
             with open_ground(service.home, database_url=service.url) as ground:
                 found, stored = contents(ground)
@@ -176,21 +180,32 @@ def work_meanwhile(
     packets: int,
     reports: int,
 ) -> list[str]:
-    """Upload every piece, and all of them again while there are kills, with reports in between; the jobs."""
+    """Upload every piece, and all of them again while there are kills, with reports in between; the jobs.
+
+    A round waits a little for the first job of the round before: a great heap of jobs tells no more than a small one.
+    """
     definition = {
         "name": "all",
         "start": format_utc(START),
         "stop": format_utc(START + packets * STEP_NS // 4),
         "spacecraft_id": SPACECRAFT,
     }
-    jobs = []
+    jobs: list[str] = []
+    first = ""
     round_ = 0
     while round_ == 0 or harassment.is_alive():
+        patient = time.monotonic() + ROUND_S
+        while round_ > 0 and harassment.is_alive() and time.monotonic() < patient:
+            if ask(api, "GET", f"/jobs/{first}")["state"] in ENDS:
+                break
+            time.sleep(0.2)
+        first = ""
         for k in rng.sample(range(len(parts)), len(parts)):
             answer = ask(
                 api, "POST", f"/telemetry?spacecraft_id={SPACECRAFT}", parts[k], f"piece {k} {round_}"
             )
             jobs.append(answer["job_id"])
+            first = first or answer["job_id"]
             if round_ > 0 and not harassment.is_alive():
                 break
         if round_ == 0:
@@ -210,7 +225,7 @@ def ends_of(api: str, jobs: Sequence[str]) -> tuple[Counter[str], int]:
         until = time.monotonic() + PATIENCE_S
         while True:
             row = ask(api, "GET", f"/jobs/{job}")
-            if row["state"] in ("done", "failed") or time.monotonic() > until:
+            if row["state"] in ENDS or time.monotonic() > until:
                 break
             time.sleep(0.5)
         states[row["state"]] += 1
