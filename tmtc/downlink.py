@@ -47,7 +47,7 @@ FRAME_GOOD, FRAME_UNCORRECTABLE, FRAME_BAD_CHECKSUM, FRAME_FOREIGN = 0, 1, 2, 3
 FRAME_VERDICTS = ("good", "uncorrectable", "bad_checksum", "foreign")
 
 _RANDOMISERS: tuple[Randomiser, ...] = ("legacy", "long", "none")
-_BATCH = 2048
+_BATCH = 512
 _SAMPLE = 48
 
 

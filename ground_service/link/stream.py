@@ -20,8 +20,9 @@ from tmtc.packets import PACKET_MAX_LENGTH
 from tmtc.schema import Dictionary
 from tmtc.stream import PacketCut, cut_packets
 
-WINDOW_OCTETS = 4 << 20
-"""Octets decoded and stored at a time: large enough to spread the cost of a transaction, small against memory."""
+WINDOW_OCTETS = 2 << 20
+"""Octets decoded and stored at a time: large enough to spread the cost of a transaction and of the overlap, small
+against memory: decoding and storing take about ten times as much."""
 
 PROBE_OCTETS = 256 << 10
 """Octets from which the settings of a link are told; the whole window where the stream begins with noise."""

@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 
 BUSY_TIMEOUT_MS = 30_000
 
+PAGE_CACHE_KIB = 16_384
+"""SQLite's own cache of each connection; what falls out of it is still in the system's, which all of them share."""
+
 
 @dataclass(frozen=True, slots=True)
 class Database:
@@ -240,7 +243,7 @@ def _prepare_sqlite(connection: sqlite3.Connection, _record: object) -> None:
     cursor.execute("PRAGMA synchronous=NORMAL")
     cursor.execute("PRAGMA foreign_keys=ON")
     cursor.execute("PRAGMA temp_store=MEMORY")
-    cursor.execute("PRAGMA cache_size=-65536")
+    cursor.execute(f"PRAGMA cache_size=-{PAGE_CACHE_KIB}")
     cursor.close()
 
 
