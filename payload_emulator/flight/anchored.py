@@ -401,7 +401,7 @@ class AnchoredNavigator:
             @ np.swapaxes(sighting.by_position, 1, 2)
         )
         # Craters among the states bring their own uncertainty with them, the others that of the catalogue.
-        scaled = sighting.by_offset * self._crater_sigma_m(sighting.index)[:, None, :]
+        scaled = sighting.by_offset * self.landmarks.sigma_m[sighting.index][:, None, :]
         own = scaled @ np.swapaxes(scaled, 1, 2)
         own[prior.slots(sighting.index) >= 0] = 0.0
         return identify(
@@ -409,7 +409,7 @@ class AnchoredNavigator:
             sighting,
             spread,
             own,
-            self._fresh_variance(found),
+            self._detection_variance(found),
             float(self._camera.width_px * self._camera.height_px),
             self.parameters.identification,
             place,
@@ -431,14 +431,15 @@ class AnchoredNavigator:
             identification = identification.select(np.sort(surest[: self.parameters.crater_limit]))
         index = sighting.index[identification.sighted]
         uv = np.stack([found.u_px, found.v_px], axis=1)[identification.detection]
+        variance = self._detection_variance(found)[identification.detection]
         update = kalman.update(
-            prior.with_craters(index, self._crater_sigma_m(index)),
+            prior.with_craters(index, self._crater_sigma_m(index, variance)),
             pose.camera_from_icrf,
             pose.mcmf_from_icrf,
             self.landmarks,
             index,
             uv,
-            self._fresh_variance(found)[identification.detection],
+            self._fresh(variance),
             self._camera,
             self.parameters.errors,
         )
@@ -516,15 +517,15 @@ class AnchoredNavigator:
         elif usable >= 4:
             self._disagreements += 1
 
-    def _crater_sigma_m(self, index: Index) -> Float:
+    def _crater_sigma_m(self, index: Index, variance_px2: Float) -> Float:
         """Return the uncertainty of where each crater is detected, east, north, up.
 
         That is the catalogue's, and the part of the detector's error that stays with the crater.
         """
         altitude_m = max(float(np.linalg.norm(self.state.mean[:3])) - MOON_RADIUS_M, 1_000.0)
-        lasting_px = self.parameters.detection_sigma_px * np.sqrt(self.parameters.detection_persistence)
+        lasting_px = np.sqrt(variance_px2 * self.parameters.detection_persistence)
         sigma_m = self.landmarks.sigma_m[index].copy()
-        sigma_m[:, :2] = np.hypot(sigma_m[:, :2], lasting_px * altitude_m / self._camera.focal_px)
+        sigma_m[:, :2] = np.hypot(sigma_m[:, :2], (lasting_px * altitude_m / self._camera.focal_px)[:, None])
         return sigma_m
 
     def _detection_variance(self, found: Detections) -> Float:
@@ -534,9 +535,9 @@ class AnchoredNavigator:
         sigma = np.maximum(sigma * parameters.detection_sigma_scale, parameters.detection_sigma_floor_px)
         return np.asarray(sigma**2, dtype=np.float64)
 
-    def _fresh_variance(self, found: Detections) -> Float:
+    def _fresh(self, variance_px2: Float) -> Float:
         """Return the part of each detection's variance that is new in every frame."""
-        fresh = self._detection_variance(found) * (1.0 - self.parameters.detection_persistence)
+        fresh = variance_px2 * (1.0 - self.parameters.detection_persistence)
         return np.maximum(fresh, _SMALLEST_VARIANCE_PX2)
 
     def _report(
