@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,7 +20,7 @@ from payload_emulator.flight.detections import Detections, no_detections
 from payload_emulator.flight.modes import PayloadMode
 from payload_emulator.flight.ports import UNLIMITED
 from payload_emulator.flight.preprocess import ImageQuality
-from payload_emulator.link import LIGHT_S, Transmitter, contacts
+from payload_emulator.link import LIGHT_S, Receiver, Transmitter, contacts
 from payload_emulator.scenario import ClockSection
 from payload_emulator.spacecraft import Spacecraft
 from payload_emulator.world import Exposure, World, clock_ticks, exposures, orders_before, sample_truth
@@ -65,12 +66,13 @@ class Moment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Flown:
-    """What became of a moment."""
+    """What became of a moment; `clcw` is the state of the telecommand receiver after it, as frames carry it."""
 
     moment: Moment
     exposure: Exposure | None
     telecommands: bytes
     packets: list[bytes]
+    clcw: bytes
 
 
 @dataclass(slots=True, eq=False)
@@ -173,7 +175,10 @@ def arcs(world: World) -> list[tuple[int, int]]:
 
 @dataclass(slots=True, eq=False)
 class Operator:
-    """What the ground sends: the observation windows for the schedule, modes around contacts, requests for playback."""
+    """What the ground sends: the observation windows for the schedule, modes around contacts, requests for playback.
+
+    What arrives at a moment was sent a light time before, by somebody who had seen telemetry of two light times before.
+    """
 
     world: World
     sequence_count: int = 0
@@ -183,6 +188,8 @@ class Operator:
     _contact_start: int = 0
     _started: bool = False
     _idle_since_ns: int | None = None
+    _modes: deque[tuple[int, PayloadMode]] = field(default_factory=deque)
+    _last_utc_ns: int = 0
 
     def command(self, name: str, **values: object) -> bytes:
         """The next telecommand packet."""
@@ -197,7 +204,8 @@ class Operator:
         return self.command("perform_function", function_id=name, argument_1=first, argument_2=second)
 
     def orders(self, moment: Moment, mode: PayloadMode) -> bytes:
-        """What is sent at a moment, seeing the mode that telemetry shows."""
+        """What arrives at a moment; `mode` is the payload's since the moment before."""
+        mode = self._mode_seen(moment, mode)
         first = not self._started
         self._started = True
         if not (moment.heard or first):
@@ -211,6 +219,15 @@ class Operator:
         if moment.frame >= 0:
             orders.append(orders_before(self.world, moment.frame))
         return b"".join(orders)
+
+    def _mode_seen(self, moment: Moment, mode: PayloadMode) -> PayloadMode:
+        """The mode in the newest telemetry that what arrives now can be an answer to."""
+        self._modes.append((self._last_utc_ns, mode))
+        self._last_utc_ns = moment.utc_ns
+        seen_until = moment.utc_ns - round(2.0 * moment.light_s * _NS)
+        while len(self._modes) > 1 and self._modes[1][0] <= seen_until:
+            self._modes.popleft()
+        return self._modes[0][1]
 
     def _windows(self, moment: Moment) -> Iterator[bytes]:
         world, every = self.world, arcs(self.world)
@@ -281,11 +298,12 @@ class Nobody:
 
 def fly(world: World, spacecraft: Spacecraft) -> Generator[Flown]:
     """Fly the moments of a scenario in order."""
-    operator = Operator(world)
+    operator, receiver = Operator(world), Receiver(SPACECRAFT_ID)
     frames = exposures(world)
     for moment in timeline(world):
         exposure = next(frames) if moment.frame >= 0 else None
-        yield fly_moment(world, spacecraft, operator, moment, exposure)
+        receiver.in_lock = moment.heard
+        yield fly_moment(world, spacecraft, operator, receiver, moment, exposure)
     frames.close()
 
 
@@ -293,14 +311,15 @@ def fly_moment(
     world: World,
     spacecraft: Spacecraft,
     operator: Operator | Nobody,
+    receiver: Receiver,
     moment: Moment,
     exposure: Exposure | None,
     by_hand: bytes = b"",
 ) -> Flown:
-    """Fly one moment; `by_hand` are telecommand packets beside those of the operator."""
+    """Fly one moment; `by_hand` are telecommand packets that were received beside those of the operator."""
     if exposure is not None and isinstance(spacecraft.detector, CatalogueDetector):
         spacecraft.detector.show(exposure)
-    orders = operator.orders(moment, spacecraft.payload.mode) + by_hand
+    orders = receiver.take(operator.orders(moment, spacecraft.payload.mode)) + by_hand
     packets = spacecraft.step(
         moment.utc_ns,
         None if exposure is None else exposure.image,
@@ -310,7 +329,7 @@ def fly_moment(
         sunlit=moment.sunlit,
         downlink_octets=moment.downlink_octets,
     )
-    return Flown(moment, exposure, orders, packets)
+    return Flown(moment, exposure, orders, packets, receiver.clcw)
 
 
 @dataclass(slots=True, eq=False)
@@ -325,7 +344,7 @@ class Sender:
     settings: LinkSettings
     transmitter: Transmitter = field(init=False)
     time_reports: list[tuple[bytes, int]] = field(default_factory=list)
-    _waiting: dict[int, list[bytes]] = field(default_factory=dict)
+    _waiting: dict[int, list[tuple[bytes, bytes]]] = field(default_factory=dict)
     _utc_ns: int = 0
     _light_s: float = LIGHT_S
 
@@ -339,15 +358,16 @@ class Sender:
         now = clock_ticks(self.world, flown.moment.utc_ns)
         for packet in flown.packets:
             late = stations and now - int.from_bytes(packet[14:20], "big") > _LATE_TICKS
-            self._waiting.setdefault(_PLAYBACK_CHANNEL if late else 0, []).append(packet)
+            self._waiting.setdefault(_PLAYBACK_CHANNEL if late else 0, []).append((packet, flown.clcw))
             if not late and int.from_bytes(packet[:2], "big") & 0x7FF == APID_TIME_REPORT:
                 self.time_reports.append((packet, flown.moment.utc_ns))
-        waiting = sum(len(packet) for packets in self._waiting.values() for packet in packets)
+        waiting = sum(len(packet) for packets in self._waiting.values() for packet, _ in packets)
         if stations and (not flown.moment.heard or waiting > _DUMP_OCTETS):
             self.flush()
 
     def flush(self) -> None:
         """Send everything."""
-        for channel, packets in sorted(self._waiting.items()):
-            self.transmitter.send(packets, self._utc_ns, channel, self._light_s)
+        for channel, waiting in sorted(self._waiting.items()):
+            packets, clcws = [packet for packet, _ in waiting], [clcw for _, clcw in waiting]
+            self.transmitter.send(packets, self._utc_ns, channel, self._light_s, clcws)
         self._waiting = {}

@@ -7,7 +7,7 @@ of order and come twice without touching each other. Bit errors come in two stat
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,10 @@ from lunar.visibility import GroundStation, link
 from payload_emulator.errors import ScenarioError
 from payload_emulator.scenario import LinkSection
 from tmtc import cadu
+from tmtc.crc import CRC_LENGTH
 from tmtc.downlink import DownlinkEncoder, LinkSettings
+from tmtc.frames import FRAME_HEADER_LENGTH, OCF_LENGTH, pack_clcw
+from tmtc.uplink import Farm, UplinkDecoder, UplinkEncoder, cut_telecommands
 
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -39,6 +42,40 @@ STATIONS = {
     "malargue": (-35.78, -69.40, 1550.0),
     "new_norcia": (-31.05, 116.19, 250.0),
 }
+
+
+@dataclass(slots=True, eq=False)
+class Receiver:
+    """The spacecraft's telecommand receiver: frames in, packets out, and the CLCW that its telemetry carries.
+
+    It belongs to the platform, so a restart of the payload leaves it as it is.
+
+    Attributes
+    ----------
+    decoder
+        Takes CLTUs apart and decides by FARM-1 which frames are accepted.
+    in_lock
+        Whether a station transmits to it.
+    """
+
+    spacecraft_id: int
+    in_lock: bool = True
+    decoder: UplinkDecoder = field(init=False)
+    _station: UplinkEncoder = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.decoder = UplinkDecoder(self.spacecraft_id)
+        self._station = UplinkEncoder(self.spacecraft_id)
+
+    def take(self, packets: bytes) -> bytes:
+        """Telecommand packets of a station, sent as it sends them and received here."""
+        return b"".join(self.decoder.decode(self._station.encode(cut_telecommands(packets))).packets)
+
+    @property
+    def clcw(self) -> bytes:
+        """The operational control field of a frame that is sent now."""
+        state = self.decoder.farms.get(self._station.virtual_channel, Farm()).clcw
+        return pack_clcw(replace(state, no_rf_available=not self.in_lock, no_bit_lock=not self.in_lock))
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,14 +112,15 @@ class Transmitter:
         utc_ns: int,
         virtual_channel: int = 0,
         light_s: float = LIGHT_S,
+        clcw: bytes | Sequence[bytes] | None = None,
     ) -> bytes:
-        """The CADUs of these packets."""
-        octets = self._encoder.encode(packets, virtual_channel)
+        """The CADUs of these packets; `clcw` as for `DownlinkEncoder.encode`."""
+        octets = self._encoder.encode(packets, virtual_channel, clcw)
         if not packets:
             return octets
         frames = len(octets) // self.settings.cadu_length
         lengths = np.array([len(packet) for packet in packets], dtype=np.int64)
-        zone = self._zone()
+        zone = self._zone(clcw is not None)
         stop = np.cumsum(lengths)
         self.dumps.append(
             Dump(
@@ -98,8 +136,10 @@ class Transmitter:
         assert int(self.dumps[-1].last[-1]) < frames
         return octets
 
-    def _zone(self) -> int:
-        return self.settings.frame_length - 6 - (2 if self.settings.checksum else 0)
+    def _zone(self, ocf: bool) -> int:
+        """Octets of a frame for packets."""
+        trailer = (OCF_LENGTH if ocf else 0) + (CRC_LENGTH if self.settings.checksum else 0)
+        return self.settings.frame_length - FRAME_HEADER_LENGTH - trailer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,8 +223,7 @@ def save_time_receptions(
     folder: Path, packets: Sequence[bytes], emitted_utc_ns: IntArray, position_icrf_m: NDArray[np.float64]
 ) -> None:
     """Write when time reports (n,), emitted at positions (n, 3) from the Moon, came to the Earth's centre."""
-    earth = np.asarray(earth_position_icrf_m(np.asarray(tdb_s_from_utc_ns(emitted_utc_ns)))).reshape(-1, 3)
-    light_s = np.linalg.norm(position_icrf_m - earth, axis=1) / SPEED_OF_LIGHT_M_S
+    light_s = _light_to_earth_s(position_icrf_m, emitted_utc_ns)
     received = emitted_utc_ns + np.rint(light_s * 1e9).astype(np.int64)
     rows = [
         f"{int.from_bytes(packet[14:20], 'big')},{int.from_bytes(packet[2:4], 'big') & 0x3FFF},{format_utc(utc)}\n"
@@ -216,12 +255,14 @@ def station(name: str, minimum_elevation_deg: float = 10.0) -> GroundStation:
 def contacts(
     ephemeris: Ephemeris, utc_ns: IntArray, section: LinkSection
 ) -> tuple[BoolArray, NDArray[np.float64]]:
-    """Whether any station hears the spacecraft at emission epochs (n,), and the light time in s.
+    """Whether any station hears the spacecraft at emission epochs (n,), and the light time to there in s.
 
-    Without stations it is always heard. Contacts begin and end on a grid of a minute.
+    Without stations it is always heard, by the Earth's centre. Contacts begin and end on a grid of a minute.
     """
-    if not section.stations or utc_ns.size == 0:
-        return np.ones(utc_ns.size, dtype=np.bool_), np.full(utc_ns.size, LIGHT_S)
+    if utc_ns.size == 0:
+        return np.ones(0, dtype=np.bool_), np.full(0, LIGHT_S)
+    if not section.stations:
+        return np.ones(utc_ns.size, dtype=np.bool_), _light_to_earth_s(ephemeris.at(utc_ns)[0], utc_ns)
     grid = np.arange(utc_ns.min(), utc_ns.max() + 1, _CONTACT_STEP_NS, dtype=np.int64)
     heard, light_s = np.zeros(grid.size, dtype=np.bool_), np.full(grid.size, LIGHT_S)
     for name in section.stations:
@@ -231,6 +272,12 @@ def contacts(
         light_s = np.where(geometry.visible, geometry.light_time_s, light_s)
     at = (utc_ns - grid[0]) // _CONTACT_STEP_NS
     return heard[at], light_s[at]
+
+
+def _light_to_earth_s(position_icrf_m: NDArray[np.float64], utc_ns: IntArray) -> NDArray[np.float64]:
+    """Light time (n,) from positions (n, 3) from the Moon to the Earth's centre, s."""
+    earth = np.asarray(earth_position_icrf_m(np.asarray(tdb_s_from_utc_ns(utc_ns)))).reshape(-1, 3)
+    return np.asarray(np.linalg.norm(position_icrf_m - earth, axis=1) / SPEED_OF_LIGHT_M_S)
 
 
 def _bursts(

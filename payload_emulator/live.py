@@ -1,7 +1,9 @@
 """The payload as a process to watch and to command: telemetry out and telecommands in over TCP, and a console.
 
 Three ports. Telemetry: CADUs to whoever is connected, from the moment of connection on. Telecommands: CLTUs or bare
-telecommand packets, told apart by their first octets. Console: one JSON object a line out, one word a line in (`pause`,
+telecommand packets, told apart by their first octets; both are on their way for the light time (by the rate of the
+simulated clock, so not at all at rate 0), and what arrives while no station sees the spacecraft is lost, as in space.
+Console: what really happens, at once. One JSON object a line out, one word a line in (`pause`,
 `run`, `step`, `rate X`, `quit`). A step by hand, or going on after a pause, breaks the continuity of time for those who
 watch: as in the simulator of the paper, the odometries are told to start anew (trigger `manual_step`).
 """
@@ -36,13 +38,13 @@ from payload_emulator.flying import (
     fly_moment,
     timeline,
 )
-from payload_emulator.link import Transmitter, transmit
+from payload_emulator.link import LIGHT_S, Receiver, Transmitter, transmit
 from payload_emulator.spacecraft import Spacecraft
 from payload_emulator.world import World, exposures
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import LinkSettings
 from tmtc.errors import TmtcError
-from tmtc.uplink import CLTU_START, CLTU_TAIL, UplinkDecoder
+from tmtc.uplink import CLTU_START, CLTU_TAIL
 
 _NS = 1_000_000_000
 _POLL_S = 0.05
@@ -61,11 +63,13 @@ class TelecommandBuffer:
 
     Attributes
     ----------
+    receiver
+        What CLTUs are received with.
     dropped
         Octets that were neither.
     """
 
-    decoder: UplinkDecoder = field(default_factory=lambda: UplinkDecoder(SPACECRAFT_ID))
+    receiver: Receiver = field(default_factory=lambda: Receiver(SPACECRAFT_ID))
     dropped: int = 0
     _octets: bytes = b""
 
@@ -82,7 +86,7 @@ class TelecommandBuffer:
                 if end < 0:
                     break
                 stop = end + len(CLTU_TAIL)
-                decoded = self.decoder.decode(self._octets[:stop])
+                decoded = self.receiver.decoder.decode(self._octets[:stop])
                 self.dropped += decoded.octets_skipped
                 packets += decoded.packets
                 self._octets = self._octets[stop:]
@@ -149,6 +153,33 @@ class Server:
 
 
 @dataclass(slots=True, eq=False)
+class Flight:
+    """Octets on their way, given to `arrive` when it is over; what started later arrives later."""
+
+    arrive: Callable[[bytes], None]
+    _on_the_way: deque[tuple[float, bytes]] = field(default_factory=deque)
+
+    def start(self, octets: bytes, seconds: float) -> None:
+        """Send octets; without a way they are there at once."""
+        due = time.monotonic() + seconds
+        if self._on_the_way:
+            due = max(due, self._on_the_way[-1][0])
+        elif seconds <= 0.0:
+            self.arrive(octets)
+            return
+        self._on_the_way.append((due, octets))
+
+    def land(self, now: float) -> None:
+        """Hand over what has arrived by a time of the monotonic clock."""
+        while self._on_the_way and self._on_the_way[0][0] <= now:
+            self.arrive(self._on_the_way.popleft()[1])
+
+    def land_all(self) -> None:
+        """Hand over everything."""
+        self.land(float("inf"))
+
+
+@dataclass(slots=True, eq=False)
 class LivePayload:
     """A scenario flown live.
 
@@ -183,8 +214,14 @@ class LivePayload:
     _discontinuous: bool = False
     _console_count: int = _CONSOLE_COUNTS
     _transmitter: Transmitter = field(init=False)
+    _upwards: Flight = field(init=False)
+    _downwards: Flight = field(init=False)
+    _light_s: float = LIGHT_S
+    _heard: bool = True
 
     def __post_init__(self) -> None:
+        self._upwards = Flight(self._arrive)
+        self._downwards = Flight(lambda octets: self._servers["telemetry"].send(octets))
         settings = LinkSettings(coding=self.world.scenario.link.coding)
         self._transmitter = Transmitter(SPACECRAFT_ID, settings)
         self._servers = {}
@@ -210,6 +247,7 @@ class LivePayload:
         try:
             self._fly()
         finally:
+            self._downwards.land_all()
             self._say({"kind": "end"})
             self.close()
 
@@ -243,8 +281,14 @@ class LivePayload:
                         return
                     before = moment
                     exposure = next(frames) if moment.frame >= 0 else None
+                    self._light_s, self._heard = moment.light_s, moment.heard
+                    receiver = self._uplink.receiver
+                    receiver.in_lock = self._heard and (
+                        self.has_operator or bool(self._servers["telecommand"].clients)
+                    )
+                    by_hand = self._by_hand(moment)
                     flown = fly_moment(
-                        self.world, self.spacecraft, operator, moment, exposure, self._by_hand(moment)
+                        self.world, self.spacecraft, operator, receiver, moment, exposure, by_hand
                     )
                     self._tell(flown)
         finally:
@@ -269,6 +313,9 @@ class LivePayload:
             self._serve(selector, min(left, _POLL_S))
 
     def _serve(self, selector: selectors.BaseSelector, timeout_s: float) -> None:
+        now = time.monotonic()
+        self._upwards.land(now)
+        self._downwards.land(now)
         for key, _ in selector.select(timeout_s):
             server: Server = key.data
             if key.fileobj is server.listener:
@@ -289,7 +336,17 @@ class LivePayload:
                 server.drop(client)
 
     def _take_telecommands(self, octets: bytes) -> None:
-        self._orders.extend(self._uplink.take(octets))
+        self._upwards.start(octets, self._way_s)
+
+    def _arrive(self, octets: bytes) -> None:
+        """Octets reach the spacecraft's antenna."""
+        if self._heard:
+            self._orders.extend(self._uplink.take(octets))
+
+    @property
+    def _way_s(self) -> float:
+        """Seconds of the wall clock that a signal takes now."""
+        return self._light_s / self.rate if self.rate > 0.0 else 0.0
 
     def _take_words(self, octets: bytes) -> None:
         self._words = (self._words + octets)[-_BUFFER_LIMIT:]
@@ -333,13 +390,12 @@ class LivePayload:
     def _tell(self, flown: Flown) -> None:
         """Send the packets of a moment to those who listen, and the snapshot to those who watch."""
         if flown.packets:
-            self._transmitter.send(flown.packets, flown.moment.utc_ns)
+            self._transmitter.send(flown.packets, flown.moment.utc_ns, clcw=flown.clcw)
             dump = self._transmitter.dumps.pop()
             section = self.world.scenario.link
             seed = self.world.scenario.seed + self.sent
-            self._servers["telemetry"].send(
-                transmit([dump], self._transmitter.settings, section, seed).octets
-            )
+            octets = transmit([dump], self._transmitter.settings, section, seed).octets
+            self._downwards.start(octets, self._way_s)
             self.sent += 1
         if self._servers["console"].clients:
             self._say(snapshot(self.world, self.spacecraft, flown, self.paused, self.rate))

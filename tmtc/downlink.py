@@ -8,14 +8,15 @@ by trial where they are not given, and never fails on damage: what is lost is co
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from tmtc import cadu, reed_solomon
+from tmtc.clcw import UplinkSeen, uplink_seen
 from tmtc.crc import CRC_LENGTH
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import LinkFormatError, ValueRefused
@@ -105,8 +106,17 @@ class DownlinkEncoder:
                 "transfer frame", "frame_length", self.settings.frame_length, f"16..{FRAME_MAX_LENGTH}"
             )
 
-    def encode(self, packets: Iterable[bytes], virtual_channel: int = 0, clcw: bytes | None = None) -> bytes:
-        """CADUs that carry `packets` whole, the last frame filled up with an idle packet; nothing for none."""
+    def encode(
+        self,
+        packets: Iterable[bytes],
+        virtual_channel: int = 0,
+        clcw: bytes | Sequence[bytes] | None = None,
+    ) -> bytes:
+        """CADUs that carry `packets` whole, the last frame filled up with an idle packet; nothing for none.
+
+        `clcw` is the operational control field of all frames; or one for each packet, of which a frame carries that of
+        the last packet that has begun by its end. None: the frames have no such field.
+        """
         joined = list(packets)
         lengths = np.array([len(p) for p in joined], dtype=np.int64)
         if not lengths.size:
@@ -124,28 +134,33 @@ class DownlinkEncoder:
         pointers = np.full(data.shape[0], NO_PACKET_BEGINS, dtype=np.int64)
         frame, first = np.unique(starts // zone, return_index=True)
         pointers[frame] = starts[first] % zone
-        return self._cadus(data, pointers, virtual_channel, clcw)
+        fields = _control_fields(clcw, 1 if isinstance(clcw, bytes) else lengths.size)
+        if fields is not None and not isinstance(clcw, bytes):
+            fields = fields[np.searchsorted(starts[: lengths.size], zone * np.arange(1, len(data) + 1)) - 1]
+        return self._cadus(data, pointers, virtual_channel, fields)
 
     def idle(self, frames: int = 1, clcw: bytes | None = None) -> bytes:
         """CADUs that carry nothing, on the idle channel."""
         data = np.frombuffer(idle_data(self._zone(clcw)), dtype=np.uint8)
         pointers = np.full(frames, ONLY_IDLE_DATA, dtype=np.int64)
-        return self._cadus(np.broadcast_to(data, (frames, data.size)), pointers, IDLE_CHANNEL, clcw)
+        data = np.broadcast_to(data, (frames, data.size))
+        return self._cadus(data, pointers, IDLE_CHANNEL, _control_fields(clcw, 1))
 
-    def _zone(self, clcw: bytes | None) -> int:
+    def _zone(self, clcw: bytes | Sequence[bytes] | None) -> int:
         """Octets of a frame for packets."""
         return (
             self.settings.frame_length
             - FRAME_HEADER_LENGTH
-            - (OCF_LENGTH if clcw else 0)
+            - (0 if clcw is None else OCF_LENGTH)
             - (CRC_LENGTH if self.settings.checksum else 0)
         )
 
-    def _cadus(self, data: OctetArray, pointers: IntArray, virtual_channel: int, clcw: bytes | None) -> bytes:
+    def _cadus(
+        self, data: OctetArray, pointers: IntArray, virtual_channel: int, clcw: OctetArray | None
+    ) -> bytes:
+        """CADUs of packet zones (n, zone) with operational control fields (n or 1, 4)."""
         if not 0 <= virtual_channel < 8:
             raise ValueRefused("transfer frame", "virtual_channel", virtual_channel, "0..7")
-        if clcw is not None and len(clcw) != OCF_LENGTH:
-            raise ValueRefused("transfer frame", "clcw", clcw, f"{OCF_LENGTH} octets")
         n, zone = data.shape
         settings = self.settings
         code = settings.code
@@ -160,7 +175,7 @@ class DownlinkEncoder:
         frames[:, FRAME_HEADER_LENGTH : FRAME_HEADER_LENGTH + zone] = data
         if clcw is not None:
             at = FRAME_HEADER_LENGTH + zone
-            frames[:, at : at + OCF_LENGTH] = np.frombuffer(clcw, dtype=np.uint8)
+            frames[:, at : at + OCF_LENGTH] = clcw
         if settings.checksum:
             append_frame_checksums(frames)
         self.master_count = (self.master_count + n) & 0xFF
@@ -170,6 +185,19 @@ class DownlinkEncoder:
         result[:, : cadu.ASM_LENGTH] = np.frombuffer(cadu.ASM, dtype=np.uint8)
         result[:, cadu.ASM_LENGTH :] = randomise(blocks, settings.randomiser)
         return result.tobytes()
+
+
+def _control_fields(clcw: bytes | Sequence[bytes] | None, count: int) -> OctetArray | None:
+    """The operational control fields (count, 4)."""
+    if clcw is None:
+        return None
+    fields = [clcw] if isinstance(clcw, bytes) else list(clcw)
+    if len(fields) != count:
+        raise ValueRefused("transfer frame", "clcw", f"{len(fields)} fields", f"{count}, one for each packet")
+    wrong = next((one for one in fields if len(one) != OCF_LENGTH), None)
+    if wrong is not None:
+        raise ValueRefused("transfer frame", "clcw", wrong, f"{OCF_LENGTH} octets")
+    return np.frombuffer(b"".join(fields), dtype=np.uint8).reshape(count, OCF_LENGTH)
 
 
 def encode_cadus(
@@ -288,6 +316,11 @@ class DownlinkDecode:
         return 0 if self.frames is None else len(self.frames)
 
     @property
+    def uplink(self) -> tuple[UplinkSeen, ...]:
+        """What the frames of the spacecraft tell of its telecommand channels."""
+        return () if self.frames is None else uplink_seen(self.frames.clcw)
+
+    @property
     def complete(self) -> bool:
         """Whether nothing is damaged, missing, unknown or left over."""
         return not (
@@ -321,6 +354,7 @@ class DownlinkDecode:
             "frames_bad": self.frames_bad,
             "frames_lost": self.frames_lost,
             "symbols_corrected": self.symbols_corrected,
+            "clcw": [asdict(seen) for seen in self.uplink],
             "octets": self.octets,
             "spacecraft_id": self.spacecraft_id,
             "link": None if self.settings is None else _describe(self.settings),

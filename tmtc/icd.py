@@ -57,16 +57,42 @@ Dictionary hash (SHA-256): `{hash}`
 
 ## Downlink
 
-Packets travel in TM transfer frames (CCSDS 132.0-B) of 1115 octets on virtual channel 0, with frame error
-control; virtual channel 7 carries idle frames. A frame is a Reed-Solomon (255,223) codeblock of
-interleaving depth 5 in the dual basis, randomised (legacy sequence of CCSDS 131.0-B, h(x) = x^8 + x^7 + x^5
-+ x^3 + 1), behind the marker `1ACFFC1D`: 1279 octets in all. Space packets may span frames; idle packets
-have APID 0x7FF.
+Packets travel in TM transfer frames (CCSDS 132.0-B) of 1115 octets, with frame error control: what is new on
+virtual channel 0, playback on 1; virtual channel 7 carries idle frames. A frame is a Reed-Solomon (255,223)
+codeblock of interleaving depth 5 in the dual basis, randomised (legacy sequence of CCSDS 131.0-B, h(x) = x^8
++ x^7 + x^5 + x^3 + 1), behind the marker `1ACFFC1D`: 1279 octets in all. Space packets may span frames; idle
+packets have APID 0x7FF.
 
 ## Uplink
 
 Telecommand packets travel one in a segment (header `11` and MAP id) in TC transfer frames (CCSDS 232.0-B)
-with frame error control, in CLTUs: start `EB90`, BCH(63,56) code blocks, tail `C5C5C5C5C5C5C579`.
+with frame error control, in CLTUs: start `EB90`, BCH(63,56) code blocks, tail `C5C5C5C5C5C5C579`, randomised
+(CCSDS 231.0-B, h(x) = x^8 + x^6 + x^4 + x^3 + x^2 + x + 1). The receiver accepts frames by FARM-1 (CCSDS 232.1-B,
+positive and negative window of 10 frames): expedited frames (type BD) whatever their number,
+sequence-controlled ones (AD) in order.
+
+## Command link control word
+
+Every frame of the downlink ends, before its frame error control, with an operational control field (flag `1` in the
+frame header): the state of the telecommand receiver when the last packet that begins in the frame was handed over.
+Frames without the field (flag `0`, as older recordings have them) are read as well.
+
+| bit | content |
+|---|---|
+| 0 | control word type `0` |
+| 1-2 | version `00` |
+| 3-5 | status, `000` |
+| 6-7 | COP in effect, `01` (COP-1) |
+| 8-13 | telecommand virtual channel, 0 |
+| 14-15 | spare |
+| 16 | no RF available: no station transmits |
+| 17 | no bit lock |
+| 18 | lockout: a frame came from outside the window; only expedited frames are accepted until `Unlock` |
+| 19 | wait, `0` |
+| 20 | retransmit: a sequence-controlled frame is missing |
+| 21-22 | FARM-B counter: expedited frames accepted, modulo 4 |
+| 23 | spare |
+| 24-31 | report value: the number of the sequence-controlled frame that is expected next |
 """
 
 

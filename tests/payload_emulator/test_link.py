@@ -11,10 +11,12 @@ from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.third_bodies import earth_position_icrf_m
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.errors import ScenarioError
-from payload_emulator.link import Transmitter, contacts, station, transmit
+from payload_emulator.link import Receiver, Transmitter, contacts, station, transmit
 from payload_emulator.scenario import LinkSection
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import LinkSettings, decode
+from tmtc.frames import Clcw, pack_clcw, unpack_clcw
+from tmtc.uplink import UplinkEncoder
 
 EPOCH = parse_utc("2029-08-08T00:00:00Z")
 
@@ -29,10 +31,12 @@ def packets(count: int, start: int, rng: np.random.Generator) -> list[bytes]:
 
 
 def transmitter(coding: str = "rs", dumps: int = 8, each: int = 30) -> Transmitter:
+    """Dumps of packets, every third in frames without an operational control field."""
     rng = np.random.default_rng(3)
     sender = Transmitter(76, LinkSettings(coding=coding))
     for k in range(dumps):
-        sender.send(packets(each, k * each, rng), EPOCH + k, virtual_channel=k % 2)
+        clcw = None if k % 3 == 2 else pack_clcw(Clcw(0, k))
+        sender.send(packets(each, k * each, rng), EPOCH + k, virtual_channel=k % 2, clcw=clcw)
     return sender
 
 
@@ -113,6 +117,25 @@ def test_errors_come_in_bursts_of_the_length_that_is_asked_for() -> None:
     assert lost / frames == pytest.approx(1 / 6, abs=0.03)
 
 
+def test_the_receiver_reports_what_it_accepted_and_whether_it_hears_anybody() -> None:
+    receiver = Receiver(76)
+    ping = DICTIONARY.pack_command("test_connection", {}, sequence_count=1)
+    assert unpack_clcw(receiver.clcw) == Clcw(0, 0)
+    assert receiver.take(ping * 3) == ping * 3
+    assert unpack_clcw(receiver.clcw) == Clcw(0, 0, farm_b_counter=3)
+    # A sequence-controlled frame that does not follow is not accepted, and one far off locks the receiver.
+    assert (
+        receiver.decoder.decode(UplinkEncoder(76, bypass=False, sequence_number=1).encode([ping])).packets
+        == ()
+    )
+    assert unpack_clcw(receiver.clcw).retransmit
+    receiver.decoder.decode(UplinkEncoder(76, bypass=False, sequence_number=99).encode([ping]))
+    assert unpack_clcw(receiver.clcw).lockout
+    receiver.in_lock = False
+    state = unpack_clcw(receiver.clcw)
+    assert state.no_rf_available and state.no_bit_lock and state.farm_b_counter == 3
+
+
 def circling(hours: float = 4.0) -> Ephemeris:
     """A circular polar orbit at 30 km whose plane holds the Earth at the epoch, in closed form."""
     times = EPOCH + np.arange(-300, int(3600 * hours) + 300, 10) * 10**9
@@ -136,8 +159,10 @@ def test_contacts_end_behind_the_limb_of_the_moon_once_an_orbit() -> None:
     hidden = (np.pi - 2.0 * np.arccos(1737.4 / 1767.4)) / (2.0 * np.pi)
     assert 1.0 - heard.mean() == pytest.approx(hidden, abs=0.04)
     assert np.all((light_s > 1.1) & (light_s < 1.4))
-    always, _ = contacts(ephemeris, times, LinkSection())
+    always, way_s = contacts(ephemeris, times, LinkSection())
     assert always.all()
+    # To the Earth's centre it is farther than to a station that sees the Moon, by an Earth's radius at most.
+    assert np.all((way_s[heard] > light_s[heard] - 1e-3) & (way_s[heard] < light_s[heard] + 0.0213))
     one, _ = contacts(ephemeris, times, LinkSection(stations=("madrid",)))
     assert one.sum() < heard.sum()
 

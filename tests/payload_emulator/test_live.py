@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import base64
 import json
+import selectors
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,10 +16,13 @@ import numpy as np
 import pytest
 
 from lunar.datafolder import DataFolder, find_data
+from lunar.timescales import parse_utc
 from payload_emulator.campaign import Case, fly_case, load_campaign, table
 from payload_emulator.emulator import load_scenario_payload, new_spacecraft
 from payload_emulator.errors import LinkError, ScenarioError
-from payload_emulator.live import LivePayload, TelecommandBuffer
+from payload_emulator.flight.modes import PayloadMode
+from payload_emulator.flying import Flown, Moment, Operator
+from payload_emulator.live import Flight, LivePayload, Server, TelecommandBuffer
 from payload_emulator.loading import LoadedPayload
 from payload_emulator.scenario import parse_scenario
 from payload_emulator.world import World, build_world
@@ -46,6 +51,7 @@ filter_gravity = "builtin"
 filter_degree = 8
 """
 NO_DATA = find_data(None)
+EPOCH = parse_utc("2029-08-07T01:40:00Z")
 
 
 @pytest.fixture(scope="module")
@@ -138,6 +144,9 @@ def test_a_session_of_watching_stepping_and_commanding(running: tuple[LivePayloa
     decoded = decode(watcher.rest_of_telemetry(), spacecraft_id=0x4C)
     assert decoded.complete
     assert decoded.by_apid[DICTIONARY.packet("connection_report").apid] == 2
+    # The CLTU was an expedited frame; what came bare went past the receiver's frames, as did the operator's.
+    (uplink,) = decoded.uplink
+    assert uplink.frames == decoded.frame_count and not uplink.no_rf_available and uplink.changes > 0
 
 
 def test_the_scenario_runs_through_and_the_machine_goes_on(running: tuple[LivePayload, Watcher]) -> None:
@@ -158,6 +167,66 @@ def test_the_scenario_runs_through_and_the_machine_goes_on(running: tuple[LivePa
     }
     watcher.say("rate 5")
     watcher.until(lambda message: message.get("rate") == 5.0)
+
+
+def test_signals_arrive_a_light_time_later_in_order_and_none_is_forgotten() -> None:
+    arrived: list[bytes] = []
+    flight = Flight(arrived.append)
+    flight.start(b"at once", 0.0)
+    assert arrived == [b"at once"]
+    begin = time.monotonic()
+    flight.start(b"slow", 1000.0)
+    flight.start(b"quick, behind it", 0.0)
+    flight.land(begin + 999.0)
+    assert arrived == [b"at once"]
+    flight.land(begin + 1001.0)
+    assert arrived == [b"at once", b"slow", b"quick, behind it"]
+    flight.start(b"last", 1000.0)
+    flight.land_all()
+    assert arrived[-1] == b"last"
+
+
+def test_telecommands_and_telemetry_of_the_live_payload_take_the_light_time(
+    flown: tuple[World, LoadedPayload], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world, loaded = flown
+    live = LivePayload(world, new_spacecraft(world, loaded), rate=1.0)
+    sent: list[bytes] = []
+    clock = [1000.0]
+    monkeypatch.setattr("payload_emulator.live.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr(Server, "send", lambda server, octets: sent.append(octets) or None)
+    with selectors.DefaultSelector() as selector, socket.create_server(("127.0.0.1", 0)) as idle:
+        selector.register(idle, selectors.EVENT_READ)
+        live._take_telecommands(UplinkEncoder(0x4C).encode([ping(3)]))
+        live._tell(Flown(Moment(EPOCH, -1, 1.0, True, 1 << 20), None, b"", [ping(1)], bytes(4)))
+        live._serve(selector, 0.0)
+        assert not sent and not live._orders
+        clock[0] += 1.27
+        live._serve(selector, 0.0)
+        assert not sent and not live._orders
+        clock[0] += 0.02
+        live._serve(selector, 0.0)
+        assert len(sent) == 1 and list(live._orders) == [ping(3)]
+        # Behind the limb nobody hears.
+        live._heard = False
+        live._take_telecommands(ping(4))
+        clock[0] += 2.0
+        live._serve(selector, 0.0)
+        assert list(live._orders) == [ping(3)]
+    live.close()
+
+
+def test_the_operator_answers_to_telemetry_of_two_light_times_ago(flown: tuple[World, LoadedPayload]) -> None:
+    second = 1_000_000_000
+    modes = [PayloadMode(1 + (k // 3) % 3) for k in range(12)]
+    for step_s, behind in ((10, 0), (1, 2)):
+        operator = Operator(flown[0])
+        # What the payload is in before moment k it was in telemetry of moment k - 1.
+        seen = [
+            operator._mode_seen(Moment(EPOCH + k * step_s * second, -1, 1.0, True, 0, 1.28), mode)
+            for k, mode in enumerate(modes)
+        ]
+        assert seen[behind:] == modes[: len(modes) - behind]
 
 
 def test_a_port_in_use_is_named_and_nothing_stays_open(flown: tuple[World, LoadedPayload]) -> None:

@@ -183,6 +183,35 @@ def test_the_command_link_control_word_comes_down_with_each_frame():
     assert {unpack_clcw(int(word).to_bytes(4, "big")) for word in decoded.frames.clcw} == {clcw}
 
 
+def test_each_frame_carries_the_control_word_of_the_last_packet_that_began():
+    settings = LinkSettings()
+    encoder = DownlinkEncoder(76, settings)
+    clcws = [pack_clcw(Clcw(0, k & 0xFF, farm_b_counter=k >> 8)) for k in range(len(PACKETS))]
+    octets = encoder.encode(PACKETS, clcw=clcws)
+    decoded = decode(octets)
+    assert list(decoded.cut.packets(decoded.buffer)) == PACKETS and decoded.complete
+    zone = settings.frame_length - 6 - 4 - 2
+    starts = np.concatenate(([0], np.cumsum([len(packet) for packet in PACKETS])[:-1]))
+    for frame, word in enumerate(decoded.frames.clcw):
+        begun = int(np.count_nonzero(starts < (frame + 1) * zone)) - 1
+        assert int(word).to_bytes(4, "big") == clcws[begun]
+    with pytest.raises(ValueRefused, match="one for each packet"):
+        encoder.encode(PACKETS, clcw=clcws[1:])
+    with pytest.raises(ValueRefused, match="4 octets"):
+        encoder.encode(PACKETS[:1], clcw=b"\x01\x00\x00")
+
+
+def test_frames_with_and_without_control_words_are_read_from_one_stream():
+    encoder = DownlinkEncoder(76)
+    octets = encoder.encode(PACKETS[:50]) + encoder.encode(PACKETS[50:], clcw=pack_clcw(Clcw(0, 5)))
+    decoded = decode(octets)
+    assert sorted(decoded.cut.packets(decoded.buffer)) == sorted(PACKETS) and decoded.complete
+    assert_all_octets_are_accounted_for(octets, decoded)
+    (seen,) = decoded.uplink
+    assert 0 < seen.frames < decoded.frame_count and seen.report_value == 5 and seen.changes == 0
+    assert decode(encoder.encode(PACKETS)).uplink == ()
+
+
 # injuries of the link
 
 
