@@ -147,6 +147,10 @@ class Client:
             ids = [int(text) for text in answer.headers.get("X-Telecommands", "").split(",") if text]
             return answer.read(), ids
 
+    def uplink_state(self, spacecraft_id: int, instance: str = "flight") -> View:
+        """The state of a spacecraft's telecommand receiver, by its newest telemetry."""
+        return self._json("GET", f"/spacecraft/{spacecraft_id}/uplink", query={"instance": instance})
+
     # Time
 
     def correlate(self, spacecraft_id: int, instance: str, points: list[View]) -> View:

@@ -119,6 +119,11 @@ class LocalOperations:
             actor=self._actor,
         )
 
+    def uplink_state(self, spacecraft_id: int, instance: str = "flight") -> View:
+        from ground_service.services.uplink_state import uplink_state
+
+        return uplink_state(self.ground, spacecraft_id, instance)
+
     def correlate(self, spacecraft_id: int, instance: str, points: list[View]) -> View:
         from ground_service.services.timekeeping import correlate_spacecraft, time_points
 

@@ -43,6 +43,9 @@ class Metrics:
     def answer(self, ground: Ground) -> Response:
         """All figures, those of the work read from the database now."""
         counts = work_counts(ground)
+        # A state that nothing is in any more has no row, and must not keep its last count.
+        self._jobs.clear()
+        self._ingests.clear()
         for (kind, state), count in counts.jobs.items():
             self._jobs.labels(kind, state).set(count)
         for state, count in counts.ingests.items():

@@ -230,6 +230,39 @@ class Telecommand(Schema):
     reports: list[CommandReport]
 
 
+class UplinkChannel(Schema):
+    """A telecommand channel as the command link control words of one reception show it; flags are of the last word."""
+
+    virtual_channel: int = Field(ge=0, le=63, examples=[0])
+    report_value: int = Field(
+        ge=0, le=255, description="Number of the sequence-controlled frame that is expected next"
+    )
+    farm_b_counter: int = Field(ge=0, le=3, description="Expedited frames accepted, modulo 4", examples=[3])
+    lockout: bool
+    wait: bool
+    retransmit: bool
+    no_rf_available: bool
+    no_bit_lock: bool
+    frames: int = Field(
+        description="Frames of the reception that carry a word of the channel", examples=[120]
+    )
+    changes: int = Field(description="How often the word changed in it")
+    frames_lockout: int
+    frames_wait: int
+    frames_retransmit: int
+    frames_no_rf: int
+    ingest_id: int = Field(examples=[1])
+    received: str = Field(examples=["2029-08-07T06:30:00.000000000Z"])
+
+
+class UplinkState(Schema):
+    """What a spacecraft's telemetry last told of its telecommand receiver; no channels where it tells nothing."""
+
+    spacecraft_id: int = Field(examples=[76])
+    instance: str = Field(examples=["flight"])
+    channels: list[UplinkChannel]
+
+
 class Job(Schema):
     """A piece of background work."""
 

@@ -16,11 +16,13 @@ from ground_service.api.common import (
     Offset,
     Operator,
     RowId,
+    SpacecraftId,
     Viewer,
     page_of,
 )
 from ground_service.services import commanding
 from ground_service.services.ingest import FLOWN
+from ground_service.services.uplink_state import uplink_state
 from ground_service.services.views import telecommand_view
 
 telecommands = APIRouter(prefix=API_PREFIX, responses=PROBLEMS, tags=["telecommands"])
@@ -74,6 +76,14 @@ def rejecttelecommand_view(
     """Take a queued telecommand out of the queue."""
     commanding.reject_command(ground, command_id, actor=caller.name, reason=given.reason)
     return telecommand_view(commanding.get_command(ground, command_id))
+
+
+@telecommands.get("/spacecraft/{spacecraft_id}/uplink", response_model=schemas.UplinkState)
+def get_uplink_state(
+    ground: GroundOf, _: Viewer, spacecraft_id: SpacecraftId, instance: Instance = FLOWN
+) -> Any:
+    """The state of a spacecraft's telecommand receiver, by the control words of its newest telemetry."""
+    return uplink_state(ground, spacecraft_id, instance)
 
 
 @telecommands.post(

@@ -8,12 +8,13 @@ taken off again, so the sums are those of the stream read at once.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ground_service.link.packets import PacketBatch, batch_of_cut
 from tmtc.cadu import ASM
+from tmtc.clcw import UplinkSeen
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import FRAME_FOREIGN, DownlinkDecode, LinkSettings, decode
 from tmtc.packets import PACKET_MAX_LENGTH
@@ -42,6 +43,8 @@ class LinkAccounting:
     frames: int = 0
     frames_bad: int = 0
     symbols_corrected: int = 0
+    uplink: dict[tuple[int, int], UplinkSeen] = field(default_factory=dict)
+    """Telecommand channels by spacecraft and number, as the frames show them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,10 +146,19 @@ class DownlinkReader:
         if sign > 0:
             self._frame_edges(first, settings, len(window))
         for one in found:
+            self._uplink(one, sign)
             self.accounting.octets_skipped += sign * (one.octets["orphaned"] + one.octets["skipped"])
             self._count(one.cut, sign)
             if sign > 0:
                 yield batch_of_cut(one.buffer, one.cut, self._dictionary, one.spacecraft_id)
+
+    def _uplink(self, found: DownlinkDecode, sign: int) -> None:
+        if found.spacecraft_id is None:
+            return
+        channels = self.accounting.uplink
+        for seen in found.uplink:
+            key = (found.spacecraft_id, seen.virtual_channel)
+            channels[key] = channels[key].followed_by(seen, sign) if key in channels else seen
 
     def _packet_edges(self, cut: PacketCut, octets: int, final: bool) -> None:
         first = self.edges

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from sqlalchemy import Connection
 
@@ -34,7 +35,8 @@ FLOWN = "flight"
 class IngestResult:
     """What one ingest found in its file, and what of it was new.
 
-    `packets_joined` came about only together with files that were ingested before.
+    `packets_joined` came about only together with files that were ingested before. `uplink` holds, for each spacecraft
+    and telecommand channel that the frames tell of, what `tmtc.clcw.UplinkSeen` says.
     """
 
     ingest_id: int
@@ -51,6 +53,7 @@ class IngestResult:
     frames_bad: int
     symbols_corrected: int
     unknown: int
+    uplink: tuple[dict[str, Any], ...] = ()
 
 
 def ingest_file(
@@ -212,6 +215,10 @@ def _store_stream(
         frames_bad=found.frames_bad,
         symbols_corrected=found.symbols_corrected,
         unknown=unknown,
+        uplink=tuple(
+            {"spacecraft_id": spacecraft_id, **asdict(seen)}
+            for (spacecraft_id, _), seen in sorted(found.uplink.items())
+        ),
     )
 
 

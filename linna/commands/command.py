@@ -1,4 +1,4 @@
-"""`linna command enter | list | show | release | reject | uplink`: telecommands of the ground service."""
+"""`linna command enter | list | show | release | reject | uplink | receiver`: telecommands of the ground service."""
 
 from __future__ import annotations
 
@@ -39,11 +39,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
     taking.add_argument("--out", type=Path, metavar="FILE", help="file to write them to")
     taking.add_argument("--tcp", metavar="HOST:PORT", help="send them there, too")
     taking.set_defaults(handler=uplink)
-    for action in (entering, taking):
+    looking = actions.add_parser(
+        "receiver", help="state of the telecommand receiver, by the newest telemetry"
+    )
+    looking.add_argument("--spacecraft-id", type=int, required=True, metavar="N")
+    looking.set_defaults(handler=receiver)
+    for action in (entering, taking, looking):
         action.add_argument(
             "--instance", default="flight", help="instance of the spacecraft (default: flight)"
         )
-    for action in (entering, listing, showing, releasing, rejecting, taking):
+    for action in (entering, listing, showing, releasing, rejecting, taking, looking):
         add_operator_options(action)
         add_json_flag(action)
 
@@ -108,6 +113,23 @@ def uplink(arguments: argparse.Namespace) -> int:
     figures = {"file": where, "octets": len(stream), "telecommands": ids}
     emit(arguments, figures, text=f"{where}: {len(ids)} telecommands, {len(stream)} octets")
     return 0
+
+
+def receiver(arguments: argparse.Namespace) -> int:
+    with operations(arguments) as service:
+        state = service.uplink_state(arguments.spacecraft_id, arguments.instance)
+    lines = [_channel_line(channel) for channel in state["channels"]]
+    emit(arguments, state, text="\n".join(lines) or "no telemetry that tells of the telecommand receiver")
+    return 0
+
+
+def _channel_line(channel: dict[str, Any]) -> str:
+    flags = ("no_rf_available", "no_bit_lock", "lockout", "wait", "retransmit")
+    said = ", ".join(flag.replace("_", " ") for flag in flags if channel[flag]) or "ready"
+    return (
+        f"channel {channel['virtual_channel']}: {said}; expects frame {channel['report_value']}, "
+        f"expedited frames {channel['farm_b_counter']} (modulo 4); received {channel['received']}"
+    )
 
 
 def _connection(address: str) -> Any:

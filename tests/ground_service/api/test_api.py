@@ -13,6 +13,8 @@ from ground_service.api.app import create_app
 from ground_service.services.archive_import import import_archive
 from ground_service.services.users import add_user
 from ground_service.settings import Settings
+from tmtc.downlink import DownlinkEncoder
+from tmtc.frames import Clcw, pack_clcw
 
 with warnings.catch_warnings():
     # It recommends another HTTP library than the installed one; both serve it.
@@ -75,6 +77,35 @@ def test_an_upload_over_the_limit_is_refused_announced_or_not(client: TestClient
     blocks = (b"\0" * (1 << 18) for _ in range(12))
     assert is_problem(client.post(f"{V1}/telemetry", content=blocks), 413)
     assert is_problem(client.post(f"{V1}/passes", content=b"[" * (2 << 20)), 413)
+
+
+def test_the_telecommand_receiver_is_shown_as_the_newest_telemetry_tells_it(
+    client: TestClient, make_pass: Callable[..., Any]
+) -> None:
+    packets = make_pass(frames=3, seed=11).packets
+
+    def receive(clcw: Clcw | None) -> int:
+        field = None if clcw is None else pack_clcw(clcw)
+        stream = DownlinkEncoder(76).encode(packets, clcw=field)
+        query = {"instance": "uplink"}
+        return int(client.post(f"{V1}/telemetry", content=stream, params=query).json()["ingest_id"])
+
+    def shown() -> list[dict[str, Any]]:
+        state = client.get(f"{V1}/spacecraft/76/uplink", params={"instance": "uplink"}).json()
+        channels: list[dict[str, Any]] = state["channels"]
+        return channels
+
+    assert is_problem(client.get(f"{V1}/spacecraft/76/uplink", params={"instance": "nobody"}), 404)
+    receive(None)  # as recorded before frames had the field
+    assert shown() == []
+    locked = receive(Clcw(0, 4, lockout=True, farm_b_counter=1))
+    assert [(one["ingest_id"], one["lockout"], one["frames_lockout"] > 0) for one in shown()] == [
+        (locked, True, True)
+    ]
+    ready = receive(Clcw(0, 4, farm_b_counter=2))
+    receive(None)
+    (channel,) = shown()
+    assert (channel["ingest_id"], channel["lockout"], channel["farm_b_counter"]) == (ready, False, 2)
 
 
 def test_passes_are_listed_in_pages_and_shown(client: TestClient) -> None:
@@ -260,6 +291,7 @@ MATRIX = [
     ("POST", "/spacecraft/76/correlations/run", "operator"),
     ("POST", "/spacecraft/76/receptions", "operator"),
     ("GET", "/spacecraft/76/time-reports", "viewer"),
+    ("GET", "/spacecraft/76/uplink", "viewer"),
     ("POST", "/windows/search", "viewer"),
     ("GET", "/windows", "viewer"),
     ("POST", "/windows", "operator"),
@@ -356,6 +388,19 @@ def test_figures_are_kept_by_route(client: TestClient) -> None:
     figures = client.get("/metrics").text
     assert 'linna_http_requests_total{method="GET",route="/api/v1/passes/{pass_id}",status="200"}' in figures
     assert "linna_passes 1.0" in figures or "linna_passes 2.0" in figures
+
+
+def test_figures_of_work_that_is_over_go_away(tmp_path: Path) -> None:
+    from ground_service.services.jobs import enter_job, run_job
+
+    with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as opened:
+        ground = opened.app.state.ground  # type: ignore[attr-defined]
+        job = enter_job(ground, "report", {"pass_id": 1})
+        assert 'linna_jobs{kind="report",state="queued"} 1.0' in opened.get("/metrics").text
+        run_job(ground, job)
+        figures = opened.get("/metrics").text
+    assert 'linna_jobs{kind="report",state="failed"} 1.0' in figures
+    assert 'state="queued"' not in figures
 
 
 def test_jobs_left_unfinished_are_taken_up_again(synthetic_pass: Any, tmp_path: Path) -> None:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from ground_service.link.stream import DownlinkReader
-from tmtc.downlink import decode, encode_cadus
+from tmtc.downlink import DownlinkEncoder, LinkSettings, decode, encode_cadus
+from tmtc.frames import Clcw, pack_clcw
 
 SPACECRAFT = 76
 
@@ -75,3 +76,26 @@ def test_frames_of_another_spacecraft_are_left_out_when_one_is_named(packets: li
     found, accounting = read(stream, 1 << 20, 1 << 20, 33)
     assert found == packets[20:60]
     assert accounting.frames_bad > 0
+
+
+@pytest.mark.parametrize("window", [1 << 20, 60_000])
+def test_the_uplink_is_seen_alike_in_windows_and_at_once(packets: list[bytes], window: int) -> None:
+    encoder = DownlinkEncoder(SPACECRAFT, LinkSettings(frame_length=223))
+    clcws = [
+        pack_clcw(Clcw(0, k // 9, lockout=40 < k < 60, farm_b_counter=k % 4)) for k in range(len(packets))
+    ]
+    stream = encoder.encode(packets, clcw=clcws)
+    (whole,) = decode(stream).uplink
+    found, accounting = read(stream, 1000, window)
+    assert set(found) == set(packets)
+    assert accounting.uplink == {(SPACECRAFT, 0): whole}
+    assert whole.frames == accounting.frames and whole.changes > 50 and whole.frames_lockout > 0
+
+
+def test_the_uplinks_of_two_spacecraft_in_one_file_are_told_apart(packets: list[bytes]) -> None:
+    stream = b"".join(
+        DownlinkEncoder(spacecraft).encode(packets[:40], clcw=pack_clcw(Clcw(0, number)))
+        for spacecraft, number in ((76, 5), (33, 200))
+    )
+    _, accounting = read(stream, 1 << 20, 1 << 20)
+    assert {key: seen.report_value for key, seen in accounting.uplink.items()} == {(76, 0): 5, (33, 0): 200}
