@@ -81,20 +81,17 @@ def join_pairs(
 
 def wrong_fixes(pairs: Pairs, camera: PinholeCamera, utc_ns: IntArray, position_mcmf_m: FloatArray) -> int:
     """How many frames were identified wrongly; the reference (m, 3), MCMF, at the ascending times `utc_ns` (m,)."""
-    wrong = 0
-    for rows in _by_frame(pairs):
-        at = int(np.searchsorted(utc_ns, pairs.utc_ns[rows[0]]))
-        if (
-            at >= len(utc_ns)
-            or utc_ns[at] != pairs.utc_ns[rows[0]]
-            or not np.isfinite(position_mcmf_m[at, 0])
-        ):
-            continue
-        uv = _projected(camera, position_mcmf_m[at][None], pairs.crater_mcmf_m[rows])[0]
-        allowed = np.minimum(CENTRE_TOLERANCE_RADII * pairs.diameter_px[rows] / 2.0, CENTRE_TOLERANCE_PX)
-        right = np.hypot(*(uv - pairs.uv_px[rows]).T) <= allowed
-        wrong += int(2 * np.count_nonzero(right) <= len(rows))
-    return wrong
+    at = np.minimum(np.searchsorted(utc_ns, pairs.utc_ns), max(len(utc_ns) - 1, 0))
+    if len(utc_ns) == 0 or len(pairs.frame) == 0:
+        return 0
+    kept = np.flatnonzero((utc_ns[at] == pairs.utc_ns) & np.isfinite(position_mcmf_m[at, 0]))
+    rotations = nadir_camera_from_mcmf(position_mcmf_m)
+    line = pairs.crater_mcmf_m[kept] - position_mcmf_m[at[kept]]
+    uv = camera.project(np.einsum("nij,nj->ni", rotations[at[kept]], line))
+    allowed = np.minimum(CENTRE_TOLERANCE_RADII * pairs.diameter_px[kept] / 2.0, CENTRE_TOLERANCE_PX)
+    right = np.hypot(*(uv - pairs.uv_px[kept]).T) <= allowed
+    _, frame = np.unique(pairs.frame[kept], return_inverse=True)
+    return int(np.count_nonzero(2 * np.bincount(frame, weights=right) <= np.bincount(frame)))
 
 
 def snapshot_positions(

@@ -43,6 +43,9 @@ CENTRE_TOLERANCE_PX = 10.0
 DIAMETER_TOLERANCE = 2.0
 """A detection more than twice or less than half as wide is of another crater (one inside it, or around it)."""
 
+FRAMES_AT_ONCE = 500
+"""Frames whose craters are projected together: some 200,000 candidates."""
+
 ALTITUDE_BIN_KM = 10.0
 SUN_ELEVATION_BIN_DEG = 5.0
 
@@ -77,22 +80,30 @@ def expected_craters(
     rotations = nadir_camera_from_mcmf(position_mcmf_m)
     distance = np.linalg.norm(position_mcmf_m, axis=-1)
     radius_m = float(np.mean(np.linalg.norm(points, axis=-1))) if len(points) else 1.0
+    reach_m = _view_radius_m(camera, distance - radius_m)
+    counts = np.zeros(len(position_mcmf_m) + 1, dtype=np.int64)
     pieces: list[tuple[IntArray, FloatArray, FloatArray]] = []
-    counts = [0]
-    for position, rotation, range_m in zip(position_mcmf_m, rotations, distance, strict=True):
-        if not math.isfinite(range_m) or len(points) == 0:
-            counts.append(0)
+    known = np.flatnonzero(np.isfinite(distance)) if len(points) else np.zeros(0, dtype=np.int64)
+    for frames in np.array_split(known, -(-len(known) // FRAMES_AT_ONCE) or 1):
+        nearby, lines = [], []
+        for position, rotation, range_m, reach in zip(
+            position_mcmf_m[frames], rotations[frames], distance[frames], reach_m[frames], strict=True
+        ):
+            near = catalogue.near(
+                math.asin(position[2] / range_m), math.atan2(position[1], position[0]), float(reach)
+            )
+            nearby.append(near)
+            lines.append((points[near] - position) @ rotation.T)
+        if not nearby:
             continue
-        latitude = math.asin(position[2] / range_m)
-        longitude = math.atan2(position[1], position[0])
-        near = catalogue.near(latitude, longitude, _view_radius_m(camera, range_m - radius_m))
-        line = points[near] - position
-        in_camera = line @ rotation.T
+        near, in_camera = np.concatenate(nearby), np.concatenate(lines)
+        owner = np.repeat(frames, [len(one) for one in nearby])
         uv = camera.project(in_camera)
-        inside = camera.contains(uv) & above_horizon(position, points[near])
-        diameter = camera.focal_px * catalogue.diameter_m[near] / in_camera[:, 2]
-        pieces.append((near[inside], uv[inside], diameter[inside]))
-        counts.append(int(np.count_nonzero(inside)))
+        inside = np.flatnonzero(camera.contains(uv))
+        inside = inside[above_horizon(position_mcmf_m[owner[inside]], points[near[inside]])]
+        diameter = camera.focal_px * catalogue.diameter_m[near[inside]] / in_camera[inside, 2]
+        pieces.append((near[inside], uv[inside], diameter))
+        counts[1:] += np.bincount(owner[inside], minlength=len(counts) - 1)
     index = np.concatenate([p[0] for p in pieces]) if pieces else np.zeros(0, dtype=np.int64)
     uv = np.concatenate([p[1] for p in pieces]) if pieces else np.zeros((0, 2))
     diameter = np.concatenate([p[2] for p in pieces]) if pieces else np.zeros(0)
@@ -322,15 +333,17 @@ def _residuals(
     )
 
 
-def _view_radius_m(camera: PinholeCamera, altitude_m: float) -> float:
-    """Arc on the ground to the furthest corner of the image, or to the horizon where a corner sees the sky.
+def _view_radius_m(camera: PinholeCamera, altitude_m: FloatArray) -> FloatArray:
+    """Arcs (f,) on the ground to the furthest corner of the image, or to the horizon where a corner sees the sky.
 
     A twentieth is added for relief: rims stand up to some km above and below the sphere.
     """
     half_u, half_v = camera.width_px / 2.0, camera.height_px / 2.0
     corner = math.atan(math.hypot(half_u, half_v) / camera.focal_px)
-    arc = float(ground_arc_m(corner, altitude_m))
-    return 1.05 * (arc if math.isfinite(arc) else float(horizon_arc_m(altitude_m))) + 5e3
+    arc = ground_arc_m(corner, altitude_m)
+    with np.errstate(invalid="ignore"):
+        horizon = horizon_arc_m(altitude_m)
+    return np.asarray(1.05 * np.where(np.isfinite(arc), arc, horizon) + 5e3)
 
 
 def _share(part: int, whole: int) -> float:

@@ -136,11 +136,16 @@ def _carried(
     state = state.copy()
     total = np.tile(np.eye(SIZE), (len(state), 1, 1))
     noise = np.zeros((len(state), SIZE, SIZE))
+    starts_s = np.asarray(tdb_s_from_utc_ns(from_utc_ns), dtype=np.float64)
     legs = [
-        _legs(int(start), int(stop), model.burns) for start, stop in zip(from_utc_ns, to_utc_ns, strict=True)
+        _legs(start, stop, start_s, model.burns)
+        for start, stop, start_s in zip(
+            from_utc_ns.tolist(), to_utc_ns.tolist(), starts_s.tolist(), strict=True
+        )
     ]
-    for number in range(max((len(one) for one in legs), default=0)):
-        rows = np.array([row for row, one in enumerate(legs) if len(one) > number])
+    lengths = np.array([len(one) for one in legs], dtype=np.int64)
+    for number in range(int(lengths.max(initial=0))):
+        rows = np.flatnonzero(lengths > number)
         starts, steps, burns = zip(*(legs[row][number] for row in rows), strict=True)
         state[rows], transition, added = _step(state[rows], np.array(starts), np.array(steps), model)
         total[rows] = transition @ total[rows]
@@ -153,9 +158,12 @@ def _carried(
 
 
 def _legs(
-    from_utc_ns: int, to_utc_ns: int, burns: tuple[CommandedBurn, ...]
+    from_utc_ns: int, to_utc_ns: int, start_s: float, burns: tuple[CommandedBurn, ...]
 ) -> list[tuple[float, float, CommandedBurn | None]]:
-    """Start (TDB seconds), length (s) and the burn at the end, if any, of every step from one instant to a later."""
+    """Start (TDB seconds), length (s) and the burn at the end, if any, of every step from one instant to a later.
+
+    ``start_s`` is the first instant in TDB seconds.
+    """
     legs: list[tuple[float, float, CommandedBurn | None]] = []
     at = from_utc_ns
     between = [burn for burn in burns if from_utc_ns < burn.utc_ns <= to_utc_ns]
@@ -163,7 +171,8 @@ def _legs(
         count = max(1, int(np.ceil((stop - at) / (_LONGEST_STEP_S * NANOSECONDS_PER_SECOND))))
         step_s = (stop - at) / NANOSECONDS_PER_SECOND / count
         if step_s > 0.0 or burn is not None:
-            start_s = float(tdb_s_from_utc_ns(at))
+            if at != from_utc_ns:
+                start_s = float(tdb_s_from_utc_ns(at))
             legs += [(start_s + i * step_s, step_s, burn if i == count - 1 else None) for i in range(count)]
         at = stop
     return legs

@@ -12,9 +12,10 @@ from typing import Any
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import storage_error
-from ground_service.processing.pass_evaluation import evaluate_pass, summary_of
+from ground_service.processing.pass_evaluation import PassInputs, evaluate_pass, summary_of
 from ground_service.services.ground import Ground
 from ground_service.services.pass_data import load_pass_inputs
+from ground_service.services.press import Press, worthwhile
 from ground_service.services.surface import surface_map
 from ground_service.services.window_progress import advance_windows
 from ground_service.store import repository
@@ -40,7 +41,10 @@ class MadeReport:
 
 def evaluate(ground: Ground, pass_id: int, *, created_utc: str = "") -> PassReport:
     """The report of a pass as a value; the same archive gives the same value."""
-    inputs = load_pass_inputs(ground, pass_id, created_utc=created_utc)
+    return _evaluated(ground, load_pass_inputs(ground, pass_id, created_utc=created_utc))
+
+
+def _evaluated(ground: Ground, inputs: PassInputs) -> PassReport:
     # The face of the real Moon belongs under tracks over the real Moon only.
     rung = rung_number(inputs.evidence_rung)
     if ground.data.albedo is not None and rung is not None and rung >= REAL_TERRAIN_RUNG:
@@ -70,14 +74,16 @@ def make_report(
     out
         Folder for the documents; ``reports/pass-<id>`` under the service's home when None.
     """
-    from reports.render import render_html, render_pdf, to_json
-
     identity = report_id or uuid.uuid4().hex
     now = utc_now_ns()
-    report = evaluate(ground, pass_id, created_utc=format_utc(now))
-    documents = {"html": render_html(report).encode(), "json": to_json(report).encode()}
-    if pdf:
-        documents["pdf"] = render_pdf(report)
+    inputs = load_pass_inputs(ground, pass_id, created_utc=format_utc(now))
+    if pdf and worthwhile(len(inputs.detections)):
+        with Press() as press:
+            report = _evaluated(ground, inputs)
+            documents = _documents(report, pdf=True, press=press)
+    else:
+        report = _evaluated(ground, inputs)
+        documents = _documents(report, pdf=pdf)
     stored = {kind: ground.files.put_octets(octets) for kind, octets in documents.items()}
     summary = _summary(report, pass_id)
     with ground.database.writing() as connection:
@@ -108,6 +114,19 @@ def make_report(
         folder / "report.pdf" if pdf else None,
         summary,
     )
+
+
+def _documents(report: PassReport, *, pdf: bool, press: Press | None = None) -> dict[str, bytes]:
+    """The octets of a report by kind, its PDF from a press where there is one."""
+    from reports.render import render_html, render_pdf, to_json
+
+    if press is not None:
+        press.begin(report)
+    documents = {"html": render_html(report).encode(), "json": to_json(report).encode()}
+    if pdf:
+        # Should the press have failed, so will this, and say why.
+        documents["pdf"] = (press.finish() if press is not None else None) or render_pdf(report)
+    return documents
 
 
 def _summary(report: PassReport, pass_id: int) -> dict[str, Any]:
