@@ -6,6 +6,7 @@ other. The process is started before the pass is evaluated, so that it is ready 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import subprocess
@@ -37,18 +38,19 @@ class Press:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._process.poll() is None:
-            self._process.kill()
-        self._process.communicate()
+        self._process.kill()
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(BrokenPipeError):
+                    pipe.close()
 
     def begin(self, report: Any) -> None:
         """Hand over the report; the process sets it while this one goes on."""
         assert self._process.stdin is not None
-        try:
+        with contextlib.suppress(BrokenPipeError):  # `finish` finds nothing printed
             self._process.stdin.write(pickle.dumps(report, pickle.HIGHEST_PROTOCOL))
             self._process.stdin.close()
-        except BrokenPipeError:
-            pass  # `finish` finds nothing printed
 
     def finish(self) -> bytes | None:
         """The octets of the PDF; None where the process failed, whatever the cause."""
