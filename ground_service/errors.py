@@ -13,6 +13,7 @@ GroundError
 ├── Conflict                 the request contradicts what is stored
 ├── InvalidInput             what was given cannot be accepted (file, manifest, field)
 ├── EvaluationError          a pass that cannot be evaluated
+├── Stopping                 the service is being stopped in the middle of the work
 ├── NotAuthorised            the caller is not known or may not do this
 └── ServerError              the HTTP server cannot start (port in use, unsafe address)
 """
@@ -86,7 +87,14 @@ class StorageReadOnly(StoreError):
         )
 
 
-PASSING = (DatabaseUnavailable, StorageFull, StorageReadOnly)
+class Stopping(GroundError):
+    """The service is being stopped in the middle of the work, which goes on when it runs again."""
+
+    def __init__(self) -> None:
+        super().__init__("the service is being stopped; the work goes on when it runs again")
+
+
+PASSING = (DatabaseUnavailable, StorageFull, StorageReadOnly, Stopping)
 """What is no fault of the work that meets it: the same work, later, may well succeed."""
 
 

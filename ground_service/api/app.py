@@ -37,6 +37,9 @@ DAY_NS = 86_400_000_000_000
 NIGHT_NS = 1_800_000_000_000
 """The nightly job is entered at 00:30 UTC."""
 
+CATCH_UP_S = 60.0
+"""A service that was not running then enters it so long after its start."""
+
 SWEEP_S = 15.0
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
@@ -106,9 +109,13 @@ async def _nights(app: FastAPI, settings: Settings) -> None:
     """Enter the nightly job once a day; it is one job however many servers and schedulers enter it."""
     if settings.resolved_broker_url() is not None:
         return  # the workers' scheduler does it
+    wait_s = CATCH_UP_S
     while True:
-        now = utc_now_ns()
-        await asyncio.sleep((NIGHT_NS - now % DAY_NS) % DAY_NS / 1e9 + 1.0)
+        left_s = (NIGHT_NS - utc_now_ns() % DAY_NS) % DAY_NS / 1e9
+        await asyncio.sleep(min(wait_s, left_s) + 1.0)
+        wait_s = DAY_NS / 1e9
+        if utc_now_ns() % DAY_NS < NIGHT_NS:
+            continue  # the last night's was before this day, and the next is to come
         try:
             await run_in_threadpool(
                 app.state.dispatcher.submit,

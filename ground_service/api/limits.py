@@ -85,7 +85,8 @@ class BodyLimit:
 class RateLimit:
     """Refuses callers that ask more often than they may: a bucket of two seconds' worth for each, refilled evenly.
 
-    A caller is known by its token (its hash: tokens are not kept), else by its address.
+    A caller is known by its token (its hash: tokens are not kept) once that was accepted, before that and without one
+    by its address: tokens made up one after the other earn nothing.
     """
 
     def __init__(self, app: ASGIApp, per_second: float) -> None:
@@ -93,18 +94,35 @@ class RateLimit:
         self._rate = per_second
         self._depth = max(2.0 * per_second, 1.0)
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
+        self._accepted: OrderedDict[str, None] = OrderedDict()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or self._rate <= 0.0 or scope["path"] in _WATCHED:
             await self._app(scope, receive, send)
             return
-        wait_s = self._wait_s(_caller(scope), time.monotonic())
+        token = _token(scope)
+        known = token in self._accepted
+        address = str((scope.get("client") or ("",))[0])
+        wait_s = self._wait_s(token if known else address, time.monotonic())
         if wait_s <= 0.0:
-            await self._app(scope, receive, send)
+
+            async def watched(message: Message) -> None:
+                if message["type"] == "http.response.start":
+                    self._note(token, accepted=message["status"] != 401)
+                await send(message)
+
+            await self._app(scope, receive, watched if token else send)
             return
         response = problem(429, "too many requests", f"expected at most {self._rate:g} requests a second")
         response.headers["Retry-After"] = str(math.ceil(wait_s))
         await response(scope, receive, send)
+
+    def _note(self, token: str, *, accepted: bool) -> None:
+        self._accepted.pop(token, None)
+        if accepted:
+            self._accepted[token] = None
+            if len(self._accepted) > CALLERS_KEPT:
+                self._accepted.popitem(last=False)
 
     def _wait_s(self, caller: str, now_s: float) -> float:
         """Take one from the caller's bucket; how long it has to wait where that is empty."""
@@ -117,11 +135,10 @@ class RateLimit:
         return 0.0 if allowed else (1.0 - left) / self._rate
 
 
-def _caller(scope: Scope) -> str:
+def _token(scope: Scope) -> str:
+    """The hash of the token that a request carries; empty without one."""
     token = Headers(scope=scope).get("authorization", "")
-    if token:
-        return hashlib.sha256(token.encode()).hexdigest()
-    return str((scope.get("client") or ("",))[0])
+    return hashlib.sha256(token.encode()).hexdigest() if token else ""
 
 
 class HeadersAndTags:

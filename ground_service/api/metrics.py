@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+import re
 import time
+import uuid
 
 from prometheus_client import (
     CONTENT_TYPE_LATEST,
@@ -12,6 +15,7 @@ from prometheus_client import (
     Histogram,
     generate_latest,
 )
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -54,8 +58,17 @@ class Metrics:
         return Response(generate_latest(self._registry), media_type=CONTENT_TYPE_LATEST)
 
 
+log = logging.getLogger(__name__)
+
+_UNLOGGED = ("/healthz", "/readyz", "/metrics")
+_REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+
+
 class Watch:
-    """Counts and times every request by its route, never by its path, so that there are few series."""
+    """Counts, times and logs every request; counts by its route, never by its path, so that there are few series.
+
+    Each has an id, the caller's own or a new one: it is in the answer (X-Request-ID) and in the log.
+    """
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         self._app = app
@@ -67,16 +80,33 @@ class Watch:
             return
         started = time.perf_counter()
         status = 500
+        given = Headers(scope=scope).get("x-request-id", "")
+        request_id = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex[:16]
+        scope.setdefault("state", {})["request_id"] = request_id
 
         async def noted(message: Message) -> None:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
+                MutableHeaders(scope=message)["X-Request-ID"] = request_id
             await send(message)
 
         try:
             await self._app(scope, receive, noted)
         finally:
             route = getattr(scope.get("route"), "path", "none")
+            took_s = time.perf_counter() - started
             self._metrics.requests.labels(scope["method"], route, status).inc()
-            self._metrics.seconds.labels(scope["method"], route).observe(time.perf_counter() - started)
+            self._metrics.seconds.labels(scope["method"], route).observe(took_s)
+            if scope["path"] not in _UNLOGGED:
+                told = {
+                    "request_id": request_id,
+                    "method": scope["method"],
+                    "path": scope["path"],
+                    "route": route,
+                    "status": status,
+                    "ms": round(1e3 * took_s, 1),
+                    "caller": scope["state"].get("caller"),
+                    "address": (scope.get("client") or (None,))[0],
+                }
+                log.info("%s %s %d", scope["method"], scope["path"], status, extra=told)

@@ -98,6 +98,9 @@ def install(app: FastAPI) -> None:
 
     async def http(request: Request, error: Exception) -> JSONResponse:
         assert isinstance(error, HTTPException)
+        if error.status_code == 400:  # what the framework says of a body that its JSON reader gives up on
+            detail = "body: expected JSON of ordinary depth with numbers of ordinary length, found none"
+            return problem(400, "invalid request", detail, request)
         return problem(error.status_code, str(error.detail).lower(), str(error.detail), request)
 
     async def invalid(request: Request, error: Exception) -> JSONResponse:
@@ -110,7 +113,8 @@ def install(app: FastAPI) -> None:
         return problem(422, "invalid request", detail, request, errors=found)
 
     async def unexpected(request: Request, error: Exception) -> JSONResponse:
-        log.exception("%s %s", request.method, request.url.path, exc_info=error)
+        told = {"request_id": getattr(request.state, "request_id", None)}
+        log.exception("%s %s", request.method, request.url.path, exc_info=error, extra=told)
         return problem(500, "internal error", "the service met an error that it has logged", request)
 
     for kind in (GroundError, TmtcError, LunarError, ReportError):

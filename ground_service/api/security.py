@@ -22,9 +22,12 @@ def caller_of(
     ground = request.app.state.ground
     if given is None:
         if request.app.state.open_without_users and not has_users(ground):
+            request.state.caller = LOCAL_CALLER.name
             return LOCAL_CALLER
         raise NotAuthorised("expected a bearer token in the Authorization header, found none")
-    return authenticate(ground, given.credentials)
+    caller = authenticate(ground, given.credentials)
+    request.state.caller = caller.name
+    return caller
 
 
 def requires(role: str) -> Callable[..., Coroutine[Any, Any, Caller]]:

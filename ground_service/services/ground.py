@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+import threading
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ground_service.errors import storage_error
+from ground_service.errors import Stopping, storage_error
 from ground_service.store.database import Database, prepare_database
 from ground_service.store.files import FileArchive
 from lunar.datafolder import DataFolder, default_gravity, default_orientation, find_data
@@ -20,12 +21,27 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """An opened ground service: pass it to the functions of `ground_service.services`."""
+    """An opened ground service: pass it to the functions of `ground_service.services`.
+
+    Whoever is about to close it sets `stopping`; long work then ends between two transactions.
+    """
 
     database: Database
     files: FileArchive
     home: Path
     data: DataFolder
+    stopping: threading.Event = field(default_factory=threading.Event, compare=False, repr=False)
+
+    def check_stopping(self) -> None:
+        """Called by long work where it can be broken off.
+
+        Raises
+        ------
+        Stopping
+            If the service is being stopped.
+        """
+        if self.stopping.is_set():
+            raise Stopping
 
     @property
     def orientation(self) -> Orientation:

@@ -6,7 +6,7 @@ files or on how often they came. An ingest that was cut off can simply be run ag
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,8 @@ from tmtc.errors import TmtcError
 
 FLOWN = "flight"
 """Instance of a spacecraft that telemetry belongs to when nothing else is said."""
+
+Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,16 +122,24 @@ def add_ingest(connection: Connection, stored: StoredFile, name: str) -> int:
 
 
 def run_ingest(
-    ground: Ground, ingest_id: int, *, spacecraft_id: int | None = None, instance: str = FLOWN
+    ground: Ground,
+    ingest_id: int,
+    *,
+    spacecraft_id: int | None = None,
+    instance: str = FLOWN,
+    progress: Progress | None = None,
 ) -> IngestResult:
-    """Do what was entered with `begin_ingest`; running it again is harmless."""
+    """Do what was entered with `begin_ingest`; running it again is harmless.
+
+    `progress` is told the share of the file that is stored, several times where it is long.
+    """
     with ground.database.writing() as connection:
         record = repository.get(connection, repository.INGESTS, ingest_id, "ingest")
         repository.change(connection, repository.INGESTS, ingest_id, state="running")
     path = ground.files.path(record["file_sha256"])
     try:
         reader = DownlinkReader(spacecraft_id)
-        result = _store_stream(ground, ingest_id, reader, instance, record["file_sha256"], read_blocks(path))
+        result = _store_stream(ground, ingest_id, reader, instance, record["file_sha256"], path, progress)
         if result.packets == 0 and result.frames == result.frames_bad:
             raise InvalidInput(
                 _name(ground, record["file_sha256"]),
@@ -170,11 +180,14 @@ def _store_stream(
     reader: DownlinkReader,
     instance: str,
     sha256: str,
-    blocks: Iterable[bytes],
+    path: Path,
+    progress: Progress | None,
 ) -> IngestResult:
     vehicles: dict[int, int] = {}
     new = samples = unknown = 0
-    for batch in reader.batches(blocks):
+    total = max(path.stat().st_size, 1)
+    for batch in reader.batches(read_blocks(path)):
+        ground.check_stopping()
         if len(batch) == 0 and (reader.edges is None or reader.edges.settings is None):
             continue
         if batch.spacecraft_id is None:
@@ -188,6 +201,8 @@ def _store_stream(
         new += stored.new
         samples += stored.samples
         unknown += batch.unknown
+        if progress is not None:
+            progress(reader.accounting.octets / total)
     joined = 0
     if reader.edges is not None:
         for spacecraft_id, vehicle in vehicles.items():

@@ -11,7 +11,7 @@ import logging
 import threading
 import uuid
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from sqlalchemy import Connection, select
@@ -39,6 +39,8 @@ FINISHED = ("done", "failed")
 ATTEMPTS_LIMIT = 25
 """A job that ended with its process this often (for want of memory, say) is not tried again."""
 
+PROGRESS_STEP = 0.02
+
 Work = Callable[[Ground, Mapping[str, Any], str], dict[str, Any]]
 
 
@@ -47,12 +49,13 @@ def _report(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[s
     return {"report_id": made.report_id, "pass_id": made.pass_id}
 
 
-def _ingest(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[str, Any]:
+def _ingest(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
     result = run_ingest(
         ground,
         int(arguments["ingest_id"]),
         spacecraft_id=arguments["spacecraft_id"],
         instance=str(arguments["instance"]),
+        progress=_progress_of(ground, job_id),
     )
     return {"ingest_id": result.ingest_id, "packets": result.packets, "packets_new": result.packets_new}
 
@@ -186,14 +189,39 @@ def _run_alone(ground: Ground, job_id: str) -> dict[str, Any]:
     if job["attempts"] >= ATTEMPTS_LIMIT:
         error = f"given up after {ATTEMPTS_LIMIT} attempts that did not come to an end"
         return _finish(ground, job_id, state="failed", error=error)
+    log.info("job %s (%s) begins", job_id, job["kind"], extra={"job": job_id, "kind": job["kind"]})
     try:
         result = WORK[job["kind"]](ground, job["arguments"], job_id)
-    except PASSING:
+    except PASSING as error:
+        log.info("job %s (%s) is to be done again: %s", job_id, job["kind"], error)
+        _put_back(ground, job)
         raise
     except (GroundError, TmtcError, LunarError, ReportError) as error:
         log.warning("job %s (%s) failed: %s", job_id, job["kind"], error)
         return _finish(ground, job_id, state="failed", error=str(error))
     return _finish(ground, job_id, state="done", result=result, progress=1.0, error=None)
+
+
+def _put_back(ground: Ground, job: Mapping[str, Any]) -> None:
+    """Queue a job again that something else broke off; that is no attempt of its own. Not being able to is no harm."""
+    with suppress(*PASSING), ground.database.writing() as connection:
+        repository.change(
+            connection, repository.JOBS, job["id"], state="queued", attempts=job["attempts"], progress=0.0
+        )
+
+
+def _progress_of(ground: Ground, job_id: str) -> Callable[[float], None]:
+    """Keeps the share of a job that is done in its row, in steps that cost nothing beside the work."""
+    kept = 0.0
+
+    def keep(share: float) -> None:
+        nonlocal kept
+        if share - kept >= PROGRESS_STEP and share < 1.0:
+            kept = share
+            with ground.database.writing() as connection:
+                repository.change(connection, repository.JOBS, job_id, progress=share)
+
+    return keep
 
 
 @contextmanager
@@ -227,7 +255,10 @@ def _finish(ground: Ground, job_id: str, **values: Any) -> dict[str, Any]:
             "job",
             {"id": job_id, "kind": job["kind"], "state": job["state"], "result": job["result"]},
         )
-        return job
+    took_s = (job["finished_utc_ns"] - job["started_utc_ns"]) / 1e9
+    told = {"job": job_id, "kind": job["kind"], "state": job["state"], "seconds": round(took_s, 3)}
+    log.info("job %s (%s) is %s after %.1f s", job_id, job["kind"], job["state"], took_s, extra=told)
+    return job
 
 
 def unfinished_jobs(ground: Ground) -> list[str]:

@@ -109,6 +109,7 @@ def _begin(connection: Connection, row: repository.Row, version: int) -> None:
 def _go_on(ground: Ground, vehicle: int, dictionary: Dictionary) -> int:
     rows = 0
     while True:
+        ground.check_stopping()
         with ground.database.writing() as connection:
             row = _locked(connection, vehicle)
             if row["redecoding_version"] != dictionary.version:

@@ -6,13 +6,16 @@ twice without harm, that loses and doubles nothing.
 
 from __future__ import annotations
 
+import logging.config
 from typing import Any
 
 from celery import Celery
 from celery.schedules import crontab
+from celery.signals import setup_logging
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import PASSING, SettingsError
+from ground_service.logs import logging_config
 from ground_service.services.ground import Ground, ground_from_settings
 from ground_service.services.jobs import enter_job, run_job
 from ground_service.services.upkeep import nightly_job_id
@@ -134,6 +137,11 @@ def run_worker(settings: Settings, concurrency: int = 1, *, beat: bool = False) 
     if settings.resolved_broker_url() is None:
         raise SettingsError("LINNA_BROKER_URL", "a broker such as redis://localhost:6379/0", "nothing")
     _ground_of(settings).close()
+
+    @setup_logging.connect(weak=False)
+    def configure(**_: Any) -> None:
+        logging.config.dictConfig(logging_config(settings.log_format))
+
     words = [
         "worker",
         "--loglevel=INFO",

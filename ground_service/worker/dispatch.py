@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
 
+from ground_service.errors import PASSING
 from ground_service.services.ground import Ground
 from ground_service.services.jobs import enter_job, run_job, unfinished_jobs
 from ground_service.settings import Settings
 
 log = logging.getLogger(__name__)
+
+FIRST_WAIT_S = 10.0
+LONGEST_WAIT_S = 300.0
+"""A job that the database or the disk stopped waits so long before it is taken up again, doubled each time."""
 
 
 class Dispatcher(Protocol):
@@ -28,7 +34,7 @@ class Dispatcher(Protocol):
         """Take up jobs that somebody left unfinished; may be called as often as one likes."""
 
     def close(self) -> None:
-        """Let jobs that run here come to their end."""
+        """End what runs here: a job that can be broken off goes on at the next start, others come to their end."""
 
 
 class InlineDispatcher:
@@ -60,6 +66,7 @@ class ThreadDispatcher:
         self._ground = ground
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="job")
         self._waiting: set[str] = set()
+        self._held: dict[str, tuple[float, float]] = {}
         self._lock = threading.Lock()
 
     def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
@@ -76,11 +83,17 @@ class ThreadDispatcher:
 
     def resume(self) -> None:
         for identity in unfinished_jobs(self._ground):
-            self.start(identity)
+            if self._held.get(identity, (0.0, 0.0))[0] <= time.monotonic():
+                self.start(identity)
 
     def _run(self, job_id: str) -> None:
         try:
             run_job(self._ground, job_id)
+            self._held.pop(job_id, None)
+        except PASSING as error:
+            wait_s = min(2.0 * self._held.get(job_id, (0.0, FIRST_WAIT_S / 2.0))[1], LONGEST_WAIT_S)
+            self._held[job_id] = (time.monotonic() + wait_s, wait_s)
+            log.warning("job %s came to no end: %s", job_id, error)
         except Exception:  # the thread's outermost loop: the job stays unfinished and is taken up again
             log.exception("job %s came to no end", job_id)
         finally:
@@ -88,7 +101,8 @@ class ThreadDispatcher:
                 self._waiting.discard(job_id)
 
     def close(self) -> None:
-        self._pool.shutdown(wait=True)
+        self._ground.stopping.set()
+        self._pool.shutdown(wait=True, cancel_futures=True)
 
 
 class CeleryDispatcher:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ from ground_service.api.app import create_app
 from ground_service.services.archive_import import import_archive
 from ground_service.services.users import add_user
 from ground_service.settings import Settings
+from lunar.timescales import parse_utc
 from tmtc.downlink import DownlinkEncoder
 from tmtc.frames import Clcw, pack_clcw
 
@@ -388,6 +390,46 @@ def test_figures_are_kept_by_route(client: TestClient) -> None:
     figures = client.get("/metrics").text
     assert 'linna_http_requests_total{method="GET",route="/api/v1/passes/{pass_id}",status="200"}' in figures
     assert "linna_passes 1.0" in figures or "linna_passes 2.0" in figures
+
+
+def test_requests_are_logged_with_an_id_that_the_answer_carries(
+    client: TestClient, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level("INFO", "ground_service.api.metrics"):
+        named = client.get(f"{V1}/passes/999", headers={"X-Request-ID": "abc-1"})
+        made_up = client.get(f"{V1}/passes", headers={"X-Request-ID": "two\tlines"})
+        client.get("/healthz")
+    assert named.headers["X-Request-ID"] == "abc-1"
+    told = [vars(record) for record in caplog.records if record.name == "ground_service.api.metrics"]
+    assert [(one["status"], one["route"], one["caller"]) for one in told] == [
+        (404, "/api/v1/passes/{pass_id}", "local"),
+        (200, "/api/v1/passes", "local"),
+    ]
+    assert [one["request_id"] for one in told] == ["abc-1", made_up.headers["X-Request-ID"]]
+    assert len(made_up.headers["X-Request-ID"]) == 16
+
+
+def test_json_that_no_reader_takes_is_refused_in_one_line(client: TestClient) -> None:
+    for body in (b"[" * 500_000, b"1" * 500_000):
+        answer = client.post(f"{V1}/plan", content=body, headers={"Content-Type": "application/json"})
+        assert is_problem(answer, 400)
+        assert "expected JSON of ordinary depth" in answer.json()["detail"]
+
+
+def test_a_night_that_was_slept_through_is_made_up_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from ground_service.api import app as application
+    from ground_service.services.upkeep import nightly_job_id
+
+    noon = parse_utc("2029-08-07T12:00:00Z")
+    monkeypatch.setattr(application, "CATCH_UP_S", -1.0)
+    monkeypatch.setattr(application, "utc_now_ns", lambda: noon)
+    with TestClient(create_app(Settings(home=tmp_path))) as opened:
+        path, until = f"{V1}/jobs/{nightly_job_id(noon)}", time.monotonic() + 60.0
+        while opened.get(path).status_code == 404 and time.monotonic() < until:
+            time.sleep(0.05)
+        assert opened.get(path).json()["kind"] == "nightly"
 
 
 def test_figures_of_work_that_is_over_go_away(tmp_path: Path) -> None:

@@ -85,7 +85,8 @@ def test_an_ingest_that_a_full_disk_stops_is_done_when_there_is_space(
         disk.setattr(ingesting, "store_batch", no_space)
         with pytest.raises(StorageFull):
             run_job(ground, job)
-    assert client.get(f"{V1}/jobs/{job}").json()["state"] == "running"
+    stopped = client.get(f"{V1}/jobs/{job}").json()
+    assert (stopped["state"], stopped["attempts"]) == ("queued", 0)
     assert client.get(f"{V1}/ingests/1").json()["state"] == "running"
     client.app.state.dispatcher.resume()  # type: ignore[attr-defined]
     assert client.get(f"{V1}/jobs/{job}").json()["state"] == "done"

@@ -27,9 +27,11 @@ INGEST = """
 import sys
 from pathlib import Path
 from ground_service.link import stream
+from ground_service.store import files
 from ground_service.services.ground import open_ground
 from ground_service.services.ingest import ingest_file
-stream.DownlinkReader.__init__.__defaults__ = (None, stream.DICTIONARY, 20_000)
+files.BLOCK_OCTETS = 4_000
+stream.DownlinkReader.__init__.__defaults__ = (None, stream.DICTIONARY, 4_000)
 with open_ground(Path(sys.argv[1])) as ground:
     print("ready", flush=True)
     ingest_file(ground, Path(sys.argv[2]))
