@@ -1,5 +1,8 @@
 # The ground service and the command line; the same image serves, works and migrates.
-FROM python:3.11-slim AS build
+# Another base (one pinned by its digest, or from a mirror) can be given: --build-arg PYTHON_IMAGE=...@sha256:...
+ARG PYTHON_IMAGE=python:3.11.14-slim-bookworm
+
+FROM ${PYTHON_IMAGE} AS build
 ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
 RUN python -m venv /opt/linna
 WORKDIR /src
@@ -16,7 +19,7 @@ COPY db db
 COPY scenarios scenarios
 RUN /opt/linna/bin/pip install --no-deps .
 
-FROM python:3.11-slim
+FROM ${PYTHON_IMAGE}
 LABEL org.opencontainers.image.title="linna" org.opencontainers.image.licenses="Apache-2.0"
 RUN groupadd --gid 10001 linna && useradd --uid 10001 --gid linna --create-home linna \
     && mkdir /var/lib/linna && chown linna:linna /var/lib/linna
@@ -24,9 +27,10 @@ COPY --from=build /opt/linna /opt/linna
 ENV PATH=/opt/linna/bin:$PATH \
     PYTHONUNBUFFERED=1 \
     MPLBACKEND=Agg \
+    MPLCONFIGDIR=/tmp/matplotlib \
     NUMBA_CACHE_DIR=/var/lib/linna/.numba \
     LINNA_HOME=/var/lib/linna
-USER linna
+USER 10001:10001
 WORKDIR /var/lib/linna
 VOLUME /var/lib/linna
 EXPOSE 8042

@@ -7,11 +7,13 @@ twice without harm, that loses and doubles nothing.
 from __future__ import annotations
 
 import logging.config
+import socket
 from typing import Any
 
 from celery import Celery
 from celery.schedules import crontab
 from celery.signals import setup_logging
+from kombu.exceptions import OperationalError
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import PASSING, SettingsError
@@ -19,7 +21,7 @@ from ground_service.logs import logging_config
 from ground_service.services.ground import Ground, ground_from_settings
 from ground_service.services.jobs import enter_job, run_job
 from ground_service.services.upkeep import nightly_job_id
-from ground_service.settings import Settings, load_settings
+from ground_service.settings import Settings
 
 RUN_JOB = "ground_service.run_job"
 NIGHTLY = "ground_service.nightly"
@@ -98,9 +100,14 @@ def queue_length(settings: Settings) -> int:
         return int(connection.default_channel._size(QUEUE))
 
 
-def application() -> Celery:
-    """The application of the environment's settings, for `celery -A ground_service.worker.app:application`."""
-    return make_app(load_settings())
+def worker_answers(settings: Settings, timeout_s: float = 4.0) -> bool:
+    """Whether the worker of this machine answers over the broker."""
+    name = f"celery@{socket.gethostname()}"
+    inspect = _app_of(settings).control.inspect(destination=[name], timeout=timeout_s)
+    try:
+        return bool(inspect.ping())
+    except (OperationalError, OSError):
+        return False
 
 
 _grounds: dict[str, Ground] = {}

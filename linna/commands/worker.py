@@ -12,14 +12,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--beat", action="store_true", help="enter the nightly job, too (one worker of a deployment has to)"
     )
+    parser.add_argument(
+        "--check", action="store_true", help="exit 0 when the worker of this machine answers, 1 when not"
+    )
     add_service_options(parser)
     parser.set_defaults(handler=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from ground_service.worker.app import run_worker
+    from ground_service.worker.app import run_worker, worker_answers
     from linna.data import data_folder
 
+    if arguments.check:
+        return 0 if worker_answers(settings_of(arguments)) else 1
     run_worker(
         settings_of(arguments, data=data_folder().root), max(arguments.concurrency, 1), beat=arguments.beat
     )

@@ -1,5 +1,6 @@
 """The same service on PostgreSQL, Redis and real workers."""
 
+import json
 import os
 import subprocess
 import sys
@@ -25,7 +26,7 @@ from ground_service.store.database import (
     prepare_database,
     schema_revisions,
 )
-from ground_service.worker.app import run_worker
+from ground_service.worker.app import run_worker, worker_answers
 from ground_service.worker.dispatch import dispatcher_for
 
 SPACECRAFT = 76
@@ -102,6 +103,7 @@ def test_a_worker_makes_the_report(
     waiting = dispatcher.submit("report", {"pass_id": pass_id})
     assert job_row(ground, waiting)["state"] == "queued"
     hopeless = dispatcher.submit("report", {"pass_id": 4711})
+    assert not worker_answers(settings, timeout_s=1.0)
     environment = {
         **os.environ,
         "LINNA_HOME": str(ground.home),
@@ -110,6 +112,7 @@ def test_a_worker_makes_the_report(
         "LINNA_DATA": "",
     }
     environment.pop("LINNA_DATA")
+    environment["LINNA_LOG_FORMAT"] = "json"
     with (tmp_path / "worker.log").open("wb") as log:
         worker = subprocess.Popen(
             [sys.executable, "-m", "linna", "worker"], env=environment, stdout=log, stderr=log
@@ -120,9 +123,13 @@ def test_a_worker_makes_the_report(
             assert row["attempts"] == 1
             failed = finished(ground, hopeless)
             assert (failed["state"], failed["error"]) == ("failed", "pass 4711: not found")
+            assert worker_answers(settings, timeout_s=30.0)
         finally:
             worker.terminate()
             worker.wait(60)
+    lines = (tmp_path / "worker.log").read_text().splitlines()
+    logged = [json.loads(line) for line in lines if line.startswith("{")]
+    assert {"job", "kind", "state", "seconds"} <= {key for entry in logged for key in entry}
     with ground.database.reading() as connection:
         report = repository.get(connection, repository.REPORTS, row["result"]["report_id"], "report")
     assert report["summary"]["packets"] == pass_summary(ground, pass_id)["packets"]
