@@ -124,18 +124,25 @@ def served(home: Path) -> Iterator[str]:
         process.wait(30)
 
 
-def measure(url: str, paths: Sequence[str]) -> dict[str, dict[str, int]]:
-    """Milliseconds to interactive, and of the main thread's processor, of each page."""
+@contextmanager
+def open_chromium() -> Iterator[Any]:
+    """The system's Chromium, without a screen."""
     from playwright.sync_api import sync_playwright
 
-    found: dict[str, dict[str, int]] = {}
     with sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=_CHROMIUM, args=list(_FLAGS))
+        yield chromium
+        chromium.close()
+
+
+def measure(url: str, paths: Sequence[str]) -> dict[str, dict[str, int]]:
+    """Milliseconds to interactive, and of the main thread's processor, of each page."""
+    found: dict[str, dict[str, int]] = {}
+    with open_chromium() as chromium:
         for path in paths:
             opened = [_opened(chromium, url + path) for _ in range(_TIMES)]
             clock, processor = (round(statistics.median(one)) for one in zip(*opened, strict=True))
             found[path] = {"clock": clock, "main_thread": processor}
-        chromium.close()
     return found
 
 

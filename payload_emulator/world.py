@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Generator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -174,14 +174,22 @@ def _disturbed(
 
 
 def exposures(world: World) -> Generator[Exposure]:
-    """The frames of a world in time order, the next ones rendered while the payload works on this one."""
+    """The frames of a world in time order, the next ones rendered while the payload works on this one.
+
+    One thread renders, as a terrain wants it; a second lets the sensor take the picture of what the first has rendered.
+    """
     world.terrain.hand_over()
     try:
-        with ThreadPoolExecutor(max_workers=1) as renderer:
-            pending = [renderer.submit(expose_frame, world, 0)]
+        with ThreadPoolExecutor(max_workers=1) as renderer, ThreadPoolExecutor(max_workers=1) as sensor:
+
+            def begin(number: int) -> Future[Exposure]:
+                scene = renderer.submit(_scene, world, number)
+                return sensor.submit(lambda: _exposed(world, scene.result()))
+
+            pending = [begin(0)]
             for number in range(world.frame_utc_ns.size):
                 if number + 1 < world.frame_utc_ns.size:
-                    pending.append(renderer.submit(expose_frame, world, number + 1))
+                    pending.append(begin(number + 1))
                 yield pending.pop(0).result()
     finally:
         world.terrain.hand_over()
@@ -206,54 +214,79 @@ def orders_before(world: World, number: int) -> bytes:
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scene:
+    """What lies before the camera at one frame, and the draws that are still to come.
+
+    Attributes
+    ----------
+    radiance
+        None where the camera gives no picture of the ground; `picture` is what it gives instead.
+    """
+
+    utc_ns: int
+    camera_from_mcmf: FloatArray
+    camera_from_icrf: FloatArray
+    sun_mcmf: FloatArray
+    radiance: NDArray[np.float32] | None
+    picture: Picture | None
+    rng: np.random.Generator
+
+
 def expose_frame(world: World, number: int) -> Exposure:
     """What the camera, the ADCS and the clock deliver for one frame. Every draw depends on (seed, frame) alone."""
+    return _exposed(world, _scene(world, number))
+
+
+def _scene(world: World, number: int) -> _Scene:
     scenario = world.scenario
     utc_ns = int(world.frame_utc_ns[number])
     rng = np.random.default_rng((scenario.seed, number))
     position = world.truth.positions_mcmf(utc_ns)[0]
     tdb_s = float(tdb_s_from_utc_ns(utc_ns))
     sun = true_sun_direction(world, position, utc_ns, rng)
-    attitude = scenario.attitude
-    pointing = np.radians(attitude.pointing_error_deg) * rng.standard_normal(3)
+    pointing = np.radians(scenario.attitude.pointing_error_deg) * rng.standard_normal(3)
     camera_from_mcmf = perturbed(world.camera_from_mcmf(position), pointing)
     camera_from_icrf = camera_from_mcmf @ world.truth.orientation.mcmf_from_icrf(tdb_s)
-    image = _image(world, utc_ns, position, camera_from_mcmf, sun, rng)
+    radiance, picture = _seen(world, utc_ns, position, camera_from_mcmf, sun)
+    return _Scene(utc_ns, camera_from_mcmf, camera_from_icrf, sun, radiance, picture, rng)
+
+
+def _exposed(world: World, scene: _Scene) -> Exposure:
+    scenario, rng = world.scenario, scene.rng
+    image = scene.picture
+    if scene.radiance is not None:
+        image = take_picture(scene.radiance, scenario.sensor, rng)
+    assert image is not None
+    attitude = scenario.attitude
     bias = np.radians(attitude.knowledge_bias_deg) * np.random.default_rng(
         (scenario.seed, 2**32)
     ).standard_normal(3)
     noise = np.radians(attitude.knowledge_noise_deg) * rng.standard_normal(3)
-    known = perturbed(camera_from_icrf, bias + noise)
+    known = perturbed(scene.camera_from_icrf, bias + noise)
     return Exposure(
-        utc_ns,
+        scene.utc_ns,
         image,
-        attitude_message(known, known @ camera_from_icrf.T @ camera_from_mcmf @ sun),
-        clock_ticks(world, utc_ns),
-        camera_from_mcmf,
+        attitude_message(known, known @ scene.camera_from_icrf.T @ scene.camera_from_mcmf @ scene.sun_mcmf),
+        clock_ticks(world, scene.utc_ns),
+        scene.camera_from_mcmf,
     )
 
 
-def _image(
-    world: World,
-    utc_ns: int,
-    position_mcmf_m: FloatArray,
-    camera_from_mcmf: FloatArray,
-    sun_mcmf: FloatArray,
-    rng: np.random.Generator,
-) -> Picture:
-    """What the camera gives: nothing in an outage, noise in deep night."""
+def _seen(
+    world: World, utc_ns: int, position_mcmf_m: FloatArray, camera_from_mcmf: FloatArray, sun_mcmf: FloatArray
+) -> tuple[NDArray[np.float32] | None, Picture | None]:
+    """The light on the sensor, none of it in deep night; in an outage no light but a picture without pixels."""
     section, camera = world.scenario.disturbances, world.true_camera
     elapsed_s = (utc_ns - int(world.frame_utc_ns[0])) / _NS
     if section.outage_at_s <= elapsed_s < section.outage_at_s + section.outage_duration_s:
-        return np.empty((0, 0, 3), dtype=np.uint8)
+        return None, np.empty((0, 0, 3), dtype=np.uint8)
     if world.scenario.camera.images == "reduced":
-        return np.full((_REDUCED_PX, _REDUCED_PX, 3), 128, dtype=np.uint8)
+        return None, np.full((_REDUCED_PX, _REDUCED_PX, 3), 128, dtype=np.uint8)
     if position_mcmf_m @ sun_mcmf < -np.sin(_NIGHT_RAD) * np.linalg.norm(position_mcmf_m):
-        radiance = np.zeros((camera.height_px, camera.width_px), dtype=np.float32)
-    else:
-        law = Photometry(world.scenario.light.photometry)
-        radiance = render(world.terrain, camera, position_mcmf_m, camera_from_mcmf, sun_mcmf, law).radiance
-    return take_picture(radiance, world.scenario.sensor, rng)
+        return np.zeros((camera.height_px, camera.width_px), dtype=np.float32), None
+    law = Photometry(world.scenario.light.photometry)
+    return render(world.terrain, camera, position_mcmf_m, camera_from_mcmf, sun_mcmf, law).radiance, None
 
 
 def true_sun_direction(

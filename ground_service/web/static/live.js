@@ -5,13 +5,17 @@ import { token } from "./api.js";
 import { byId, element, figure, notice, show, timeText } from "./page.js";
 
 const KEPT = 600;
+const REFRESH_MS = 250; // pictures come as fast as they can; numbers, map and charts are read by eye
 const context = byId("frame").getContext("2d");
 const history = { times: [], names: [], errors: {}, altitude: [] };
 let socket = null;
 let map = null;
 let lines = {};
+let paths = {};
 let dots = {};
 let plots = [];
+let waiting = []; // frames that numbers, map and charts do not show yet
+let refreshing = null;
 let shown = 0;
 let shownSince = performance.now();
 
@@ -65,29 +69,47 @@ function drawFrame(message) {
     count();
   };
   if (message.image_jpeg) picture.src = `data:image/jpeg;base64,${message.image_jpeg}`;
-  numbers(message);
-  remember(message);
+  for (const [name, one] of Object.entries(message.estimates ?? {})) {
+    if (one.reset_trigger && one.reset_trigger !== "none") log(`${timeText(message.utc)} ${name}: reset, ${one.reset_trigger.replaceAll("_", " ")}`);
+  }
+  waiting.push(message);
+  refreshing ??= setTimeout(refresh, REFRESH_MS);
+}
+
+function refresh() {
+  refreshing = null;
+  numbers(waiting.at(-1));
+  waiting.splice(0).forEach(remember);
+  for (const [name, line] of Object.entries(lines)) line.setLatLngs(paths[name]);
+  for (const [name, one] of Object.entries(dots)) one.setLatLng(paths[name].at(-1).at(-1));
+  const here = paths.reference?.at(-1).at(-1);
+  if (here && !map.getBounds().pad(-0.15).contains(here)) map.panTo(here, { animate: false });
+  plots[0]?.setData([history.times, ...history.names.map((name) => history.errors[name])]);
+  plots[1]?.setData([history.times, history.altitude]);
 }
 
 // A detection counts as matched here where a catalogued crater lies within half its radius.
 function rings({ catalogue = [], detections = [] }) {
-  const ring = (one, css, dash) => {
+  const circles = (ones, css, dash) => {
     context.beginPath();
     context.setLineDash(dash);
     context.strokeStyle = css;
-    context.arc(one.u_px + 0.5, one.v_px + 0.5, one.diameter_px / 2, 0, 2 * Math.PI);
+    for (const one of ones) {
+      context.moveTo(one.u_px + 0.5 + one.diameter_px / 2, one.v_px + 0.5);
+      context.arc(one.u_px + 0.5, one.v_px + 0.5, one.diameter_px / 2, 0, 2 * Math.PI);
+    }
     context.stroke();
   };
+  const matched = (one) => catalogue.some((other) => Math.hypot(other.u_px - one.u_px, other.v_px - one.v_px) < other.diameter_px / 4);
   context.lineWidth = 1.5;
-  for (const one of catalogue) ring(one, "#ffd400", [3, 3]);
-  for (const one of detections) {
-    const matched = catalogue.some((other) => Math.hypot(other.u_px - one.u_px, other.v_px - one.v_px) < other.diameter_px / 4);
-    ring(one, matched ? "#5dff5d" : "#00e5ff", []);
-  }
+  circles(catalogue, "#ffd400", [3, 3]);
+  circles(detections.filter((one) => !matched(one)), "#00e5ff", []);
+  circles(detections.filter(matched), "#5dff5d", []);
 }
 
 function count() {
   shown += 1;
+  byId("frame").dataset.shown = 1 + Number(byId("frame").dataset.shown ?? 0);
   const elapsed = (performance.now() - shownSince) / 1000;
   if (elapsed < 2) return;
   byId("frame").dataset.rate = (shown / elapsed).toFixed(1);
@@ -108,9 +130,6 @@ function numbers(message) {
     estimates.map(([name, one]) => fact(name, `${one.outcome ?? "–"}${one.error_m === undefined ? "" : `, ${figure(one.error_m)} m off`}`)),
     fact("Shown", `${byId("frame").dataset.rate ?? "–"} frames/s`),
   );
-  for (const [name, one] of estimates) {
-    if (one.reset_trigger && one.reset_trigger !== "none") log(`${timeText(message.utc)} ${name}: reset, ${one.reset_trigger.replaceAll("_", " ")}`);
-  }
 }
 
 function log(text) {
@@ -131,14 +150,12 @@ function remember(message) {
     for (const column of [history.times, history.altitude, ...Object.values(history.errors)]) column.shift();
   }
   for (const [name, place] of [["reference", reference], ...Object.entries(estimates)]) {
-    if (place?.latitude_deg === undefined || place.latitude_deg === null) continue;
-    const longitude = ((((place.longitude_deg + 180) % 360) + 360) % 360) - 180;
-    lines[name]?.addLatLng([place.latitude_deg, longitude]);
-    dots[name]?.setLatLng([place.latitude_deg, longitude]);
-    if (name === "reference" && !map.getBounds().pad(-0.15).contains([place.latitude_deg, longitude])) map.panTo([place.latitude_deg, longitude], { animate: false });
+    if (place?.latitude_deg === undefined || place.latitude_deg === null || !paths[name]) continue;
+    const here = [place.latitude_deg, ((((place.longitude_deg + 180) % 360) + 360) % 360) - 180];
+    // No line goes across the whole map where a track passes 180 degrees.
+    if (Math.abs(here[1] - paths[name].at(-1).at(-1)[1]) > 180) paths[name].push([]);
+    paths[name].at(-1).push(here);
   }
-  plots[0]?.setData([history.times, ...history.names.map((name) => history.errors[name])]);
-  plots[1]?.setData([history.times, history.altitude]);
 }
 
 // Map, legend and charts, once it is known which estimators fly.
@@ -148,11 +165,13 @@ function begin(names, reference) {
   map?.remove();
   map = moonMap(byId("map"));
   lines = {};
+  paths = {};
   dots = {};
   show("map-legend");
   for (const [index, name] of ["reference", ...names].entries()) {
     const css = name === "reference" ? "#ffffff" : solutionStyle(name, "estimate", index).colour;
-    const first = [[reference.latitude_deg], [reference.longitude_deg]];
+    const first = [[reference.latitude_deg], [((((reference.longitude_deg + 180) % 360) + 360) % 360) - 180]];
+    paths[name] = [[first.flat()]];
     lines[name] = track(map, ...first, { color: css, weight: name === "reference" ? 5 : 2 });
     dots[name] = dot(map, ...first.flat(), { color: css });
     byId("map-legend").append(legendItem(name, css));

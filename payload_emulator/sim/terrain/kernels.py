@@ -165,6 +165,38 @@ def resample_cubic(
             out[i, j] = w0 * line[m - 1] + w1 * line[m] + w2 * line[m + 1] + w3 * line[m + 2]
 
 
+@njit(error_model="numpy", nogil=True)
+def smooth(values: Any, weights: Any) -> Any:
+    """Rows and then columns of ``values`` under symmetric ``weights`` (2 n + 1); the outer n pixels are left.
+
+    Terms are added in the order of the weights and rounded one by one, whatever the machine: no fast mathematics.
+    """
+    rows, columns = values.shape
+    reach = weights.size // 2
+    out = values.copy()
+    line = np.empty(columns, np.float32)
+    for i in range(rows):
+        line[:] = values[i]
+        if reach <= i < rows - reach:
+            source = values[i - reach]
+            for j in range(columns):
+                line[j] = weights[0] * source[j]
+            for k in range(1, weights.size):
+                source = values[i - reach + k]
+                weight = weights[k]
+                for j in range(columns):
+                    line[j] += weight * source[j]
+        inner = out[i, reach : columns - reach]
+        for j in range(inner.size):
+            total = weights[0] * line[j]
+            for k in range(1, weights.size):
+                total += weights[k] * line[j + k]
+            inner[j] = total
+        out[i, :reach] = line[:reach]
+        out[i, columns - reach :] = line[columns - reach :]
+    return out
+
+
 @njit(fastmath=True, error_model="numpy", nogil=True)
 def stamp_craters(
     out: Any,

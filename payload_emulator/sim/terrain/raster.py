@@ -247,12 +247,8 @@ def _smoothed(values: Heights, sigma: float, reach: int) -> Heights:
     offsets = np.arange(-reach, reach + 1)
     weights = np.exp(-0.5 * (offsets / sigma) ** 2)
     weights = np.asarray(weights / weights.sum(), dtype=np.float32)
-    out = values.copy()
-    inner = slice(reach, -reach)
-    out[inner] = sum(w * values[k : values.shape[0] - 2 * reach + k] for k, w in enumerate(weights))
-    rows = out.copy()
-    out[:, inner] = sum(w * rows[:, k : values.shape[1] - 2 * reach + k] for k, w in enumerate(weights))
-    return out
+    smoothed: Heights = kernels.smooth(np.ascontiguousarray(values), weights)
+    return smoothed
 
 
 def _density_map(catalogue: CraterCatalogue) -> Floats:
