@@ -267,13 +267,19 @@ class Scenario:
     def epoch_utc_ns(self) -> int:
         return parse_utc(self.orbit.epoch)
 
-    def with_choices(self, *, modes: Sequence[str] | None = None, seed: int | None = None) -> Scenario:
-        """The same scenario with other estimators or another seed; None keeps what it has."""
-        navigation = (
-            self.navigation
-            if modes is None
-            else dataclasses.replace(self.navigation, estimators=tuple(dict.fromkeys(modes)))
-        )
+    def with_choices(
+        self,
+        *,
+        modes: Sequence[str] | None = None,
+        seed: int | None = None,
+        anchoring_catalogue: Path | None = None,
+    ) -> Scenario:
+        """The same scenario with other estimators, seed or table of craters; None keeps what it has."""
+        navigation = self.navigation
+        if modes is not None:
+            navigation = dataclasses.replace(navigation, estimators=tuple(dict.fromkeys(modes)))
+        if anchoring_catalogue is not None:
+            navigation = dataclasses.replace(navigation, anchoring_catalogue=str(anchoring_catalogue))
         return dataclasses.replace(self, navigation=navigation, seed=self.seed if seed is None else seed)
 
 

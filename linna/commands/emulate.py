@@ -23,6 +23,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=int, help="another seed than the scenario's")
     parser.add_argument(
+        "--anchoring-catalogue",
+        type=Path,
+        metavar="F",
+        help="table of `linna catalogue curate`, uploaded in place of the terrain's craters",
+    )
+    parser.add_argument(
         "--frames",
         choices=("none", "some", "all"),
         default="some",
@@ -67,7 +73,9 @@ def run(arguments: argparse.Namespace) -> int:
     from payload_emulator.emulator import emulate
     from payload_emulator.scenario import load_scenario
 
-    scenario = load_scenario(arguments.scenario).with_choices(modes=arguments.mode, seed=arguments.seed)
+    scenario = load_scenario(arguments.scenario).with_choices(
+        modes=arguments.mode, seed=arguments.seed, anchoring_catalogue=arguments.anchoring_catalogue
+    )
     if arguments.campaign:
         return _campaign(arguments, scenario)
     if arguments.live:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,8 @@ import pytest
 from lunar.datafolder import find_data
 from lunar.timescales import parse_utc
 from payload_emulator.emulator import emulate
+from payload_emulator.errors import TableError
+from payload_emulator.flight.tables import CatalogueTable, pack_catalogue_table
 from payload_emulator.scenario import parse_scenario
 from tmtc.downlink import decode
 
@@ -132,3 +135,58 @@ def test_the_ground_finds_the_time_of_every_frame_from_time_reports(
     nearest = np.abs(found.utc_ns[:, None] - true[None, :, 1]).min(axis=1)
     # 0.4 s off without the correlation; a tick is 15 us, and the first line is carried on to the boot.
     assert nearest.max() < 1_000_000
+
+
+SHORT = """
+name = "short"
+[dynamics]
+gravity = "builtin"
+degree = 8
+orientation = "iau"
+[window]
+search = "none"
+start = "2029-08-08T02:30:00Z"
+duration_s = 90.0
+latitude_limit_deg = 90.0
+[camera]
+images = "reduced"
+frame_interval_s = 30.0
+[terrain]
+source = "procedural"
+[navigation]
+estimators = ["anchored"]
+filter_gravity = "builtin"
+filter_degree = 8
+"""
+
+
+def test_a_named_anchoring_table_is_uploaded_as_it_is(tmp_path: Path) -> None:
+    table = CatalogueTable(
+        np.arange(3),
+        np.radians([10.0, 20.0, 30.0]),
+        np.radians([40.0, 50.0, 60.0]),
+        np.full(3, 8e3),
+        np.zeros(3),
+        np.full((3, 3), 50.0),
+    )
+    named = tmp_path / "three.table"
+    named.write_bytes(pack_catalogue_table(table))
+    scenario = parse_scenario(SHORT).with_choices(anchoring_catalogue=named)
+    emulate(scenario, find_data(None), tmp_path / "pass")
+    manifest = json.loads((tmp_path / "pass" / "manifest.json").read_text())
+    assert manifest["tables"]["catalogue"] == hashlib.sha256(named.read_bytes()).hexdigest()
+
+
+def test_an_anchoring_table_that_is_none_is_refused_before_the_flight(tmp_path: Path) -> None:
+    missing = parse_scenario(SHORT).with_choices(anchoring_catalogue=tmp_path / "none.table")
+    with pytest.raises(TableError, match=r"none\.table: expected a table made by linna catalogue curate"):
+        emulate(missing, find_data(None), tmp_path / "pass")
+    damaged = tmp_path / "damaged.table"
+    damaged.write_bytes(b"no table")
+    with pytest.raises(TableError):
+        emulate(
+            parse_scenario(SHORT).with_choices(anchoring_catalogue=damaged),
+            find_data(None),
+            tmp_path / "pass",
+        )
+    assert not (tmp_path / "pass").exists()
