@@ -56,6 +56,14 @@ IdempotencyKey = Annotated[
         description="The same key again gives the same job, not another",
     ),
 ]
+OnceKey = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key",
+        max_length=128,
+        description="The same request again with the same key does nothing and is answered as the first was",
+    ),
+]
 Instance = Annotated[str, Query(min_length=1, max_length=96, pattern=r"^[A-Za-z0-9._@-]+$")]
 Name = Annotated[str, Query(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
 

@@ -13,6 +13,7 @@ from ground_service.api.common import (
     GroundOf,
     Limit,
     Offset,
+    OnceKey,
     Operator,
     PassId,
     Viewer,
@@ -21,6 +22,7 @@ from ground_service.api.common import (
 from ground_service.api.problems import PreconditionFailed
 from ground_service.services import commanding, plan_exchange, plan_requests, plan_schemas
 from ground_service.services import planning as plan_service
+from ground_service.services.answers import once
 from ground_service.services.views import search_view, telecommand_view, window_view
 from ground_service.store.repository import Row
 
@@ -51,11 +53,27 @@ def list_windows(
 
 
 @planning.post("/windows", status_code=201, response_model=plan_schemas.WindowOut)
-def add_window(response: Response, ground: GroundOf, caller: Operator, given: plan_schemas.WindowIn) -> Any:
+def add_window(
+    response: Response,
+    ground: GroundOf,
+    caller: Operator,
+    given: plan_schemas.WindowIn,
+    idempotency_key: OnceKey = None,
+) -> Any:
     """Enter a window as a draft; conflicts with committed windows or with resources are answered with 409."""
-    row = plan_service.add_window(ground, plan_requests.window_entry(given), actor=caller.name)
-    response.headers["Location"] = f"{API_PREFIX}/windows/{row['id']}"
-    return _tagged(response, row)
+    view = once(
+        ground,
+        actor=caller.name,
+        operation="window",
+        key=idempotency_key,
+        request=given.model_dump(mode="json"),
+        work=lambda: window_view(
+            plan_service.add_window(ground, plan_requests.window_entry(given), actor=caller.name)
+        ),
+    )
+    response.headers["Location"] = f"{API_PREFIX}/windows/{view['id']}"
+    response.headers["ETag"] = _tag(view)
+    return view
 
 
 @planning.get("/windows/{window_id}", response_model=plan_schemas.WindowOut)

@@ -19,6 +19,7 @@ from ground_service.api.common import (
     Limit,
     Name,
     Offset,
+    OnceKey,
     Operator,
     PassId,
     RowId,
@@ -32,6 +33,7 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.services import ephemerides as ephemeris_service
 from ground_service.services import passes as pass_service
+from ground_service.services.answers import once
 from ground_service.services.ingest import FLOWN
 from ground_service.services.jobs import enter_ingest
 from ground_service.services.plan_schemas import time_of
@@ -194,17 +196,30 @@ def list_passes(ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Offset 
 
 
 @router.post("/passes", status_code=201, response_model=schemas.PassDetail)
-def define_pass(ground: GroundOf, _: Operator, given: schemas.PassDefinition) -> Any:
+def define_pass(
+    ground: GroundOf, caller: Operator, given: schemas.PassDefinition, idempotency_key: OnceKey = None
+) -> Any:
     """Keep an interval of a spacecraft's time as a pass."""
-    pass_id = pass_service.define_pass(
+
+    def define() -> dict[str, Any]:
+        pass_id = pass_service.define_pass(
+            ground,
+            name=given.name,
+            start_utc_ns=time_of(given.start, "start"),
+            stop_utc_ns=time_of(given.stop, "stop"),
+            spacecraft_id=given.spacecraft_id,
+            instance=given.instance,
+        )
+        return pass_detail_view(pass_service.get_pass(ground, pass_id))
+
+    return once(
         ground,
-        name=given.name,
-        start_utc_ns=time_of(given.start, "start"),
-        stop_utc_ns=time_of(given.stop, "stop"),
-        spacecraft_id=given.spacecraft_id,
-        instance=given.instance,
+        actor=caller.name,
+        operation="pass",
+        key=idempotency_key,
+        request=given.model_dump(mode="json"),
+        work=define,
     )
-    return get_pass(ground, _, pass_id)
 
 
 @router.get("/passes/{pass_id}", response_model=schemas.PassDetail)

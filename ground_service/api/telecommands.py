@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response
@@ -14,6 +15,7 @@ from ground_service.api.common import (
     Instance,
     Limit,
     Offset,
+    OnceKey,
     Operator,
     RowId,
     SpacecraftId,
@@ -21,6 +23,7 @@ from ground_service.api.common import (
     page_of,
 )
 from ground_service.services import commanding
+from ground_service.services.answers import once
 from ground_service.services.ingest import FLOWN
 from ground_service.services.uplink_state import uplink_state
 from ground_service.services.views import telecommand_view
@@ -42,18 +45,31 @@ def list_telecommands(
 
 
 @telecommands.post("/telecommands", status_code=201, response_model=schemas.Telecommand)
-def entertelecommand_view(ground: GroundOf, caller: Operator, given: schemas.CommandEntry) -> Any:
+def entertelecommand_view(
+    ground: GroundOf, caller: Operator, given: schemas.CommandEntry, idempotency_key: OnceKey = None
+) -> Any:
     """Queue a telecommand; the dictionary has to accept it."""
-    command_id = commanding.enter_command(
+
+    def enter() -> dict[str, Any]:
+        command_id = commanding.enter_command(
+            ground,
+            given.name,
+            given.arguments,
+            spacecraft_id=given.spacecraft_id,
+            instance=given.instance,
+            timeout_s=given.timeout_s,
+            actor=caller.name,
+        )
+        return telecommand_view(commanding.get_command(ground, command_id))
+
+    return once(
         ground,
-        given.name,
-        given.arguments,
-        spacecraft_id=given.spacecraft_id,
-        instance=given.instance,
-        timeout_s=given.timeout_s,
         actor=caller.name,
+        operation="telecommand",
+        key=idempotency_key,
+        request=given.model_dump(mode="json"),
+        work=enter,
     )
-    return telecommand_view(commanding.get_command(ground, command_id))
 
 
 @telecommands.get("/telecommands/{command_id}", response_model=schemas.Telecommand)
@@ -97,13 +113,29 @@ def take_uplink(
     spacecraft_id: Annotated[int, Query(ge=0, le=1023)],
     instance: Instance = FLOWN,
     format: Annotated[str, Query(pattern="^(cltu|packets)$")] = "cltu",
+    idempotency_key: OnceKey = None,
 ) -> Response:
-    """Take all released telecommands as octets to radiate; they count as sent from then on."""
-    stream, ids = commanding.take_uplink(
-        ground, spacecraft_id=spacecraft_id, instance=instance, framed=format == "cltu", actor=caller.name
+    """Take all released telecommands as octets to radiate; they count as sent from then on.
+
+    With an idempotency key, an answer that was lost on its way can be asked for again.
+    """
+
+    def take() -> dict[str, Any]:
+        stream, ids = commanding.take_uplink(
+            ground, spacecraft_id=spacecraft_id, instance=instance, framed=format == "cltu", actor=caller.name
+        )
+        return {"octets": base64.b64encode(stream).decode(), "telecommands": ids}
+
+    taken = once(
+        ground,
+        actor=caller.name,
+        operation="uplink",
+        key=idempotency_key,
+        request={"spacecraft_id": spacecraft_id, "instance": instance, "format": format},
+        work=take,
     )
     return Response(
-        stream,
+        base64.b64decode(taken["octets"]),
         media_type="application/octet-stream",
-        headers={"X-Telecommands": ",".join(str(number) for number in ids)},
+        headers={"X-Telecommands": ",".join(str(number) for number in taken["telecommands"])},
     )

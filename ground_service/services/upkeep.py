@@ -1,7 +1,7 @@
 """What the service does by itself every night: trends with limit checks, and taking away what is no longer needed.
 
-The raw telemetry, what is decoded from it and the audit log are kept for good. What is watched and forgotten (the
-feed, finished jobs, what broken uploads left) goes after `retention_days`.
+The raw telemetry, what is decoded from it, reports and the audit log are kept for good. What is watched and forgotten
+(the feed, finished jobs, answers to idempotency keys, what broken uploads left) goes after `retention_days`.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def trend_view(trend: Trend) -> dict[str, Any]:
 def tidy(ground: Ground, retention_days: int) -> dict[str, int]:
     """Take away what is older than it is kept; how much of each kind that was."""
     before = utc_now_ns() - retention_days * DAY_NS
-    feed, jobs = repository.FEED, repository.JOBS
+    feed, jobs, answers = repository.FEED, repository.JOBS, repository.ANSWERS
     with ground.database.writing() as connection:
         # The newest item stays, so that numbers are never given twice.
         newest = select(feed.c.id).order_by(feed.c.id.desc()).limit(1).scalar_subquery()
@@ -124,6 +124,7 @@ def tidy(ground: Ground, retention_days: int) -> dict[str, int]:
             "jobs": connection.execute(
                 delete(jobs).where(jobs.c.finished_utc_ns < before, jobs.c.state.in_(("done", "failed")))
             ).rowcount,
+            "answers": connection.execute(delete(answers).where(answers.c.created_utc_ns < before)).rowcount,
         }
     removed["files"] = _sweep(ground)
     return removed

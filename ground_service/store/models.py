@@ -472,6 +472,16 @@ class FeedItem(Base):
     payload: Mapped[dict[str, Any]] = mapped_column(JSON)
 
 
+class Answer(Base):
+    """What was answered under an idempotency key; NULL while the work is being done."""
+
+    __tablename__ = "answers"
+    key: Mapped[str] = mapped_column(String(64), primary_key=True)
+    request: Mapped[str] = mapped_column(String(64))
+    answer: Mapped[dict[str, Any] | None] = mapped_column(JSON)
+    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+
+
 class Telecommand(Base):
     """A telecommand, from being entered to its end; its octets exist from its release on.
 

@@ -432,6 +432,70 @@ def test_a_night_that_was_slept_through_is_made_up_for(
         assert opened.get(path).json()["kind"] == "nightly"
 
 
+def test_a_telecommand_that_is_sent_again_under_its_key_is_queued_once(
+    guarded: tuple[TestClient, dict[str, str]],
+) -> None:
+    client, tokens = guarded
+    operator = {"Authorization": f"Bearer {tokens['operator']}", "Idempotency-Key": "k1"}
+    ping = {"name": "test_connection", "arguments": {}, "spacecraft_id": 76}
+
+    def post(path: str, headers: dict[str, str], **body: Any) -> Any:
+        return client.post(f"{V1}{path}", headers=headers, **body)
+
+    first = post("/telecommands", operator, json=ping)
+    again = post("/telecommands", operator, json=ping)
+    assert (first.status_code, again.status_code) == (201, 201) and again.json() == first.json()
+    assert client.get(f"{V1}/telecommands", headers=operator).json()["total"] == 1
+    # A key belongs to one request of one caller.
+    assert is_problem(post("/telecommands", operator, json={**ping, "timeout_s": 7}), 409)
+    other = {"Authorization": f"Bearer {tokens['admin']}", "Idempotency-Key": "k1"}
+    assert post("/telecommands", other, json=ping).json()["id"] == 2
+    # What was refused may be asked for again.
+    wrong = {**operator, "Idempotency-Key": "k2"}
+    assert is_problem(post("/telecommands", wrong, json={**ping, "name": "dance"}), 422)
+    assert post("/telecommands", wrong, json=ping).status_code == 201
+
+    # An uplink whose answer is lost on the way is not lost.
+    assert post("/telecommands/1/release", operator).status_code == 200
+    query = {"params": {"spacecraft_id": 76}}
+    taken, once_more = post("/uplink", operator, **query), post("/uplink", operator, **query)
+    assert taken.headers["X-Telecommands"] == once_more.headers["X-Telecommands"] == "1"
+    assert taken.content == once_more.content != b""
+    assert post("/uplink", {**operator, "Idempotency-Key": "later"}, **query).content == b""
+
+
+def test_a_key_whose_work_was_cut_off_is_refused_and_says_why(tmp_path: Path) -> None:
+    from ground_service.errors import Conflict, DatabaseUnavailable
+    from ground_service.services.answers import once
+    from ground_service.services.ground import open_ground
+
+    def ask(ground: Any, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        return once(ground, actor="ann", operation="window", key="k", request={"a": 1}, work=work)
+
+    def cut_off() -> dict[str, Any]:
+        raise DatabaseUnavailable("db", "gone")
+
+    with open_ground(tmp_path) as ground:
+        with pytest.raises(DatabaseUnavailable):
+            ask(ground, cut_off)
+        with pytest.raises(Conflict, match="begun and its end is not known"):
+            ask(ground, lambda: {"id": 1})
+
+
+def test_passes_and_windows_sent_again_under_their_key_are_entered_once(client: TestClient) -> None:
+    span = {"start": "2029-08-07T06:00:00Z", "stop": "2029-08-07T07:00:00Z", "spacecraft_id": 76}
+    for path, body in (
+        ("/passes", {"name": "once", **span}),
+        ("/windows", {"name": "once", "cadence_s": 15.0, **span}),
+    ):
+        headers = {"Idempotency-Key": f"key {path}"}
+        answers = [client.post(f"{V1}{path}", json=body, headers=headers) for _ in range(2)]
+        assert [answer.status_code for answer in answers] == [201, 201], answers[0].text
+        assert answers[0].json() == answers[1].json()
+        for name in ("Location", "ETag"):
+            assert answers[0].headers.get(name) == answers[1].headers.get(name)
+
+
 def test_figures_of_work_that_is_over_go_away(tmp_path: Path) -> None:
     from ground_service.services.jobs import enter_job, run_job
 

@@ -56,11 +56,15 @@ def test_what_is_old_goes_and_the_record_stays(ground: Ground) -> None:
         audit(connection, "ann", "look", "", {})
         connection.execute(repository.FEED.update().values(utc_ns=0))
         connection.execute(repository.AUDIT.update().values(utc_ns=0))
+    with ground.database.writing() as connection:
+        connection.execute(
+            repository.ANSWERS.insert().values(key="k", request="r", answer={"id": 1}, created_utc_ns=0)
+        )
     for name in (".incoming-old", ".incoming-new"):
         ground.files.root.mkdir(exist_ok=True)
         (ground.files.root / name).write_bytes(b"")
     os.utime(ground.files.root / ".incoming-old", (0, 0))
-    assert tidy(ground, 90) == {"feed": 2, "jobs": 0, "files": 1}
+    assert tidy(ground, 90) == {"feed": 2, "jobs": 0, "answers": 1, "files": 1}
     assert [item["id"] for item in read_feed(ground, 0)] == [3]
     with ground.database.reading() as connection:
         assert repository.page(connection, repository.AUDIT).total == 1

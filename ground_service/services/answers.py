@@ -1,0 +1,89 @@
+"""What was answered under an idempotency key, so that a request that is sent again does nothing and is told the same.
+
+A key is taken before the work is begun. Where a crash leaves it without an answer, nobody knows whether the work was
+done: the key is then refused, and whoever asked has to look.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from typing import Any
+
+from sqlalchemy import delete
+from sqlalchemy.exc import IntegrityError
+
+from ground_service.clock import utc_now_ns
+from ground_service.errors import Conflict, GroundError, StoreError
+from ground_service.services.ground import Ground
+from ground_service.store import repository
+
+Work = Callable[[], dict[str, Any]]
+
+
+def once(
+    ground: Ground, *, actor: str, operation: str, key: str | None, request: dict[str, Any], work: Work
+) -> dict[str, Any]:
+    """What `work` gives, or what it gave when this actor asked for the same under the same key.
+
+    Work that ends with an error leaves the key free: it may be asked for again. Without a key the work is simply done.
+
+    Raises
+    ------
+    Conflict
+        If the key stands for another request, or for one that was begun and whose end is not known.
+    """
+    if key is None:
+        return work()
+    identity = _digest([actor, operation, key])
+    asked = _digest(request)
+    known = _take(ground, identity, asked)
+    if known is not None:
+        return known
+    try:
+        answer = work()
+    except StoreError:
+        raise  # it may have been done all the same
+    except GroundError:
+        _forget(ground, identity)
+        raise
+    table = repository.ANSWERS
+    with ground.database.writing() as connection:
+        connection.execute(table.update().where(table.c.key == identity).values(answer=answer))
+    return answer
+
+
+def _take(ground: Ground, identity: str, asked: str) -> dict[str, Any] | None:
+    """The answer that is known already; None when the key is now this caller's to use."""
+    table = repository.ANSWERS
+    with ground.database.writing() as connection:
+        known = repository.find(connection, table, key=identity)
+        if known is None:
+            try:
+                with connection.begin_nested():
+                    connection.execute(
+                        table.insert().values(key=identity, request=asked, created_utc_ns=utc_now_ns())
+                    )
+                return None
+            except IntegrityError:
+                known = {"request": asked, "answer": None}  # somebody took it at the same time
+    if known["request"] != asked:
+        raise Conflict("Idempotency-Key: expected the request that it was first sent with, found another")
+    if known["answer"] is None:
+        raise Conflict(
+            "Idempotency-Key: the request was begun and its end is not known; look whether it was done, "
+            "and use another key if it was not"
+        )
+    answer: dict[str, Any] = known["answer"]
+    return answer
+
+
+def _forget(ground: Ground, identity: str) -> None:
+    table = repository.ANSWERS
+    with ground.database.writing() as connection:
+        connection.execute(delete(table).where(table.c.key == identity))
+
+
+def _digest(value: object) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
