@@ -16,6 +16,7 @@ from ground_service.services.ground import Ground, open_ground
 from ground_service.services.ingest import ingest_file
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
+from tmtc.crc import append_crc
 from tmtc.downlink import encode_cadus
 
 SPACECRAFT = 76
@@ -114,6 +115,37 @@ def test_clocks_of_1970_and_of_the_future_are_stored_as_they_are(
     assert result.packets_new == len(packets) + 2
     again = ingest(ground, b"".join(strays), tmp_path)
     assert again.packets_new == 0
+
+
+def test_two_spacecraft_in_one_file_have_archives_of_their_own(
+    ground: Ground, packets: list[bytes], expected: str, tmp_path: Path
+) -> None:
+    mixed = encode_cadus(packets, spacecraft_id=SPACECRAFT) + encode_cadus(packets[:20], spacecraft_id=33)
+    (tmp_path / "mixed.cadu").write_bytes(mixed)
+    result = ingest_file(ground, tmp_path / "mixed.cadu")
+    assert result.packets_new == len(packets) + 20 and result.frames_bad == 0
+    assert archive(ground) == expected
+    with ground.database.reading() as connection:
+        other = repository.vehicle_id(connection, 33, "flight")
+        stored = repository.page(connection, repository.PACKETS, vehicle_id=other)
+    assert stored.total == 20
+
+
+def test_a_downlink_of_another_dictionary_is_kept_octet_by_octet_and_counted(
+    ground: Ground, packets: list[bytes], tmp_path: Path
+) -> None:
+    def foreign(packet: bytes) -> bytes:
+        """The packet under a message type that no dictionary of ours has."""
+        return append_crc(packet[:7] + bytes((201, 77)) + packet[9:-2])
+
+    strangers = [foreign(packet) for packet in packets[:25]]
+    result = ingest(ground, b"".join([*strangers, *packets[25:]]), tmp_path)
+    assert (result.packets_new, result.unknown, result.crc_errors) == (len(packets), 25, 0)
+    assert result.samples == len(packets) - 25
+    table = repository.PACKETS
+    with ground.database.reading() as connection:
+        kept = set(connection.execute(select(table.c.octets)).scalars())
+    assert set(strangers) <= kept
 
 
 def test_noise_is_refused_in_one_line_and_remembered(ground: Ground, tmp_path: Path) -> None:
