@@ -302,7 +302,7 @@ def fly(world: World, spacecraft: Spacecraft) -> Generator[Flown]:
     frames = exposures(world)
     for moment in timeline(world):
         exposure = next(frames) if moment.frame >= 0 else None
-        receiver.in_lock = moment.heard
+        receiver.carrier = receiver.bit_lock = moment.heard
         yield fly_moment(world, spacecraft, operator, receiver, moment, exposure)
     frames.close()
 

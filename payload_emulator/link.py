@@ -54,12 +54,13 @@ class Receiver:
     ----------
     decoder
         Takes CLTUs apart and decides by FARM-1 which frames are accepted.
-    in_lock
-        Whether a station transmits to it.
+    carrier, bit_lock
+        Whether a station transmits to it, and bits of telecommands (or the idle pattern between them).
     """
 
     spacecraft_id: int
-    in_lock: bool = True
+    carrier: bool = True
+    bit_lock: bool = True
     decoder: UplinkDecoder = field(init=False)
     _station: UplinkEncoder = field(init=False)
 
@@ -75,7 +76,7 @@ class Receiver:
     def clcw(self) -> bytes:
         """The operational control field of a frame that is sent now."""
         state = self.decoder.farms.get(self._station.virtual_channel, Farm()).clcw
-        return pack_clcw(replace(state, no_rf_available=not self.in_lock, no_bit_lock=not self.in_lock))
+        return pack_clcw(replace(state, no_rf_available=not self.carrier, no_bit_lock=not self.bit_lock))
 
 
 @dataclass(frozen=True, slots=True)

@@ -283,9 +283,10 @@ class LivePayload:
                     exposure = next(frames) if moment.frame >= 0 else None
                     self._light_s, self._heard = moment.light_s, moment.heard
                     receiver = self._uplink.receiver
-                    receiver.in_lock = self._heard and (
-                        self.has_operator or bool(self._servers["telecommand"].clients)
-                    )
+                    # Who listens is taken to track it with a carrier, who commands to send bits on it.
+                    commanded = self.has_operator or bool(self._servers["telecommand"].clients)
+                    receiver.bit_lock = self._heard and commanded
+                    receiver.carrier = self._heard and (commanded or bool(self._servers["telemetry"].clients))
                     by_hand = self._by_hand(moment)
                     flown = fly_moment(
                         self.world, self.spacecraft, operator, receiver, moment, exposure, by_hand

@@ -131,7 +131,9 @@ def test_the_receiver_reports_what_it_accepted_and_whether_it_hears_anybody() ->
     assert unpack_clcw(receiver.clcw).retransmit
     receiver.decoder.decode(UplinkEncoder(76, bypass=False, sequence_number=99).encode([ping]))
     assert unpack_clcw(receiver.clcw).lockout
-    receiver.in_lock = False
+    receiver.bit_lock = False
+    assert unpack_clcw(receiver.clcw).no_bit_lock and not unpack_clcw(receiver.clcw).no_rf_available
+    receiver.carrier = False
     state = unpack_clcw(receiver.clcw)
     assert state.no_rf_available and state.no_bit_lock and state.farm_b_counter == 3
 
