@@ -29,7 +29,7 @@ from reports.document import (
 )
 from reports.figures.svg import draw_svg
 from reports.stylesheet import page_style
-from reports.text import NOT_A_VALUE, significant_text
+from reports.text import NOT_A_VALUE, headline_text
 
 VERDICT_WORDS = {"good": "Verdict: good", "caution": "Verdict: with reservations", "bad": "Verdict: not met"}
 _SHORT_TABLE_ROWS = 14
@@ -115,7 +115,7 @@ def _plain(block: Block) -> str:
 def _headline(block: Headline) -> str:
     items = []
     for figure in block.figures:
-        value = significant_text(figure.value)
+        value = headline_text(figure.value)
         words = isinstance(figure.value, str) and len(figure.value) > 9
         if value == NOT_A_VALUE:
             value, words = "not available", True

@@ -37,7 +37,7 @@ from reports.document import (
 from reports.figures.canvas import Canvas
 from reports.figures.theme import LIGHT, color, drawing
 from reports.html_page import VERDICT_WORDS
-from reports.text import significant_text
+from reports.text import headline_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -389,7 +389,7 @@ def _headline(block: Headline) -> list[_Piece]:
             x = _LEFT + i * width
             for k, line in enumerate(labels[i]):
                 page.text(x, y + 0.10 + k * 7.2 * 1.35 / 72, line, 7.2, color=color("muted"))
-            value = significant_text(figure.value)
+            value = headline_text(figure.value)
             value = "not available" if value == "–" else value
             size = _headline_size(value, figure.unit, inner)
             page.text(x, y + 0.12 + above + (18 - size) / 72 * 0.8, value, size, weight="bold")

@@ -78,6 +78,13 @@ def significant_text(value: float | int | str | None, digits: int = 3) -> str:
     return number_text(round(value, digits - 1 - exponent), max(0, digits - 1 - exponent))
 
 
+def headline_text(value: float | int | str | None) -> str:
+    """A number of the first page to three digits; one too small to be told from nothing is said to be so."""
+    if isinstance(value, float) and 0.0 < abs(value) < 1e-3:
+        return "< 0.001" if value > 0.0 else "> −0.001"
+    return significant_text(value)
+
+
 def percent_text(part: float | None, whole: float | None, decimals: int = 1) -> str:
     """A share in percent, a dash where the whole is nothing."""
     if part is None or not whole:

@@ -147,6 +147,8 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
         missing["navigation"] = missing["reference"] = "no reference ephemeris covers this pass"
     else:
         reference, navigation = _navigation(inputs, inputs.reference, provenance, remarks)
+        if len(reference.utc_ns) == 0:
+            missing["reference"] = "no frame came down to set against the reference"
     detector, gallery, worst, craters = _detector(inputs, missing, remarks)
     if not inputs.images:
         missing["gallery"] = missing["worst_frames"] = "no images came down with this pass"
@@ -644,7 +646,7 @@ def _verdict(
 ) -> tuple[str, str]:
     best = _best(navigation, "estimate")
     only = next((s for s in navigation if s.name == "propagate-only"), None)
-    loss = "All packets arrived." if inputs.packets.lost == 0 else f"{inputs.packets.lost} packets were lost."
+    loss, whole = _arrived(inputs)
     if best is None:
         return f"No position estimate could be compared with a reference. {loss}", "bad"
     figure = f"{best.name.capitalize()} navigation held a median 3-D error of {_length(best.statistics.median_3d_m)}"
@@ -655,15 +657,29 @@ def _verdict(
     if perfect is not None:
         baseline += f"; {_length(perfect.statistics.median_3d_m)} from a perfect start"
     if best.statistics.median_3d_m < only.statistics.median_3d_m:
-        level = "good" if inputs.packets.lost == 0 else "caution"
         return (
             f"{figure}, better than propagating the same start state without images ({baseline}). {loss}",
-            level,
+            "good" if whole else "caution",
         )
     return (
         f"{figure}; propagating the same start state without images does better ({baseline}). {loss}",
         "caution",
     )
+
+
+def _arrived(inputs: PassInputs) -> tuple[str, bool]:
+    """What of the pass arrived, in words, and whether it is all that was to be expected.
+
+    Packets missing at the end of a downlink leave no gap in any count: frames that never came tell of them.
+    """
+    packets, came, expected = inputs.packets, len(inputs.detections), inputs.frames_expected
+    if packets.packets == 0:
+        return "No packet arrived.", False
+    if packets.lost:
+        return f"{packets.lost} packets were lost.", False
+    if expected is not None and came < expected:
+        return f"Of {count_text(expected)} frames planned, {count_text(came)} came down.", False
+    return "All packets arrived.", True
 
 
 def _length(value_m: float) -> str:

@@ -9,6 +9,7 @@ from reports.text import (
     count_text,
     duration_text,
     hash_text,
+    headline_text,
     length_text,
     number_text,
     percent_text,
@@ -95,3 +96,11 @@ def test_rungs_of_evidence_are_read_from_their_number_or_name(rung: str, number:
 
 def test_an_unstated_rung_is_said_to_be_unstated() -> None:
     assert rung_text("") == "evidence not stated"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1.1e-5, "< 0.001"), (-1.1e-5, "> −0.001"), (1.23e-3, "0.00123"), (0.0, "0"), (28.14, "28.1"), (0, "0")],
+)
+def test_what_is_next_to_nothing_is_said_so_on_the_first_page(value: float, text: str) -> None:
+    assert headline_text(value) == text

@@ -71,7 +71,7 @@ export function chart(place, title, unit, series, { logarithmic = false, group =
       stroke,
       width: 1.5,
       dash: one.dash,
-      points: { show: one.times.length < 40, size: 4 },
+      points: { show: (plot) => plot.data[0].length < 40, size: 4 },
       value: (_, value) => (value === null || value === undefined ? "–" : value.toPrecision(6)),
     });
     if (!one.low) return;
@@ -81,6 +81,8 @@ export function chart(place, title, unit, series, { logarithmic = false, group =
   });
   const ink = style("--muted");
   const grid = { stroke: style("--grid"), width: 1 };
+  // Decades only: the nine lines in each make a hatching.
+  const rules = logarithmic ? { ...grid, filter: (_, splits) => splits.map((value) => (Number.isInteger(Math.log10(value)) ? value : null)) } : grid;
   const plot = new uPlot(
     {
       width: box.clientWidth,
@@ -91,7 +93,7 @@ export function chart(place, title, unit, series, { logarithmic = false, group =
       scales: { y: logarithmic ? { distr: 3, range: (_, low, high) => [Math.max(1, 10 ** Math.floor(Math.log10(Math.max(low, 1)))), 10 ** Math.ceil(Math.log10(Math.max(high, 10)))] } : {} },
       axes: [
         { stroke: ink, grid, ticks: grid, values: clockTexts, space: 80 },
-        { stroke: ink, grid, ticks: grid, size: 86, values: (_, values) => values.map((value) => (value === null ? null : figure(value, 6))) },
+        { stroke: ink, grid: rules, ticks: rules, size: 86, values: (_, values) => values.map((value) => (value === null ? null : figure(value, 6))) },
       ],
       series: lines,
       bands,

@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 
 from ground_service.errors import InvalidInput, NotFound
+from ground_service.services import reports
 from ground_service.services.archive_import import import_archive
 from ground_service.services.ground import Ground, open_ground
+from ground_service.services.press import Press
 from ground_service.services.reports import evaluate, make_report, pass_summary
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
+from reports.render import render_pdf
 from reports.values import PassReport
 
 FRAMES = 40
@@ -132,6 +135,42 @@ def test_a_report_is_written_and_kept(imported: tuple[Ground, int, PassReport], 
     with ground.database.reading() as connection:
         row = repository.get(connection, repository.REPORTS, made.report_id, "report")
     assert ground.files.get(row["html_sha256"]) == made.html.read_bytes()
+
+
+def test_half_a_downlink_is_not_called_whole(synthetic_pass: Any, ground: Ground, tmp_path: Path) -> None:
+    """No count has a gap where the end of a downlink is missing; the frames that were planned tell of it."""
+    folder = tmp_path / "half"
+    shutil.copytree(synthetic_pass.folder, folder)
+    octets = (folder / "downlink.cadu").read_bytes()
+    (folder / "downlink.cadu").write_bytes(octets[: len(octets) // 2])
+    _rewrite_manifest(folder, lambda manifest: manifest.update(pass_name="half of it"))
+    half = evaluate(ground, import_archive(ground, folder))
+    assert half.packets is not None and half.packets.lost == 0
+    assert half.accounting is not None and 0 < half.accounting.acquired < 40
+    assert half.verdict.endswith(f"Of 40 frames planned, {half.accounting.acquired} came down.")
+    assert half.verdict_level == "caution"
+
+
+def test_a_long_report_is_printed_elsewhere_with_the_same_octets(
+    imported: tuple[Ground, int, PassReport], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ground, pass_id, report = imported
+    monkeypatch.setattr(reports, "worthwhile", lambda frames: frames == FRAMES)
+    monkeypatch.setattr(reports, "utc_now_ns", lambda: 0)
+    printed = make_report(ground, pass_id, out=tmp_path / "press", pdf=True)
+    monkeypatch.setattr(reports, "worthwhile", lambda frames: False)
+    here = make_report(ground, pass_id, out=tmp_path / "here", pdf=True)
+    assert printed.pdf is not None and here.pdf is not None
+    assert printed.pdf.read_bytes() == here.pdf.read_bytes()
+    with Press() as press:
+        press.begin(report)
+        assert press.finish() == render_pdf(report)
+
+
+def test_a_press_that_fails_prints_nothing() -> None:
+    with Press() as press:
+        press.begin("no report")
+        assert press.finish() is None
 
 
 def test_a_lost_frame_shows_as_lost_packets(synthetic_pass: Any, ground: Ground, tmp_path: Path) -> None:
