@@ -24,6 +24,7 @@ from ground_service.api.telecommands import telecommands
 from ground_service.api.timekeeping import timekeeping
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError
+from ground_service.services.commanding import note_timeouts
 from ground_service.services.ground import ground_from_settings
 from ground_service.services.jobs import enter_redecoding
 from ground_service.services.upkeep import nightly_job_id
@@ -128,10 +129,15 @@ async def _nights(app: FastAPI, settings: Settings) -> None:
 
 
 async def _sweeps(app: FastAPI) -> None:
-    """Take up, every now and then, jobs that a killed worker, broker or database left unfinished."""
+    """Take up, every now and then, jobs that something left unfinished, and note telecommands whose end is overdue."""
+    since = utc_now_ns() - DAY_NS
     while True:
         await asyncio.sleep(SWEEP_S)
         try:
             await run_in_threadpool(app.state.dispatcher.resume)
+            until = utc_now_ns()
+            for command in await run_in_threadpool(note_timeouts, app.state.ground, since, until):
+                log.warning("telecommand %d: its end is overdue", command, extra={"telecommand": command})
+            since = until
         except GroundError as error:
-            log.warning("unfinished jobs could not be taken up: %s", error)
+            log.warning("unfinished work could not be looked after: %s", error)

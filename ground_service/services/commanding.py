@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, func, select
+from sqlalchemy import BigInteger, Connection, cast, func, select
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, InvalidInput
@@ -32,6 +32,8 @@ DEFAULT_TIMEOUT_S = 600
 CRITICAL_COMMANDS = ("reset_schedule", "delete_store", "uplink_first", "uplink_middle", "uplink_last")
 CRITICAL_FUNCTIONS = ("clear_store", "reboot", "abort_uplink")
 """What destroys data or changes what the payload is: a second person has to agree."""
+
+_SERVICE, _TIME_OUT = "service", "time out"
 
 COMMANDS = tuple(definition.name for definition in DICTIONARY.telecommands)
 
@@ -180,6 +182,37 @@ def take_uplink(
     packets = [bytes(row[1]) for row in rows]
     stream = UplinkEncoder(spacecraft_id).encode(packets) if framed else b"".join(packets)
     return stream, [int(row[0]) for row in rows]
+
+
+def note_timeouts(ground: Ground, since_utc_ns: int, until_utc_ns: int) -> list[int]:
+    """Put on record, and tell those who watch, which telecommands should have ended in between and did not; their ids.
+
+    Each is noted once, however often it is asked for. What is reported late counts all the same.
+    """
+    table, log = repository.TELECOMMANDS, repository.AUDIT
+    due = table.c.sent_utc_ns + cast(table.c.timeout_s, BigInteger) * 1_000_000_000
+    with ground.database.reading() as connection:
+        rows = connection.execute(
+            select(table).where(table.c.state == "sent", due >= since_utc_ns, due < until_utc_ns)
+        ).mappings()
+        views = [command_view(connection, dict(row)) for row in rows.all()]
+    overdue = [view for view in views if view.fate is not None and view.fate.timed_out]
+    noted = []
+    for view in overdue:
+        command_id = int(view.row["id"])
+        with ground.database.writing() as connection:
+            known = connection.execute(
+                select(log.c.id).where(
+                    log.c.utc_ns >= view.row["sent_utc_ns"],
+                    log.c.action == f"{_TIME_OUT} telecommand",
+                    log.c.target == str(command_id),
+                )
+            ).first()
+            if known is None:
+                detail = {"state": view.state, "timeout_s": view.row["timeout_s"]}
+                _note(connection, _SERVICE, _TIME_OUT, command_id, "timed out", detail)
+                noted.append(command_id)
+    return noted
 
 
 def get_command(ground: Ground, command_id: int) -> CommandView:

@@ -1,5 +1,6 @@
 """Reading a downlink in windows: no packet lost at a border, the same accounting as read at once."""
 
+import tracemalloc
 from collections.abc import Callable
 from typing import Any
 
@@ -76,6 +77,24 @@ def test_frames_of_another_spacecraft_are_left_out_when_one_is_named(packets: li
     found, accounting = read(stream, 1 << 20, 1 << 20, 33)
     assert found == packets[20:60]
     assert accounting.frames_bad > 0
+
+
+def test_memory_does_not_grow_with_the_stream(packets: list[bytes]) -> None:
+    stream = encode_cadus(packets, spacecraft_id=SPACECRAFT, frame_length=223)
+    window = 10 * len(stream)
+
+    def peak(copies: int) -> int:
+        reader = DownlinkReader(SPACECRAFT, window_octets=window)
+        tracemalloc.start()
+        for _ in reader.batches(stream for _ in range(copies)):
+            pass
+        _, highest = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert reader.accounting.octets == copies * len(stream)
+        return highest
+
+    peak(40)  # what is kept for good
+    assert peak(200) - peak(40) < 0.05 * 160 * len(stream)
 
 
 @pytest.mark.parametrize("window", [1 << 20, 60_000])

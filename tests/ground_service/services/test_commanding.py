@@ -14,10 +14,12 @@ from ground_service.services.commanding import (
     enter_command,
     get_command,
     list_commands,
+    note_timeouts,
     reject_command,
     release_command,
     take_uplink,
 )
+from ground_service.services.feed import read_feed
 from ground_service.services.ground import Ground
 from ground_service.services.ingest import ingest_file
 from ground_service.store import repository
@@ -182,6 +184,32 @@ def test_a_command_whose_end_is_overdue_is_timed_out_until_late_reports_come() -
     assert fate_of(COMMAND, [report(1, 150)], 11).timed_out
     late = fate_of(COMMAND, [report(1, 150), report(7, 900)], 11)
     assert (late.state, late.timed_out) == ("completed", False)
+
+
+def test_a_time_out_is_put_on_record_once_and_stays_there(
+    ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    silent, completed = sent(ground), sent(ground)
+    request = {"request_id": get_command(ground, completed).row["request_id"]}
+    downlink(ground, tmp_path, ("verification_completed", 3000, request))
+    due = get_command(ground, silent).row["sent_utc_ns"] + 600 * 10**9
+
+    def noted(now: int) -> list[int]:
+        monkeypatch.setattr("ground_service.services.command_state.utc_now_ns", lambda: now)
+        return note_timeouts(ground, 0, now)
+
+    assert noted(due - 1) == []
+    assert noted(due + 10**9) == [silent]
+    assert noted(due + 2 * 10**9) == []
+    late = {"request_id": get_command(ground, silent).row["request_id"]}
+    downlink(ground, tmp_path, ("verification_completed", 9000, late))
+    assert (get_command(ground, silent).state, noted(due + 3 * 10**9)) == ("completed", [])
+    with ground.database.reading() as connection:
+        record = repository.page(connection, repository.AUDIT, action="time out telecommand").rows
+    assert [(row["actor"], row["target"], row["detail"]["state"]) for row in record] == [
+        ("service", str(silent), "sent")
+    ]
+    assert {"id": silent, "state": "timed out"} in [item["payload"] for item in read_feed(ground, 0)]
 
 
 @given(st.lists(st.sampled_from([1, 3, 5, 7]), unique=True), st.randoms())

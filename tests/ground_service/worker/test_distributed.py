@@ -13,6 +13,7 @@ import pytest
 
 from ground_service.errors import DatabaseNotMigrated, SettingsError
 from ground_service.services.archive_import import import_archive
+from ground_service.services.commanding import enter_command, note_timeouts, release_command, take_uplink
 from ground_service.services.ground import Ground, open_ground
 from ground_service.services.ingest import ingest_file
 from ground_service.services.jobs import _lock_key, enter_job, run_job
@@ -133,6 +134,18 @@ def test_a_worker_makes_the_report(
     with ground.database.reading() as connection:
         report = repository.get(connection, repository.REPORTS, row["result"]["report_id"], "report")
     assert report["summary"]["packets"] == pass_summary(ground, pass_id)["packets"]
+
+
+def test_time_outs_are_found_on_a_server_as_well(ground_on_postgres: Ground) -> None:
+    ground = ground_on_postgres
+    command = enter_command(ground, "test_connection", {}, spacecraft_id=SPACECRAFT, timeout_s=7, actor="ann")
+    release_command(ground, command, actor="ann")
+    take_uplink(ground, spacecraft_id=SPACECRAFT, actor="ann")
+    table = repository.TELECOMMANDS
+    with ground.database.writing() as connection:
+        connection.execute(table.update().values(sent_utc_ns=10**18))
+    assert note_timeouts(ground, 10**18, 10**18 + 7 * 10**9) == []
+    assert note_timeouts(ground, 10**18, 10**18 + 7 * 10**9 + 1) == [command]
 
 
 def test_a_job_entered_twice_is_one_job(ground: Ground) -> None:
