@@ -528,7 +528,7 @@ def _table(block: Table, number: int) -> list[_Piece]:
             for cell, lines, column, start, width in zip(
                 row, texts, block.columns, starts, widths, strict=True
             ):
-                _draw_cell(page, y + 0.035, cell, lines, column, start, width, size)
+                _draw_cell(page, y + 0.057, cell, lines, column, start, width, size)
             page.rule(_LEFT, _LEFT + total, y + height, "ink" if last else "grid", 0.6 if last else 0.5)
 
         pieces.append(

@@ -59,13 +59,15 @@ class ReferenceStates:
         return np.degrees(self.longitude_rad) % 360.0
 
 
-def reference_states(reference: Ephemeris, orientation: Orientation, utc_ns: IntArray) -> ReferenceStates:
-    """The reference at `utc_ns` (n,); epochs that it does not cover are NaN and not `covered`."""
+def reference_states(
+    reference: Ephemeris | None, orientation: Orientation, utc_ns: IntArray
+) -> ReferenceStates:
+    """The reference at `utc_ns` (n,); epochs that it does not cover, all of them without one, are NaN."""
     utc_ns = np.asarray(utc_ns, dtype=np.int64)
-    covered = reference.covers(utc_ns)
+    covered = np.zeros(len(utc_ns), dtype=np.bool_) if reference is None else reference.covers(utc_ns)
     position = np.full((len(utc_ns), 3), np.nan)
     velocity = np.full((len(utc_ns), 3), np.nan)
-    if covered.any():
+    if reference is not None and covered.any():
         position[covered], velocity[covered] = reference.at(utc_ns[covered])
     rotation = np.full((len(utc_ns), 3, 3), np.nan)
     if covered.any():

@@ -144,7 +144,8 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
     reference: TrackSeries | None = None
     navigation: tuple[NavigationSeries, ...] = ()
     if inputs.reference is None:
-        missing["navigation"] = missing["reference"] = "no reference ephemeris covers this pass"
+        missing["error"] = missing["reference"] = "no reference ephemeris covers this pass"
+        navigation = _without_reference(inputs)
     else:
         reference, navigation = _navigation(inputs, inputs.reference, provenance, remarks)
         if len(reference.utc_ns) == 0:
@@ -255,6 +256,17 @@ def _navigation(
     return (
         TrackSeries(times, track.latitude_deg, track.longitude_deg, track.altitude_m),
         tuple(series),
+    )
+
+
+def _without_reference(inputs: PassInputs) -> tuple[NavigationSeries, ...]:
+    """What the estimators reported, with no error of any of it."""
+    track = reference_states(None, inputs.orientation, _sample_times(inputs))
+    path_m = np.full(len(track.utc_ns), np.nan)
+    return tuple(
+        _estimate_series(samples, _outcomes_of(inputs, samples.estimator), track, path_m)
+        for samples in inputs.navigation
+        if len(samples.utc_ns)
     )
 
 

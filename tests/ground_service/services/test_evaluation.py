@@ -151,6 +151,26 @@ def test_half_a_downlink_is_not_called_whole(synthetic_pass: Any, ground: Ground
     assert half.verdict_level == "caution"
 
 
+def test_without_a_reference_outcomes_and_ledger_are_still_told(
+    synthetic_pass: Any, ground: Ground, tmp_path: Path
+) -> None:
+    folder = tmp_path / "alone"
+    shutil.copytree(synthetic_pass.folder, folder)
+    (folder / "reference.oem").unlink()
+    manifest = json.loads((folder / "manifest.json").read_text())
+    del manifest["files"]["reference.oem"]
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    made = make_report(ground, import_archive(ground, folder), out=tmp_path / "out")
+    report = json.loads(made.json.read_text())
+    assert report["not_available"]["error"] == "no reference ephemeris covers this pass"
+    paper = series(evaluate(ground, made.pass_id), "paper")
+    assert paper.outcome == ("multi",) * FRAMES and paper.anchor_reads == 2
+    assert np.isnan(paper.error_rtn_m).all() and np.isnan(paper.statistics.median_3d_m)
+    text = made.html.read_text()
+    assert "Position error</b><span>not available: no reference ephemeris covers this pass" in text
+    assert "Outcomes of all frames" in text and "Reads of the anchor ephemeris" in text
+
+
 def test_a_long_report_is_printed_elsewhere_with_the_same_octets(
     imported: tuple[Ground, int, PassReport], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
