@@ -7,6 +7,7 @@ from lunar.catalogue import load_catalogue, make_catalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder, find_data
 from payload_emulator.errors import TerrainError
+from payload_emulator.sim.terrain import kernels
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.raster import RasterTerrain
 from payload_emulator.sim.terrain.rasters import open_layers
@@ -164,3 +165,14 @@ def test_fresh_craters_of_the_real_catalogue_are_as_deep_on_gld100_as_they_shoul
     # quarter of the 5 to 30 km craters shallower than 0.03. One region of 10 degrees scatters by 0.03 and 0.12.
     assert np.percentile(ratio, 98) == pytest.approx(0.184, abs=0.03)
     assert np.mean(ratio < 0.03) == pytest.approx(0.25, abs=0.12)
+
+
+def test_smoothing_adds_its_terms_one_by_one_to_the_last_bit() -> None:
+    """Tiles must be the same on every machine: the sums are those of float32 arrays added in order."""
+    values = np.random.default_rng(5).normal(0.0, 900.0, (41, 57)).astype(np.float32)
+    weights = np.array([0.06, 0.24, 0.4, 0.24, 0.06], dtype=np.float32)
+    half = values.copy()
+    half[2:-2] = sum(w * values[k : 37 + k] for k, w in enumerate(weights))
+    expected = half.copy()
+    expected[:, 2:-2] = sum(w * half[:, k : 53 + k] for k, w in enumerate(weights))
+    assert np.array_equal(kernels.smooth(values, weights), expected)
