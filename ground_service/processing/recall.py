@@ -322,14 +322,15 @@ def _residuals(
     at, by = tally.crater_rows[found], tally.crater_detection[found]
     if len(at) == 0:
         return None
+    # Telemetry tells places to 1/64 px: more decimals would only make the report longer.
     return ResidualSeries(
-        u_px=expected.u_px[at],
-        v_px=expected.v_px[at],
-        du_px=detections.u_px[by] - expected.u_px[at],
-        dv_px=detections.v_px[by] - expected.v_px[at],
+        u_px=np.round(expected.u_px[at], 2),
+        v_px=np.round(expected.v_px[at], 2),
+        du_px=np.round(detections.u_px[by] - expected.u_px[at], 3),
+        dv_px=np.round(detections.v_px[by] - expected.v_px[at], 3),
         # The image's up is north, so an azimuth on the ground is one in the image.
         sun_azimuth_deg=None if sun_azimuth_deg is None else sun_azimuth_deg[tally.crater_frame[found]],
-        diameter_px=expected.diameter_px[at],
+        diameter_px=np.round(expected.diameter_px[at], 2),
     )
 
 
