@@ -32,6 +32,14 @@ function showArguments() {
   show("arguments", inputs.length ? inputs : element("p", { class: "hint" }, "No arguments."));
 }
 
+// Arguments as words: octets of a packet by their number, items by their values, one after the other.
+function plain(value) {
+  if (!Array.isArray(value)) return value !== null && typeof value === "object" ? Object.values(value).join(" ") : value;
+  if (value.length && value.every((item) => Object.keys(item).join() === "octet")) return `${value.length} octets`;
+  const text = value.map((item) => plain(item)).join("; ");
+  return text.length > 80 ? `${text.slice(0, 79)}…` : text;
+}
+
 function argumentsOf(chosen) {
   const given = {};
   for (const field of chosen.fields) {
@@ -87,7 +95,7 @@ const load = pager(async (limit, offset) => {
       [
         ["No", (row) => String(row.id), "num"],
         ["Telecommand", (row) => element("span", {}, words(row.name), row.critical ? element("b", { class: "critical" }, " critical") : null)],
-        ["Arguments", (row) => Object.entries(row.arguments).map(([key, value]) => `${words(key)} ${typeof value === "object" ? JSON.stringify(value).slice(0, 80) : value}`).join(", ")],
+        ["Arguments", (row) => Object.entries(row.arguments).map(([key, value]) => `${words(key)} ${plain(value)}`).join(", ")],
         ["Entered", (row) => `${timeText(row.requested)} by ${row.requested_by}`],
         ["State", (row) => stateMark(row.state)],
         ["Verification", lights],
