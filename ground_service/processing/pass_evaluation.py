@@ -610,8 +610,12 @@ def _outcomes_of(inputs: PassInputs, estimator: str) -> OutcomeSamples | None:
 
 
 def _best(navigation: tuple[NavigationSeries, ...], kind: str) -> NavigationSeries | None:
-    """The series of this kind with the smallest median error."""
-    known = [s for s in navigation if s.kind == kind and np.isfinite(s.statistics.median_3d_m)]
+    """The series of this kind with the smallest median error; at its first frame odometry is where it was put."""
+    known = [
+        s
+        for s in navigation
+        if s.kind == kind and len(s.utc_ns) > 1 and np.isfinite(s.statistics.median_3d_m)
+    ]
     return min(known, key=lambda s: s.statistics.median_3d_m, default=None)
 
 
@@ -659,6 +663,8 @@ def _verdict(
     best = _best(navigation, "estimate")
     only = next((s for s in navigation if s.name == "propagate-only"), None)
     loss, whole = _arrived(inputs)
+    if best is None and any(s.kind == "estimate" and len(s.utc_ns) == 1 for s in navigation):
+        return f"One frame was navigated: too little to judge by. {loss}", "caution"
     if best is None:
         return f"No position estimate could be compared with a reference. {loss}", "bad"
     figure = f"{best.name.capitalize()} navigation held a median 3-D error of {_length(best.statistics.median_3d_m)}"

@@ -256,3 +256,11 @@ def _rewrite_manifest(folder: Path, change: Any) -> None:
         manifest["files"][name]["sha256"] = hashlib.sha256((folder / name).read_bytes()).hexdigest()
     change(manifest)
     path.write_text(json.dumps(manifest))
+
+
+def test_one_frame_is_no_navigation(make_pass: Any, ground: Ground) -> None:
+    """At its first frame odometry is where it was put: nothing to be proud of."""
+    one = evaluate(ground, import_archive(ground, make_pass(frames=1, seed=5).folder))
+    assert one.verdict_level == "caution"
+    assert one.verdict.startswith("One frame was navigated: too little to judge by.")
+    assert one.headline[0].value is None
