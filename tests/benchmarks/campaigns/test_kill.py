@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.campaigns import kill
 from benchmarks.campaigns.kill import holds, main, totals
 
 SHORT = "--laptop --packets 1200 --pieces 4 --reports 0 --pause 0.3 --json"
@@ -40,3 +41,21 @@ def test_a_lost_packet_or_an_unfinished_job_fails_the_campaign() -> None:
         {"lost": 1}, {"doubled": 1}, {"archive_identical": False}, {"jobs": {"failed": 1}}, {"ingests": {"running": 1}},
     ):  # fmt: skip
         assert not holds(totals([run, {**run, **injury}]))
+
+
+def test_a_pass_whose_definition_was_cut_off_is_looked_for_before_it_is_asked_for_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[str] = []
+
+    def ask(_api: str, method: str, _path: str, _body: bytes | None = None, key: str = "") -> Any:
+        asked.append(f"{method} {key}".strip())
+        if method == "GET":
+            return {"items": []}
+        if key == "pass 0":
+            raise SystemExit("POST /passes: 409 b'begun and its end is not known'")
+        return {"id": 7}
+
+    monkeypatch.setattr(kill, "ask", ask)
+    assert kill.the_pass("http://nowhere", b"{}") == 7
+    assert asked == ["POST pass 0", "GET", "POST pass 1"]
