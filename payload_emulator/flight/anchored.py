@@ -400,7 +400,8 @@ class AnchoredNavigator:
             @ prior.covariance[kalman.POSITION, kalman.POSITION]
             @ np.swapaxes(sighting.by_position, 1, 2)
         )
-        # Craters among the states bring their own uncertainty with them, the others that of the catalogue.
+        # Craters among the states bring their own uncertainty with them, the others that of the catalogue. What the
+        # detector errs by is taken whole for both: which detection is of which crater is not known yet.
         scaled = sighting.by_offset * self.landmarks.sigma_m[sighting.index][:, None, :]
         own = scaled @ np.swapaxes(scaled, 1, 2)
         own[prior.slots(sighting.index) >= 0] = 0.0

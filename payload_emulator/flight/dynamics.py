@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lunar.constants import GM_EARTH_M3_S2, GM_SUN_M3_S2
 from lunar.gravity import GravityField, packed, packed_gradient
-from lunar.gravity_omission import field_psd_m2_s3
+from lunar.gravity_omission import FAR_SIDE_COSINE, field_psd_m2_s3
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns, utc_ns_from_ticks
 from payload_emulator.flight.tables import TICKS_PER_SECOND, BurnTable, GravityTable, OrientationTable
@@ -27,9 +27,6 @@ _ARC_S = 60.0
 _STEP_S = 5.0
 # The gradient of a field of degree 12 is right to a few parts in a thousand at 15 km.
 _GRADIENT_DEGREE = 12
-# Cosine of the angle from the middle of the near side beyond which no orbiter of old was in sight of the Earth: errors
-# of LP165P at 30 km grow from 6 mGal at 97 degrees of longitude to 30 at 127.
-_FAR_SIDE = float(np.cos(np.radians(105.0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +134,7 @@ class OrbitModel:
     def _white_psd(self, position_mcmf_m: Float) -> tuple[float, float, float]:
         """Return the spectral density of white acceleration over a place."""
         far = self._noise.far_side_psd_m2_s3
-        if far is None or position_mcmf_m[0] > _FAR_SIDE * float(np.linalg.norm(position_mcmf_m)):
+        if far is None or position_mcmf_m[0] > FAR_SIDE_COSINE * float(np.linalg.norm(position_mcmf_m)):
             return self._noise.white_psd_m2_s3
         return far
 

@@ -18,9 +18,7 @@ from payload_emulator.flight.tables import CatalogueTable, pack_catalogue_table
 from payload_emulator.scenario import parse_scenario
 from tmtc.downlink import decode
 
-SCENARIO = """
-name = "lossy"
-seed = 11
+ORBIT = """
 [dynamics]
 gravity = "builtin"
 degree = 8
@@ -28,7 +26,12 @@ orientation = "iau"
 [window]
 search = "none"
 start = "2029-08-08T02:30:00Z"
-duration_s = 6600.0
+"""
+
+SCENARIO = f"""
+name = "lossy"
+seed = 11
+{ORBIT}duration_s = 6600.0
 [camera]
 images = "reduced"
 frame_interval_s = 30.0
@@ -137,16 +140,9 @@ def test_the_ground_finds_the_time_of_every_frame_from_time_reports(
     assert nearest.max() < 1_000_000
 
 
-SHORT = """
+SHORT = f"""
 name = "short"
-[dynamics]
-gravity = "builtin"
-degree = 8
-orientation = "iau"
-[window]
-search = "none"
-start = "2029-08-08T02:30:00Z"
-duration_s = 90.0
+{ORBIT}duration_s = 90.0
 latitude_limit_deg = 90.0
 [camera]
 images = "reduced"
