@@ -22,7 +22,7 @@ RUN /opt/linna/bin/pip install --no-deps .
 FROM ${PYTHON_IMAGE}
 LABEL org.opencontainers.image.title="linna" org.opencontainers.image.licenses="Apache-2.0"
 RUN groupadd --gid 10001 linna && useradd --uid 10001 --gid linna --create-home linna \
-    && mkdir /var/lib/linna && chown linna:linna /var/lib/linna
+    && mkdir /var/lib/linna /exchange && chown linna:linna /var/lib/linna /exchange && chmod 2770 /exchange
 COPY --from=build /opt/linna /opt/linna
 ENV PATH=/opt/linna/bin:$PATH \
     PYTHONUNBUFFERED=1 \

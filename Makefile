@@ -13,7 +13,12 @@ PIP       = $(if $(BASE_PIP),$(PYTHON) -m pip --python $(BIN)/python,$(BIN)/pyth
 DEMO_STAMPS := $(VENV)/.runtime $(if $(LINNA_DATA),$(VENV)/.terrain)
 DEMO_OUT    ?= linna-demo
 
-.PHONY: demo test check bench up install install-dev clean
+
+# Mutants of each group that `make mutation` tests; 0: every one.
+SAMPLE ?= 60
+SEED   ?= 1
+
+.PHONY: demo test check bench mutation up install install-dev clean
 
 demo: $(DEMO_STAMPS)
 	$(BIN)/linna demo --out $(DEMO_OUT)
@@ -31,7 +36,11 @@ check: $(VENV)/.dev
 bench: $(VENV)/.bench
 	$(BIN)/python -m benchmarks
 
+mutation: $(VENV)/.mutation
+	$(BIN)/python -m benchmarks.mutation --sample $(SAMPLE) --seed $(SEED) $(if $(GROUP),--group $(GROUP))
+
 up:
+	sh deploy/secrets.sh
 	docker compose up --build
 
 install: $(DEMO_STAMPS)
@@ -55,6 +64,10 @@ $(VENV)/.dev: requirements/dev.txt requirements/train.txt requirements/postgres.
 
 $(VENV)/.bench: requirements/bench.txt $(VENV)/.dev
 	$(PIP) -r requirements/bench.txt
+	touch $@
+
+$(VENV)/.mutation: requirements/mutation.txt $(VENV)/.dev
+	$(PIP) -r requirements/mutation.txt
 	touch $@
 
 clean:

@@ -27,13 +27,13 @@ from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.datafolder import find_data
 from lunar.errors import LunarError
 from lunar.frames import mcmf_from_spherical
+from lunar.lens import pointed_camera_from_mcmf
 from payload_emulator.comparison import compare_renderings, thinned
 from payload_emulator.errors import PayloadError
 from payload_emulator.sim import raymarch, renderer
 from payload_emulator.sim.cycles import render_scene
 from payload_emulator.sim.cycles_scene import CyclesSettings, describe_scene
 from payload_emulator.sim.labels import label_frame
-from payload_emulator.sim.lens import pointed_camera_from_mcmf
 from payload_emulator.sim.light import paper_light, sun_direction_mcmf
 from payload_emulator.sim.rims import rim_errors
 from payload_emulator.sim.sensor import SensorModel, expose
@@ -204,9 +204,9 @@ def main() -> None:
     root = os.environ.get("LINNA_DATA")
     blender = os.environ.get("LINNA_BLENDER_PYTHON", "")
     results: dict[str, object] = {}
-    worlds = [("procedural Moon (rung 2)", "procedural", None, PROCEDURAL)]
+    worlds = [("procedural Moon (level 2)", "procedural", None, PROCEDURAL)]
     if root:
-        worlds.append(("GLD100, regions never trained on (rung 3)", "raster", root, REAL))
+        worlds.append(("GLD100, regions never trained on (level 3)", "raster", root, REAL))
     for name, kind, data, region in worlds:
         if arguments.terrain and (arguments.terrain == "real") != (kind == "raster"):
             continue

@@ -20,6 +20,9 @@ from ground_service.errors import GroundError, InvalidInput
 
 API_PREFIX = "/api/v1"
 TIMEOUT_S = 120.0
+BUSY_S = 120.0
+"""A service that answers 503 with Retry-After is asked again for so long."""
+
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 2.0
 
 View = dict[str, Any]
@@ -60,15 +63,29 @@ class Client:
         """The figures of one pass."""
         return self._json("GET", f"/passes/{pass_id}/summary")
 
-    def ingest_file(self, path: Path, *, spacecraft_id: int | None = None, instance: str = "flight") -> View:
+    def ingest_file(
+        self,
+        path: Path,
+        *,
+        spacecraft_id: int | None = None,
+        instance: str = "flight",
+        stream: str | None = None,
+        offset: int = 0,
+    ) -> View:
         """Upload a downlink and wait until it is ingested: its accounting with `ingest_id`."""
         if not path.is_file():
             raise InvalidInput(
                 str(path), "", "a downlink file", "a folder" if path.is_dir() else "nothing there"
             )
-        query = {"name": path.name, "instance": instance, "spacecraft_id": spacecraft_id}
-        with path.open("rb") as stream:
-            accepted = self._json("POST", "/telemetry", query=query, body=stream, octets=path.stat().st_size)
+        query = {
+            "name": path.name,
+            "instance": instance,
+            "spacecraft_id": spacecraft_id,
+            "stream": stream,
+            "offset": None if stream is None else offset,
+        }
+        with path.open("rb") as body:
+            accepted = self._json("POST", "/telemetry", query=query, body=body, octets=path.stat().st_size)
         self._finished(accepted["job_id"])
         ingest = self._json("GET", f"/ingests/{accepted['ingest_id']}")
         return {**ingest["accounting"], "ingest_id": ingest["id"]}
@@ -117,6 +134,21 @@ class Client:
                 body=stream,
                 octets=path.stat().st_size,
             )
+
+    # Mission descriptions
+
+    def list_missions(self, limit: int = 100) -> View:
+        """List the revisions of mission descriptions, the newest first."""
+        return self._json("GET", "/missions", query={"limit": limit})
+
+    def add_mission(self, path: Path) -> View:
+        """Enter a mission description as a revision."""
+        with path.open("rb") as stream:
+            return self._json("POST", "/missions", body=stream, octets=path.stat().st_size)
+
+    def get_mission(self, revision: str) -> View:
+        """Return a revision with its document."""
+        return self._json("GET", f"/missions/{urllib.parse.quote(revision, safe='')}")
 
     # Telecommands
 
@@ -219,6 +251,16 @@ class Client:
         """Enter the windows of a plan."""
         return self._json("POST", "/plan", body=dict(plan))
 
+    # Audit log
+
+    def list_audit(self, **query: Any) -> View:
+        """A page of the audit log, the newest entry first."""
+        return self._json("GET", "/audit", query=query)
+
+    def audit_head(self) -> View:
+        """Number and hash of the newest entry of the audit log."""
+        return self._json("GET", "/audit/head")
+
     # The wire
 
     def _finished(self, job_id: str) -> View:
@@ -268,14 +310,37 @@ class Client:
             headers["Content-Type"] = "application/json"
         elif octets is not None:
             headers |= {"Content-Type": "application/octet-stream", "Content-Length": str(octets)}
+        until = time.monotonic() + BUSY_S
+        while True:
+            try:
+                return self._open(url, data, headers, method)
+            except _Busy as busy:
+                if time.monotonic() + busy.wait_s > until:
+                    raise ServiceProblem(503, busy.detail) from None
+                time.sleep(busy.wait_s)
+
+    def _open(self, url: str, data: Any, headers: dict[str, str], method: str) -> Any:
+        if hasattr(data, "seek"):
+            data.seek(0)
         request = urllib.request.Request(url, data=data, headers=headers, method=method)
         try:
             return self._opener.open(request, timeout=TIMEOUT_S)
         except urllib.error.HTTPError as error:
+            wait = error.headers.get("Retry-After", "")
+            if error.code == 503 and wait.isdigit():  # nothing was done: too many others ask at once
+                raise _Busy(_detail(error), float(min(int(wait), 10))) from None
             raise ServiceProblem(error.code, _detail(error)) from None
         except (urllib.error.URLError, http.client.HTTPException, OSError) as error:
             reason = getattr(error, "reason", error)
             raise ServiceProblem(0, f"{self._server}: cannot be reached: {reason}") from None
+
+
+class _Busy(Exception):
+    """The service asks to come again."""
+
+    def __init__(self, detail: str, wait_s: float) -> None:
+        super().__init__(detail)
+        self.detail, self.wait_s = detail, wait_s
 
 
 class _NoRedirects(urllib.request.HTTPRedirectHandler):

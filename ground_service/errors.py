@@ -4,14 +4,19 @@ GroundError
 ├── SettingsError            a setting that cannot be used
 ├── StoreError
 │   ├── DatabaseUnavailable      the database cannot be opened or reached
+│   ├── DatabaseBusy             the database gave up a transaction in favour of another
 │   ├── DatabaseTooNew           written by a newer version of this program
+│   ├── DatabaseTooOld           written before version 1.0; has to be exported and imported
 │   ├── DatabaseNotMigrated      older than this program and not migrated by itself
 │   ├── StorageFull              no space left where the archive lives
 │   ├── StorageReadOnly          the archive cannot be written
+│   ├── AuditBroken              the audit chain cannot be continued
 │   └── FileDamaged              a stored file no longer has the octets it was stored with
 ├── NotFound                 no such pass, ingest, report, job, ...
 ├── Conflict                 the request contradicts what is stored
+│   └── StateConflict            the state of the thing does not allow it (any more)
 ├── InvalidInput             what was given cannot be accepted (file, manifest, field)
+├── BuildNotChecked          the parameters of a payload build cannot be checked here
 ├── EvaluationError          a pass that cannot be evaluated
 ├── Stopping                 the service is being stopped in the middle of the work
 ├── NotAuthorised            the caller is not known or may not do this
@@ -21,7 +26,12 @@ GroundError
 from __future__ import annotations
 
 import errno
+import re
 from pathlib import Path
+
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://[^\s'\"]*")
+_PATH = re.compile(r"(?<![\w./])/(?:[^\s/'\",;:()]+/)+([^\s/'\",;:()]*)")
+PUBLIC_LIMIT = 500
 
 
 class GroundError(Exception):
@@ -48,6 +58,13 @@ class DatabaseUnavailable(StoreError):
         self.url = url
 
 
+class DatabaseBusy(StoreError):
+    """The database gave up a transaction in favour of another; the same again may well succeed."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"database: nothing was changed, the same again may succeed: {reason}")
+
+
 class DatabaseTooNew(StoreError):
     """The database was written by a newer version of this program."""
 
@@ -55,6 +72,18 @@ class DatabaseTooNew(StoreError):
         super().__init__(
             f"database {url}: expected schema revision {expected} or older, found {found} of a newer version; "
             "update linna or use another database"
+        )
+        self.expected = expected
+        self.found = found
+
+
+class DatabaseTooOld(StoreError):
+    """The database was written before version 1.0; its rows can be exported and imported, not migrated."""
+
+    def __init__(self, url: str, expected: str, found: str) -> None:
+        super().__init__(
+            f"database {url}: expected schema revision {expected}, found {found} of a version before 1.0; "
+            "run 'linna db export FILE' on it, then 'linna db import FILE' with a new database"
         )
         self.expected = expected
         self.found = found
@@ -94,8 +123,12 @@ class Stopping(GroundError):
         super().__init__("the service is being stopped; the work goes on when it runs again")
 
 
-PASSING = (DatabaseUnavailable, StorageFull, StorageReadOnly, Stopping)
+PASSING = (DatabaseUnavailable, DatabaseBusy, StorageFull, StorageReadOnly, Stopping)
 """What is no fault of the work that meets it: the same work, later, may well succeed."""
+
+
+class AuditBroken(StoreError):
+    """The audit chain cannot be continued."""
 
 
 class FileDamaged(StoreError):
@@ -118,6 +151,17 @@ class Conflict(GroundError):
     """The request contradicts what is stored."""
 
 
+class StateConflict(Conflict):
+    """The state of a thing does not allow the request; `found` is the state that won."""
+
+    def __init__(self, kind: str, key: object, expected: str, found: str) -> None:
+        super().__init__(f"{kind} {key}: expected state {expected}, found {found}")
+        self.kind = kind
+        self.key = key
+        self.expected = expected
+        self.found = found
+
+
 class InvalidInput(GroundError):
     """What was given cannot be accepted."""
 
@@ -130,8 +174,21 @@ class InvalidInput(GroundError):
         self.found = found
 
 
+class BuildNotChecked(GroundError):
+    """The parameters of a payload build cannot be checked here, so it is not registered."""
+
+    def __init__(self, build: str, reason: str) -> None:
+        super().__init__(f"build {build}: expected its parameters to be checked, found: {reason}")
+        self.build = build
+        self.reason = reason
+
+
 class EvaluationError(GroundError):
     """A pass that cannot be evaluated."""
+
+
+class Forbidden(GroundError):
+    """The caller is known and may not do this."""
 
 
 class NotAuthorised(GroundError):
@@ -149,3 +206,18 @@ def storage_error(error: OSError, where: Path | str) -> GroundError:
     if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
         return StorageReadOnly(str(where), error.strerror or "read-only")
     return StoreError(f"{where}: {error.strerror or error}")
+
+
+def public_text(error: BaseException) -> str:
+    """Return what an error says in one line that may be shown to any caller: no URL, and of paths the last part only.
+
+    The whole text belongs in the log of the service.
+    """
+    text = str(error) if str(error) else type(error).__name__
+    if not isinstance(error, GroundError) and type(error).__module__ in ("builtins", "numpy"):
+        text = f"{type(error).__name__}: {text}" if str(error) else text
+    if isinstance(error, OSError):
+        text = f"{type(error).__name__}: {error.strerror or type(error).__name__}"
+    shown = _PATH.sub(r"\1", _URL.sub("(address)", text))
+    line = " ".join("".join(c if c.isprintable() else " " for c in shown).split())
+    return line if len(line) <= PUBLIC_LIMIT else line[: PUBLIC_LIMIT - 1] + "…"

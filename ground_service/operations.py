@@ -46,10 +46,21 @@ class LocalOperations:
 
         return pass_summary(self.ground, pass_id)
 
-    def ingest_file(self, path: Path, *, spacecraft_id: int | None = None, instance: str = "flight") -> View:
-        from ground_service.services.ingest import ingest_file
+    def ingest_file(
+        self,
+        path: Path,
+        *,
+        spacecraft_id: int | None = None,
+        instance: str = "flight",
+        stream: str | None = None,
+        offset: int = 0,
+    ) -> View:
+        from ground_service.services.ingest import Place, ingest_file
 
-        return asdict(ingest_file(self.ground, path, spacecraft_id=spacecraft_id, instance=instance))
+        place = None if stream is None else Place(stream, offset)
+        return asdict(
+            ingest_file(self.ground, path, spacecraft_id=spacecraft_id, instance=instance, place=place)
+        )
 
     def import_archive(self, folder: Path) -> int:
         from ground_service.services.archive_import import import_archive
@@ -79,6 +90,23 @@ class LocalOperations:
                 self.ground, stored, name=name or path.name, precedence=precedence, actor=self._actor
             )
         )
+
+    def list_missions(self, limit: int = 100) -> View:
+        from ground_service.missions.service import list_missions
+
+        items, total = list_missions(self.ground, limit=limit)
+        return {"items": [one.model_dump(mode="json") for one in items], "total": total}
+
+    def add_mission(self, path: Path) -> View:
+        from ground_service.missions.service import add_mission
+
+        octets = _octets_of(path)
+        return add_mission(self.ground, octets, source=str(path), actor=self._actor).model_dump(mode="json")
+
+    def get_mission(self, revision: str) -> View:
+        from ground_service.missions.service import get_mission
+
+        return get_mission(self.ground, revision).model_dump(mode="json")
 
     def enter_command(self, name: str, arguments: Mapping[str, Any], **where: Any) -> View:
         from ground_service.services.commanding import enter_command
@@ -219,6 +247,26 @@ class LocalOperations:
         entries = plan_entries(self._read("Plan", plan))
         return {"windows": import_plan(self.ground, entries, actor=self._actor)}
 
+    def list_audit(
+        self, *, limit: int = 100, since: str | None = None, until: str | None = None, **equal: str | None
+    ) -> View:
+        from ground_service.services.audit_log import list_entries
+        from ground_service.services.plan_schemas import time_of
+
+        entries, total = list_entries(
+            self.ground,
+            since_utc_ns=None if since is None else time_of(since, "since"),
+            until_utc_ns=None if until is None else time_of(until, "until"),
+            limit=limit,
+            **equal,
+        )
+        return {"items": [entry.model_dump() for entry in entries], "total": total}
+
+    def audit_head(self) -> View:
+        from ground_service.services.audit_log import audit_head
+
+        return audit_head(self.ground).model_dump()
+
     def _read(self, name: str, request: Mapping[str, Any]) -> Any:
         """A request checked like one that comes over the wire."""
         from pydantic import ValidationError
@@ -233,3 +281,10 @@ class LocalOperations:
             raise InvalidInput(
                 "request", where, first["msg"].lower(), repr(first.get("input"))[:80]
             ) from None
+
+
+def _octets_of(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InvalidInput(str(path), "", "a file that can be read", error.strerror or str(error)) from None

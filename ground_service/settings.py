@@ -5,12 +5,14 @@ Nothing below the command line, the API factory and the worker reads the environ
 
 from __future__ import annotations
 
+import ipaddress
 import os
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+from urllib.parse import quote
 
-from pydantic import Field, SecretStr, ValidationError
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import BeforeValidator, Field, SecretStr, ValidationError, field_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from ground_service.errors import SettingsError
 
@@ -19,6 +21,16 @@ def default_home() -> Path:
     """Where the archive lives when ``LINNA_HOME`` is not set: the user's own data folder."""
     base = os.environ.get("XDG_DATA_HOME")
     return (Path(base) if base else Path.home() / ".local" / "share") / "linna"
+
+
+def _words(value: object) -> object:
+    """The words of a list that is written with commas between them."""
+    return (
+        tuple(word.strip() for word in value.split(",") if word.strip()) if isinstance(value, str) else value
+    )
+
+
+Words = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_words)]
 
 
 class Settings(BaseSettings):
@@ -31,6 +43,15 @@ class Settings(BaseSettings):
     )
     database_url: SecretStr | None = Field(
         default=None, description="SQLAlchemy URL; default: SQLite file linna.db under the home folder"
+    )
+    migration_database_url: SecretStr | None = Field(
+        default=None,
+        description="URL of the owner of the schema, for `linna db upgrade` alone, which then grants the role of "
+        "LINNA_DATABASE_URL its rights; default: LINNA_DATABASE_URL",
+    )
+    allow_database_owner: bool = Field(
+        default=False,
+        description="Serve as a database role that could change the schema or the audit log, as on a laptop",
     )
     broker_url: SecretStr | None = Field(
         default=None, description="Celery broker such as redis://host:6379/0; default: jobs run in-process"
@@ -49,16 +70,66 @@ class Settings(BaseSettings):
     rate_limit_per_s: float = Field(
         default=200.0, ge=0.0, description="Requests a second that one caller may make; 0: any number"
     )
+    allowed_hosts: Words = Field(
+        default=(),
+        description="Names under which browsers and programs may ask for the service, with commas between them, "
+        "besides localhost and the addresses it listens on",
+    )
+    trusted_proxies: Words = Field(
+        default=(),
+        description="Addresses or networks of reverse proxies, with commas between them, whose X-Forwarded-For, "
+        "-Proto and -Host headers are believed; nobody else's are",
+    )
     retention_days: int = Field(
         default=90, ge=1, description="Days for which the feed and finished jobs are kept"
     )
+    runner_exchange: Path | None = Field(
+        default=None,
+        description="Folder shared with a runner (`linna runner`) that runs payload builds; "
+        "default: builds run in a sandbox of this machine, or are refused",
+    )
+    uploads_at_once: int = Field(
+        default=64, ge=1, le=4096, description="Uploads received at once; others wait a little, then get 503"
+    )
+    connections: int = Field(
+        default=4096, ge=16, description="Connections at once, as far as the limit of open files allows"
+    )
+    connections_per_client: int = Field(
+        default=1024, ge=4, description="Connections at once of one address that is no trusted proxy"
+    )
+    sockets: int = Field(default=500, ge=1, description="WebSockets at once")
+    sockets_per_user: int = Field(
+        default=30, ge=1, description="WebSockets at once of one user, or of one address without users"
+    )
+    request_timeout_s: float = Field(
+        default=20.0,
+        ge=1.0,
+        le=3600.0,
+        description="Seconds in which the head of a request has to come, and the next 4 KiB of its body",
+    )
     upload_limit_mib: int = Field(default=4096, ge=1, description="Largest upload accepted, MiB")
+
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _networks(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for text in value:
+            try:
+                ipaddress.ip_network(text)
+            except ValueError:
+                raise ValueError(f"expected IP addresses or networks, found {text!r}") from None
+        return value
 
     def resolved_database_url(self) -> str:
         """The SQLAlchemy URL in force."""
         if self.database_url is not None:
             return normalised_url(self.database_url.get_secret_value())
         return f"sqlite:///{self.home / 'linna.db'}"
+
+    def resolved_migration_url(self) -> str:
+        """The SQLAlchemy URL that changes of the schema are made with."""
+        if self.migration_database_url is not None:
+            return normalised_url(self.migration_database_url.get_secret_value())
+        return self.resolved_database_url()
 
     def resolved_live_console(self) -> tuple[str, int] | None:
         """Host and port of the console of a live payload; None where there is none."""
@@ -75,7 +146,9 @@ class Settings(BaseSettings):
 def load_settings(**given: object) -> Settings:
     """Settings from the environment, overridden by what is given (None means: not given).
 
-    ``LINNA_DATABASE_URL_FILE`` and ``LINNA_BROKER_URL_FILE`` name files that hold the secret instead.
+    ``LINNA_DATABASE_URL_FILE``, ``LINNA_MIGRATION_DATABASE_URL_FILE`` and ``LINNA_BROKER_URL_FILE`` name files that
+    hold the secret instead; ``LINNA_DATABASE_PASSWORD_FILE`` and the like name files with the password alone, for a URL
+    that has a user and no password.
 
     Raises
     ------
@@ -83,21 +156,40 @@ def load_settings(**given: object) -> Settings:
         If a value cannot be used; the message names the setting.
     """
     values = {name: value for name, value in given.items() if value is not None}
-    for name in ("database_url", "broker_url"):
+    for name in ("database_url", "migration_database_url", "broker_url"):
         path = os.environ.get(f"LINNA_{name.upper()}_FILE")
         if path and name not in values:
-            try:
-                values[name] = Path(path).read_text(encoding="utf-8").strip()
-            except OSError as error:
-                raise SettingsError(
-                    f"LINNA_{name.upper()}_FILE", "a readable file", f"{path} ({error.strerror})"
-                ) from None
+            values[name] = _secret(name, path)
+        password = os.environ.get(f"LINNA_{name.removesuffix('_url').upper()}_PASSWORD_FILE")
+        url = values.get(name) or os.environ.get(f"LINNA_{name.upper()}")
+        if password and url:
+            values[name] = _with_password(
+                str(url), _secret(f"{name.removesuffix('_url')}_password", password)
+            )
     try:
         return Settings(**values)  # type: ignore[arg-type]
     except ValidationError as error:
         first = error.errors()[0]
         name = "LINNA_" + "_".join(str(part) for part in first["loc"]).upper()
         raise SettingsError(name, first["msg"].lower(), repr(first.get("input"))) from None
+
+
+def _secret(name: str, path: str) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8").strip()
+    except OSError as error:
+        raise SettingsError(
+            f"LINNA_{name.upper()}_FILE", "a readable file", f"{path} ({error.strerror})"
+        ) from None
+
+
+def _with_password(url: str, password: str) -> str:
+    """The URL of a user without a password, with this one."""
+    scheme, mark, rest = url.partition("://")
+    user, at, place = rest.rpartition("@")
+    if not at or ":" in user:
+        return url
+    return f"{scheme}{mark}{user}:{quote(password, safe='')}@{place}"
 
 
 def normalised_url(url: str) -> str:

@@ -1,6 +1,6 @@
 """The `linna` command: finds the group asked for, imports only that one, turns known errors into one line.
 
-Exit status: 0 done, 1 a gate or requirement not met, 2 bad usage or bad input, 130 interrupted.
+Exit status: 0 done, 1 a gate or requirement not met, 2 bad usage or bad input, 3 inconclusive, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -33,6 +33,8 @@ GROUPS: dict[str, tuple[str, str]] = {
     "dataset": ("dataset", "build, check and summarise detector data sets"),
     "detector": ("detector", "train, export, evaluate and run the crater detector"),
     "tm": ("tm", "decode and check telemetry; the dictionary as ICD and XTCE"),
+    "link": ("link", "link settings of a recorded downlink, with the evidence"),
+    "mission": ("mission", "mission descriptions: write, check, add, list, show"),
     "ingest": ("ingest", "ingest downlink files or pass archives into the ground database"),
     "pass": ("pass_", "list and show passes"),
     "report": ("report", "write the report of a pass"),
@@ -42,8 +44,11 @@ GROUPS: dict[str, tuple[str, str]] = {
     "command": ("command", "telecommands: queue, release, uplink, verification"),
     "serve": ("serve", "run the ground service's HTTP API"),
     "worker": ("worker", "run a job worker of the ground service"),
-    "db": ("db", "database migrations"),
-    "user": ("user", "users of the ground service"),
+    "runner": ("runner", "run payload builds for a service, in a container of their own"),
+    "db": ("db", "the database: schema, backup, export and import"),
+    "verify": ("verify", "check the archive against itself: files, rows, packets, audit chain"),
+    "user": ("user", "users of the ground service and their tokens"),
+    "audit": ("audit", "the audit log: who did what, and the head of its hash chain"),
 }
 
 

@@ -7,6 +7,7 @@ LunarError
 ├── UnknownFrameError        a reference frame or centre that cannot be converted
 ├── EphemerisError           states that form no ephemeris, or that a file format cannot hold
 ├── EphemerisCoverageError   an epoch outside the span of an ephemeris or orientation, or inside a gap of it
+├── LensError                a distortion that gives some pixels no ray
 └── OrbitError               elements or states that are no orbit about the Moon
     └── ImpactError          the orbit meets the ground, with epoch and place
 """
@@ -32,6 +33,10 @@ class DataFileError(LunarError):
         self.found = found
         place = f"{path}: {where}" if where else str(path)
         super().__init__(f"{place}: expected {expected}, found {found}")
+
+
+class LensError(LunarError):
+    """A lens distortion that gives some pixels of the image no ray, or several."""
 
 
 class TimeFormatError(LunarError):

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.constants import MOON_RADIUS_M
 from lunar.gravity import GravityField, acceleration
 
 Float = NDArray[np.float64]
@@ -24,6 +25,9 @@ Densities = tuple[float, float, float]
 FAR_SIDE_COSINE = float(np.cos(np.radians(105.0)))
 """Cosine of the angle from the middle of the near side beyond which no orbiter of old was in sight of the Earth:
 errors of LP165P at 30 km grow from 6 mGal at 97 degrees of longitude to 30 at 127."""
+
+# The orbit of the study: the paper's semi-major axis and eccentricity, polar.
+_SEMI_MAJOR_M, _ECCENTRICITY = 1_768_180.0, 0.006908
 
 # GRAIL's field to degree 150 beyond the degree, 16 revolutions of an orbit like the paper's at 30 km, nodes drawn at
 # random: two-sided spectral density, m^2/s^3, radial, transverse, normal (transverse from the faster half: the slower
@@ -39,11 +43,75 @@ _OMITTED_M2_S3 = {
 }
 # Fields made before GRAIL: tracked over the near side only, since no orbiter is in sight of the Earth over the other.
 _OLDER = ("LP", "GLGM", "JGL")
-# LP165P against GRAIL, both to degree 100, on 30 such revolutions: 2 to 6 mGal over the near side, 30 to 43 over the
-# far side in waves of some 300 s, of which a fifth is left over the time of a coast; how much of it was set on the NEES
-# of the tuning track: `linna orbit omission --flown FILE --revolutions 30` measures four to ten times as much there.
+# LP165P against GRAIL, both to degree 100: 2 to 6 mGal over the near side, 30 to 43 over the far side in waves of some
+# 300 s. The far side is as measured, from means over 208 s on 40 polar circles at 30 km; over the altitudes of the
+# paper's orbit `linna orbit omission --flown FILE --revolutions 40` gives a quarter more. A quarter of it, as once set
+# on the NEES of a polar track, claims too much after a coast over the far side on a track inclined by 60 degrees.
 _NEAR_SIDE_M2_S3 = (5e-8, 3e-9, 5e-8)
-_FAR_SIDE_M2_S3 = (1.3e-6, 2e-7, 6.5e-7)
+_FAR_SIDE_M2_S3 = (5.3e-6, 1.8e-6, 4.6e-6)
+
+
+# A harmonic of degree n falls with height as (R/r)^(n+2), its density as the square of that. What a cut at degree N
+# omits falls like degree N + 14, measured as `linna orbit omission` does on circles at 15 and 46 km, GRAIL's field to
+# degree 150 cut at 8, 20, 30, 50, 70 and 100, within 6 %.
+_OMITTED_ABOVE = 14
+# What LP165P has wrong falls like degree 87 over the near side and 27 over the far side, measured in the same way.
+_NEAR_SIDE_DEGREE, _FAR_SIDE_DEGREE = 87, 27
+
+REFERENCE_ALTITUDE_M = 30_000.0
+"""Altitude at which `FieldNoise` gives densities."""
+
+
+@dataclass(frozen=True, slots=True)
+class FieldNoise:
+    """White acceleration that stands for what a gravity field lacks or has wrong, and how it falls with altitude.
+
+    Attributes
+    ----------
+    near_psd_m2_s3, far_psd_m2_s3
+        Two-sided spectral density at `REFERENCE_ALTITUDE_M` over the near and the far side, radial, transverse, normal.
+    near_scale_height_m, far_scale_height_m
+        Height over which the density falls to 1/e.
+    """
+
+    near_psd_m2_s3: Densities
+    far_psd_m2_s3: Densities
+    near_scale_height_m: float
+    far_scale_height_m: float
+
+
+def field_noise(name: str, degree: int) -> FieldNoise:
+    """Return what a field by its name, cut at a degree, lacks or has wrong, by side of the Moon and altitude.
+
+    Densities over an orbit like the paper's (`field_psd_m2_s3`) are means over its altitudes. Where the density falls
+    to 1/e in a height H, the mean over an orbit of mean altitude h and amplitude a e is exp((30 km - h) / H) I0(ae / H)
+    times that at 30 km.
+    """
+    omitted = (omission_psd_m2_s3(degree), _scale_height_m(degree + _OMITTED_ABOVE))
+    if not name.upper().startswith(_OLDER):
+        psd = _at_reference(*omitted)
+        return FieldNoise(psd, psd, omitted[1], omitted[1])
+    sides = []
+    for wrong, wrong_degree in ((_NEAR_SIDE_M2_S3, _NEAR_SIDE_DEGREE), (_FAR_SIDE_M2_S3, _FAR_SIDE_DEGREE)):
+        parts = [omitted, (wrong, _scale_height_m(wrong_degree))]
+        densities = [_at_reference(*part) for part in parts]
+        # One exponential for the sum of two: its slope at the reference altitude.
+        slope = sum(psd[0] / height for psd, (_, height) in zip(densities, parts, strict=True))
+        total = _sum(*densities)
+        sides.append((total, total[0] / slope))
+    (near, near_height), (far, far_height) = sides
+    return FieldNoise(near, far, near_height, far_height)
+
+
+def _scale_height_m(degree: float) -> float:
+    return _SEMI_MAJOR_M / (2.0 * (degree + 2.0))
+
+
+def _at_reference(mean: Densities, scale_height_m: float) -> Densities:
+    """Return the density at the reference altitude of one whose mean over the orbit of the study is given."""
+    altitude_m, amplitude_m = _SEMI_MAJOR_M - MOON_RADIUS_M, _SEMI_MAJOR_M * _ECCENTRICITY
+    gain = np.exp((REFERENCE_ALTITUDE_M - altitude_m) / scale_height_m) * np.i0(amplitude_m / scale_height_m)
+    return mean[0] / float(gain), mean[1] / float(gain), mean[2] / float(gain)
 
 
 def omission_psd_m2_s3(degree: int) -> Densities:
@@ -68,8 +136,6 @@ def _sum(one: Densities, other: Densities) -> Densities:
     return one[0] + other[0], one[1] + other[1], one[2] + other[2]
 
 
-# The orbit of the study: the paper's semi-major axis and eccentricity, polar.
-_SEMI_MAJOR_M, _ECCENTRICITY = 1_768_180.0, 0.006908
 _MOON_TURN_RAD_S = 2.6617e-6
 _SAMPLES, _WAVES = 1_024, 30
 _PIECES = 32

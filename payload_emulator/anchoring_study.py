@@ -2,7 +2,7 @@
 
 Every run is the same flight over the same craters with the same detector; only what is on board changes. Three ways
 to choose: at random, the largest first, and spread evenly over the ground (the largest of each cell of a grid that
-grows finer until there are enough). Simulated detections, rung 2.
+grows finer until there are enough). Simulated detections, level 2.
 """
 
 from __future__ import annotations

@@ -28,6 +28,7 @@ from payload_emulator.flight.ports import ResetCause
 from payload_emulator.flying import SPACECRAFT_ID, CatalogueDetector, Sender, fly, timeline
 from payload_emulator.link import Reception, save_receptions, save_time_receptions, transmit
 from payload_emulator.loading import LoadedPayload, load_payload
+from payload_emulator.mission import save_attitudes, save_mission
 from payload_emulator.recording import StepInput, save_frame_times, save_image, save_record, step_input
 from payload_emulator.scenario import Scenario, format_scenario
 from payload_emulator.scoring import score_navigation
@@ -100,7 +101,7 @@ def load_scenario_payload(world: World, data: DataFolder) -> tuple[LoadedPayload
     """The payload loaded for a world, with the reference and the catalogue that the ground made its tables of."""
     scenario = world.scenario
     truth_ephemeris = sample_truth(world.truth, world.frame_utc_ns)
-    reference = with_reference_error(truth_ephemeris, scenario.reference.position_error_m, scenario.seed)
+    reference = with_reference_error(truth_ephemeris, scenario.reference, scenario.seed)
     catalogue = catalogue_near_track(world)
     loaded = load_payload(
         scenario,
@@ -150,6 +151,8 @@ def _emulate_into(
     reception = transmit(sender.transmitter.dumps, sender.transmitter.settings, scenario.link, scenario.seed)
     save_record(folder, inputs, loaded.parameters, loaded.tables)
     save_frame_times(folder, world.frame_utc_ns)
+    save_attitudes(folder, inputs)
+    save_mission(folder, world, data)
     save_oem(sample_truth(world.truth, world.frame_utc_ns), folder / "truth.oem")
     save_oem(reference, folder / "reference.oem")
     save_catalogue(catalogue, folder / "catalogue.csv")
@@ -200,6 +203,7 @@ def _summary(
         },
         "maneuvers": len(world.burns),
         **spacecraft.payload.summary(),
+        "truth_reads_after_start": spacecraft.truth_reads.count,
         "link": reception.account,
         "resets": [ResetCause(cause).name for cause in spacecraft.resets],
         "mode": spacecraft.payload.mode.name,

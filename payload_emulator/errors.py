@@ -43,7 +43,17 @@ class DatasetError(PayloadError):
 
 
 class ParameterError(PayloadError):
-    """A parameter file is no TOML, or names a parameter that flight does not have, or gives it another type."""
+    """A parameter file is no TOML, or names a parameter that flight does not have, or gives it an impossible value.
+
+    `file`, `key`, `expected` and `found` are the parts of the message.
+    """
+
+    def __init__(self, file: str, key: str, expected: str, found: str) -> None:
+        super().__init__(f"{file}{', ' if key else ''}{key}: expected {expected}, found {found}")
+        self.file = file
+        self.key = key
+        self.expected = expected
+        self.found = found
 
 
 class RecordError(PayloadError):

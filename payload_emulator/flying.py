@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lunar.camera import project_mcmf
+from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import spherical_from_mcmf
 from lunar.third_bodies import sun_position_icrf_m
@@ -30,7 +31,7 @@ from tmtc.downlink import LinkSettings
 SPACECRAFT_ID = 0x4C
 
 _NS = 1_000_000_000
-_PLAYBACK_CHANNEL = 1
+PLAYBACK_CHANNEL = 1
 # Source of the planned telecommands; whoever commands by hand has another one, with counts of its own.
 _PLANNING_SOURCE = 1
 _TIME_RATE_EXPONENT = 1  # a clock known to be off is watched: a time report every second frame of telemetry
@@ -114,12 +115,18 @@ class CatalogueDetector:
 
 
 def craters_in_view(
-    world: World, exposure: Exposure, smallest_px: float
+    world: World, exposure: Exposure, smallest_px: float, craters: CraterCatalogue | None = None
 ) -> tuple[IntArray, NDArray[np.float64], NDArray[np.float64]]:
-    """Craters of the terrain's catalogue in a picture: index, place (n, 2) and diameter (n,) in pixels."""
+    """Return the craters in a picture: index, place (n, 2) and diameter (n,) in pixels.
+
+    Parameters
+    ----------
+    craters
+        Catalogue with the heights of the rims; that of the terrain, whose heights may be unknown, when None.
+    """
     position = world.truth.positions_mcmf(exposure.utc_ns)[0]
     latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))
-    craters, camera = world.terrain.catalogue, world.true_camera
+    craters, camera = world.terrain.catalogue if craters is None else craters, world.true_camera
     reach_m = min(2.5 * altitude * np.tan(camera.fov_rad / 2.0), 0.1 * MOON_RADIUS_M)
     near = craters.near(latitude, longitude, reach_m)
     points = craters.position_mcmf_m[near]
@@ -358,7 +365,7 @@ class Sender:
         now = clock_ticks(self.world, flown.moment.utc_ns)
         for packet in flown.packets:
             late = stations and now - int.from_bytes(packet[14:20], "big") > _LATE_TICKS
-            self._waiting.setdefault(_PLAYBACK_CHANNEL if late else 0, []).append((packet, flown.clcw))
+            self._waiting.setdefault(PLAYBACK_CHANNEL if late else 0, []).append((packet, flown.clcw))
             if not late and int.from_bytes(packet[:2], "big") & 0x7FF == APID_TIME_REPORT:
                 self.time_reports.append((packet, flown.moment.utc_ns))
         waiting = sum(len(packet) for packets in self._waiting.values() for packet, _ in packets)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lunar.camera import ground_point_sphere
 from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
+from lunar.lens import BrownCamera
 from lunar.oem import load_oem
 from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
@@ -23,7 +24,6 @@ from payload_emulator.scenario import Scenario
 from payload_emulator.sim import raymarch, renderer
 from payload_emulator.sim.cycles_scene import CyclesSettings, describe_scene
 from payload_emulator.sim.labels import Labels, label_frame, label_frame_as_the_paper
-from payload_emulator.sim.lens import BrownCamera
 from payload_emulator.sim.light import sun_angles
 from payload_emulator.sim.photometry import Photometry
 from payload_emulator.sim.renderer import Rendering

@@ -1,7 +1,7 @@
 """How often craters are taken for others: identification on simulated detections of a real catalogue.
 
 Detections are drawn from the craters in view with a recall, a precision and errors that are stated; no images are
-made (rungs 1 and 2 of the evidence ladder). Hostile frames come with the same numbers: nothing but false detections,
+made (evidence levels 1 and 2). Hostile frames come with the same numbers: nothing but false detections,
 mirror images, images turned by a right angle. A fix is wrong if half of its pairs or more are, and its place is.
 """
 

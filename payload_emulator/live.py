@@ -14,16 +14,16 @@ import base64
 import contextlib
 import json
 import selectors
-import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from lunar.catalogue import CraterCatalogue
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from lunar.timescales import format_utc
 from payload_emulator.errors import LinkError
@@ -39,12 +39,15 @@ from payload_emulator.flying import (
     timeline,
 )
 from payload_emulator.link import LIGHT_S, Receiver, Transmitter, transmit
+from payload_emulator.live_ports import Server
 from payload_emulator.spacecraft import Spacecraft
 from payload_emulator.world import World, exposures
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import LinkSettings
 from tmtc.errors import TmtcError
 from tmtc.uplink import CLTU_START, CLTU_TAIL
+
+Signal = TypeVar("Signal")
 
 _NS = 1_000_000_000
 _POLL_S = 0.05
@@ -112,62 +115,21 @@ _TELECOMMAND_START = 0b00011
 
 
 @dataclass(slots=True, eq=False)
-class Server:
-    """Clients of one TCP port; what they send goes to `receive`, octet by octet as it comes."""
+class Flight(Generic[Signal]):
+    """Signals on their way, given to `arrive` when it is over; what started later arrives later."""
 
-    name: str
-    port: int
-    host: str
-    receive: Callable[[bytes], None]
-    listener: socket.socket = field(init=False)
-    clients: list[socket.socket] = field(default_factory=list)
+    arrive: Callable[[Signal], None]
+    _on_the_way: deque[tuple[float, Signal]] = field(default_factory=deque)
 
-    def __post_init__(self) -> None:
-        try:
-            self.listener = socket.create_server((self.host, self.port))
-        except OSError as error:
-            raise LinkError(
-                f"{self.name} port {self.port}: expected a free port on {self.host}, found {error.strerror}"
-            ) from None
-        self.listener.setblocking(False)
-        self.port = int(self.listener.getsockname()[1])
-
-    def send(self, octets: bytes) -> None:
-        """Give octets to every client; one that does not take them in time is let go."""
-        for client in list(self.clients):
-            try:
-                client.settimeout(2.0)
-                client.sendall(octets)
-            except OSError:
-                self.drop(client)
-
-    def drop(self, client: socket.socket) -> None:
-        with contextlib.suppress(ValueError):
-            self.clients.remove(client)
-        client.close()
-
-    def close(self) -> None:
-        for client in list(self.clients):
-            self.drop(client)
-        self.listener.close()
-
-
-@dataclass(slots=True, eq=False)
-class Flight:
-    """Octets on their way, given to `arrive` when it is over; what started later arrives later."""
-
-    arrive: Callable[[bytes], None]
-    _on_the_way: deque[tuple[float, bytes]] = field(default_factory=deque)
-
-    def start(self, octets: bytes, seconds: float) -> None:
-        """Send octets; without a way they are there at once."""
+    def start(self, signal: Signal, seconds: float) -> None:
+        """Send a signal; without a way it is there at once."""
         due = time.monotonic() + seconds
         if self._on_the_way:
             due = max(due, self._on_the_way[-1][0])
         elif seconds <= 0.0:
-            self.arrive(octets)
+            self.arrive(signal)
             return
-        self._on_the_way.append((due, octets))
+        self._on_the_way.append((due, signal))
 
     def land(self, now: float) -> None:
         """Hand over what has arrived by a time of the monotonic clock."""
@@ -189,6 +151,8 @@ class LivePayload:
         Simulated seconds in a second of the wall clock; 0: as quick as it goes.
     paused
         Whether time stands still until `run` or `step`.
+    catalogue
+        Craters with the heights of their rims, for the rings of the console; without it the terrain's catalogue.
     has_operator
         Whether the scenario's own operator commands, too; without it, telecommands come over TCP only, whose counts its
         own would collide with.
@@ -204,18 +168,20 @@ class LivePayload:
     paused: bool = False
     stop_at_end: bool = False
     has_operator: bool = True
+    catalogue: CraterCatalogue | None = None
     stopping: threading.Event = field(default_factory=threading.Event)
     sent: int = 0
     _servers: dict[str, Server] = field(init=False)
     _orders: deque[bytes] = field(default_factory=deque)
-    _uplink: TelecommandBuffer = field(default_factory=TelecommandBuffer)
-    _words: bytes = b""
+    _receiver: Receiver = field(default_factory=lambda: Receiver(SPACECRAFT_ID))
+    _uplinks: dict[int, TelecommandBuffer] = field(default_factory=dict)
+    _words: dict[int, bytes] = field(default_factory=dict)
     _steps: int = 0
     _discontinuous: bool = False
     _console_count: int = _CONSOLE_COUNTS
     _transmitter: Transmitter = field(init=False)
-    _upwards: Flight = field(init=False)
-    _downwards: Flight = field(init=False)
+    _upwards: Flight[tuple[int, bytes]] = field(init=False)
+    _downwards: Flight[bytes] = field(init=False)
     _light_s: float = LIGHT_S
     _heard: bool = True
 
@@ -225,17 +191,33 @@ class LivePayload:
         settings = LinkSettings(coding=self.world.scenario.link.coding)
         self._transmitter = Transmitter(SPACECRAFT_ID, settings)
         self._servers = {}
-        ports = (
-            ("telemetry", self.telemetry_port, lambda octets: None),
-            ("telecommand", self.telecommand_port, self._take_telecommands),
-            ("console", self.console_port, self._take_words),
-        )
         try:
-            for name, port, receive in ports:
-                self._servers[name] = Server(name, port, self.host, receive)
+            self._open("telemetry", self.telemetry_port, lambda number, octets: None)
+            # The end of a connection takes as long as what was sent on it.
+            self._open(
+                "telecommand",
+                self.telecommand_port,
+                lambda number, octets: self._take_telecommands(octets, number),
+                lambda number: self._take_telecommands(b"", number),
+            )
+            self._open(
+                "console",
+                self.console_port,
+                self._take_words,
+                lambda number: self._words.pop(number, None),
+            )
         except LinkError:
             self.close()
             raise
+
+    def _open(
+        self,
+        name: str,
+        port: int,
+        receive: Callable[[int, bytes], None],
+        ended: Callable[[int], object] = lambda number: None,
+    ) -> None:
+        self._servers[name] = Server(name, port, self.host, receive, ended)
 
     @property
     def ports(self) -> dict[str, int]:
@@ -263,9 +245,7 @@ class LivePayload:
         interval_ns = round(self.world.scenario.camera.frame_interval_s * _NS)
         last = moments[-1]
         try:
-            with selectors.DefaultSelector() as selector:
-                for server in self._servers.values():
-                    selector.register(server.listener, selectors.EVENT_READ, server)
+            with selectors.DefaultSelector() as selector, self._served(selector):
                 pending = deque(moments)
                 before: Moment | None = None
                 while not self.stopping.is_set():
@@ -282,7 +262,7 @@ class LivePayload:
                     before = moment
                     exposure = next(frames) if moment.frame >= 0 else None
                     self._light_s, self._heard = moment.light_s, moment.heard
-                    receiver = self._uplink.receiver
+                    receiver = self._receiver
                     # Who listens is taken to track it with a carrier, who commands to send bits on it.
                     commanded = self.has_operator or bool(self._servers["telecommand"].clients)
                     receiver.bit_lock = self._heard and commanded
@@ -294,6 +274,16 @@ class LivePayload:
                     self._tell(flown)
         finally:
             frames.close()
+
+    @contextlib.contextmanager
+    def _served(self, selector: selectors.BaseSelector) -> Iterator[None]:
+        for server in self._servers.values():
+            server.attach(selector)
+        try:
+            yield
+        finally:
+            for server in self._servers.values():
+                server.detach()
 
     def _wait(self, selector: selectors.BaseSelector, seconds: float) -> None:
         """Serve the ports until it is time for the next moment."""
@@ -317,41 +307,31 @@ class LivePayload:
         now = time.monotonic()
         self._upwards.land(now)
         self._downwards.land(now)
-        for key, _ in selector.select(timeout_s):
-            server: Server = key.data
-            if key.fileobj is server.listener:
-                with contextlib.suppress(OSError):
-                    client, _ = server.listener.accept()
-                    server.clients.append(client)
-                    selector.register(client, selectors.EVENT_READ, server)
-                continue
-            client = key.fileobj  # type: ignore[assignment]
-            try:
-                octets = client.recv(65_536)
-            except OSError:
-                octets = b""
-            if octets:
-                server.receive(octets)
-            else:
-                selector.unregister(client)
-                server.drop(client)
+        for key, events in selector.select(timeout_s):
+            server, client = key.data
+            server.serve(client, events)
 
-    def _take_telecommands(self, octets: bytes) -> None:
-        self._upwards.start(octets, self._way_s)
+    def _take_telecommands(self, octets: bytes, connection: int = 0) -> None:
+        """Send the octets of a connection up; none mean that it has ended."""
+        self._upwards.start((connection, octets), self._way_s)
 
-    def _arrive(self, octets: bytes) -> None:
-        """Octets reach the spacecraft's antenna."""
-        if self._heard:
-            self._orders.extend(self._uplink.take(octets))
+    def _arrive(self, signal: tuple[int, bytes]) -> None:
+        """Octets reach the spacecraft's antenna; a packet that a lost connection broke off ends with it."""
+        connection, octets = signal
+        if not octets:
+            self._uplinks.pop(connection, None)
+        elif self._heard:
+            uplink = self._uplinks.setdefault(connection, TelecommandBuffer(self._receiver))
+            self._orders.extend(uplink.take(octets))
 
     @property
     def _way_s(self) -> float:
         """Seconds of the wall clock that a signal takes now."""
         return self._light_s / self.rate if self.rate > 0.0 else 0.0
 
-    def _take_words(self, octets: bytes) -> None:
-        self._words = (self._words + octets)[-_BUFFER_LIMIT:]
-        *lines, self._words = self._words.split(b"\n")
+    def _take_words(self, connection: int, octets: bytes) -> None:
+        words = (self._words.get(connection, b"") + octets)[-_BUFFER_LIMIT:]
+        *lines, self._words[connection] = words.split(b"\n")
         for line in lines:
             self._obey(line.decode("utf-8", "replace").split())
 
@@ -399,14 +379,21 @@ class LivePayload:
             self._downwards.start(octets, self._way_s)
             self.sent += 1
         if self._servers["console"].clients:
-            self._say(snapshot(self.world, self.spacecraft, flown, self.paused, self.rate))
+            self._say(snapshot(self.world, self.spacecraft, flown, self.paused, self.rate, self.catalogue))
 
     def _say(self, message: dict[str, Any]) -> None:
         if "console" in self._servers:
             self._servers["console"].send(json.dumps(message).encode() + b"\n")
 
 
-def snapshot(world: World, spacecraft: Spacecraft, flown: Flown, paused: bool, rate: float) -> dict[str, Any]:
+def snapshot(
+    world: World,
+    spacecraft: Spacecraft,
+    flown: Flown,
+    paused: bool,
+    rate: float,
+    craters: CraterCatalogue | None = None,
+) -> dict[str, Any]:
     """A moment for a viewer: image, detections, catalogue, outcome and estimate of each estimator beside the truth."""
     message: dict[str, Any] = {
         "kind": "turn" if flown.exposure is None else "frame",
@@ -465,7 +452,7 @@ def snapshot(world: World, spacecraft: Spacecraft, flown: Flown, paused: bool, r
                 "altitude_m": altitude,
             },
             "altitude_km": altitude / 1e3,
-            "catalogue": _catalogue(world, flown),
+            "catalogue": _catalogue(world, flown, craters),
             "image_jpeg": _jpeg(flown.exposure.image),
         }
         for estimate in estimates.values():
@@ -480,12 +467,13 @@ def snapshot(world: World, spacecraft: Spacecraft, flown: Flown, paused: bool, r
     return message
 
 
-def _catalogue(world: World, flown: Flown) -> list[dict[str, float]]:
-    """Craters of the terrain's catalogue in the picture, the largest of them."""
+def _catalogue(world: World, flown: Flown, craters: CraterCatalogue | None) -> list[dict[str, float]]:
+    """Return the largest craters in the picture: of the given catalogue, else of that of the terrain."""
     assert flown.exposure is not None
-    index, uv, diameter_px = craters_in_view(world, flown.exposure, _SMALLEST_SHOWN_PX)
+    craters = world.terrain.catalogue if craters is None else craters
+    index, uv, diameter_px = craters_in_view(world, flown.exposure, _SMALLEST_SHOWN_PX, craters)
     shown = np.argsort(-diameter_px, kind="stable")[:_SHOWN_CRATERS].tolist()
-    ids = world.terrain.catalogue.ids[index]
+    ids = craters.ids[index]
     return [
         {
             "id": int(ids[k]),

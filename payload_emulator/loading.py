@@ -121,7 +121,7 @@ def load_payload(
     """
     model_octets = _model_octets(model)
     navigation = scenario.navigation
-    field = _filter_field(navigation.filter_gravity, navigation.filter_degree, data)
+    field = filter_field(navigation.filter_gravity, navigation.filter_degree, data)
     chosen = BuildParameters(
         DetectorParameters(width_px=camera.width_px, height_px=camera.height_px),
         FlightParameters(
@@ -267,8 +267,8 @@ def _burn_table(burns: Sequence[TrueBurn]) -> bytes:
     )
 
 
-def _filter_field(name: str, degree: int, data: DataFolder) -> GravityField:
-    """The gravity field the filter flies: by default another one than the truth's."""
+def filter_field(name: str, degree: int, data: DataFolder) -> GravityField:
+    """Return the gravity field that the filter flies: by default another one than the truth's."""
     if name == "auto":
         if data.gravity_alternative is None:
             return builtin_gravity().truncated(min(degree, _CUT_DEGREE))

@@ -61,8 +61,9 @@ class SimulatedDetector:
         Error of centres, per axis; `claimed_sigma_px` is what the detector says of it (None: the truth).
     persistence
         Share of the variance that stays with its crater.
-    bias_px, bias_sigma_px
-        Shift of all detections, right and down: given, and drawn once per run on top.
+    bias_px, bias_sigma_px, bias_correlation_s
+        Shift of all detections, right and down: given, and drawn on top, as a first-order Gauss-Markov process with
+        this memory (infinite: constant for a run).
     scale, scale_sigma
         Stretch of all detections about the image centre: given, and drawn once per run on top.
     log_diameter_sigma
@@ -76,6 +77,7 @@ class SimulatedDetector:
     persistence: float = 0.0
     bias_px: tuple[float, float] = (0.0, 0.0)
     bias_sigma_px: float = 0.0
+    bias_correlation_s: float = float("inf")
     scale: float = 0.0
     scale_sigma: float = 0.0
     log_diameter_sigma: float = 0.1
@@ -124,12 +126,14 @@ class NavigationCase:
         True craters with rim heights.
     start_position_m, start_velocity_m_s
         Size (3-D, one sigma) of the error of the state that starts the filter.
-    attitude_noise_rad, attitude_bias_rad
-        Of the ADCS message, per axis, one sigma; the bias is drawn once per run.
+    attitude_noise_rad, attitude_bias_rad, attitude_correlation_s
+        Of the ADCS message, per axis, one sigma; the bias is a first-order Gauss-Markov process with this memory
+        (infinite: constant for a run).
     on_board
         Craters that the uploaded catalogue holds, a mask; None for all.
-    any_node
-        Each run turns the orbit about the Moon's axis by an angle of its own.
+    any_node, node_longitudes_deg
+        Each run turns the orbit about the Moon's axis by an angle of its own, and so that the longitude of the
+        ascending node at the epoch lies between two values, if they are given.
     """
 
     epoch_utc_ns: int
@@ -150,9 +154,11 @@ class NavigationCase:
     start_velocity_m_s: float = 1.0
     attitude_noise_rad: float = float(np.radians(0.01))
     attitude_bias_rad: float = float(np.radians(0.01))
+    attitude_correlation_s: float = float("inf")
     kidnap: Kidnap | None = None
     on_board: NDArray[np.bool_] | None = None
     any_node: bool = False
+    node_longitudes_deg: tuple[float, float] | None = None
     parameters: AnchoredParameters = field(default_factory=AnchoredParameters)
 
 
@@ -236,7 +242,7 @@ class Consistency:
 
 def fly(case: NavigationCase, seed: int) -> NavigationRun:
     """Return one run of a case: the same seed, the same run."""
-    rng = np.random.default_rng(seed)
+    rng, given_px = np.random.default_rng(seed), np.array(case.detector.bias_px)
     case = _with_drawn_biases(case, np.random.default_rng((seed, 1)))
     if case.any_node:
         case = _with_drawn_node(case, np.random.default_rng((seed, 2)))
@@ -249,11 +255,20 @@ def fly(case: NavigationCase, seed: int) -> NavigationRun:
     navigator = _navigator(case, table, states[0], int(ticks[0]), rng)
     bias_rad = case.attitude_bias_rad * rng.standard_normal(3)
     lasting = rng.standard_normal((len(true_map), 2))
+    detector, slow = case.detector, np.random.default_rng((seed, 3))
+    elapsed_s = np.diff(case.frame_utc_ns) / _NS
+    tilts_rad = _wandering(bias_rad, case.attitude_bias_rad, case.attitude_correlation_s, elapsed_s, slow)
+    drawn_px = np.array(detector.bias_px) - given_px
+    shifts_px = given_px + _wandering(
+        drawn_px, detector.bias_sigma_px, detector.bias_correlation_s, elapsed_s, slow
+    )
     rows = []
     for k in range(ticks.size):
         camera_from_icrf = nadir_camera_from_mcmf(rotations[k] @ states[k, :3]) @ rotations[k]
-        found, truth = _detect(case, true_map, states[k, :3], camera_from_icrf, rotations[k], lasting, rng)
-        told = _turned(camera_from_icrf, bias_rad + case.attitude_noise_rad * rng.standard_normal(3))
+        found, truth = _detect(
+            case, true_map, states[k, :3], camera_from_icrf, rotations[k], lasting, shifts_px[k], rng
+        )
+        told = _turned(camera_from_icrf, tilts_rad[k] + case.attitude_noise_rad * rng.standard_normal(3))
         if case.kidnap is not None and case.kidnap.told and k == case.kidnap.frame:
             navigator.widen(case.kidnap.distance_m, 1e-3 * case.kidnap.distance_m)
         shown = bool(case.imaging[k])
@@ -360,10 +375,30 @@ def _with_drawn_biases(case: NavigationCase, rng: np.random.Generator) -> Naviga
     )
 
 
+def _wandering(
+    first: Float, sigma: float, correlation_s: float, elapsed_s: Float, rng: np.random.Generator
+) -> Float:
+    """Return a stationary first-order Gauss-Markov process (n + 1, k) from its first value over n steps."""
+    decay = np.exp(-elapsed_s / correlation_s)
+    fresh = sigma * np.sqrt(1.0 - decay**2)[:, None] * rng.standard_normal((elapsed_s.size, first.size))
+    values = np.empty((elapsed_s.size + 1, first.size))
+    values[0] = first
+    for k in range(elapsed_s.size):
+        values[k + 1] = decay[k] * values[k] + fresh[k]
+    return values
+
+
 def _with_drawn_node(case: NavigationCase, rng: np.random.Generator) -> NavigationCase:
     """The case with its orbit turned about the Moon's axis."""
-    axis = case.orientation.mcmf_from_icrf(float(tdb_s_from_utc_ns(case.epoch_utc_ns)))[2]
-    turn = _rotation(rng.uniform(0.0, 2.0 * np.pi) * axis)
+    rotation = case.orientation.mcmf_from_icrf(float(tdb_s_from_utc_ns(case.epoch_utc_ns)))
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    if case.node_longitudes_deg is not None:
+        normal = rotation @ np.cross(case.position_icrf_m, case.velocity_icrf_m_s)
+        low, high = case.node_longitudes_deg
+        # The ascending node lies along axis x normal.
+        now = float(np.arctan2(normal[0], -normal[1]))
+        angle = float(np.radians(low + (high - low) * angle / (2.0 * np.pi))) - now
+    turn = _rotation(angle * rotation[2])
     return replace(
         case,
         position_icrf_m=turn @ case.position_icrf_m,
@@ -455,6 +490,7 @@ def _detect(
     camera_from_icrf: Float,
     mcmf_from_icrf: Float,
     lasting: Float,
+    bias_px: Float,
     rng: np.random.Generator,
 ) -> tuple[Detections, Index]:
     """Return the detections of a frame and the crater that each is of, -1 for none."""
@@ -474,7 +510,7 @@ def _detect(
     seen = look(craters, index, pose, camera)
     fresh, kept = np.sqrt(1.0 - detector.persistence), np.sqrt(detector.persistence)
     error = detector.sigma_px * (fresh * rng.standard_normal((index.size, 2)) + kept * lasting[index])
-    uv = seen.uv_px + error + np.array(detector.bias_px)
+    uv = seen.uv_px + error + bias_px
     diameter = seen.diameter_px * np.exp(detector.log_diameter_sigma * rng.standard_normal(index.size))
     false = int(rng.poisson(max(index.size, 1) * (1.0 / detector.precision - 1.0)))
     corner = np.array([camera.width_px - 1.0, camera.height_px - 1.0])

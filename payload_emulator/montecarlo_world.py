@@ -1,9 +1,12 @@
-"""Worlds for Monte Carlo runs: gravity rough to any degree, craters of the paper's density, two tracks."""
+"""Worlds for Monte Carlo runs: gravity rough to any degree, craters of the paper's density, tracks.
+
+Noise of the filter is chosen on the track `tuning` alone. The others are held out: nothing is chosen on them.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -18,7 +21,8 @@ from payload_emulator.flight.anchored import AnchoredParameters
 from payload_emulator.flight.dynamics import ProcessNoise, process_noise
 from payload_emulator.montecarlo import CatalogueErrors, NavigationCase, SimulatedDetector
 
-Track = Literal["tuning", "test"]
+Track = Literal["test", "tuning", "inclined", "limb"]
+TRACKS: tuple[Track, ...] = get_args(Track)
 
 # Kaula's rule for the Moon: size of a normalised coefficient of degree n is this over n squared.
 KAULA = 2.5e-4
@@ -26,10 +30,37 @@ _TRUTH_DEGREE, _FILTER_DEGREE = 150, 100
 # Craters of 5 to 30 km per square metre, and the slope of their cumulative size distribution (the paper's counts).
 _DENSITY_M2, _SIZE_SLOPE = 2.09e-9, -1.77
 _NS = 1_000_000_000
-# The paper's orbit; the track for tuning lies elsewhere in inclination, node, perilune and time.
-_TRACKS = {
-    "test": ("2029-08-07T00:00:00Z", (89.076, 3.164, 333.604, 8.882)),
-    "tuning": ("2029-09-16T06:00:00Z", (86.5, 121.0, 210.0, 80.0)),
+
+
+@dataclass(frozen=True, slots=True)
+class TrackOrbit:
+    """An orbit that Monte Carlo runs fly, as elements at an epoch in the Moon's equator of date.
+
+    Attributes
+    ----------
+    angles_deg
+        Inclination, node, argument of perilune, true anomaly.
+    node_longitudes_deg
+        Longitudes of the ascending node among which each run draws its own; None for any.
+    """
+
+    epoch: str
+    semi_major_m: float
+    eccentricity: float
+    angles_deg: tuple[float, float, float, float]
+    node_longitudes_deg: tuple[float, float] | None = None
+
+
+_TRACKS: dict[Track, TrackOrbit] = {
+    # The paper's orbit: 19 to 43 km.
+    "test": TrackOrbit("2029-08-07T00:00:00Z", 1_768_180.0, 0.006908, (89.076, 3.164, 333.604, 8.882)),
+    # Another inclination, perilune and time: images from 19 km on.
+    "tuning": TrackOrbit("2029-09-16T06:00:00Z", 1_768_180.0, 0.006908, (86.5, 121.0, 210.0, 80.0)),
+    # Inclined by 60 degrees, nearly circular: 25 to 34 km.
+    "inclined": TrackOrbit("2029-11-02T12:00:00Z", 1_767_000.0, 0.0025, (60.0, 200.0, 20.0, 300.0)),
+    # Higher, and over the limbs as seen from the Earth, where a field without tracking of the far side is good: 34 to
+    # 62 km.
+    "limb": TrackOrbit("2030-01-15T18:00:00Z", 1_785_400.0, 0.008, (80.0, 30.0, 150.0, 190.0), (75.0, 105.0)),
 }
 
 
@@ -58,13 +89,13 @@ def crater_world(seed: int = 11) -> CraterCatalogue:
 
 
 def standard_case(data: DataFolder, track: Track, hours: float, noise_factor: float = 1.0) -> NavigationCase:
-    """The paper's orbit from 5 km and 5 m/s off, a frame each 15 s, images within 60 degrees of latitude.
+    """The orbit of a track from 5 km and 5 m/s off, a frame each 15 s, two imaging arcs of 37 minutes a revolution.
 
     Each run flies it with another node: over the same ground every run would meet the same errors of the gravity field,
     and however many there were, their average would tell of one draw.
 
     Truth flies GRAIL to degree 150, the filter Lunar Prospector's field to 100, where both are at hand; else a rough
-    field and the same cut. Every error that the filter allows for is drawn with the size that it allows.
+    field and the same cut. Every error that the filter allows for is drawn with the size and memory that it allows.
 
     Parameters
     ----------
@@ -75,11 +106,11 @@ def standard_case(data: DataFolder, track: Track, hours: float, noise_factor: fl
         gravity, other = load_gravity(data.gravity), load_gravity(data.gravity_alternative)
     else:
         gravity = other = rough_gravity(_TRUTH_DEGREE)
-    epoch, degrees = _TRACKS[track]
-    epoch_utc_ns = parse_utc(epoch)
-    inclination, node, perilune, anomaly = (float(value) for value in np.radians(degrees))
+    orbit = _TRACKS[track]
+    epoch_utc_ns = parse_utc(orbit.epoch)
+    inclination, node, perilune, anomaly = (float(value) for value in np.radians(orbit.angles_deg))
     position, velocity = icrf_state_from_elements(
-        Elements(1_768_180.0, 0.006908, inclination, node, perilune, anomaly),
+        Elements(orbit.semi_major_m, orbit.eccentricity, inclination, node, perilune, anomaly),
         float(tdb_s_from_utc_ns(epoch_utc_ns)),
         gravity.gm_m3_s2,
     )
@@ -101,9 +132,11 @@ def standard_case(data: DataFolder, track: Track, hours: float, noise_factor: fl
         filter_orientation=IauOrientation(),
         craters=crater_world(),
         any_node=True,
+        node_longitudes_deg=orbit.node_longitudes_deg,
         detector=SimulatedDetector(
             persistence=parameters.detection_persistence,
             bias_sigma_px=errors.pixel_bias_px,
+            bias_correlation_s=errors.pixel_correlation_s,
             scale_sigma=errors.scale_sigma,
         ),
         catalogue_errors=CatalogueErrors(offset_sigma_m=errors.catalogue_offset_m),
@@ -111,6 +144,7 @@ def standard_case(data: DataFolder, track: Track, hours: float, noise_factor: fl
         start_velocity_m_s=5.0,
         attitude_noise_rad=errors.attitude_noise_rad,
         attitude_bias_rad=errors.attitude_bias_rad,
+        attitude_correlation_s=errors.attitude_correlation_s,
         parameters=replace(
             parameters, noise=_scaled(process_noise(_FILTER_DEGREE, other.name), noise_factor)
         ),
@@ -122,9 +156,9 @@ def _scaled(noise: ProcessNoise, factor: float) -> ProcessNoise:
         return by * values[0], by * values[1], by * values[2]
 
     far = noise.far_side_psd_m2_s3
-    return ProcessNoise(
-        times(noise.white_psd_m2_s3, factor),
-        times(noise.markov_sigma_m_s2, float(np.sqrt(factor))),
-        noise.correlation_s,
-        None if far is None else times(far, factor),
+    return replace(
+        noise,
+        white_psd_m2_s3=times(noise.white_psd_m2_s3, factor),
+        markov_sigma_m_s2=times(noise.markov_sigma_m_s2, float(np.sqrt(factor))),
+        far_side_psd_m2_s3=None if far is None else times(far, factor),
     )

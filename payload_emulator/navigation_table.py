@@ -1,17 +1,20 @@
 """The navigation of several sessions side by side: a row per archive, from what its summary says.
 
-Errors are three-dimensional, in metres, after the frames counted (see `counted_from`); every row names its rung.
+Errors are three-dimensional, in metres, after the frames counted (see `counted_from`); every row names its
+evidence level, which follows from the world that the mission description of the archive declares.
 """
 
 from __future__ import annotations
 
 import json
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from payload_emulator.errors import RecordError
+from payload_emulator.mission import MISSION_FILE, level_of, level_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,8 +25,10 @@ class NavigationRow:
     ----------
     altitude_km
         Smallest, mean and largest over the frames.
-    rung
-        Of the evidence ladder: 2 on a procedural Moon, 3 on real terrain.
+    level
+        Evidence level: "2", "3s" or "3"; "" where the archive declares no world.
+    unseen_share
+        Share of frames over real terrain that was never used in training; None where it is not declared.
     median_m, p95_m, max_m
         Of the position while images come.
     coast_end_p95_m
@@ -36,7 +41,8 @@ class NavigationRow:
 
     scenario: str
     seed: int
-    rung: int
+    level: str
+    unseen_share: float | None
     altitude_km: tuple[float, float, float]
     frames: int
     counted_from: str
@@ -58,7 +64,7 @@ class NavigationRow:
 _COLUMNS = (
     "scenario",
     "seed",
-    "rung",
+    "level",
     "altitude km",
     "frames",
     "median m",
@@ -95,18 +101,31 @@ def load_row(archive: Path) -> NavigationRow:
             f"{path}: expected figures of the anchored estimator under navigation, found none; fly the scenario "
             "with --mode anchored"
         )
-    return row_of(summary)
+    return row_of(summary, *_declared(archive / MISSION_FILE))
 
 
-def row_of(summary: Mapping[str, Any]) -> NavigationRow:
-    """Return the row of a session's summary."""
+def _declared(path: Path) -> tuple[str, float | None]:
+    """Return level and share of unseen frames from a mission description; unknown without one."""
+    try:
+        evidence = tomllib.loads(path.read_text(encoding="utf-8")).get("evidence", {})
+    except FileNotFoundError:
+        return "", None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise RecordError(f"{path}: expected a mission description, found {error}") from None
+    world, share = evidence.get("world"), evidence.get("unseen_share")
+    unseen = float(share) if isinstance(share, int | float) else None
+    return level_of(str(world), unseen), unseen
+
+
+def row_of(summary: Mapping[str, Any], level: str = "", unseen: float | None = None) -> NavigationRow:
+    """Return the row of a session's summary, flown at an evidence level."""
     navigation, altitude = summary["navigation"], summary["altitude_km"]
     imaging = navigation["imaging"]
-    procedural = any("procedural" in str(name) for name in summary["data"])
     return NavigationRow(
         summary["scenario"],
         int(summary["seed"]),
-        2 if procedural else 3,
+        level,
+        unseen,
         (altitude["min"], altitude["mean"], altitude["max"]),
         int(summary["frames"]),
         navigation["counted_from"],
@@ -132,7 +151,7 @@ def cells(row: NavigationRow) -> list[str]:
     return [
         row.scenario,
         str(row.seed),
-        str(row.rung),
+        level_text(row.level, row.unseen_share),
         f"{mean:.0f} ({low:.0f} to {high:.0f})",
         str(row.frames),
         _number(row.median_m),

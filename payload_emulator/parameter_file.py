@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import tomllib
 from enum import IntEnum
 from types import NoneType, UnionType
@@ -19,6 +20,36 @@ import numpy as np
 from payload_emulator.errors import ParameterError
 from payload_emulator.flight.detector import DetectorParameters
 from payload_emulator.flight.payload import FlightParameters
+
+SHOWN = 80
+"""Characters of a wrong value that a message shows."""
+
+TYPE_WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
+
+_SHARE = (0.0, 1.0)
+_COUNT = (1, math.inf)
+RANGES: dict[str, tuple[float, float]] = {
+    "score_threshold": _SHARE,
+    "detection_persistence": _SHARE,
+    "agreement_share": _SHARE,
+    "false_set_limit": _SHARE,
+    "harmful_set_limit": _SHARE,
+    "false_fix_limit": _SHARE,
+    "max_detections": _COUNT,
+    "width_px": _COUNT,
+    "height_px": _COUNT,
+    "minimum_pairs": _COUNT,
+    "lost_search_every": _COUNT,  # divides the number of frames
+    "housekeeping_interval_s": (1e-3, math.inf),
+    "reference_interval_s": (1e-3, math.inf),
+    "fov_rad": (1e-3, math.pi),
+    "scale": (-0.5, 0.5),  # relative, of either sign
+}
+"""Least and greatest value of a parameter by its last name. All others are limits, lengths, times, sigmas or counts,
+which are never negative."""
+
+BOUND_WORDS = (("minimum", "maximum"), ("lowest", "highest"))
+"""Words that make a lower limit and its upper limit of the names of two parameters of a section."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -51,12 +82,12 @@ def parse_parameters(
     Raises
     ------
     ParameterError
-        No TOML, an unknown key, or a value of another type; the message names the key.
+        No TOML, an unknown key, or a value of another type or out of its range; the message names the key.
     """
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ParameterError(f"{source}: not TOML: {error}") from None
+        raise ParameterError(source, "", "parameters (TOML)", str(error)) from None
     changed: BuildParameters = _changed(flown, BuildParameters, table, source, "", dropped)
     return changed
 
@@ -126,7 +157,7 @@ def _changed(
 ) -> Any:
     """A dataclass with the fields that `table` names changed; built anew where there was none."""
     if not isinstance(table, dict):
-        raise ParameterError(f"{source}: [{path}] must be a table, found {type(table).__name__}")
+        raise ParameterError(source, path, "a table", repr(table)[:SHOWN])
     hints = get_type_hints(kind)
     known = [item.name for item in dataclasses.fields(kind)]
     values: dict[str, Any] = {}
@@ -137,13 +168,51 @@ def _changed(
             continue
         if key not in known:
             close = difflib.get_close_matches(key, known, n=1)
-            hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(known)}"
-            raise ParameterError(f"{source}: unknown key '{place}'; {hint}")
+            expected = f"{close[0]} (nearest known key)" if close else f"one of {', '.join(known)}"
+            raise ParameterError(source, place, expected, "an unknown key")
         values[key] = _converted(hints[key], getattr(value, key, None), given, source, place, dropped)
     try:
-        return kind(**values) if value is None else dataclasses.replace(value, **values)
+        result = kind(**values) if value is None else dataclasses.replace(value, **values)
     except TypeError:
-        raise ParameterError(f"{source}: [{path}] needs all of {', '.join(known)}") from None
+        raise ParameterError(source, path, f"all of {', '.join(known)}", ", ".join(table) or "none") from None
+    _refuse_crossed(result, values, source, path)
+    return result
+
+
+def _refuse_crossed(value: Any, changed: dict[str, Any], source: str, path: str) -> None:
+    """Refuse a lower limit of a section that lies above its upper limit.
+
+    Raises
+    ------
+    ParameterError
+        A changed limit crosses its counterpart.
+    """
+    for low_word, high_word in BOUND_WORDS:
+        for item in dataclasses.fields(value):
+            upper = item.name.replace(low_word, high_word)
+            if (
+                low_word not in item.name
+                or not hasattr(value, upper)
+                or not {item.name, upper} & set(changed)
+            ):
+                continue
+            low, high = getattr(value, item.name), getattr(value, upper)
+            if low > high:
+                raise ParameterError(source, f"{path}.{item.name}", f"at most {upper} = {high!r}", repr(low))
+
+
+def _in_range(given: float, source: str, place: str) -> None:
+    """Refuse a number that is not finite or outside the range of its parameter.
+
+    Raises
+    ------
+    ParameterError
+        It is.
+    """
+    low, high = RANGES.get(place.rsplit(".", 1)[-1].partition("[")[0], (0.0, math.inf))
+    if not math.isfinite(given) or not low <= given <= high:
+        expected = f"a finite number from {low:g}" + (f" to {high:g}" if math.isfinite(high) else "")
+        raise ParameterError(source, place, expected, repr(given))
 
 
 def _converted(
@@ -159,24 +228,22 @@ def _converted(
         return _changed(present, hint, given, source, place, dropped)  # type: ignore[arg-type]
     if origin is tuple:
         if not isinstance(given, list):
-            raise ParameterError(f"{source}: {place} must be a list, found {given!r}")
+            raise ParameterError(source, place, "a list", repr(given)[:SHOWN])
         kinds = [inner[0]] * len(given) if len(inner) == 2 and inner[1] is Ellipsis else list(inner)
         if len(kinds) != len(given):
-            raise ParameterError(f"{source}: {place} must have {len(kinds)} values, found {len(given)}")
+            raise ParameterError(source, place, f"{len(kinds)} values", str(len(given)))
         return tuple(
             _converted(kind, None, item, source, f"{place}[{i}]", dropped)
             for i, (kind, item) in enumerate(zip(kinds, given, strict=True))
         )
     if isinstance(hint, type) and issubclass(hint, IntEnum):
         if given not in hint.__members__:
-            raise ParameterError(
-                f"{source}: {place} must be one of {', '.join(hint.__members__)}, found {given!r}"
-            )
+            raise ParameterError(source, place, f"one of {', '.join(hint.__members__)}", repr(given)[:SHOWN])
         return hint[given]
     if hint is float and type(given) is int:
         given = float(given)
     if type(given) is not hint:
-        raise ParameterError(
-            f"{source}: {place} must be a {getattr(hint, '__name__', hint)}, found {given!r}"
-        )
+        raise ParameterError(source, place, TYPE_WORDS.get(hint, str(hint)), repr(given)[:SHOWN])
+    if hint in (int, float):
+        _in_range(given, source, place)
     return given

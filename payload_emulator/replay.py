@@ -85,15 +85,13 @@ def load_flight_build(path: Path) -> FlightBuild:
     """
     table = _build_table(path)
     if "command" in table:
-        raise ParameterError(f"{path}: expected a build of a model and parameters, found one with a command")
+        raise ParameterError(str(path), "command", "a build of a model and parameters", "one with a command")
 
     def octets_of(key: str) -> bytes:
         try:
             return (path.parent / str(table[key])).read_bytes()
         except OSError as error:
-            raise ParameterError(
-                f"{path}, {key}: expected a file {table[key]}, found none ({error.strerror})"
-            ) from None
+            raise ParameterError(str(path), key, f"a file {table[key]}", f"none ({error.strerror})") from None
 
     return FlightBuild(
         str(table.get("name", path.stem)),
@@ -101,6 +99,24 @@ def load_flight_build(path: Path) -> FlightBuild:
         octets_of("model") if "model" in table else None,
         octets_of("parameters").decode() if "parameters" in table else "",
     )
+
+
+def check_parameters(path: Path) -> None:
+    """Refuse a build file whose parameters this flight code does not have, or whose values it cannot have.
+
+    Raises
+    ------
+    ParameterError
+        The message names the parameter file, the key, what was expected and what was found.
+    """
+    name = str(_build_table(path).get("parameters", ""))
+    if not name:
+        return
+    try:
+        text = (path.parent / name).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ParameterError(name, "", "parameters (TOML, UTF-8)", str(error)) from None
+    parse_parameters(text, source=name)
 
 
 def names_command(path: Path) -> bool:
@@ -164,6 +180,8 @@ def replay_archive(
         "downlink_octets": len(octets),
         "dropped": list(record.dropped),
         **flown.summary,
+        # A replay has the record alone: no truth is there to be read.
+        "truth_reads_after_start": 0,
         "cpu_ms_per_frame": cpu_ms / max(frames, 1),
         "wall_s": round(wall_s, 3),
         "realtime_factor": round(frames * float(manifest.get("cadence_s") or 0.0) / max(wall_s, 1e-9), 2),
@@ -375,9 +393,9 @@ def _build_table(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ParameterError(f"{path}: expected a build file, found none ({error.strerror})") from None
+        raise ParameterError(str(path), "", "a build file", f"none ({error.strerror})") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ParameterError(f"{path}: expected a build file, not TOML: {error}") from None
+        raise ParameterError(str(path), "", "a build file (TOML)", str(error)) from None
 
 
 def _manifest(archive: Path) -> dict[str, Any]:

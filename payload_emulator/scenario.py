@@ -235,9 +235,56 @@ class FaultsSection:
 
 @dataclass(frozen=True, slots=True)
 class ReferenceSection:
-    """How far the ground's reference ephemeris is from the truth (constant RTN offset of that sigma)."""
+    """How far the ground's reference ephemeris is from the truth, 1 sigma.
+
+    `radial_m`, `transverse_m` and `normal_m` are the errors of one orbit determination: an orbit of the same period
+    that differs in eccentricity, phase and plane, so that errors are correlated over the whole arc and repeat with each
+    revolution. The transverse error is at least twice the radial one, as the dynamics demand. `position_error_m` adds a
+    constant offset in R/T/N.
+    """
 
     position_error_m: float = 0.0
+    radial_m: float = 0.0
+    transverse_m: float = 0.0
+    normal_m: float = 0.0
+
+    @property
+    def sigma_rtn_m(self) -> tuple[float, float, float]:
+        """Standard deviations of the whole error in radial, transverse and normal."""
+        own = (self.radial_m, self.transverse_m, self.normal_m)
+        return (
+            math.hypot(self.position_error_m, own[0]),
+            math.hypot(self.position_error_m, own[1]),
+            math.hypot(self.position_error_m, own[2]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class RequirementsSection:
+    """Limits that the mission description states for verdicts; a negative limit is not stated.
+
+    `estimator` is the one whose accuracy is judged, by default the filter where it is flown, else the first listed.
+    Errors are 3-D position errors. Consistency is the share of NEES and NIS values inside their 95 % bounds, which is
+    95 % for a filter that knows its errors; 90 % leaves room for the few samples of one pass. The temperature is the
+    warning limit of the packet dictionary, the other resources leave a fifth free.
+    """
+
+    estimator: Literal["", "paper", "spherical", "anchored"] = ""
+    median_error_m: float = 100.0
+    p95_error_m: float = 300.0
+    better_than: tuple[str, ...] = ("propagate-only", "snapshot")
+    consistency_inside_percent: float = 90.0
+    packets_percent: float = 99.9
+    frames_percent: float = 99.0
+    images_percent: float = 95.0
+    recall: float = 0.25
+    precision: float = 0.8
+    anchor_reads: float = 0.0
+    resets: float = 0.0
+    cpu_percent: float = 80.0
+    memory_mib: float = -1.0
+    storage_percent: float = 80.0
+    temperature_max_c: float = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,6 +309,7 @@ class Scenario:
     link: LinkSection = field(default_factory=LinkSection)
     faults: FaultsSection = field(default_factory=FaultsSection)
     reference: ReferenceSection = field(default_factory=ReferenceSection)
+    requirements: RequirementsSection = field(default_factory=RequirementsSection)
 
     @property
     def epoch_utc_ns(self) -> int:
@@ -490,6 +538,15 @@ def _check(scenario: Scenario, source: str) -> None:
     for name in scenario.navigation.estimators:
         require(name in ESTIMATORS, "navigation.estimators", f"of {', '.join(ESTIMATORS)}", name)
     require(len(scenario.navigation.estimators) > 0, "navigation.estimators", "at least one estimator", ())
+    reference = scenario.reference
+    for key in ("position_error_m", "radial_m", "transverse_m", "normal_m"):
+        require(getattr(reference, key) >= 0.0, f"reference.{key}", "zero or more", getattr(reference, key))
+    require(
+        reference.transverse_m >= 2.0 * reference.radial_m,
+        "reference.transverse_m",
+        "at least twice reference.radial_m",
+        reference.transverse_m,
+    )
     link = scenario.link
     for key in (
         "frame_loss",

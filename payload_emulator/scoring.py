@@ -31,6 +31,7 @@ from payload_emulator.flight.tables import (
 from payload_emulator.loading import LoadedPayload
 from payload_emulator.world import World, clock_ticks
 from tmtc.dictionary import DICTIONARY
+from tmtc.estimates import ESTIMATE_PACKETS, FilterEstimates, filter_estimates
 from tmtc.schema import Table
 from tmtc.stream import cut_packets
 
@@ -38,7 +39,7 @@ Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _NS = 1_000_000_000
-_PACKETS = ("filter_state", "identifications", "navigation_state", "frame_outcome", "detections")
+_PACKETS = (*ESTIMATE_PACKETS, "identifications", "navigation_state", "frame_outcome", "detections")
 # Frames further apart than this belong to different arcs: the shortest gap, over a pole, takes 18 minutes.
 _ARC_GAP_NS = 600 * _NS
 # A session of several arcs is judged from the third on, a single one after this many frames.
@@ -100,12 +101,13 @@ def score_navigation(
         All packets of the payload, end to end.
     """
     tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=_PACKETS)
-    if "filter_state" not in tables or not len(tables["filter_state"]):
+    estimates = filter_estimates(tables)
+    if not len(estimates):
         return {}
     frame_ticks = np.array([clock_ticks(world, int(utc_ns)) for utc_ns in world.frame_utc_ns])
     outcomes, nis, matched = _outcomes(tables, frame_ticks)
     imaging = (outcomes >= 0) & (outcomes != Outcome.no_image)
-    errors = _errors(world, loaded, tables["filter_state"], frame_ticks, imaging)
+    errors = _errors(world, loaded, estimates, frame_ticks, imaging)
     pairs = _judged_pairs(world, catalogue, camera_from_mcmf, tables, frame_ticks)
     arcs = _arcs(world.frame_utc_ns, imaging)
     rows = [_arc_row(world, errors, outcomes, arc) for arc in arcs]
@@ -148,9 +150,9 @@ def score_navigation(
     }
 
 
-def _first_of_each(table: Table, frame_ticks: Index) -> tuple[Index, Index]:
-    """Rows of a table that speak of frames of the session, each frame once (what is played back comes twice)."""
-    ticks = table.columns["image_ticks"].astype(np.int64)
+def _first_of_each(image_ticks: Index, frame_ticks: Index) -> tuple[Index, Index]:
+    """Rows (n,) that speak of frames of the session, each frame once (what is played back comes twice)."""
+    ticks = image_ticks.astype(np.int64)
     at = np.minimum(np.searchsorted(frame_ticks, ticks), frame_ticks.size - 1)
     rows = np.flatnonzero(frame_ticks[at] == ticks)
     frames, first = np.unique(at[rows], return_index=True)
@@ -175,21 +177,18 @@ def _outcomes(tables: dict[str, Table], frame_ticks: Index) -> tuple[Index, Floa
 def _errors(
     world: World,
     loaded: LoadedPayload,
-    states: Table,
+    estimates: FilterEstimates,
     frame_ticks: Index,
     imaging: NDArray[np.bool_],
 ) -> FlownErrors:
-    which, frame = _first_of_each(states, frame_ticks)
-    columns = {name: values[which] for name, values in states.columns.items()}
+    which, frame = _first_of_each(estimates.image_ticks, frame_ticks)
+    own, covariance = estimates.state[which], estimates.covariance[which]
     ticks = frame_ticks[frame]
     orientation = unpack_orientation_table(loaded.tables.orientation)
     burns = unpack_burn_table(loaded.tables.burns) if loaded.tables.burns else no_burns()
     gravity = unpack_gravity_table(loaded.tables.gravity)
     degree = gravity.c_bar.shape[0] - 1
     model = OrbitModel(gravity, orientation, degree, process_noise(degree))
-    own = np.concatenate(
-        [columns["position_icrf_m"], columns["velocity_icrf_m_s"], columns["acceleration_rtn_m_s2"]], axis=1
-    )
     utc_ns = world.frame_utc_ns[frame]
     position, velocity = world.truth.states(utc_ns)
     truth = np.concatenate([position, velocity], axis=1)
@@ -198,7 +197,7 @@ def _errors(
     rtn = rtn_from_inertial(truth[:, :3], truth[:, 3:])
     error = _split(own[:, :6], truth, to_truth, rtn)
     own_error = np.einsum("nji,nkj->nki", to_truth, _halves(_turned(own[:, :6], to_truth) - truth))
-    nees = _nees(own_error.reshape(-1, 6), columns["covariance"])
+    nees = _nees(own_error.reshape(-1, 6), covariance[:, :6, :6])
     only = _propagated(loaded, model, burns, ticks)
     only_error = np.linalg.norm(_split(only, truth, to_truth, rtn)[:, :3], axis=1)
     coast_end = np.full(frame.size, np.nan)
@@ -235,12 +234,8 @@ def _split(states: Float, truth: Float, turn: Float, rtn: Float) -> Float:
     return _turned(_turned(states, turn) - truth, rtn)
 
 
-def _nees(error: Float, triangles: Float) -> Float:
-    """Normalised errors (n,) of position and velocity under covariances given as lower triangles (n, 45)."""
-    covariance = np.zeros((len(error), 9, 9))
-    rows, columns = np.tril_indices(9)
-    covariance[:, rows, columns] = covariance[:, columns, rows] = triangles
-    block = covariance[:, :6, :6]
+def _nees(error: Float, block: Float) -> Float:
+    """Return the normalised errors squared (n,) of position and velocity (n, 6) under covariances (n, 6, 6)."""
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", block), 1e-30))
     whitened = error / scale
     correlation = block / (scale[:, :, None] * scale[:, None, :])
@@ -279,10 +274,14 @@ def _judged_pairs(
     position = world.truth.positions_mcmf(world.frame_utc_ns)
     rim = catalogue.position_mcmf_m
     used = tables.get("identifications")
-    used_row = {} if used is None else dict(zip(*_first_of_each(used, frame_ticks)[::-1], strict=True))
+    used_row = (
+        {}
+        if used is None
+        else dict(zip(*_first_of_each(used.columns["image_ticks"], frame_ticks)[::-1], strict=True))
+    )
     order = np.argsort(catalogue.ids)
     latitude, longitude, altitude = spherical_from_mcmf(position)
-    for row, number in zip(*_first_of_each(seen, frame_ticks), strict=True):
+    for row, number in zip(*_first_of_each(seen.columns["image_ticks"], frame_ticks), strict=True):
         mine = places[_rows_of(seen.item_owner, row)]
         if not len(mine):
             continue

@@ -18,6 +18,7 @@ from payload_emulator.flight.preprocess import ImageQuality
 from payload_emulator.loading import LoadedPayload
 from payload_emulator.sim.faults import Fault
 from payload_emulator.sim.platform import PlatformModel, SimulatedBoard
+from payload_emulator.sim.truth import ReadCount, counted_reads
 
 _NS = 1_000_000_000
 _TICKS_PER_SECOND = 65_536
@@ -99,6 +100,8 @@ class Spacecraft:
         Starts of the processor after the first, by cause.
     given
         What the payload was given in the last step; None while the processor was down.
+    truth_reads
+        Reads of the simulated truth while the payload took its steps: a payload has no way to it.
     """
 
     loaded: LoadedPayload
@@ -109,6 +112,7 @@ class Spacecraft:
     resets: list[int] = field(default_factory=list)
     payload: Payload = field(init=False)
     given: Given | None = None
+    truth_reads: ReadCount = field(default_factory=ReadCount)
     _booted: int | None = None
     _breakable: BreakableDetector = field(init=False)
     _begun: set[Fault] = field(default_factory=set)
@@ -152,7 +156,8 @@ class Spacecraft:
         shown, ticks = _NO_IMAGE if picture is None else picture, clock_ticks + self._clock_error_ticks
         cause, self._booted = self._booted, None
         try:
-            packets = self.payload.step(shown, message, ticks, telecommands)
+            with counted_reads(self.truth_reads):
+                packets = self.payload.step(shown, message, ticks, telecommands)
         except ProcessorHang:
             self._down_until_ns = utc_ns + round(board.model.watchdog_s * _NS)
             packets = []

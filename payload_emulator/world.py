@@ -18,15 +18,15 @@ from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.frames import Orientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.gravity import GravityField
+from lunar.lens import BrownCamera, pointed_camera_from_mcmf
 from lunar.oem import load_oem
 from lunar.propagation import ForceModel
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns, utc_ns_from_tdb_s
 from payload_emulator.errors import ScenarioError
 from payload_emulator.orbit import force_model, propagate_scenario
-from payload_emulator.scenario import Scenario
+from payload_emulator.scenario import ReferenceSection, Scenario
 from payload_emulator.sim.disturbances import TrueBurn, changed, executed, turned_state
-from payload_emulator.sim.lens import BrownCamera, pointed_camera_from_mcmf
 from payload_emulator.sim.light import sun_direction_mcmf
 from payload_emulator.sim.photometry import Photometry
 from payload_emulator.sim.renderer import render
@@ -419,15 +419,45 @@ def sample_truth(truth: Truth, frame_utc_ns: IntArray) -> Ephemeris:
     return Ephemeris(tuple(segments))
 
 
-def with_reference_error(ephemeris: Ephemeris, sigma_m: float, seed: int) -> Ephemeris:
-    """The ephemeris displaced by one constant offset in RTN: what orbit determination leaves to the ground."""
-    if sigma_m == 0.0:
+def with_reference_error(ephemeris: Ephemeris, section: ReferenceSection, seed: int) -> Ephemeris:
+    """Return the ephemeris with the errors that orbit determination leaves to the ground.
+
+    The errors follow the Clohessy-Wiltshire solution of equal period about a circular orbit: with the angle u since the
+    start, x = a cos u + b sin u, y = c - 2 a sin u + 2 b cos u, z = d cos u + e sin u (radial, transverse, normal), all
+    coefficients drawn once. Velocities are the derivatives of the displaced positions.
+
+    References
+    ----------
+    Clohessy, Wiltshire (1960), Terminal guidance system for satellite rendezvous, equations 9.
+    """
+    if not any(section.sigma_rtn_m):
         return ephemeris
-    offset = sigma_m * np.random.default_rng((seed, 2**33)).standard_normal(3)
+    draw = np.random.default_rng((seed, 2**33)).standard_normal(8)
+    offset = section.position_error_m * draw[:3]
+    a, b = section.radial_m * draw[3:5]
+    c = np.sqrt(section.transverse_m**2 - 4.0 * section.radial_m**2) * draw[5]
+    d, e = section.normal_m * draw[6:8]
+    first = ephemeris.segments[0]
+    radius = float(np.linalg.norm(first.position_m[0]))
+    rate = float(np.linalg.norm(np.cross(first.position_m[0], first.velocity_m_s[0]))) / radius**2
 
     def displaced(segment: EphemerisSegment) -> EphemerisSegment:
+        u = rate * (segment.utc_ns - ephemeris.start_utc_ns) / _NS
+        cosine, sine = np.cos(u), np.sin(u)
+        x, y = a * cosine + b * sine, c - 2.0 * a * sine + 2.0 * b * cosine
+        z = d * cosine + e * sine
+        error = np.stack([x, y, z], axis=1) + offset
+        # The axes turn with the orbit: derivative in them, and the turn of the displacement about the normal.
+        slope = rate * np.stack(
+            [-a * sine + b * cosine, -2.0 * a * cosine - 2.0 * b * sine, -d * sine + e * cosine], axis=1
+        )
+        slope += rate * np.stack([-error[:, 1], error[:, 0], np.zeros_like(u)], axis=1)
         rtn_from_icrf = rtn_from_inertial(segment.position_m, segment.velocity_m_s)
-        return replace(segment, position_m=segment.position_m + np.einsum("nji,j->ni", rtn_from_icrf, offset))
+        return replace(
+            segment,
+            position_m=segment.position_m + np.einsum("nji,nj->ni", rtn_from_icrf, error),
+            velocity_m_s=segment.velocity_m_s + np.einsum("nji,nj->ni", rtn_from_icrf, slope),
+        )
 
     return Ephemeris(tuple(displaced(segment) for segment in ephemeris.segments))
 

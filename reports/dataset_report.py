@@ -142,7 +142,7 @@ def _integrity(report: DatasetReport) -> Table:
             Column("check", numeric=False),
             Column("looked at"),
             Column("failed"),
-            Column("", numeric=False),
+            Column("detail", numeric=False),
         ),
         tuple(
             (

@@ -35,10 +35,10 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Headline:
-    """The numbers of the first page and the rung of evidence on which they stand; None where they need no evidence."""
+    """The numbers of the first page and the evidence level of them; None where they need no evidence."""
 
     figures: tuple[HeadlineFigure, ...]
-    evidence_rung: str | None
+    evidence_level: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,27 +140,45 @@ def cells(row: Sequence[Cell | str]) -> tuple[Cell, ...]:
     return tuple(c if isinstance(c, Cell) else Cell(c) for c in row)
 
 
-EVIDENCE_RUNGS = (
+EVIDENCE_LEVELS = (
     "unit geometry",
     "procedural Moon",
-    "real terrain",
+    "real terrain never used in training",
     "another renderer",
-    "images nobody rendered",
+    "real photographs",
 )
 
 
-def rung_number(rung: str) -> int | None:
-    """Number of a rung of the evidence ladder, from text that starts with it or names it."""
-    text = rung.strip().lower().removeprefix("rung").strip(" (:")
-    if text[:1].isdigit():
-        number = int(text[0])
-        return number if 1 <= number <= len(EVIDENCE_RUNGS) else None
-    return next((i + 1 for i, name in enumerate(EVIDENCE_RUNGS) if name in text), None)
+SEEN_MARK = "s"
+"""Follows the number of a level whose terrain was seen in training: 3s."""
+
+SEEN_WORDS = "real terrain seen in training"
 
 
-def rung_text(rung: str) -> str:
-    """Words for a rung: "rung 3 of 5, real terrain"."""
-    number = rung_number(rung)
+def evidence_number(level: str) -> int | None:
+    """Return the number of an evidence level, from text that starts with it; None for any other text."""
+    text = level.strip().lower().removeprefix("level").strip(" (:")
+    if not text[:1].isdigit() or text[1:2].isdigit():
+        return None
+    number = int(text[0])
+    return number if 1 <= number <= len(EVIDENCE_LEVELS) else None
+
+
+def evidence_label(level: str) -> str:
+    """Return the number of a level with its mark, such as "3" or "3s"; empty where none is stated."""
+    number = evidence_number(level)
     if number is None:
-        return rung.strip() or "evidence not stated"
-    return f"rung {number} of {len(EVIDENCE_RUNGS)}, {EVIDENCE_RUNGS[number - 1]}"
+        return ""
+    text = level.strip().lower().removeprefix("level").strip(" (:")
+    return f"{number}{SEEN_MARK}" if text[1:2] == SEEN_MARK else str(number)
+
+
+def evidence_text(level: str) -> str:
+    """Return words for a level: "level 2 of 5, procedural Moon", or those that the text itself gives in parentheses."""
+    number = evidence_number(level)
+    if number is None:
+        return level.strip() or "evidence not stated"
+    label = evidence_label(level)
+    own = level.partition("(")[2].rpartition(")")[0].strip()
+    words = own or (SEEN_WORDS if label.endswith(SEEN_MARK) else EVIDENCE_LEVELS[number - 1])
+    return f"level {label} of {len(EVIDENCE_LEVELS)}, {words}"

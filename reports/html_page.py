@@ -7,7 +7,7 @@ from html import escape
 from itertools import groupby
 
 from reports.document import (
-    EVIDENCE_RUNGS,
+    EVIDENCE_LEVELS,
     Absent,
     Block,
     Bullets,
@@ -24,8 +24,9 @@ from reports.document import (
     Table,
     Verdict,
     cells,
-    rung_number,
-    rung_text,
+    evidence_label,
+    evidence_number,
+    evidence_text,
 )
 from reports.figures.svg import draw_svg
 from reports.stylesheet import page_style
@@ -121,31 +122,34 @@ def _headline(block: Headline) -> str:
             value, words = "not available", True
         unit = f"<small>{escape(figure.unit)}</small>" if figure.unit and not words else ""
         note = f'<dd class="note">{escape(figure.note)}</dd>' if figure.note else ""
-        rung = "" if block.evidence_rung is None else _rung(figure.evidence_rung or block.evidence_rung)
+        level = (
+            "" if block.evidence_level is None else _evidence(figure.evidence_level or block.evidence_level)
+        )
         items.append(
             f"<div><dt>{escape(figure.label)}</dt>"
-            f'<dd class="number{" words" if words else ""}">{escape(value)}{unit}</dd>{note}{rung}</div>'
+            f'<dd class="number{" words" if words else ""}">{escape(value)}{unit}</dd>{note}{level}</div>'
         )
-    return f'\n<dl class="headline">{"".join(items)}</dl>{_ladder(block.evidence_rung)}'
+    return f'\n<dl class="headline">{"".join(items)}</dl>{_ladder(block.evidence_level)}'
 
 
-def _ladder(rung: str | None) -> str:
-    if rung is None:
+def _ladder(level: str | None) -> str:
+    if level is None:
         return ""
-    ladder = ", ".join(f"{i} {name}" for i, name in enumerate(EVIDENCE_RUNGS, 1))
-    stands = "No rung of evidence was stated for these figures."
-    if rung:
-        stands = f"These figures stand on {rung_text(rung)}."
-    return f'<p class="ladder">{escape(stands)} Rungs of evidence: {escape(ladder)}.</p>'
+    ladder = ", ".join(f"{i} {name}" for i, name in enumerate(EVIDENCE_LEVELS, 1))
+    stands = "No evidence level was stated for these figures."
+    if level:
+        stands = f"These figures are at {evidence_text(level)}."
+    return f'<p class="ladder">{escape(stands)} Evidence levels: {escape(ladder)}.</p>'
 
 
-def _rung(rung: str) -> str:
-    number = rung_number(rung)
+def _evidence(level: str) -> str:
+    number = evidence_number(level)
     if number is None:
-        return f'<dd class="rung">{escape(rung_text(rung))}</dd>'
-    dots = "".join(f"<i{' class=on' if i < number else ''}></i>" for i in range(len(EVIDENCE_RUNGS)))
-    title = escape(rung_text(rung))
-    return f'<dd class="rung" title="{title}"><span aria-hidden="true">{dots}</span> rung {number}</dd>'
+        return f'<dd class="level">{escape(evidence_text(level))}</dd>'
+    dots = "".join(f"<i{' class=on' if i < number else ''}></i>" for i in range(len(EVIDENCE_LEVELS)))
+    title = escape(evidence_text(level))
+    words = f"level {evidence_label(level)}"
+    return f'<dd class="level" title="{title}"><span aria-hidden="true">{dots}</span> {words}</dd>'
 
 
 def _picture(block: Picture, number: int) -> str:

@@ -74,6 +74,7 @@ def check(report: PassReport) -> None:
             "nis": (one.nis, (n,)),
             "nis_dof": (one.nis_dof, (n,)),
             "nees": (one.nees, (n,)),
+            "squared_normalised_errors": (one.squared_normalised_errors, (n,)),
             "sun_elevation_deg": (one.sun_elevation_deg, (n,)),
             "time_since_fix_s": (one.time_since_fix_s, (n,)),
         }

@@ -14,7 +14,7 @@ from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 from reports.document import (
-    EVIDENCE_RUNGS,
+    EVIDENCE_LEVELS,
     Absent,
     Block,
     Bullets,
@@ -31,8 +31,8 @@ from reports.document import (
     Table,
     Verdict,
     cells,
-    rung_number,
-    rung_text,
+    evidence_label,
+    evidence_text,
 )
 from reports.figures.canvas import Canvas
 from reports.figures.theme import LIGHT, color, drawing
@@ -399,19 +399,19 @@ def _headline(block: Headline) -> list[_Piece]:
             for k, line in enumerate(notes[i]):
                 top = y + 0.10 + above + 0.38 + k * 6.4 * 1.4 / 72
                 page.text(x, top, line, 6.4, color=color("muted"))
-            if block.evidence_rung is None:
+            if block.evidence_level is None:
                 continue
-            rung = rung_number(figure.evidence_rung or block.evidence_rung)
-            words = f"rung {rung}" if rung else "rung not stated"
+            level = evidence_label(figure.evidence_level or block.evidence_level)
+            words = f"level {level}" if level else "level not stated"
             page.text(x, y + height - 0.18, words, 6.4, color=color("muted"))
 
-    if block.evidence_rung is None:
+    if block.evidence_level is None:
         return [_Piece(height + 0.1, draw)]
-    ladder = ", ".join(f"{i} {name}" for i, name in enumerate(EVIDENCE_RUNGS, 1))
-    stands = "No rung of evidence was stated for these figures."
-    if block.evidence_rung:
-        stands = f"These figures stand on {rung_text(block.evidence_rung)}."
-    text = f"{stands} Rungs of evidence: {ladder}."
+    ladder = ", ".join(f"{i} {name}" for i, name in enumerate(EVIDENCE_LEVELS, 1))
+    stands = "No evidence level was stated for these figures."
+    if block.evidence_level:
+        stands = f"These figures are at {evidence_text(block.evidence_level)}."
+    text = f"{stands} Evidence levels: {ladder}."
     note = _lines(_wrapped(text, _WIDTH, 6.8), 6.8, before=0.06, after=0.06, color=color("muted"))
     return [_Piece(height, draw, keep=True), *note]
 

@@ -11,17 +11,20 @@ from reports.sections.detection import gallery_picture
 from reports.sections.opening import about, absent, judgement, missing_and_remarks, provenance_and_data
 from reports.statistics import quantiles
 from reports.text import count_text, significant_text
-from reports.values import CampaignPass, FloatArray, RegressionReport
+from reports.values import CampaignPass, FloatArray, RegressionGate, RegressionReport
+
+_ORDER = ("fail", "inconclusive", "pass")
+_SWATCHES = {"pass": "green", "inconclusive": "orange", "fail": "vermillion"}
 
 
 def regression_document(report: RegressionReport) -> Document:
     """The document of a regression."""
-    failed = [g for g in report.gates if not g.passed]
+    counts = {outcome: sum(g.outcome == outcome for g in report.gates) for outcome in _ORDER}
     blocks: list[Block] = [*judgement(report), Heading("Gates")]
     if report.gates:
         blocks.append(_gates(report))
     else:
-        blocks.append(absent(report, "gates", "Gates", "none was set"))
+        blocks.append(absent(report, "gates", "Gates", "no gate was judged, so the verdict is inconclusive"))
     blocks += missing_and_remarks(report)
     before, after = _paired(report)
     if before:
@@ -37,28 +40,32 @@ def regression_document(report: RegressionReport) -> Document:
         report,
         ("Candidate", report.candidate),
         ("baseline", report.baseline),
-        ("gates failed", f"{len(failed)} of {len(report.gates)}"),
+        (
+            "gates",
+            f"{counts['fail']} failed, {counts['inconclusive']} inconclusive, {counts['pass']} passed",
+        ),
         ("passes", count_text(len(before))),
     )
     return Document("Regression report", report.title, report.regression_id, facts, tuple(blocks))
 
 
 def _gates(report: RegressionReport) -> Table:
-    ordered = sorted(report.gates, key=lambda g: g.passed)
     rows = tuple(
         (
-            Cell(g.name, swatch="green" if g.passed else "vermillion", strong=not g.passed),
+            Cell(g.name, swatch=_SWATCHES[g.outcome], strong=g.outcome != "pass"),
             g.pass_id or "all",
             significant_text(g.baseline),
             significant_text(g.candidate),
             significant_text(g.limit),
             g.unit,
-            Cell("passed" if g.passed else "failed", strong=not g.passed),
+            significant_text(g.resolution / g.margin) if g.margin > 0.0 else "exact",
+            Cell(_outcome_text(g), strong=g.outcome != "pass"),
         )
-        for g in ordered
+        for g in sorted(report.gates, key=lambda g: _ORDER.index(g.outcome))
     )
     return Table(
-        "Gates, those that failed first.",
+        "Gates, those that failed first. A resolution above 1 means that these frames cannot show a degradation as "
+        "large as the margin.",
         (
             Column("gate", numeric=False),
             Column("pass", numeric=False),
@@ -66,10 +73,24 @@ def _gates(report: RegressionReport) -> Table:
             Column("candidate"),
             Column("limit"),
             Column("unit", numeric=False),
-            Column("verdict", numeric=False),
+            Column("resolution / margin"),
+            Column("outcome", numeric=False),
         ),
         rows,
     )
+
+
+def _outcome_text(gate: RegressionGate) -> str:
+    """Outcome, what would decide an open gate, and the reason of a waiver."""
+    text = {"pass": "passed", "fail": "failed"}.get(gate.outcome, gate.outcome)
+    if gate.outcome == "inconclusive":
+        if gate.reason.startswith("unknown"):
+            text += f": {gate.reason}"
+        elif gate.frames_needed is not None:
+            text += f": {count_text(gate.frames_needed)} frames needed, {count_text(gate.frames)} compared"
+        else:
+            text += f": {count_text(gate.frames)} frames are too few to tell how many are needed"
+    return f"{text}; waived: {gate.waived}" if gate.waived else text
 
 
 def _changed(report: RegressionReport) -> Block:

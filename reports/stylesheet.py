@@ -43,10 +43,10 @@ h1{margin:0 0 .5rem;font-size:2.15rem;line-height:1.15;font-weight:650;letter-sp
 .headline .number small{white-space:nowrap;line-height:1.3;font-size:.95rem;font-weight:450;
  letter-spacing:0;color:var(--f-muted)}
 .headline .note{font-size:.8rem;line-height:1.35;color:var(--f-muted)}
-.headline .rung{margin-top:auto;padding-top:.5rem;font-size:.76rem;color:var(--f-muted)}
-.rung i{display:inline-block;width:.62em;height:.62em;margin-right:.16em;border:1px solid var(--f-gray2);
+.headline .level{margin-top:auto;padding-top:.5rem;font-size:.76rem;color:var(--f-muted)}
+.level i{display:inline-block;width:.62em;height:.62em;margin-right:.16em;border:1px solid var(--f-gray2);
  border-radius:50%;vertical-align:-.02em}
-.rung i.on{background:var(--accent);border-color:var(--accent)}
+.level i.on{background:var(--accent);border-color:var(--accent)}
 .ladder{margin:.55rem 0 2rem;font-size:.82rem;color:var(--f-muted)}
 h2{display:flex;gap:.7em;margin:3rem 0 .9rem;padding-top:.75rem;border-top:1px solid var(--f-ink);
  font-size:1.36rem;line-height:1.25;font-weight:650;letter-spacing:-.01em}
@@ -75,7 +75,7 @@ thead th.group:last-child{padding-right:0}
 thead th .unit{display:block;font-weight:400}
 tbody tr+tr>*{border-top:1px solid var(--f-grid)}
 tbody tr:last-child>*{border-bottom:1px solid var(--f-ink)}
-tbody th{white-space:nowrap}
+tbody th{min-width:7rem;overflow-wrap:break-word}
 .num{text-align:right}
 td.num,th.num{white-space:nowrap}
 td b,th b{font-weight:650}
@@ -112,7 +112,7 @@ pre{margin:.6rem 0;padding:.9rem 1rem;overflow:auto;background:var(--panel);font
  .headline>div,.headline>div:first-child{border-left:0;padding-left:0;border-top:1px solid var(--f-grid)}
  .headline dt{min-height:0}h1{font-size:1.7rem}.kicker{flex-direction:column;gap:.2rem}
  .pairs{grid-template-columns:1fr}.pairs dt{border-bottom:0;padding-bottom:0}figure{overflow-x:auto}
- figure svg{min-width:38rem}}
+ figure svg{min-width:51rem}}
 @media print{
  html{font-size:8.6pt}body{font-size:1rem;line-height:1.42}
  .sheet{display:block;padding:0}.contents,.skip{display:none}

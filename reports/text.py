@@ -52,6 +52,11 @@ def count_text(count: int | None) -> str:
     return NOT_A_VALUE if count is None else f"{count:,}".replace(",", THIN_SPACE)
 
 
+def computed_text(count: int | None, absent: str = "not computed") -> str:
+    """Return a count with thin spaces between thousands, or words where it was not computed."""
+    return absent if count is None else count_text(count)
+
+
 def number_text(value: float | None, decimals: int) -> str:
     """A number with fixed decimals and thin spaces between thousands, a dash where there is none."""
     if value is None or not math.isfinite(value):

@@ -33,14 +33,55 @@ class HeadlineFigure:
     """One of the five numbers of the first page.
 
     ``value`` is a number (printed with three significant digits), text (printed as it is) or None ("not
-    available"). ``evidence_rung`` overrides the report's own rung where one figure rests on other evidence.
+    available"). ``evidence_level`` overrides the report's own level where one figure rests on other evidence.
     """
 
     label: str
     value: float | int | str | None
     unit: str = ""
     note: str = ""
-    evidence_rung: str = ""
+    evidence_level: str = ""
+
+
+REQUIREMENT_STATUSES = ("met", "not met", "unknown", "not judged")
+
+
+@dataclass(frozen=True, slots=True)
+class Requirement:
+    """One line of the verdict table.
+
+    ``value`` has to be at most (``at_most``) or at least ``limit``. ``status`` is one of `REQUIREMENT_STATUSES`; a
+    value or limit that is not known is None and never "met", and one that is not judged is "not judged".
+    """
+
+    key: str
+    name: str
+    unit: str
+    value: float | None
+    limit: float | None
+    at_most: bool
+    status: str
+    note: str = ""
+
+    @property
+    def margin(self) -> float | None:
+        """What is left up to the limit; negative past it, None where one of the two is not known."""
+        if self.value is None or self.limit is None:
+            return None
+        return self.limit - self.value if self.at_most else self.value - self.limit
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorBudget:
+    """Root mean square of the 3-D error of an estimate, split: observed² = estimate² + reference².
+
+    ``reference_rms_m`` is what the mission description declares; ``estimate_rms_m`` is NaN where the observed error is
+    smaller than that.
+    """
+
+    observed_rms_m: float
+    reference_rms_m: float
+    estimate_rms_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,14 +101,19 @@ class FrameAccounting:
 
 @dataclass(frozen=True, slots=True)
 class ApidAccounting:
-    """Packets of one application process."""
+    """Packets of one application process; None where a count was not computed.
+
+    ``lost`` are missing between packets that came, by their sequence counts; ``lost_at_edges`` before the first and
+    after the last one, by the frames that were planned.
+    """
 
     name: str
     packets: int
     lost: int = 0
-    duplicates: int = 0
+    duplicates: int | None = None
     conflicts: int = 0
-    crc_errors: int = 0
+    crc_errors: int | None = None
+    lost_at_edges: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,20 +127,34 @@ class CompletenessSeries:
 
 @dataclass(frozen=True, slots=True)
 class PacketAccounting:
-    """What became of every octet of the downlink."""
+    """Octet accounting of the downlink of a pass; None where a count was not computed.
+
+    ``lost`` and ``lost_at_edges`` are the sums over application processes.
+    """
 
     packets: int
     lost: int = 0
-    duplicates: int = 0
+    duplicates: int | None = None
     conflicts: int = 0
-    crc_errors: int = 0
-    octets_skipped: int = 0
+    crc_errors: int | None = None
+    octets_skipped: int | None = None
     frames: int | None = None
-    frames_bad: int = 0
-    symbols_corrected: int = 0
+    frames_bad: int | None = None
+    symbols_corrected: int | None = None
+    lost_at_edges: int | None = None
     octets: int | None = None
     by_apid: Mapping[int, ApidAccounting] = field(default_factory=dict)
     completeness: CompletenessSeries | None = None
+
+    @property
+    def missing(self) -> int:
+        """Packets known to be missing, within the pass and at its edges."""
+        return self.lost + (self.lost_at_edges or 0)
+
+    @property
+    def expected(self) -> int:
+        """Packets that came and packets known to be missing."""
+        return self.packets + self.missing
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,8 +210,9 @@ class NavigationSeries:
     ``reset_trigger`` name what the matcher did at each sample (see `ODOMETRY_OUTCOMES`, `FIX_OUTCOMES`,
     `RESET_TRIGGERS`); empty tuples where the solution has no such thing. ``error_rtn_m`` at a reset is the
     error after it; ``reset_error_m`` (n,) holds the horizontal error at the instant before, NaN elsewhere.
-    The optional arrays (n,) are what the error may depend on; ``nees`` has three degrees of freedom, ``nis``
-    ``nis_dof``.
+    The optional arrays (n,) are what the error may depend on; ``nees`` (of the position under its full covariance) has
+    three degrees of freedom, ``nis`` ``nis_dof``. ``squared_normalised_errors`` stands in place of ``nees`` where only
+    standard deviations are known: squared errors over variances, summed over the axes.
     """
 
     name: str
@@ -174,10 +235,12 @@ class NavigationSeries:
     nis: FloatArray | None = None
     nis_dof: IntArray | None = None
     nees: FloatArray | None = None
+    squared_normalised_errors: FloatArray | None = None
     sun_elevation_deg: FloatArray | None = None
     time_since_fix_s: FloatArray | None = None
     terrain: tuple[str, ...] = ()
     wrong_fixes: int | None = None
+    error_budget: ErrorBudget | None = None
     drift_by_length: tuple[DriftSample, ...] = ()
 
 
@@ -370,9 +433,9 @@ class AnchorRead:
 class PassReport:
     """Everything the report of one pass says.
 
-    ``verdict`` is one or two sentences; ``verdict_level`` is "good", "caution", "bad" or "" and colours the
-    rule beside them. ``evidence_rung`` names the rung of the evidence ladder on which the accuracy figures
-    stand. ``not_available`` gives the reason why a section is missing; its keys are names of fields of this
+    ``verdict`` is the sentence on the table of ``requirements``; ``verdict_level`` is "good", "caution", "bad" or ""
+    and colours the rule beside them. ``evidence_level`` is the evidence level of the
+    accuracy figures. ``not_available`` gives the reason why a section is missing; its keys are names of fields of this
     value. ``configuration`` maps a group ("camera") to its settings.
     """
 
@@ -380,9 +443,10 @@ class PassReport:
     pass_id: str
     verdict: str = ""
     verdict_level: str = ""
+    requirements: tuple[Requirement, ...] = ()
     generated_for: str = ""
     created_utc: str = ""
-    evidence_rung: str = ""
+    evidence_level: str = ""
     headline: tuple[HeadlineFigure, ...] = ()
     provenance: Mapping[str, str] = field(default_factory=dict)
     data_sources: tuple[str, ...] = ()
@@ -442,7 +506,7 @@ class CampaignReport:
     verdict_level: str = ""
     generated_for: str = ""
     created_utc: str = ""
-    evidence_rung: str = ""
+    evidence_level: str = ""
     headline: tuple[HeadlineFigure, ...] = ()
     provenance: Mapping[str, str] = field(default_factory=dict)
     data_sources: tuple[str, ...] = ()
@@ -533,7 +597,7 @@ class DetectorReport:
     verdict_level: str = ""
     generated_for: str = ""
     created_utc: str = ""
-    evidence_rung: str = ""
+    evidence_level: str = ""
     headline: tuple[HeadlineFigure, ...] = ()
     provenance: Mapping[str, str] = field(default_factory=dict)
     data_sources: tuple[str, ...] = ()
@@ -597,7 +661,7 @@ class DatasetReport:
     verdict_level: str = ""
     generated_for: str = ""
     created_utc: str = ""
-    evidence_rung: str = ""
+    evidence_level: str = ""
     headline: tuple[HeadlineFigure, ...] = ()
     provenance: Mapping[str, str] = field(default_factory=dict)
     data_sources: tuple[str, ...] = ()
@@ -608,15 +672,35 @@ class DatasetReport:
 
 @dataclass(frozen=True, slots=True)
 class RegressionGate:
-    """One requirement on a candidate build; ``limit`` is the value that must not be passed, in the same unit."""
+    """One requirement on a candidate build.
+
+    Attributes
+    ----------
+    limit
+        The baseline degraded by the margin, in the same unit.
+    outcome
+        "pass", "fail" or "inconclusive".
+    margin, resolution
+        Degradation that is tolerated, and the smallest that the frames detect: in the unit, or a share of the baseline.
+    frames, frames_needed
+        Frames that were compared, and with which the gate would be decided; None where that is unknown.
+    reason, waived
+        Why it is inconclusive, and why its outcome does not count; empty where neither applies.
+    """
 
     name: str
     baseline: float
     candidate: float
     limit: float
-    passed: bool
+    outcome: str
     unit: str = ""
     pass_id: str = ""
+    margin: float = float("nan")
+    resolution: float = float("nan")
+    frames: int = 0
+    frames_needed: int | None = None
+    reason: str = ""
+    waived: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -644,7 +728,7 @@ class RegressionReport:
     verdict_level: str = ""
     generated_for: str = ""
     created_utc: str = ""
-    evidence_rung: str = ""
+    evidence_level: str = ""
     headline: tuple[HeadlineFigure, ...] = ()
     provenance: Mapping[str, str] = field(default_factory=dict)
     data_sources: tuple[str, ...] = ()

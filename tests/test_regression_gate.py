@@ -1,6 +1,6 @@
 """The gate of this project's own payload: its network and parameters pass a small suite, an untrained network does not.
 
-The passes are made here, on the procedural Moon (rung 2): a few frames in the light of the paper, and with the faults
+The passes are made here, on the procedural Moon (level 2): a few frames in the light of the paper, and with the faults
 of the shipped suite.
 """
 
@@ -18,6 +18,9 @@ from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.suite import SUITE, suite_scenarios, write_suite
 
 FRAMES = 8
+
+pytestmark = pytest.mark.timeout(1200)
+"""A confined build compiles its kernels in every run, since nothing that it writes is kept."""
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +91,7 @@ def test_an_untrained_network_fails_for_what_it_takes_for_craters(
 ) -> None:
     status, figures = regress(suite, home, str(untrained(tmp_path / "untrained")), capsys)
     assert (status, figures["verdict"]) == (1, "fail")
-    failed = {gate["name"] for gate in figures["gates"] if not gate["passed"]}
+    failed = {gate["name"] for gate in figures["gates"] if gate["outcome"] == "fail"}
     assert {"detector.precision", "navigation.anchored.fixes"} <= failed
     assert "telemetry.undecodable" not in failed
     assert all(one["state"] == "judged" for one in figures["passes"])

@@ -1,119 +1,318 @@
-"""Attached sync markers: where channel access data units (CADUs) stand in a stream of octets.
+"""Attached sync markers: bit-level search for channel access data units (CADUs) in a stream of octets.
 
-The synchroniser has three states, as flight practice asks: *search* for a marker, *check* that another
-stands one period later, *lock* as long as markers keep standing there. In lock a single damaged marker is
-passed over (fly-wheel); at two in a row the search begins anew, from just behind the last frame's marker,
-so that octets lost or inserted by the link cost the frames they hit and no other.
+The synchroniser has three states, as flight practice asks: *search* for a marker, *check* that another marker stands
+one period later, *lock* as long as markers keep standing there. In lock a single damaged marker is passed over
+(fly-wheel). At two in a row the search begins again, just behind the last frame's marker, so that bits lost or
+inserted by the link cost the frames they hit and no other. When the search finds the next marker a whole number of
+periods later, the frames between are kept as well: their own checks judge them.
+
+Markers are sought at every bit, upright and inverted (a receiver may lose bits and may lock with the wrong sign). A
+station may put octets between CADUs, a fixed header or a varying gap: the distance of the last two frames is tried as
+well as the period, and a frame without neighbours is accepted when its marker has at most one wrong bit or its own
+code or checksum proves it.
+
+References
+----------
+CCSDS 131.0-B section 9 (attached sync marker); CCSDS 130.1-G section 9 (frame synchronisation).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 OctetArray = npt.NDArray[np.uint8]
 IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 
 ASM = bytes.fromhex("1ACFFC1D")
 ASM_LENGTH = 4
 DEFAULT_TOLERANCE = 3
+"""Wrong bits of a marker that are accepted: chance gives one false marker in 4e5 bits, which the check removes."""
 
-_ASM_WORD = np.uint32(int.from_bytes(ASM, "big"))
-_WINDOW = 1 << 16
+MARKER_BITS = 32
+LONE_TOLERANCE = 1
+"""Wrong bits of a marker that stands alone and proves itself by nothing else: one false marker in 6e7 bits."""
+
+MOST_BRIDGED = 64
+"""Frames that the fly-wheel fills in between two stretches in lock."""
+
+_ASM_WORD = np.uint64(int.from_bytes(ASM, "big"))
+_SCAN_BITS = 1 << 19
+_CANDIDATES = 4096
+SETTLED = 4
+"""Frames in lock after which a damaged marker is passed over without a search."""
+
+Verify = Callable[["CaduSync"], BoolArray]
+"""Whether each CADU holds a frame that its own code or checksum proves."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CaduSync:
-    """Starts of whole CADUs (n,), `period` octets each, and the wrong bits of each marker (n,).
+    """Whole CADUs of a stream in order: start bit (n,), polarity (n,) and wrong bits of the marker (n,).
 
-    `truncated` holds the starts of those that lost octets, so that the next marker came too early.
+    `period` is the length of a CADU in octets. `truncated` holds the octets in which CADUs
+    begin that lost bits, so that the next marker came too early.
     """
 
-    offsets: IntArray
+    start_bits: IntArray
+    inverted: BoolArray
     marker_errors: IntArray
     truncated: IntArray
     period: int
 
+    @property
+    def offsets(self) -> IntArray:
+        """Octet (n,) in which each CADU begins."""
+        return self.start_bits >> 3
+
     def head(self, count: int) -> CaduSync:
         """The first `count` CADUs."""
-        return CaduSync(self.offsets[:count], self.marker_errors[:count], self.truncated[:0], self.period)
+        return CaduSync(
+            self.start_bits[:count],
+            self.inverted[:count],
+            self.marker_errors[:count],
+            self.truncated[:0],
+            self.period,
+        )
+
+    def take(self, rows: IntArray) -> CaduSync:
+        """The CADUs of these rows."""
+        return CaduSync(
+            self.start_bits[rows],
+            self.inverted[rows],
+            self.marker_errors[rows],
+            self.truncated[:0],
+            self.period,
+        )
 
 
-def find_period(octets: OctetArray, limit: int = 1 << 22) -> int:
-    """Octets from one marker to the next, by the commonest distance of undamaged markers; 0 where there is
-    no stream.
+def cadu_octets(octets: OctetArray, sync: CaduSync) -> OctetArray:
+    """CADUs (n, period), markers included, aligned to octets and upright."""
+    n = sync.start_bits.size
+    result = np.empty((n, sync.period), dtype=np.uint8)
+    if not n:
+        return result
+    shifts = sync.start_bits & 7
+    windows = np.lib.stride_tricks.sliding_window_view(octets, sync.period)
+    for shift in np.unique(shifts).tolist():
+        rows = np.flatnonzero(shifts == shift)
+        first = sync.start_bits[rows] >> 3
+        result[rows] = windows[first]
+        if shift:
+            # the bits of an octet that begins `shift` bits later
+            result[rows] <<= shift
+            result[rows, :-1] |= windows[first, 1:] >> (8 - shift)
+            result[rows, -1] |= octets[first + sync.period] >> (8 - shift)
+    result[sync.inverted] ^= 0xFF
+    return result
 
-    A single marker at the very start stands for a stream of one CADU.
+
+def find_period(octets: OctetArray) -> int:
+    """Octets from one marker to the next, by the commonest distance of undamaged markers; 0 where there is no stream.
+
+    Markers are sought at every bit of the whole stream. A single marker at the very start stands for a stream of one
+    CADU.
     """
-    head = octets[:limit].tobytes()
-    found = []
-    at = head.find(ASM)
-    while at >= 0:
-        found.append(at)
-        at = head.find(ASM, at + 1)
-    if len(found) >= 2:
-        distances, counts = np.unique(np.diff(found), return_counts=True)
-        return int(distances[np.argmax(counts)])
-    return octets.size if found == [0] else 0
+    starts, _ = undamaged_markers(octets)
+    distances = distances_of(starts)
+    if distances:
+        return next(iter(distances))
+    return octets.size if starts.tolist() == [0] else 0
 
 
-def synchronise(octets: OctetArray, period: int, tolerance: int = DEFAULT_TOLERANCE) -> CaduSync:
-    """CADUs of `period` octets in `octets`, markers with up to `tolerance` wrong bits accepted."""
-    offsets: list[IntArray] = []
-    errors: list[IntArray] = []
-    last = octets.size - period  # last possible start of a whole CADU
-    p = _search(octets, 0, period, tolerance)
-    while p <= last:
-        starts = np.arange(p, last + 1, period, dtype=np.int64)
-        wrong = _marker_errors(octets, starts)
-        bad = wrong > tolerance
-        # lock ends at a damaged marker that is not followed by a good one
-        lost = bad.copy()
-        lost[:-1] &= bad[1:]
-        if starts.size and bad[-1]:
-            follower = starts[-1] + period
-            lost[-1] = not (
-                follower + ASM_LENGTH <= octets.size
-                and _marker_errors(octets, np.array([follower]))[0] <= tolerance
-            )
-        count = int(np.argmax(lost)) if lost.any() else starts.size
-        offsets.append(starts[:count])
-        errors.append(wrong[:count])
-        if count == starts.size:
-            break
-        expected = int(starts[count])
-        p = _search(octets, expected - period + 1, period, tolerance)
-        if p > last:
-            # nothing better follows: the frame that should stand here is kept, its own checks will judge it
-            offsets.append(starts[count : count + 1])
-            errors.append(wrong[count : count + 1])
-            break
+def undamaged_markers(octets: OctetArray) -> tuple[IntArray, BoolArray]:
+    """Start bits (n,) of all markers without a wrong bit, and whether they are inverted (n,)."""
     none = np.empty(0, dtype=np.int64)
-    starts, wrong = np.concatenate([none, *offsets]), np.concatenate([none, *errors])
-    # a frame that lost octets reaches into the next one
-    whole = np.append(np.diff(starts) >= period, True)[: starts.size]
-    return CaduSync(starts[whole], wrong[whole], starts[~whole], period)
+    starts = np.concatenate([none, *_candidates(octets, 0, 0, _SCAN_BITS)])
+    if not starts.size:
+        return none, np.empty(0, dtype=np.bool_)
+    return starts, _marker_errors(octets, starts)[1]
 
 
-def _search(octets: OctetArray, p: int, period: int, tolerance: int) -> int:
-    """First position from `p` on with a marker, and with another one period later where the stream reaches so far."""
-    end = octets.size - ASM_LENGTH + 1
-    while p < end:
-        window = np.arange(p, min(p + _WINDOW, end), dtype=np.int64)
-        for at in window[_marker_errors(octets, window) <= tolerance].tolist():
-            follower = at + period
-            if follower >= end or _marker_errors(octets, np.array([follower]))[0] <= tolerance:
-                return int(at)
-        p += _WINDOW
-    return octets.size
+def distances_of(start_bits: IntArray) -> dict[int, int]:
+    """How often each distance in octets occurs between two markers in a row, commonest first.
+
+    Distances that bits lost or inserted made no whole number of octets are left out.
+    """
+    distance = np.diff(start_bits)
+    whole = distance[(distance % 8 == 0) & (distance >= 8 * ASM_LENGTH)] // 8
+    values, counts = np.unique(whole, return_counts=True)
+    return {int(values[k]): int(counts[k]) for k in np.argsort(-counts, kind="stable")}
 
 
-def _marker_errors(octets: OctetArray, starts: IntArray) -> IntArray:
-    """Bits in which the four octets at `starts` differ from the marker."""
-    word = octets[starts].astype(np.uint32)
+def synchronise(
+    octets: OctetArray,
+    period: int,
+    tolerance: int = DEFAULT_TOLERANCE,
+    verify: Verify | None = None,
+) -> CaduSync:
+    """CADUs of `period` octets in `octets`, markers with up to `tolerance` wrong bits accepted.
+
+    Parameters
+    ----------
+    verify
+        Tells which CADUs prove themselves; frames without neighbours are accepted by it.
+    """
+    return _Synchroniser(octets, period, tolerance, verify).run()
+
+
+@dataclass(slots=True)
+class _Synchroniser:
+    """One pass over a stream."""
+
+    octets: OctetArray
+    period: int
+    tolerance: int
+    verify: Verify | None
+    starts: list[IntArray] = field(default_factory=list)
+
+    def run(self) -> CaduSync:
+        """Return the CADUs of the stream."""
+        length = 8 * self.period
+        last = 8 * self.octets.size - length
+        spacing = length
+        position = self._search(0, 0, (length,))
+        while position is not None and position <= last:
+            count = self._in_lock(position, spacing)
+            if count == 1 and spacing != length:
+                spacing = length
+                count = self._in_lock(position, spacing)
+            self.starts.append(position + spacing * np.arange(count, dtype=np.int64))
+            final = position + spacing * (count - 1)
+            expected = final + spacing
+            if expected > last + (spacing - length):
+                break
+            found = self._search(final + 1, final + length, (spacing, length))
+            if found is None or found > last:
+                # nothing better follows: the frame that should stand here is kept, its own checks will judge it
+                if expected <= last and count > 1:
+                    self.starts.append(np.array([expected], dtype=np.int64))
+                break
+            if found > expected and (found - expected) % spacing == 0:
+                missing = (found - expected) // spacing
+                if missing <= MOST_BRIDGED and count > 1:
+                    self.starts.append(expected + spacing * np.arange(missing, dtype=np.int64))
+            else:
+                distance = found - final
+                spacing = distance if length <= distance < 2 * length else length
+            position = found
+        return self._result()
+
+    def _result(self) -> CaduSync:
+        none = np.empty(0, dtype=np.int64)
+        starts = np.concatenate([none, *self.starts])
+        wrong, inverted = _marker_errors(self.octets, starts)
+        # a frame that lost bits reaches into the next one
+        whole = np.append(np.diff(starts) >= 8 * self.period, True)[: starts.size]
+        return CaduSync(starts[whole], inverted[whole], wrong[whole], starts[~whole] >> 3, self.period)
+
+    def _in_lock(self, position: int, spacing: int) -> int:
+        """Frames from `position` on until two markers in a row are damaged; at least one."""
+        last = 8 * self.octets.size - 8 * self.period
+        count, block = 0, 4
+        while True:
+            starts = position + spacing * np.arange(count, count + block, dtype=np.int64)
+            starts = starts[starts <= last]
+            if not starts.size:
+                return max(count, 1)
+            wrong, _ = _marker_errors(self.octets, starts)
+            bad = wrong > self.tolerance
+            follower = np.append(bad[1:], self._damaged_or_cut_off(int(starts[-1]) + spacing))
+            # a distance that came about by chance may fit the frame after next
+            settled = count + np.arange(starts.size) >= SETTLED
+            lost = bad & (follower | ~settled)
+            if lost.any():
+                return max(count + int(np.argmax(lost)), 1)
+            count += starts.size
+            if starts.size < block:
+                return count
+            block = min(4 * block, 4096)
+
+    def _damaged_or_cut_off(self, bit: int) -> bool:
+        """Whether no marker stands at `bit`, or the stream ends before."""
+        if bit + MARKER_BITS > 8 * self.octets.size:
+            return True
+        wrong, _ = _marker_errors(self.octets, np.array([bit]))
+        return bool(wrong[0] > self.tolerance)
+
+    def _search(self, first: int, free: int, distances: tuple[int, ...]) -> int | None:
+        """First bit from `first` on at which a CADU is believed to begin; None where there is none.
+
+        `free`: end of the frame before; a marker that stands alone counts from there on.
+        """
+        total = 8 * self.octets.size
+        length = 8 * self.period
+        lone: int | None = None
+        for candidates in _candidates(self.octets, first, self.tolerance, 2 * length):
+            wrong, inverted = _marker_errors(self.octets, candidates)
+            confirmed = np.zeros(candidates.size, dtype=np.bool_)
+            for distance in distances:
+                confirmed |= self._follower_stands(candidates, inverted, distance)
+            for k in range(candidates.size):
+                at = int(candidates[k])
+                if lone is not None and at >= lone + length:
+                    return lone
+                if confirmed[k]:
+                    return at
+                if at + length > total:
+                    continue
+                if self.verify is not None:
+                    one = CaduSync(
+                        candidates[k : k + 1],
+                        inverted[k : k + 1],
+                        wrong[k : k + 1],
+                        candidates[:0],
+                        self.period,
+                    )
+                    if self.verify(one)[0]:
+                        return at
+                if lone is None and wrong[k] <= LONE_TOLERANCE and at >= free:
+                    lone = at
+        return lone
+
+    def _follower_stands(self, candidates: IntArray, inverted: BoolArray, distance: int) -> BoolArray:
+        """Whether another marker of the same polarity stands at `distance`, or the stream ends before it."""
+        follower = candidates + distance
+        inside = follower + MARKER_BITS <= 8 * self.octets.size
+        result = ~inside & (candidates + 8 * self.period <= 8 * self.octets.size)
+        if inside.any():
+            wrong, turned = _marker_errors(self.octets, follower[inside])
+            result[inside] = (wrong <= self.tolerance) & (turned == inverted[inside])
+        return result
+
+
+def _candidates(octets: OctetArray, first: int, tolerance: int, stretch: int) -> Iterator[IntArray]:
+    """Yield start bits of markers from bit `first` on, in order, in arrays of limited size.
+
+    `stretch` bits are searched before the first are yielded, more each time after that.
+    """
+    from tmtc import _markers  # numba is imported only where it is used
+
+    readable = octets.view()
+    readable.flags.writeable = False
+    stop = 8 * octets.size - MARKER_BITS + 1
+    found = np.empty(_CANDIDATES, dtype=np.int64)
+    while first < stop:
+        until = min(first + stretch, stop)
+        stretch = min(2 * stretch, _SCAN_BITS)
+        count, first = _markers.find_markers(readable, first, until, tolerance, _markers.tables(), found)
+        if count:
+            yield found[:count].copy()
+
+
+def _marker_errors(octets: OctetArray, start_bits: IntArray) -> tuple[IntArray, BoolArray]:
+    """Bits in which the 32 bits at each start differ from the marker, and whether they fit it inverted."""
+    first, shift = start_bits >> 3, (start_bits & 7).astype(np.uint64)
+    word = octets[first].astype(np.uint64)
     for k in range(1, ASM_LENGTH):
-        word = word << np.uint32(8) | octets[starts + k]
+        word = word << np.uint64(8) | octets[first + k]
+    # of the fifth octet only what a shifted marker reaches; there is none behind an aligned marker at the end
+    fifth = octets[np.minimum(first + ASM_LENGTH, octets.size - 1)]
+    word = (word << np.uint64(8) | fifth) >> (np.uint64(8) - shift) & np.uint64(0xFFFFFFFF)
     wrong: IntArray = np.bitwise_count(word ^ _ASM_WORD).astype(np.int64)
-    return wrong
+    inverted = wrong > MARKER_BITS // 2
+    return np.where(inverted, MARKER_BITS - wrong, wrong), inverted

@@ -1,7 +1,7 @@
-"""The packet dictionary of the payload: version 2, and version 1 before it.
+"""The packet dictionary of the payload: version 3, and versions 1 and 2 before it.
 
 Everything that crosses the link is defined here and nowhere else; the ICD and the XTCE export are generated
-from it.
+from it. A version only adds packets: each decodes everything that an older payload sends.
 """
 
 from __future__ import annotations
@@ -477,18 +477,53 @@ def _second_telecommands() -> tuple[PacketDefinition, ...]:
     )  # fmt: skip
 
 
+def _third_telemetry() -> tuple[PacketDefinition, ...]:
+    """What version 3 adds: the estimate of the filter in place of `filter_state`, which older payloads send."""
+    return (
+        PacketDefinition(
+            "filter_estimate", APID_NAVIGATION_STATE, 129, 7,
+            "Estimate of the navigation filter after a frame with its covariance; sent in place of filter_state",
+            (
+                *_FRAME,
+                Field("position_icrf_m", "f64", "Position, Moon-centred ICRF axes", "m", size=3),
+                Field("velocity_icrf_m_s", "f64", "Velocity, Moon-centred ICRF axes", "m/s", size=3),
+                Field(
+                    "acceleration_rtn_m_s2", "f32", "Empirical acceleration, radial, transverse, normal", "m/s^2",
+                    size=3,
+                ),
+                # Single precision changes the NEES by 1e-7 of its value, half precision of correlations by 1e-3;
+                # the smoother takes differences of successive covariances.
+                Field(
+                    "covariance", "f32",
+                    "Covariance of the nine numbers above, in their order and axes: upper triangle by rows",
+                    "products of m, m/s, m/s^2", size=45,
+                ),
+                Field(
+                    "innovation_degrees", "u16",
+                    "Degrees of freedom of the normalised innovation squared of this frame, 0 without a fix",
+                ),
+            ),
+        ),
+    )  # fmt: skip
+
+
 DICTIONARY_1 = Dictionary(
     version=1,
     telemetry=_telemetry(EVENTS_1, FAILURES_1, TABLES_1),
     telecommands=_telecommands(EVENTS_1, FUNCTIONS_1, TABLES_1, ARGUMENTS_1, 1),
 )
-DICTIONARY = Dictionary(
+DICTIONARY_2 = Dictionary(
     version=2,
     telemetry=_telemetry(EVENTS, FAILURES, TABLES) + _second_telemetry(),
     telecommands=_telecommands(EVENTS, FUNCTIONS, TABLES, ARGUMENTS, 31) + _second_telecommands(),
 )
+DICTIONARY = Dictionary(
+    version=3,
+    telemetry=DICTIONARY_2.telemetry + _third_telemetry(),
+    telecommands=DICTIONARY_2.telecommands,
+)
 
-_VERSIONS = {dictionary.version: dictionary for dictionary in (DICTIONARY_1, DICTIONARY)}
+_VERSIONS = {dictionary.version: dictionary for dictionary in (DICTIONARY_1, DICTIONARY_2, DICTIONARY)}
 
 
 def dictionary_version(version: int) -> Dictionary:

@@ -7,22 +7,19 @@ by trial where they are not given, and never fails on damage: what is lost is co
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Literal
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 from tmtc import cadu, reed_solomon
 from tmtc.clcw import UplinkSeen, uplink_seen
-from tmtc.crc import CRC_LENGTH
+from tmtc.crc import CRC_LENGTH, crc16
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import LinkFormatError, ValueRefused
 from tmtc.frames import (
     FRAME_HEADER_LENGTH,
-    FRAME_MAX_LENGTH,
     IDLE_CHANNEL,
     NO_PACKET_BEGINS,
     OCF_LENGTH,
@@ -32,61 +29,26 @@ from tmtc.frames import (
     frame_headers,
     idle_data,
 )
-from tmtc.packets import idle_packet
+from tmtc.link import Coding, LinkSettings
+from tmtc.link_check import LinkProposal, propose_link
+from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, idle_packet
 from tmtc.pus import TM_HEADER_LENGTH
 from tmtc.randomiser import Randomiser, randomise
-from tmtc.reed_solomon import ReedSolomon, code_for
 from tmtc.schema import Dictionary, Table, as_octets
 from tmtc.sequence import SequenceReport, account
 from tmtc.stream import Octets, PacketCut, PrimaryHeaders, cut_packets, primary_headers
 
 OctetArray = npt.NDArray[np.uint8]
 IntArray = npt.NDArray[np.int64]
-Coding = Literal["rs", "none"]
 
-FRAME_GOOD, FRAME_UNCORRECTABLE, FRAME_BAD_CHECKSUM, FRAME_FOREIGN = 0, 1, 2, 3
-FRAME_VERDICTS = ("good", "uncorrectable", "bad_checksum", "foreign")
+FRAME_GOOD, FRAME_UNCORRECTABLE, FRAME_BAD_CHECKSUM, FRAME_FOREIGN, FRAME_UNCHECKED = 0, 1, 2, 3, 4
+FRAME_VERDICTS = ("good", "uncorrectable", "bad_checksum", "foreign", "unchecked")
+"""A frame that carries neither code nor checksum is `unchecked`: its packets are read, but it is never good."""
 
-_RANDOMISERS: tuple[Randomiser, ...] = ("legacy", "long", "none")
 _BATCH = 512
-_SAMPLE = 48
 
 
-@dataclass(frozen=True, slots=True)
-class LinkSettings:
-    """How frames travel; what both ends of a link have to agree on.
-
-    `interleave` None takes the least that fits `frame_length`. `checksum`: frames end with frame error
-    control.
-    """
-
-    frame_length: int = 1115
-    coding: Coding = "rs"
-    randomiser: Randomiser = "legacy"
-    interleave: int | None = None
-    rs_errors: int = 16
-    dual_basis: bool = True
-    checksum: bool = True
-
-    @property
-    def code(self) -> ReedSolomon | None:
-        """The Reed-Solomon code, or None."""
-        if self.coding == "none":
-            return None
-        if self.coding != "rs":
-            raise LinkFormatError(f"link: expected coding rs or none, found {self.coding!r}")
-        return code_for(self.frame_length, self.rs_errors, self.interleave, self.dual_basis)
-
-    @property
-    def block_length(self) -> int:
-        """Octets between two markers."""
-        code = self.code
-        return self.frame_length if code is None else code.block_length
-
-    @property
-    def cadu_length(self) -> int:
-        """Octets of a CADU, marker included."""
-        return cadu.ASM_LENGTH + self.block_length
+_DEFAULT = LinkSettings()
 
 
 @dataclass(slots=True)
@@ -94,17 +56,13 @@ class DownlinkEncoder:
     """The sending end: keeps the frame counts from one call to the next."""
 
     spacecraft_id: int
-    settings: LinkSettings = LinkSettings()
+    settings: LinkSettings = _DEFAULT
     master_count: int = 0
     channel_counts: dict[int, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not 0 <= self.spacecraft_id < 1 << 10:
             raise ValueRefused("transfer frame", "spacecraft_id", self.spacecraft_id, "0..1023")
-        if not 16 <= self.settings.frame_length <= FRAME_MAX_LENGTH:
-            raise ValueRefused(
-                "transfer frame", "frame_length", self.settings.frame_length, f"16..{FRAME_MAX_LENGTH}"
-            )
 
     def encode(
         self,
@@ -228,7 +186,9 @@ class FrameTable:
 
     `offset` of the marker in the stream, `marker_errors` wrong bits of it, `corrected` symbols repaired
     ((n, interleave), -1 where a codeword is lost), `verdict` an index of `FRAME_VERDICTS`; the header
-    fields of lost frames are not to be trusted.
+    fields of lost frames are not to be trusted. `buffer_offset` and `buffer_octets` are where the packet zone of the
+    frame lies in the buffer of packet octets, -1 and 0 for frames that gave none. Packets that were put together from
+    parts lie in the buffer behind the zones.
     """
 
     offset: IntArray
@@ -241,6 +201,8 @@ class FrameTable:
     channel_count: IntArray
     first_header_pointer: IntArray
     clcw: npt.NDArray[np.uint32]
+    buffer_offset: IntArray
+    buffer_octets: IntArray
 
     def __len__(self) -> int:
         return int(self.offset.size)
@@ -316,6 +278,11 @@ class DownlinkDecode:
         return 0 if self.frames is None else len(self.frames)
 
     @property
+    def frames_unchecked(self) -> int:
+        """Frames that carry neither code nor checksum, so that nobody knows whether they are good."""
+        return 0 if self.frames is None else int(np.count_nonzero(self.frames.verdict == FRAME_UNCHECKED))
+
+    @property
     def uplink(self) -> tuple[UplinkSeen, ...]:
         """What the frames of the spacecraft tell of its telecommand channels."""
         return () if self.frames is None else uplink_seen(self.frames.clcw)
@@ -352,12 +319,13 @@ class DownlinkDecode:
             "octets_skipped": self.octets_skipped,
             "frames": self.frame_count,
             "frames_bad": self.frames_bad,
+            "frames_unchecked": self.frames_unchecked,
             "frames_lost": self.frames_lost,
             "symbols_corrected": self.symbols_corrected,
             "clcw": [asdict(seen) for seen in self.uplink],
             "octets": self.octets,
             "spacecraft_id": self.spacecraft_id,
-            "link": None if self.settings is None else _describe(self.settings),
+            "link": None if self.settings is None else self.settings.describe(),
         }
 
 
@@ -384,13 +352,49 @@ def decode(
         Markers stand in the stream, but no setting known here makes frames of what is between them.
     """
     stream = as_octets(octets)
-    period = settings.cadu_length if settings else cadu.find_period(stream)
-    if not period or (settings is None and not _looks_like_cadus(stream, period)):
-        return _bare_packets(stream, dictionary)
-    synchronised = cadu.synchronise(stream, period)
     if settings is None:
-        settings = _find_settings(stream, synchronised)
+        settings = settings_of(stream, dictionary)
+    if settings is None:
+        return _bare_packets(stream, dictionary)
+    synchronised = cadu.synchronise(stream, settings.cadu_length, verify=proof_of(stream, settings))
     return _frames_to_packets(stream, synchronised, settings, spacecraft_id, dictionary)
+
+
+def propose_settings(octets: Octets, dictionary: Dictionary = DICTIONARY) -> LinkProposal:
+    """Return the link settings that the whole stream supports, with the evidence."""
+    stream = as_octets(octets)
+
+    def count_packets(sync: cadu.CaduSync, settings: LinkSettings) -> tuple[int, float]:
+        found = _frames_to_packets(stream, sync, settings, None, dictionary)
+        filled = found.octets["packets"] + found.octets["idle_packets"] + found.octets["idle_frames"]
+        return found.packets, filled / max(len(sync.start_bits) * settings.frame_length, 1)
+
+    return propose_link(stream, count_packets)
+
+
+def settings_of(octets: Octets, dictionary: Dictionary = DICTIONARY) -> LinkSettings | None:
+    """Return the link settings of a stream of CADUs; None for bare packets.
+
+    Raises
+    ------
+    LinkFormatError
+        Markers stand in the stream, but no frame proves itself under any setting known here.
+    """
+    proposal = propose_settings(octets, dictionary)
+    if proposal.settings is None and proposal.has_regular_markers and not _holds_packets(octets):
+        distance = next(iter(proposal.distances), 0)
+        raise LinkFormatError(
+            f"downlink: {proposal.markers} markers stand in the stream, most of them every {distance} octets, but no "
+            "coding and randomiser known here fits; expected Reed-Solomon, frame error control or packets to prove a "
+            "frame, found none; state the settings of the link if they are known"
+        )
+    return proposal.settings
+
+
+def _holds_packets(octets: Octets) -> bool:
+    """Whether bare packets take up most of a stream."""
+    cut = cut_packets(octets)
+    return 2 * int(cut.lengths[cut.crc_ok].sum()) > as_octets(octets).size
 
 
 def _bare_packets(stream: OctetArray, dictionary: Dictionary) -> DownlinkDecode:
@@ -433,6 +437,8 @@ def _frames_to_packets(
     foreign = (header.version != 0) | (header.spacecraft_id != spacecraft_id)
     verdict[(verdict == FRAME_GOOD) & foreign] = FRAME_FOREIGN
     good = verdict == FRAME_GOOD
+    if not settings.proves_frames:
+        verdict[good] = FRAME_UNCHECKED
 
     end = settings.frame_length - (CRC_LENGTH if settings.checksum else 0)
     clcw = np.zeros(frames.shape[0], dtype=np.uint32)
@@ -441,7 +447,9 @@ def _frames_to_packets(
 
     parts: list[OctetArray] = []
     segments: list[IntArray] = []
-    filled, idle_octets, orphaned, frames_lost = 0, 0, 0, 0
+    filled, zone_octets, orphaned, idle_octets, frames_lost = 0, 0, 0, 0, 0
+    buffer_offset = np.full(frames.shape[0], -1, dtype=np.int64)
+    buffer_octets = np.zeros(frames.shape[0], dtype=np.int64)
     # where the packet zone begins and ends: behind the secondary header, before the operational control field
     zone_start = FRAME_HEADER_LENGTH + np.where(
         header.secondary_header, (frames[:, FRAME_HEADER_LENGTH] & 0x3F).astype(np.int64) + 1, 0
@@ -454,9 +462,13 @@ def _frames_to_packets(
         rebuilt = _rebuild(
             frames[mine, start:stop], header.channel_count[mine], header.first_header_pointer[mine]
         )
+        used = mine[header.first_header_pointer[mine] != ONLY_IDLE_DATA]
+        buffer_offset[used] = filled + (stop - start) * np.arange(used.size)
+        buffer_octets[used] = stop - start
         parts.append(rebuilt.buffer)
         segments.append(rebuilt.segments + filled)
         filled += rebuilt.buffer.size
+        zone_octets += rebuilt.octets + rebuilt.idle_octets
         idle_octets += rebuilt.idle_octets
         orphaned += rebuilt.orphaned
         frames_lost += rebuilt.frames_lost
@@ -465,7 +477,6 @@ def _frames_to_packets(
     cut = cut_packets(buffer, segments=ranges)
     headers = primary_headers(buffer, cut)
     n_good = int(np.count_nonzero(good))
-    zone_octets = filled + idle_octets
     octets = _octet_account(int((ranges[:, 1] - ranges[:, 0]).sum()), cut)
     octets["orphaned"] = orphaned
     octets["idle_frames"] = idle_octets
@@ -483,6 +494,8 @@ def _frames_to_packets(
         channel_count=header.channel_count,
         first_header_pointer=header.first_header_pointer,
         clcw=clcw,
+        buffer_offset=buffer_offset,
+        buffer_octets=buffer_octets,
     )
     return DownlinkDecode(
         buffer=buffer,
@@ -510,7 +523,7 @@ def _read_frames(
     corrected = np.zeros((n, code.interleave if code else 1), dtype=np.int16)
     for first in range(0, n, _BATCH):
         part = slice(first, min(first + _BATCH, n))
-        blocks = randomise(_blocks(stream, sync.offsets[part], settings.block_length), settings.randomiser)
+        blocks = randomise(_blocks(stream, sync.take(np.arange(n)[part])), settings.randomiser)
         if code is None:
             frames[part] = blocks
         else:
@@ -519,21 +532,35 @@ def _read_frames(
     return frames, corrected
 
 
-def _blocks(stream: OctetArray, offsets: IntArray, length: int) -> OctetArray:
-    """The `length` octets behind each marker (n, length)."""
-    if not offsets.size:
-        return np.empty((0, length), dtype=np.uint8)
-    windows = np.lib.stride_tricks.sliding_window_view(stream, cadu.ASM_LENGTH + length)
-    return np.ascontiguousarray(windows[offsets][:, cadu.ASM_LENGTH :])
+def _blocks(stream: OctetArray, sync: cadu.CaduSync) -> OctetArray:
+    """The octets behind each marker (n, period - 4), aligned and upright."""
+    return cadu.cadu_octets(stream, sync)[:, cadu.ASM_LENGTH :]
+
+
+def proof_of(stream: OctetArray, settings: LinkSettings) -> cadu.Verify | None:
+    """Return a test whether CADUs hold frames that their code or checksum proves; None where a frame has neither."""
+    if not settings.proves_frames:
+        return None
+
+    def proves(sync: cadu.CaduSync) -> npt.NDArray[np.bool_]:
+        frames, corrected = _read_frames(stream, sync, settings)
+        repaired: npt.NDArray[np.bool_] = np.all(corrected >= 0, axis=1)
+        return repaired & frame_checksums_hold(frames) if settings.checksum else repaired
+
+    return proves
 
 
 _LATE_FRAMES = 64
+COUNT_MODULUS = 256
+_MOST_TRIED = 4096
+"""Frames tried for the rest of one packet: a packet of 65,542 octets in the shortest frames in use takes 310."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rebuilt:
     buffer: OctetArray
     segments: IntArray
+    octets: int
     idle_octets: int
     orphaned: int
     frames_lost: int
@@ -543,28 +570,145 @@ def _rebuild(zones: OctetArray, count: IntArray, pointer: IntArray) -> _Rebuilt:
     """The packet octets of one virtual channel and the stretches of them that are unbroken.
 
     A stretch begins at the first packet that begins in it: octets before belong to a packet whose head was
-    lost.
+    lost. A packet whose end is missing behind its beginning is completed from frames that stand elsewhere in the
+    stream: sent again, received by another station, or recorded out of order.
     """
     zone = zones.shape[1]
-    step = np.diff(count) % 256
+    step = np.diff(count) % COUNT_MODULUS
     run = np.concatenate((np.zeros(1, dtype=np.int64), np.cumsum(step != 1)))
     idle = pointer == ONLY_IDLE_DATA
-    lost = 0 if (step == 1).all() else _frames_lost(zones, count, idle)
-    zones, pointer, run = zones[~idle], pointer[~idle], run[~idle]
+    in_order = bool((step == 1).all())
+    lost = 0 if in_order else _frames_lost(zones, count, idle)
+    zones, pointer, run, count = zones[~idle], pointer[~idle], run[~idle], count[~idle]
+    buffer = np.ascontiguousarray(zones).reshape(-1)
+    segments = _segments(pointer, run, zone)
+    octets = buffer.size
+    if not in_order and segments.size:
+        run = _split_where_damaged(buffer, segments, run, zone)
+        segments = _segments(pointer, run, zone)
+        completed, joined = _complete(zones, count, pointer, run, buffer, segments)
+        if len(joined) > len(segments):
+            # frames that belong together do not follow one another: their order tells nothing about losses
+            lost = min(lost, _least_frames_lost(zones, count))
+        buffer, segments = completed, joined
+    return _Rebuilt(
+        buffer=buffer,
+        segments=segments,
+        octets=octets,
+        idle_octets=int(np.count_nonzero(idle)) * zone,
+        orphaned=octets - int((segments[:, 1] - segments[:, 0]).sum()),
+        frames_lost=lost,
+    )
+
+
+def _segments(pointer: IntArray, run: IntArray, zone: int) -> IntArray:
+    """Octets [start, stop) (s, 2) of each run from the first packet that begins in it."""
     begins = np.flatnonzero(pointer < zone)
     runs, first = np.unique(run[begins], return_index=True)
     starts = begins[first] * zone + pointer[begins[first]]
     stops = np.searchsorted(run, runs, side="right") * zone
-    segments = np.stack((starts, stops), axis=1).astype(np.int64)
-    used = int((stops - starts).sum())
-    buffer = np.ascontiguousarray(zones).reshape(-1)
-    return _Rebuilt(
-        buffer=buffer,
-        segments=segments,
-        idle_octets=int(np.count_nonzero(idle)) * zone,
-        orphaned=buffer.size - used,
-        frames_lost=lost,
+    return np.stack((starts, stops), axis=1).astype(np.int64)
+
+
+def _split_where_damaged(buffer: OctetArray, segments: IntArray, run: IntArray, zone: int) -> IntArray:
+    """Runs (n,) that end where a packet across the border of two frames does not hold.
+
+    Of frames in any order one in 256 follows another by chance.
+    """
+    cut = cut_packets(buffer, segments=segments)
+    bad = ~cut.crc_ok
+    ranges = np.concatenate(
+        [cut.skipped, np.stack((cut.offsets[bad], cut.offsets[bad] + cut.lengths[bad]), axis=1)]
     )
+    border = -(-(ranges[:, 0] + 1) // zone)
+    # not at the end of the run, where there is nothing to part
+    parted = border[(border * zone < ranges[:, 1]) & (border < run.size)]
+    begins_anew = np.zeros(run.size, dtype=np.int64)
+    begins_anew[parted] = 1
+    begins_anew[1:] |= np.diff(run) != 0
+    return np.cumsum(begins_anew)
+
+
+def _complete(
+    zones: OctetArray,
+    count: IntArray,
+    pointer: IntArray,
+    run: IntArray,
+    buffer: OctetArray,
+    segments: IntArray,
+) -> tuple[OctetArray, IntArray]:
+    """Buffer and segments with the packets that the ends of runs and the orphaned beginnings of others make up.
+
+    The end of a run that is the beginning of a packet is continued by frames with the counts that follow; the length
+    in the packet's header and its checksum decide whether they belong together. Octets are used once.
+    """
+    zone = zones.shape[1]
+    orphans: dict[int, list[int]] = {}
+    for begin in np.flatnonzero(np.concatenate((np.ones(1, dtype=np.bool_), np.diff(run) != 0))).tolist():
+        for k in range(begin, run.size):
+            if run[k] != run[begin]:
+                break
+            if pointer[k] > 0:
+                orphans.setdefault(int(count[k]), []).append(k)
+            if pointer[k] < zone:
+                break
+    tails = cut_packets(buffer, segments=segments).skipped
+    ends = dict(zip(segments[:, 1].tolist(), range(len(segments)), strict=True))
+    segments, extra = segments.copy(), []
+    used: set[int] = set()
+    for start, stop in tails.tolist():
+        row = ends.get(stop)
+        if row is None:
+            continue
+        path = _continuation(
+            buffer[start:stop].tobytes(), int(count[stop // zone - 1]), zones, pointer, orphans, used
+        )
+        if path:
+            used.update(path)
+            segments[row, 1] = start
+            extra.append(
+                np.concatenate([buffer[start:stop], *(zones[k, : min(pointer[k], zone)] for k in path)])
+            )
+    lengths = np.array([part.size for part in extra], dtype=np.int64)
+    stops = buffer.size + np.cumsum(lengths)
+    added = np.stack((stops - lengths, stops), axis=1)
+    return np.concatenate([buffer, *extra]), np.concatenate([segments, added])
+
+
+def _continuation(
+    begun: bytes,
+    count: int,
+    zones: OctetArray,
+    pointer: IntArray,
+    orphans: dict[int, list[int]],
+    used: set[int],
+) -> list[int]:
+    """Frames whose first octets complete a packet that has begun in a frame with that count; none where none do.
+
+    Paths through copies of one frame are tried once, and `_MOST_TRIED` frames at most.
+    """
+    zone = zones.shape[1]
+    open_paths: list[tuple[bytes, int, list[int]]] = [(begun, count, [])]
+    known: set[tuple[int, bytes]] = set()
+    tried = 0
+    while open_paths and tried < _MOST_TRIED:
+        octets_before, count, path = open_paths.pop()
+        count = (count + 1) % COUNT_MODULUS
+        for k in orphans.get(count, ()):
+            if k in used or k in path:
+                continue
+            tried += 1
+            octets = octets_before + zones[k, : min(pointer[k], zone)].tobytes()
+            if (len(path), octets) in known:
+                continue
+            known.add((len(path), octets))
+            long_enough = len(octets) >= PRIMARY_HEADER_LENGTH
+            wanted = int.from_bytes(octets[4:6], "big") + 7 if long_enough else PACKET_MAX_LENGTH
+            if len(octets) == wanted and crc16(octets) == 0:
+                return [*path, k]
+            if pointer[k] >= zone and len(octets) < wanted:
+                open_paths.append((octets, count, [*path, k]))
+    return []
 
 
 def _frames_lost(zones: OctetArray, count: IntArray, idle: npt.NDArray[np.bool_]) -> int:
@@ -586,6 +730,19 @@ def _frames_lost(zones: OctetArray, count: IntArray, idle: npt.NDArray[np.bool_]
     unwrapped = np.cumsum(np.where(step >= 256 - _LATE_FRAMES, step - 256, step), dtype=np.int64)
     numbers = np.unique(np.concatenate((np.zeros(1, dtype=np.int64), unwrapped)))
     return int(numbers[-1] - numbers[0]) + 1 - numbers.size
+
+
+def _least_frames_lost(zones: OctetArray, count: IntArray) -> int:
+    """The least number of frames that must be missing between frames (n, zone) in an unknown order.
+
+    A sequence of T frames with counts from s on holds the count c at most (T - (c - s) mod 256 + 255) div 256 times.
+    """
+    different = {(number, zones[k].tobytes()) for k, number in enumerate(count.tolist())}
+    times = np.bincount([number for number, _ in different], minlength=COUNT_MODULUS)
+    seen = np.flatnonzero(times)
+    behind = (seen[None, :] - np.arange(COUNT_MODULUS)[:, None]) % COUNT_MODULUS
+    needed = (COUNT_MODULUS * (times[seen] - 1) + behind + 1).max(axis=1)
+    return int(needed.min()) - len(different)
 
 
 def _octet_account(total: int, cut: PacketCut) -> dict[str, int]:
@@ -615,10 +772,11 @@ def _account(
     good = np.flatnonzero(cut.crc_ok)
     offsets, lengths = cut.offsets[good], cut.lengths[good]
     ticks = np.arange(good.size, dtype=np.int64)
-    timed = np.flatnonzero(
-        headers.secondary_header[good] & (lengths >= FRAME_HEADER_LENGTH + TM_HEADER_LENGTH)
-    )
-    timed = timed[buffer[offsets[timed] + 13] == 0x2E]
+    apid = headers.apid[good]
+    # only packets of the dictionary are known to carry their time there; an APID is ordered by it as a whole or not
+    has_time = (dictionary.identify(buffer, cut)[good] >= 0) & headers.secondary_header[good]
+    has_time &= lengths >= FRAME_HEADER_LENGTH + TM_HEADER_LENGTH
+    timed = np.flatnonzero(has_time & ~np.isin(apid, apid[~has_time]))
     value = np.zeros(timed.size, dtype=np.int64)
     for k in range(14, 20):
         value = value << 8 | buffer[offsets[timed] + k]
@@ -630,7 +788,7 @@ def _account(
         return bool(first == view[offsets[b] : offsets[b] + lengths[b]])
 
     return account(
-        headers.apid[good],
+        apid,
         headers.sequence_count[good],
         ticks,
         same,
@@ -665,104 +823,3 @@ def _boots(buffer: OctetArray, cut: PacketCut, ticks: IntArray, dictionary: Dict
                 begins[k] = between.min()
     found: IntArray = boots[np.maximum(np.searchsorted(begins, ticks, side="right") - 1, 0)]
     return found
-
-
-def _looks_like_cadus(stream: OctetArray, period: int) -> bool:
-    """Whether markers stand at most of the places where a stream of that period has them."""
-    if period < cadu.ASM_LENGTH + FRAME_HEADER_LENGTH + 2:
-        return False
-    sample = stream[: max(64 * period, 1 << 16)]
-    found = cadu.synchronise(sample, period).offsets.size
-    return 2 * found * period >= sample.size or found >= 3
-
-
-def _find_settings(stream: OctetArray, sync: cadu.CaduSync) -> LinkSettings:
-    """The settings under which the stream makes sense, among those that the distance of markers allows.
-
-    Codewords, then frame checksums, then headers and packets are asked. The last decide between settings that the code
-    cannot tell apart: the legacy sequence is a codeword itself where no virtual fill is used.
-    """
-    n = sync.offsets.size
-    # spread over the stream, so that one bad stretch does not hide the truth
-    spread = (
-        sync.offsets[np.unique(np.linspace(0, n - 1, min(n, _SAMPLE)).astype(np.int64))]
-        if n
-        else sync.offsets
-    )
-    coded, uncoded = _candidates(sync.period - cadu.ASM_LENGTH)
-    blocks = _blocks(stream, spread, sync.period - cadu.ASM_LENGTH)
-    plain = {name: randomise(blocks, name) for name in _RANDOMISERS}
-    finalists = (
-        _best([(_clean_share(plain[c.randomiser], c), c) for c in coded])
-        or _best([(float(frame_checksums_hold(plain[c.randomiser]).mean()), c) for c in uncoded])
-        or [c for c in coded if _can_repair(plain[c.randomiser], c)]
-        or [replace(c, checksum=False) for c in uncoded]
-    )
-    scores = []
-    for candidate in finalists:
-        settings = candidate
-        code = candidate.code
-        frames = plain[candidate.randomiser]
-        if code is not None:
-            decoded = reed_solomon.decode(frames[:8], code)
-            frames = decoded.frames[(decoded.corrected >= 0).all(axis=1)]
-            if not frame_checksums_hold(frames).sum() > frames.shape[0] / 2:
-                settings = replace(candidate, checksum=False)
-        # version 0, and behind the counts: no flags set, segment length id 11
-        regular = (frames[:, 0] >> 6 == 0) & (frames[:, 4] >> 3 == 0b00011)
-        packets = _frames_to_packets(stream, sync.head(64), settings, None, DICTIONARY).packets
-        scores.append((packets + float(regular.mean()) if regular.size else packets, settings))
-    score, settings = max(scores, key=operator.itemgetter(0))
-    if score < 0.5:
-        raise LinkFormatError(
-            f"downlink: markers stand every {sync.period} octets, but no coding and randomiser known here fits; "
-            "expected Reed-Solomon, frame error control, frame headers or packets to make sense, found none of them"
-        )
-    return settings
-
-
-def _best(shares: list[tuple[float, LinkSettings]]) -> list[LinkSettings]:
-    """Those with at least half of the greatest share; none where all shares are small."""
-    greatest = max((share for share, _ in shares), default=0.0)
-    return [settings for share, settings in shares if share >= greatest / 2] if greatest > 0.02 else []
-
-
-def _clean_share(blocks: OctetArray, settings: LinkSettings) -> float:
-    assert settings.code is not None
-    return float(reed_solomon.clean(blocks, settings.code).mean())
-
-
-def _can_repair(blocks: OctetArray, settings: LinkSettings) -> bool:
-    """Whether the first codeword of some block can be repaired."""
-    code = settings.code
-    assert code is not None
-    _, corrected = reed_solomon.repair(blocks[:8, :: code.interleave], code)
-    return bool((corrected >= 0).any())
-
-
-def _candidates(block_length: int) -> tuple[list[LinkSettings], list[LinkSettings]]:
-    coded = []
-    for errors in (16, 8):
-        for depth in reversed(reed_solomon.INTERLEAVES):
-            frame_length = block_length - 2 * errors * depth
-            if block_length % depth or block_length // depth > reed_solomon.CODEWORD or frame_length < 16:
-                continue
-            for dual in (True, False):
-                for name in _RANDOMISERS:
-                    coded.append(LinkSettings(frame_length, "rs", name, depth, errors, dual))
-    uncoded = [LinkSettings(block_length, "none", name) for name in _RANDOMISERS]
-    return coded, uncoded
-
-
-def _describe(settings: LinkSettings) -> dict[str, object]:
-    code = settings.code
-    return {
-        "frame_length": settings.frame_length,
-        "cadu_length": settings.cadu_length,
-        "coding": settings.coding,
-        "interleave": code.interleave if code else None,
-        "rs_errors": code.errors if code else None,
-        "dual_basis": code.dual_basis if code else None,
-        "randomiser": settings.randomiser,
-        "checksum": settings.checksum,
-    }

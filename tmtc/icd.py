@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tmtc.dictionary import DICTIONARY
+from tmtc.effects import EFFECTS
 from tmtc.packets import TYPE_TELEMETRY
 from tmtc.schema import Dictionary, Field, PacketDefinition
 
@@ -113,6 +114,7 @@ def format_icd(dictionary: Dictionary = DICTIONARY) -> str:
         lines.append("")
         for d in definitions:
             lines += _packet(d)
+    lines += _effects()
     lines += _enumerations(dictionary)
     return "\n".join(lines)
 
@@ -179,6 +181,18 @@ def _range(f: Field) -> str:
 
 def _labels(f: Field) -> str:
     return f" (see [{f.name}](#values-of-{f.name}))" if f.labels else ""
+
+
+def _effects() -> list[str]:
+    lines = ["## Effects of telecommands\n"]
+    lines.append(
+        "Telecommands that are not routine are released by another person than who entered them, unless the mission "
+        "says otherwise. `insert_activity` has the effect of the telecommand that it carries.\n"
+    )
+    lines.append("| telecommand | effect | reason |\n|---|---|---|")
+    lines += [f"| {one.subject} | {one.effect} | {one.reason} |" for one in EFFECTS.values()]
+    lines.append("")
+    return lines
 
 
 def _enumerations(dictionary: Dictionary) -> list[str]:

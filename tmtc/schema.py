@@ -312,11 +312,16 @@ class Dictionary:
         acknowledgements: int = ACK_ALL,
         source: int = 0,
     ) -> bytes:
-        """The telecommand packet `name` holding `values`; same rules as `pack`."""
+        """The telecommand packet `name` holding `values`; same rules as `pack`, for finite numbers only.
+
+        Nothing is taken for a number that is none: true and false are refused as values of any field.
+        """
         compiled = self._find(name)
         definition = compiled.definition
         if definition.packet_type != TYPE_TELECOMMAND:
             raise UnknownPacket(f"expected a telecommand, found telemetry packet {name!r}")
+        for field_name, value in values.items():
+            _refuse_no_number(name, field_name, value)
         header = TcSecondaryHeader(definition.service, definition.subtype, acknowledgements, source)
         return compiled.packet(pack_tc_header(header), values, sequence_count)
 
@@ -748,6 +753,21 @@ def _encode_column(packet: str, f: Field, value: object) -> Array:
     _refuse(packet, f, given, (codes < least) | (codes > greatest))
     codes[absent] = 0 if f.missing is None else f.missing
     return codes.astype(f.dtype)
+
+
+def _refuse_no_number(packet: str, name: str, value: object) -> None:
+    """Refuse booleans, NaN and infinities anywhere in an argument of a telecommand."""
+    if isinstance(value, Mapping):
+        for key, one in value.items():
+            _refuse_no_number(packet, f"{name}.{key}", one)
+    elif isinstance(value, np.ndarray):
+        if value.dtype.kind == "b" or (value.dtype.kind == "f" and not np.isfinite(value).all()):
+            raise ValueRefused(packet, name, f"an array of {value.dtype}", "finite numbers")
+    elif isinstance(value, (list, tuple)):
+        for one in value:
+            _refuse_no_number(packet, name, one)
+    elif isinstance(value, (bool, np.bool_)) or (isinstance(value, float) and not math.isfinite(value)):
+        raise ValueRefused(packet, name, value, "a finite number")
 
 
 def _refuse(packet: str, f: Field, given: Array, wrong: Array) -> None:

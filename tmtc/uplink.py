@@ -175,12 +175,14 @@ class Farm:
     def accept(self, frame: TcFrame) -> bool:
         """Whether the frame's data are to be used; control commands are executed here and give False."""
         if frame.control:
-            if not frame.bypass:
+            sets_count = frame.data[:2] == CONTROL_SET_COUNT and len(frame.data) == 3
+            # a command that is neither of the two is an invalid frame, which is not counted (232.1-B, event E9)
+            if not frame.bypass or not (sets_count or frame.data == CONTROL_UNLOCK):
                 return False
             self.farm_b_counter = (self.farm_b_counter + 1) & 0b11
             if frame.data == CONTROL_UNLOCK:
                 self.lockout = self.retransmit = False
-            elif frame.data[:2] == CONTROL_SET_COUNT and len(frame.data) == 3 and not self.lockout:
+            elif not self.lockout:
                 self.expected, self.retransmit = frame.data[2], False
             return False
         if frame.bypass:

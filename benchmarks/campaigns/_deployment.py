@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import shutil
 import signal
@@ -14,7 +15,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from sqlalchemy import text
+
 from ground_service.store.database import prepare_database
+from ground_service.store.roles import grant_service
 
 
 def free_port() -> int:
@@ -79,6 +83,15 @@ class Part:
         assert self._process is not None
         return self._process.pid
 
+    def kill_child(self, module: str) -> bool:
+        """Kill the child process that runs this module, which its parent has to start again; whether there was one."""
+        for pid in descendants(self.pid):
+            with contextlib.suppress(OSError):
+                if module.encode() in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"):
+                    os.kill(pid, signal.SIGKILL)
+                    return True
+        return False
+
     def end(self) -> None:
         """Kill it for good: it is not started again."""
         self._ended = True
@@ -95,14 +108,27 @@ class Part:
                 os.kill(pid, signal.SIGKILL)
         self._process.wait()
         until = time.monotonic() + 10.0
-        while any(Path(f"/proc/{pid}").exists() for pid in family) and time.monotonic() < until:
+        while any(runs(pid) for pid in family) and time.monotonic() < until:
             time.sleep(0.05)
 
 
-def service_environment(**settings: str) -> dict[str, str]:
+def bare_environment(**settings: str) -> dict[str, str]:
     """The environment with these settings of the service and none that it had before."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("LINNA_")}
     return {**kept, **settings}
+
+
+def service_environment(**settings: str) -> dict[str, str]:
+    """The environment of a service whose database belongs to the role that it uses."""
+    return bare_environment(LINNA_ALLOW_DATABASE_OWNER="true", **settings)
+
+
+def runs(pid: int) -> bool:
+    """Whether a process is there and has not ended; one that has may wait long for its parent to notice."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
 
 
 def descendants(pid: int) -> list[int]:
@@ -125,6 +151,7 @@ class Laptop:
     def __init__(self, folder: Path, **settings: str) -> None:
         port = free_port()
         self.api = f"http://127.0.0.1:{port}"
+        self.apis = (self.api,)
         self.home = folder / "home"
         self.url: str | None = None
         command = [sys.executable, "-m", "linna", "serve", "--port", str(port)]
@@ -187,37 +214,97 @@ class PostgresServer:
         return subprocess.run(ask, check=False).returncode == 0
 
 
-class Deployment:
-    """PostgreSQL, Redis, the API and two workers."""
+SERVICE_ROLE = "service"
 
-    def __init__(self, folder: Path) -> None:
+
+class Deployment:
+    """PostgreSQL, Redis, API processes and two workers, as a database role that owns nothing."""
+
+    def __init__(self, folder: Path, apis: int = 1, **settings: str) -> None:
         if shutil.which("redis-server") is None:
             raise SystemExit("expected redis-server on this machine, found none")
         database = PostgresServer(folder)
         self.parts = {"database": database.part}
-        self.url = database.url
+        self.url = database.url.replace("//linna@", f"//{SERVICE_ROLE}@")
         self.home = folder / "home"
-        broker, port = free_port(), free_port()
-        self.api = f"http://127.0.0.1:{port}"
-        environment = service_environment(
+        broker = free_port()
+        environment = bare_environment(
             LINNA_HOME=str(self.home),
             LINNA_DATABASE_URL=self.url,
             LINNA_BROKER_URL=f"redis://127.0.0.1:{broker}/0",
             LINNA_RATE_LIMIT_PER_S="0",
+            **settings,
         )
         linna = [sys.executable, "-m", "linna"]
         redis = [
             "redis-server", "--port", str(broker), "--bind", "127.0.0.1", "--dir", str(folder), "--save", "",
             "--appendonly", "no",
         ]  # fmt: skip
+        addresses = []
         try:
-            prepare_database(self.url, upgrade=True).engine.dispose()
+            self._prepare(database.url)
             self._add("broker", Part(redis, folder / "redis.log", lambda: listens(broker)))
-            serve = [*linna, "serve", "--port", str(port)]
-            self._add("api", Part(serve, folder / "api.log", lambda: listens(port), env=environment))
+            for number in range(1, apis + 1):
+                port = free_port()
+                addresses.append(f"http://127.0.0.1:{port}")
+                serve = [*linna, "serve", "--port", str(port)]
+                ready = functools.partial(listens, port)
+                self._add(f"api {number}", Part(serve, folder / f"api{number}.log", ready, env=environment))
             for number in (1, 2):
                 log = folder / f"worker{number}.log"
                 self._add(f"worker {number}", Part([*linna, "worker"], log, lambda: True, env=environment))
+        except BaseException:
+            self.stop()
+            raise
+        self.apis = tuple(addresses)
+        self.api = self.apis[0]
+
+    @staticmethod
+    def _prepare(owner_url: str) -> None:
+        """Make the schema as its owner, and the role of the service."""
+        database = prepare_database(owner_url, upgrade=True)
+        with database.writing() as connection:
+            connection.execute(text(f"CREATE ROLE {SERVICE_ROLE} LOGIN"))
+        grant_service(database, SERVICE_ROLE)
+        database.engine.dispose()
+
+    def _add(self, name: str, part: Part) -> None:
+        part.start()
+        self.parts[name] = part
+
+    def stop(self) -> None:
+        for part in self.parts.values():
+            part.end()
+
+
+class ManyApis:
+    """Several API processes over one database and one broker, without workers: jobs are entered and left."""
+
+    def __init__(self, folder: Path, url: str, count: int = 2) -> None:
+        if shutil.which("redis-server") is None:
+            raise SystemExit("expected redis-server on this machine, found none")
+        self.url = url
+        self.home = folder / "home"
+        self.parts: dict[str, Part] = {}
+        broker, ports = free_port(), [free_port() for _ in range(count)]
+        self.ports = tuple(ports)
+        environment = service_environment(
+            LINNA_HOME=str(self.home),
+            LINNA_DATABASE_URL=url,
+            LINNA_BROKER_URL=f"redis://127.0.0.1:{broker}/0",
+            LINNA_RATE_LIMIT_PER_S="0",
+        )
+        redis = [
+            "redis-server", "--port", str(broker), "--bind", "127.0.0.1", "--dir", str(folder), "--save", "",
+            "--appendonly", "no",
+        ]  # fmt: skip
+        try:
+            self._add("broker", Part(redis, folder / "redis.log", lambda: listens(broker)))
+            for number, port in enumerate(ports, start=1):
+                command = [sys.executable, "-m", "linna", "serve", "--port", str(port)]
+                log = folder / f"api{number}.log"
+                ready = functools.partial(listens, port)
+                self._add(f"api {number}", Part(command, log, ready, env=environment))
         except BaseException:
             self.stop()
             raise
@@ -225,6 +312,12 @@ class Deployment:
     def _add(self, name: str, part: Part) -> None:
         part.start()
         self.parts[name] = part
+
+    def __enter__(self) -> ManyApis:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
 
     def stop(self) -> None:
         for part in self.parts.values():

@@ -1,11 +1,17 @@
-"""Random kills of every part of the service during ingest and reports.
+"""Random kills of every part of the service during ingest, commanding and reports.
 
-    python -m benchmarks.campaigns.kill [--kills 500] [--state FILE [--seconds S]] [--laptop] [--json]
+    python -m benchmarks.campaigns.kill [--kills 300] [--state FILE [--seconds S]] [--laptop] [--json]
 
-Starts PostgreSQL, Redis, the API and two workers on private ports, uploads pieces of one downlink in random order, over
-and over, asks for reports, and meanwhile kills (SIGKILL) one part after another and starts it again. In the end every
-job has to be at its end, every upload ingested, and the archive equal to that of the same downlink ingested once,
-undisturbed, into SQLite. Exit status 1 where that does not hold. `--laptop`: the API alone, with its jobs, on SQLite.
+Starts PostgreSQL, Redis, two API processes and two workers on private ports. Four clients upload pieces of one
+downlink, cut at random octets, in random order, with and without their place, over and over, and meanwhile enter,
+release, reject and fetch telecommands. One part after another, the front process of an API among them, is killed
+(SIGKILL) and started again.
+
+In the end every job has to be done, the archive equal to that of the same downlink ingested once, undisturbed, into
+SQLite, and what the clients were told has to hold: every acknowledged telecommand is there once, in the acknowledged
+state, none shares a sequence count or was handed out twice, every change has one audit entry, the hash chain is whole,
+and `linna verify` finds no damage. Exit status 1 where that does not hold. `--laptop`: one API alone, with its jobs, on
+SQLite.
 
 The campaign goes in runs of `--kills-per-run`, each with servers and an archive of its own. With `--state` each run is
 added to a file when it is over, and a campaign goes on where that file ends; `--seconds` begins no run after that time
@@ -15,8 +21,6 @@ and ends the kills of the one under way.
 from __future__ import annotations
 
 import argparse
-import http.client
-import itertools
 import json
 import os
 import random
@@ -25,51 +29,35 @@ import sys
 import tempfile
 import threading
 import time
-import urllib.error
-import urllib.request
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from sqlalchemy import select
 
+from benchmarks.campaigns._clients import PATIENCE_S, Client, Piece, Session, broken_of, cut_pieces
 from benchmarks.campaigns._deployment import Deployment, Laptop
+from benchmarks.campaigns._ledger import FAULTS, AuditLine, Ledger, judge
 from benchmarks.ground import START, STEP_NS, mixed_downlink
 from ground_service.services.ground import Ground, open_ground
 from ground_service.services.ingest import ingest_file
-from ground_service.store import repository
+from ground_service.services.integrity import verify
+from ground_service.services.users import add_user
+from ground_service.store import audit, repository
 from ground_service.store.canonical import archive_hash
 from lunar.timescales import format_utc
 
-CADU_OCTETS = 1279
 SPACECRAFT = 76
-PATIENCE_S = 900.0
+CLIENTS = 4
+APIS = 2
 ROUND_S = 10.0
-TARGETS = ("api", "worker", "database", "broker")
+FRONT = "ground_service.api.front"
+TARGETS = ("api", "front", "worker", "database", "broker")
 ENDS = ("done", "failed")
-COUNTS = ("uploads", "attempts", "lost", "doubled", "seconds")
+COUNTS = ("uploads", "attempts", "telecommands", "handed_out", "lost", "doubled", *FAULTS, "seconds")
 
 Figures = dict[str, Any]
-
-
-def ask(api: str, method: str, path: str, body: bytes | None = None, key: str = "") -> Any:
-    """The answer as JSON; asked again until there is one that is not about something being away."""
-    headers = {"Idempotency-Key": key, "Content-Type": "application/json"} if key else {}
-    until = time.monotonic() + PATIENCE_S
-    while True:
-        request = urllib.request.Request(f"{api}/api/v1{path}", data=body, method=method, headers=headers)
-        try:
-            with urllib.request.urlopen(request, timeout=60) as answer:
-                return json.loads(answer.read())
-        except urllib.error.HTTPError as error:
-            if error.code < 500:
-                raise SystemExit(f"{method} {path}: {error.code} {error.read()[:300]!r}") from None
-        except (OSError, ValueError, http.client.HTTPException):  # cut off in the middle of an answer
-            pass
-        if time.monotonic() > until:
-            raise SystemExit(f"{method} {path}: no answer within {PATIENCE_S:.0f} s")
-        time.sleep(0.3)
 
 
 class Harassment(threading.Thread):
@@ -82,24 +70,26 @@ class Harassment(threading.Thread):
         self.killed: Counter[str] = Counter()
         self.broken: BaseException | None = None
         self.enough = threading.Event()
-        self._service, self._rng, self._kills, self._pause_s, self._until = (
-            service,
-            rng,
-            kills,
-            pause_s,
-            until,
-        )
+        self._service, self._rng, self._kills = service, rng, kills
+        self._pause_s, self._until = pause_s, until
+        names = list(service.parts)
+        self._targets = [*names, *(f"front of {name}" for name in names if name.startswith("api"))]
 
     def run(self) -> None:
         try:
             while self.killed.total() < self._kills and time.monotonic() < self._until:
                 if self.enough.wait(self._rng.uniform(0.0, 2.0 * self._pause_s)):
                     return
-                part = self._rng.choice(list(self._service.parts))
-                self._service.parts[part].kill()
+                name = self._rng.choice(self._targets)
+                part = self._service.parts[name.removeprefix("front of ")]
+                if name.startswith("front of "):
+                    if part.kill_child(FRONT):
+                        self.killed["front"] += 1
+                    continue
+                part.kill()
                 time.sleep(self._rng.uniform(0.0, self._pause_s))
-                self._service.parts[part].start()
-                self.killed[part.partition(" ")[0]] += 1
+                part.start()
+                self.killed[name.partition(" ")[0]] += 1
         except BaseException as error:
             self.broken = error
 
@@ -111,6 +101,28 @@ def contents(ground: Ground) -> tuple[str, list[bytes]]:
         vehicle = repository.vehicle_id(connection, SPACECRAFT, "flight")
         digests = connection.execute(select(table.c.digest).where(table.c.vehicle_id == vehicle)).scalars()
         return archive_hash(connection, vehicle), [bytes(digest) for digest in digests]
+
+
+def commands_of(ground: Ground, ledger: Ledger) -> tuple[int, Counter[str]]:
+    """How many telecommands there are, and how often the archive differs from what clients were told."""
+    lines = []
+    with ground.database.reading() as connection:
+        rows = [dict(row) for row in connection.execute(select(repository.TELECOMMANDS)).mappings()]
+        for action, target, actor in connection.execute(
+            select(repository.AUDIT.c.action, repository.AUDIT.c.target, repository.AUDIT.c.actor)
+        ):
+            verb, _, kind = action.rpartition(" ")
+            if kind == "telecommand":
+                lines.append(AuditLine(verb, int(target), actor))
+        faults = judge(ledger, rows, lines)
+        faults["chain_broken"] = sum(1 for _ in audit.broken_entries(connection))
+        for number, sha256 in set(ledger.heads):
+            faults["heads_lost"] += number > 0 and audit.read_entry_sha256(connection, number) != sha256
+    damage = verify(ground).damaged
+    for one in damage[:5]:
+        print(f"damaged: {one}", file=sys.stderr, flush=True)
+    faults["rows_damaged"] = len(damage)
+    return len(rows), faults
 
 
 def one_run(
@@ -134,28 +146,34 @@ def one_run(
         with open_ground(folder / "reference") as ground:
             ingest_file(ground, folder / "whole.cadu")
             expected, there = contents(ground)
-        cadus = len(stream) // CADU_OCTETS
-        cuts = [round(k * cadus / pieces) * CADU_OCTETS for k in range(pieces + 1)]
-        parts = [stream[a:b] for a, b in itertools.pairwise(cuts)]
-        service = Laptop(folder) if laptop else Deployment(folder)
+        service = Laptop(folder) if laptop else Deployment(folder, APIS)
+        ledger = Ledger()
         harassment = Harassment(service, rng, kills, pause_s, until)
-        harassment.start()
         try:
-            jobs = work_meanwhile(service.api, harassment, parts, random.Random(seed + 1), packets, reports)
+            with open_ground(service.home, database_url=service.url) as ground:
+                sessions = [
+                    Session(service.apis, add_user(ground, f"client{k}", "operator")) for k in range(CLIENTS)
+                ]
+            harassment.start()
+            work_meanwhile(
+                sessions, harassment, stream, pieces, random.Random(seed + 1), packets, reports, ledger
+            )
             harassment.join()
             if harassment.broken:
                 raise harassment.broken
             for part in service.parts.values():
                 part.revive()
-            states, attempts = ends_of(service.api, jobs)
+            states, attempts = ends_of(sessions[0], ledger.jobs)
             with open_ground(service.home, database_url=service.url) as ground:
                 found, stored = contents(ground)
                 with ground.database.reading() as connection:
                     rows = repository.page(connection, repository.INGESTS, limit=100_000).rows
+                telecommands, faults = commands_of(ground, ledger)
         finally:
             harassment.enough.set()
             service.stop()
-            harassment.join()
+            if harassment.ident is not None:
+                harassment.join()
             service.stop()  # what was being started meanwhile
     return {
         "seed": seed,
@@ -169,75 +187,105 @@ def one_run(
         "lost": len(set(there) - set(stored)),
         "doubled": len(stored) - len(set(stored)),
         "archive_identical": found == expected,
+        "telecommands": telecommands,
+        "handed_out": sum(len(one.commands) for one in ledger.hand_outs),
+        "hand_outs_unanswered": ledger.unanswered_hand_outs,
+        **{name: faults[name] for name in FAULTS},
     }
 
 
-def the_pass(api: str, definition: bytes) -> int:
+def the_pass(session: Session, definition: bytes) -> int:
     """Define a pass; where a kill leaves open whether it was done, look, and ask again under another key."""
     for attempt in range(20):
-        try:
-            return int(ask(api, "POST", "/passes", definition, f"pass {attempt}")["id"])
-        except SystemExit as refused:
-            if "409" not in str(refused):
-                raise
-        known = ask(api, "GET", "/passes")["items"]
+        answer = session.ask("POST", "/passes", definition, f"pass {attempt}")
+        if answer.status == 201:
+            return int(answer.json()["id"])
+        if answer.status != 409:
+            raise SystemExit(f"POST /passes: {answer.status} {answer.body[:300]!r}")
+        known = session.get("/passes")["items"]
         if known:
             return int(known[0]["id"])
     raise SystemExit("POST /passes: its end was left open 20 times")
 
 
 def work_meanwhile(
-    api: str,
+    sessions: Sequence[Session],
     harassment: Harassment,
-    parts: Sequence[bytes],
+    stream: bytes,
+    pieces: int,
     rng: random.Random,
     packets: int,
     reports: int,
-) -> list[str]:
-    """Upload every piece, and all of them again while there are kills, with reports in between; the jobs.
+    ledger: Ledger,
+) -> None:
+    """Have the clients upload the downlink, anew while there are kills, with commands and reports in between.
 
     A round waits a little for the first job of the round before: a great heap of jobs tells no more than a small one.
     """
+    waiting: deque[Piece] = deque()
+    over = threading.Event()
+    clients = [
+        Client(f"client{k}", session, SPACECRAFT, waiting, ledger, random.Random(rng.getrandbits(64)), over)
+        for k, session in enumerate(sessions)
+    ]
+    try:
+        waiting.extend(cut_pieces(stream, pieces, rng, "round 0"))
+        for client in clients:
+            client.start()
+        wait_for_room(waiting, over)
+        ask_for_reports(sessions[0], packets, reports, ledger)
+        round_ = 0
+        while harassment.is_alive() and not over.is_set():
+            patient = time.monotonic() + ROUND_S
+            first = ledger.jobs[round_ * pieces // 2]
+            while harassment.is_alive() and time.monotonic() < patient:
+                if sessions[0].get(f"/jobs/{first}")["state"] in ENDS:
+                    break
+                over.wait(0.5)
+            round_ += 1
+            waiting.extend(cut_pieces(stream, pieces, rng, f"round {round_}"))
+            while waiting and harassment.is_alive() and not over.wait(0.2):
+                pass
+        waiting.clear()
+    finally:
+        over.set()
+        for client in clients:
+            if client.ident is not None:
+                client.join()
+    if broken := broken_of(clients):
+        raise broken
+
+
+def wait_for_room(waiting: deque[Piece], over: threading.Event) -> None:
+    """Wait until all pieces are taken."""
+    while waiting and not over.wait(0.2):
+        pass
+
+
+def ask_for_reports(session: Session, packets: int, reports: int, ledger: Ledger) -> None:
+    """Define a pass over everything and ask for reports of it."""
     definition = {
         "name": "all",
         "start": format_utc(START),
         "stop": format_utc(START + packets * STEP_NS // 4),
         "spacecraft_id": SPACECRAFT,
     }
-    jobs: list[str] = []
-    first = ""
-    round_ = 0
-    while round_ == 0 or harassment.is_alive():
-        patient = time.monotonic() + ROUND_S
-        while round_ > 0 and harassment.is_alive() and time.monotonic() < patient:
-            if ask(api, "GET", f"/jobs/{first}")["state"] in ENDS:
-                break
-            time.sleep(0.2)
-        first = ""
-        for k in rng.sample(range(len(parts)), len(parts)):
-            answer = ask(
-                api, "POST", f"/telemetry?spacecraft_id={SPACECRAFT}", parts[k], f"piece {k} {round_}"
-            )
-            jobs.append(answer["job_id"])
-            first = first or answer["job_id"]
-            if round_ > 0 and not harassment.is_alive():
-                break
-        if round_ == 0:
-            pass_id = the_pass(api, json.dumps(definition).encode())
-            jobs += [ask(api, "POST", f"/passes/{pass_id}/reports", b"", f"report {k}")["id"]
-                     for k in range(reports)]  # fmt: skip
-        round_ += 1
-    return jobs
+    pass_id = the_pass(session, json.dumps(definition).encode())
+    for k in range(reports):
+        answer = session.ask("POST", f"/passes/{pass_id}/reports", b"", f"report {k}")
+        if answer.status not in (200, 202):
+            raise SystemExit(f"POST /passes/{pass_id}/reports: {answer.status} {answer.body[:300]!r}")
+        ledger.jobs.append(answer.json()["id"])
 
 
-def ends_of(api: str, jobs: Sequence[str]) -> tuple[Counter[str], int]:
+def ends_of(session: Session, jobs: Sequence[str]) -> tuple[Counter[str], int]:
     """How the jobs ended, and how often they were begun."""
     states: Counter[str] = Counter()
     attempts = 0
     for job in jobs:
         until = time.monotonic() + PATIENCE_S
         while True:
-            row = ask(api, "GET", f"/jobs/{job}")
+            row = session.get(f"/jobs/{job}")
             if row["state"] in ENDS or time.monotonic() > until:
                 break
             time.sleep(0.5)
@@ -266,6 +314,7 @@ def holds(figures: Mapping[str, Any]) -> bool:
     return (
         figures["archives_identical"] == figures["runs"]
         and figures["lost"] == figures["doubled"] == 0
+        and not any(figures[name] for name in FAULTS)
         and set(figures["jobs"]) <= {"done"}
         and set(figures["ingests"]) <= {"done"}
     )
@@ -281,6 +330,8 @@ def table(figures: Mapping[str, Any]) -> str:
         f"jobs ended: {ended} ({figures['attempts']} attempts); uploads: {figures['uploads']}",
         f"packets lost: {figures['lost']}, doubled: {figures['doubled']}; "
         f"archives identical to an undisturbed one: {figures['archives_identical']} of {figures['runs']}",
+        f"telecommands: {figures['telecommands']}, handed out and acknowledged: {figures['handed_out']}; "
+        + ", ".join(f"{name.replace('_', ' ')}: {figures[name]}" for name in FAULTS),
     ]
     return "\n".join(lines)
 
@@ -305,7 +356,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--kills", type=int, default=500)
+    parser.add_argument("--kills", type=int, default=300)
     parser.add_argument("--kills-per-run", type=int, default=100)
     parser.add_argument("--state", type=Path, help="file that runs are added to, to go on from")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="kill no longer than that")

@@ -1,9 +1,13 @@
-"""Alembic environment: runs the migrations on the connection that the program hands over."""
+"""Alembic environment: runs the migrations on the connection that the program hands over, then installs the triggers.
+
+Triggers follow from the tables of this version, so they are made anew after every migration.
+"""
 
 from __future__ import annotations
 
 from alembic import context
 
+from ground_service.store.database import install_triggers
 from ground_service.store.models import Base
 
 
@@ -29,6 +33,7 @@ def _migrate(connection: object) -> None:
         transaction_per_migration=False,
     )
     context.run_migrations()
+    install_triggers(connection)  # type: ignore[arg-type]
 
 
 run()

@@ -7,23 +7,32 @@ import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
+from anyio import to_thread
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
+from starlette.routing import Route
 
 from ground_service.api import problems
+from ground_service.api.access import access
 from ground_service.api.common import API_PREFIX
-from ground_service.api.limits import BodyLimit, HeadersAndTags, RateLimit
+from ground_service.api.limits import BodyLimit, HeadersAndTags, RateLimit, SharedBudgets
 from ground_service.api.live import live
 from ground_service.api.metrics import Metrics, Watch
 from ground_service.api.operations import operations
+from ground_service.api.origins import LOOPBACK, SameOrigin
 from ground_service.api.payload_console import payload_console
 from ground_service.api.planning import planning
+from ground_service.api.proxies import ForwardedHeaders, TrustedProxies
 from ground_service.api.regression_routes import REGRESSION_UPLOAD_PATHS, regressions
+from ground_service.api.requests import PlainText
 from ground_service.api.routes import UPLOAD_PATHS, router
+from ground_service.api.sockets import Sockets
 from ground_service.api.telecommands import telecommands
 from ground_service.api.timekeeping import timekeeping
+from ground_service.api.uploads import UploadPool
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError
+from ground_service.missions.routes import missions
 from ground_service.services.commanding import note_timeouts
 from ground_service.services.ground import ground_from_settings
 from ground_service.services.jobs import enter_redecoding
@@ -43,7 +52,8 @@ CATCH_UP_S = 60.0
 
 SWEEP_S = 15.0
 
-LOOPBACK = ("127.0.0.1", "::1", "localhost")
+SQLITE_THREADS = 4
+SERVER_THREADS = 20
 
 
 def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
@@ -55,25 +65,43 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         Do jobs before the answer is sent (without a broker only), for tests and scripts.
     """
 
+    budgets = shared_budgets(settings)
+
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         ground = ground_from_settings(settings)
         app.state.ground = ground
+        app.state.uploads = UploadPool(settings.uploads_at_once)
+        # With the threads of uploads, jobs and the feed no more than there are connections to the database.
+        threads = SQLITE_THREADS if ground.database.dialect == "sqlite" else SERVER_THREADS
+        to_thread.current_default_thread_limiter().total_tokens = threads
         app.state.dispatcher = dispatcher_for(ground, settings, inline=inline_jobs)
         for job in enter_redecoding(ground):
             log.warning("decoding the archive again with a newer dictionary: job %s", job)
             app.state.dispatcher.start(job)
         if inline_jobs or settings.resolved_broker_url() is None:
             app.state.dispatcher.resume()
-        chores = [asyncio.create_task(_nights(app, settings)), asyncio.create_task(_sweeps(app))]
+        app.state.sockets = Sockets(
+            ground,
+            open_without_users=app.state.open_without_users,
+            per_user=settings.sockets_per_user,
+            total=settings.sockets,
+        )
+        chores = [
+            asyncio.create_task(work)
+            for work in (_nights(app, settings), _sweeps(app), app.state.sockets.run())
+        ]
         try:
             yield
         finally:
             for chore in chores:
                 chore.cancel()
             await asyncio.gather(*chores, return_exceptions=True)
+            await asyncio.to_thread(app.state.uploads.close)
             app.state.dispatcher.close()
             ground.close()
+            if budgets is not None:
+                await budgets.close()
 
     app = FastAPI(
         title="LINNA ground service",
@@ -87,12 +115,10 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
     app.state.open_without_users = settings.host in LOOPBACK
     app.state.live_console = settings.resolved_live_console()
     app.state.upload_limit_octets = settings.upload_limit_mib << 20
-    for one in (router, timekeeping, planning, telecommands, regressions):
+    routers = (router, missions, timekeeping, planning, telecommands, regressions, access, operations, pages)
+    for one in (*routers, live, payload_console):
         app.include_router(one)
-    app.include_router(operations)
-    app.include_router(live)
-    app.include_router(payload_console)
-    app.include_router(pages)
+    app.state.operations = [route for one in routers for route in one.routes if isinstance(route, Route)]
     app.state.metrics = Metrics()
     problems.install(app)
     app.add_middleware(
@@ -100,10 +126,21 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         upload_paths=(*UPLOAD_PATHS, *REGRESSION_UPLOAD_PATHS),
         upload_limit_octets=settings.upload_limit_mib << 20,
     )
-    app.add_middleware(RateLimit, per_second=settings.rate_limit_per_s)
+    app.add_middleware(RateLimit, per_second=settings.rate_limit_per_s, budgets=budgets)
+    app.add_middleware(PlainText)
+    app.add_middleware(SameOrigin, hosts=(settings.host, *settings.allowed_hosts), api_prefix=API_PREFIX)
     app.add_middleware(HeadersAndTags)
     app.add_middleware(Watch, metrics=app.state.metrics)
+    app.add_middleware(ForwardedHeaders, proxies=TrustedProxies(settings.trusted_proxies))
     return app
+
+
+def shared_budgets(settings: Settings) -> SharedBudgets | None:
+    """Return the budgets of the rate limit that API processes share, where there is a Redis broker to share them in."""
+    broker = settings.resolved_broker_url()
+    if settings.rate_limit_per_s <= 0.0 or broker is None or not broker.startswith(("redis://", "rediss://")):
+        return None
+    return SharedBudgets(broker, settings.rate_limit_per_s)
 
 
 async def _nights(app: FastAPI, settings: Settings) -> None:

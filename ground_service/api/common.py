@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
-import queue
-import threading
-from collections.abc import Iterator
 from typing import Annotated, Any
 
 from fastapi import Depends, Header, Path, Query, Request
-from starlette.concurrency import run_in_threadpool
 
 from ground_service.api import schemas
-from ground_service.api.problems import TooLarge
 from ground_service.api.security import requires
 from ground_service.services.ground import Ground
 from ground_service.services.users import Caller
-from ground_service.store.files import StoredFile
+from ground_service.text import LINE_PATTERN_JSON
 
 API_PREFIX = "/api/v1"
 
@@ -31,9 +25,11 @@ PROBLEMS: dict[int | str, dict[str, Any]] = {
         (409, "Conflict"),
         (412, "Precondition failed"),
         (413, "Too large"),
+        (415, "Encoding not supported"),
+        (421, "Not a name of this service"),
         (422, "Invalid input"),
         (429, "Too many requests"),
-        (503, "Store unavailable"),
+        (503, "Busy, or store unavailable"),
         (507, "No space left"),
     )
 }
@@ -65,7 +61,7 @@ OnceKey = Annotated[
     ),
 ]
 Instance = Annotated[str, Query(min_length=1, max_length=96, pattern=r"^[A-Za-z0-9._@-]+$")]
-Name = Annotated[str, Query(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+Name = Annotated[str, Query(min_length=1, max_length=200, pattern=LINE_PATTERN_JSON)]
 
 
 async def ground_of(request: Request) -> Ground:
@@ -75,56 +71,6 @@ async def ground_of(request: Request) -> Ground:
 
 
 GroundOf = Annotated[Ground, Depends(ground_of)]
-
-
-async def stored_body(request: Request) -> StoredFile:
-    """The body, streamed into the archive of files with bounded memory."""
-    ground: Ground = request.app.state.ground
-    limit: int = request.app.state.upload_limit_octets
-    blocks: queue.Queue[bytes | BaseException | None] = queue.Queue(maxsize=8)
-    stopped = threading.Event()
-
-    def take() -> Iterator[bytes]:
-        while True:
-            block = blocks.get()
-            if block is None:
-                return
-            if isinstance(block, BaseException):
-                raise block
-            yield block
-
-    def store() -> StoredFile:
-        try:
-            return ground.files.put(take())
-        finally:
-            stopped.set()
-
-    def hand_over(block: bytes | BaseException | None) -> None:
-        while not stopped.is_set():
-            try:
-                blocks.put(block, timeout=0.2)
-                return
-            except queue.Full:
-                continue
-
-    task = asyncio.create_task(run_in_threadpool(store))
-    taken = 0
-    try:
-        async for block in request.stream():
-            taken += len(block)
-            if taken > limit:
-                raise TooLarge(f"body: expected at most {limit} octets")
-            if block:
-                try:
-                    blocks.put_nowait(block)
-                except queue.Full:
-                    await run_in_threadpool(hand_over, block)
-    except BaseException as error:
-        await run_in_threadpool(hand_over, error)
-        await asyncio.gather(task, return_exceptions=True)
-        raise
-    await run_in_threadpool(hand_over, None)
-    return await task
 
 
 def idempotent_id(what: str, caller: Caller, key: str | None) -> str | None:

@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import math
 import time
 from collections import OrderedDict
-from typing import Any
+from typing import Any, Protocol
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from ground_service.api.problems import problem
+from ground_service.api.origins import refuse
+from ground_service.api.problems import busy, problem
+from ground_service.api.proxies import address_key
+from ground_service.api.security import VERIFIED_CALLER
+
+log = logging.getLogger(__name__)
 
 JSON_LIMIT_OCTETS = 1 << 20
+HELD_LIMIT_OCTETS = 64 << 20
 TAGGED_LIMIT_OCTETS = 4 << 20
 
 CALLERS_KEPT = 10_000
+BURST_S = 2.0
+REDIS_TIMEOUT_S = 1.0
+REDIS_RETRY_S = 10.0
 _WATCHED = ("/healthz", "/readyz", "/metrics")
 
 SECURE_HEADERS = {
@@ -33,18 +44,24 @@ SECURE_HEADERS = {
 
 
 class BodyLimit:
-    """Refuses bodies over a limit, announced or not; paths of uploads have their own, larger one."""
+    """Refuse bodies over a limit, announced or not; paths of uploads have their own, larger one.
+
+    Bodies that are not uploads are held in memory until they have come whole, before anybody knows whose they are.
+    All of them together may therefore hold `HELD_LIMIT_OCTETS`.
+    """
 
     def __init__(self, app: ASGIApp, upload_paths: tuple[str, ...], upload_limit_octets: int) -> None:
         self._app = app
         self._uploads = upload_paths
         self._upload_limit = upload_limit_octets
+        self._held = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        limit = self._upload_limit if scope["path"] in self._uploads else JSON_LIMIT_OCTETS
+        upload = scope["path"] in self._uploads
+        limit = self._upload_limit if upload else JSON_LIMIT_OCTETS
         announced = Headers(scope=scope).get("content-length", "")
         if announced and (not announced.isdigit() or int(announced) > limit):
             response = problem(
@@ -53,91 +70,158 @@ class BodyLimit:
             await response(scope, receive, send)
             return
         taken = 0
-        over = False
+        refusal: JSONResponse | None = None
 
         async def counted() -> Message:
-            nonlocal taken, over
+            nonlocal taken, refusal
             message = await receive()
-            taken += len(message.get("body", b""))
+            octets = len(message.get("body", b""))
+            taken += octets
+            if not upload:
+                self._held += octets
             if taken > limit:
-                over = True
-                return {"type": "http.disconnect"}
-            return message
+                refusal = problem(413, "too large", f"body: expected at most {limit} octets")
+            elif self._held > HELD_LIMIT_OCTETS and not upload:
+                refusal = busy(f"bodies: expected at most {HELD_LIMIT_OCTETS} octets at once")
+            return message if refusal is None else {"type": "http.disconnect"}
 
         started = False
 
         async def watched(message: Message) -> None:
             nonlocal started
-            started = started or message["type"] == "http.response.start"
-            if not over:
+            if refusal is None:
+                started = started or message["type"] == "http.response.start"
                 await send(message)
 
         try:
             await self._app(scope, counted, watched)
         except Exception:
-            if not over:
+            if refusal is None:
                 raise
-        if over and not started:
-            response = problem(413, "too large", f"body: expected at most {limit} octets")
-            await response(scope, receive, send)
+        finally:
+            if not upload:
+                self._held -= taken
+        if refusal is not None and not started:
+            await refusal(scope, receive, send)
 
 
 class RateLimit:
-    """Refuses callers that ask more often than they may: a bucket of two seconds' worth for each, refilled evenly.
+    """Refuse callers that ask more often than they may: a budget of two seconds' worth for each, refilled evenly.
 
-    A caller is known by its token (its hash: tokens are not kept) once that was accepted, before that and without one
-    by its address: tokens made up one after the other earn nothing.
+    A caller is a user, once a token of that user was verified, and before that or without one the address of the
+    peer (see `proxies`). An invented token is therefore paid for by the address that it comes from.
     """
 
-    def __init__(self, app: ASGIApp, per_second: float) -> None:
+    def __init__(self, app: ASGIApp, per_second: float, budgets: Budgets | None = None) -> None:
         self._app = app
         self._rate = per_second
-        self._depth = max(2.0 * per_second, 1.0)
-        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
-        self._accepted: OrderedDict[str, None] = OrderedDict()
+        self._budgets = LocalBudgets(per_second) if budgets is None else budgets
+        self._verified: OrderedDict[str, str] = OrderedDict()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or self._rate <= 0.0 or scope["path"] in _WATCHED:
+        if scope["type"] not in ("http", "websocket") or self._rate <= 0.0 or scope["path"] in _WATCHED:
             await self._app(scope, receive, send)
             return
         token = _token(scope)
-        known = token in self._accepted
-        address = str((scope.get("client") or ("",))[0])
-        wait_s = self._wait_s(token if known else address, time.monotonic())
-        if wait_s <= 0.0:
-
-            async def watched(message: Message) -> None:
-                if message["type"] == "http.response.start":
-                    self._note(token, accepted=message["status"] != 401)
-                await send(message)
-
-            await self._app(scope, receive, watched if token else send)
+        user = self._verified.get(token)
+        address = address_key(str((scope.get("client") or ("",))[0]))
+        wait_s = await self._budgets.take(f"address {address}" if user is None else f"user {user}")
+        if wait_s > 0.0:
+            response = problem(429, "too many requests", f"expected at most {self._rate:g} requests a second")
+            response.headers["Retry-After"] = str(math.ceil(wait_s))
+            await refuse(response, scope, receive, send)
             return
-        response = problem(429, "too many requests", f"expected at most {self._rate:g} requests a second")
-        response.headers["Retry-After"] = str(math.ceil(wait_s))
-        await response(scope, receive, send)
+        try:
+            await self._app(scope, receive, send)
+        finally:
+            if token:
+                self._note(token, scope.get("state", {}).get(VERIFIED_CALLER))
 
-    def _note(self, token: str, *, accepted: bool) -> None:
-        self._accepted.pop(token, None)
-        if accepted:
-            self._accepted[token] = None
-            if len(self._accepted) > CALLERS_KEPT:
-                self._accepted.popitem(last=False)
+    def _note(self, token: str, caller: str | None) -> None:
+        """Remember whose token it is; forget one that was not verified this time."""
+        self._verified.pop(token, None)
+        if caller is not None:
+            self._verified[token] = caller
+            if len(self._verified) > CALLERS_KEPT:
+                self._verified.popitem(last=False)
 
-    def _wait_s(self, caller: str, now_s: float) -> float:
-        """Take one from the caller's bucket; how long it has to wait where that is empty."""
-        left, since = self._buckets.pop(caller, (self._depth, now_s))
+
+class Budgets(Protocol):
+    """Requests that callers have left."""
+
+    async def take(self, caller: str) -> float:
+        """Take one from a caller's budget; the seconds to wait where none is left."""
+
+
+class LocalBudgets:
+    """Budgets of the callers of this process, of the `CALLERS_KEPT` that asked last."""
+
+    def __init__(self, per_second: float) -> None:
+        self._rate = per_second
+        self._depth = max(BURST_S * per_second, 1.0)
+        self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
+
+    async def take(self, caller: str) -> float:
+        now_s = time.monotonic()
+        left, since = self._left.pop(caller, (self._depth, now_s))
         left = min(left + (now_s - since) * self._rate, self._depth)
         allowed = left >= 1.0
-        self._buckets[caller] = (left - 1.0 if allowed else left, now_s)
-        if len(self._buckets) > CALLERS_KEPT:
-            self._buckets.popitem(last=False)
+        self._left[caller] = (left - 1.0 if allowed else left, now_s)
+        if len(self._left) > CALLERS_KEPT:
+            self._left.popitem(last=False)
         return 0.0 if allowed else (1.0 - left) / self._rate
 
 
+_TAKE = """
+local now = redis.call('TIME')
+local now_us = now[1] * 1000000 + now[2]
+local each_us, depth_us = tonumber(ARGV[1]), tonumber(ARGV[2])
+local paid_until = math.max(tonumber(redis.call('GET', KEYS[1]) or '0'), now_us)
+local wait_us = paid_until + each_us - now_us - depth_us
+if wait_us > 0 then return math.ceil(wait_us) end
+redis.call('SET', KEYS[1], string.format('%.0f', paid_until + each_us), 'PX', math.ceil(depth_us / 1000) + 1000)
+return 0
+"""
+"""The generic cell rate algorithm (ATM Forum TM 4.0, 4.4.2): one number for each caller, which expires by itself."""
+
+
+class SharedBudgets:
+    """Budgets that all API processes of a deployment share, kept in Redis; while it is away, each has its own."""
+
+    def __init__(self, url: str, per_second: float) -> None:
+        import redis.asyncio
+
+        self._client = redis.asyncio.from_url(url, socket_timeout=REDIS_TIMEOUT_S)
+        self._script = self._client.register_script(_TAKE)
+        self._each_us = 1e6 / per_second
+        self._depth_us = max(BURST_S * per_second, 1.0) * self._each_us
+        self._local = LocalBudgets(per_second)
+        self._away_until = 0.0
+
+    async def take(self, caller: str) -> float:
+        import redis.exceptions
+
+        now_s = time.monotonic()
+        if now_s >= self._away_until:
+            key = "linna:budget:" + hashlib.sha256(caller.encode()).hexdigest()[:32]
+            try:
+                return float(await self._script(keys=[key], args=[self._each_us, self._depth_us])) / 1e6
+            except (redis.exceptions.RedisError, OSError) as error:
+                self._away_until = now_s + REDIS_RETRY_S
+                log.warning("rate limit: the broker is away (%s); each process counts for itself", error)
+        return await self._local.take(caller)
+
+    async def close(self) -> None:
+        """Give the connections back."""
+        await self._client.aclose()
+
+
 def _token(scope: Scope) -> str:
-    """The hash of the token that a request carries; empty without one."""
-    token = Headers(scope=scope).get("authorization", "")
+    """The hash of the token that a request carries, wherever it may; empty without one. Tokens are not kept."""
+    headers = Headers(scope=scope)
+    token = headers.get("authorization", "")
+    if not token and scope["type"] == "websocket":
+        token = headers.get("sec-websocket-protocol", "")
     return hashlib.sha256(token.encode()).hexdigest() if token else ""
 
 

@@ -12,8 +12,8 @@ operations = APIRouter(include_in_schema=False)
 
 
 @operations.get("/healthz")
-def healthz() -> schemas.Health:
-    """The process lives."""
+async def healthz() -> schemas.Health:
+    """The process lives; `front` answers this where it comes first on a connection."""
     return schemas.Health(status="ok")
 
 

@@ -13,17 +13,16 @@ import re
 from collections import deque
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
-from starlette.concurrency import run_in_threadpool
 
 from ground_service.api.common import API_PREFIX
-from ground_service.api.live import POLICY_VIOLATION, caller_of_socket
+from ground_service.api.requests import query_is_known
+from ground_service.api.sockets import TRY_AGAIN_LATER, Session, Sockets, until_over
 
 LINE_LIMIT_OCTETS = 8 << 20
 WAITING_LIMIT = 4
 """Messages kept for a browser that cannot keep up; the oldest go first, as newer ones tell more."""
 
 CONNECT_TIMEOUT_S = 3.0
-TRY_AGAIN_LATER = 1013
 
 _WORDS = re.compile(r"pause|run|step|rate [0-9]{1,6}(\.[0-9]{1,3})?")
 
@@ -33,11 +32,17 @@ payload_console = APIRouter()
 @payload_console.websocket(f"{API_PREFIX}/payload")
 async def watch_payload(socket: WebSocket) -> None:
     """Messages of the payload's console as they come; words `pause`, `run`, `step` and `rate X` from operators."""
-    caller = await run_in_threadpool(caller_of_socket, socket)
-    if caller is None or not caller.may("viewer"):
-        await socket.close(POLICY_VIOLATION)
+    if not await query_is_known(socket):
         return
-    await socket.accept(subprotocol="bearer" if "sec-websocket-protocol" in socket.headers else None)
+    sockets: Sockets = socket.app.state.sockets
+    async with sockets.admitted(socket) as session:
+        if session is not None:
+            await until_over(session, _watched(session))
+
+
+async def _watched(session: Session) -> None:
+    socket = session.socket
+    await session.accept()
     address: tuple[str, int] | None = socket.app.state.live_console
     if address is None:
         await _refuse(socket, "no payload to watch: serve with LINNA_LIVE_CONSOLE=HOST:PORT")
@@ -52,16 +57,15 @@ async def watch_payload(socket: WebSocket) -> None:
         return
     await socket.send_json({"kind": "connected"})
     try:
-        await _relay(socket, reader, writer, may_steer=caller.may("operator"))
+        await _relay(session, reader, writer)
     finally:
         writer.close()
         with contextlib.suppress(OSError):
             await writer.wait_closed()
 
 
-async def _relay(
-    socket: WebSocket, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, may_steer: bool
-) -> None:
+async def _relay(session: Session, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    socket = session.socket
     waiting: deque[str] = deque(maxlen=WAITING_LIMIT)
     arrived = asyncio.Event()
     tasks = [
@@ -69,7 +73,7 @@ async def _relay(
         for task in (
             _listen(reader, waiting, arrived),
             _show(socket, waiting, arrived),
-            _steer(socket, writer, waiting, arrived, may_steer),
+            _steer(session, writer, waiting, arrived),
         )
     ]
     try:
@@ -99,15 +103,11 @@ async def _show(socket: WebSocket, waiting: deque[str], arrived: asyncio.Event) 
 
 
 async def _steer(
-    socket: WebSocket,
-    writer: asyncio.StreamWriter,
-    waiting: deque[str],
-    arrived: asyncio.Event,
-    may_steer: bool,
+    session: Session, writer: asyncio.StreamWriter, waiting: deque[str], arrived: asyncio.Event
 ) -> None:
     while True:
-        words = (await socket.receive_text()).strip()
-        if not may_steer:
+        words = (await session.socket.receive_text()).strip()
+        if not session.caller.may("operator"):
             trouble = "expected the role operator or higher to steer the payload"
         elif not _WORDS.fullmatch(words):
             trouble = f"expected pause, run, step or rate X, found {words[:40]!r}"

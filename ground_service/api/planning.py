@@ -20,13 +20,14 @@ from ground_service.api.common import (
     page_of,
 )
 from ground_service.api.problems import PreconditionFailed
+from ground_service.api.requests import StrictRoute
 from ground_service.services import commanding, plan_exchange, plan_requests, plan_schemas
 from ground_service.services import planning as plan_service
 from ground_service.services.answers import once
 from ground_service.services.views import search_view, telecommand_view, window_view
 from ground_service.store.repository import Row
 
-planning = APIRouter(prefix=API_PREFIX, responses=PROBLEMS, tags=["planning"])
+planning = APIRouter(route_class=StrictRoute, prefix=API_PREFIX, responses=PROBLEMS, tags=["planning"])
 
 IfMatch = Annotated[
     str | None, Header(alias="If-Match", max_length=200, description="Change only what was seen: its ETag")
@@ -109,9 +110,9 @@ def delete_window(
     ground: GroundOf, caller: Operator, window_id: PassId, if_match: IfMatch = None
 ) -> Response:
     """Take a window off the plan."""
-    if if_match is not None:
-        _expect(plan_service.get_window(ground, window_id), if_match)
-    plan_service.delete_window(ground, window_id, actor=caller.name)
+    plan_service.delete_window(
+        ground, window_id, actor=caller.name, expected=lambda row: _expect(row, if_match)
+    )
     return Response(status_code=204)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from http import HTTPStatus
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -11,15 +12,20 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
 from ground_service.errors import (
+    BuildNotChecked,
     Conflict,
     EvaluationError,
+    FileDamaged,
+    Forbidden,
     GroundError,
     InvalidInput,
     NotAuthorised,
     NotFound,
+    StateConflict,
     StorageFull,
     StorageReadOnly,
     StoreError,
+    public_text,
 )
 from ground_service.services.planning import PlanConflicts
 from lunar.errors import LunarError
@@ -35,6 +41,7 @@ STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (Conflict, 409, "conflict"),
     (InvalidInput, 422, "invalid input"),
     (EvaluationError, 422, "cannot be evaluated"),
+    (BuildNotChecked, 503, "build not checked"),
     (NotAuthorised, 401, "not authorised"),
     (StorageFull, 507, "no space left"),
     (StorageReadOnly, 503, "read-only"),
@@ -45,13 +52,33 @@ STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (GroundError, 400, "bad request"),
 )
 
+RETRY_AFTER_S = 1
 
-class Forbidden(GroundError):
-    """The caller is known, but may not do this."""
+TOLD: tuple[tuple[type[Exception], str], ...] = (
+    (StorageFull, "no space left; nothing more was stored"),
+    (StorageReadOnly, "the archive or the database cannot be written"),
+    (FileDamaged, "a stored file no longer has the octets it was stored with"),
+    (StoreError, "database unavailable"),
+    (BuildNotChecked, "the parameters of the build cannot be checked here, so it was not registered"),
+    (Exception, "the service met an error that it has logged"),
+)
+"""What callers are told of errors that are the service's own: neither places nor addresses."""
 
 
 class TooLarge(GroundError):
     """More octets than the service takes."""
+
+
+class Busy(GroundError):
+    """More at once than the service takes; the same request later may succeed."""
+
+
+class BrokenOff(GroundError):
+    """A body that did not come to its end."""
+
+
+class UnsupportedEncoding(GroundError):
+    """A body in a form that the service does not read."""
 
 
 class PreconditionFailed(GroundError):
@@ -75,6 +102,22 @@ def problem(
     return JSONResponse(body, status_code=status, media_type=MEDIA_TYPE, headers=headers)
 
 
+def busy(detail: str, request: Request | None = None) -> JSONResponse:
+    """A problem document that asks the caller to come again."""
+    response = problem(503, "busy", detail, request)
+    response.headers["Retry-After"] = str(RETRY_AFTER_S)
+    return response
+
+
+def _allowed(app: FastAPI, request: Request) -> list[str]:
+    """The methods of all operations at the path of a request."""
+    methods: set[str] = set()
+    for route in app.state.operations:
+        if route.path_regex.match(request.scope["path"]):
+            methods |= set(route.methods or ())
+    return sorted(methods)
+
+
 def install(app: FastAPI) -> None:
     """Make the application answer every error with a problem document."""
 
@@ -83,25 +126,42 @@ def install(app: FastAPI) -> None:
             return problem(403, "forbidden", str(error), request)
         if isinstance(error, TooLarge):
             return problem(413, "too large", str(error), request)
+        if isinstance(error, Busy):
+            return busy(str(error), request)
+        if isinstance(error, BrokenOff):
+            return problem(400, "broken off", str(error), request)
+        if isinstance(error, UnsupportedEncoding):
+            return problem(415, "unsupported encoding", str(error), request)
         if isinstance(error, PreconditionFailed):
             return problem(412, "precondition failed", str(error), request)
+        told = public_text(error)  # the log has the whole text
         if isinstance(error, PlanConflicts):
             found = [
                 {"where": f"window {one.window_id}" if one.window_id else one.kind, "detail": one.detail}
                 for one in error.conflicts
             ]
-            return problem(409, "conflict", str(error), request, errors=found)
+            return problem(409, "conflict", told, request, errors=found)
+        if isinstance(error, StateConflict):
+            return problem(409, "conflict", told, request, state=error.found)
         status, title = next((s, t) for kind, s, t in STATUSES if isinstance(error, kind))
-        if status >= 500:
-            log.error("%s %s: %s", request.method, request.url.path, error)
-        return problem(status, title, str(error), request)
+        if status < 500:
+            return problem(status, title, told, request)
+        # The message names the database or a folder of this machine: it goes to the log, which the id leads to.
+        request_id = getattr(request.state, "request_id", None)
+        log.error("%s %s: %s", request.method, request.url.path, error, extra={"request_id": request_id})
+        detail = next(text for kind, text in TOLD if isinstance(error, kind))
+        return problem(status, title, detail, request, request_id=request_id)
 
     async def http(request: Request, error: Exception) -> JSONResponse:
         assert isinstance(error, HTTPException)
         if error.status_code == 400:  # what the framework says of a body that its JSON reader gives up on
             detail = "body: expected JSON of ordinary depth with numbers of ordinary length, found none"
             return problem(400, "invalid request", detail, request)
-        return problem(error.status_code, str(error.detail).lower(), str(error.detail), request)
+        title = HTTPStatus(error.status_code).phrase.lower()
+        answer = problem(error.status_code, title, str(error.detail), request)
+        if error.status_code == 405:
+            answer.headers["Allow"] = ", ".join(_allowed(app, request))
+        return answer
 
     async def invalid(request: Request, error: Exception) -> JSONResponse:
         assert isinstance(error, RequestValidationError)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import uuid
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import Field
-from starlette.concurrency import run_in_threadpool
 
 from ground_service.api import schemas
 from ground_service.api.common import (
@@ -21,13 +21,16 @@ from ground_service.api.common import (
     Viewer,
     idempotent_id,
     page_of,
-    stored_body,
 )
 from ground_service.api.problems import Forbidden
+from ground_service.api.requests import StrictRoute
 from ground_service.api.routes import get_job
+from ground_service.api.uploads import UploadOf
 from ground_service.services import regression_archives as archive_service
 from ground_service.services.builds import load_build, register_build
 from ground_service.services.ground import Ground
+from ground_service.services.jobs import enter_jobs
+from ground_service.services.plan_schemas import Given
 from ground_service.services.regression_jobs import missing_replays, prepared
 from ground_service.services.users import Caller
 from ground_service.services.views import time_text
@@ -44,7 +47,7 @@ _ZIP = {
     }
 }
 
-regressions = APIRouter(prefix=API_PREFIX, responses=PROBLEMS)
+regressions = APIRouter(route_class=StrictRoute, prefix=API_PREFIX, responses=PROBLEMS)
 
 
 class BuildOut(schemas.Schema):
@@ -73,7 +76,7 @@ class ArchiveOut(schemas.Schema):
     kept_since: str
 
 
-class RegressionRequest(schemas.Schema):
+class RegressionRequest(Given):
     """Which builds to hold against each other, over which archives."""
 
     candidate: str = Field(
@@ -89,7 +92,7 @@ class RegressionOut(schemas.Schema):
     """The verdict on a candidate build."""
 
     id: str
-    verdict: str = Field(description="pass, fail or incomplete", examples=["pass"])
+    verdict: str = Field(description="pass, fail or inconclusive", examples=["pass"])
     created: str
     result: dict[str, Any] = Field(description="As printed by `linna regress run --json`")
 
@@ -98,11 +101,16 @@ class RegressionItem(schemas.Schema):
     """One line of the list of verdicts."""
 
     id: str
-    verdict: str = Field(description="pass, fail or incomplete", examples=["pass"])
+    verdict: str = Field(description="pass, fail or inconclusive", examples=["pass"])
     candidate: str = Field(description="Identity of the build that was judged")
     baseline: str = Field(description="Identity of the build it was held against")
     gates: int = Field(description="Gates that were judged")
     gates_failed: int
+    gates_inconclusive: int
+    frames: int = Field(description="Frames that both builds flew")
+    frames_needed: int | None = Field(
+        description="Frames with which every gate over the suite would be decided; null where no gate states a number"
+    )
     created: str
 
 
@@ -115,13 +123,13 @@ def list_builds(ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Offset 
 
 
 @regressions.post("/builds", status_code=201, response_model=BuildOut, openapi_extra=_ZIP)
-async def add_build(request: Request, ground: GroundOf, caller: Operator) -> BuildOut:
+async def add_build(upload: UploadOf, ground: GroundOf, caller: Operator) -> BuildOut:
     """Register a build: a zip that holds build.toml and the files it names.
 
     A build that is a program is code to be run here: only administrators may register one.
     """
-    stored = await stored_body(request)
-    return await run_in_threadpool(_register, ground, stored, caller)
+    stored = await upload.stored()
+    return await upload.run(_register, ground, stored, caller)
 
 
 @regressions.get("/regression-archives", response_model=list[ArchiveOut])
@@ -131,12 +139,18 @@ def list_archives(ground: GroundOf, _: Viewer) -> Any:
 
 
 @regressions.post("/regression-archives", status_code=201, response_model=ArchiveOut, openapi_extra=_ZIP)
-async def add_archive(request: Request, ground: GroundOf, _: Operator, pinned: bool = False) -> ArchiveOut:
+async def add_archive(upload: UploadOf, ground: GroundOf, _: Operator, pinned: bool = False) -> ArchiveOut:
     """Keep a zipped pass archive, after checking every hash in it."""
-    stored = await stored_body(request)
-    kept = await run_in_threadpool(archive_service.keep_archive, ground, stored.path, pinned=pinned)
-    with ground.database.reading() as connection:
-        return _archive(repository.get(connection, repository.REGRESSION_ARCHIVES, kept.digest, "archive"))
+    stored = await upload.stored()
+
+    def keep() -> ArchiveOut:
+        kept = archive_service.keep_archive(ground, stored.path, pinned=pinned)
+        with ground.database.reading() as connection:
+            return _archive(
+                repository.get(connection, repository.REGRESSION_ARCHIVES, kept.digest, "archive")
+            )
+
+    return await upload.run(keep)
 
 
 @regressions.post("/regressions", status_code=202, response_model=schemas.Job)
@@ -149,12 +163,11 @@ def start_regression(
     idempotency_key: IdempotencyKey = None,
 ) -> Any:
     """Hold a candidate against a baseline: a job for every replay that is missing, and one for the verdict."""
-    job_id = idempotent_id("regression", caller, idempotency_key)
+    identity = idempotent_id("regression", caller, idempotency_key) or uuid.uuid4().hex
     arguments = prepared(ground, given.candidate, given.baseline, given.archives)
-    dispatcher = request.app.state.dispatcher
-    for replay in missing_replays(ground, arguments):
-        dispatcher.submit("replay", replay)
-    identity = dispatcher.submit("regression", arguments, job_id=job_id)
+    replays = {f"{one['archive']} {one['build']}": one for one in missing_replays(ground, arguments)}
+    for job in enter_jobs(ground, replays, "regression", arguments, identity):
+        request.app.state.dispatcher.start(job)
     response.headers["Location"] = f"{API_PREFIX}/regressions/{identity}"
     return get_job(ground, caller, identity)
 
@@ -171,7 +184,10 @@ def list_regressions(ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Of
             candidate=row["candidate_digest"],
             baseline=row["baseline_digest"],
             gates=len(row["result"]["gates"]),
-            gates_failed=sum(not gate["passed"] for gate in row["result"]["gates"]),
+            gates_failed=_count(row, "fail"),
+            gates_inconclusive=_count(row, "inconclusive"),
+            frames=row["result"]["frames"],
+            frames_needed=row["result"]["frames_needed"],
             created=time_text(row["created_utc_ns"]),
         )
         for row in page.rows
@@ -210,6 +226,11 @@ def _register(ground: Ground, stored: StoredFile, caller: Caller) -> BuildOut:
         register_build(ground, build, actor=caller.name)
     with ground.database.reading() as connection:
         return _build(repository.get(connection, repository.BUILDS, build.digest, "build"))
+
+
+def _count(row: repository.Row, outcome: str) -> int:
+    """Gates of a verdict with this outcome that are not waived."""
+    return sum(gate["outcome"] == outcome and not gate["waived"] for gate in row["result"]["gates"])
 
 
 def _build(row: repository.Row) -> BuildOut:

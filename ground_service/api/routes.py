@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Query, Request, Response
-from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse
 
 from ground_service.api import schemas
@@ -27,14 +26,15 @@ from ground_service.api.common import (
     Viewer,
     idempotent_id,
     page_of,
-    stored_body,
 )
+from ground_service.api.requests import StrictRoute
+from ground_service.api.uploads import UploadOf
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.services import ephemerides as ephemeris_service
 from ground_service.services import passes as pass_service
 from ground_service.services.answers import once
-from ground_service.services.ingest import FLOWN
+from ground_service.services.ingest import FLOWN, Place
 from ground_service.services.jobs import enter_ingest
 from ground_service.services.plan_schemas import time_of
 from ground_service.services.report_overview import report_overview
@@ -56,7 +56,7 @@ UPLOAD_PATHS = tuple(f"{API_PREFIX}/{name}" for name in ("telemetry", "ephemerid
 
 REPORT_MEDIA = {"html": "text/html", "pdf": "application/pdf", "json": "application/json"}
 
-router = APIRouter(prefix=API_PREFIX, responses=PROBLEMS)
+router = APIRouter(route_class=StrictRoute, prefix=API_PREFIX, responses=PROBLEMS)
 
 
 # Reference ephemerides
@@ -71,18 +71,22 @@ router = APIRouter(prefix=API_PREFIX, responses=PROBLEMS)
     },
 )
 async def upload_ephemeris(
-    request: Request,
+    upload: UploadOf,
     ground: GroundOf,
     caller: Operator,
     name: Name = "reference",
     precedence: Annotated[int, Query(ge=-1000, le=1000)] = 0,
 ) -> Any:
     """Add a reference ephemeris: a CCSDS OEM or an STK .e file as the body."""
-    stored = await stored_body(request)
-    row = await run_in_threadpool(
-        ephemeris_service.add_ephemeris, ground, stored, name=name, precedence=precedence, actor=caller.name
-    )
-    return ephemeris_view(row)
+    stored = await upload.stored()
+
+    def add() -> dict[str, Any]:
+        row = ephemeris_service.add_ephemeris(
+            ground, stored, name=name, precedence=precedence, actor=caller.name
+        )
+        return ephemeris_view(row)
+
+    return await upload.run(add)
 
 
 @router.get("/ephemerides", response_model=schemas.PageOf[schemas.Ephemeris])
@@ -110,15 +114,35 @@ def list_ephemerides(ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Of
 async def upload_telemetry(
     request: Request,
     response: Response,
+    upload: UploadOf,
     ground: GroundOf,
     caller: Operator,
     spacecraft_id: Annotated[int | None, Query(ge=0, le=1023, description="Needed for bare packets")] = None,
     instance: Instance = FLOWN,
     name: Name = "upload",
+    stream: Annotated[
+        str | None,
+        Query(
+            min_length=1,
+            max_length=200,
+            pattern=r"^[^\x00-\x1f\x7f]*$",
+            description="Stream that the octets are a piece of; with `offset`",
+        ),
+    ] = None,
+    offset: Annotated[
+        int | None, Query(ge=0, lt=1 << 62, description="Where in `stream` the piece begins, in octets")
+    ] = None,
     idempotency_key: IdempotencyKey = None,
 ) -> schemas.IngestAccepted:
-    """Take a downlink (a stream of CADUs or of space packets) and ingest it."""
-    stored = await stored_body(request)
+    """Take a downlink, or a piece of one cut at any octet, and ingest it.
+
+    A downlink is a stream of CADUs or of space packets. Pieces are joined by `stream` and `offset` where they are
+    given, else in order of arrival and by content.
+    """
+    if (stream is None) != (offset is None):
+        raise InvalidInput("telemetry", "stream, offset", "both or neither", "one of them")
+    place = None if stream is None or offset is None else Place(stream, offset)
+    stored = await upload.stored()
     if stored.octets == 0:
         raise InvalidInput("body", "", "the octets of a downlink", "nothing")
     job_id = idempotent_id("ingest", caller, idempotency_key)
@@ -126,12 +150,18 @@ async def upload_telemetry(
 
     def enter() -> tuple[int, str]:
         ingest_id, job = enter_ingest(
-            ground, stored, name, spacecraft_id=spacecraft_id, instance=instance, job_id=job_id
+            ground,
+            stored,
+            name,
+            spacecraft_id=spacecraft_id,
+            instance=instance,
+            place=place,
+            job_id=job_id,
         )
         dispatcher.start(job)
         return ingest_id, job
 
-    ingest_id, job = await run_in_threadpool(enter)
+    ingest_id, job = await upload.run(enter)
     response.headers["Location"] = f"{API_PREFIX}/ingests/{ingest_id}"
     return schemas.IngestAccepted(ingest_id=ingest_id, job_id=job, sha256=stored.sha256, octets=stored.octets)
 
@@ -150,13 +180,14 @@ async def upload_telemetry(
 async def upload_archive(
     request: Request,
     response: Response,
+    upload: UploadOf,
     ground: GroundOf,
     caller: Operator,
     name: Name = "archive.zip",
     idempotency_key: IdempotencyKey = None,
 ) -> Any:
     """Take a zipped pass archive (manifest, downlink, reference, catalogue, images) and import it."""
-    stored = await stored_body(request)
+    stored = await upload.stored()
     job_id = idempotent_id("archive", caller, idempotency_key)
     dispatcher = request.app.state.dispatcher
 
@@ -165,9 +196,9 @@ async def upload_archive(
             repository.register_file(connection, stored, "archive", name, utc_now_ns())
         return str(dispatcher.submit("archive", {"sha256": stored.sha256, "name": name}, job_id=job_id))
 
-    job = await run_in_threadpool(enter)
+    job = await upload.run(enter)
     response.headers["Location"] = f"{API_PREFIX}/jobs/{job}"
-    return await run_in_threadpool(get_job, ground, caller, job)
+    return await upload.run(get_job, ground, caller, job)
 
 
 @router.get("/ingests", response_model=schemas.PageOf[schemas.Ingest])
@@ -240,16 +271,26 @@ def get_completeness(ground: GroundOf, _: Viewer, pass_id: PassId) -> schemas.Co
     found = pass_service.completeness(ground, pass_id)
     return schemas.Completeness(
         packets=found.packets,
+        expected=found.expected,
         lost=found.lost,
+        lost_at_edges=found.lost_at_edges,
         duplicates=found.duplicates,
         conflicts=found.conflicts,
         crc_errors=found.crc_errors,
         octets_skipped=found.octets_skipped,
+        frames=found.frames,
         frames_bad=found.frames_bad,
         symbols_corrected=found.symbols_corrected,
         by_apid=[
             schemas.ApidCompleteness(
-                apid=apid, name=one.name, packets=one.packets, lost=one.lost, conflicts=one.conflicts
+                apid=apid,
+                name=one.name,
+                packets=one.packets,
+                lost=one.lost,
+                lost_at_edges=one.lost_at_edges,
+                duplicates=one.duplicates,
+                conflicts=one.conflicts,
+                crc_errors=one.crc_errors,
             )
             for apid, one in sorted(found.by_apid.items())
         ],

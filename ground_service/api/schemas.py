@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from typing import Any, Generic, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
+
+from ground_service.services.plan_schemas import Given, Schema
+from ground_service.text import LINE_PATTERN_JSON
 
 Item = TypeVar("Item")
-
-
-class Schema(BaseModel):
-    """Base of everything sent."""
-
-    model_config = ConfigDict(extra="forbid")
 
 
 class Problem(BaseModel):
@@ -23,7 +20,11 @@ class Problem(BaseModel):
     status: int = Field(examples=[404])
     detail: str = Field(examples=["pass 7: not found"])
     instance: str | None = Field(default=None, examples=["/api/v1/passes/7"])
+    request_id: str | None = Field(default=None, description="Where the log says more")
     errors: list[dict[str, str]] | None = Field(default=None, description="What is wrong, one by one")
+    state: str | None = Field(
+        default=None, description="Of a conflict: the state that another request brought about"
+    )
 
 
 class PageOf(Schema, Generic[Item]):
@@ -86,18 +87,22 @@ class PassDetail(PassSummary):
     spacecraft_id: int = Field(examples=[76])
     instance: str = Field(examples=["flight"])
     archive_sha256: str | None
+    mission: str | None = Field(examples=["selenita"])
+    mission_revision: str | None = Field(description="Revision of the mission description in force")
     manifest: dict[str, Any]
     reports: list[str]
 
 
-class PassDefinition(Schema):
+class PassDefinition(Given):
     """An interval of a spacecraft's time to be kept as a pass."""
 
-    name: str = Field(min_length=1, max_length=200, examples=["evening pass"])
+    name: str = Field(min_length=1, max_length=200, pattern=LINE_PATTERN_JSON, examples=["evening pass"])
     start: str = Field(examples=["2029-08-07T06:00:00Z"], max_length=40)
     stop: str = Field(examples=["2029-08-07T06:37:00Z"], max_length=40)
     spacecraft_id: int = Field(ge=0, le=1023, examples=[76])
-    instance: str = Field(default="flight", min_length=1, max_length=96, examples=["flight"])
+    instance: str = Field(
+        default="flight", min_length=1, max_length=96, pattern=r"^[A-Za-z0-9._@-]+$", examples=["flight"]
+    )
 
 
 class ApidCompleteness(Schema):
@@ -106,21 +111,27 @@ class ApidCompleteness(Schema):
     apid: int = Field(examples=[161])
     name: str = Field(examples=["detections"])
     packets: int
-    lost: int
+    lost: int = Field(description="Missing between packets that came, by sequence count")
+    lost_at_edges: int | None = Field(description="Missing before the first and after the last, by the plan")
+    duplicates: int | None = Field(description="Came again with the same octets; null: not computed")
     conflicts: int
+    crc_errors: int | None = Field(description="Came with a wrong checksum; null: not computed")
 
 
 class Completeness(Schema):
-    """Packets of a pass that came and that did not."""
+    """Packets of a pass that came and that did not; null: not computed."""
 
     packets: int
+    expected: int = Field(description="Packets that came and packets known to be missing")
     lost: int
-    duplicates: int
+    lost_at_edges: int | None
+    duplicates: int | None
     conflicts: int
-    crc_errors: int
-    octets_skipped: int
-    frames_bad: int
-    symbols_corrected: int
+    crc_errors: int | None
+    octets_skipped: int | None
+    frames: int | None
+    frames_bad: int | None
+    symbols_corrected: int | None
     by_apid: list[ApidCompleteness]
 
 
@@ -176,7 +187,7 @@ class EventItem(Schema):
     correlation_id: int = Field(description="Time correlation used; 0 is an ideal clock")
 
 
-class CommandEntry(Schema):
+class CommandEntry(Given):
     """A telecommand to be queued."""
 
     name: str = Field(max_length=64, examples=["perform_function"])
@@ -189,10 +200,10 @@ class CommandEntry(Schema):
     timeout_s: int = Field(default=600, ge=1, le=86_400 * 30)
 
 
-class Rejection(Schema):
+class Rejection(Given):
     """Why a telecommand is not to be sent."""
 
-    reason: str = Field(min_length=1, max_length=500, examples=["wrong cadence"])
+    reason: str = Field(min_length=1, max_length=500, pattern=LINE_PATTERN_JSON, examples=["wrong cadence"])
 
 
 class CommandReport(Schema):
@@ -294,7 +305,7 @@ class Health(Schema):
     status: str = Field(examples=["ok"])
 
 
-class TimePointIn(Schema):
+class TimePointIn(Given):
     """A time report as it was received."""
 
     ticks: int = Field(ge=0, lt=2**48, description="On-board time, 2^-16 s")
@@ -303,13 +314,13 @@ class TimePointIn(Schema):
     boot_count: int = Field(default=0, ge=0, le=65_535)
 
 
-class TimePoints(Schema):
+class TimePoints(Given):
     """Time reports of one spacecraft."""
 
     points: list[TimePointIn] = Field(min_length=1, max_length=10_000)
 
 
-class ReceptionIn(Schema):
+class ReceptionIn(Given):
     """When a time report came to the Earth; its packet may come in before or after this."""
 
     packet_ticks: int = Field(ge=0, lt=2**48, description="On-board time in the packet's header, 2^-16 s")
@@ -318,7 +329,7 @@ class ReceptionIn(Schema):
     station: str = Field(default="", max_length=64, description="Empty: light time to the Earth's centre")
 
 
-class Receptions(Schema):
+class Receptions(Given):
     """Receptions of time reports of one spacecraft."""
 
     receptions: list[ReceptionIn] = Field(min_length=1, max_length=10_000)
@@ -382,6 +393,19 @@ class ReportErrors(Schema):
     after_gap: list[bool] = Field(description="A silence lies before the stretch: no line over it")
 
 
+class ReportRequirement(Schema):
+    """One line of the verdict table: the value has to be at most, or at least, the limit."""
+
+    key: str = Field(examples=["accuracy.median"])
+    name: str = Field(examples=["median 3-D error"])
+    unit: str = Field(examples=["m"])
+    value: float | None = Field(description="null: unknown")
+    limit: float | None = Field(description="null: the mission description states none")
+    at_most: bool
+    status: str = Field(description="met, not met, unknown or not judged", examples=["met"])
+    note: str
+
+
 class ReportOverview(Schema):
     """The head of a report and its error series made short."""
 
@@ -389,8 +413,9 @@ class ReportOverview(Schema):
     title: str
     verdict: str
     verdict_level: str = Field(examples=["good"])
-    evidence_rung: str
+    evidence_level: str
     created_utc: str
     headline: list[dict[str, Any]]
+    requirements: list[ReportRequirement]
     not_available: dict[str, str]
     navigation: list[ReportErrors]

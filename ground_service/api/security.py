@@ -12,6 +12,9 @@ from ground_service.api.problems import Forbidden
 from ground_service.errors import NotAuthorised
 from ground_service.services.users import LOCAL_CALLER, Caller, authenticate, has_users
 
+VERIFIED_CALLER = "verified_caller"
+"""Name in the state of a request of the user whose token was verified; absent where no token was."""
+
 _bearer = HTTPBearer(auto_error=False, description="Token given out by 'linna user add'")
 
 
@@ -27,6 +30,7 @@ def caller_of(
         raise NotAuthorised("expected a bearer token in the Authorization header, found none")
     caller = authenticate(ground, given.credentials)
     request.state.caller = caller.name
+    setattr(request.state, VERIFIED_CALLER, caller.name)
     return caller
 
 

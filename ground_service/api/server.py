@@ -2,16 +2,47 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
+import logging
+import mmap
+import os
 import socket
+import subprocess
 import sys
+import time
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from ground_service.api.app import LOOPBACK, create_app
+import ground_service
+from ground_service.api import front
+from ground_service.api.app import create_app
+from ground_service.api.connections import ConnectionLimits, Door, raise_file_limit
+from ground_service.api.front import HEARTBEAT
+from ground_service.api.origins import LOOPBACK
+from ground_service.api.proxies import TrustedProxies
 from ground_service.errors import ServerError
 from ground_service.logs import logging_config
 from ground_service.services.ground import ground_from_settings
 from ground_service.services.users import has_users
 from ground_service.settings import Settings
+
+if TYPE_CHECKING:
+    import uvicorn
+
+log = logging.getLogger(__name__)
+
+FILES_KEPT = 320
+"""Files that are not connections or uploads: the reserve of connections, the database, the archive, the program."""
+
+QUEUED = 4096
+TAKEN_AT_ONCE = 16
+BEAT_S = 0.5
+SOCKET_MESSAGE_OCTETS = 4096
+
+SWITCH_S = 0.0005
+"""Python threads that compute give way to the event loop after so long (default: 5 ms)."""
 
 
 def serve(settings: Settings) -> None:
@@ -31,19 +62,133 @@ def serve(settings: Settings) -> None:
                 "run 'linna user add NAME --role admin' first"
             )
     listener = bind(settings.host, settings.port)
+    files = raise_file_limit()
+    sys.setswitchinterval(SWITCH_S)
+    limits = ConnectionLimits(
+        total=max(min(settings.connections, files - FILES_KEPT - settings.uploads_at_once), 16),
+        per_client=settings.connections_per_client,
+        head_s=settings.request_timeout_s,
+        body_s=settings.request_timeout_s,
+    )
+    http, websocket = Door(limits, TrustedProxies(settings.trusted_proxies)).protocols()
     config = uvicorn.Config(
         create_app(settings),
+        http=http,
+        ws=websocket,
+        ws_max_size=SOCKET_MESSAGE_OCTETS,
+        # A compressor for every socket costs more memory than the messages are worth.
+        ws_per_message_deflate=False,
         log_config=logging_config(settings.log_format),
         timeout_graceful_shutdown=20,
         # Longer than clients and proxies keep idle connections, so that none is closed under a request of theirs.
         timeout_keep_alive=75,
         server_header=False,
+        # `proxies` does this, for proxies that the settings name; the server itself would believe any local process.
+        proxy_headers=False,
     )
     host, port = listener.getsockname()[:2]
     shown = f"[{host}]" if ":" in host else host
     print(f"LINNA ground service on http://{shown}:{port}/", file=sys.stderr, flush=True)
+    listener.listen(QUEUED)
     with listener:
-        uvicorn.Server(config).run(sockets=[listener])
+        _server(config, listener).run(sockets=[listener])
+
+
+def _server(config: uvicorn.Config, listener: socket.socket) -> uvicorn.Server:
+    """A server that takes its connections from a front process."""
+    import uvicorn
+
+    class Server(uvicorn.Server):
+        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+            await super().startup([])
+            self._front = FrontProcess(listener, self._serve_connection)
+            self._front.start(asyncio.get_running_loop())
+
+        async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+            self._front.stop()
+            await super().shutdown(sockets)
+
+        def _serve_connection(self, client: socket.socket) -> Coroutine[Any, Any, object]:
+            loop = asyncio.get_running_loop()
+
+            def protocol() -> asyncio.Protocol:
+                make: Any = config.http_protocol_class
+                made: asyncio.Protocol = make(
+                    config=config,
+                    server_state=self.server_state,
+                    app_state=self.lifespan.state,
+                    _loop=loop,
+                )
+                return made
+
+            return loop.connect_accepted_socket(protocol, client)
+
+    return Server(config)
+
+
+class FrontProcess:
+    """The front process as the server sees it: connections come out of a channel, a heartbeat goes in."""
+
+    def __init__(
+        self, listener: socket.socket, serve: Callable[[socket.socket], Coroutine[Any, Any, object]]
+    ) -> None:
+        self._listener = listener
+        self._serve = serve
+        self._tasks: set[asyncio.Task[object]] = set()
+
+    def start(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Start the process, and take connections from it; it is started again where it ends."""
+        self._loop = loop
+        self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._channel.setblocking(False)
+        descriptor = os.memfd_create("linna-heartbeat")
+        os.ftruncate(descriptor, HEARTBEAT.size)
+        self._heartbeat = mmap.mmap(descriptor, HEARTBEAT.size)
+        self._beat()
+        passed = [self._listener.fileno(), theirs.fileno(), descriptor]
+        root = Path(ground_service.__file__).resolve().parent.parent
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", front.__name__, *map(str, passed)],
+            pass_fds=passed,
+            cwd=root,
+            stdin=subprocess.DEVNULL,
+            env={"PYTHONPATH": str(root)},
+        )
+        theirs.close()
+        os.close(descriptor)
+        loop.add_reader(self._channel, self._take)
+
+    def stop(self) -> None:
+        """Accept no more connections; the process ends with its channel."""
+        self._beats.cancel()
+        self._loop.remove_reader(self._channel)
+        self._channel.close()
+        self._process.wait()
+
+    def _beat(self) -> None:
+        HEARTBEAT.pack_into(self._heartbeat, 0, time.monotonic())
+        self._beats = self._loop.call_later(BEAT_S, self._beat)
+
+    def _take(self) -> None:
+        for _ in range(TAKEN_AT_ONCE):
+            try:
+                message, descriptors, _, _ = socket.recv_fds(self._channel, 1, 1)
+            except BlockingIOError:
+                return
+            if not message:
+                self._again()
+                return
+            for descriptor in descriptors:
+                client = socket.socket(fileno=descriptor)
+                client.setblocking(False)
+                task = self._loop.create_task(self._serve(client))
+                self._tasks.add(task)
+                task.add_done_callback(self._tasks.discard)
+
+    def _again(self) -> None:
+        log.error("the front process has ended; it is started again")
+        self.stop()
+        self.start(self._loop)
 
 
 def bind(host: str, port: int) -> socket.socket:

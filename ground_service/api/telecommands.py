@@ -22,13 +22,16 @@ from ground_service.api.common import (
     Viewer,
     page_of,
 )
+from ground_service.api.requests import StrictRoute
 from ground_service.services import commanding
 from ground_service.services.answers import once
 from ground_service.services.ingest import FLOWN
 from ground_service.services.uplink_state import uplink_state
 from ground_service.services.views import telecommand_view
 
-telecommands = APIRouter(prefix=API_PREFIX, responses=PROBLEMS, tags=["telecommands"])
+telecommands = APIRouter(
+    route_class=StrictRoute, prefix=API_PREFIX, responses=PROBLEMS, tags=["telecommands"]
+)
 
 
 @telecommands.get("/telecommands", response_model=schemas.PageOf[schemas.Telecommand])

@@ -17,6 +17,7 @@ from ground_service.api.common import (
     Viewer,
     page_of,
 )
+from ground_service.api.requests import StrictRoute
 from ground_service.services.ingest import FLOWN
 from ground_service.services.recorrelation import enter_receptions, received_reports
 from ground_service.services.timekeeping import (
@@ -28,7 +29,7 @@ from ground_service.services.timekeeping import (
 )
 from ground_service.services.views import correlation_view, time_report_view
 
-timekeeping = APIRouter(prefix=API_PREFIX, responses=PROBLEMS)
+timekeeping = APIRouter(route_class=StrictRoute, prefix=API_PREFIX, responses=PROBLEMS)
 
 
 @timekeeping.get(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmtc.dictionary import DICTIONARY
+from tmtc.estimates import ESTIMATE_PACKETS, filter_estimates
 from tmtc.schema import Dictionary, Table, as_octets, gather
 from tmtc.stream import Octets, PacketCut, primary_headers
 
@@ -68,7 +69,7 @@ def batch_of_cut(
     return PacketBatch(
         apid=headers.apid[good],
         sequence_count=headers.sequence_count[good],
-        ticks=_packet_ticks(buffer, cut, good, headers.secondary_header[good]),
+        ticks=packet_ticks(buffer, cut, good, headers.secondary_header[good]),
         octets=octets,
         digest=[hashlib.blake2b(packet, digest_size=DIGEST_OCTETS).digest() for packet in octets],
         spacecraft_id=spacecraft_id,
@@ -92,10 +93,10 @@ def _joined(pieces: list[Columns]) -> Columns:
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
 
-def _packet_ticks(
+def packet_ticks(
     buffer: Octets, cut: PacketCut, good: IntArray, secondary_header: NDArray[np.bool_]
 ) -> IntArray:
-    """On-board time (n,) of PUS-C packets with the agency's CUC 4+2; `NO_TICKS` for all others."""
+    """Return the on-board time (n,) of PUS-C packets with the agency's CUC 4+2; `NO_TICKS` for all others."""
     ticks = np.full(len(good), NO_TICKS, dtype=np.int64)
     long_enough = np.flatnonzero(secondary_header & (cut.lengths[good] >= _TIMED_HEADER.itemsize))
     header = gather(as_octets(buffer), cut.offsets[good[long_enough]], _TIMED_HEADER)
@@ -162,12 +163,14 @@ def _outcomes(table: Table, place: IntArray) -> Columns:
 
 
 def _filter_states(table: Table, place: IntArray) -> Columns:
-    columns = table.columns
-    names = ("position_icrf_m", "velocity_icrf_m_s", "acceleration_rtn_m_s2", "covariance")
-    packed = np.concatenate([columns[name] for name in names], axis=1).astype("<f8")
-    values = np.empty(len(packed), dtype=object)
-    values[:] = [row.tobytes() for row in packed]
-    return {**_frame_columns(table, place), "values": values}
+    estimates = filter_estimates({table.name: table})
+    degrees = estimates.innovation_degrees.astype(np.float64)
+    return {
+        **_frame_columns(table, place),
+        "state": estimates.state,
+        "covariance": estimates.covariance,
+        "innovation_degrees": _optional(np.where(degrees >= 0.0, degrees, np.nan)),
+    }
 
 
 def _identifications(table: Table, place: IntArray) -> Columns:
@@ -236,7 +239,7 @@ _KINDS: tuple[tuple[str, frozenset[str], _Translation], ...] = (
     ("events", frozenset(_SEVERITIES), _events),
     ("time_reports", frozenset({"time_report"}), _time_reports),
     ("verifications", frozenset(_VERIFICATION_SUBTYPES), _verifications),
-    ("filter_states", frozenset({"filter_state"}), _filter_states),
+    ("filter_states", frozenset(ESTIMATE_PACKETS), _filter_states),
     ("identifications", frozenset({"identifications"}), _identifications),
 )
 """Kinds of samples, the packets they come from, and how."""

@@ -1,35 +1,79 @@
 """A downlink, read window by window: packets are handed on as soon as they are whole, every octet is accounted for.
 
-CADU streams are decoded in windows that overlap by as many frames as the longest packet can span. A packet in the
-overlap is met twice and stored once, so no packet is lost at a border; the accounting of each overlap by itself is
-taken off again, so the sums are those of the stream read at once.
+Windows of a CADU stream do not overlap: what one leaves unfinished (a CADU, a packet of a channel) is kept for the
+next. What is unfinished at the ends of the stream is given as edges, to be joined with those of other files.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ground_service.link.edges import CLOSER, MIDDLE, OPENER, UNKNOWN, Edge, packet_octets_missing
+from ground_service.link.frames import (
+    COUNTS,
+    ChannelEdge,
+    ChannelReader,
+    FrameBlock,
+    control_words,
+    frames_of,
+    is_checked,
+    read_frames,
+)
 from ground_service.link.packets import PacketBatch, batch_of_cut
-from tmtc.cadu import ASM
-from tmtc.clcw import UplinkSeen
+from tmtc import cadu
+from tmtc.cadu import ASM, ASM_LENGTH
+from tmtc.clcw import UplinkSeen, uplink_seen
 from tmtc.dictionary import DICTIONARY
-from tmtc.downlink import FRAME_FOREIGN, DownlinkDecode, LinkSettings, decode
-from tmtc.packets import PACKET_MAX_LENGTH
-from tmtc.schema import Dictionary
-from tmtc.stream import PacketCut, cut_packets
+from tmtc.downlink import decode, proof_of
+from tmtc.errors import LinkFormatError
+from tmtc.frames import FRAME_HEADER_LENGTH, frame_headers
+from tmtc.link import LinkSettings
+from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH
+from tmtc.randomiser import randomise
+from tmtc.schema import Dictionary, as_octets
+from tmtc.stream import cut_packets
+
+OctetArray = NDArray[np.uint8]
+IntArray = NDArray[np.int64]
 
 WINDOW_OCTETS = 2 << 20
-"""Octets decoded and stored at a time: large enough to spread the cost of a transaction and of the overlap, small
-against memory: decoding and storing take about ten times as much."""
+"""Octets decoded and stored at a time: large enough to spread the cost of a transaction, small against memory:
+decoding and storing take about ten times as much."""
 
 PROBE_OCTETS = 256 << 10
 """Octets from which the settings of a link are told; the whole window where the stream begins with noise."""
 
+CADU_MAX_OCTETS = 2048 + 2 * 16 * 8 + ASM_LENGTH
+"""No CADU of a known setting is longer."""
+
 FOREIGN_FRAMES = 2
-"""A spacecraft is believed to be in a stream from this many good frames on."""
+"""A spacecraft is believed to be in a stream of frames without any check from this many frames on."""
+
+_CONTEXT_CADUS = 6
+"""CADUs of one window that the next is synchronised by: enough that the lock is settled."""
+
+_LED_BACK = 64
+"""CADUs before the first marker that are tried."""
+
+_REGULAR_FRAMES = 3
+"""Frames without any check have to be this many, at equal distances, to show their link."""
+
+_CERTAIN_PERIODS = 8
+"""Markers at this many distances are no chance: a coding that is not known is an error then."""
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """How a downlink comes: as CADUs with these settings, or as bare packets (None)."""
+
+    settings: LinkSettings | None
+
+
+BARE = Link(None)
 
 
 @dataclass(slots=True)
@@ -47,30 +91,19 @@ class LinkAccounting:
     """Telecommand channels by spacecraft and number, as the frames show them."""
 
 
-@dataclass(frozen=True, slots=True)
-class StreamEdges:
-    """How a stream begins and ends: what does not belong to a whole unit there, and the counts of the frames there.
-
-    `settings` is None for bare packets. Counts are those of the master channel, None where the frame at the edge is
-    not good.
-    """
-
-    settings: LinkSettings | None
-    octets: int
-    head_loose: int
-    tail_loose: int
-    head_count: int | None = None
-    tail_count: int | None = None
-
-
 class DownlinkReader:
     """Reads one stream: CADUs or bare space packets, told apart by content.
+
+    After the last batch `link` says how it came (None: nothing in it could be read), `edges` what stands at its
+    ends, and `take_channel_edges` gives what was cut off in its channels.
 
     Parameters
     ----------
     spacecraft_id
         Only frames of this spacecraft are used; None: those of every spacecraft in the stream. Bare packets do not
         say whose they are.
+    known
+        Links that are tried before the settings are found out from the stream.
     """
 
     def __init__(
@@ -78,12 +111,27 @@ class DownlinkReader:
         spacecraft_id: int | None = None,
         dictionary: Dictionary = DICTIONARY,
         window_octets: int = WINDOW_OCTETS,
+        known: Sequence[Link] = (),
     ) -> None:
         self.accounting = LinkAccounting()
-        self.edges: StreamEdges | None = None
+        self.link: Link | None = None
+        self.edges: list[Edge] = []
         self._spacecraft_id = spacecraft_id
         self._dictionary = dictionary
         self._window_octets = window_octets
+        self._known = known
+        self._channels = ChannelReader(dictionary)
+        self._last_words: dict[int, NDArray[np.uint32]] = {}
+        self._believed: set[int] = set()
+        self._held: OctetArray = np.empty(0, dtype=np.uint8)
+        self._context = 0
+        self._position = 0
+        self._located = False
+
+    def take_channel_edges(self) -> list[ChannelEdge]:
+        """What was cut off in the channels since the last call."""
+        edges, self._channels.edges = self._channels.edges, []
+        return edges
 
     def batches(self, blocks: Iterable[bytes]) -> Iterator[PacketBatch]:
         """The packets of the stream, in batches.
@@ -93,134 +141,261 @@ class DownlinkReader:
         LinkFormatError
             If frames stand in the stream whose coding is not known.
         """
-        windows = _last_marked(_rebuffered(blocks, self._window_octets))
         rest = b""
-        settings: LinkSettings | None = None
-        bare: bool | None = None
-        for block, final in windows:
+        for block, final in _last_marked(_rebuffered(blocks, self._window_octets)):
             self.accounting.octets += len(block)
             window = rest + block
-            if bare is None:
-                settings = self._settings_of(window)
-                bare = settings is None
-            if settings is None:
-                cut = cut_packets(window, final=final)
-                self._packet_edges(cut, len(window), final)
-                self.accounting.octets_skipped += cut.octets_skipped
-                self._count(cut)
-                rest = b"" if final else bytes(memoryview(window)[cut.consumed :])
-                yield batch_of_cut(window, cut, self._dictionary, self._spacecraft_id)
-                continue
-            yield from self._frames(window, settings, sign=1)
             rest = b""
-            if not final:
-                rest = _overlap(window, settings)
-                for _ in self._frames(rest, settings, sign=-1):
-                    pass
+            if self.link is None:
+                self.link = self._link_of(window)
+            if self.link is None:
+                rest = window if final else window[-2 * CADU_MAX_OCTETS :]
+                self.accounting.octets_skipped += len(window) - (0 if final else len(rest))
+                self._position += len(window) - len(rest)
+            elif self.link.settings is None:
+                rest, batch = self._packets(window, final)
+                yield batch
+            else:
+                yield from self._frames(as_octets(window), self.link.settings, final)
+        if self.link is not None and self.link.settings is not None:
+            self._channels.close()
+            self._count_channels()
+        elif self.link is None and rest:
+            self.edges = fragment_edges(rest, None)
 
-    def _settings_of(self, window: bytes) -> LinkSettings | None:
-        """How frames travel in the stream that begins like this; None for bare packets."""
-        probe = decode(window[:PROBE_OCTETS], dictionary=self._dictionary)
-        if probe.settings is None and len(window) > PROBE_OCTETS and ASM in window:
-            probe = decode(window, dictionary=self._dictionary)
-        return probe.settings
+    def _link_of(self, window: bytes) -> Link | None:
+        """How the stream travels that begins like this; None while that cannot be told."""
+        for link in self._known:
+            if link.settings is not None and _good_frames(window, link.settings):
+                return link
+        found = proposed_link(window, self._dictionary)
+        if found is None and BARE in self._known and np.any(cut_packets(window).crc_ok):
+            return BARE
+        return found
 
-    def _frames(self, window: bytes, settings: LinkSettings, sign: int) -> Iterator[PacketBatch]:
-        """Batches of every spacecraft in a window; `sign` -1 takes the window off the accounting again."""
-        first = decode(
-            window, settings=settings, spacecraft_id=self._spacecraft_id, dictionary=self._dictionary
-        )
-        found = [first]
-        if self._spacecraft_id is None:
-            found += [
-                decode(window, settings=settings, spacecraft_id=other, dictionary=self._dictionary)
-                for other in _other_spacecraft(first)
-            ]
-        own = sum(_good_frames(one) for one in found)
-        frames = len(first.frames) if first.frames is not None else 0
-        truncated = first.frames_bad - (frames - _good_frames(first))
-        self.accounting.frames += sign * frames
-        self.accounting.frames_bad += sign * (frames - own + truncated)
-        self.accounting.symbols_corrected += sign * first.symbols_corrected
-        self.accounting.octets_skipped += sign * first.octets["unsynchronised"]
-        if sign > 0:
-            self._frame_edges(first, settings, len(window))
-        for one in found:
-            self._uplink(one, sign)
-            self.accounting.octets_skipped += sign * (one.octets["orphaned"] + one.octets["skipped"])
-            self._count(one.cut, sign)
-            if sign > 0:
-                yield batch_of_cut(one.buffer, one.cut, self._dictionary, one.spacecraft_id)
+    def _packets(self, window: bytes, final: bool) -> tuple[bytes, PacketBatch]:
+        """Octets left over and the packets of a window of bare packets."""
+        cut = cut_packets(window, final=final)
+        if not self._located and (len(cut) or final):
+            self._located = True
+            head = int(cut.skipped[0, 1]) if len(cut.skipped) and cut.skipped[0, 0] == 0 else 0
+            if 0 < head <= PACKET_MAX_LENGTH and self._position == 0:
+                self.edges.append(Edge(CLOSER, UNKNOWN, UNKNOWN, window[:head], 0))
+        if final and len(cut.skipped) and cut.skipped[-1, 1] == len(window):
+            start = int(cut.skipped[-1, 0])
+            if 0 < len(window) - start <= PACKET_MAX_LENGTH and (start or self._position):
+                self.edges.append(Edge(OPENER, UNKNOWN, UNKNOWN, window[start:], self._position + start))
+        self._position += cut.consumed
+        self.accounting.octets_skipped += cut.octets_skipped
+        self.accounting.packets += int(np.count_nonzero(cut.crc_ok))
+        self.accounting.crc_errors += cut.crc_errors
+        rest = b"" if final else bytes(memoryview(window)[cut.consumed :])
+        return rest, batch_of_cut(window, cut, self._dictionary, self._spacecraft_id)
 
-    def _uplink(self, found: DownlinkDecode, sign: int) -> None:
-        if found.spacecraft_id is None:
+    def _frames(self, window: OctetArray, settings: LinkSettings, final: bool) -> Iterator[PacketBatch]:
+        """Batches of every spacecraft in a window."""
+        length = settings.cadu_length
+        stream = np.concatenate((self._held, window))
+        base, context = self._position - self._held.size, self._context
+        sync = cadu.synchronise(stream, length, verify=proof_of(stream, settings))
+        truncated = int(np.count_nonzero(sync.truncated >= context))
+        sync = sync.take(np.flatnonzero(sync.offsets >= context))
+        offsets, cadus = sync.offsets, cadu.cadu_octets(stream, sync)
+        if not self._located and offsets.size and not sync.start_bits[0] & 7:
+            before = _led_back(stream, int(offsets[0]), settings)
+            offsets = np.concatenate((before, offsets))
+            cadus = np.concatenate((_cadus_at(stream, before, length), cadus))
+        block = frames_of(cadus, offsets, settings)
+        first_found = not self._located and offsets.size > 0
+        own = 0
+        for spacecraft in self._wanted(block):
+            own += int(np.count_nonzero(block.of(spacecraft)))
+            self._uplink(spacecraft, control_words(block, spacecraft))
+            yield self._channels.read(block, spacecraft)
+        accounting = self.accounting
+        accounting.frames += offsets.size
+        accounting.frames_bad += offsets.size - own + truncated
+        accounting.symbols_corrected += int(block.corrected.sum())
+        end = int(offsets[-1]) + length if offsets.size else context
+        if first_found:
+            self._located = True
+            self._head_edge(stream, block, base)
+        if final:
+            self._tail_edge(stream, block, end, base)
+            accounting.octets_skipped += int(stream.size - context - offsets.size * length)
             return
+        # the last CADUs are kept as what the next window is synchronised by, and what is not whole yet
+        kept_from = max(end - _CONTEXT_CADUS * length, 0) if offsets.size or context else 0
+        if stream.size - end > 2 * length:
+            kept_from = end = stream.size - 2 * length
+        accounting.octets_skipped += int(end - context - offsets.size * length)
+        self._held, self._context = stream[kept_from:].copy(), end - kept_from
+        self._position = base + stream.size
+
+    def _wanted(self, block: FrameBlock) -> list[int]:
+        """Spacecraft whose frames are used."""
+        found = block.spacecraft()
+        if self._spacecraft_id is not None:
+            return [one for one in found if one == self._spacecraft_id]
+        if is_checked(block.settings):
+            return found
+        for position, one in enumerate(found):
+            enough = int(np.count_nonzero(block.of(one))) >= FOREIGN_FRAMES
+            if enough or (position == 0 and not self._believed):
+                self._believed.add(one)
+        return [one for one in found if one in self._believed]
+
+    def _uplink(self, spacecraft: int, words: NDArray[np.uint32]) -> None:
+        last = self._last_words.get(spacecraft, np.empty(0, dtype=np.uint32))
         channels = self.accounting.uplink
-        for seen in found.uplink:
-            key = (found.spacecraft_id, seen.virtual_channel)
-            channels[key] = channels[key].followed_by(seen, sign) if key in channels else seen
+        for words_now, sign in ((np.concatenate((last, words)), 1), (last, -1)):
+            for seen in uplink_seen(words_now):
+                key = (spacecraft, seen.virtual_channel)
+                channels[key] = channels[key].followed_by(seen, sign) if key in channels else seen
+        both = np.concatenate((last, words))
+        _, newest = np.unique((both >> np.uint32(18) & np.uint32(0x3F))[::-1], return_index=True)
+        self._last_words[spacecraft] = both[::-1][np.sort(newest)][::-1]
 
-    def _packet_edges(self, cut: PacketCut, octets: int, final: bool) -> None:
-        first = self.edges
-        head = int(cut.skipped[0, 1]) if len(cut.skipped) and cut.skipped[0, 0] == 0 else 0
-        tail = (
-            octets - int(cut.skipped[-1, 0])
-            if final and len(cut.skipped) and cut.skipped[-1, 1] == octets
-            else 0
-        )
-        self.edges = StreamEdges(
-            None, self.accounting.octets, head if first is None else first.head_loose, tail
-        )
-
-    def _frame_edges(self, found: DownlinkDecode, settings: LinkSettings, octets: int) -> None:
-        frames = found.frames
-        if frames is None or len(frames) == 0:
+    def _head_edge(self, stream: OctetArray, block: FrameBlock, base: int) -> None:
+        """Note the octets before the first CADU, which end one that began before the stream."""
+        loose = int(block.offsets[0]) % block.settings.cadu_length
+        if base or self._context or not loose:
             return
-        first = self.edges
-        counts = [int(frames.master_count[i]) if frames.verdict[i] == 0 else None for i in (0, -1)]
-        tail = octets - int(frames.offset[-1]) - settings.cadu_length
-        if first is None:
-            self.edges = StreamEdges(
-                settings, self.accounting.octets, int(frames.offset[0]), tail, counts[0], counts[1]
-            )
-        else:
-            self.edges = StreamEdges(
-                settings, self.accounting.octets, first.head_loose, tail, first.head_count, counts[1]
-            )
+        count = UNKNOWN
+        if len(block.spacecraft()) == 1:
+            first = int(np.flatnonzero(block.good)[0])
+            away, odd = divmod(int(block.offsets[first]) - loose, block.settings.cadu_length)
+            count = UNKNOWN if odd else (int(block.header.master_count[first]) - 1 - away) % COUNTS
+        self.edges.append(Edge(CLOSER, count, UNKNOWN, stream[:loose].tobytes(), 0))
 
-    def _count(self, cut: PacketCut, sign: int = 1) -> None:
-        self.accounting.packets += sign * int(np.count_nonzero(cut.crc_ok))
-        self.accounting.crc_errors += sign * cut.crc_errors
+    def _tail_edge(self, stream: OctetArray, block: FrameBlock, end: int, base: int) -> None:
+        """Note the octets behind the last CADU, which begin one that goes on behind the stream."""
+        settings = block.settings
+        if 0 < stream.size - end < settings.cadu_length and (self._located or block.offsets.size):
+            count = UNKNOWN
+            if block.good.any() and len(block.spacecraft()) == 1:
+                last = int(np.flatnonzero(block.good)[-1])
+                away, odd = divmod(end - int(block.offsets[last]), settings.cadu_length)
+                count = UNKNOWN if odd else (int(block.header.master_count[last]) + away) % COUNTS
+            self.edges.append(opener_of(stream[end:].tobytes(), settings, base + end, count))
 
-
-def _good_frames(result: DownlinkDecode) -> int:
-    """Frames of the spacecraft that was decoded that are without fault."""
-    return int(np.count_nonzero(result.frames.verdict == 0)) if result.frames is not None else 0
-
-
-def _other_spacecraft(result: DownlinkDecode) -> list[int]:
-    """Ids of further spacecraft in a window, by their good frames."""
-    if result.frames is None:
-        return []
-    foreign = result.frames.spacecraft_id[result.frames.verdict == FRAME_FOREIGN]
-    ids, counts = np.unique(foreign, return_counts=True)
-    return [
-        int(i) for i, n in zip(ids, counts, strict=True) if n >= FOREIGN_FRAMES and i != result.spacecraft_id
-    ]
+    def _count_channels(self) -> None:
+        self.accounting.packets += self._channels.packets
+        self.accounting.crc_errors += self._channels.crc_errors
+        self.accounting.octets_skipped += self._channels.octets_unused
 
 
-def _overlap(window: bytes, settings: LinkSettings) -> bytes:
-    """The end of a window that the next one has to begin with: the longest packet may begin anywhere in it."""
-    length = min(reach_octets(settings), len(window) // 2)
-    return window[len(window) - length :]
+def proposed_link(window: bytes, dictionary: Dictionary = DICTIONARY) -> Link | None:
+    """How a stream travels that holds these octets, where they are evidence enough; else None.
+
+    Raises
+    ------
+    LinkFormatError
+        If markers stand at a regular distance and no coding that is known fits.
+    """
+    try:
+        probe = decode(window[:PROBE_OCTETS], dictionary=dictionary)
+        if probe.settings is None and len(window) > PROBE_OCTETS and ASM in window:
+            probe = decode(window, dictionary=dictionary)
+    except LinkFormatError:
+        period = cadu.find_period(as_octets(window))
+        if len(window) >= _CERTAIN_PERIODS * max(period, CADU_MAX_OCTETS // 2):
+            raise
+        return None
+    if probe.settings is not None:
+        good = probe.frame_count - probe.frames_bad
+        enough = good >= 1 if is_checked(probe.settings) else good >= _REGULAR_FRAMES and probe.packets >= 2
+        return Link(probe.settings) if enough else None
+    octets = probe.octets["packets"]
+    return BARE if probe.packets >= 2 or (octets and 2 * octets >= len(window)) else None
 
 
-def reach_octets(settings: LinkSettings | None) -> int:
-    """Octets of a stream over which one packet can stretch; of bare packets when there are no settings."""
+def fragment_edges(octets: bytes, settings: LinkSettings | None) -> list[Edge]:
+    """Edges of a piece in which no whole unit was found: around a marker, or a middle.
+
+    A piece that ends with the first octets of a marker may be either; both are given then.
+    """
     if settings is None:
-        return PACKET_MAX_LENGTH
-    frames = PACKET_MAX_LENGTH // max(settings.frame_length - 16, 1) + 3
-    return frames * settings.cadu_length
+        if len(octets) > PACKET_MAX_LENGTH:
+            return []
+        middle = Edge(MIDDLE, UNKNOWN, UNKNOWN, octets, 0)
+        return [Edge(OPENER, UNKNOWN, UNKNOWN, octets, 0), middle] if _begins_packet(octets) else [middle]
+    length = settings.cadu_length
+    found = octets.find(ASM)
+    if found >= 0:
+        return _around(octets, found, settings)
+    edges = []
+    for part in (3, 2, 1):
+        if len(octets) > part and octets.endswith(ASM[:part]):
+            edges += _around(octets, len(octets) - part, settings)
+    if len(octets) < length:
+        edges.append(Edge(MIDDLE, UNKNOWN, UNKNOWN, octets, 0))
+    return edges
+
+
+def _begins_packet(octets: bytes) -> bool:
+    """Whether a PUS-C telemetry packet seems to begin here that does not end here."""
+    return (
+        len(octets) > PRIMARY_HEADER_LENGTH
+        and octets[0] & 0xF8 == 0x08
+        and octets[PRIMARY_HEADER_LENGTH] >> 4 == 2
+        and packet_octets_missing(octets) > 0
+    )
+
+
+def _around(octets: bytes, marker: int, settings: LinkSettings) -> list[Edge]:
+    """The end of a CADU before a marker, and the beginning of one at it."""
+    opener = opener_of(octets[marker:], settings, marker, UNKNOWN)
+    edges = []
+    if 0 < marker < settings.cadu_length:
+        count = UNKNOWN if opener.next_count == UNKNOWN else (opener.next_count - 1) % COUNTS
+        edges.append(Edge(CLOSER, count, UNKNOWN, octets[:marker], 0))
+    if len(opener.octets) < settings.cadu_length:
+        edges.append(opener)
+    return edges
+
+
+def opener_of(octets: bytes, settings: LinkSettings, start: int, count: int) -> Edge:
+    """The beginning of a CADU; its own header says its count where it is there, else `count` does."""
+    header = randomise(as_octets(octets)[ASM_LENGTH:], settings.randomiser)[:FRAME_HEADER_LENGTH]
+    if header.size == FRAME_HEADER_LENGTH:
+        fields = frame_headers(header[None])
+        if fields.version[0] == 0 and header[4] >> 3 & 0b111 == 0b011:
+            count = int(fields.master_count[0])
+    return Edge(OPENER, UNKNOWN, count, octets, start, settings.cadu_length - len(octets))
+
+
+def _good_frames(window: bytes, settings: LinkSettings) -> bool:
+    """Whether a window holds a good frame of these settings."""
+    for octets in (window[:PROBE_OCTETS], window if len(window) > PROBE_OCTETS and ASM in window else b""):
+        stream = as_octets(octets)
+        sync = cadu.synchronise(stream, settings.cadu_length, verify=proof_of(stream, settings))
+        for first in range(0, sync.start_bits.size, 64):
+            some = sync.take(np.arange(first, min(first + 64, sync.start_bits.size)))
+            block = frames_of(cadu.cadu_octets(stream, some), some.offsets, settings)
+            if not is_checked(settings):
+                regular = block.good & (block.frames[:, 4] >> 3 == 0b00011)
+                return bool(np.count_nonzero(regular) * 2 > regular.size)
+            if block.good.any():
+                return True
+    return False
+
+
+def _led_back(stream: OctetArray, first: int, settings: LinkSettings) -> IntArray:
+    """Where CADUs stand before the first one found whose markers are damaged and whose frames are good."""
+    length = settings.cadu_length
+    before = first - length * np.arange(min(first // length, _LED_BACK), 0, -1, dtype=np.int64)
+    if not before.size or not is_checked(settings):
+        return before[:0]
+    good = np.flatnonzero(read_frames(stream, before, settings).good)
+    return before[good[0] :] if good.size else before[:0]
+
+
+def _cadus_at(stream: OctetArray, offsets: IntArray, length: int) -> OctetArray:
+    if not offsets.size:
+        return np.empty((0, length), dtype=np.uint8)
+    cadus: OctetArray = np.lib.stride_tricks.sliding_window_view(stream, length)[offsets]
+    return cadus
 
 
 def _rebuffered(blocks: Iterable[bytes], octets: int) -> Iterator[bytes]:

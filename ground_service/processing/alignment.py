@@ -60,17 +60,22 @@ class ReferenceStates:
 
 
 def reference_states(
-    reference: Ephemeris | None, orientation: Orientation, utc_ns: IntArray
+    reference: Ephemeris | None, orientation: Orientation | None, utc_ns: IntArray
 ) -> ReferenceStates:
-    """The reference at `utc_ns` (n,); epochs that it does not cover, all of them without one, are NaN."""
+    """Return the reference at `utc_ns` (n,); epochs that it does not cover are NaN.
+
+    Without a reference, or without an orientation to relate it to the ground, all epochs are NaN.
+    """
     utc_ns = np.asarray(utc_ns, dtype=np.int64)
+    if reference is None or orientation is None:
+        reference = orientation = None
     covered = np.zeros(len(utc_ns), dtype=np.bool_) if reference is None else reference.covers(utc_ns)
     position = np.full((len(utc_ns), 3), np.nan)
     velocity = np.full((len(utc_ns), 3), np.nan)
     if reference is not None and covered.any():
         position[covered], velocity[covered] = reference.at(utc_ns[covered])
     rotation = np.full((len(utc_ns), 3, 3), np.nan)
-    if covered.any():
+    if orientation is not None and covered.any():
         rotation[covered] = orientation.mcmf_from_icrf(np.asarray(tdb_s_from_utc_ns(utc_ns[covered])))
     position_mcmf = np.einsum("nij,nj->ni", rotation, position)
     latitude, longitude, altitude = spherical_from_mcmf(position_mcmf)

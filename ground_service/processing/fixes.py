@@ -2,11 +2,12 @@
 
 A fix is wrong when at least half of its identifications name a crater that, seen from the reference position, lies
 further from the detection than the detector's own tolerance. The snapshot baseline solves each frame for its position
-alone, from the same identifications and the nadir attitude, without dynamics and without memory.
+alone, from the same identifications and the attitude, without dynamics and without memory.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ from lunar.catalogue import CraterCatalogue
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+Pointing = Callable[[FloatArray], FloatArray]
 
 ROUNDS = 8
 STEP_M = 1.0
@@ -79,13 +81,23 @@ def join_pairs(
     )
 
 
-def wrong_fixes(pairs: Pairs, camera: PinholeCamera, utc_ns: IntArray, position_mcmf_m: FloatArray) -> int:
-    """How many frames were identified wrongly; the reference (m, 3), MCMF, at the ascending times `utc_ns` (m,)."""
+def wrong_fixes(
+    pairs: Pairs,
+    camera: PinholeCamera,
+    utc_ns: IntArray,
+    position_mcmf_m: FloatArray,
+    camera_from_mcmf: FloatArray | None = None,
+) -> int:
+    """Return how many frames were identified wrongly.
+
+    The reference (m, 3), MCMF, and the attitude (m, 3, 3) are given at the ascending times `utc_ns` (m,); the camera
+    looks to nadir where no attitude is given.
+    """
     at = np.minimum(np.searchsorted(utc_ns, pairs.utc_ns), max(len(utc_ns) - 1, 0))
     if len(utc_ns) == 0 or len(pairs.frame) == 0:
         return 0
     kept = np.flatnonzero((utc_ns[at] == pairs.utc_ns) & np.isfinite(position_mcmf_m[at, 0]))
-    rotations = nadir_camera_from_mcmf(position_mcmf_m)
+    rotations = nadir_camera_from_mcmf(position_mcmf_m) if camera_from_mcmf is None else camera_from_mcmf
     line = pairs.crater_mcmf_m[kept] - position_mcmf_m[at[kept]]
     uv = camera.project(np.einsum("nij,nj->ni", rotations[at[kept]], line))
     allowed = np.minimum(CENTRE_TOLERANCE_RADII * pairs.diameter_px[kept] / 2.0, CENTRE_TOLERANCE_PX)
@@ -95,7 +107,12 @@ def wrong_fixes(pairs: Pairs, camera: PinholeCamera, utc_ns: IntArray, position_
 
 
 def snapshot_positions(
-    pairs: Pairs, camera: PinholeCamera, utc_ns: IntArray, start_mcmf_m: FloatArray
+    pairs: Pairs,
+    camera: PinholeCamera,
+    utc_ns: IntArray,
+    start_mcmf_m: FloatArray,
+    pointing: Pointing = nadir_camera_from_mcmf,
+    camera_from_mcmf: FloatArray | None = None,
 ) -> FloatArray:
     """Position (m, 3), MCMF, of each epoch from its own identifications; NaN where they do not give one.
 
@@ -103,7 +120,13 @@ def snapshot_positions(
     ----------
     utc_ns, start_mcmf_m
         Ascending epochs (m,) and where to begin (m, 3): what the payload itself believed.
+    pointing
+        Attitude (..., 3, 3) of a camera at positions (..., 3), for epochs without an attitude of their own.
+    camera_from_mcmf
+        Attitude (m, 3, 3) at each epoch; NaN where it is not known.
     """
+    if camera_from_mcmf is None:
+        camera_from_mcmf = np.full((len(utc_ns), 3, 3), np.nan)
     result = np.full((len(utc_ns), 3), np.nan)
     frames: dict[int, list[tuple[int, IntArray]]] = {}
     for rows in _by_frame(pairs):
@@ -113,7 +136,14 @@ def snapshot_positions(
     for alike in frames.values():
         where = np.array([at for at, _ in alike])
         chosen = np.array([rows for _, rows in alike])
-        result[where] = _solved(camera, start_mcmf_m[where], pairs.crater_mcmf_m[chosen], pairs.uv_px[chosen])
+        result[where] = _solved(
+            camera,
+            start_mcmf_m[where],
+            pairs.crater_mcmf_m[chosen],
+            pairs.uv_px[chosen],
+            pointing,
+            camera_from_mcmf[where],
+        )
     return result
 
 
@@ -125,16 +155,23 @@ def _by_frame(pairs: Pairs) -> list[IntArray]:
 
 
 def _solved(
-    camera: PinholeCamera, start_m: FloatArray, crater_m: FloatArray, uv_px: FloatArray
+    camera: PinholeCamera,
+    start_m: FloatArray,
+    crater_m: FloatArray,
+    uv_px: FloatArray,
+    pointing: Pointing,
+    fixed: FloatArray,
 ) -> FloatArray:
-    """Gauss-Newton on the positions (f, 3) of nadir cameras that see n craters each; NaN where it does not settle."""
+    """Gauss-Newton on the positions (f, 3) of cameras that see n craters each; NaN where it does not settle."""
     result = np.full(start_m.shape, np.nan)
     position = start_m.astype(np.float64)
     going = np.flatnonzero(np.isfinite(position).all(axis=1))
     steps = STEP_M * np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     coordinates = 2 * crater_m.shape[1]
     for _ in range(ROUNDS):
-        projected = _projected(camera, position[going, None] + steps, crater_m[going, None])
+        projected = _projected(
+            camera, position[going, None] + steps, crater_m[going, None], pointing, fixed[going, None]
+        )
         residual = (uv_px[going] - projected[:, 0]).reshape(-1, coordinates)
         slope = ((projected[:, 1:4] - projected[:, 4:]) / (2.0 * STEP_M)).reshape(-1, 3, coordinates)
         known = np.isfinite(residual).all(axis=1) & np.isfinite(slope).all(axis=(1, 2))
@@ -151,7 +188,13 @@ def _solved(
     return result
 
 
-def _projected(camera: PinholeCamera, positions_m: FloatArray, crater_m: FloatArray) -> FloatArray:
-    """Pixels (..., n, 2) of craters (..., n, 3) from nadir cameras at positions (..., 3)."""
-    rotations = nadir_camera_from_mcmf(positions_m)
+def _projected(
+    camera: PinholeCamera,
+    positions_m: FloatArray,
+    crater_m: FloatArray,
+    pointing: Pointing,
+    fixed: FloatArray,
+) -> FloatArray:
+    """Pixels (..., n, 2) of craters (..., n, 3) from cameras at positions (..., 3), in a fixed attitude where known."""
+    rotations = np.where(np.isfinite(fixed), fixed, pointing(positions_m))
     return np.asarray(camera.project((crater_m - positions_m[..., None, :]) @ rotations.swapaxes(-1, -2)))

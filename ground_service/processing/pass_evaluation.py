@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from ground_service.processing.alignment import (
     reference_states,
 )
 from ground_service.processing.baseline import BASELINE_DEGREE, StartState, propagated_positions
+from ground_service.processing.consistency import nees, squared_normalised_errors
 from ground_service.processing.drift import drift_by_length, error_before_reset_m, navigation_statistics
 from ground_service.processing.fixes import (
     IdentificationSamples,
@@ -39,10 +40,12 @@ from ground_service.processing.recall import (
     match_detections,
     score_detections,
 )
+from ground_service.processing.reference_error import error_budget, reference_covariance_m2
 from ground_service.processing.samples import DetectionSamples, NavigationSamples, OutcomeSamples
 from ground_service.processing.smoothed_series import SMOOTHED, smoothed_series, smoother_model
 from ground_service.processing.smoother import CommandedBurn, FilterStates
-from lunar.camera import PinholeCamera
+from ground_service.processing.verdict import Evaluated, Limits, requirements, verdict_of
+from ground_service.processing.viewing import Viewing
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M, NANOSECONDS_PER_SECOND
 from lunar.ephemeris import Ephemeris
@@ -86,6 +89,9 @@ WORST_FRAMES = 6
 WORST_MINIMUM_EXPECTED = 3
 """A frame with fewer expected craters says nothing about the detector and is no candidate for the worst ones."""
 
+_NO_IMAGE_GRAY = 72
+"""Gray level of the ground on which a frame is drawn whose image did not come down."""
+
 RESETS = ("initialization", "time_gap", "manual_step", "safety_timeout")
 
 
@@ -96,15 +102,29 @@ PERFECT_START_M = 1.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PassInputs:
-    """Everything that the evaluation of a pass needs; None or empty where it is not known."""
+    """Everything that the evaluation of a pass needs; None or empty where it is not known.
+
+    Attributes
+    ----------
+    orientation, gravity, onboard_gravity
+        Lunar orientation of the pass, gravity field of its reference and that of the on-board filter, as declared.
+    refused
+        Why one of these is None, by its name.
+    reference_sigma_rtn_m
+        Declared 1-sigma error of the reference in radial, transverse and normal.
+    limits
+        Limits of the verdict.
+    cpu_percent
+        Largest processor time of a step over the cadence.
+    """
 
     pass_id: str
     title: str
     start_utc_ns: int
     stop_utc_ns: int
     packets: PacketAccounting
-    camera: PinholeCamera
-    orientation: Orientation
+    viewing: Viewing
+    orientation: Orientation | None
     reference: Ephemeris | None
     catalogue: CraterCatalogue | None
     detections: DetectionSamples
@@ -117,7 +137,11 @@ class PassInputs:
     sun_known: bool = False
     burns: tuple[CommandedBurn, ...] = ()
     gravity: GravityField | None = None
-    other_gravity: GravityField | None = None
+    onboard_gravity: GravityField | None = None
+    refused: Mapping[str, str] = field(default_factory=dict)
+    reference_sigma_rtn_m: tuple[float, float, float] | None = None
+    limits: Limits = field(default_factory=Limits)
+    cpu_percent: float | None = None
     frames_expected: int | None = None
     cadence_s: float | None = None
     housekeeping: tuple[HousekeepingParameter, ...] = ()
@@ -125,7 +149,7 @@ class PassInputs:
     images: Mapping[int, NDArray[np.uint8]] = field(default_factory=dict)
     provenance: Mapping[str, str] = field(default_factory=dict)
     data_sources: tuple[str, ...] = ()
-    evidence_rung: str = ""
+    evidence_level: str = ""
     configuration: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     scenario_text: str = ""
     generated_for: str = ""
@@ -143,8 +167,9 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
     provenance = dict(inputs.provenance)
     reference: TrackSeries | None = None
     navigation: tuple[NavigationSeries, ...] = ()
-    if inputs.reference is None:
-        missing["error"] = missing["reference"] = "no reference ephemeris covers this pass"
+    refusal = _refusal(inputs)
+    if inputs.reference is None or refusal:
+        missing["error"] = missing["reference"] = refusal
         navigation = _without_reference(inputs)
     else:
         reference, navigation = _navigation(inputs, inputs.reference, provenance, remarks)
@@ -153,20 +178,26 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
     detector, gallery, worst, craters = _detector(inputs, missing, remarks)
     if not inputs.images:
         missing["gallery"] = missing["worst_frames"] = "no images came down with this pass"
-    verdict, level = _verdict(inputs, navigation, detector)
+    accounting = _frame_accounting(inputs)
+    table = requirements(
+        inputs.limits,
+        Evaluated(navigation, detector, accounting, inputs.packets, inputs.housekeeping, inputs.cpu_percent),
+    )
+    verdict, level = verdict_of(table)
     return PassReport(
         title=inputs.title,
         pass_id=inputs.pass_id,
         verdict=verdict,
         verdict_level=level,
+        requirements=table,
         generated_for=inputs.generated_for,
         created_utc=inputs.created_utc,
-        evidence_rung=inputs.evidence_rung,
+        evidence_level=inputs.evidence_level,
         headline=_headline(inputs, navigation, detector),
         provenance=provenance,
         data_sources=inputs.data_sources,
         span=TimeSpan(inputs.start_utc_ns, inputs.stop_utc_ns, "pass"),
-        accounting=_frame_accounting(inputs),
+        accounting=accounting,
         packets=inputs.packets,
         reference=reference,
         navigation=navigation,
@@ -195,7 +226,8 @@ def summary_of(report: PassReport) -> dict[str, Any]:
         "pass_id": report.pass_id,
         "frames": report.accounting.processed if report.accounting else None,
         "packets": report.packets.packets if report.packets else 0,
-        "packets_lost": report.packets.lost if report.packets else 0,
+        "packets_lost": report.packets.missing if report.packets else 0,
+        "packets_expected": report.packets.expected if report.packets else 0,
         "detector": {
             "precision": micro.precision if micro else None,
             "recall": micro.recall if micro else None,
@@ -215,7 +247,31 @@ def summary_of(report: PassReport) -> dict[str, Any]:
         "smoothed": {s.name: _figures(s.statistics) for s in report.navigation if s.kind == SMOOTHED},
         "baselines": {s.name: _figures(s.statistics) for s in report.navigation if s.kind == "baseline"},
         "verdict": report.verdict,
-        "evidence_rung": report.evidence_rung,
+        "verdict_level": report.verdict_level,
+        "requirements": [
+            {
+                "key": one.key,
+                "name": one.name,
+                "value": one.value,
+                "limit": one.limit,
+                "relation": "<=" if one.at_most else ">=",
+                "unit": one.unit,
+                "margin": one.margin,
+                "status": one.status,
+                "note": one.note,
+            }
+            for one in report.requirements
+        ],
+        "error_budget": {
+            s.name: {
+                "observed_rms_m": s.error_budget.observed_rms_m,
+                "reference_rms_m": s.error_budget.reference_rms_m,
+                "estimate_rms_m": s.error_budget.estimate_rms_m,
+            }
+            for s in report.navigation
+            if s.error_budget is not None
+        },
+        "evidence_level": report.evidence_level,
         "data": list(report.data_sources),
     }
 
@@ -232,26 +288,29 @@ def _navigation(
     track = reference_states(reference, inputs.orientation, times)
     path_m = _path(track)
     series = [
-        _estimate_series(samples, _outcomes_of(inputs, samples.estimator), track, path_m)
+        _estimate_series(inputs, samples, track, path_m)
         for samples in inputs.navigation
         if len(samples.utc_ns)
     ]
-    series += _smoothed(inputs, track, path_m, provenance)
+    series += _smoothed(inputs, track, path_m, provenance, remarks)
     uncovered = int(np.count_nonzero(~track.covered))
     if uncovered:
         remarks.append(
             f"{uncovered} of {len(times)} sample times lie outside the reference ephemeris and have no error"
         )
-    if inputs.start_state is not None and inputs.gravity is not None:
+    if inputs.start_state is not None and inputs.gravity is not None and inputs.orientation is not None:
         try:
-            series += _baselines(inputs, inputs.start_state, inputs.gravity, track, path_m)
+            series += _baselines(
+                inputs, inputs.start_state, inputs.gravity, inputs.orientation, track, path_m
+            )
             provenance["gravity of the baseline"] = (
                 f"{inputs.gravity.name}, degree {min(BASELINE_DEGREE, inputs.gravity.degree)}, with Earth and Sun"
             )
         except LunarError as error:
             remarks.append(f"no propagate-only baseline: {error}")
     else:
-        remarks.append("no propagate-only baseline: the pass names no start state")
+        reason = inputs.refused.get("gravity") if inputs.start_state is not None else None
+        remarks.append(f"no propagate-only baseline: {reason or 'the pass names no start state'}")
     series = _with_extras(inputs, series, track, path_m)
     return (
         TrackSeries(times, track.latitude_deg, track.longitude_deg, track.altitude_m),
@@ -261,10 +320,10 @@ def _navigation(
 
 def _without_reference(inputs: PassInputs) -> tuple[NavigationSeries, ...]:
     """What the estimators reported, with no error of any of it."""
-    track = reference_states(None, inputs.orientation, _sample_times(inputs))
+    track = reference_states(None, None, _sample_times(inputs))
     path_m = np.full(len(track.utc_ns), np.nan)
     return tuple(
-        _estimate_series(samples, _outcomes_of(inputs, samples.estimator), track, path_m)
+        _estimate_series(inputs, samples, track, path_m)
         for samples in inputs.navigation
         if len(samples.utc_ns)
     )
@@ -282,11 +341,11 @@ def _with_extras(
     if inputs.identifications is None or inputs.catalogue is None:
         return series
     pairs = join_pairs(inputs.identifications, inputs.detections, inputs.catalogue)
-    series = [with_wrong_fixes(one, pairs, inputs.camera, track) for one in series]
+    series = [with_wrong_fixes(one, pairs, inputs.viewing, track) for one in series]
     filtered = next((samples for samples in inputs.navigation if samples.estimator == FILTER), None)
     snapshot = None
     if filtered is not None:
-        snapshot = snapshot_series(pairs, filtered, inputs.camera, track, path_m)
+        snapshot = snapshot_series(pairs, filtered, inputs.viewing, track, path_m)
     return series if snapshot is None else [*series, snapshot]
 
 
@@ -304,8 +363,9 @@ def _path(track: ReferenceStates) -> FloatArray:
 
 
 def _estimate_series(
-    samples: NavigationSamples, outcomes: OutcomeSamples | None, track: ReferenceStates, path_m: FloatArray
+    inputs: PassInputs, samples: NavigationSamples, track: ReferenceStates, path_m: FloatArray
 ) -> NavigationSeries:
+    outcomes = _outcomes_of(inputs, samples.estimator)
     rows = np.searchsorted(track.utc_ns, samples.utc_ns)
     error = error_of_places_rtn_m(
         track.at_rows(rows), samples.latitude_deg, samples.longitude_deg, samples.altitude_m
@@ -315,9 +375,11 @@ def _estimate_series(
     if not triggers:
         is_reset = np.zeros(len(samples.utc_ns), dtype=np.bool_)
     sigma = samples.sigma_rtn_m
-    with np.errstate(invalid="ignore", divide="ignore"):
-        nees = np.sum((error / sigma) ** 2, axis=-1)
     has_sigma = bool(np.isfinite(sigma).any())
+    filtered = inputs.filter_states if samples.estimator == FILTER else None
+    nees_of_samples, degrees = _consistency(
+        samples, filtered, error, reference_covariance_m2(inputs.reference_sigma_rtn_m)
+    )
     return NavigationSeries(
         name=samples.estimator,
         kind="estimate",
@@ -337,39 +399,83 @@ def _estimate_series(
         matched=samples.matched,
         candidates=candidates,
         nis=samples.nis if bool(np.isfinite(samples.nis).any()) else None,
-        nees=nees if has_sigma else None,
-        nis_dof=_nis_dof(samples),
+        nees=nees_of_samples,
+        squared_normalised_errors=(
+            squared_normalised_errors(error, sigma) if has_sigma and nees_of_samples is None else None
+        ),
+        nis_dof=degrees,
         time_since_fix_s=_time_since_fix_s(samples),
+        error_budget=error_budget(error, inputs.reference_sigma_rtn_m),
         drift_by_length=drift_by_length(error, path_m[rows], is_reset),
     )
 
 
-def _nis_dof(samples: NavigationSamples) -> IntArray | None:
-    """Degrees of freedom of each NIS: two pixel coordinates for every crater that a fix used."""
+def _consistency(
+    samples: NavigationSamples,
+    filtered: FilterStates | None,
+    error_rtn_m: FloatArray,
+    reference_covariance: FloatArray,
+) -> tuple[FloatArray | None, IntArray | None]:
+    """Return the NEES of the position (n,; None without a covariance) and the degrees of freedom of each NIS.
+
+    The covariance of the reference (3, 3), R/T/N, is added to that of the estimate.
+
+    A NIS has two degrees for every crater that a fix used: as downlinked, or of the count of craters.
+    """
     known = np.isfinite(samples.nis)
-    return np.where(known, 2 * samples.matched, 0).astype(np.int64) if known.any() else None
+    degrees = np.where(known, 2 * samples.matched, 0).astype(np.int64) if known.any() else None
+    if filtered is None or not len(filtered):
+        return None, degrees
+    at = np.minimum(np.searchsorted(filtered.utc_ns, samples.utc_ns), len(filtered) - 1)
+    same = filtered.utc_ns[at] == samples.utc_ns
+    if not same.any():
+        return None, degrees
+    covariance = np.where(same[:, None, None], filtered.position_covariance_rtn_m2[at], np.nan)
+    if degrees is not None and filtered.innovation_degrees is not None:
+        told = filtered.innovation_degrees[at]
+        degrees = np.where(known & same & (told >= 0), told, degrees).astype(np.int64)
+    return nees(error_rtn_m, covariance + reference_covariance), degrees
 
 
 def _smoothed(
-    inputs: PassInputs, track: ReferenceStates, path_m: FloatArray, provenance: dict[str, str]
+    inputs: PassInputs,
+    track: ReferenceStates,
+    path_m: FloatArray,
+    provenance: dict[str, str],
+    remarks: list[str],
 ) -> list[NavigationSeries]:
-    """The filter's orbit smoothed on the ground, where its states came down in full and the reference covers them."""
+    """The filter's orbit smoothed on the ground, where its states came down in full and the reference covers them.
+
+    The gravity field is that of the filter: another one than that of the truth, so that a common error shows.
+    """
     filtered = inputs.filter_states
     reported = next((s for s in inputs.navigation if s.estimator == "anchored"), None)
-    gravity = inputs.other_gravity or inputs.gravity
-    if filtered is None or reported is None or gravity is None or not len(filtered):
+    if filtered is None or reported is None or not len(filtered):
+        return []
+    gravity = inputs.onboard_gravity
+    if gravity is None or inputs.orientation is None:
+        remarks.append(
+            f"no smoothed orbit: {inputs.refused.get('onboard_gravity', 'no gravity field is given')}"
+        )
         return []
     rows = np.minimum(np.searchsorted(track.utc_ns, filtered.utc_ns), len(track.utc_ns) - 1)
     kept = track.covered[rows] & (track.utc_ns[rows] == filtered.utc_ns)
     filtered, rows = filtered.select(kept), rows[kept]
     model = smoother_model(gravity, inputs.orientation, inputs.burns)
-    series = smoothed_series(filtered, reported, track.at_rows(rows), path_m[rows], model)
+    series = smoothed_series(
+        filtered,
+        reported,
+        track.at_rows(rows),
+        path_m[rows],
+        model,
+        reference_covariance_m2(inputs.reference_sigma_rtn_m),
+    )
     if series is None:
         return []
     provenance["gravity of the smoother"] = (
         f"{gravity.name}, degree {model.forces.degree}, with Earth and Sun"
     )
-    return [series]
+    return [replace(series, error_budget=error_budget(series.error_rtn_m, inputs.reference_sigma_rtn_m))]
 
 
 def _joined(
@@ -400,7 +506,12 @@ def _time_since_fix_s(samples: NavigationSamples) -> FloatArray | None:
 
 
 def _baselines(
-    inputs: PassInputs, start: StartState, gravity: GravityField, track: ReferenceStates, path_m: FloatArray
+    inputs: PassInputs,
+    start: StartState,
+    gravity: GravityField,
+    orientation: Orientation,
+    track: ReferenceStates,
+    path_m: FloatArray,
 ) -> list[NavigationSeries]:
     rows = np.flatnonzero(track.covered & (track.utc_ns >= start.utc_ns))
     if len(rows) == 0:
@@ -408,15 +519,15 @@ def _baselines(
     here = track.at_rows(rows)
     series = []
     runs = [("propagate-only", start, gravity, min(BASELINE_DEGREE, gravity.degree))]
-    if inputs.other_gravity is not None:
-        other = inputs.other_gravity
+    other = inputs.onboard_gravity
+    if other is not None and other.name != gravity.name:
         runs.append((f"propagate-only, {other.name}", start, other, min(BASELINE_DEGREE, other.degree)))
     perfect = StartState(int(here.utc_ns[0]), here.position_icrf_m[0], here.velocity_icrf_m_s[0])
     if _apart_m(start, perfect) > PERFECT_START_M:
         runs.append((PERFECT_START, perfect, gravity, runs[0][3]))
     for name, begin, field_used, degree in (*runs, ("Kepler", start, gravity, 0)):
         position = propagated_positions(
-            begin, here.utc_ns, field_used, degree, inputs.orientation, third_bodies=degree > 0
+            begin, here.utc_ns, field_used, degree, orientation, third_bodies=degree > 0
         )
         origin = "state of the reference" if begin is perfect else "start state of the filter"
         text = (
@@ -458,11 +569,16 @@ def _detector(
     if len(detections) == 0:
         missing["detector"] = missing["craters"] = "no detections came down"
         return None, (), (), None
-    if inputs.catalogue is None or inputs.reference is None:
-        missing["detector"] = missing["craters"] = "it needs a crater catalogue and a reference ephemeris"
+    if inputs.catalogue is None or inputs.reference is None or inputs.orientation is None:
+        reason = "it needs a crater catalogue and a reference ephemeris"
+        if inputs.orientation is None:
+            reason = _refusal(inputs)
+        missing["detector"] = missing["craters"] = reason
         return None, (), (), None
     track = reference_states(inputs.reference, inputs.orientation, detections.utc_ns)
-    expected = expected_craters(inputs.catalogue, inputs.camera, track.position_mcmf_m)
+    viewing = inputs.viewing
+    rotations = viewing.camera_from_mcmf(detections.utc_ns, track.position_mcmf_m, track.mcmf_from_icrf)
+    expected = expected_craters(inputs.catalogue, viewing.camera, track.position_mcmf_m, rotations)
     matches = match_detections(detections, expected)
     sun = sun_angles(track) if inputs.sun_known else None
     score = score_detections(
@@ -472,6 +588,7 @@ def _detector(
         track.altitude_m,
         None if sun is None else sun.elevation_deg,
         None if sun is None else sun.azimuth_deg,
+        pointing=_pointing_text(inputs, remarks),
     )
     chosen, worst = _choose_frames(inputs, expected, matches)
     frames = {frame: _gallery_frame(inputs, expected, matches, frame) for frame in sorted({*chosen, *worst})}
@@ -481,6 +598,29 @@ def _detector(
         tuple(frames[frame] for frame in worst),
         _crater_map(inputs.catalogue, expected, matches),
     )
+
+
+def _refusal(inputs: PassInputs) -> str:
+    """Why nothing can be compared with a reference; empty where it can."""
+    if inputs.reference is None:
+        return "no reference ephemeris covers this pass"
+    if inputs.orientation is None:
+        return inputs.refused.get("orientation", "no lunar orientation is given")
+    return ""
+
+
+def _pointing_text(inputs: PassInputs, remarks: list[str]) -> str:
+    """Words for how the camera looked; what is not known of it becomes a remark."""
+    known = int(np.count_nonzero(inputs.viewing.known(inputs.detections.utc_ns)))
+    total = len(inputs.detections)
+    if known == total:
+        return "the camera in its telemetered attitude"
+    if "camera" in inputs.refused:
+        remarks.append(inputs.refused["camera"])
+    if known:
+        remarks.append(f"the attitude of {total - known} of {total} frames is not known: taken as declared")
+        return "the camera in its telemetered attitude, where there is one"
+    return "the camera as declared" if "camera" not in inputs.refused else "a nadir camera"
 
 
 def _choose_frames(
@@ -499,7 +639,9 @@ def _choose_frames(
     scored = np.isin(expected.size_class, (0, 1, 2)) & expected.complete
     total = np.bincount(owner[scored], minlength=len(detections))
     hit = np.bincount(owner[scored & (matches.detection_of_crater >= 0)], minlength=len(detections))
-    candidates = rows[(total[rows] >= WORST_MINIMUM_EXPECTED) & (hit[rows] < total[rows])]
+    # Every frame is a candidate: the few whose images came down are not the worst ones of the pass.
+    every = np.flatnonzero(detections.usable)
+    candidates = every[(total[every] >= WORST_MINIMUM_EXPECTED) & (hit[every] < total[every])]
     recall = hit[candidates] / np.maximum(total[candidates], 1)
     worst = candidates[np.lexsort((candidates, recall))][:WORST_FRAMES]
     return [int(row) for row in spread], sorted(int(row) for row in worst)
@@ -512,10 +654,16 @@ def _gallery_frame(inputs: PassInputs, expected: ExpectedCraters, matches: Match
     c = c[np.isin(expected.size_class[c], (0, 1, 2))]
     found = matches.detection_of_crater[c] >= 0
     number = int(detections.frame_number[row])
+    camera = inputs.viewing.camera
+    image = (
+        inputs.images[number]
+        if number in inputs.images
+        else np.full((camera.height_px, camera.width_px), _NO_IMAGE_GRAY, dtype=np.uint8)
+    )
     return GalleryFrame(
         frame_number=number,
         utc_ns=int(detections.utc_ns[row]),
-        image=inputs.images[number],
+        image=image,
         detection_u_px=detections.u_px[d],
         detection_v_px=detections.v_px[d],
         detection_diameter_px=detections.diameter_px[d],
@@ -526,7 +674,8 @@ def _gallery_frame(inputs: PassInputs, expected: ExpectedCraters, matches: Match
         catalogue_class=expected.size_class[c],
         detection_matched=matches.crater_of_detection[d] >= 0,
         catalogue_matched=found,
-        caption=f"{int(found.sum())} of {len(c)} catalogued craters of 5–30 km detected",
+        caption=f"{int(found.sum())} of {len(c)} craters of 5–30 km detected"
+        + ("" if number in inputs.images else ", no image"),
     )
 
 
@@ -609,29 +758,22 @@ def _outcomes_of(inputs: PassInputs, estimator: str) -> OutcomeSamples | None:
     return next((samples for samples in inputs.outcomes if samples.estimator == estimator), None)
 
 
-def _best(navigation: tuple[NavigationSeries, ...], kind: str) -> NavigationSeries | None:
-    """The series of this kind with the smallest median error; at its first frame odometry is where it was put."""
-    known = [
-        s
-        for s in navigation
-        if s.kind == kind and len(s.utc_ns) > 1 and np.isfinite(s.statistics.median_3d_m)
-    ]
-    return min(known, key=lambda s: s.statistics.median_3d_m, default=None)
-
-
 def _headline(
     inputs: PassInputs, navigation: tuple[NavigationSeries, ...], detector: DetectorScore | None
 ) -> tuple[HeadlineFigure, ...]:
-    best = _best(navigation, "estimate")
+    """The five figures: those of the declared estimator, never of the one that did best."""
+    name = inputs.limits.estimator
+    own = next((s for s in navigation if s.kind == "estimate" and s.name == name and len(s.utc_ns) > 1), None)
     only = next((s for s in navigation if s.name == "propagate-only"), None)
     micro = detector.micro if detector else None
-    lost = inputs.packets.lost
+    packets = inputs.packets
+    absent = "no estimator is declared" if name is None else f"{name} is not known"
     return (
         HeadlineFigure(
             "Median position error",
-            best.statistics.median_3d_m if best else None,
+            own.statistics.median_3d_m if own else None,
             "m",
-            f"{best.name}; 95 % below {_length(best.statistics.p95_3d_m)}" if best else "",
+            f"{own.name}; 95 % below {_length(own.statistics.p95_3d_m)}" if own else absent,
         ),
         HeadlineFigure(
             "Propagation alone, same start",
@@ -641,9 +783,9 @@ def _headline(
         ),
         HeadlineFigure(
             "Drift",
-            best.statistics.drift_percent if best else None,
+            own.statistics.drift_percent if own else None,
             "% of path",
-            f"{best.name}, horizontal" if best else "",
+            f"{own.name}, horizontal" if own else absent,
         ),
         HeadlineFigure(
             "Craters detected",
@@ -653,51 +795,8 @@ def _headline(
             if micro
             else "",
         ),
-        HeadlineFigure("Packets lost", lost, "", f"of {count_text(inputs.packets.packets + lost)}"),
+        HeadlineFigure("Packets missing", packets.missing, "", f"of {count_text(packets.expected)} expected"),
     )
-
-
-def _verdict(
-    inputs: PassInputs, navigation: tuple[NavigationSeries, ...], detector: DetectorScore | None
-) -> tuple[str, str]:
-    best = _best(navigation, "estimate")
-    only = next((s for s in navigation if s.name == "propagate-only"), None)
-    loss, whole = _arrived(inputs)
-    if best is None and any(s.kind == "estimate" and len(s.utc_ns) == 1 for s in navigation):
-        return f"One frame was navigated: too little to judge by. {loss}", "caution"
-    if best is None:
-        return f"No position estimate could be compared with a reference. {loss}", "bad"
-    figure = f"{best.name.capitalize()} navigation held a median 3-D error of {_length(best.statistics.median_3d_m)}"
-    if only is None:
-        return f"{figure}; there is no propagate-only baseline to judge it by. {loss}", "caution"
-    baseline = _length(only.statistics.median_3d_m)
-    perfect = next((s for s in navigation if s.name == PERFECT_START), None)
-    if perfect is not None:
-        baseline += f"; {_length(perfect.statistics.median_3d_m)} from a perfect start"
-    if best.statistics.median_3d_m < only.statistics.median_3d_m:
-        return (
-            f"{figure}, better than propagating the same start state without images ({baseline}). {loss}",
-            "good" if whole else "caution",
-        )
-    return (
-        f"{figure}; propagating the same start state without images does better ({baseline}). {loss}",
-        "caution",
-    )
-
-
-def _arrived(inputs: PassInputs) -> tuple[str, bool]:
-    """What of the pass arrived, in words, and whether it is all that was to be expected.
-
-    Packets missing at the end of a downlink leave no gap in any count: frames that never came tell of them.
-    """
-    packets, came, expected = inputs.packets, len(inputs.detections), inputs.frames_expected
-    if packets.packets == 0:
-        return "No packet arrived.", False
-    if packets.lost:
-        return f"{packets.lost} packets were lost.", False
-    if expected is not None and came < expected:
-        return f"Of {count_text(expected)} frames planned, {count_text(came)} came down.", False
-    return "All packets arrived.", True
 
 
 def _length(value_m: float) -> str:

@@ -11,7 +11,7 @@ from ground_service.processing.alignment import ReferenceStates, error_of_places
 from ground_service.processing.drift import navigation_statistics
 from ground_service.processing.fixes import Pairs, snapshot_positions, wrong_fixes
 from ground_service.processing.samples import NavigationSamples
-from lunar.camera import PinholeCamera
+from ground_service.processing.viewing import Viewing
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns
@@ -88,18 +88,22 @@ def dark_limit(surface: TerrainMap) -> float:
 
 
 def with_wrong_fixes(
-    series: NavigationSeries, pairs: Pairs, camera: PinholeCamera, track: ReferenceStates
+    series: NavigationSeries, pairs: Pairs, viewing: Viewing, track: ReferenceStates
 ) -> NavigationSeries:
     """The filter's series with the number of its wrong fixes; any other as it is."""
     if series.name != FILTER or len(pairs.frame) == 0:
         return series
-    return replace(series, wrong_fixes=wrong_fixes(pairs, camera, track.utc_ns, track.position_mcmf_m))
+    rotations = viewing.camera_from_mcmf(track.utc_ns, track.position_mcmf_m, track.mcmf_from_icrf)
+    return replace(
+        series,
+        wrong_fixes=wrong_fixes(pairs, viewing.camera, track.utc_ns, track.position_mcmf_m, rotations),
+    )
 
 
 def snapshot_series(
     pairs: Pairs,
     samples: NavigationSamples,
-    camera: PinholeCamera,
+    viewing: Viewing,
     track: ReferenceStates,
     path_m: FloatArray,
 ) -> NavigationSeries | None:
@@ -109,7 +113,11 @@ def snapshot_series(
     believed = mcmf_from_spherical(
         np.radians(samples.latitude_deg), np.radians(samples.longitude_deg), samples.altitude_m
     )
-    position = snapshot_positions(pairs, camera, samples.utc_ns, believed)
+    every = track.at_rows(np.searchsorted(track.utc_ns, samples.utc_ns))
+    known = viewing.known(samples.utc_ns)
+    rotations = viewing.camera_from_mcmf(samples.utc_ns, every.position_mcmf_m, every.mcmf_from_icrf)
+    rotations[~known] = np.nan
+    position = snapshot_positions(pairs, viewing.camera, samples.utc_ns, believed, viewing.pointed, rotations)
     solved = np.flatnonzero(np.isfinite(position[:, 0]))
     if len(solved) == 0:
         return None
@@ -128,5 +136,5 @@ def snapshot_series(
         error_rtn_m=error,
         # Frames know nothing of one another: each is a fix of its own, and there is no drift to speak of.
         statistics=navigation_statistics(error, path_m[rows], np.ones(len(solved), dtype=np.bool_)),
-        description="each frame by itself: the filter's identifications and the nadir attitude, no dynamics",
+        description="each frame by itself: the filter's identifications and the attitude, no dynamics",
     )

@@ -1,9 +1,9 @@
 """The detector judged on the ground: which catalogued craters should be in each image, and which were detected.
 
-A crater is expected where its centre, at rim height, projects into the image of a nadir camera at the reference
-position of the frame. A detection is true when it lies within half a radius of the crater, and within the paper's
-pixel limit, one detection to one crater. Detections of craters outside the scored size classes count neither for
-nor against.
+A crater is expected where its centre, at rim height, projects into the image of the camera at the reference position
+and in the attitude of the frame. A detection is true when it lies within half a radius of the crater, and within the
+paper's pixel limit, one detection to one crater. Detections of craters outside the scored size classes count neither
+for nor against.
 """
 
 from __future__ import annotations
@@ -72,18 +72,28 @@ class Matches:
 
 
 def expected_craters(
-    catalogue: CraterCatalogue, camera: PinholeCamera, position_mcmf_m: FloatArray
+    catalogue: CraterCatalogue,
+    camera: PinholeCamera,
+    position_mcmf_m: FloatArray,
+    camera_from_mcmf: FloatArray | None = None,
 ) -> ExpectedCraters:
-    """Craters of the catalogue whose centres a nadir camera sees from each of the positions (f, 3), MCMF."""
+    """Return the craters of the catalogue whose centres the camera sees from each of the positions (f, 3), MCMF.
+
+    `camera_from_mcmf` (f, 3, 3) is the attitude of each frame; None means a nadir camera with image up to the north.
+    """
     points = catalogue.position_mcmf_m
     classes = size_class(catalogue.diameter_m).astype(np.int64)
-    rotations = nadir_camera_from_mcmf(position_mcmf_m)
+    rotations = nadir_camera_from_mcmf(position_mcmf_m) if camera_from_mcmf is None else camera_from_mcmf
     distance = np.linalg.norm(position_mcmf_m, axis=-1)
     radius_m = float(np.mean(np.linalg.norm(points, axis=-1))) if len(points) else 1.0
-    reach_m = _view_radius_m(camera, distance - radius_m)
+    reach_m = _view_radius_m(camera, distance - radius_m, _off_nadir_rad(rotations, position_mcmf_m))
     counts = np.zeros(len(position_mcmf_m) + 1, dtype=np.int64)
     pieces: list[tuple[IntArray, FloatArray, FloatArray]] = []
-    known = np.flatnonzero(np.isfinite(distance)) if len(points) else np.zeros(0, dtype=np.int64)
+    known = (
+        np.flatnonzero(np.isfinite(distance) & np.isfinite(rotations).all(axis=(1, 2)))
+        if len(points)
+        else np.zeros(0, dtype=np.int64)
+    )
     for frames in np.array_split(known, -(-len(known) // FRAMES_AT_ONCE) or 1):
         nearby, lines = [], []
         for position, rotation, range_m, reach in zip(
@@ -153,6 +163,7 @@ def score_detections(
     altitude_m: FloatArray,
     sun_elevation_deg: FloatArray | None = None,
     sun_azimuth_deg: FloatArray | None = None,
+    pointing: str = "a nadir camera",
 ) -> DetectorScore:
     """Precision, recall and localisation per size class, with bins, curves and residuals.
 
@@ -168,7 +179,7 @@ def score_detections(
         per_class=per_class,
         micro=micro,
         method=(
-            "catalogue projected at rim height from the reference orbit into a nadir camera; a detection is true "
+            f"catalogue projected at rim height from the reference orbit into {pointing}; a detection is true "
             f"within {CENTRE_TOLERANCE_RADII:g} radii and {CENTRE_TOLERANCE_PX:g} px of the centre, one to one"
         ),
         by_altitude_km=_bins(tally, altitude_m / 1e3, ALTITUDE_BIN_KM),
@@ -334,14 +345,21 @@ def _residuals(
     )
 
 
-def _view_radius_m(camera: PinholeCamera, altitude_m: FloatArray) -> FloatArray:
+def _off_nadir_rad(rotations: FloatArray, position_mcmf_m: FloatArray) -> FloatArray:
+    """Angle (f,) of the boresight from nadir."""
+    with np.errstate(invalid="ignore"):
+        down = -position_mcmf_m / np.linalg.norm(position_mcmf_m, axis=-1, keepdims=True)
+    return np.asarray(np.arccos(np.clip(np.einsum("ni,ni->n", rotations[:, 2], down), -1.0, 1.0)))
+
+
+def _view_radius_m(camera: PinholeCamera, altitude_m: FloatArray, off_nadir_rad: FloatArray) -> FloatArray:
     """Arcs (f,) on the ground to the furthest corner of the image, or to the horizon where a corner sees the sky.
 
     A twentieth is added for relief: rims stand up to some km above and below the sphere.
     """
-    half_u, half_v = camera.width_px / 2.0, camera.height_px / 2.0
-    corner = math.atan(math.hypot(half_u, half_v) / camera.focal_px)
-    arc = ground_arc_m(corner, altitude_m)
+    corner = off_nadir_rad + float(np.arccos(camera.rays(camera.corners_px())[:, 2].min()))
+    # Past a right angle the sine falls again: such a corner sees the sky.
+    arc = np.where(corner < np.pi / 2.0, ground_arc_m(corner, altitude_m), np.nan)
     with np.errstate(invalid="ignore"):
         horizon = horizon_arc_m(altitude_m)
     return np.asarray(1.05 * np.where(np.isfinite(arc), arc, horizon) + 5e3)

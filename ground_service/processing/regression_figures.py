@@ -1,4 +1,4 @@
-"""Figures of a build over passes: each a function of frame samples and frame weights, so that it can be resampled."""
+"""Metrics of a build over passes: each a ratio of sums or a percentile over frames."""
 
 from __future__ import annotations
 
@@ -12,63 +12,136 @@ from ground_service.processing.regression_samples import BAD_OUTCOMES, Estimator
 from ground_service.processing.regression_statistics import weighted_quantile, weighted_ratio
 
 FloatArray = NDArray[np.float64]
-Compute = Callable[[PassFrames, FloatArray], FloatArray]
 
 LATENCY_LEVEL = 0.25
 """Of CPU times the lower quartile over the frames is taken: whatever else the machine does only ever adds."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Ratio:
+    """A sum over frames over another sum, (n,) each; NaN in the numerator leaves a frame out.
+
+    Attributes
+    ----------
+    counts
+        Whether it is a share of counted things (craters, frames), which is never known better than to a few of them.
+    """
+
+    numerator: FloatArray
+    denominator: FloatArray
+    counts: bool
+
+    def value(self, weights: FloatArray) -> FloatArray:
+        """Value for each row of weights (b, n)."""
+        return weighted_ratio(self.numerator, self.denominator, weights)
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Frames (n,) that have a value."""
+        return np.isfinite(self.numerator)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Percentile:
+    """A percentile of the finite values (n,); `level` between 0 and 1."""
+
+    values: FloatArray
+    level: float
+
+    def value(self, weights: FloatArray) -> FloatArray:
+        """Value for each row of weights (b, n)."""
+        return weighted_quantile(self.values, self.level, weights)
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Frames (n,) that have a value."""
+        return np.isfinite(self.values)
+
+
+Sample = Ratio | Percentile
+
+
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A figure that can be gated.
+    """A metric that can be gated.
 
     Attributes
     ----------
     name, unit
         As in policies and verdicts.
     higher_is_better
-        Which way is worse.
+        Which direction is worse.
     relative
         Whether a change counts as a ratio (lengths, times) or as a difference (shares, pixels).
-    compute
-        Figure for each row of weights (b, n).
+    sample
+        What the metric is computed from.
     """
 
     name: str
     unit: str
     higher_is_better: bool
     relative: bool
-    compute: Compute
+    sample: Callable[[PassFrames], Sample]
+
+    def compute(self, frames: PassFrames, weights: FloatArray) -> FloatArray:
+        """Value for each row of weights (b, n)."""
+        return self.sample(frames).value(weights)
 
 
 def figures_of(passes: Sequence[PassFrames]) -> tuple[Figure, ...]:
-    """Every figure that can be made of these passes, whichever build flew them."""
+    """Return every metric that these passes allow, whichever build flew them."""
     estimators = sorted({name for one in passes for name in one.estimators})
     stages = sorted({name for one in passes for name in one.latency})
     found = [
-        Figure("detector.recall", "", True, False, _ratio("hits", "expected")),
-        Figure("detector.precision", "", True, False, _precision),
-        Figure("detector.localisation", "px", False, False, _ratio("error_px", "hits")),
-        Figure("telemetry.packets_per_frame", "", False, True, _mean("packets")),
-        Figure("telemetry.octets_per_frame", "octets", False, True, _mean("octets")),
-        Figure("telemetry.frames_answered", "", True, False, _answered),
+        Figure("detector.recall", "", True, False, lambda f: Ratio(f.hits, f.expected, counts=True)),
+        Figure(
+            "detector.precision", "", True, False, lambda f: Ratio(f.hits, f.hits + f.alarms, counts=True)
+        ),
+        Figure(
+            "detector.localisation", "px", False, False, lambda f: Ratio(f.error_px, f.hits, counts=False)
+        ),
+        Figure("telemetry.packets_per_frame", "", False, True, lambda f: _mean(f.packets)),
+        Figure("telemetry.octets_per_frame", "octets", False, True, lambda f: _mean(f.octets)),
+        Figure("telemetry.frames_answered", "", True, False, lambda f: _share(f.answered.astype(np.float64))),
     ]
     for name in estimators:
         place = f"navigation.{name}"
         found += [
-            Figure(f"{place}.p50", "m", False, True, _error(name, 0.5)),
-            Figure(f"{place}.p95", "m", False, True, _error(name, 0.95)),
-            Figure(f"{place}.bad_outcomes", "", False, False, _share(name, *BAD_OUTCOMES)),
+            Figure(f"{place}.p50", "m", False, True, _of(name, lambda e: Percentile(e.error_m, 0.5))),
+            Figure(f"{place}.p95", "m", False, True, _of(name, lambda e: Percentile(e.error_m, 0.95))),
+            Figure(
+                f"{place}.bad_outcomes", "", False, False, _of(name, lambda e: _share(e.share(*BAD_OUTCOMES)))
+            ),
         ]
-        if any(np.isfinite(one.estimators[name].nees).any() for one in passes if name in one.estimators):
+        if any(
+            np.isfinite(one.estimators[name].squared_normalised_error).any()
+            for one in passes
+            if name in one.estimators
+        ):
             found += [
-                Figure(f"{place}.nees", "", False, True, _nees(name)),
-                Figure(f"{place}.sigma_p95", "m", False, True, _sigma(name)),
-                Figure(f"{place}.fixes", "", True, False, _share(name, "fixed")),
-                Figure(f"{place}.wrong_fixes", "", False, False, _wrong(name)),
+                Figure(
+                    f"{place}.squared_normalised_error",
+                    "",
+                    False,
+                    True,
+                    _of(name, lambda e: _mean(e.squared_normalised_error)),
+                ),
+                Figure(
+                    f"{place}.sigma_p95", "m", False, True, _of(name, lambda e: Percentile(e.sigma_m, 0.95))
+                ),
+                Figure(f"{place}.fixes", "", True, False, _of(name, lambda e: _share(e.share("fixed")))),
+                Figure(f"{place}.wrong_fixes", "", False, False, _of(name, lambda e: _share(e.wrong))),
             ]
         else:
-            found.append(Figure(f"{place}.drift", "% of path", False, True, _drift(name)))
+            found.append(
+                Figure(
+                    f"{place}.drift",
+                    "% of path",
+                    False,
+                    True,
+                    _of(name, lambda e: Percentile(e.drift_percent, 0.5)),
+                )
+            )
     found += [Figure(f"latency.{name}", "yardsticks", False, True, _latency(name)) for name in stages]
     return tuple(found)
 
@@ -82,14 +155,39 @@ def outcome_shares(frames: PassFrames) -> dict[str, dict[str, float]]:
     return shares
 
 
-def shift_px(frames: PassFrames, weights: FloatArray) -> FloatArray:
-    """Mean of detected minus expected centre (b, 2) over the hits."""
-    return np.column_stack(
-        [
-            weighted_ratio(frames.shift_u_px, frames.hits, weights),
-            weighted_ratio(frames.shift_v_px, frames.hits, weights),
-        ]
+def shift_samples(frames: PassFrames) -> tuple[Ratio, Ratio]:
+    """Return the mean of detected minus expected centre over the hits, in columns and rows."""
+    return (
+        Ratio(frames.shift_u_px, frames.hits, counts=False),
+        Ratio(frames.shift_v_px, frames.hits, counts=False),
     )
+
+
+def same_telemetry(first: PassFrames, second: PassFrames) -> bool:
+    """Whether two builds sent the same values in every frame; CPU times and memory are no telemetry."""
+    names = (
+        "answered",
+        "expected",
+        "hits",
+        "alarms",
+        "error_px",
+        "shift_u_px",
+        "shift_v_px",
+        "packets",
+        "octets",
+    )
+    if first.undecodable != second.undecodable or first.estimators.keys() != second.estimators.keys():
+        return False
+    pairs = [(getattr(first, name), getattr(second, name)) for name in names]
+    for key, one in first.estimators.items():
+        other = second.estimators[key]
+        if one.outcome != other.outcome:
+            return False
+        pairs += [
+            (getattr(one, name), getattr(other, name))
+            for name in ("error_m", "sigma_m", "squared_normalised_error", "drift_percent", "wrong")
+        ]
+    return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
 
 
 def joined(passes: Sequence[PassFrames]) -> PassFrames:
@@ -107,7 +205,7 @@ def joined(passes: Sequence[PassFrames]) -> PassFrames:
         return EstimatorFrames(
             np.concatenate([part.error_m for part in parts]),
             np.concatenate([part.sigma_m for part in parts]),
-            np.concatenate([part.nees for part in parts]),
+            np.concatenate([part.squared_normalised_error for part in parts]),
             np.concatenate([part.drift_percent for part in parts]),
             tuple(outcome for part in parts for outcome in part.outcome),
             np.concatenate([part.wrong for part in parts]),
@@ -148,65 +246,19 @@ def _silent(frames: int) -> EstimatorFrames:
     return EstimatorFrames(nothing, nothing, nothing, nothing, ("",) * frames, nothing)
 
 
-def _ratio(numerator: str, denominator: str) -> Compute:
-    return lambda frames, weights: weighted_ratio(
-        getattr(frames, numerator), getattr(frames, denominator), weights
+def _mean(values: FloatArray) -> Ratio:
+    return Ratio(values, np.ones(len(values)), counts=False)
+
+
+def _share(values: FloatArray) -> Ratio:
+    return Ratio(values, np.ones(len(values)), counts=True)
+
+
+def _of(estimator: str, sample: Callable[[EstimatorFrames], Sample]) -> Callable[[PassFrames], Sample]:
+    return lambda frames: sample(frames.estimators.get(estimator) or _silent(len(frames)))
+
+
+def _latency(stage: str) -> Callable[[PassFrames], Sample]:
+    return lambda frames: Percentile(
+        np.asarray(frames.latency.get(stage, np.full(len(frames), np.nan)), dtype=np.float64), LATENCY_LEVEL
     )
-
-
-def _precision(frames: PassFrames, weights: FloatArray) -> FloatArray:
-    return weighted_ratio(frames.hits, frames.hits + frames.alarms, weights)
-
-
-def _mean(name: str) -> Compute:
-    return lambda frames, weights: _mean_of(getattr(frames, name), weights)
-
-
-def _answered(frames: PassFrames, weights: FloatArray) -> FloatArray:
-    return _mean_of(frames.answered.astype(np.float64), weights)
-
-
-def _mean_of(values: FloatArray, weights: FloatArray) -> FloatArray:
-    return weighted_ratio(values, np.ones(len(values)), weights)
-
-
-def _error(estimator: str, level: float) -> Compute:
-    return _of(estimator, lambda e, w: weighted_quantile(e.error_m, level, w))
-
-
-def _sigma(estimator: str) -> Compute:
-    return _of(estimator, lambda e, w: weighted_quantile(e.sigma_m, 0.95, w))
-
-
-def _share(estimator: str, *outcomes: str) -> Compute:
-    return _of(estimator, lambda e, w: _mean_of(e.share(*outcomes), w))
-
-
-def _nees(estimator: str) -> Compute:
-    return _of(estimator, lambda e, w: _mean_of(e.nees, w))
-
-
-def _wrong(estimator: str) -> Compute:
-    return _of(estimator, lambda e, w: _mean_of(e.wrong, w))
-
-
-def _drift(estimator: str) -> Compute:
-    return _of(estimator, lambda e, w: weighted_quantile(e.drift_percent, 0.5, w))
-
-
-def _of(estimator: str, compute: Callable[[EstimatorFrames, FloatArray], FloatArray]) -> Compute:
-    def figure(frames: PassFrames, weights: FloatArray) -> FloatArray:
-        if estimator not in frames.estimators:
-            return np.full(len(weights), np.nan)
-        return compute(frames.estimators[estimator], weights)
-
-    return figure
-
-
-def _latency(stage: str) -> Compute:
-    def figure(frames: PassFrames, weights: FloatArray) -> FloatArray:
-        if stage not in frames.latency:
-            return np.full(len(weights), np.nan)
-        return weighted_quantile(frames.latency[stage], LATENCY_LEVEL, weights)
-
-    return figure

@@ -1,10 +1,21 @@
-"""Gates: whether a candidate build is worse than a baseline by more than a policy tolerates, beyond what chance makes.
+"""Gates: whether a candidate build is worse than a baseline by more than a policy tolerates.
 
-A gate asks one question of paired samples: is the worsening larger than the margin? It fails when chance would show so
-much with a probability below the level of the test (one-sided Student's t on a block bootstrap). Two families are
-tested, each with half of the policy's alpha under Holm's procedure: gates over the whole suite, and the same gates pass
-by pass, so that a build that fails on one kind of terrain is not saved by the others. Gates without chance in them
-(packets that cannot be decoded, memory) are compared as they are.
+A gate compares paired samples of both builds and has three outcomes:
+
+- **fail**: the degradation exceeds the margin by more than chance explains (one-sided Student's t). Gates over the
+  suite and gates of single passes are two families, each with half of 1 - confidence under Holm's procedure, so that
+  a build as good as the baseline fails any gate with a probability of at most 1 - confidence.
+- **pass**: the frames resolve the margin (a change as large as the margin would be detected at the policy's confidence
+  and power), and the upper confidence bound of the degradation is within the margin. A build passes only if every gate
+  passes, so this needs no correction for the number of gates (intersection-union test).
+- **inconclusive**: everything else, such as too few frames or a value that is unknown.
+
+Telemetry that is identical in every frame is compared exactly, as are metrics without chance in them (packets that
+cannot be decoded, memory).
+
+References
+----------
+R. L. Berger, "Multiparameter hypothesis testing and acceptance sampling", Technometrics 24, 1982 (intersection-union).
 """
 
 from __future__ import annotations
@@ -17,39 +28,79 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ground_service.processing.regression_figures import Figure, figures_of, joined, shift_px
+from ground_service.processing.regression_figures import (
+    Figure,
+    Percentile,
+    Ratio,
+    Sample,
+    figures_of,
+    joined,
+    same_telemetry,
+    shift_samples,
+)
 from ground_service.processing.regression_samples import PassFrames
 from ground_service.processing.regression_statistics import (
+    Spread,
+    autocorrelation_time,
+    block_length,
     block_weights,
-    degrees_of_freedom,
+    frames_needed,
     holm_levels,
     interval,
-    standard_error,
+    ratio_influence,
+    resampled_spread,
+    resolution,
+    series_spread,
     student_quantile,
     student_upper_tail,
+    unseen_changes,
 )
 
 FloatArray = NDArray[np.float64]
 
+PASS, FAIL, INCONCLUSIVE = "pass", "fail", "inconclusive"
+
 BIAS = "detector.bias"
+LATENCY = "latency."
 UNDECODABLE = "telemetry.undecodable"
 MEMORY = "memory"
+EXACT_METRICS = (UNDECODABLE, MEMORY)
+"""Metrics without chance in them: their margin may be 0."""
+
 _LARGEST_LOG = 50.0
-POWER_MISS = 0.1
-"""The resolution of a gate is the worsening that it sees with a probability of nine in ten."""
+_IDENTICAL = "identical telemetry in every frame"
+_SAME = "identical values in every frame"
 
 
 @dataclass(frozen=True, slots=True)
 class GateRule:
-    """What a policy says of some figures: `figure` may hold wildcards; `margin` is in the figure's unit or a share."""
+    """What a policy states about some metrics.
+
+    Attributes
+    ----------
+    figure
+        Name of the metric; may hold wildcards.
+    margin
+        Degradation that is tolerated over the suite: in the metric's unit, or as a share of the baseline.
+    pass_margin
+        The same for every pass alone; None where the gate is not applied to single passes.
+    reason
+        Why the margin is as it is.
+    required
+        Whether a metric without a value leaves the verdict open. A rule with wildcards that is not required applies to
+        the metrics that exist.
+    """
 
     figure: str
     margin: float
+    pass_margin: float | None = None
+    reason: str = ""
+    required: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Waiver:
-    """A gate that may fail for a while: `gate` and `pass_name` may hold wildcards; `until` is the last day, ISO."""
+    """A gate that need not pass until a day (ISO, inclusive): `gate` and `pass_name` may hold wildcards."""
 
     gate: str
     reason: str
@@ -59,50 +110,77 @@ class Waiver:
 
 @dataclass(frozen=True, slots=True)
 class GatePolicy:
-    """How builds are judged."""
+    """How builds are judged.
+
+    Attributes
+    ----------
+    confidence
+        Of every pass; 1 - confidence is the chance that a build as good as the baseline fails any gate.
+    power
+        Probability with which a degradation as large as the resolution is detected.
+    """
 
     version: str
-    alpha: float
-    block_frames: int
+    confidence: float
+    power: float
     resamples: int
     rules: tuple[GateRule, ...]
-    per_pass: tuple[str, ...]
     waivers: tuple[Waiver, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """The answer of one gate.
+    """The decision of one gate.
 
     Attributes
     ----------
+    outcome
+        "pass", "fail" or "inconclusive".
     pass_name
         Empty for a gate over the whole suite.
+    baseline, candidate
+        Values of the metric; NaN where unknown.
+    margin
+        Degradation that is tolerated: a difference, or a share of the baseline.
     limit
-        Value of the candidate's figure that must not be passed.
-    low, high
-        Interval (95 %) of the candidate's change: a difference, or a ratio minus 1.
+        The baseline degraded by the margin.
+    change_low, change_high
+        One-sided confidence bounds of the degradation: a difference, or a share of the baseline. Positive is worse.
     p_value, level
-        Of the test; NaN for gates without chance in them.
+        Of the test for failure; NaN for gates without chance in them.
     resolution
-        Worsening that this gate would have seen nine times in ten: a difference, or a share of the baseline.
+        Smallest degradation that these frames detect at the policy's confidence and power, in the unit of the margin;
+        infinite where they detect none.
+    frames, frames_needed
+        Frames that were compared, and with which the gate would be decided; None where that is unknown.
+    reason
+        Why the gate is inconclusive; for other gates what the decision rests on, where it is not the test.
     waived
-        Why a failure does not count; empty where it does.
+        Why the outcome does not count; empty where it does.
     """
 
     name: str
+    outcome: str
     baseline: float
     candidate: float
+    margin: float
     limit: float
-    passed: bool
     unit: str = ""
     pass_name: str = ""
-    low: float = math.nan
-    high: float = math.nan
+    change_low: float = math.nan
+    change_high: float = math.nan
     p_value: float = math.nan
     level: float = math.nan
-    resolution: float = math.nan
+    resolution: float = 0.0
+    frames: int = 0
+    frames_needed: int | None = None
+    reason: str = ""
     waived: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the gate passed."""
+        return self.outcome == PASS
 
     @property
     def counts_as_passed(self) -> bool:
@@ -117,7 +195,7 @@ def judge(
     *,
     today: str = "",
 ) -> list[Gate]:
-    """The gates of a policy over the passes that both builds flew, those of the suite first.
+    """Return the gates of a policy over the passes that both builds flew, those of the suite first.
 
     Parameters
     ----------
@@ -130,234 +208,425 @@ def judge(
     if not names:
         return []
     before, after = [baseline[name] for name in names], [candidate[name] for name in names]
-    suite = _tests(before, after, policy, "", every=True)
+    suite = _tests(before, after, policy, "")
     single: list[_Test] = []
     if len(names) > 1:
         for name in names:
-            single += _tests([baseline[name]], [candidate[name]], policy, name, every=False)
+            single += _tests([baseline[name]], [candidate[name]], policy, name)
     # With one pass there is one family, which has all of alpha.
-    alpha = policy.alpha / (2.0 if single else 1.0)
-    gates = [*_decided(suite, alpha), *_fixed(before, after, policy), *_decided(single, alpha)]
+    alpha = (1.0 - policy.confidence) / (2.0 if single else 1.0)
+    gates = [
+        *_decided(suite, alpha, policy),
+        *_exact(before, after, policy),
+        *_decided(single, alpha, policy),
+    ]
+    gates += _unknown(policy, {gate.name for gate in gates}, sum(len(one) for one in before))
     return [_with_waiver(gate, policy.waivers, today) for gate in gates]
+
+
+def verdict_of(gates: Sequence[Gate]) -> str:
+    """Return "fail" if a gate failed, "pass" if all passed and there are any, else "inconclusive"; waivers count."""
+    if any(gate.outcome == FAIL and not gate.waived for gate in gates):
+        return FAIL
+    return PASS if gates and all(gate.counts_as_passed for gate in gates) else INCONCLUSIVE
+
+
+def metric_interval(sample: Sample, sizes: Sequence[int], resamples: int) -> tuple[float, float]:
+    """Return the 95 % interval of a metric of one build by a block bootstrap; NaN where there is none."""
+    whole = np.ones((1, sum(sizes)))
+    if isinstance(sample, Ratio):
+        series = ratio_influence(sample.numerator, sample.denominator)
+    else:
+        value = float(sample.value(whole)[0])
+        series = np.where(sample.known, sample.values > value, False).astype(np.float64)
+    if not np.isfinite(series).all() or sum(sizes) == 0:
+        return math.nan, math.nan
+    block = block_length(autocorrelation_time(series, sizes))
+    return interval(sample.value(block_weights(tuple(sizes), block, resamples)))
+
+
+def rule_of(policy: GatePolicy, figure: str) -> GateRule | None:
+    """Return the last rule that applies to a metric; None where none does."""
+    found = [rule for rule in policy.rules if fnmatch.fnmatchcase(figure, rule.figure)]
+    return found[-1] if found else None
 
 
 @dataclass(frozen=True, slots=True)
 class _Test:
-    """A gate before the level of its test is known; `worsening` and `error` in the scale that is tested."""
+    """A gate before the level of its test is known; `change` (positive is worse) and `margin` in the tested scale."""
 
     name: str
     unit: str
     pass_name: str
     baseline: float
     candidate: float
-    worsening: float
-    error: float
+    change: float
+    spread: Spread
     margin: float
-    low: float
-    high: float
-    freedom: int
+    stated_margin: float
     relative: bool
     sign: float
-    p_value: float
+    frames: int
+    passes: int
+    missing: int = 0
+    reason: str = ""
+
+    @property
+    def p_value(self) -> float:
+        """Probability of so large a degradation by chance if the true one equals the margin."""
+        if math.isnan(self.change):
+            # Telemetry that only the baseline sends is a fault of the candidate; a cost that nobody measured is not.
+            lost = math.isfinite(self.baseline) and not self.name.startswith(LATENCY)
+            return 0.0 if lost else 1.0
+        if self.change <= self.margin:
+            return 1.0
+        error = self.spread.failure_error
+        if math.isinf(self.change) or error == 0.0:
+            return 0.0
+        if not math.isfinite(error) or self.spread.freedom < 1.0:
+            return 1.0
+        return student_upper_tail((self.change - self.margin) / error, self.spread.freedom)
 
 
 def _tests(
-    before: Sequence[PassFrames],
-    after: Sequence[PassFrames],
-    policy: GatePolicy,
-    pass_name: str,
-    *,
-    every: bool,
+    before: Sequence[PassFrames], after: Sequence[PassFrames], policy: GatePolicy, pass_name: str
 ) -> list[_Test]:
     sizes = [len(one) for one in before]
-    weights = block_weights(tuple(sizes), policy.block_frames, policy.resamples)
-    freedom = degrees_of_freedom(sizes, policy.block_frames)
     old, new = joined(before), joined(after)
-    whole = np.ones((1, weights.shape[1]))
+    identical = same_telemetry(old, new)
+    whole = np.ones((1, len(old)))
     tests = []
     for figure in figures_of([*before, *after]):
-        margin = margin_of(policy, figure.name)
-        wanted = every or any(fnmatch.fnmatch(figure.name, pattern) for pattern in policy.per_pass)
-        if margin is None or not wanted:
+        rule = rule_of(policy, figure.name)
+        margin = _margin(rule, pass_name)
+        if rule is None or margin is None:
             continue
-        then, now = (float(figure.compute(frames, whole)[0]) for frames in (old, new))
-        if not math.isfinite(then):
-            continue  # the baseline has no such figure: there is nothing to be worse than
-        change = _change(figure, figure.compute(old, weights), figure.compute(new, weights))
-        worsening = float(_change(figure, np.array([then]), np.array([now]))[0])
-        tests.append(_test(figure, pass_name, then, now, worsening, change, margin, sizes, policy, freedom))
-    margin = margin_of(policy, BIAS)
-    if margin is not None and (every or BIAS in policy.per_pass):
-        bias = _bias_test(old, new, weights, whole, margin, sizes, policy, freedom, pass_name)
+        samples = figure.sample(old), figure.sample(new)
+        then, now = (float(sample.value(whole)[0]) for sample in samples)
+        if not (math.isfinite(then) or math.isfinite(now) or rule.required):
+            continue  # neither build has this metric
+        # Latencies are equal in every frame only where both builds are the same replay.
+        exact = _same_values(*samples) if figure.name.startswith(LATENCY) else identical
+        spread = Spread(0.0, math.inf, 1.0) if exact else _spread(figure, *samples, sizes, policy)
+        tests.append(
+            _Test(
+                figure.name,
+                figure.unit,
+                pass_name,
+                then,
+                now,
+                _change(figure, then, now),
+                spread,
+                math.log1p(margin) if figure.relative else margin,
+                margin,
+                figure.relative,
+                -1.0 if figure.higher_is_better else 1.0,
+                len(old),
+                sum(1 for size in sizes if size),
+                missing=_missing(figure, *samples),
+                reason=(_SAME if figure.name.startswith(LATENCY) else _IDENTICAL) if exact else "",
+            )
+        )
+    rule = rule_of(policy, BIAS)
+    margin = _margin(rule, pass_name)
+    if margin is not None:
+        bias = _bias_test(old, new, margin, sizes, policy, pass_name, identical)
         if bias is not None:
             tests.append(bias)
     return tests
 
 
-def _change(figure: Figure, then: FloatArray, now: FloatArray) -> FloatArray:
-    """Worsening of resampled figures: a difference, or the logarithm of a ratio."""
-    if not figure.relative:
-        return then - now if figure.higher_is_better else now - then
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.log(now / then)
-    # Nothing against nothing is no change; something against nothing is left to the finite samples.
-    ratio = np.where((now == 0.0) & (then == 0.0), 0.0, ratio)
-    return -ratio if figure.higher_is_better else ratio
+def _margin(rule: GateRule | None, pass_name: str) -> float | None:
+    if rule is None:
+        return None
+    return rule.pass_margin if pass_name else rule.margin
 
 
-def _test(
-    figure: Figure,
-    pass_name: str,
-    then: float,
-    now: float,
-    worsening: float,
-    change: FloatArray,
-    margin: float,
-    sizes: Sequence[int],
-    policy: GatePolicy,
-    freedom: int,
-) -> _Test:
-    error = standard_error(change, sizes, policy.block_frames)
-    low, high = interval(change)
+def _missing(figure: Figure, old: Sample, new: Sample) -> int:
+    """Frames on which the baseline has a value of a telemetered metric and the candidate none."""
+    if figure.name.startswith(LATENCY):
+        return 0  # a stage that did not run has no latency
+    return int(np.count_nonzero(old.known & ~new.known))
+
+
+def _same_values(old: Sample, new: Sample) -> bool:
+    return (
+        isinstance(old, Percentile)
+        and isinstance(new, Percentile)
+        and np.array_equal(old.values, new.values, equal_nan=True)
+    )
+
+
+def _change(figure: Figure, then: float, now: float) -> float:
+    """Degradation: a difference, or the logarithm of a ratio; infinite against nothing."""
     sign = -1.0 if figure.higher_is_better else 1.0
-    ends = sorted((sign * low, sign * high))
-    if figure.relative:
-        ends = [_ratio(end) - 1.0 for end in ends]
-    return _Test(
-        figure.name,
-        figure.unit,
-        pass_name,
-        then,
-        now,
-        worsening,
-        error,
-        math.log1p(margin) if figure.relative else margin,
-        ends[0],
-        ends[1],
-        freedom,
-        figure.relative,
-        sign,
-        _p_value(worsening, error, math.log1p(margin) if figure.relative else margin, freedom),
+    if not figure.relative:
+        return sign * (now - then)
+    if then == now:
+        return 0.0
+    if not (then > 0.0 and now >= 0.0):
+        return math.inf if then == 0.0 and now > 0.0 else math.nan
+    return sign * (math.log(now / then) if now > 0.0 else -math.inf)
+
+
+def _spread(figure: Figure, old: Sample, new: Sample, sizes: Sequence[int], policy: GatePolicy) -> Spread:
+    if isinstance(old, Ratio) and isinstance(new, Ratio):
+        return _ratio_spread(old, new, figure.relative, sizes, policy)
+    assert isinstance(old, Percentile) and isinstance(new, Percentile)
+    return _percentile_spread(old, new, figure.relative, sizes, policy)
+
+
+def _ratio_spread(old: Ratio, new: Ratio, relative: bool, sizes: Sequence[int], policy: GatePolicy) -> Spread:
+    """Spread of the change of a ratio of sums, from the influence of each frame."""
+    influences = []
+    for sample in (old, new):
+        influence = ratio_influence(sample.numerator, sample.denominator)
+        if relative:
+            value = float(sample.value(np.ones((1, len(influence))))[0])
+            influence = influence / value if value > 0.0 else np.full(len(influence), np.nan)
+        influences.append(influence)
+    series = influences[1] - influences[0]
+    if not np.isfinite(series).all():
+        return Spread(math.nan, 0.0, 1.0)
+    spread = series_spread(series, sizes)
+    if spread.freedom < 1.0:
+        return spread
+    one_frame = math.sqrt(2.0) * float(np.sqrt(np.mean(influences[0] ** 2)))
+    counted = float(np.sum(np.where(old.known, old.denominator, 0.0)))
+    one_count = 1.0 / counted if old.counts and counted > 0.0 else 0.0
+    changes = unseen_changes(policy.confidence) / student_quantile(policy.confidence, spread.freedom)
+    return replace(spread, floor=changes * spread.correlation_frames * max(one_frame, one_count))
+
+
+def _percentile_spread(
+    old: Percentile, new: Percentile, relative: bool, sizes: Sequence[int], policy: GatePolicy
+) -> Spread:
+    """Spread of the change of a percentile, from a block bootstrap of both builds with the same weights."""
+    whole = np.ones((1, len(old.values)))
+    then, now = float(old.value(whole)[0]), float(new.value(whole)[0])
+    with np.errstate(invalid="ignore"):
+        beyond = np.where(new.known, new.values > now, 0.0) - np.where(old.known, old.values > then, 0.0)
+    time = series_spread(np.asarray(beyond, dtype=np.float64), sizes).correlation_frames
+    block = block_length(time)
+    weights = block_weights(tuple(sizes), block, policy.resamples)
+    pair = old.value(weights), new.value(weights)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        change = np.log(pair[1] / pair[0]) if relative else pair[1] - pair[0]
+    change = np.where(pair[0] == pair[1], 0.0, change)
+    spread = resampled_spread(change, sizes, block, time)
+    if spread.freedom < 1.0:
+        return spread
+    # As many values as this share of the frames may lie on either side of the percentile in an equal sample.
+    independent = float(np.count_nonzero(old.known)) / time
+    unseen = unseen_changes(policy.confidence) / independent if independent > 0.0 else math.inf
+    reach = student_quantile(policy.confidence, spread.freedom)
+
+    def step(sample: Percentile, value: float, level: float) -> float:
+        moved = float(Percentile(sample.values, level).value(whole)[0])
+        if not relative:
+            return abs(moved - value)
+        return abs(math.log(moved / value)) if moved > 0.0 and value > 0.0 else 0.0
+
+    lower = max(old.level - unseen, 1e-9)
+    upper = old.level + unseen
+    return replace(
+        spread,
+        floor=step(old, then, upper) / reach if upper < 1.0 else math.inf,
+        fewest_frames=unseen_changes(policy.confidence) * time / (1.0 - old.level),
+        failure_floor=max(step(old, then, lower), step(new, now, lower)) / reach,
     )
 
 
 def _bias_test(
     old: PassFrames,
     new: PassFrames,
-    weights: FloatArray,
-    whole: FloatArray,
     margin: float,
     sizes: Sequence[int],
     policy: GatePolicy,
-    freedom: int,
     pass_name: str,
+    identical: bool,
 ) -> _Test | None:
-    """Whether the candidate's centres lie elsewhere than the baseline's, and not because an old bias went away.
+    """Test whether the candidate's centres lie elsewhere than the baseline's, and not because an old bias went away.
 
-    The figure is the length of the mean difference of detected and catalogued centre. What is tested is the length of
-    its change, along the direction of the change; a change that at least halves the bias is no worsening.
+    The metric is the length of the mean difference of detected and catalogued centre. What is tested is the length of
+    its change, along the direction of the change; a change that at least halves the bias is no degradation.
     """
-    then, now = shift_px(old, whole)[0], shift_px(new, whole)[0]
-    if not (np.isfinite(then).all() and np.isfinite(now).all()):
+    whole = np.ones((1, len(old)))
+    pairs = list(zip(shift_samples(old), shift_samples(new), strict=True))
+    then = np.array([float(first.value(whole)[0]) for first, _ in pairs])
+    now = np.array([float(second.value(whole)[0]) for _, second in pairs])
+    if not (np.isfinite(then).all() or np.isfinite(now).all()):
         return None
     moved = now - then
     length = float(np.linalg.norm(moved))
-    direction = moved / length if length > 0.0 else np.array([1.0, 0.0])
-    change = (shift_px(new, weights) - shift_px(old, weights)) @ direction
     better = float(np.linalg.norm(now)) <= 0.5 * float(np.linalg.norm(then))
-    worsening = 0.0 if better else length
-    error = standard_error(change, sizes, policy.block_frames)
-    low, high = interval(change)
+    if identical:
+        spread = Spread(0.0, math.inf, 1.0)
+    else:
+        direction = moved / length if math.isfinite(length) and length > 0.0 else np.array([1.0, 0.0])
+        along = [
+            Ratio(
+                direction[0] * parts[0].numerator + direction[1] * parts[1].numerator,
+                parts[0].denominator,
+                counts=False,
+            )
+            for parts in (shift_samples(old), shift_samples(new))
+        ]
+        spread = _ratio_spread(along[0], along[1], False, sizes, policy)
     return _Test(
         BIAS,
         "px",
         pass_name,
         float(np.linalg.norm(then)),
         float(np.linalg.norm(now)),
-        worsening,
-        error,
+        0.0 if better else length,
+        spread,
         margin,
-        low,
-        high,
-        freedom,
+        margin,
         False,
         1.0,
-        _p_value(worsening, error, margin, freedom),
+        len(old),
+        sum(1 for size in sizes if size),
+        reason=_IDENTICAL if identical else "",
     )
 
 
-def _p_value(worsening: float, error: float, margin: float, freedom: int) -> float:
-    if math.isnan(worsening):
-        return 0.0  # the candidate gives no figure where the baseline does
-    if worsening <= margin:
-        return 1.0
-    if math.isinf(worsening) or not error > 0.0 or freedom < 1:
-        return 0.0 if error == 0.0 or math.isinf(worsening) else 1.0
-    return student_upper_tail((worsening - margin) / error, freedom)
-
-
-def _decided(tests: Sequence[_Test], alpha: float) -> list[Gate]:
+def _decided(tests: Sequence[_Test], alpha: float, policy: GatePolicy) -> list[Gate]:
     levels = holm_levels([test.p_value for test in tests], alpha)
-    return [_gate(test, level) for test, level in zip(tests, levels, strict=True)]
+    return [_gate(test, level, policy) for test, level in zip(tests, levels, strict=True)]
 
 
-def _gate(test: _Test, level: float) -> Gate:
-    spread = test.error if math.isfinite(test.error) else 0.0
-    reach = test.margin + (student_quantile(level, test.freedom) * spread if test.freedom > 0 else 0.0)
-    if test.relative:
-        limit = test.baseline * _ratio(test.sign * reach)
-    elif test.name == BIAS:
-        limit = max(test.candidate - test.worsening + reach, reach)
-    else:
-        limit = test.baseline + test.sign * reach
-    seen = reach + (student_quantile(POWER_MISS, test.freedom) * spread if test.freedom > 0 else 0.0)
+def _gate(test: _Test, level: float, policy: GatePolicy) -> Gate:
+    detectable = resolution(test.spread, policy.confidence, policy.power)
+    low = high = math.nan
+    if math.isfinite(test.change) and math.isfinite(test.spread.error):
+        reach = student_quantile(policy.confidence, test.spread.freedom)
+        low = test.change - (reach * test.spread.failure_error if test.spread.failure_error > 0.0 else 0.0)
+        high = test.change + (reach * test.spread.credible_error if test.spread.credible_error > 0.0 else 0.0)
+    outcome, reason, needed = _outcome(test, level, detectable, high, policy)
     return Gate(
         test.name,
+        outcome,
         test.baseline,
         test.candidate,
-        limit,
-        test.p_value > level,
+        test.stated_margin,
+        _limit(test),
         test.unit,
         test.pass_name,
-        test.low,
-        test.high,
+        _stated(test, low),
+        _stated(test, high),
         test.p_value,
         level,
-        _ratio(seen) - 1.0 if test.relative else seen,
+        _stated(test, detectable),
+        test.frames,
+        needed,
+        reason,
     )
+
+
+def _outcome(
+    test: _Test, level: float, detectable: float, high: float, policy: GatePolicy
+) -> tuple[str, str, int | None]:
+    """Outcome, reason, and frames with which the gate would be decided."""
+    if test.p_value <= level:
+        return FAIL, "the candidate has no value" if math.isnan(test.change) else "", None
+    if not math.isfinite(test.baseline):
+        return INCONCLUSIVE, "unknown: the baseline has no value", None
+    if math.isnan(test.change):
+        return INCONCLUSIVE, "unknown: the candidate has no value", None
+    if test.missing:
+        return (
+            INCONCLUSIVE,
+            f"unknown: the candidate has no value on {test.missing} of {test.frames} frames",
+            None,
+        )
+
+    def needed(detected: float) -> int | None:
+        return frames_needed(test.frames, test.passes, test.spread, detected, policy.confidence, policy.power)
+
+    better = high <= 0.0 and math.isfinite(test.spread.floor) and test.spread.error > 0.0
+    if detectable > test.margin and not better:
+        return INCONCLUSIVE, "the resolution exceeds the margin", needed(test.margin)
+    if high > test.margin:
+        return INCONCLUSIVE, "the change is too close to the margin", needed(abs(test.margin - test.change))
+    return PASS, test.reason, None
+
+
+def _limit(test: _Test) -> float:
+    if test.relative:
+        return test.baseline * _ratio(test.sign * test.margin)
+    if test.name == BIAS:
+        return test.baseline + test.margin
+    return test.baseline + test.sign * test.margin
+
+
+def _stated(test: _Test, change: float) -> float:
+    """A change of the tested scale in the unit of the margin."""
+    return _ratio(change) - 1.0 if test.relative else change
 
 
 def _ratio(logarithm: float) -> float:
-    """The ratio of a logarithm; infinite where too few blocks leave everything open."""
+    """Ratio of a logarithm; infinite where too few frames leave everything open."""
     return math.inf if logarithm > _LARGEST_LOG else math.exp(logarithm)
 
 
-def _fixed(before: Sequence[PassFrames], after: Sequence[PassFrames], policy: GatePolicy) -> list[Gate]:
+def _exact(before: Sequence[PassFrames], after: Sequence[PassFrames], policy: GatePolicy) -> list[Gate]:
     """Gates without chance in them."""
     gates = []
-    margin = margin_of(policy, UNDECODABLE)
-    if margin is not None:
+    frames = sum(len(one) for one in before)
+    rule = rule_of(policy, UNDECODABLE)
+    if rule is not None:
         then, now = (float(sum(one.undecodable for one in passes)) for passes in (before, after))
-        gates.append(Gate(UNDECODABLE, then, now, then + margin, now <= then + margin, "packets"))
-    margin = margin_of(policy, MEMORY)
-    then, now = (max(one.memory_mib for one in passes) for passes in (before, after))
-    if margin is not None and math.isfinite(then):
-        limit = then * (1.0 + margin)
-        gates.append(Gate(MEMORY, then, now, limit, bool(now <= limit), "MiB"))
+        limit = then + rule.margin
+        outcome = PASS if now <= limit else FAIL
+        gates.append(Gate(UNDECODABLE, outcome, then, now, rule.margin, limit, "packets", frames=frames))
+    rule = rule_of(policy, MEMORY)
+    then, now = (float(np.max([one.memory_mib for one in passes])) for passes in (before, after))
+    if rule is not None and (math.isfinite(then) or math.isfinite(now) or rule.required):
+        limit = then * (1.0 + rule.margin)
+        known = math.isfinite(then) and math.isfinite(now)
+        lacking = "the candidate" if math.isfinite(then) else "the baseline"
+        gates.append(
+            Gate(
+                MEMORY,
+                INCONCLUSIVE if not known else PASS if now <= limit else FAIL,
+                then,
+                now,
+                rule.margin,
+                limit,
+                "MiB",
+                resolution=0.0 if known else math.inf,
+                frames=frames,
+                reason="" if known else f"unknown: {lacking} has no value",
+            )
+        )
     return gates
 
 
-def margin_of(policy: GatePolicy, figure: str) -> float | None:
-    """The margin of the last rule that speaks of a figure; None where none does."""
-    found = [rule.margin for rule in policy.rules if fnmatch.fnmatch(figure, rule.figure)]
-    return found[-1] if found else None
+def _unknown(policy: GatePolicy, judged: set[str], frames: int) -> list[Gate]:
+    """Inconclusive gates of the rules that require a metric and found none."""
+    return [
+        Gate(
+            rule.figure,
+            INCONCLUSIVE,
+            math.nan,
+            math.nan,
+            rule.margin,
+            math.nan,
+            resolution=math.inf,
+            frames=frames,
+            reason="unknown: neither build has this metric",
+        )
+        for rule in policy.rules
+        if rule.required and not any(fnmatch.fnmatchcase(name, rule.figure) for name in judged)
+    ]
 
 
 def _with_waiver(gate: Gate, waivers: Sequence[Waiver], today: str) -> Gate:
     if gate.passed or not today:
         return gate
     for waiver in waivers:
-        applies = fnmatch.fnmatch(gate.name, waiver.gate) and fnmatch.fnmatch(
+        applies = fnmatch.fnmatchcase(gate.name, waiver.gate) and fnmatch.fnmatchcase(
             gate.pass_name, waiver.pass_name
         )
         if applies and today <= waiver.until:

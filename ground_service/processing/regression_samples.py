@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_service.processing.alignment import error_of_places_rtn_m, reference_states
+from ground_service.processing.consistency import squared_normalised_errors
 from ground_service.processing.recall import SCORED_CLASSES, expected_craters, match_detections
 from ground_service.processing.samples import DetectionSamples, NavigationSamples
+from ground_service.processing.viewing import Viewing
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
@@ -37,8 +39,9 @@ class EstimatorFrames:
     ----------
     error_m, sigma_m
         Length of the position error, and of the standard deviations claimed with it.
-    nees
-        Squared error over variance summed over the three axes: 3 on average for an estimator that knows its errors.
+    squared_normalised_error
+        Sum of squared errors over variances of the three axes: 3 on average for an estimator that knows its errors.
+        Packets of most dictionaries hold sigmas and no covariance, so this ignores correlations and is no NEES.
     drift_percent
         Horizontal error gained since the frame before over the ground path in between.
     outcome
@@ -49,7 +52,7 @@ class EstimatorFrames:
 
     error_m: FloatArray
     sigma_m: FloatArray
-    nees: FloatArray
+    squared_normalised_error: FloatArray
     drift_percent: FloatArray
     outcome: tuple[str, ...]
     wrong: FloatArray
@@ -112,6 +115,7 @@ def pass_frames(
     catalogue: CraterCatalogue,
     camera: PinholeCamera,
     orientation: Orientation,
+    viewing: Viewing | None = None,
 ) -> PassFrames:
     """The frames of a pass by what came down of them.
 
@@ -125,10 +129,15 @@ def pass_frames(
         Outcome of each estimator by row of the frame.
     packet_ticks, packet_octets
         On-board time and length of every packet.
+    viewing
+        Mounting and attitudes of the camera; a nadir camera when None.
     """
     n = len(frame_ticks)
     track = reference_states(reference, orientation, frame_utc_ns)
-    expected = expected_craters(catalogue, camera, track.position_mcmf_m)
+    rotations = None
+    if viewing is not None:
+        rotations = viewing.camera_from_mcmf(frame_utc_ns, track.position_mcmf_m, track.mcmf_from_icrf)
+    expected = expected_craters(catalogue, camera, track.position_mcmf_m, rotations)
     whole = _by_frame(detections, n)
     matches = match_detections(whole, expected)
     frame_of_crater = np.repeat(np.arange(n), np.diff(expected.offsets))
@@ -178,8 +187,6 @@ def _estimator(
 ) -> EstimatorFrames:
     n = len(error_rtn_m)
     length = np.linalg.norm(error_rtn_m, axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        nees = np.sum((error_rtn_m / sigma_rtn_m) ** 2, axis=1)
     direction = position_mcmf_m / np.linalg.norm(position_mcmf_m, axis=1, keepdims=True)
     path_m = np.full(n, np.nan)
     path_m[1:] = MOON_RADIUS_M * np.linalg.norm(np.diff(direction, axis=0), axis=1)
@@ -193,7 +200,7 @@ def _estimator(
     return EstimatorFrames(
         error_m=length,
         sigma_m=claimed,
-        nees=np.where(np.isfinite(nees), nees, np.nan),
+        squared_normalised_error=squared_normalised_errors(error_rtn_m, sigma_rtn_m),
         drift_percent=np.where(path_m > 0.0, 100.0 * gained / np.where(path_m > 0.0, path_m, 1.0), np.nan),
         outcome=outcome,
         wrong=np.where(known, (fixed & far).astype(np.float64), np.nan),

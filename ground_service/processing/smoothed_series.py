@@ -10,10 +10,11 @@ from ground_service.processing.alignment import (
     error_of_places_rtn_m,
     places_of_positions,
 )
+from ground_service.processing.consistency import nees
 from ground_service.processing.drift import drift_by_length, navigation_statistics
 from ground_service.processing.samples import NavigationSamples
 from ground_service.processing.smoother import CommandedBurn, FilterStates, SmootherModel, smooth
-from lunar.frames import Orientation, mcmf_from_spherical, rtn_from_inertial
+from lunar.frames import Orientation, mcmf_from_spherical
 from lunar.gravity import GravityField
 from lunar.gravity_omission import omission_psd_m2_s3
 from lunar.propagation import ForceModel
@@ -41,6 +42,7 @@ def smoothed_series(
     track: ReferenceStates,
     path_m: FloatArray,
     model: SmootherModel,
+    reference_covariance_m2: FloatArray,
 ) -> NavigationSeries | None:
     """The smoothed orbit against the reference; None where no state came down in full.
 
@@ -53,6 +55,8 @@ def smoothed_series(
         Places that the same filter reported.
     track
         Reference at the times of `filtered`; `path_m` (n,) is the ground path to each.
+    reference_covariance_m2
+        Covariance of the reference (3, 3), R/T/N, which the NEES adds to that of the estimate.
     """
     rows = np.searchsorted(reported.utc_ns, filtered.utc_ns)
     rows = np.minimum(rows, max(len(reported.utc_ns) - 1, 0))
@@ -69,11 +73,6 @@ def smoothed_series(
     latitude, longitude, altitude = places_of_positions(track, position)
     error = error_of_places_rtn_m(track, latitude, longitude, altitude)
     never = np.zeros(len(filtered), dtype=np.bool_)
-    sigma = smoothed.sigma_rtn_m
-    rtn = rtn_from_inertial(smoothed.state[:, :3], smoothed.state[:, 3:6])
-    block = rtn @ smoothed.covariance[:, :3, :3] @ np.swapaxes(rtn, 1, 2)
-    with np.errstate(invalid="ignore"):
-        nees = np.einsum("ni,nij,nj->n", error, np.linalg.pinv(block, hermitian=True), error)
     return NavigationSeries(
         name=SMOOTHED,
         kind=SMOOTHED,
@@ -82,12 +81,12 @@ def smoothed_series(
         longitude_deg=longitude,
         altitude_m=altitude,
         error_rtn_m=error,
-        sigma_rtn_m=sigma,
+        sigma_rtn_m=smoothed.sigma_rtn_m,
         statistics=navigation_statistics(error, path_m, never),
         description=(
             f"the filter smoothed on the ground with {model.forces.gravity.name} to degree "
             f"{model.forces.degree}, Earth and Sun"
         ),
-        nees=nees,
+        nees=nees(error, smoothed.position_covariance_rtn_m2 + reference_covariance_m2),
         drift_by_length=drift_by_length(error, path_m, never),
     )

@@ -42,25 +42,36 @@ class FilterStates:
         Position (m) and velocity (m/s), Moon-centred ICRF, empirical acceleration (m/s^2; R, T, N), shape (n, 9).
     covariance
         Shape (n, 9, 9).
+    innovation_degrees
+        Degrees of freedom of the normalised innovation squared of each frame, 0 without a fix, -1 where it is not
+        known, shape (n,); None for states that no frame belongs to.
     """
 
     utc_ns: IntArray
     state: FloatArray
     covariance: FloatArray
+    innovation_degrees: IntArray | None = None
 
     def __len__(self) -> int:
         return len(self.utc_ns)
 
     def select(self, which: NDArray[np.bool_]) -> FilterStates:
         """The states of a mask."""
-        return FilterStates(self.utc_ns[which], self.state[which], self.covariance[which])
+        degrees = None if self.innovation_degrees is None else self.innovation_degrees[which]
+        return FilterStates(self.utc_ns[which], self.state[which], self.covariance[which], degrees)
+
+    @property
+    def position_covariance_rtn_m2(self) -> FloatArray:
+        """Covariance of the position (n, 3, 3) along radial, transverse and normal of each state."""
+        rtn = rtn_from_inertial(self.state[:, _POSITION], self.state[:, _VELOCITY])
+        block = rtn @ self.covariance[:, _POSITION, _POSITION] @ np.swapaxes(rtn, 1, 2)
+        return np.asarray(block, dtype=np.float64)
 
     @property
     def sigma_rtn_m(self) -> FloatArray:
         """Standard deviations of the position (n, 3): radial, transverse, normal."""
-        rtn = rtn_from_inertial(self.state[:, _POSITION], self.state[:, _VELOCITY])
-        block = rtn @ self.covariance[:, :3, :3] @ np.swapaxes(rtn, 1, 2)
-        return np.asarray(np.sqrt(np.maximum(np.einsum("nii->ni", block), 0.0)), dtype=np.float64)
+        variance = np.einsum("nii->ni", self.position_covariance_rtn_m2)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

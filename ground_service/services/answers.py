@@ -12,12 +12,12 @@ from collections.abc import Callable
 from typing import Any
 
 from sqlalchemy import delete
-from sqlalchemy.exc import IntegrityError
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, GroundError, StoreError
 from ground_service.services.ground import Ground
 from ground_service.store import repository
+from ground_service.store.states import change_if
 
 Work = Callable[[], dict[str, Any]]
 
@@ -50,7 +50,7 @@ def once(
         raise
     table = repository.ANSWERS
     with ground.database.writing() as connection:
-        connection.execute(table.update().where(table.c.key == identity).values(answer=answer))
+        change_if(connection, table, identity, {"answer": None}, answer=answer)
     return answer
 
 
@@ -58,16 +58,9 @@ def _take(ground: Ground, identity: str, asked: str) -> dict[str, Any] | None:
     """The answer that is known already; None when the key is now this caller's to use."""
     table = repository.ANSWERS
     with ground.database.writing() as connection:
-        known = repository.find(connection, table, key=identity)
-        if known is None:
-            try:
-                with connection.begin_nested():
-                    connection.execute(
-                        table.insert().values(key=identity, request=asked, created_utc_ns=utc_now_ns())
-                    )
-                return None
-            except IntegrityError:
-                known = {"request": asked, "answer": None}  # somebody took it at the same time
+        if repository.add_new(connection, table, key=identity, request=asked, created_utc_ns=utc_now_ns()):
+            return None
+        known = repository.get(connection, table, identity, "answer")
     if known["request"] != asked:
         raise Conflict("Idempotency-Key: expected the request that it was first sent with, found another")
     if known["answer"] is None:
@@ -82,7 +75,7 @@ def _take(ground: Ground, identity: str, asked: str) -> dict[str, Any] | None:
 def _forget(ground: Ground, identity: str) -> None:
     table = repository.ANSWERS
     with ground.database.writing() as connection:
-        connection.execute(delete(table).where(table.c.key == identity))
+        connection.execute(delete(table).where(table.c.key == identity, table.c.answer.is_(None)))
 
 
 def _digest(value: object) -> str:

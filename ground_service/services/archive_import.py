@@ -10,11 +10,18 @@ from typing import Any
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, storage_error
+from ground_service.missions.declared import mission_of_manifest
+from ground_service.missions.model import Mission
+from ground_service.missions.service import enter, read_mission
+from ground_service.missions.store import ARCHIVE_ACTOR
+from ground_service.services.attitudes import load_attitudes
 from ground_service.services.ground import Ground
 from ground_service.services.ingest import ingest_stored
 from ground_service.services.recorrelation import enter_receptions, read_receptions
 from ground_service.store import repository
+from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile
+from ground_service.text import require_line
 from lunar.catalogue import load_catalogue
 from lunar.ephemeris import load_ephemeris
 from lunar.errors import LunarError
@@ -22,6 +29,8 @@ from lunar.timescales import parse_utc
 
 SCHEMA_VERSION = 1
 RECEPTIONS_FILE = "receptions.csv"
+MISSION_FILE = "mission.toml"
+ATTITUDE_FILE = "attitude.csv"
 MANIFEST_LIMIT_OCTETS = 16 << 20
 
 FRAMES_KEPT = 200
@@ -54,12 +63,17 @@ def import_archive(ground: Ground, folder: Path, progress: Callable[[str], None]
     say("checking the archive")
     names = checked_files(folder, manifest)
     start_utc_ns, stop_utc_ns = _interval(folder, manifest)
+    mission, text = _mission(folder, manifest)
     for name, load in (("reference.oem", load_ephemeris), ("catalogue.csv", load_catalogue)):
         if name in names:
             _refuse_unreadable(folder / name, load)
+    if ATTITUDE_FILE in names:
+        load_attitudes(folder / ATTITUDE_FILE, str(folder / ATTITUDE_FILE))
     stored = {name: ground.files.put_file(folder / name) for name in names if not name.startswith("frames/")}
     images = {number: ground.files.put_file(folder / name) for number, name in _chosen_frames(names)}
-    pass_id = _register(ground, folder, manifest, digest, start_utc_ns, stop_utc_ns, stored, images)
+    pass_id = _register(
+        ground, folder, manifest, digest, start_utc_ns, stop_utc_ns, stored, images, (mission, text)
+    )
     if RECEPTIONS_FILE in stored:
         enter_receptions(
             ground,
@@ -113,6 +127,10 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
             f"{SCHEMA_VERSION} or less",
             f"{manifest['schema_version']} of a newer version",
         )
+    require_line(manifest["pass_name"], str(path), "pass_name")
+    if not 0 <= manifest["spacecraft_id"] <= repository.SPACECRAFT_ID_MAX:
+        found = str(manifest["spacecraft_id"])[:40]
+        raise InvalidInput(str(path), "spacecraft_id", f"0 to {repository.SPACECRAFT_ID_MAX}", found)
     return manifest, hashlib.sha256(octets).hexdigest()
 
 
@@ -169,6 +187,23 @@ def _interval(folder: Path, manifest: Mapping[str, Any]) -> tuple[int, int]:
     return start, stop
 
 
+def archived_mission(folder: Path, manifest: Mapping[str, Any]) -> Mission:
+    """Return the mission description of an archive, else what its manifest declares."""
+    return _mission(folder, manifest)[0]
+
+
+def _mission(folder: Path, manifest: Mapping[str, Any]) -> tuple[Mission, str | None]:
+    if MISSION_FILE not in manifest["files"]:
+        return mission_of_manifest(manifest), None
+    path = folder / MISSION_FILE
+    mission, text = read_mission(path.read_bytes(), str(path))
+    stated = mission.spacecraft.id
+    if stated is not None and stated != manifest["spacecraft_id"]:
+        expected = f"{manifest['spacecraft_id']} as in manifest.json"
+        raise InvalidInput(str(path), "spacecraft.id", expected, str(stated))
+    return mission, text
+
+
 def _refuse_unreadable(path: Path, load: Callable[[Path], object]) -> None:
     try:
         load(path)
@@ -199,10 +234,12 @@ def _register(
     stop_utc_ns: int,
     stored: Mapping[str, StoredFile],
     images: Mapping[int, StoredFile],
+    mission: tuple[Mission, str | None],
 ) -> int:
     now = utc_now_ns()
     reference = load_ephemeris(folder / "reference.oem") if "reference.oem" in stored else None
     with ground.database.writing() as connection:
+        hold(connection, f"archive {digest}")
         existing = repository.find(connection, repository.PASSES, archive_digest=digest)
         if existing is not None:
             return int(existing["id"])
@@ -239,6 +276,8 @@ def _register(
                 manifest={key: value for key, value in manifest.items() if key != "files"},
                 ephemeris_id=ephemeris_id,
                 catalogue_sha256=stored["catalogue.csv"].sha256 if "catalogue.csv" in stored else None,
+                attitude_sha256=stored[ATTITUDE_FILE].sha256 if ATTITUDE_FILE in stored else None,
+                mission_id=enter(connection, *mission, actor=ARCHIVE_ACTOR),
                 created_utc_ns=now,
             )
         )

@@ -6,6 +6,7 @@ import contextlib
 import os
 import shutil
 import stat
+import struct
 import tempfile
 import zipfile
 import zlib
@@ -16,8 +17,12 @@ from pathlib import Path, PurePosixPath
 from ground_service.errors import InvalidInput, storage_error
 from ground_service.services.archive_import import import_archive
 from ground_service.services.ground import Ground
+from ground_service.store.files import UNPACKING, unfinished_prefix
 
 ENTRIES_LIMIT = 20_000
+DIRECTORY_LIMIT_OCTETS = 8 << 20
+"""Octets of the central directory: 400 for each entry; the directory is read as a whole."""
+
 OCTETS_LIMIT = 16 << 30
 RATIO_LIMIT = 200
 """Images and telemetry shrink by ten at most; what grows a hundredfold and more is made to fill the disk."""
@@ -42,7 +47,7 @@ def import_zip(ground: Ground, path: Path, name: str = "archive.zip") -> int:
 def unpacked(path: Path, work: Path, name: str) -> Iterator[Path]:
     """The files of a zip in a folder under `work`, which is removed in the end."""
     try:
-        folder = Path(tempfile.mkdtemp(prefix=".unpacking-", dir=work))
+        folder = Path(tempfile.mkdtemp(prefix=unfinished_prefix(UNPACKING), dir=work))
     except OSError as error:
         raise storage_error(error, work) from None
     try:
@@ -56,6 +61,7 @@ def unpacked(path: Path, work: Path, name: str) -> Iterator[Path]:
 @contextmanager
 def _opened(path: Path, name: str) -> Iterator[zipfile.ZipFile]:
     try:
+        _check_directory(path, name)
         archive = zipfile.ZipFile(path)
     except (zipfile.BadZipFile, OSError, ValueError, EOFError):
         raise InvalidInput(name, "", "a zip file of a pass archive", "something else") from None
@@ -63,12 +69,60 @@ def _opened(path: Path, name: str) -> Iterator[zipfile.ZipFile]:
         yield archive
 
 
+_END = struct.Struct("<4s4H2LH")
+_END_64 = struct.Struct("<4sQ2H2L4Q")
+_LOCATOR_64 = struct.Struct("<4sLQL")
+_ENTRY_OCTETS = 46
+
+
+def _check_directory(path: Path, name: str) -> None:
+    """Refuse a zip by its central directory before any of it is kept in memory.
+
+    Raises
+    ------
+    InvalidInput
+        If the directory has too many octets or entries, whatever the end record says of them.
+    """
+    with path.open("rb") as stream:
+        size = stream.seek(0, os.SEEK_END)
+        tail_start = max(size - (1 << 16) - _END.size, 0)
+        stream.seek(tail_start)
+        tail = stream.read()
+        at = len(tail) - _END.size
+        if at < 0 or tail[at : at + 4] != b"PK\5\6" or tail[-2:] != b"\0\0":
+            at = tail.rfind(b"PK\5\6")
+        if at < 0 or at + _END.size > len(tail):
+            raise zipfile.BadZipFile
+        entries, octets = _END.unpack_from(tail, at)[4:6]
+        end = tail_start + at
+        stream.seek(max(end - _LOCATOR_64.size - _END_64.size, 0))
+        record = stream.read(_END_64.size + _LOCATOR_64.size)
+        if len(record) == _END_64.size + _LOCATOR_64.size and record[_END_64.size :][:4] == b"PK\6\7":
+            entries, octets = _END_64.unpack_from(record)[7:9]
+            end -= len(record)
+        _refuse_over(name, "files", ENTRIES_LIMIT, entries)
+        _refuse_over(name, "octets of its directory", DIRECTORY_LIMIT_OCTETS, octets)
+        if octets > end:
+            raise zipfile.BadZipFile
+        stream.seek(end - octets)
+        directory = stream.read(octets)
+    position = found = 0
+    while position + _ENTRY_OCTETS <= len(directory):
+        found += 1
+        position += _ENTRY_OCTETS + sum(struct.unpack_from("<3H", directory, position + 28))
+    _refuse_over(name, "files", ENTRIES_LIMIT, found)
+
+
+def _refuse_over(name: str, what: str, limit: int, found: int) -> None:
+    if found > limit:
+        raise InvalidInput(name, "", f"at most {limit} {what}", str(found))
+
+
 def _unpack(archive: zipfile.ZipFile, folder: Path, packed_octets: int, name: str) -> None:
     entries = archive.infolist()
-    if len(entries) > ENTRIES_LIMIT:
-        raise InvalidInput(name, "", f"at most {ENTRIES_LIMIT} files", str(len(entries)))
     seen: set[str] = set()
     limit = min(OCTETS_LIMIT, max(packed_octets * RATIO_LIMIT, RATIO_FREE_OCTETS))
+    _refuse_over(name, "octets when unpacked", limit, sum(entry.file_size for entry in entries))
     taken = 0
     for entry in entries:
         target = folder / _checked_name(entry, seen, name)

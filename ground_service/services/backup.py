@@ -1,72 +1,94 @@
-"""Backup and restore: the whole service as a folder, readable on any machine and by either kind of database.
+"""Backup and restore: the whole service as a folder, while it runs, from and into either database.
 
-A backup holds a SQLite database of the same schema (whatever the service itself runs on), every file of the archive,
-and a manifest with their hashes. The database is read in one snapshot; files are immutable and written before the
-rows that name them, so a backup of a running service is consistent.
+The folder holds a SQLite database of the same schema, the archive's files, and a list of what must be in it: the
+SHA-256 of every table and of the list of files, and the head of the audit chain. A restore checks all of it before it
+writes anything, and fills an empty service only.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Iterator
+from dataclasses import asdict
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Table, insert, select, text
+from sqlalchemy import Connection, Table, select
 
-from ground_service.errors import Conflict, FileDamaged, InvalidInput, storage_error
+from ground_service.errors import Conflict, FileDamaged, InvalidInput, NotFound, storage_error
 from ground_service.services.ground import Ground
+from ground_service.store import audit, row_digests, rows
 from ground_service.store.database import Database, prepare_database, schema_revisions
-from ground_service.store.files import FileArchive
+from ground_service.store.files import (
+    FileArchive,
+    StoredFile,
+    make_durable_folder,
+    read_blocks,
+    replace_durably,
+)
 from ground_service.store.models import Base
 from lunar.timescales import format_utc
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+MANIFEST = "backup.json"
 DATABASE = "linna.db"
 FILES = "files"
-MANIFEST = "backup.json"
-BLOCK_ROWS = 5_000
+DAMAGE_LISTED = 20
 
 
 def backup(ground: Ground, out: Path, *, now_utc_ns: int) -> dict[str, Any]:
-    """Write a backup into the new folder `out`; its manifest.
+    """Write everything into a new folder; what was written.
+
+    `damaged` of the list names rows of the service that do not fit their digests: they are in the backup as they are.
 
     Raises
     ------
     Conflict
-        If there is something at `out` already.
+        If something is there already.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise Conflict(f"{out}: expected a folder that is new or empty, found something in it")
     partial = out.with_name(f".{out.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     try:
-        partial.mkdir(parents=True)
+        make_durable_folder(out.parent)
+        partial.mkdir()
         copy = prepare_database(f"sqlite:///{partial / DATABASE}")
         try:
-            rows = _copy_rows(ground.database, copy)
-            with copy.writing() as connection:
-                names = sorted(connection.execute(select(Base.metadata.tables["files"].c.sha256)).scalars())
+            with ground.database.snapshot() as connection:
+                damaged = [
+                    f"{one.table} {one.key}: {one.reason}"
+                    for one in islice(_strays(connection), DAMAGE_LISTED)
+                ]
+                _copy_rows(connection, copy)
+            with copy.reading() as connection:
+                tables = rows.table_digests(connection)
+                head = audit.read_head(connection)
+                names = _file_names(connection)
         finally:
             copy.engine.dispose()
         octets = 0
         for sha256 in names:
-            octets += _copy_file(ground.files.path(sha256), FileArchive(partial / FILES).path(sha256), sha256)
+            octets += _copy_file(ground.files.path(sha256), FileArchive(partial / FILES), sha256)
         manifest = {
             "schema_version": SCHEMA_VERSION,
             "made_utc": format_utc(now_utc_ns),
             "revision": schema_revisions(ground.database)[0],
-            "rows": rows,
+            "rows": {name: table.rows for name, table in tables.items()},
+            "tables": {name: table.sha256 for name, table in tables.items()},
             "files": len(names),
+            "files_sha256": _list_sha256(names),
             "octets": octets,
+            "audit_head": asdict(head) if head is not None else None,
+            "damaged": damaged,
         }
         (partial / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
         if out.exists():
             out.rmdir()
-        os.replace(partial, out)
+        replace_durably(partial, out)
     except OSError as error:
         raise storage_error(error, out) from None
     finally:
@@ -75,35 +97,36 @@ def backup(ground: Ground, out: Path, *, now_utc_ns: int) -> dict[str, Any]:
 
 
 def restore(folder: Path, ground: Ground) -> dict[str, Any]:
-    """Fill an empty service from a backup; its manifest.
+    """Fill an empty service from a backup that is found to be whole; its list.
 
     Raises
     ------
     InvalidInput
-        If the folder is no backup.
+        If the folder is no backup, or a row of it was changed.
+    FileDamaged, NotFound
+        If a file of it was changed or is missing.
     Conflict
         If the service holds anything.
     """
     manifest = _manifest(folder)
     with ground.database.reading() as connection:
-        for table in _tables():
-            if connection.execute(select(*table.primary_key.columns).limit(1)).first() is not None:
-                raise Conflict(
-                    f"{ground.database.label}: expected an empty service, found {table.name} in it"
-                )
+        filled = rows.first_filled_table(connection)
+    if filled is not None:
+        raise Conflict(f"{ground.database.label}: expected an empty service, found {filled} in it")
     source = prepare_database(f"sqlite:///{folder / DATABASE}", upgrade=False)
     try:
-        with source.reading() as connection:
-            names = sorted(connection.execute(select(Base.metadata.tables["files"].c.sha256)).scalars())
-        for sha256 in names:
-            _copy_file(FileArchive(folder / FILES).path(sha256), ground.files.path(sha256), sha256)
-        rows = _copy_rows(source, ground.database)
+        with source.snapshot() as connection:
+            _check_rows(folder, connection, manifest)
+            names = _file_names(connection)
+            for sha256 in names:
+                _check_file(FileArchive(folder / FILES), sha256)
+            for sha256 in names:
+                _copy_file(FileArchive(folder / FILES).path(sha256), ground.files, sha256)
+            _copy_rows(connection, ground.database)
     except OSError as error:
         raise storage_error(error, ground.home) from None
     finally:
         source.engine.dispose()
-    if rows != manifest["rows"]:
-        raise InvalidInput(str(folder), "rows", str(manifest["rows"]), str(rows))
     return manifest
 
 
@@ -117,83 +140,70 @@ def _manifest(folder: Path) -> dict[str, Any]:
         raise InvalidInput(str(path), "", "a JSON object", str(error)[:80]) from None
     if not isinstance(manifest, dict) or manifest.get("schema_version") != SCHEMA_VERSION:
         raise InvalidInput(str(path), "schema_version", str(SCHEMA_VERSION), "another")
+    for key in ("rows", "tables", "files_sha256", "audit_head"):
+        if key not in manifest:
+            raise InvalidInput(str(path), key, "an entry", "none")
     return manifest
 
 
-def _tables() -> list[Table]:
-    """All tables, those that others point to first."""
-    return list(Base.metadata.sorted_tables)
-
-
-def _copy_rows(source: Database, target: Database) -> dict[str, int]:
-    """Every row of one database into another empty one, read in one snapshot, written in one transaction."""
-    counts = {}
-    with source.engine.connect() as reading, target.writing() as writing:
-        if source.dialect == "postgresql":
-            reading = reading.execution_options(isolation_level="REPEATABLE READ")
-        with reading.begin():
-            for table in _tables():
-                counts[table.name] = 0
-                later = []
-                for block in _blocks(reading, table):
-                    if table.name == "windows":
-                        # A window may name one with a greater key: they are linked when all are there.
-                        later += [row for row in block if row["predecessor_id"] is not None]
-                        block = [{**row, "predecessor_id": None} for row in block]
-                    writing.execute(insert(table), block)
-                    counts[table.name] += len(block)
-                for row in later:
-                    writing.execute(
-                        table.update()
-                        .where(table.c.id == row["id"])
-                        .values(predecessor_id=row["predecessor_id"])
-                    )
-        if target.dialect == "postgresql":
-            _advance_sequences(writing)
-    return counts
-
-
-def _blocks(connection: Connection, table: Table) -> Iterator[list[dict[str, Any]]]:
-    rows = connection.execution_options(yield_per=BLOCK_ROWS).execute(
-        select(table).order_by(*table.primary_key.columns)
-    )
-    for part in rows.mappings().partitions(BLOCK_ROWS):
-        yield [dict(row) for row in part]
-
-
-def _advance_sequences(connection: Connection) -> None:
-    """Let new keys begin behind those that were copied."""
-    for table in _tables():
-        keys = list(table.primary_key.columns)
-        if len(keys) != 1 or not isinstance(keys[0].type.python_type(), int):
-            continue
-        name = connection.execute(
-            text("SELECT pg_get_serial_sequence(:table, :column)"),
-            {"table": f'"{table.name}"', "column": keys[0].name},
-        ).scalar()
-        if name is not None:
-            connection.execute(
-                text(
-                    f'SELECT setval(:name, (SELECT COALESCE(MAX({keys[0].name}), 0) + 1 FROM "{table.name}"), false)'
-                ),
-                {"name": name},
+def _check_rows(folder: Path, connection: Connection, manifest: dict[str, Any]) -> None:
+    """Compare every table, the list of files and the audit chain of a backup with its list."""
+    for name, table in rows.table_digests(connection).items():
+        if manifest["rows"].get(name) != table.rows:
+            raise InvalidInput(
+                str(folder / DATABASE), name, f"{manifest['rows'].get(name)} rows", str(table.rows)
             )
+        if manifest["tables"].get(name) != table.sha256:
+            raise InvalidInput(str(folder / DATABASE), name, "the rows that were saved", "changed rows")
+    if _list_sha256(_file_names(connection)) != manifest["files_sha256"]:
+        raise InvalidInput(str(folder / DATABASE), "files", "the files that were saved", "a changed list")
+    head = audit.read_head(connection)
+    if head is None or asdict(head) != manifest["audit_head"]:
+        raise InvalidInput(str(folder / MANIFEST), "audit_head", "the head of the audit chain", "another")
+    broken = next(audit.broken_entries(connection), None)
+    if broken is not None:
+        raise InvalidInput(str(folder / DATABASE), f"audit {broken.number}", "a whole chain", broken.reason)
 
 
-def _copy_file(source: Path, target: Path, sha256: str) -> int:
-    """Copy a file, checked while it is read; its octets."""
+def _strays(connection: Connection) -> Iterator[row_digests.StrayRow]:
+    for table in row_digests.guarded_tables():
+        yield from row_digests.stray_rows(connection, table)
+
+
+def _file_names(connection: Connection) -> list[str]:
+    table: Table = Base.metadata.tables["files"]
+    return sorted(connection.execute(select(table.c.sha256)).scalars())
+
+
+def _list_sha256(names: list[str]) -> str:
+    return hashlib.sha256("\n".join(names).encode()).hexdigest()
+
+
+def _copy_rows(connection: Connection, target: Database) -> None:
+    """Every row that a connection sees into another, empty database, in one transaction."""
+    with target.writing() as writing:
+        for table in rows.copied_tables():
+            rows.insert_rows(writing, table, rows.row_blocks(connection, table))
+        rows.advance_sequences(writing)
+
+
+def _check_file(files: FileArchive, sha256: str) -> None:
+    path = files.path(sha256)
+    if not path.is_file():
+        raise NotFound("file", f"{sha256} in {files.root}")
     digest = hashlib.sha256()
-    octets = 0
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.name}.copying")
-    with source.open("rb") as reading, temporary.open("wb") as writing:
-        while block := reading.read(1 << 20):
-            digest.update(block)
-            octets += len(block)
-            writing.write(block)
+    for block in read_blocks(path):
+        digest.update(block)
     if digest.hexdigest() != sha256:
-        temporary.unlink()
-        raise FileDamaged(source, sha256, digest.hexdigest())
-    temporary.chmod(0o444)
-    os.replace(temporary, target)
-    return octets
+        raise FileDamaged(path, sha256, digest.hexdigest())
+
+
+def _copy_file(source: Path, files: FileArchive, sha256: str) -> int:
+    """Copy a file into an archive, checked while it is read; its octets."""
+    if not source.is_file():
+        raise NotFound("file", f"{sha256} in {source.parent.parent}")
+    stored: StoredFile = files.put_file(source)
+    if stored.sha256 != sha256:
+        stored.path.unlink(missing_ok=True)
+        raise FileDamaged(source, sha256, stored.sha256)
+    return stored.octets

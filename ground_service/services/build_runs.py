@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-import functools
 import json
-import os
 import shutil
-import subprocess
-import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from ground_service.errors import InvalidInput
-from ground_service.services import _confine
-from ground_service.services.builds import Build, package_root
+from ground_service.sandbox.host import SandboxRefused, check_private, tail
+from ground_service.services.builds import Build
 from ground_service.services.regression_archives import write_flight_view
+from ground_service.services.runner import (
+    DOWNLINKS,
+    PERFORMANCE,
+    RunRequest,
+    run_by_runner,
+    run_in_sandbox,
+)
 
-DOWNLINKS = ("downlink.cadu", "downlink.packets")
-PERFORMANCE = "performance.json"
 PERFORMANCE_LIMIT_OCTETS = 64 << 20
 PRINTED_SHOWN = 2000
-GRACE_S = 60
+PRINTED = "printed.txt"
 
 OK = "ok"
 OUTCOMES = {
@@ -36,31 +37,6 @@ OUTCOMES = {
     "garbage": "wrote a downlink that is no telemetry",
     "refused": "was not run",
 }
-# A shell that waits: the first process of a namespace is spared most signals, which the program shall not be.
-_WAITING_SHELL = ("sh", "-c", '"$@"; exit $?', "sh")
-# Ways to shut a program off from the network, the strongest first; a process namespace also holds back all it starts.
-_NAMESPACES = (
-    (
-        "network and process namespace",
-        ("unshare", "--net", "--pid", "--fork", "--kill-child", "--", *_WAITING_SHELL),
-    ),
-    (
-        "network, process and user namespace",
-        (
-            "unshare",
-            "--user",
-            "--map-root-user",
-            "--net",
-            "--pid",
-            "--fork",
-            "--kill-child",
-            "--",
-            *_WAITING_SHELL,
-        ),
-    ),
-    ("network namespace", ("unshare", "--user", "--map-root-user", "--net", "--")),
-)
-NO_NAMESPACE = "environment without proxies only"
 _OUT_OF_MEMORY = ("MemoryError", "bad_alloc", "Cannot allocate memory", "std::length_error", "out of memory")
 _OUT_OF_DISK = ("File too large", "No space left on device", "file size limit")
 
@@ -76,7 +52,7 @@ class BuildRun:
     detail
         What to tell a person who asks why.
     isolation
-        How the program was shut off from the network.
+        What the program was confined by; "" if it was not run.
     """
 
     build: str
@@ -102,11 +78,20 @@ class BuildRun:
         }
 
 
-def run_build(build: Build, archive: Path, out: Path) -> BuildRun:
+def run_build(
+    build: Build, archive: Path, out: Path, *, runner: Path | None = None, private: Sequence[Path] = ()
+) -> BuildRun:
     """Run a build over an archived pass, its downlink written into `out`.
 
-    The program sees a copy of what the payload was given, in a folder of its own: no reference, no truth, no catalogue
-    of the ground, no network, no clock but what the operating system cannot hide.
+    The program sees a copy of what the payload was given and of its own files: no reference, no truth, no catalogue
+    of the ground, no network, nothing else of this machine. Where it cannot be confined it is not run.
+
+    Parameters
+    ----------
+    runner
+        Exchange folder of a runner that takes the run over; None runs it in a sandbox here.
+    private
+        Folders that a build must not be able to read, such as the archive of the service.
     """
     if out.exists() and any(out.iterdir()):
         raise InvalidInput(str(out), "", "a new or empty folder", "something in it")
@@ -114,89 +99,25 @@ def run_build(build: Build, archive: Path, out: Path) -> BuildRun:
     work.mkdir(parents=True)
     try:
         write_flight_view(archive, work / "archive")
+        build.stage(work / "build")
         written = work / "out"
         written.mkdir()
-        report = _confined(build, work / "archive", written, out / "printed.txt")
+        request = RunRequest(build.words, asdict(build.limits))
+        try:
+            if runner is not None:
+                report = run_by_runner(runner, request, work, written, out / PRINTED)
+            else:
+                check_private(private)
+                report = run_in_sandbox(request, work, written, out / PRINTED)
+        except SandboxRefused as error:
+            return BuildRun(build.title, "refused", str(error), None, None, 0.0, 0.0, 0.0, "")
         return _judged(build, report, written, out)
     finally:
         shutil.rmtree(work, ignore_errors=True)
 
 
-@functools.cache
-def network_prefix() -> tuple[str, tuple[str, ...]]:
-    """How programs are shut off from the network here, and the command that does it."""
-    for name, prefix in _NAMESPACES:
-        try:
-            tried = subprocess.run([*prefix, "true"], capture_output=True, timeout=10, check=False)
-        except (OSError, subprocess.TimeoutExpired):
-            continue
-        if tried.returncode == 0:
-            return name, prefix
-    return NO_NAMESPACE, ()
-
-
-def _confined(build: Build, archive: Path, written: Path, printed: Path) -> dict[str, Any]:
-    isolation, prefix = network_prefix()
-    limits = asdict(build.limits)
-    job = {
-        "command": build.arguments(archive.absolute(), written.absolute()),
-        "cwd": str(written.absolute()),
-        "environment": _environment(written),
-        "limits": limits,
-        "prefix": list(prefix),
-        "output": str(printed.absolute()),
-    }
-    reading, writing = os.pipe()
-    try:
-        with subprocess.Popen(
-            [sys.executable, "-I", "-S", str(Path(_confine.__file__)), str(writing)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            pass_fds=(writing,),
-            start_new_session=True,
-        ) as keeper:
-            os.close(writing)
-            writing = -1
-            try:
-                keeper.communicate(json.dumps(job).encode(), timeout=limits["wall_s"] + GRACE_S)
-            except (subprocess.TimeoutExpired, KeyboardInterrupt):
-                keeper.kill()
-                raise
-        with os.fdopen(reading) as stream:
-            reading = -1
-            told = stream.read()
-    finally:
-        for descriptor in (reading, writing):
-            if descriptor >= 0:
-                os.close(descriptor)
-    report: dict[str, Any] = (
-        json.loads(told) if told else {"cause": "crashed", "exit_status": None, "signal": None}
-    )
-    return {"wall_s": 0.0, "cpu_s": 0.0, "peak_rss_mib": 0.0, **report, "isolation": isolation}
-
-
-def _environment(written: Path) -> dict[str, str]:
-    """Everything that a program is told of the world: no data folder, no proxies, one thread."""
-    return {
-        "PATH": os.environ.get("PATH", "/usr/local/bin:/usr/bin:/bin"),
-        "PYTHONPATH": str(package_root()),
-        "PYTHONDONTWRITEBYTECODE": "1",
-        "PYTHONHASHSEED": "0",
-        "HOME": str(written.absolute()),
-        "TMPDIR": str(written.absolute()),
-        "XDG_DATA_HOME": str(written.absolute()),
-        "LANG": "C.UTF-8",
-        "TZ": "UTC",
-        "OMP_NUM_THREADS": "1",
-        "OMP_WAIT_POLICY": "PASSIVE",
-        "OPENBLAS_NUM_THREADS": "1",
-        "NUMBA_NUM_THREADS": "1",
-    }
-
-
 def _judged(build: Build, report: Mapping[str, Any], written: Path, out: Path) -> BuildRun:
-    printed = _tail(out / "printed.txt")
+    printed = tail(out / PRINTED, PRINTED_SHOWN)
     outcome, detail = _outcome(report, printed)
     downlink: Path | None = None
     performance = None
@@ -236,6 +157,8 @@ def _outcome(report: Mapping[str, Any], printed: str) -> tuple[str, str]:
         killed = status - 128
     if cause:
         return str(cause), ""
+    if status != 0 and report.get("full"):
+        return "disk", last
     if killed == 24:  # SIGXCPU
         return "cpu", ""
     if killed == 25 or (status != 0 and any(sign in printed for sign in _OUT_OF_DISK)):  # SIGXFSZ
@@ -256,10 +179,3 @@ def read_performance(path: Path) -> dict[str, Any] | None:
         return {"stages": stages, "yardstick": [float(value) for value in given.get("yardstick", [])]}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
-
-
-def _tail(path: Path) -> str:
-    try:
-        return path.read_text(errors="replace")[-PRINTED_SHOWN:]
-    except OSError:
-        return ""

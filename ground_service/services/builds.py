@@ -11,16 +11,21 @@ import hashlib
 import importlib.util
 import json
 import shutil
-import sys
+import tempfile
 import tomllib
-from dataclasses import dataclass, field, fields
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from ground_service.clock import utc_now_ns
-from ground_service.errors import InvalidInput, NotFound, storage_error
+from ground_service.errors import BuildNotChecked, InvalidInput, NotFound, storage_error
+from ground_service.sandbox.host import SandboxRefused, check_private, tail
 from ground_service.services.ground import Ground
+from ground_service.services.runner import RunRequest, run_by_runner, run_in_sandbox
 from ground_service.store import repository
+from ground_service.store.files import make_durable_folder, replace_durably
+from ground_service.text import require_line
 
 SCHEMA_VERSION = 1
 CURRENT = "current"
@@ -29,6 +34,9 @@ BUILD_FILE_LIMIT_OCTETS = 1 << 20
 FLIGHT_COMMAND = (
     "{python}", "-m", "linna", "replay", "{archive}", "--build", "{build}", "--out", "{out}", "--recorded-only",
 )  # fmt: skip
+CHECK_COMMAND = ("{python}", "-m", "linna", "replay", "--check-build", "{folder}/" + BUILD_FILE, "--json")
+CHECK_FAILED = 2
+CHECK_LIMIT_OCTETS = 1 << 14
 _KEYS = (
     "schema_version", "name", "version", "description", "command", "files", "model", "parameters", "camera",
     "limits", "provenance",
@@ -47,7 +55,10 @@ _SHIPPED_MODEL = "payload_emulator/flight/models/craters.onnx"
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a run of a build may use: seconds, MiB, open files. `folder_mib` is all that it writes together."""
+    """What a run of a build may use: seconds, MiB, open files, processes and threads.
+
+    `cpu_s` and `memory_mib` count all processes of the run together, and `folder_mib` everything that it writes.
+    """
 
     wall_s: int = 900
     cpu_s: int = 900
@@ -55,6 +66,11 @@ class Limits:
     file_mib: int = 256
     folder_mib: int = 512
     open_files: int = 256
+    processes: int = 128
+
+
+CHECK_LIMITS = Limits(wall_s=120, cpu_s=60, memory_mib=2048, file_mib=1, folder_mib=16, processes=32)
+"""The check imports the flight code and reads a text file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +85,8 @@ class Build:
         Program and arguments with the places {archive}, {out} and {build}; empty for a build on the flight code.
     files
         SHA-256 of every file that belongs to the build, by name.
+    parameters
+        Name of the parameter file of a build on the flight code; "" without one.
     camera
         What the build is made for, where it is made for one camera only.
     digest
@@ -86,6 +104,7 @@ class Build:
     limits: Limits = field(default_factory=Limits)
     provenance: tuple[tuple[str, str], ...] = ()
     flight_code: str = ""
+    parameters: str = ""
 
     @property
     def title(self) -> str:
@@ -96,23 +115,31 @@ class Build:
     def folder(self) -> Path:
         return self.file.parent
 
-    def arguments(self, archive: Path, out: Path) -> list[str]:
-        """The command line that flies an archive."""
-        places = {
-            "{archive}": str(archive),
-            "{out}": str(out),
-            "{build}": str(self.folder) if self.command else _file_argument(self.file),
-            "{python}": sys.executable,
-        }
-        words = []
-        for word in self.command or FLIGHT_COMMAND:
-            for place, value in places.items():
-                word = word.replace(place, value)
-            words.append(word)
-        first = self.folder / words[0]
-        if words[0] in dict(self.files) and first.is_file():
-            words[0] = str(first.absolute())
-        return words
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The command line, with the places {python}, {archive}, {out} and {folder} (of the staged build)."""
+        place = "{folder}" if self.command else ("{folder}/" + BUILD_FILE if self.folder_needed else CURRENT)
+        words = [word.replace("{build}", place) for word in self.command or FLIGHT_COMMAND]
+        if words[0] in dict(self.files):
+            words[0] = "{folder}/" + words[0]
+        return tuple(words)
+
+    @property
+    def folder_needed(self) -> bool:
+        """Whether there are files of the build, as there are not for the flight code at hand."""
+        return str(self.file) != CURRENT
+
+    def stage(self, folder: Path) -> None:
+        """Copy the build file and the files it names into a new folder: all that a run sees of a build."""
+        folder.mkdir(parents=True)
+        if not self.folder_needed:
+            return
+        for name, source in (
+            (BUILD_FILE, self.file),
+            *((name, self.folder / name) for name, _ in self.files),
+        ):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(source, folder / name)
 
 
 def load_build(given: str | Path) -> Build:
@@ -166,42 +193,107 @@ def load_build(given: str | Path) -> Build:
         limits=_limits(table, source),
         provenance=tuple((str(key), str(value)) for key, value in sorted(provenance.items())),
         flight_code=code,
+        parameters=own["parameters"],
     )
 
 
 def register_build(ground: Ground, build: Build, *, actor: str = "local") -> Build:
-    """Keep a build with the service: its files by content, its identity and origin; the kept build comes back."""
+    """Keep a build with the service: its files by content, its identity and origin; the kept build comes back.
+
+    Raises
+    ------
+    InvalidInput
+        Its parameters are not those of the flight code.
+    BuildNotChecked
+        Its parameters cannot be checked here.
+    """
     folder = ground.home / "regression" / "builds" / build.digest
+    if not folder.exists():
+        check_parameters(build, runner=ground.runner, private=(ground.home,))
     try:
         if not folder.exists():
-            partial = folder.with_name(f".{build.digest}.partial")
-            shutil.rmtree(partial, ignore_errors=True)
-            partial.mkdir(parents=True)
+            make_durable_folder(folder.parent)
+            # A name of its own: another process may register the same build at the same time.
+            partial = Path(tempfile.mkdtemp(prefix=f".{build.digest[:16]}.", dir=folder.parent))
             text = build.file.read_bytes() if build.file.is_file() else _current_text().encode()
             (partial / BUILD_FILE).write_bytes(text)
             for name, _ in build.files:
                 (partial / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy(build.folder / name, partial / name)
-            partial.rename(folder)
+            partial.chmod(0o755)
+            try:
+                replace_durably(partial, folder)
+            except OSError:
+                shutil.rmtree(partial, ignore_errors=True)
+                if not folder.exists():  # else the other process was first, with the same files
+                    raise
     except OSError as error:
         raise storage_error(error, folder) from None
     with ground.database.writing() as connection:
-        if repository.find(connection, repository.BUILDS, digest=build.digest) is None:
-            repository.add(
-                connection,
-                repository.BUILDS,
-                digest=build.digest,
-                name=build.name,
-                version=build.version,
-                description=build.description,
-                kind="command" if build.command else "flight",
-                files=dict(build.files),
-                flight_code=build.flight_code or None,
-                provenance=dict(build.provenance),
-                registered_by=actor,
-                created_utc_ns=utc_now_ns(),
-            )
+        repository.add_new(
+            connection,
+            repository.BUILDS,
+            digest=build.digest,
+            name=build.name,
+            version=build.version,
+            description=build.description,
+            kind="command" if build.command else "flight",
+            files=dict(build.files),
+            flight_code=build.flight_code or None,
+            provenance=dict(build.provenance),
+            registered_by=actor,
+            created_utc_ns=utc_now_ns(),
+        )
     return load_build(folder)
+
+
+def check_parameters(build: Build, *, runner: Path | None = None, private: Sequence[Path] = ()) -> None:
+    """Have the flight code check the parameter file of a build; other builds have nothing to check.
+
+    The flight code is a program to the ground: it runs confined like a build, on a copy of the build's files.
+
+    Raises
+    ------
+    InvalidInput
+        A parameter is unknown or has an impossible value.
+    BuildNotChecked
+        The check cannot be confined here, or did not finish.
+    """
+    if not build.parameters:
+        return
+    with tempfile.TemporaryDirectory(prefix="build-check-") as name:
+        work = Path(name)
+        (work / "archive").mkdir()
+        (work / "out").mkdir()
+        build.stage(work / "build")
+        request = RunRequest(CHECK_COMMAND, asdict(CHECK_LIMITS))
+        printed = work / "printed.txt"
+        try:
+            if runner is not None:
+                report = run_by_runner(runner, request, work, work / "out", printed)
+            else:
+                check_private(private)
+                report = run_in_sandbox(request, work, work / "out", printed)
+        except SandboxRefused as error:
+            raise BuildNotChecked(build.title, str(error)) from None
+        told = tail(printed, CHECK_LIMIT_OCTETS).strip()
+    if report["exit_status"] == 0 and not report["cause"]:
+        return
+    fault = _fault_of(told) if report["exit_status"] == CHECK_FAILED else None
+    if fault is None:
+        last = told.splitlines()[-1][:200] if told else "nothing printed"
+        status = report["cause"] or f"status {report['exit_status']}, signal {report['signal']}"
+        raise BuildNotChecked(build.title, f"the check of the parameters ended with {status}: {last}")
+    raise fault
+
+
+def _fault_of(told: str) -> InvalidInput | None:
+    """Return the fault that the check printed as JSON; None where it printed no such thing."""
+    try:
+        fault = json.loads(told[told.index('{"fault"') :])["fault"]
+        return InvalidInput(*(str(fault[name]) for name in ("file", "key", "expected", "found")))
+    except (ValueError, KeyError, TypeError):
+        return None
 
 
 def registered_build(ground: Ground, digest: str) -> Build:
@@ -263,11 +355,6 @@ def _root() -> Path:
     return Path(next(iter(spec.submodule_search_locations))).parent
 
 
-def package_root() -> Path:
-    """Folder to put on the module path of a run on the flight code."""
-    return _root()
-
-
 def _current() -> Build:
     code = flight_code_hash()
     model = _hash_of(_root() / _SHIPPED_MODEL)
@@ -283,10 +370,6 @@ def _current() -> Build:
 
 def _current_text() -> str:
     return 'schema_version = 1\nname = "current"\n'
-
-
-def _file_argument(path: Path) -> str:
-    return str(path) if str(path) == CURRENT else str(path.absolute())
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -329,6 +412,10 @@ def _text(table: dict[str, Any], key: str, source: str, *, required: bool = Fals
     value = table.get(key, None if required else "")
     if not isinstance(value, str) or (required and not value):
         raise InvalidInput(source, key, "a text", repr(value)[:80])
+    if value and key in ("name", "version"):
+        return require_line(value, source, key)
+    if "\0" in value or "\x1b" in value:
+        raise InvalidInput(source, key, "a text without control characters", ascii(value)[:80])
     return value
 
 

@@ -1,19 +1,24 @@
 """Telecommands: entered, released or rejected, sent, and followed to their end.
 
-queued → released → sent → (accepted → started → completed | failed), or queued → rejected. A critical command is
-released by somebody other than who entered it. Every step goes into the audit log in the transaction that makes it.
+queued → released → sent → (accepted → started → completed | failed), or queued → rejected. A command that
+changes the state of the payload or destroys data (`tmtc.effects`) is critical: it is released by somebody other than
+who entered it. Every step is a compare-and-set in the database (`store.states`) and
+goes into the audit log in the transaction that makes it.
 """
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from sqlalchemy import BigInteger, Connection, cast, func, select
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, InvalidInput
+from ground_service.missions.store import approval_in_force
+from ground_service.processing.approval import DEFAULT_POLICY, ApprovalPolicy
 from ground_service.services.command_state import CommandView, command_view
 from ground_service.services.feed import publish
 from ground_service.services.ground import Ground
@@ -22,20 +27,30 @@ from ground_service.services.pass_data import readable_version
 from ground_service.services.users import audit
 from ground_service.services.window_progress import advance_windows
 from ground_service.store import repository
+from ground_service.store.counters import lock_spacecraft, next_telecommand
+from ground_service.store.states import TELECOMMAND, change_if, move, move_all
+from ground_service.text import REASON_LIMIT, require_line
 from tmtc.dictionary import DICTIONARY
+from tmtc.effects import CommandEffect, effect_of
 from tmtc.errors import TmtcError
 from tmtc.packets import SEQUENCE_COUNT_LIMIT
 from tmtc.uplink import UplinkEncoder
 
 DEFAULT_TIMEOUT_S = 600
-
-CRITICAL_COMMANDS = ("reset_schedule", "delete_store", "uplink_first", "uplink_middle", "uplink_last")
-CRITICAL_FUNCTIONS = ("clear_store", "reboot", "abort_uplink")
-"""What destroys data or changes what the payload is: a second person has to agree."""
+TIMEOUT_LIMIT_S = 2**31 - 1
+"""Commands of a planned window are followed to the end of the window, which may be years away."""
 
 _SERVICE, _TIME_OUT = "service", "time out"
 
 COMMANDS = tuple(definition.name for definition in DICTIONARY.telecommands)
+
+
+@dataclass(frozen=True, slots=True)
+class Approval:
+    """Who entered what a telecommand is made from, and who approved it."""
+
+    entered_by: str
+    approved_by: str | None
 
 
 def enter_command(
@@ -69,18 +84,18 @@ def add_released(
     actor: str,
     timeout_s: int = DEFAULT_TIMEOUT_S,
     window_id: int | None = None,
+    approval: Approval | None = None,
 ) -> int:
     """Add a telecommand that is released already, within the caller's transaction; its id.
 
     Raises
     ------
     Conflict
-        If it is critical: such a one has to be entered and then released by somebody else.
+        If it needs a second person and `approval` names none.
     """
-    if _is_critical(name, arguments):
-        raise Conflict(f"telecommand {name}: is critical; it has to be released by a second person")
+    _require_approval(connection, vehicle, name, arguments, approval)
     key = _add(connection, vehicle, name, arguments, "queued", actor, timeout_s, window_id)
-    _release(connection, key, actor)
+    _release(connection, repository.get(connection, TELECOMMAND.table, key, TELECOMMAND.kind), actor)
     return key
 
 
@@ -94,15 +109,16 @@ def add_scheduled(
     actor: str,
     timeout_s: int,
     window_id: int | None = None,
+    approval: Approval | None = None,
 ) -> int:
     """Add a released `insert_activity` that carries a telecommand to be done at an on-board time; its id.
 
     The telecommand inside has a sequence count and a row of its own, so that the reports about it are found.
     """
-    if _is_critical(name, arguments):
-        raise Conflict(f"telecommand {name}: is critical; it has to be released by a second person")
-    inner = _add(connection, vehicle, name, arguments, "carried", actor, timeout_s, window_id)
-    octets = _commit(connection, inner, "carried", actor)
+    _require_approval(connection, vehicle, name, arguments, approval)
+    issued = _issued(connection, vehicle, name, arguments, actor)
+    octets = bytes(issued["octets"])
+    inner = _add(connection, vehicle, name, arguments, "carried", actor, timeout_s, window_id, **issued)
     outer = add_released(
         connection,
         vehicle,
@@ -111,6 +127,7 @@ def add_scheduled(
         actor=actor,
         timeout_s=timeout_s,
         window_id=window_id,
+        approval=approval,
     )
     repository.change(connection, repository.TELECOMMANDS, inner, carrier_id=outer)
     return outer
@@ -121,32 +138,35 @@ def release_command(ground: Ground, command_id: int, *, actor: str) -> None:
 
     Raises
     ------
+    StateConflict
+        If it is not queued, or somebody else decided on it at the same time.
     Conflict
-        If it is not queued, or is critical and was entered by the same person.
+        If it is critical and was entered by the same person.
     """
     with ground.database.writing() as connection:
-        row = _queued(connection, command_id)
-        if row["critical"] and row["requested_by"] == actor:
-            raise Conflict(
-                f"telecommand {command_id} ({row['name']}): is critical; "
-                f"expected another person than {actor} to release it"
+        row = repository.get(connection, repository.TELECOMMANDS, command_id, TELECOMMAND.kind)
+        if row["state"] == "queued" and row["critical"] and row["requested_by"] == actor:
+            effect = effect_of(
+                DICTIONARY, row["name"], row["arguments"], _packed(row["name"], row["arguments"], 0)
             )
-        _release(connection, command_id, actor)
+            raise Conflict(
+                f"telecommand {command_id} ({row['name']}): is critical; expected another person than {actor} "
+                f"to release it ({effect.effect}: {effect.reason})"
+            )
+        _release(connection, row, actor)
 
 
 def reject_command(ground: Ground, command_id: int, *, actor: str, reason: str) -> None:
-    """Take a queued command out of the queue."""
+    """Take a queued command out of the queue.
+
+    Raises
+    ------
+    StateConflict
+        If it is not queued, or somebody else decided on it at the same time.
+    """
+    require_line(reason, "telecommand", "reason", REASON_LIMIT)
     with ground.database.writing() as connection:
-        _queued(connection, command_id)
-        repository.change(
-            connection,
-            repository.TELECOMMANDS,
-            command_id,
-            state="rejected",
-            decided_by=actor,
-            decided_utc_ns=utc_now_ns(),
-            reason=reason,
-        )
+        _decide(connection, command_id, "rejected", actor, reason=reason)
         _note(connection, actor, "reject", command_id, "rejected", {"reason": reason})
 
 
@@ -155,45 +175,42 @@ def take_uplink(
 ) -> tuple[bytes, list[int]]:
     """What is to be sent now: all released commands in order, as CLTUs or bare packets, and their ids.
 
-    They count as sent from then on.
+    They count as sent from then on: each is handed out once, whoever asks, and however many do.
     """
-    table = repository.TELECOMMANDS
+    table = TELECOMMAND.table
     with ground.database.writing() as connection:
         vehicle = repository.vehicle_id(connection, spacecraft_id, instance)
-        rows = connection.execute(
-            select(table.c.id, table.c.octets)
-            .where(table.c.vehicle_id == vehicle, table.c.state == "released")
-            .order_by(table.c.decided_utc_ns, table.c.id)
-            .with_for_update()
-        ).all()
-        now = utc_now_ns()
-        newest = _newest_ticks(connection, vehicle)
-        for row in rows:
-            repository.change(
-                connection, table, row[0], state="sent", sent_utc_ns=now, sent_after_ticks=newest
-            )
-            connection.execute(
-                table.update()
-                .where(table.c.carrier_id == row[0], table.c.state == "carried")
-                .values(state="sent", sent_utc_ns=now, sent_after_ticks=newest)
-            )
-            _note(connection, actor, "send", row[0], "sent", {})
+        lock_spacecraft(connection, vehicle)
+        sent = {"sent_utc_ns": utc_now_ns(), "sent_after_ticks": _newest_ticks(connection, vehicle)}
+        mine = [table.c.vehicle_id == vehicle, table.c.state == "released"]
+        rows = move_all(connection, TELECOMMAND, mine, "sent", **sent)
+        rows.sort(key=lambda row: (row["decided_utc_ns"], row["id"]))
+        ids = [int(row["id"]) for row in rows]
+        move_all(connection, TELECOMMAND, [table.c.carrier_id.in_(ids)], "sent", **sent)
+        for command_id in ids:
+            _note(connection, actor, "send", command_id, "sent", {})
     advance_windows(ground, vehicle)
-    packets = [bytes(row[1]) for row in rows]
+    packets = [bytes(row["octets"]) for row in rows]
     stream = UplinkEncoder(spacecraft_id).encode(packets) if framed else b"".join(packets)
-    return stream, [int(row[0]) for row in rows]
+    return stream, ids
 
 
 def note_timeouts(ground: Ground, since_utc_ns: int, until_utc_ns: int) -> list[int]:
     """Put on record, and tell those who watch, which telecommands should have ended in between and did not; their ids.
 
-    Each is noted once, however often it is asked for. What is reported late counts all the same.
+    Each is noted once, however often and by however many processes it is asked for. What is reported late counts all
+    the same.
     """
-    table, log = repository.TELECOMMANDS, repository.AUDIT
+    table = TELECOMMAND.table
     due = table.c.sent_utc_ns + cast(table.c.timeout_s, BigInteger) * 1_000_000_000
     with ground.database.reading() as connection:
         rows = connection.execute(
-            select(table).where(table.c.state == "sent", due >= since_utc_ns, due < until_utc_ns)
+            select(table).where(
+                table.c.state == "sent",
+                table.c.timeout_noted_utc_ns.is_(None),
+                due >= since_utc_ns,
+                due < until_utc_ns,
+            )
         ).mappings()
         views = [command_view(connection, dict(row)) for row in rows.all()]
     overdue = [view for view in views if view.fate is not None and view.fate.timed_out]
@@ -201,14 +218,13 @@ def note_timeouts(ground: Ground, since_utc_ns: int, until_utc_ns: int) -> list[
     for view in overdue:
         command_id = int(view.row["id"])
         with ground.database.writing() as connection:
-            known = connection.execute(
-                select(log.c.id).where(
-                    log.c.utc_ns >= view.row["sent_utc_ns"],
-                    log.c.action == f"{_TIME_OUT} telecommand",
-                    log.c.target == str(command_id),
-                )
-            ).first()
-            if known is None:
+            if change_if(
+                connection,
+                table,
+                command_id,
+                {"timeout_noted_utc_ns": None},
+                timeout_noted_utc_ns=utc_now_ns(),
+            ):
                 detail = {"state": view.state, "timeout_s": view.row["timeout_s"]}
                 _note(connection, _SERVICE, _TIME_OUT, command_id, "timed out", detail)
                 noted.append(command_id)
@@ -241,9 +257,12 @@ def _add(
     actor: str,
     timeout_s: int,
     window_id: int | None = None,
+    **issued: Any,
 ) -> int:
-    """Enter a telecommand that the dictionary accepts; its id."""
+    """Enter a telecommand that the dictionary accepts; its id. `issued` holds its octets where it has them already."""
     _packed(name, arguments, 0)
+    if isinstance(timeout_s, bool) or not 1 <= timeout_s <= TIMEOUT_LIMIT_S:
+        raise InvalidInput("telecommand", "timeout_s", f"1 to {TIMEOUT_LIMIT_S}", str(timeout_s)[:40])
     key = int(
         repository.add(
             connection,
@@ -252,91 +271,99 @@ def _add(
             name=name,
             arguments=dict(arguments),
             state=state,
-            critical=int(_is_critical(name, arguments)),
+            critical=int(_second_person(connection, vehicle, name, arguments) is not None),
             timeout_s=timeout_s,
             requested_by=actor,
             created_utc_ns=utc_now_ns(),
             window_id=window_id,
+            **issued,
         )
     )
     _note(connection, actor, "enter", key, state, {"name": name, "arguments": dict(arguments)})
     return key
 
 
-def _release(connection: Connection, command_id: int, actor: str) -> None:
-    octets = _commit(connection, command_id, "released", actor)
-    count = int.from_bytes(octets[2:4], "big") % SEQUENCE_COUNT_LIMIT
-    _note(connection, actor, "release", command_id, "released", {"sequence_count": count})
-
-
-def _commit(connection: Connection, command_id: int, state: str, actor: str) -> bytes:
-    """Give a telecommand its sequence count and its octets, which never change again."""
-    row = repository.get(connection, repository.TELECOMMANDS, command_id, "telecommand")
-    count = _next_count(connection, row["vehicle_id"])
-    octets = _packed(row["name"], row["arguments"], count)
-    repository.change(
+def _release(connection: Connection, row: repository.Row, actor: str) -> None:
+    """Give a queued telecommand its sequence count and its octets, which never change again."""
+    issued = _issued(connection, row["vehicle_id"], row["name"], row["arguments"], actor)
+    _decide(connection, row["id"], "released", **issued)
+    _note(
         connection,
-        repository.TELECOMMANDS,
-        command_id,
-        state=state,
-        decided_by=actor,
-        decided_utc_ns=utc_now_ns(),
-        sequence_count=count,
-        request_id=int.from_bytes(octets[:4], "big"),
-        octets=octets,
+        actor,
+        "release",
+        row["id"],
+        "released",
+        {"sequence_count": issued["sequence_count"]},
     )
-    return octets
+
+
+def _decide(connection: Connection, command_id: int, state: str, decided_by: str, **values: Any) -> None:
+    values.setdefault("decided_utc_ns", utc_now_ns())
+    move(connection, TELECOMMAND, command_id, state, expected=("queued",), decided_by=decided_by, **values)
+
+
+def _issued(
+    connection: Connection, vehicle: int, name: str, arguments: Mapping[str, Any], actor: str
+) -> dict[str, Any]:
+    """Columns of a telecommand that is given the next sequence count of its spacecraft."""
+    count = next_telecommand(connection, vehicle) % SEQUENCE_COUNT_LIMIT
+    octets = _packed(name, arguments, count)
+    return {
+        "sequence_count": count,
+        "request_id": int.from_bytes(octets[:4], "big"),
+        "octets": octets,
+        "decided_by": actor,
+        "decided_utc_ns": utc_now_ns(),
+    }
 
 
 def _packed(name: str, arguments: Mapping[str, Any], count: int) -> bytes:
     if name not in COMMANDS:
-        raise InvalidInput("telecommand", "name", ", ".join(COMMANDS), repr(name)[:80])
+        near = difflib.get_close_matches(name, COMMANDS, n=1) or COMMANDS[:1]
+        expected = f"one of the {len(COMMANDS)} telecommands of the dictionary, such as {near[0]}"
+        raise InvalidInput("telecommand", "name", expected, repr(name)[:80])
     try:
         return DICTIONARY.pack_command(name, dict(arguments), sequence_count=count)
     except TmtcError as error:
         raise InvalidInput("telecommand", name, "arguments as the dictionary says", str(error)) from None
-    except (TypeError, ValueError, OverflowError) as error:
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise InvalidInput("telecommand", name, "numbers or names as arguments", str(error)[:200]) from None
 
 
-def _is_critical(name: str, arguments: Mapping[str, Any]) -> bool:
-    if name == "perform_function":
-        labels = DICTIONARY.labels("perform_function", "function_id")
-        function = arguments.get("function_id")
-        return (labels.get(function) if isinstance(function, int) else function) in CRITICAL_FUNCTIONS
-    if name == "insert_activity":
-        return _carries_critical(name, arguments)
-    return name in CRITICAL_COMMANDS
-
-
-def _carries_critical(name: str, arguments: Mapping[str, Any]) -> bool:
-    """Whether a telecommand is in a scheduled one that needs a second person, or one that cannot be read."""
-    carrier = DICTIONARY.unpack_command(_packed(name, arguments, 0))
-    octets = bytes(np.asarray(carrier.values["items"]["octet"], dtype=np.uint8))
-    try:
-        inner = DICTIONARY.unpack_command(octets)
-    except TmtcError:
-        return True
-    return _is_critical(inner.name, inner.values)
-
-
-def _queued(connection: Connection, command_id: int) -> repository.Row:
-    row = repository.get(connection, repository.TELECOMMANDS, command_id, "telecommand")
-    if row["state"] != "queued":
-        raise Conflict(f"telecommand {command_id}: expected state queued, found {row['state']}")
-    return row
-
-
-def _next_count(connection: Connection, vehicle: int) -> int:
-    """The 14-bit sequence count after that of the newest released command."""
-    table = repository.TELECOMMANDS
-    connection.execute(
-        select(repository.VEHICLES.c.id).where(repository.VEHICLES.c.id == vehicle).with_for_update()
+def policy_of(connection: Connection, vehicle: int) -> ApprovalPolicy:
+    """Return the rule of a spacecraft about second persons: that of the dictionary, changed by its mission."""
+    row = repository.get(connection, repository.VEHICLES, vehicle, "spacecraft")
+    approval = approval_in_force(connection, int(row["ccsds_id"]))
+    return DEFAULT_POLICY.raised(*(approval.second_person_for or ())).relaxed(
+        *(approval.one_person_for or ())
     )
-    released = connection.execute(
-        select(func.count()).where(table.c.vehicle_id == vehicle, table.c.sequence_count.is_not(None))
-    ).scalar_one()
-    return int(released) % SEQUENCE_COUNT_LIMIT
+
+
+def _second_person(
+    connection: Connection, vehicle: int, name: str, arguments: Mapping[str, Any]
+) -> CommandEffect | None:
+    """The effect for which a telecommand needs a second person; None where it needs none."""
+    effect = effect_of(DICTIONARY, name, arguments, _packed(name, arguments, 0))
+    return effect if policy_of(connection, vehicle).needs_second_person(effect) else None
+
+
+def _require_approval(
+    connection: Connection, vehicle: int, name: str, arguments: Mapping[str, Any], approval: Approval | None
+) -> None:
+    """Refuse to release a telecommand at once that needs a second person, where no such person approved its window.
+
+    Raises
+    ------
+    Conflict
+        If nobody did, or the one who entered the window.
+    """
+    effect = _second_person(connection, vehicle, name, arguments)
+    if effect is None or (approval is not None and approval.entered_by != approval.approved_by):
+        return
+    raise Conflict(
+        f"telecommand {name}: is critical; expected a window that another person than who entered it has approved "
+        f"({effect.effect}: {effect.reason})"
+    )
 
 
 def _newest_ticks(connection: Connection, vehicle: int) -> int:

@@ -8,6 +8,7 @@ from ground_service.services.ground import Ground
 from ground_service.services.recorrelation import recorrelate_all
 from ground_service.services.users import audit
 from ground_service.store import repository
+from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile
 from lunar.ephemeris import load_ephemeris
 from lunar.errors import LunarError
@@ -30,6 +31,7 @@ def add_ephemeris(
         raise InvalidInput("ephemeris", "", "a CCSDS OEM or STK .e file", reason) from None
     now = utc_now_ns()
     with ground.database.writing() as connection:
+        hold(connection, f"ephemeris {stored.sha256}")
         repository.register_file(connection, stored, "ephemeris", name, now)
         known = repository.find(
             connection, repository.EPHEMERIDES, file_sha256=stored.sha256, precedence=precedence, name=name

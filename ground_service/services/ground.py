@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import logging
+import stat
 import threading
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,13 +12,16 @@ from typing import TYPE_CHECKING
 
 from ground_service.errors import Stopping, storage_error
 from ground_service.store.database import Database, prepare_database
-from ground_service.store.files import FileArchive
-from lunar.datafolder import DataFolder, default_gravity, default_orientation, find_data
+from ground_service.store.files import UNPACKING, FileArchive, make_durable_folder, remove_leftovers
+from ground_service.store.roles import check_role
+from lunar.datafolder import DataFolder, default_orientation, find_data
 
 if TYPE_CHECKING:
     from ground_service.settings import Settings
     from lunar.frames import Orientation
-    from lunar.gravity import GravityField
+
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +35,7 @@ class Ground:
     files: FileArchive
     home: Path
     data: DataFolder
+    runner: Path | None = None
     stopping: threading.Event = field(default_factory=threading.Event, compare=False, repr=False)
 
     def check_stopping(self) -> None:
@@ -48,16 +54,6 @@ class Ground:
         """The lunar orientation of the data at hand."""
         return _orientation(self.data)
 
-    @property
-    def gravity(self) -> GravityField:
-        """The gravity field of the data at hand."""
-        return _gravity(self.data)
-
-    @property
-    def other_gravity(self) -> GravityField | None:
-        """An independent gravity field, where the data at hand hold one."""
-        return _other_gravity(self.data)
-
     def __enter__(self) -> Ground:
         return self
 
@@ -69,7 +65,13 @@ class Ground:
         self.database.engine.dispose()
 
 
-def open_ground(home: Path, data: DataFolder | None = None, *, database_url: str | None = None) -> Ground:
+def open_ground(
+    home: Path,
+    data: DataFolder | None = None,
+    *,
+    database_url: str | None = None,
+    runner: Path | None = None,
+) -> Ground:
     """The ground service under `home`, its SQLite database created or brought up to date there.
 
     Parameters
@@ -80,34 +82,55 @@ def open_ground(home: Path, data: DataFolder | None = None, *, database_url: str
         Public data products; none means the built-in models.
     database_url
         Another database than ``home/linna.db``.
+    runner
+        Exchange folder of the runner that runs payload builds; None: a sandbox of this machine.
     """
     home = home.expanduser().absolute()
     try:
-        home.mkdir(parents=True, exist_ok=True)
+        make_durable_folder(home)
+        keep_private(home, 0o700)
     except OSError as error:
         raise storage_error(error, home) from None
     database = prepare_database(database_url or f"sqlite:///{home / 'linna.db'}")
-    return Ground(database, FileArchive(home / "files"), home, data if data is not None else DataFolder())
+    keep_private(home / "linna.db", 0o600)
+    files = FileArchive(home / "files")
+    files.remove_leftovers()
+    remove_leftovers(home, UNPACKING)
+    return Ground(database, files, home, data if data is not None else DataFolder(), runner)
+
+
+def keep_private(path: Path, mode: int) -> None:
+    """Take from everybody but the owner what `mode` does not give them; a warning where that is not ours to do."""
+    try:
+        found = stat.S_IMODE(path.stat().st_mode)
+        if found & ~mode & 0o077:
+            path.chmod(found & mode)
+    except FileNotFoundError:
+        return
+    except OSError:
+        log.warning("%s: expected mode %o or less, found %o; run 'chmod %o'", path, mode, found, mode)
 
 
 def ground_from_settings(settings: Settings) -> Ground:
-    """The ground service that the deployment's settings describe."""
+    """The ground service that the deployment's settings describe.
+
+    Raises
+    ------
+    PowerfulRole
+        Its database role could change the schema or the audit log, and the settings do not allow it.
+    """
     data = find_data(settings.data) if settings.data is not None else DataFolder()
-    return open_ground(settings.home, data, database_url=settings.resolved_database_url())
+    url = settings.resolved_database_url()
+    ground = open_ground(settings.home, data, database_url=url, runner=settings.runner_exchange)
+    try:
+        if not settings.allow_database_owner:
+            check_role(ground.database)
+    except BaseException:
+        ground.close()
+        raise
+    return ground
 
 
 @functools.lru_cache(maxsize=4)
 def _orientation(data: DataFolder) -> Orientation:
     return default_orientation(data)
-
-
-@functools.lru_cache(maxsize=4)
-def _other_gravity(data: DataFolder) -> GravityField | None:
-    from lunar.gravity import load_gravity
-
-    return load_gravity(data.gravity_alternative) if data.gravity_alternative is not None else None
-
-
-@functools.lru_cache(maxsize=4)
-def _gravity(data: DataFolder) -> GravityField:
-    return default_gravity(data)

@@ -15,17 +15,28 @@ from sqlalchemy import Connection
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import PASSING, GroundError, InvalidInput
-from ground_service.link.stream import DownlinkReader
+from ground_service.link.frames import ChannelEdge, is_checked
+from ground_service.link.packets import PacketBatch
+from ground_service.link.stream import (
+    BARE,
+    CADU_MAX_OCTETS,
+    PROBE_OCTETS,
+    DownlinkReader,
+    Link,
+    fragment_edges,
+)
 from ground_service.services.ground import Ground
-from ground_service.services.joining import join_with_others
+from ground_service.services.joining import Joiner
 from ground_service.services.recorrelation import recorrelate
-from ground_service.services.redecode import catch_up, note_dictionary
+from ground_service.services.redecode import catch_up
 from ground_service.services.window_progress import advance_windows
-from ground_service.store import repository
+from ground_service.store import edges, repository
 from ground_service.store.files import StoredFile, read_blocks
 from ground_service.store.packets import store_batch
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import TmtcError
+from tmtc.link import LinkSettings
+from tmtc.packets import PACKET_MAX_LENGTH
 
 FLOWN = "flight"
 """Instance of a spacecraft that telemetry belongs to when nothing else is said."""
@@ -33,12 +44,25 @@ FLOWN = "flight"
 Progress = Callable[[float], None]
 
 
+DEFAULT_LINKS = (Link(LinkSettings()), Link(LinkSettings(checksum=False)))
+"""Links that are tried where nothing is known of a spacecraft and a piece is too small to tell."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a file stands in a stream of octets, by what its sender says."""
+
+    stream: str
+    offset: int
+
+
 @dataclass(frozen=True, slots=True)
 class IngestResult:
     """What one ingest found in its file, and what of it was new.
 
-    `packets_joined` came about only together with files that were ingested before. `uplink` holds, for each spacecraft
-    and telecommand channel that the frames tell of, what `tmtc.clcw.UplinkSeen` says.
+    `packets_joined` came about only together with files that were ingested before, of `frames_joined` frames among
+    others. `octets_pending` cannot be used yet: they wait for the octets before or behind them. `uplink` holds, for
+    each spacecraft and telecommand channel that the frames tell of, what `tmtc.clcw.UplinkSeen` says.
     """
 
     ingest_id: int
@@ -51,8 +75,10 @@ class IngestResult:
     samples: int
     crc_errors: int
     octets_skipped: int
+    octets_pending: int
     frames: int
     frames_bad: int
+    frames_joined: int
     symbols_corrected: int
     unknown: int
     uplink: tuple[dict[str, Any], ...] = ()
@@ -65,6 +91,7 @@ def ingest_file(
     spacecraft_id: int | None = None,
     instance: str = FLOWN,
     name: str | None = None,
+    place: Place | None = None,
 ) -> IngestResult:
     """Archive a downlink file and store what is in it.
 
@@ -75,6 +102,8 @@ def ingest_file(
         carry none, so they need it.
     instance
         Which instance of the spacecraft the telemetry belongs to.
+    place
+        Where the file stands in its stream; without, by the order of arrival and by content.
 
     Raises
     ------
@@ -85,40 +114,71 @@ def ingest_file(
         raise InvalidInput(str(path), "", "a downlink file", "a folder" if path.is_dir() else "nothing there")
     stored = ground.files.put_file(path)
     return ingest_stored(
-        ground, stored, spacecraft_id=spacecraft_id, instance=instance, name=name or path.name
+        ground, stored, spacecraft_id=spacecraft_id, instance=instance, name=name or path.name, place=place
     )
 
 
 def ingest_stored(
-    ground: Ground, stored: StoredFile, *, spacecraft_id: int | None = None, instance: str = FLOWN, name: str
+    ground: Ground,
+    stored: StoredFile,
+    *,
+    spacecraft_id: int | None = None,
+    instance: str = FLOWN,
+    name: str,
+    place: Place | None = None,
 ) -> IngestResult:
     """Store what is in an archived downlink file; see `ingest_file`."""
-    ingest_id = begin_ingest(ground, stored, name)
-    return run_ingest(ground, ingest_id, spacecraft_id=spacecraft_id, instance=instance)
-
-
-def begin_ingest(ground: Ground, stored: StoredFile, name: str) -> int:
-    """Enter an archived file to be ingested; the id of the ingest."""
     with ground.database.writing() as connection:
-        return add_ingest(connection, stored, name)
+        ingest_id = add_ingest(
+            connection,
+            stored,
+            name,
+            spacecraft_id=spacecraft_id,
+            instance=instance,
+            place=place,
+            state="running",
+        )
+    return _run(ground, ingest_id, spacecraft_id, instance, again=False)
 
 
-def add_ingest(connection: Connection, stored: StoredFile, name: str) -> int:
-    """As `begin_ingest`, within the caller's transaction."""
+def add_ingest(
+    connection: Connection,
+    stored: StoredFile,
+    name: str,
+    *,
+    spacecraft_id: int | None = None,
+    instance: str = FLOWN,
+    place: Place | None = None,
+    state: str = "queued",
+) -> int:
+    """Enter an archived file to be ingested, within the caller's transaction; the id of the ingest."""
     now = utc_now_ns()
     repository.register_file(connection, stored, "downlink", name, now)
-    return int(
+    ingest_id = int(
         repository.add(
             connection,
             repository.INGESTS,
             vehicle_id=None,
             file_sha256=stored.sha256,
-            state="queued",
+            state=state,
             dictionary_version=DICTIONARY.version,
             received_utc_ns=now,
             accounting={},
         )
     )
+    edges.add_piece(
+        connection,
+        edges.Piece(
+            ingest_id=ingest_id,
+            scope=f"{instance}/{'*' if spacecraft_id is None else spacecraft_id}",
+            file_sha256=stored.sha256,
+            octets=stored.octets,
+            stream=place.stream if place is not None else "",
+            position=place.offset if place is not None else ingest_id,
+            links_tried=None,
+        ),
+    )
+    return ingest_id
 
 
 def run_ingest(
@@ -129,24 +189,28 @@ def run_ingest(
     instance: str = FLOWN,
     progress: Progress | None = None,
 ) -> IngestResult:
-    """Do what was entered with `begin_ingest`; running it again is harmless.
+    """Do what was entered with `add_ingest`; running it again is harmless.
 
     `progress` is told the share of the file that is stored, several times where it is long.
     """
     with ground.database.writing() as connection:
         record = repository.get(connection, repository.INGESTS, ingest_id, "ingest")
         repository.change(connection, repository.INGESTS, ingest_id, state="running")
-    path = ground.files.path(record["file_sha256"])
+    again = record["state"] != "queued"
+    return _run(ground, ingest_id, spacecraft_id, instance, again=again, progress=progress)
+
+
+def _run(
+    ground: Ground,
+    ingest_id: int,
+    spacecraft_id: int | None,
+    instance: str,
+    *,
+    again: bool,
+    progress: Progress | None = None,
+) -> IngestResult:
     try:
-        reader = DownlinkReader(spacecraft_id)
-        result = _store_stream(ground, ingest_id, reader, instance, record["file_sha256"], path, progress)
-        if result.packets == 0 and result.frames == result.frames_bad:
-            raise InvalidInput(
-                _name(ground, record["file_sha256"]),
-                "",
-                "a stream of CADUs or of space packets",
-                f"{result.octets} octets without a single good packet",
-            )
+        result = _read_piece(ground, ingest_id, spacecraft_id, instance, again, progress)
     except PASSING:
         raise
     except (GroundError, TmtcError) as error:
@@ -174,67 +238,214 @@ def run_ingest(
     return result
 
 
-def _store_stream(
+def _read_piece(
     ground: Ground,
     ingest_id: int,
-    reader: DownlinkReader,
+    spacecraft_id: int | None,
     instance: str,
-    sha256: str,
-    path: Path,
+    again: bool,
     progress: Progress | None,
 ) -> IngestResult:
-    vehicles: dict[int, int] = {}
-    new = samples = unknown = 0
-    total = max(path.stat().st_size, 1)
-    for batch in reader.batches(read_blocks(path)):
-        ground.check_stopping()
-        if len(batch) == 0 and (reader.edges is None or reader.edges.settings is None):
-            continue
-        if batch.spacecraft_id is None:
-            raise InvalidInput("downlink of bare packets", "", "the id of their spacecraft", "none given")
+    """Store what is in a piece and what comes about together with others, and read those that wait for its link."""
+    with ground.database.reading() as connection:
+        piece = edges.piece_of(connection, ingest_id)
+    reading = _Reading(ground, piece, spacecraft_id, instance, progress)
+    learned = reading.read()
+    for other in learned:
+        late = _Reading(ground, other, spacecraft_id, instance, None, vehicles=reading.vehicles)
+        late.read()
         with ground.database.writing() as connection:
-            if batch.spacecraft_id not in vehicles:
-                vehicle = repository.vehicle_id(connection, batch.spacecraft_id, instance)
-                note_dictionary(connection, vehicle)
-                vehicles[batch.spacecraft_id] = vehicle
-            stored = store_batch(connection, vehicles[batch.spacecraft_id], batch)
-        new += stored.new
-        samples += stored.samples
-        unknown += batch.unknown
-        if progress is not None:
-            progress(reader.accounting.octets / total)
-    joined = 0
-    if reader.edges is not None:
-        for spacecraft_id, vehicle in vehicles.items():
-            with ground.database.writing() as connection:
-                joined += join_with_others(
-                    connection, ground.files, vehicle, spacecraft_id, sha256, reader.edges
-                )
-    for vehicle in vehicles.values():
+            repository.change(
+                connection, repository.INGESTS, other.ingest_id, accounting=asdict(late.result())
+            )
+    for vehicle in reading.vehicles.values():
         catch_up(ground, vehicle)
-        if not recorrelate(ground, vehicle) and new + joined:
+        new = reading.new + reading.joiner.joined.packets
+        if (new or learned or again) and not recorrelate(ground, vehicle):
             advance_windows(ground, vehicle)
-    found = reader.accounting
-    return IngestResult(
-        ingest_id=ingest_id,
-        vehicle_id=next(iter(vehicles.values()), None),
-        octets=found.octets,
-        packets=found.packets,
-        packets_new=new + joined,
-        packets_joined=joined,
-        packets_repeated=found.packets - new,
-        samples=samples,
-        crc_errors=found.crc_errors,
-        octets_skipped=found.octets_skipped,
-        frames=found.frames,
-        frames_bad=found.frames_bad,
-        symbols_corrected=found.symbols_corrected,
-        unknown=unknown,
-        uplink=tuple(
-            {"spacecraft_id": spacecraft_id, **asdict(seen)}
-            for (spacecraft_id, _), seen in sorted(found.uplink.items())
-        ),
-    )
+    return reading.result()
+
+
+@dataclass(frozen=True, slots=True)
+class _Batch:
+    """Packets of a downlink, and what was cut off in its channels with them."""
+
+    packets: PacketBatch
+    channel_edges: list[ChannelEdge]
+
+
+class _Reading:
+    """The reading of one piece."""
+
+    def __init__(
+        self,
+        ground: Ground,
+        piece: edges.Piece,
+        spacecraft_id: int | None,
+        instance: str,
+        progress: Progress | None,
+        vehicles: dict[int, int] | None = None,
+    ) -> None:
+        self.ground = ground
+        self.piece = piece
+        self.spacecraft_id = spacecraft_id
+        self.instance = instance
+        self.progress = progress
+        self.vehicles: dict[int, int] = {} if vehicles is None else vehicles
+        self.joiner = Joiner(ground, piece, instance, spacecraft_id, self.vehicles)
+        self.new = self.samples = self.unknown = 0
+        self.reader = DownlinkReader(spacecraft_id)
+
+    def read(self) -> list[edges.Piece]:
+        """Read and join the piece; the pieces that can be read now that its link is known."""
+        while True:
+            with self.ground.database.reading() as connection:
+                known = edges.known_links(connection, self.piece.scope)
+            candidates = [*known, *(link for link in DEFAULT_LINKS if link not in known)]
+            self.reader = DownlinkReader(self.spacecraft_id, known=candidates)
+            last = self._store_batches()
+            link = self.reader.link
+            if link is not None:
+                with self.ground.database.writing() as connection:
+                    self._store(connection, last)
+                    self.joiner.keep_channel_edges(connection, self.reader.take_channel_edges())
+                    self.joiner.keep_edges(connection, link, self.reader.edges)
+                    self._learn(connection, link, known, None)
+                self.joiner.join()
+                return self._readable_now()
+            link = self._link_by_place(known) if self.piece.octets <= CADU_MAX_OCTETS else None
+            if link is None:
+                self._refuse_noise()
+            with self.ground.database.writing() as connection:
+                self._keep_fragment(connection, link, known)
+                edges.note_read(connection, self.piece.ingest_id, len(known))
+            self.joiner.join()
+            if link is not None and (self.joiner.joined.frames or self.joiner.joined.packets):
+                with self.ground.database.writing() as connection:
+                    self._learn(connection, link, known, len(known) + 1)
+                return self._readable_now()
+            with self.ground.database.reading() as connection:
+                if len(edges.known_links(connection, self.piece.scope)) == len(known):
+                    return []
+
+    def _learn(self, connection: Connection, link: Link, known: list[Link], links_tried: int | None) -> None:
+        edges.note_read(connection, self.piece.ingest_id, links_tried)
+        if link not in known:
+            edges.learn_link(connection, self.piece.scope, link)
+
+    def _readable_now(self) -> list[edges.Piece]:
+        with self.ground.database.reading() as connection:
+            links = len(edges.known_links(connection, self.piece.scope))
+            return [
+                edges.piece_of(connection, one)
+                for one in edges.pieces_to_read_again(connection, self.piece.scope, links)
+                if one != self.piece.ingest_id
+            ]
+
+    def _store_batches(self) -> _Batch | None:
+        """Store all batches of the file but the last one, which is returned."""
+        ground, total = self.ground, max(self.piece.octets, 1)
+        path = ground.files.path(self.piece.file_sha256)
+        last: _Batch | None = None
+        for batch in self.reader.batches(read_blocks(path)):
+            ground.check_stopping()
+            if batch.spacecraft_id is None:
+                raise InvalidInput("downlink of bare packets", "", "the id of their spacecraft", "none given")
+            if last is not None:
+                with self.ground.database.writing() as connection:
+                    self._store(connection, last)
+            last = _Batch(batch, self.reader.take_channel_edges())
+            if self.progress is not None:
+                self.progress(self.reader.accounting.octets / total)
+        return last
+
+    def _store(self, connection: Connection, found: _Batch | None) -> None:
+        if found is None or (not len(found.packets) and self.reader.link == BARE):
+            return
+        assert found.packets.spacecraft_id is not None
+        vehicle = self.joiner.vehicle(connection, found.packets.spacecraft_id)
+        self.joiner.keep_channel_edges(connection, found.channel_edges)
+        stored = store_batch(connection, vehicle, found.packets)
+        self.new += stored.new
+        self.samples += stored.samples
+        self.unknown += found.packets.unknown
+
+    def _link_by_place(self, known: list[Link]) -> Link | None:
+        """The link that a piece too small to show it came by, told from the octets around it."""
+        if known:
+            return None
+        with self.ground.database.reading() as connection:
+            before = edges.octets_before(connection, self.piece, PROBE_OCTETS // 4)
+            behind = edges.octets_behind(connection, self.piece, PROBE_OCTETS // 4)
+        if not before and not behind:
+            return None
+        parts = [*before, edges.Part(self.piece.file_sha256, 0, self.piece.octets), *behind]
+        octets = b"".join(self.ground.files.read(one.file_sha256, one.start, one.stop) for one in parts)
+        probe = DownlinkReader(self.spacecraft_id, known=DEFAULT_LINKS)
+        try:
+            for _ in probe.batches([octets]):
+                pass
+        except TmtcError:
+            return None
+        link = probe.link  # octets that only happened to come one after another must not make a link
+        certain = link is None or link.settings is None or is_checked(link.settings)
+        return link if certain else None
+
+    def _keep_fragment(self, connection: Connection, link: Link | None, known: list[Link]) -> None:
+        """Keep a piece in which nothing whole was found, by each link that it may have come by."""
+        links = [link] if link is not None else known or list(DEFAULT_LINKS[:1])
+        if not known and self.spacecraft_id is not None and BARE not in links:
+            links = [*links, BARE]
+        octets = b""
+        if self.piece.octets <= PACKET_MAX_LENGTH:
+            octets = self.ground.files.read(self.piece.file_sha256, 0, self.piece.octets)
+        for one in links:
+            self.joiner.keep_edges(connection, one, fragment_edges(octets, one.settings) if octets else [])
+
+    def _refuse_noise(self) -> None:
+        """Refuse what cannot be a fragment of anything.
+
+        Raises
+        ------
+        InvalidInput
+            If the piece is longer than any CADU or packet without holding one.
+        """
+        limit = 2 * CADU_MAX_OCTETS if self.spacecraft_id is None else PACKET_MAX_LENGTH
+        if self.piece.octets > limit:
+            raise InvalidInput(
+                _name(self.ground, self.piece.file_sha256),
+                "",
+                "a stream of CADUs or of space packets",
+                f"{self.piece.octets} octets without a single good packet",
+            )
+
+    def result(self) -> IngestResult:
+        """What the reading found."""
+        found, joined = self.reader.accounting, self.joiner.joined
+        with self.ground.database.reading() as connection:
+            pending = edges.octets_pending(connection, self.piece.file_sha256)
+        return IngestResult(
+            ingest_id=self.piece.ingest_id,
+            vehicle_id=next(iter(self.vehicles.values()), None),
+            octets=found.octets,
+            packets=found.packets,
+            packets_new=self.new + joined.packets,
+            packets_joined=joined.packets,
+            packets_repeated=found.packets - self.new,
+            samples=self.samples + joined.samples,
+            crc_errors=found.crc_errors,
+            octets_skipped=found.octets_skipped,
+            octets_pending=pending,
+            frames=found.frames,
+            frames_bad=found.frames_bad,
+            frames_joined=joined.frames,
+            symbols_corrected=found.symbols_corrected,
+            unknown=self.unknown,
+            uplink=tuple(
+                {"spacecraft_id": spacecraft_id, **asdict(seen)}
+                for (spacecraft_id, _), seen in sorted(found.uplink.items())
+            ),
+        )
 
 
 def _name(ground: Ground, sha256: str) -> str:

@@ -15,19 +15,28 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from sqlalchemy import Connection, select
-from sqlalchemy.exc import IntegrityError
 
 from ground_service.clock import utc_now_ns
-from ground_service.errors import PASSING, GroundError, InvalidInput
+from ground_service.errors import (
+    PASSING,
+    Conflict,
+    GroundError,
+    InvalidInput,
+    StateConflict,
+    public_text,
+    storage_error,
+)
 from ground_service.services.archive_zip import import_zip
 from ground_service.services.feed import publish
 from ground_service.services.ground import Ground
-from ground_service.services.ingest import add_ingest, run_ingest
+from ground_service.services.ingest import Place, add_ingest, run_ingest
 from ground_service.services.redecode import catch_up, redecode_job_id, vehicles_behind
 from ground_service.services.reports import make_report
 from ground_service.services.upkeep import nightly
 from ground_service.store import repository
+from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile
+from ground_service.store.states import JOB, change_if, move
 from lunar.errors import LunarError
 from reports.errors import ReportError
 from tmtc.errors import TmtcError
@@ -92,6 +101,17 @@ WORK: dict[str, Work] = {
 }
 """What can be asked for, by kind. Each may be run twice with the same arguments and job without harm."""
 
+IDENTITY = {
+    "report": ("pass_id",),
+    "archive": ("sha256",),
+    "replay": ("archive", "build"),
+    "regression": ("candidate", "baseline"),
+    "redecode": ("vehicle_id",),
+}
+"""Arguments by which a request for a job under an id that is known is the same request."""
+
+_OTHER_REQUEST = "Idempotency-Key: expected the request that it was first sent with, found another"
+
 
 def enter_job(ground: Ground, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
     """Enter a job to be done; its id. Entering the same id again changes nothing."""
@@ -102,29 +122,73 @@ def enter_job(ground: Ground, kind: str, arguments: Mapping[str, Any], *, job_id
 def add_job(
     connection: Connection, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None
 ) -> str:
-    """As `enter_job`, within the caller's transaction."""
+    """As `enter_job`, within the caller's transaction.
+
+    Raises
+    ------
+    Conflict
+        If the id stands for a job that does something else.
+    """
     if kind not in WORK:
         raise InvalidInput("job", "kind", " or ".join(WORK), kind)
     identity = job_id or uuid.uuid4().hex
-    if repository.find(connection, repository.JOBS, id=identity) is not None:
-        return identity
-    try:
-        with connection.begin_nested():
-            repository.add(
-                connection,
-                repository.JOBS,
-                id=identity,
-                kind=kind,
-                state="queued",
-                arguments=dict(arguments),
-                progress=0.0,
-                attempts=0,
-                created_utc_ns=utc_now_ns(),
-            )
-    except IntegrityError:
-        return identity  # another process entered it at the same time
-    publish(connection, "job", {"id": identity, "kind": kind, "state": "queued"})
+    added = repository.add_new(
+        connection,
+        repository.JOBS,
+        id=identity,
+        kind=kind,
+        state="queued",
+        arguments=dict(arguments),
+        progress=0.0,
+        attempts=0,
+        created_utc_ns=utc_now_ns(),
+    )
+    if added:
+        publish(connection, "job", {"id": identity, "kind": kind, "state": "queued"})
+    else:
+        known = repository.get(connection, repository.JOBS, identity, "job")
+        if known["kind"] != kind or any(
+            known["arguments"].get(name) != arguments.get(name) for name in IDENTITY.get(kind, ())
+        ):
+            raise Conflict(_OTHER_REQUEST)
     return identity
+
+
+def enter_jobs(
+    ground: Ground,
+    first: Mapping[str, Mapping[str, Any]],
+    kind: str,
+    arguments: Mapping[str, Any],
+    job_id: str,
+) -> list[str]:
+    """Enter a job and the replays that it needs first, all or none; the ids of what is to be started, in this order.
+
+    Where the job was entered before, nothing is added and nothing is to be started but the job.
+
+    Parameters
+    ----------
+    first
+        Arguments of the replays by a name of each within the job.
+
+    Raises
+    ------
+    Conflict
+        If the id stands for a job that does something else.
+    """
+    with ground.database.writing() as connection:
+        hold(connection, f"job {job_id}")
+        new = repository.find(connection, repository.JOBS, id=job_id) is None
+        before = [
+            add_job(
+                connection,
+                "replay",
+                given,
+                job_id=hashlib.blake2b(f"{job_id} {name}".encode(), digest_size=16).hexdigest(),
+            )
+            for name, given in first.items()
+            if new
+        ]
+        return [*before, add_job(connection, kind, arguments, job_id=job_id)]
 
 
 def enter_ingest(
@@ -134,17 +198,44 @@ def enter_ingest(
     *,
     spacecraft_id: int | None,
     instance: str,
+    place: Place | None = None,
     job_id: str | None = None,
 ) -> tuple[int, str]:
-    """Enter an archived file and the job that ingests it, both or neither; their ids. The same job again: the same."""
+    """Enter an archived file and the job that ingests it, both or neither; their ids. The same job again: the same.
+
+    Raises
+    ------
+    Conflict
+        If the id stands for the ingest of something else.
+    """
     with ground.database.writing() as connection:
         if job_id is not None:
+            hold(connection, f"job {job_id}")
             known = repository.find(connection, repository.JOBS, id=job_id)
             if known is not None:
-                return int(known["arguments"]["ingest_id"]), job_id
-        ingest_id = add_ingest(connection, stored, name)
+                return _known_ingest(connection, known, stored, spacecraft_id, instance), job_id
+        ingest_id = add_ingest(
+            connection, stored, name, spacecraft_id=spacecraft_id, instance=instance, place=place
+        )
         arguments = {"ingest_id": ingest_id, "spacecraft_id": spacecraft_id, "instance": instance}
         return ingest_id, add_job(connection, "ingest", arguments, job_id=job_id)
+
+
+def _known_ingest(
+    connection: Connection,
+    job: Mapping[str, Any],
+    stored: StoredFile,
+    spacecraft_id: int | None,
+    instance: str,
+) -> int:
+    """The ingest of a job that was entered before with the same file and for the same spacecraft."""
+    asked = {"spacecraft_id": spacecraft_id, "instance": instance}
+    if job["kind"] == "ingest" and asked.items() <= job["arguments"].items():
+        ingest_id = int(job["arguments"]["ingest_id"])
+        record = repository.get(connection, repository.INGESTS, ingest_id, "ingest")
+        if record["file_sha256"] == stored.sha256:
+            return ingest_id
+    raise Conflict(_OTHER_REQUEST)
 
 
 def enter_redecoding(ground: Ground) -> list[str]:
@@ -156,7 +247,7 @@ def enter_redecoding(ground: Ground) -> list[str]:
 
 
 def run_job(ground: Ground, job_id: str) -> dict[str, Any]:
-    """Do a job that was entered; its row afterwards. A job that fails for its input says why and is not repeated.
+    """Do a job that was entered; its row afterwards. A job that fails says why and is not repeated, whatever the error.
 
     A job that somebody else is doing now, here or in another process, is left to that one.
 
@@ -174,39 +265,58 @@ def run_job(ground: Ground, job_id: str) -> dict[str, Any]:
 
 def _run_alone(ground: Ground, job_id: str) -> dict[str, Any]:
     with ground.database.writing() as connection:
-        job = repository.get(connection, repository.JOBS, job_id, "job")
+        job = repository.get(connection, repository.JOBS, job_id, JOB.kind)
         if job["state"] in FINISHED:
             return job
-        repository.change(
-            connection,
-            repository.JOBS,
-            job_id,
-            state="running",
-            attempts=job["attempts"] + 1,
-            started_utc_ns=utc_now_ns(),
-        )
+        attempt = int(job["attempts"]) + 1
+        try:
+            move(
+                connection,
+                JOB,
+                job_id,
+                "running",
+                where={"attempts": job["attempts"]},
+                attempts=attempt,
+                started_utc_ns=utc_now_ns(),
+            )
+        except StateConflict:  # somebody else has begun it since it was read
+            return repository.get(connection, repository.JOBS, job_id, JOB.kind)
         publish(connection, "job", {"id": job_id, "kind": job["kind"], "state": "running"})
-    if job["attempts"] >= ATTEMPTS_LIMIT:
+    if attempt > ATTEMPTS_LIMIT:
         error = f"given up after {ATTEMPTS_LIMIT} attempts that did not come to an end"
-        return _finish(ground, job_id, state="failed", error=error)
+        return _finish(ground, job_id, attempt, state="failed", error=error)
     log.info("job %s (%s) begins", job_id, job["kind"], extra={"job": job_id, "kind": job["kind"]})
     try:
         result = WORK[job["kind"]](ground, job["arguments"], job_id)
+        return _finish(ground, job_id, attempt, state="done", result=result, progress=1.0, error=None)
     except PASSING as error:
         log.info("job %s (%s) is to be done again: %s", job_id, job["kind"], error)
-        _put_back(ground, job)
+        _put_back(ground, job_id, attempt)
         raise
     except (GroundError, TmtcError, LunarError, ReportError) as error:
         log.warning("job %s (%s) failed: %s", job_id, job["kind"], error)
-        return _finish(ground, job_id, state="failed", error=str(error))
-    return _finish(ground, job_id, state="done", result=result, progress=1.0, error=None)
+        return _finish(ground, job_id, attempt, state="failed", error=public_text(error))
+    except Exception as error:  # whatever it is: the job is at its end, and says so
+        translated = storage_error(error, "archive") if isinstance(error, OSError) else None
+        if isinstance(translated, PASSING):
+            log.info("job %s (%s) is to be done again: %s", job_id, job["kind"], error)
+            _put_back(ground, job_id, attempt)
+            raise translated from error
+        log.exception("job %s (%s) met an unexpected error", job_id, job["kind"], extra={"job": job_id})
+        return _finish(ground, job_id, attempt, state="failed", error=public_text(error))
 
 
-def _put_back(ground: Ground, job: Mapping[str, Any]) -> None:
+def _put_back(ground: Ground, job_id: str, attempt: int) -> None:
     """Queue a job again that something else broke off; that is no attempt of its own. Not being able to is no harm."""
-    with suppress(*PASSING), ground.database.writing() as connection:
-        repository.change(
-            connection, repository.JOBS, job["id"], state="queued", attempts=job["attempts"], progress=0.0
+    with suppress(*PASSING, StateConflict), ground.database.writing() as connection:
+        move(
+            connection,
+            JOB,
+            job_id,
+            "queued",
+            where={"attempts": attempt},
+            attempts=attempt - 1,
+            progress=0.0,
         )
 
 
@@ -219,7 +329,7 @@ def _progress_of(ground: Ground, job_id: str) -> Callable[[float], None]:
         if share - kept >= PROGRESS_STEP and share < 1.0:
             kept = share
             with ground.database.writing() as connection:
-                repository.change(connection, repository.JOBS, job_id, progress=share)
+                change_if(connection, repository.JOBS, job_id, {"state": "running"}, progress=share)
 
     return keep
 
@@ -246,10 +356,23 @@ def _lock_key(job_id: str) -> int:
     return int.from_bytes(hashlib.blake2b(job_id.encode(), digest_size=8).digest(), "big", signed=True)
 
 
-def _finish(ground: Ground, job_id: str, **values: Any) -> dict[str, Any]:
+def _finish(ground: Ground, job_id: str, attempt: int, *, state: str, **values: Any) -> dict[str, Any]:
+    """End the attempt of a job; a job that was taken up again by somebody else meanwhile is left to that one."""
     with ground.database.writing() as connection:
-        repository.change(connection, repository.JOBS, job_id, finished_utc_ns=utc_now_ns(), **values)
-        job = repository.get(connection, repository.JOBS, job_id, "job")
+        try:
+            move(
+                connection,
+                JOB,
+                job_id,
+                state,
+                where={"attempts": attempt},
+                finished_utc_ns=utc_now_ns(),
+                **values,
+            )
+        except StateConflict as error:
+            log.warning("job %s: attempt %d ends after another was begun: %s", job_id, attempt, error)
+            return repository.get(connection, repository.JOBS, job_id, JOB.kind)
+        job = repository.get(connection, repository.JOBS, job_id, JOB.kind)
         publish(
             connection,
             "job",

@@ -1,149 +1,692 @@
-"""Putting together what was cut apart between two files: a packet or a frame that ends in one and goes on in the next.
+"""Joining of what was cut apart between pieces of a downlink, at any octet, in whatever order the pieces come.
 
-Every ingested file leaves a note of how it begins and ends. When two of them fit (the loose octets make up one whole
-frame, the frame counts follow each other, or the loose octets make up one packet), the octets around the cut are
-read as one stream and stored like any others. Since all pairs are tried whichever file came first, the archive does
-not depend on the order. A file has to hold at least one whole frame (or packet) to be placed.
+A CADU that stands in several pieces is put together from its neighbours by place (what the sender said of the position,
+or the order of arrival), else by content: a beginning and an end whose lengths make up one CADU and whose frame counts
+follow. A packet that stands in several runs of frames is put together by the counts of its channel. The codes and
+checksums of the CADU or packet decide in every case; octets that fit nowhere yet wait.
+
+Edges are committed before their neighbours are looked for. Of two pieces that are ingested at once, at least the later
+therefore sees the edges of both, and no lock is held while anything is decoded. What joining gives is stored in at most
+two transactions: one for CADUs or bare packets, one for the packets of channels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import islice, permutations
 from typing import Any
 
-from sqlalchemy import Connection, select
+import numpy as np
+from numpy.typing import NDArray
 
-from ground_service.link.packets import PacketBatch
-from ground_service.link.stream import DownlinkReader, StreamEdges, reach_octets
+from ground_service.link.edges import CLOSER, MIDDLE, OPENER, PLACED, UNKNOWN, Edge, packet_octets_missing
+from ground_service.link.frames import (
+    ChannelEdge,
+    ChannelReader,
+    FrameBlock,
+    is_checked,
+    marker_errors,
+    packets_end,
+    read_frames,
+)
+from ground_service.link.packets import batch_of_cut
+from ground_service.link.stream import BARE, Link
+from ground_service.services.ground import Ground
+from ground_service.services.redecode import note_dictionary
+from ground_service.store import edges as store
 from ground_service.store import repository
-from ground_service.store.files import FileArchive
+from ground_service.store.edges import Part, Piece, StoredEdge
 from ground_service.store.packets import store_batch
-from tmtc.downlink import LinkSettings
-from tmtc.packets import PRIMARY_HEADER_LENGTH
+from tmtc import reed_solomon
+from tmtc.cadu import ASM_LENGTH, DEFAULT_TOLERANCE
+from tmtc.crc import crc16
+from tmtc.dictionary import DICTIONARY
+from tmtc.link import LinkSettings
+from tmtc.packets import IDLE_APID, PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH
+from tmtc.randomiser import randomise
+from tmtc.schema import as_octets
+from tmtc.stream import cut_packets
 
-COUNT_MODULUS = 256
+OctetArray = NDArray[np.uint8]
 
-Edge = dict[str, Any]
+MIDDLES_LIMIT = 512
+"""Pieces without any place that are tried, the newest first."""
 
+MIDDLES_IN_A_CADU = 7
+ARRANGEMENTS_LIMIT = 5_040
+"""How many pieces without a place one CADU may have, and how many arrangements of the right length are tried."""
 
-def join_with_others(
-    connection: Connection,
-    files: FileArchive,
-    vehicle: int,
-    spacecraft_id: int,
-    sha256: str,
-    edges: StreamEdges,
-) -> int:
-    """Note how a file begins and ends, and store what it completes together with files noted before.
+ANY_COUNT_LIMIT = 16
+"""Edges of the right length and another frame count that are tried, the newest first: counts are told from the frames
+around a CADU, and are wrong where these are of another spacecraft."""
 
-    Returns how many packets that gave.
-    """
-    # One file at a time: of two that are ingested at once, the later has to see the edges of the earlier.
-    vehicles = repository.VEHICLES
-    connection.execute(select(vehicles.c.id).where(vehicles.c.id == vehicle).with_for_update())
-    table = repository.STREAM_EDGES
-    known = connection.execute(select(table).where(table.c.vehicle_id == vehicle)).mappings()
-    others = [dict(row) for row in known]
-    mine = next((row for row in others if row["file_sha256"] == sha256), None)
-    if mine is None:
-        mine = {
-            "vehicle_id": vehicle,
-            "file_sha256": sha256,
-            "link": asdict(edges.settings) if edges.settings is not None else None,
-            "octets": edges.octets,
-            "head_loose": edges.head_loose,
-            "tail_loose": edges.tail_loose,
-            "head_count": edges.head_count,
-            "tail_count": edges.tail_count,
-        }
-        repository.add(connection, table, **mine)
-        others.append(mine)
-    new = 0
-    for before in others:
-        for after in others:
-            if (before is mine or after is mine) and _fit(files, before, after):
-                for batch in _across(files, others, before, after, spacecraft_id):
-                    new += store_batch(connection, vehicle, batch).new
-    return new
+REPAIRS_LIMIT = 4
+"""Arrangements that are repaired when none is free of errors."""
+
+PATHS_LIMIT = 256
+"""Ways through middles that are followed for one packet."""
 
 
-def _fit(files: FileArchive, before: Edge, after: Edge) -> bool:
-    """Whether `after` may go on where `before` ends."""
-    if before is after or before["link"] != after["link"]:
-        return False
-    loose = before["tail_loose"] + after["head_loose"]
-    if before["link"] is None:
-        return (
-            before["tail_loose"] > 0
-            and after["head_loose"] > 0
-            and _makes_a_packet(files, before, after, loose)
+@dataclass(slots=True)
+class Joined:
+    """What joining gave."""
+
+    packets: int = 0
+    samples: int = 0
+    frames: int = 0
+
+
+@dataclass(slots=True)
+class _Found:
+    """What joining has found and not stored yet: packets by spacecraft, edges, and the octets that are used by it."""
+
+    packets: dict[int, list[bytes]] = field(default_factory=dict)
+    channel_edges: list[ChannelEdge] = field(default_factory=list)
+    openers: list[tuple[str, str, Edge]] = field(default_factory=list)
+    used: dict[int, StoredEdge] = field(default_factory=dict)
+    parts: list[tuple[str, Part]] = field(default_factory=list)
+
+    def __bool__(self) -> bool:
+        return bool(self.packets or self.channel_edges or self.openers or self.used or self.parts)
+
+    def uses(self, edge: StoredEdge) -> bool:
+        """Whether an edge is used up."""
+        if edge.id in self.used:
+            return not store.is_reusable(edge.edge)
+        return not store.is_reusable(edge.edge) and any(
+            domain == edge.domain
+            and part.file_sha256 == edge.file_sha256
+            and edge.edge.start is not None
+            and part.start <= edge.edge.start
+            and edge.edge.start + len(edge.edge.octets) <= part.stop
+            for domain, part in self.parts
         )
-    cadu_length = LinkSettings(**before["link"]).cadu_length
-    if loose not in (0, cadu_length):
+
+
+@dataclass(slots=True)
+class Joiner:
+    """Joins one piece with all others of its scope.
+
+    `vehicles` are the ids of vehicles by spacecraft, added to as spacecraft are met.
+    """
+
+    ground: Ground
+    piece: Piece
+    instance: str
+    spacecraft_id: int | None
+    vehicles: dict[int, int]
+    joined: Joined = field(default_factory=Joined)
+    _channels: list[tuple[str, bytes]] = field(default_factory=list)
+    _raw: list[tuple[Link, list[bytes]]] = field(default_factory=list)
+    _found: _Found = field(default_factory=_Found)
+
+    def vehicle(self, connection: repository.Connection, spacecraft: int) -> int:
+        """Return the id of the vehicle of a spacecraft, made when it is new."""
+        if spacecraft not in self.vehicles:
+            vehicle = repository.vehicle_id(connection, spacecraft, self.instance)
+            note_dictionary(connection, vehicle)
+            self.vehicles[spacecraft] = vehicle
+        return self.vehicles[spacecraft]
+
+    def keep_channel_edges(self, connection: repository.Connection, edges: Sequence[ChannelEdge]) -> None:
+        """Keep what was cut off in channels, within the caller's transaction, to be joined by `join`."""
+        by_domain: dict[str, list[Edge]] = {}
+        for one in edges:
+            spacecraft, channel, start, stop = one.channel
+            domain = f"channel {self.vehicle(connection, spacecraft)} {channel} {start} {stop}"
+            by_domain.setdefault(domain, []).append(one.edge)
+        for domain, mine in sorted(by_domain.items()):
+            self._channels += [(domain, identity) for identity in store.add_edges(connection, domain, mine)]
+
+    def keep_edges(self, connection: repository.Connection, link: Link, edges: Sequence[Edge]) -> None:
+        """Keep the edges of the piece, which came by `link`, within the caller's transaction."""
+        domain = raw_domain(self.piece.scope, link)
+        if self.piece.stream:
+            edges = [replace(one, role=PLACED) if one.role == MIDDLE else one for one in edges]
+        mine = store.add_edges(connection, domain, edges, self.piece.file_sha256)
+        self._raw.append((link, mine))
+
+    def join(self) -> None:
+        """Join the edges that were kept and committed, and all that comes about by it."""
+        for link, identities in self._raw:
+            domain = raw_domain(self.piece.scope, link)
+            if link.settings is not None:
+                with self.ground.database.reading() as connection:
+                    self._join_cadus_by_place(connection, domain, link.settings)
+                    for edge in self._open(connection, domain, identities):
+                        self._join_cadu_by_content(connection, domain, link.settings, edge)
+                self._store()
+            elif self.spacecraft_id is not None:
+                with self.ground.database.reading() as connection:
+                    self._join_packets_by_place(connection, domain)
+                waiting = [*identities, *self._store()]
+                while waiting:
+                    with self.ground.database.reading() as connection:
+                        for edge in self._open(connection, domain, waiting):
+                            self._join_packet_by_content(connection, domain, edge)
+                    waiting = self._store()
+        self._raw.clear()
+        self._join_channels()
+        self._store()
+
+    def _store(self) -> list[bytes]:
+        """Store what was found, in one transaction; the identities of beginnings of packets that wait since then.
+
+        All transactions write in this order, so that none waits for another in a circle.
+        """
+        found, self._found = self._found, _Found()
+        if not found:
+            return []
+        batches = {}
+        for spacecraft, packets in found.packets.items():
+            octets = b"".join(packets)
+            batches[spacecraft] = batch_of_cut(octets, cut_packets(octets), DICTIONARY, spacecraft)
+        waiting: list[bytes] = []
+        with self.ground.database.writing() as connection:
+            store.use_edges(connection, found.used.values(), found.parts)
+            for domain, file_sha256, opener in found.openers:
+                waiting += store.add_edges(connection, domain, [opener], file_sha256)
+            self.keep_channel_edges(connection, found.channel_edges)
+            vehicles = {self.vehicle(connection, spacecraft): spacecraft for spacecraft in batches}
+            for vehicle, spacecraft in sorted(vehicles.items()):
+                stored = store_batch(connection, vehicle, batches[spacecraft])
+                self.joined.packets += stored.new
+                self.joined.samples += stored.samples
+        return waiting
+
+    def _open(
+        self, connection: repository.Connection, domain: str, identities: Sequence[bytes]
+    ) -> Iterator[StoredEdge]:
+        """Those of these edges that wait, each as long as what was found since does not use it."""
+        for edge in store.open_edges(connection, domain, identities):
+            if edge.edge.role != PLACED and not self._found.uses(edge):
+                yield edge
+
+    def _candidates(
+        self, connection: repository.Connection, domain: str, role: int, **wanted: Any
+    ) -> list[StoredEdge]:
+        found = store.candidates(connection, domain, role, **wanted)
+        return [edge for edge in found if not self._found.uses(edge)]
+
+    def _use(self, edges: Sequence[StoredEdge]) -> None:
+        self._found.used.update((edge.id, edge) for edge in edges)
+
+    # CADUs
+
+    def _join_cadus_by_place(
+        self, connection: repository.Connection, domain: str, settings: LinkSettings
+    ) -> None:
+        length, octets = settings.cadu_length, self.piece.octets
+        before = store.octets_before(connection, self.piece, length - 1)
+        behind = store.octets_behind(connection, self.piece, length + ASM_LENGTH - 1)
+        sha256 = self.piece.file_sha256
+        reach = length + ASM_LENGTH - 1
+        if octets <= 2 * reach:
+            contexts = [([*before, Part(sha256, 0, octets), *behind], before, octets)]
+        else:
+            contexts = [
+                ([*before, Part(sha256, 0, reach)], before, reach),
+                ([Part(sha256, octets - reach, octets), *behind], [], reach),
+            ]
+        for parts, ahead, mine in contexts:
+            if len(parts) == 1:
+                continue
+            stream = as_octets(b"".join(self._octets(part) for part in parts))
+            start = sum(part.stop - part.start for part in ahead)
+            slots = _slots_across(stream, start, start + mine, settings)
+            if not slots.size:
+                continue
+            block = read_frames(stream, slots, settings)
+            for offset in self._take_frames(block):
+                self._found.parts += [(domain, part) for part in _within(parts, offset, offset + length)]
+
+    def _join_cadu_by_content(
+        self, connection: repository.Connection, domain: str, settings: LinkSettings, edge: StoredEdge
+    ) -> None:
+        length = settings.cadu_length
+        counts = [edge.edge.count if edge.edge.role == CLOSER else edge.edge.next_count, UNKNOWN]
+        if edge.edge.role != MIDDLE:
+            other = CLOSER if edge.edge.role == OPENER else OPENER
+            for found in self._with_count_first(connection, domain, other, edge.edge.fit, counts):
+                pairs = [[edge, one] if other == CLOSER else [one, edge] for one in found]
+                if pairs and self._try_cadus(settings, pairs):
+                    return
+        if self.piece.stream:
+            return  # what lacks octets without a place waits for those with one
+        for arrangement in self._with_middles(connection, domain, edge, counts, length):
+            if self._try_cadus(settings, arrangement):
+                return
+
+    def _with_count_first(
+        self, connection: repository.Connection, domain: str, role: int, fit: int, counts: list[int]
+    ) -> Iterator[list[StoredEdge]]:
+        """Edges of the right length: those of the right count, and then those of any."""
+        if counts[0] == UNKNOWN:
+            yield self._candidates(connection, domain, role, fit=(fit,))
+            return
+        right = self._candidates(connection, domain, role, fit=(fit,), count=counts)
+        yield right
+        tried = {one.id for one in right}
+        found = self._candidates(connection, domain, role, fit=(fit,), limit=ANY_COUNT_LIMIT)
+        yield [one for one in found if one.id not in tried]
+
+    def _with_middles(
+        self, connection: repository.Connection, domain: str, edge: StoredEdge, counts: list[int], length: int
+    ) -> Iterator[list[list[StoredEdge]]]:
+        """Arrangements of a CADU with pieces that have no place of their own, those of fewer pieces first."""
+        middles = self._candidates(connection, domain, MIDDLE, limit=MIDDLES_LIMIT)
+        if not middles:
+            return
+        wanted = None if counts[0] == UNKNOWN else counts
+        openers = [edge] if edge.edge.role == OPENER else []
+        closers = [edge] if edge.edge.role == CLOSER else []
+        openers = openers or self._candidates(connection, domain, OPENER, count=wanted, limit=MIDDLES_LIMIT)
+        closers = closers or self._candidates(connection, domain, CLOSER, count=wanted, limit=MIDDLES_LIMIT)
+        pairs = [
+            (opener, [closer], length - len(opener.edge.octets) - len(closer.edge.octets))
+            for opener in openers
+            for closer in closers
+            if _counts_fit(opener.edge.next_count, closer.edge.count)
+        ]
+        if edge.edge.role != CLOSER:  # the last CADU of a stream, which no marker follows
+            pairs += [(opener, [], opener.edge.fit) for opener in openers]
+        by_length: dict[int, list[tuple[StoredEdge, list[StoredEdge]]]] = {}
+        for opener, ending, missing in pairs:
+            by_length.setdefault(missing, []).append((opener, ending))
+        must = (edge,) if edge.edge.role == MIDDLE else ()
+        others = [one for one in middles if one.id != edge.id]
+        arrangements = (
+            [opener, *chosen, *ending]
+            for subset in _subsets(must, others, by_length)
+            for chosen in permutations(subset)
+            for opener, ending in by_length[sum(len(one.edge.octets) for one in subset)]
+        )
+        budget = islice(arrangements, ARRANGEMENTS_LIMIT)
+        while some := list(islice(budget, 256)):
+            yield some
+
+    def _try_cadus(self, settings: LinkSettings, arrangements: list[list[StoredEdge]]) -> bool:
+        """Whether one of these arrangements of edges is a CADU; its packets are taken then."""
+        length = settings.cadu_length
+        code = settings.code
+        for first in range(0, len(arrangements), 256):
+            some = arrangements[first : first + 256]
+            stream = as_octets(b"".join(one.edge.octets for arrangement in some for one in arrangement))
+            offsets = np.arange(len(some), dtype=np.int64) * length
+            if code is not None and len(some) > 1:
+                blocks = randomise(stream.reshape(-1, length)[:, ASM_LENGTH:], settings.randomiser)
+                clean = np.flatnonzero(reed_solomon.clean(blocks, code).all(axis=1))
+                if not clean.size and first == 0:
+                    clean = np.arange(min(len(some), REPAIRS_LIMIT))
+                offsets = offsets[clean]
+            block = read_frames(stream, offsets, settings)
+            for offset in self._take_frames(block):
+                if is_checked(settings):
+                    self._use(some[offset // length])
+                    return True
         return False
-    if before["tail_count"] is None or after["head_count"] is None:
-        return True
-    step = 2 if loose else 1
-    return bool((before["tail_count"] + step) % COUNT_MODULUS == after["head_count"])
+
+    def _take_frames(self, block: FrameBlock) -> list[int]:
+        """Take the packets of good frames, each for itself; the offsets of those frames."""
+        used = []
+        for index in np.flatnonzero(block.good).tolist():
+            spacecraft = int(block.header.spacecraft_id[index])
+            if self.spacecraft_id is not None and spacecraft != self.spacecraft_id:
+                continue
+            known = spacecraft in self.vehicles or spacecraft in self._found.packets
+            if not is_checked(block.settings) and not (known and block.frames[index, 4] >> 3 == 0b00011):
+                continue
+            reader = ChannelReader(DICTIONARY)
+            buffer, cut = reader.cut(block.only(index), spacecraft)
+            reader.close()
+            self._found.packets.setdefault(spacecraft, []).extend(cut.packets(buffer))
+            self._found.channel_edges += reader.edges
+            self.joined.frames += 1
+            used.append(int(block.offsets[index]))
+        return used
+
+    # packets of channels
+
+    def _join_channels(self) -> None:
+        by_domain: dict[str, list[bytes]] = {}
+        for domain, identity in self._channels:
+            by_domain.setdefault(domain, []).append(identity)
+        self._channels.clear()
+        if not by_domain:
+            return
+        with self.ground.database.reading() as connection:
+            for domain, identities in by_domain.items():
+                for edge in self._open(connection, domain, identities):
+                    self._join_channel(connection, domain, edge)
+
+    def _join_channel(self, connection: repository.Connection, domain: str, edge: StoredEdge) -> None:
+        """Join the packet that an edge of a channel belongs to."""
+        for path in self._channel_paths(connection, domain, edge):
+            octets = b"".join(one.edge.octets for one in path)
+            if _is_packet(octets):
+                self._found.packets.setdefault(self._spacecraft_of(domain), []).append(octets)
+            elif not _is_even_idle(octets):
+                continue
+            self._use(path)
+            return
+
+    def _spacecraft_of(self, domain: str) -> int:
+        vehicle = int(domain.split()[1])
+        return next(spacecraft for spacecraft, one in self.vehicles.items() if one == vehicle)
+
+    def _channel_paths(
+        self, connection: repository.Connection, domain: str, edge: StoredEdge
+    ) -> Iterator[list[StoredEdge]]:
+        """Sequences of edges, from an opener to a closer, that an edge may belong to."""
+        budget = PATHS_LIMIT
+        heads = self._backwards(connection, domain, [edge]) if edge.edge.role != OPENER else [[edge]]
+        for head in heads:
+            if head[-1].edge.role == CLOSER:
+                yield head
+                continue
+            for path in self._forwards(connection, domain, head):
+                yield path
+                budget -= 1
+                if budget <= 0:
+                    return
+
+    def _backwards(
+        self, connection: repository.Connection, domain: str, path: list[StoredEdge]
+    ) -> Iterator[list[StoredEdge]]:
+        count = path[0].edge.count
+        held = sum(len(one.edge.octets) for one in path)
+        direct = path[0].edge.role == CLOSER and len(path) == 1
+        fit = (held, UNKNOWN) if direct else None
+        for opener in self._candidates(
+            connection, domain, OPENER, fit=fit, count=(count,), limit=PATHS_LIMIT
+        ):
+            yield [opener, *path]
+        if held < PACKET_MAX_LENGTH:
+            for middle in self._candidates(connection, domain, MIDDLE, next_count=count, limit=8):
+                if all(one.id != middle.id for one in path):
+                    yield from self._backwards(connection, domain, [middle, *path])
+
+    def _forwards(
+        self, connection: repository.Connection, domain: str, path: list[StoredEdge]
+    ) -> Iterator[list[StoredEdge]]:
+        octets = b"".join(one.edge.octets for one in path)
+        count = path[-1].edge.next_count
+        missing = packet_octets_missing(octets)
+        fit = None if missing == UNKNOWN else (missing,)
+        for closer in self._candidates(
+            connection, domain, CLOSER, fit=fit, count=(count,), limit=PATHS_LIMIT
+        ):
+            yield [*path, closer]
+        if len(octets) < PACKET_MAX_LENGTH and missing != 0:
+            for middle in self._candidates(connection, domain, MIDDLE, count=(count,), limit=8):
+                if all(one.id != middle.id for one in path):
+                    yield from self._forwards(connection, domain, [*path, middle])
+
+    # bare packets
+
+    def _join_packets_by_place(self, connection: repository.Connection, domain: str) -> None:
+        """Walk along packets from the last beginning that is known before the piece, as far as octets are there."""
+        before = store.octets_before(connection, self.piece, PACKET_MAX_LENGTH)
+        behind = store.octets_behind(connection, self.piece, PACKET_MAX_LENGTH)
+        sha256, octets = self.piece.file_sha256, self.piece.octets
+        reach = min(octets, PACKET_MAX_LENGTH)
+        contexts = [[*before, Part(sha256, 0, octets), *behind]]
+        if octets > 2 * reach:
+            contexts = [
+                [*before, Part(sha256, 0, reach)],
+                [Part(sha256, octets - reach, octets), *behind],
+            ]
+        for parts in contexts:
+            if len(parts) == 1:
+                continue
+            stream = b"".join(self._octets(part) for part in parts)
+            begins = _known_beginnings(connection, domain, parts)
+            if not parts[0].start and parts[0].file_sha256 != sha256 and not begins:
+                begins = [0]
+            for begin in begins:
+                self._walk_packets(connection, domain, parts, stream, begin)
+
+    def _walk_packets(
+        self,
+        connection: repository.Connection,
+        domain: str,
+        parts: Sequence[Part],
+        stream: bytes,
+        begin: int,
+    ) -> None:
+        assert self.spacecraft_id is not None
+        end = begin
+        packets = []
+        while (length := _packet_length(stream, end)) and _is_packet_or_idle(stream[end : end + length]):
+            packets.append(stream[end : end + length])
+            end += length
+        if end == begin:
+            return
+        self._found.packets.setdefault(self.spacecraft_id, []).extend(packets)
+        self._found.parts += [(domain, part) for part in _within(parts, begin, end)]
+        rest = list(_within(parts, end, len(stream)))
+        if rest and not store.open_starts(connection, domain, rest[0]):
+            octets = self._octets(rest[0])
+            if len(octets) <= PACKET_MAX_LENGTH and not _packet_length(octets, 0):
+                opener = Edge(OPENER, UNKNOWN, UNKNOWN, octets, rest[0].start)
+                self._found.openers.append((domain, rest[0].file_sha256, opener))
+
+    def _join_packet_by_content(
+        self, connection: repository.Connection, domain: str, edge: StoredEdge
+    ) -> None:
+        assert self.spacecraft_id is not None
+        middles = []
+        if not self.piece.stream:
+            middles = self._candidates(connection, domain, MIDDLE, limit=MIDDLES_LIMIT)
+        if edge.edge.role == OPENER:
+            openers = [edge]
+        elif edge.edge.role == CLOSER and not middles:
+            openers = self._candidates(connection, domain, OPENER, fit=(edge.edge.fit, UNKNOWN))
+        else:
+            openers = self._candidates(connection, domain, OPENER, limit=MIDDLES_LIMIT)
+        ends: dict[int, list[StoredEdge]] = {}
+        for opener in openers:
+            path = self._packet_path(connection, domain, opener, middles, edge, ends)
+            if path is not None:
+                break
+        else:
+            return
+        chosen, octets = path
+        packets = self._found.packets.setdefault(self.spacecraft_id, [])
+        packets.append(octets)
+        self._use(chosen)
+        last = chosen[-1]
+        left = sum(len(one.edge.octets) for one in chosen) - len(octets)
+        if left and last.file_sha256 is not None:
+            rest = last.edge.octets[-left:]
+            end = packets_end(rest, 0, len(rest))
+            if _is_packet(rest[:end]):
+                packets.append(rest[:end])
+            start = (last.edge.start or 0) + len(last.edge.octets) - left + end
+            opener_edge = Edge(OPENER, UNKNOWN, UNKNOWN, rest[end:], start)
+            self._found.openers.append((domain, last.file_sha256, opener_edge))
+
+    def _packet_path(
+        self,
+        connection: repository.Connection,
+        domain: str,
+        opener: StoredEdge,
+        middles: Sequence[StoredEdge],
+        edge: StoredEdge,
+        ends: dict[int, list[StoredEdge]],
+    ) -> tuple[list[StoredEdge], bytes] | None:
+        """Edges that make up a packet that begins with `opener` and holds `edge`, and its octets; else None.
+
+        `ends` holds the closers by length that were looked up, and is added to.
+        """
+
+        def closers(missing: int) -> list[StoredEdge]:
+            if edge.edge.role == CLOSER:
+                return [edge] if missing in (UNKNOWN, edge.edge.fit) else []
+            if missing not in ends:
+                fit = None if missing == UNKNOWN else (missing,)
+                ends[missing] = self._candidates(connection, domain, CLOSER, fit=fit)
+            return ends[missing]
+
+        if edge.edge.role != MIDDLE:
+            for closer in closers(opener.edge.fit):
+                octets = opener.edge.octets + closer.edge.octets
+                if _is_packet(octets):
+                    return [opener, closer], octets
+        for chosen in islice(_orders(middles, edge), ARRANGEMENTS_LIMIT):
+            octets = opener.edge.octets + b"".join(one.edge.octets for one in chosen)
+            held = len(octets) - len(chosen[-1].edge.octets)
+            missing = packet_octets_missing(octets)
+            if missing == UNKNOWN:
+                continue
+            if missing == 0:
+                whole = octets[: int.from_bytes(octets[4:6], "big") + PRIMARY_HEADER_LENGTH + 1]
+                enough = edge.edge.role != CLOSER and len(whole) > held
+                if enough and _is_packet(whole) and _goes_on(whole, octets[len(whole) :]):
+                    return [opener, *chosen], whole
+            else:
+                for closer in closers(missing):
+                    whole = octets + closer.edge.octets
+                    if _is_packet(whole):
+                        return [opener, *chosen, closer], whole
+        return None
+
+    def _octets(self, part: Part) -> bytes:
+        return self.ground.files.read(part.file_sha256, part.start, part.stop)
 
 
-def _makes_a_packet(files: FileArchive, before: Edge, after: Edge, loose: int) -> bool:
-    """Whether the loose octets are as long as the packet header at their beginning says."""
-    head = _end(files, before, before["tail_loose"]) + _start(files, after, min(after["head_loose"], 8))
-    if len(head) < PRIMARY_HEADER_LENGTH:
-        return False
-    return int.from_bytes(head[4:6], "big") + 7 == loose
+def raw_domain(scope: str, link: Link) -> str:
+    """Name of what may be joined with the raw octets of a link."""
+    return f"{'packets' if link == BARE else 'cadus ' + store.link_digest(link)} {scope}"
 
 
-def _across(
-    files: FileArchive, others: list[Edge], before: Edge, after: Edge, spacecraft_id: int
-) -> Iterator[PacketBatch]:
-    """What the octets around a cut hold, read as one stream."""
-    if before["link"] is None:
-        stream = _end(files, before, before["tail_loose"]) + _start(files, after, after["head_loose"])
-    else:
-        reach = reach_octets(LinkSettings(**before["link"]))
-        stream = _back(files, others, before, reach) + _forth(files, others, after, reach)
-    yield from DownlinkReader(spacecraft_id).batches([stream])
+def _known_beginnings(connection: repository.Connection, domain: str, parts: Sequence[Part]) -> list[int]:
+    """Where in a chain of parts packets are known to begin that were cut off: at waiting openers."""
+    places = []
+    position = 0
+    for part in parts:
+        for start in store.open_starts(connection, domain, part):
+            places.append(position + start - part.start)
+        position += part.stop - part.start
+    return places
 
 
-def _back(files: FileArchive, others: list[Edge], edge: Edge, octets: int) -> bytes:
-    """The last octets up to the end of a file, with those of the files before it where it is short."""
-    stream = b""
-    seen: list[str] = []
-    while True:
-        stream = _end(files, edge, octets - len(stream)) + stream
-        seen.append(edge["file_sha256"])
-        if len(stream) >= octets:
-            return stream
-        earlier = [o for o in others if o["file_sha256"] not in seen and _fit(files, o, edge)]
-        if len(earlier) != 1:
-            return stream
-        edge = earlier[0]
+def _counts_fit(one: int, other: int) -> bool:
+    return one == other or UNKNOWN in (one, other)
 
 
-def _forth(files: FileArchive, others: list[Edge], edge: Edge, octets: int) -> bytes:
-    """The first octets of a file, with those of the files after it where it is short."""
-    stream = b""
-    seen: list[str] = []
-    while True:
-        stream += _start(files, edge, octets - len(stream))
-        seen.append(edge["file_sha256"])
-        if len(stream) >= octets:
-            return stream
-        later = [o for o in others if o["file_sha256"] not in seen and _fit(files, edge, o)]
-        if len(later) != 1:
-            return stream
-        edge = later[0]
+def _subsets(
+    must: tuple[StoredEdge, ...], others: Sequence[StoredEdge], totals: Collection[int]
+) -> Iterator[tuple[StoredEdge, ...]]:
+    """Sets of edges with those of `must` whose octets together are one of `totals`, those of fewer edges first.
+
+    Bit n of `reach[k][i]` says whether k of `others[i:]` have n octets together, so that no set is begun in vain.
+    """
+    held = sum(len(one.edge.octets) for one in must)
+    wanted = sum(1 << total - held for total in totals if total >= held)
+    within = (1 << wanted.bit_length()) - 1
+    sizes = [len(one.edge.octets) for one in others]
+    reach = [[1] * (len(sizes) + 1)]
+
+    def chosen(number: int, first: int, left: int) -> Iterator[tuple[StoredEdge, ...]]:
+        if number == 0:
+            yield ()
+            return
+        for index in range(first, len(sizes)):
+            if not reach[number][index] & left:
+                return
+            rest = left >> sizes[index]
+            if reach[number - 1][index + 1] & rest:
+                for more in chosen(number - 1, index + 1, rest):
+                    yield (others[index], *more)
+
+    for number in range(MIDDLES_IN_A_CADU + 1 - len(must)):
+        if number:
+            sums = [0] * (len(sizes) + 1)
+            for index in reversed(range(len(sizes))):
+                sums[index] = sums[index + 1] | (reach[-1][index + 1] << sizes[index] & within)
+            reach.append(sums)
+        if reach[number][0] & wanted and number + len(must):
+            for more in chosen(number, 0, wanted):
+                yield (*must, *more)
 
 
-def _start(files: FileArchive, edge: Edge, octets: int) -> bytes:
-    with files.path(edge["file_sha256"]).open("rb") as stream:
-        return stream.read(octets)
+def _slots_across(stream: OctetArray, start: int, stop: int, settings: LinkSettings) -> NDArray[np.int64]:
+    """Where CADUs stand that lie partly in [start, stop) of a stream and partly outside."""
+    length = settings.cadu_length
+    last = stream.size - length
+    if last < 0:
+        return np.empty(0, dtype=np.int64)
+    places = np.arange(max(start - length + 1, 0), min(stop, last + 1), dtype=np.int64)
+    places = places[(places < start) | (places + length > stop)]
+    if not places.size:
+        return places
+    places = places[marker_errors(stream, places) <= DEFAULT_TOLERANCE]
+    followed = places + length + ASM_LENGTH <= stream.size
+    right = ~followed
+    right[followed] = marker_errors(stream, places[followed] + length) <= DEFAULT_TOLERANCE
+    return places[right]
 
 
-def _end(files: FileArchive, edge: Edge, octets: int) -> bytes:
-    with files.path(edge["file_sha256"]).open("rb") as stream:
-        stream.seek(max(edge["octets"] - octets, 0))
-        return stream.read()
+def _within(parts: Sequence[Part], start: int, stop: int) -> Iterator[Part]:
+    """The portions of a chain of parts that lie in [start, stop) of it."""
+    position = 0
+    for part in parts:
+        size = part.stop - part.start
+        low, high = max(start - position, 0), min(stop - position, size)
+        if low < high:
+            yield Part(part.file_sha256, part.start + low, part.start + high)
+        position += size
+
+
+def _orders(middles: Sequence[StoredEdge], edge: StoredEdge) -> Iterator[tuple[StoredEdge, ...]]:
+    """Sequences of up to two middles, with `edge` where it is one."""
+    others = [one for one in middles if one.id != edge.id]
+    if edge.edge.role != MIDDLE:
+        yield from ((one,) for one in middles)
+        yield from permutations(middles, 2)
+        return
+    yield (edge,)
+    for one in others:
+        yield (one, edge)
+        yield (edge, one)
+
+
+def _goes_on(packet: bytes, rest: bytes) -> bool:
+    """Whether octets behind a packet look like the next one: one checksum is not enough among many arrangements."""
+    if len(rest) < PRIMARY_HEADER_LENGTH:
+        return rest[:1] in (b"", packet[:1])
+    return rest[0] & 0xF8 == packet[0] & 0xF8 and rest[2] >> 6 == packet[2] >> 6
+
+
+def _packet_length(octets: bytes, start: int) -> int:
+    """Octets of the packet at `start`, 0 where it is not whole or none can stand there."""
+    if len(octets) - start <= PRIMARY_HEADER_LENGTH or octets[start] >> 4:
+        return 0
+    length = int.from_bytes(octets[start + 4 : start + 6], "big") + PRIMARY_HEADER_LENGTH + 1
+    return length if start + length <= len(octets) else 0
+
+
+def _is_packet(octets: bytes) -> bool:
+    """Whether these octets are one telemetry packet whose checksum holds."""
+    return (
+        len(octets) > PRIMARY_HEADER_LENGTH + 2
+        and _packet_length(octets, 0) == len(octets)
+        and not _is_idle(octets)
+        and crc16(octets) == 0
+    )
+
+
+def _is_idle(octets: bytes) -> bool:
+    return int.from_bytes(octets[:2], "big") & 0x7FF == IDLE_APID
+
+
+def _is_even_idle(octets: bytes) -> bool:
+    """Whether these octets are one idle packet with the same octet throughout."""
+    fill = octets[PRIMARY_HEADER_LENGTH:]
+    return _packet_length(octets, 0) == len(octets) and _is_idle(octets) and fill == fill[:1] * len(fill)
+
+
+def _is_packet_or_idle(octets: bytes) -> bool:
+    return _is_packet(octets) or _is_even_idle(octets)

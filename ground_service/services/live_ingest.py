@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import os
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ground_service.errors import GroundError, InvalidInput, StoreError, storage_error
+from ground_service.store.files import make_durable_folder, replace_durably
 from tmtc.downlink import decode
 from tmtc.errors import TmtcError
 
@@ -56,10 +56,10 @@ class Spool:
     def recover(self) -> None:
         """Ingest what an earlier run left behind."""
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            make_durable_folder(self.folder)
             current = self._current
             if current.exists() and current.stat().st_size:
-                os.replace(current, self._sealed(self._first_free()))
+                replace_durably(current, self._sealed(self._first_free()))
             self._next = self._first_free()
         except OSError as error:
             raise storage_error(error, self.folder) from None
@@ -88,7 +88,7 @@ class Spool:
             return
         self._stream.close()
         self._stream, self._size = None, 0
-        os.replace(self._current, self._sealed(self._next))
+        replace_durably(self._current, self._sealed(self._next))
         self._next += 1
         self._drain()
 
@@ -222,9 +222,9 @@ class WatchedFolder:
     def _remember(self, known: dict[str, list[int]]) -> None:
         temporary = self.ledger.with_suffix(".new")
         try:
-            self.ledger.parent.mkdir(parents=True, exist_ok=True)
+            make_durable_folder(self.ledger.parent)
             temporary.write_text(json.dumps(known), encoding="utf-8")
-            temporary.replace(self.ledger)
+            replace_durably(temporary, self.ledger)
         except OSError as error:
             raise storage_error(error, self.ledger.parent) from None
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, func, select
+from sqlalchemy import Connection, select
 
-from ground_service.errors import InvalidInput
+from ground_service.errors import EvaluationError, InvalidInput
+from ground_service.missions.frames import DeclaredFrames, declared_frames
+from ground_service.missions.model import Camera, Mission
+from ground_service.missions.service import mission_of_pass
 from ground_service.processing.baseline import StartState
 from ground_service.processing.correlation import TimeCorrelation, ticks_of_utc_ns, utc_ns_of_ticks
 from ground_service.processing.fixes import IdentificationSamples
@@ -24,24 +27,28 @@ from ground_service.processing.samples import (
     OutcomeSamples,
     no_detections,
 )
-from ground_service.processing.sequence import Gap, account_sequence
 from ground_service.processing.smoother import SIZE, CommandedBurn, FilterStates
+from ground_service.processing.verdict import Limits
+from ground_service.processing.viewing import Viewing
+from ground_service.services.attitudes import AttitudeTable, load_attitudes, no_attitudes
 from ground_service.services.ground import Ground
+from ground_service.services.packet_accounting import packet_accounting
+from ground_service.services.pass_span import PassSpan
 from ground_service.store import repository
-from ground_service.store.codec import unpack_detections, unpack_identifications
+from ground_service.store.codec import unpack_detections, unpack_filter_states, unpack_identifications
 from ground_service.store.files import FileArchive
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, load_catalogue
+from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris, load_ephemeris
+from lunar.frames import Orientation
+from lunar.lens import BrownCamera
 from lunar.timescales import parse_utc
 from reports.values import (
-    ApidAccounting,
-    CompletenessSeries,
     HousekeepingParameter,
-    PacketAccounting,
     PassEvent,
 )
-from tmtc.dictionary import APID_DETECTIONS, APID_NAVIGATION_STATE, DICTIONARY
+from tmtc.dictionary import APID_DETECTIONS, APID_PERFORMANCE, DICTIONARY
 from tmtc.stream import cut_packets
 
 IntArray = NDArray[np.int64]
@@ -49,8 +56,6 @@ IntArray = NDArray[np.int64]
 PASS_MARGIN_NS = 60_000_000_000
 """Samples this far outside a window still belong to it: housekeeping before the first and after the last image."""
 
-COMPLETENESS_BINS = 60
-GAP_POINTS = 256
 
 _SEVERITIES = {1: "info", 2: "low", 3: "medium", 4: "high"}
 
@@ -62,21 +67,6 @@ _TRENDS = (
     ("queue_depth", "packets"),
     ("storage_used_permille", "‰"),
 )
-
-
-@dataclass(frozen=True, slots=True)
-class PassSpan:
-    """The stretch of on-board time that belongs to a pass, how it maps to UTC, the dictionary version to read it in."""
-
-    vehicle: int
-    start_ticks: int
-    stop_ticks: int
-    correlations: tuple[TimeCorrelation, ...]
-    dictionary_version: int
-
-    def utc_ns(self, ticks: Sequence[int]) -> IntArray:
-        """Correlated UTC (n,) of on-board ticks."""
-        return utc_ns_of_ticks(np.array(ticks, dtype=np.int64), self.correlations)[0]
 
 
 class ImageShelf(Mapping[int, NDArray[np.uint8]]):
@@ -128,6 +118,9 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
         record = repository.get(connection, repository.PASSES, pass_id, "pass")
         span = pass_span(connection, record)
         manifest: dict[str, Any] = record["manifest"]
+        mission = mission_of_pass(connection, record)
+        declared = declared_frames(mission.frames, ground.data)
+        viewing = viewing_of(mission.camera, attitude_table(ground.files, record), span)
         vehicle = repository.get(connection, repository.VEHICLES, record["vehicle_id"], "vehicle")
         ephemeris = _ephemeris_row(connection, record)
         frames = connection.execute(
@@ -140,9 +133,9 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             title=record["name"],
             start_utc_ns=record["start_utc_ns"],
             stop_utc_ns=record["stop_utc_ns"],
-            packets=packet_accounting(connection, record, span),
-            camera=camera_of(manifest),
-            orientation=ground.orientation,
+            packets=packet_accounting(ground.files, connection, record, span),
+            viewing=viewing,
+            orientation=declared.orientation,
             reference=_reference(ground, ephemeris),
             catalogue=_catalogue(ground, record),
             detections=detection_samples(connection, span),
@@ -154,16 +147,20 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             landmarks=landmark_reports(connection, span),
             sun_known=manifest.get("light", "real") == "real",
             burns=burns_of(manifest),
-            gravity=ground.gravity,
-            other_gravity=ground.other_gravity,
+            gravity=declared.gravity,
+            onboard_gravity=declared.onboard_gravity,
+            refused=_refused(declared, mission.camera),
+            reference_sigma_rtn_m=mission.reference.sigma_rtn_m,
+            limits=Limits(**mission.requirements.model_dump()),
+            cpu_percent=_cpu_percent(connection, span, manifest.get("cadence_s")),
             frames_expected=manifest.get("frames_expected"),
             cadence_s=manifest.get("cadence_s"),
             housekeeping=_housekeeping(connection, span),
             events=event_list(connection, span),
             images=ImageShelf(ground.files, {int(number): sha256 for number, sha256 in frames}),
-            provenance=_provenance(ground, manifest, record, vehicle, ephemeris, span),
+            provenance=_provenance(mission, declared, manifest, record, vehicle, ephemeris, span),
             data_sources=tuple(str(name) for name in manifest.get("data_sources", ())),
-            evidence_rung=str(manifest.get("evidence_rung", "")) or _rung(manifest),
+            evidence_level=mission.evidence.text,
             configuration=_configuration(manifest),
             scenario_text=str(manifest.get("scenario_toml", "")),
             generated_for="",
@@ -235,25 +232,26 @@ def navigation_samples(connection: Connection, span: PassSpan) -> tuple[Navigati
 
 
 def filter_states(connection: Connection, span: PassSpan) -> FilterStates | None:
-    """States of the navigation filter in full, in time order, out of the packets; None where none came down."""
-    octets = repository.packet_octets(
-        connection, span.vehicle, APID_NAVIGATION_STATE, span.start_ticks, span.stop_ticks
+    """Return the estimates of the navigation filter with their covariances, in time order; None where none came."""
+    rows = repository.samples(
+        connection,
+        "filter_states",
+        span.vehicle,
+        span.start_ticks,
+        span.stop_ticks,
+        span.dictionary_version,
+        ("ticks", "values", "innovation_degrees"),
     )
-    table = DICTIONARY.unpack_many(octets, cut_packets(octets), only=("filter_state",)).get("filter_state")
-    if table is None or not len(table):
+    if not rows["ticks"]:
         return None
-    columns = table.columns
-    _, first = np.unique(columns["image_ticks"], return_index=True)
-    covariance = np.zeros((len(first), SIZE, SIZE))
-    rows, places = np.tril_indices(SIZE)
-    covariance[:, rows, places] = covariance[:, places, rows] = columns["covariance"][first]
+    ticks, first = np.unique(np.array(rows["ticks"], dtype=np.int64), return_index=True)
+    state, covariance = unpack_filter_states([bytes(rows["values"][i]) for i in first.tolist()], SIZE)
+    degrees = [rows["innovation_degrees"][i] for i in first.tolist()]
     return FilterStates(
-        span.utc_ns(columns["image_ticks"][first]),
-        np.concatenate(
-            [columns["position_icrf_m"], columns["velocity_icrf_m_s"], columns["acceleration_rtn_m_s2"]],
-            axis=1,
-        )[first],
+        span.utc_ns(ticks),
+        state,
         covariance,
+        np.array([-1 if known is None else known for known in degrees], dtype=np.int64),
     )
 
 
@@ -378,50 +376,61 @@ def detection_frames(connection: Connection, span: PassSpan) -> tuple[IntArray, 
     return np.array([rows["ticks"][i] for i in chosen], dtype=np.int64), offsets
 
 
-def packet_accounting(connection: Connection, record: Mapping[str, Any], span: PassSpan) -> PacketAccounting:
-    """Packets of a pass and what is missing of them, with what its ingests met on the way."""
-    headers = repository.packet_headers(connection, span.vehicle, span.start_ticks, span.stop_ticks)
-    names = _apid_names()
-    by_apid: dict[int, ApidAccounting] = {}
-    lost = np.zeros((0, 2), dtype=np.float64)
-    conflicts = 0
-    for apid in np.unique(headers["apid"]).tolist():
-        here = headers["apid"] == apid
-        account = account_sequence(headers["ticks"][here], headers["sequence_count"][here])
-        by_apid[apid] = ApidAccounting(
-            name=names.get(apid, "unknown"),
-            packets=int(np.count_nonzero(here)),
-            lost=account.lost,
-            conflicts=account.conflicts,
-        )
-        conflicts += account.conflicts
-        lost = np.concatenate([lost, *(_spread(gap) for gap in account.gaps)])
-    totals = _ingest_totals(connection, span.vehicle)
-    return PacketAccounting(
-        packets=len(headers["apid"]),
-        lost=sum(apid.lost for apid in by_apid.values()),
-        duplicates=totals["duplicates"],
-        conflicts=conflicts,
-        crc_errors=totals["crc_errors"],
-        octets_skipped=totals["octets_skipped"],
-        frames=totals["frames"] or None,
-        frames_bad=totals["frames_bad"],
-        symbols_corrected=totals["symbols_corrected"],
-        octets=totals["octets"] or None,
-        by_apid=by_apid,
-        completeness=_completeness(record, span, headers["ticks"], lost),
-    )
-
-
-def camera_of(manifest: Mapping[str, Any]) -> PinholeCamera:
-    """The camera that a manifest names; the payload's own where it names none."""
-    given = manifest.get("camera") or {}
+def camera_of(camera: Camera) -> PinholeCamera:
+    """Return the camera that a mission declares, with its lens; sizes that it does not state are the paper's."""
     default = PinholeCamera()
-    return PinholeCamera(
-        width_px=int(given.get("width_px", default.width_px)),
-        height_px=int(given.get("height_px", default.height_px)),
-        fov_rad=math.radians(given["fov_deg"]) if "fov_deg" in given else default.fov_rad,
+    sizes = (
+        default.width_px if camera.width_px is None else camera.width_px,
+        default.height_px if camera.height_px is None else camera.height_px,
+        default.fov_rad if camera.fov_deg is None else math.radians(camera.fov_deg),
     )
+    lens = tuple(value or 0.0 for value in (camera.k1, camera.k2, camera.k3, camera.p1, camera.p2))
+    return BrownCamera(*sizes, *lens) if any(lens) else PinholeCamera(*sizes)
+
+
+def viewing_of(camera: Camera, attitudes: AttitudeTable, span: PassSpan) -> Viewing:
+    """Return how the camera looked during a pass."""
+    utc_ns = span.utc_ns(attitudes.image_ticks.tolist())
+    order = np.argsort(utc_ns, kind="stable")
+    return Viewing(
+        camera_of(camera),
+        math.radians(camera.tilt_deg or 0.0),
+        math.radians(camera.yaw_deg or 0.0),
+        utc_ns[order],
+        attitudes.q_wxyz[order],
+    )
+
+
+def attitude_table(files: FileArchive, record: Mapping[str, Any]) -> AttitudeTable:
+    """Return the attitude of each frame of a pass, as its archive has it."""
+    sha256 = record["attitude_sha256"]
+    return no_attitudes() if sha256 is None else load_attitudes(files.path(sha256))
+
+
+def orientation_of(mission: Mission, data: DataFolder) -> Orientation:
+    """Return the lunar orientation to evaluate a pass of a mission in.
+
+    Raises
+    ------
+    EvaluationError
+        The mission does not state it, or it is not available on this machine.
+    """
+    declared = declared_frames(mission.frames, data)
+    if declared.orientation is None:
+        raise EvaluationError(declared.refused["orientation"])
+    return declared.orientation
+
+
+def _refused(declared: DeclaredFrames, camera: Camera) -> dict[str, str]:
+    missing = [name for name in ("pointing", "k1") if getattr(camera, name) is None]
+    refused = dict(declared.refused)
+    if missing:
+        words = {"pointing": "pointing", "k1": "lens"}
+        refused["camera"] = (
+            f"the mission description does not state the {' and '.join(words[name] for name in missing)} of the "
+            "camera: a nadir camera without distortion is assumed where no attitude is known"
+        )
+    return refused
 
 
 def start_state_of(manifest: Mapping[str, Any]) -> StartState | None:
@@ -479,51 +488,6 @@ def _labels(labels: Mapping[int, str], codes: NDArray[Any]) -> tuple[str, ...]:
     return tuple(labels.get(int(code), str(int(code))) for code in codes)
 
 
-def _apid_names() -> dict[int, str]:
-    names: dict[int, str] = {}
-    for definition in DICTIONARY.telemetry:
-        names.setdefault(definition.apid, definition.name.split("_info")[0].replace("_", " "))
-    return names
-
-
-def _ingest_totals(connection: Connection, vehicle: int) -> dict[str, int]:
-    """Sums over the ingests of a vehicle, each file counted once; duplicates are packets that came more than once."""
-    keys = ("crc_errors", "octets_skipped", "frames", "frames_bad", "symbols_corrected", "octets")
-    table = repository.INGESTS
-    rows = connection.execute(
-        select(table.c.file_sha256, table.c.accounting).where(
-            table.c.vehicle_id == vehicle, table.c.state == "done"
-        )
-    )
-    by_file = {row[0]: row[1] for row in rows}
-    totals = {key: sum(int(accounting.get(key, 0)) for accounting in by_file.values()) for key in keys}
-    seen = sum(int(accounting.get("packets", 0)) for accounting in by_file.values())
-    stored = connection.execute(
-        select(func.count()).select_from(repository.PACKETS).where(repository.PACKETS.c.vehicle_id == vehicle)
-    ).scalar_one()
-    totals["duplicates"] = max(seen - int(stored), 0)
-    return totals
-
-
-def _completeness(
-    record: Mapping[str, Any], span: PassSpan, ticks: IntArray, lost: NDArray[np.float64]
-) -> CompletenessSeries | None:
-    if len(ticks) == 0:
-        return None
-    edges = np.linspace(record["start_utc_ns"], record["stop_utc_ns"], COMPLETENESS_BINS + 1).astype(np.int64)
-    received = np.histogram(np.clip(span.utc_ns(list(ticks)), edges[0], edges[-1]), edges)[0]
-    when = np.clip(span.utc_ns(lost[:, 0].astype(np.int64).tolist()), edges[0], edges[-1])
-    missing = np.histogram(when, edges, weights=lost[:, 1])[0]
-    return CompletenessSeries(edges, received + np.rint(missing).astype(np.int64), received.astype(np.int64))
-
-
-def _spread(gap: Gap) -> NDArray[np.float64]:
-    """On-board times (k, 2) over which the packets of a gap are taken to be spread, and how many at each."""
-    points = min(gap.missing, GAP_POINTS)
-    ticks = np.linspace(gap.before_ticks, gap.after_ticks, points + 2)[1:-1]
-    return np.column_stack([ticks, np.full(points, gap.missing / points)])
-
-
 def _housekeeping(connection: Connection, span: PassSpan) -> tuple[HousekeepingParameter, ...]:
     columns = _columns(connection, "housekeeping", span, ("ticks", *(name for name, _ in _TRENDS)))
     if len(columns["ticks"]) == 0:
@@ -532,6 +496,20 @@ def _housekeeping(connection: Connection, span: PassSpan) -> tuple[HousekeepingP
     return tuple(
         HousekeepingParameter(name, unit, utc_ns, columns[name].astype(np.float64)) for name, unit in _TRENDS
     )
+
+
+def _cpu_percent(connection: Connection, span: PassSpan, cadence_s: float | None) -> float | None:
+    """Largest processor time of a step over the cadence, in percent of one core; None where it is not known."""
+    octets = repository.packet_octets(
+        connection, span.vehicle, APID_PERFORMANCE, span.start_ticks, span.stop_ticks
+    )
+    table = DICTIONARY.unpack_many(octets, cut_packets(octets), only=("performance",)).get("performance")
+    if table is None or not len(table) or not cadence_s:
+        return None
+    stages = [name for name in table.columns if name.startswith("cpu_") and name.endswith("_ms")]
+    total_ms = np.sum([np.asarray(table.columns[name], dtype=np.float64) for name in stages], axis=0)
+    known = total_ms[np.isfinite(total_ms)]
+    return float(known.max()) / (10.0 * cadence_s) if len(known) else None
 
 
 def event_list(connection: Connection, span: PassSpan) -> tuple[PassEvent, ...]:
@@ -584,15 +562,9 @@ def _catalogue(ground: Ground, record: Mapping[str, Any]) -> CraterCatalogue | N
     )
 
 
-def _rung(manifest: Mapping[str, Any]) -> str:
-    sources = " ".join(str(name) for name in manifest.get("data_sources", ())).lower()
-    if "height model" in sources or "gld100" in sources:
-        return "3 (real terrain, rendered)"
-    return "2 (procedural Moon)"
-
-
 def _provenance(
-    ground: Ground,
+    mission: Mission,
+    declared: DeclaredFrames,
     manifest: Mapping[str, Any],
     record: Mapping[str, Any],
     vehicle: Mapping[str, Any],
@@ -612,7 +584,8 @@ def _provenance(
         "gravity of the truth": f"{gravity['truth']}, degree {gravity.get('degree', '?')}"
         if "truth" in gravity
         else "",
-        "lunar orientation on the ground": ground.orientation.name,
+        "mission description": f"{mission.name}, revision {mission.revision[:16]}",
+        "lunar orientation": declared.orientation.name if declared.orientation is not None else "",
         "dictionary": _dictionary_text(span.dictionary_version),
         "time correlation": ", ".join(str(c.id) for c in span.correlations) or "0 (ideal clock)",
         "reference ephemeris": (

@@ -12,23 +12,25 @@ from sqlalchemy import Connection
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound
+from ground_service.missions import store as missions
 from ground_service.processing.correlation import ticks_of_utc_ns
 from ground_service.services.ground import Ground
 from ground_service.services.ingest import FLOWN
+from ground_service.services.packet_accounting import packet_accounting
 from ground_service.services.pass_data import (
-    PassSpan,
     detection_frames,
     detection_samples,
     event_list,
     load_correlations,
-    packet_accounting,
     pass_span,
     readable_version,
 )
+from ground_service.services.pass_span import PassSpan
 from ground_service.services.remembered import remembered
 from ground_service.services.series import PARAMETERS, STATE_VALUES, Series, SeriesReading
 from ground_service.services.views import series_view
 from ground_service.store import repository
+from ground_service.text import require_line
 from reports.values import PacketAccounting, PassEvent
 from tmtc.dictionary import DICTIONARY
 
@@ -61,10 +63,13 @@ def get_pass(ground: Ground, pass_id: int) -> dict[str, Any]:
         record = repository.get(connection, repository.PASSES, pass_id, "pass")
         vehicle = repository.get(connection, repository.VEHICLES, record["vehicle_id"], "vehicle")
         reports = repository.page(connection, repository.REPORTS, limit=20, pass_id=pass_id)
+        mission = None if record["mission_id"] is None else missions.detail(connection, record["mission_id"])
     return {
         **record,
         "spacecraft_id": vehicle["ccsds_id"],
         "instance": vehicle["instance"],
+        "mission": None if mission is None else mission.mission,
+        "mission_revision": None if mission is None else mission.revision,
         "reports": [row["id"] for row in reports.rows],
     }
 
@@ -79,7 +84,11 @@ def define_pass(
     instance: str = FLOWN,
     manifest: Mapping[str, Any] | None = None,
 ) -> int:
-    """Enter an interval of a spacecraft's time as a pass; its id."""
+    """Enter an interval of a spacecraft's time as a pass; its id.
+
+    The pass refers to the mission description of the spacecraft that was entered last, where there is one.
+    """
+    require_line(name, "pass", "name")
     if stop_utc_ns <= start_utc_ns:
         raise InvalidInput("pass", "stop", "a time after the start", str(stop_utc_ns))
     with ground.database.writing() as connection:
@@ -95,6 +104,8 @@ def define_pass(
                 manifest=dict(manifest or {}),
                 ephemeris_id=None,
                 catalogue_sha256=None,
+                attitude_sha256=None,
+                mission_id=missions.newest_of_spacecraft(connection, spacecraft_id),
                 created_utc_ns=utc_now_ns(),
             )
         )
@@ -108,7 +119,7 @@ def completeness(ground: Ground, pass_id: int) -> PacketAccounting:
             ground,
             connection,
             ("completeness", pass_id),
-            lambda: packet_accounting(connection, record, pass_span(connection, record)),
+            lambda: packet_accounting(ground.files, connection, record, pass_span(connection, record)),
         )
 
 

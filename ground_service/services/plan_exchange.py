@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import Connection, select
 
 from ground_service.errors import InvalidInput
 from ground_service.services.ground import Ground
-from ground_service.services.planning import WindowEntry, add_window, delete_window
+from ground_service.services.planning import WindowEntry, insert_window
 from ground_service.services.views import time_text
 from ground_service.store import repository
+from ground_service.store.counters import lock_spacecraft
 
 SCHEMA_VERSION = 1
 
@@ -72,19 +73,24 @@ def import_plan(ground: Ground, entries: Sequence[PlanEntry], *, actor: str) -> 
         If a window contradicts committed ones.
     """
     ids: dict[str, int] = {}
-    made: list[int] = []
-    try:
-        for entry in _in_order(entries):
+    ordered = _in_order(entries)
+    with ground.database.writing() as connection:
+        # All spacecraft of the plan, always in the same order: two imports at once do not wait for each other.
+        for spacecraft_id, instance in sorted(
+            {(one.window.spacecraft_id, one.window.instance) for one in entries}
+        ):
+            vehicle = repository.vehicle_id(connection, spacecraft_id, instance)
+            vehicles = repository.VEHICLES.c.id
+            connection.execute(
+                select(vehicles).where(vehicles == vehicle).with_for_update(read=True, key_share=True)
+            )
+            lock_spacecraft(connection, vehicle)
+        for entry in ordered:
             window = replace(entry.window, predecessor_id=ids[entry.after] if entry.after else None)
-            found = _known(ground, window)
+            found = _known(connection, window)
             if found is None:
-                found = int(add_window(ground, window, actor=actor)["id"])
-                made.append(found)
+                found = int(insert_window(ground, connection, window, actor=actor)["id"])
             ids[entry.key] = found
-    except BaseException:
-        for window_id in reversed(made):
-            delete_window(ground, window_id, actor=actor)
-        raise
     return ids
 
 
@@ -108,19 +114,13 @@ def _in_order(entries: Sequence[PlanEntry]) -> list[PlanEntry]:
     return ordered
 
 
-def _known(ground: Ground, window: WindowEntry) -> int | None:
-    with ground.database.reading() as connection:
-        vehicle = repository.find(
-            connection, repository.VEHICLES, ccsds_id=window.spacecraft_id, instance=window.instance
-        )
-        if vehicle is None:
-            return None
-        row = repository.find(
-            connection,
-            repository.WINDOWS,
-            vehicle_id=vehicle["id"],
-            name=window.name,
-            start_utc_ns=window.start_utc_ns,
-            stop_utc_ns=window.stop_utc_ns,
-        )
+def _known(connection: Connection, window: WindowEntry) -> int | None:
+    row = repository.find(
+        connection,
+        repository.WINDOWS,
+        vehicle_id=repository.vehicle_id(connection, window.spacecraft_id, window.instance),
+        name=window.name,
+        start_utc_ns=window.start_utc_ns,
+        stop_utc_ns=window.stop_utc_ns,
+    )
     return None if row is None else int(row["id"])

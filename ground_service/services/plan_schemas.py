@@ -9,12 +9,13 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from ground_service.errors import InvalidInput
 from ground_service.processing.planning import STATIONS, Constraints, Resources
+from ground_service.text import LINE_PATTERN_JSON
 from lunar.errors import LunarError
 from lunar.timescales import parse_utc
 from lunar.visibility import GroundStation
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Name = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+Name = Annotated[str, Field(min_length=1, max_length=200, pattern=LINE_PATTERN_JSON)]
 InstanceName = Annotated[str, Field(min_length=1, max_length=96, pattern=r"^[A-Za-z0-9._@-]+$")]
 Time = Annotated[str, Field(min_length=10, max_length=40, examples=["2029-08-07T06:00:00Z"])]
 WindowState = Literal[
@@ -28,7 +29,13 @@ class Schema(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
-class Limits(Schema):
+class Given(Schema):
+    """Base of requests: no value is taken for one of another type, such as true for 1."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+
+class Limits(Given):
     """A least and a greatest value."""
 
     min: Finite = Field(examples=[30.0])
@@ -45,7 +52,7 @@ class Limits(Schema):
         return self.min * factor, self.max * factor
 
 
-class Station(Schema):
+class Station(Given):
     """A ground station."""
 
     name: Name = Field(examples=["Canberra"])
@@ -55,7 +62,7 @@ class Station(Schema):
     minimum_elevation_deg: Finite = Field(default=10.0, ge=0.0, le=90.0)
 
 
-class ResourcesIn(Schema):
+class ResourcesIn(Given):
     """What the spacecraft and the ground have to offer."""
 
     storage_mib: Finite = Field(default=64.0, gt=0.0, le=1e6)
@@ -93,7 +100,7 @@ class ResourcesIn(Schema):
         )
 
 
-class WindowSearch(Schema):
+class WindowSearch(Given):
     """Constraints that a window has to fulfil all along; what is left out is not asked for."""
 
     start: Time | None = Field(default=None, description="Default: where the ephemeris begins")
@@ -186,7 +193,7 @@ class SearchOut(Schema):
     refused: dict[str, int] = Field(description="Spans left out, by reason")
 
 
-class WindowIn(Schema):
+class WindowIn(Given):
     """A window to be planned."""
 
     name: Name = Field(default="observation", examples=["evening pass"])
@@ -200,7 +207,7 @@ class WindowIn(Schema):
     resources: ResourcesIn = Field(default_factory=ResourcesIn)
 
 
-class WindowChange(Schema):
+class WindowChange(Given):
     """Changes of a draft, or a decision on a window; what is left out stays."""
 
     name: Name | None = None
@@ -209,7 +216,7 @@ class WindowChange(Schema):
     cadence_s: Finite | None = Field(default=None, ge=0.1, le=3600.0)
     predecessor_id: int | None = Field(default=None, ge=1, le=2**31 - 1)
     state: Literal["draft", "approved", "failed"] | None = Field(default=None, examples=["approved"])
-    reason: str | None = Field(default=None, max_length=500)
+    reason: str | None = Field(default=None, max_length=500, pattern=LINE_PATTERN_JSON)
 
 
 class WindowOut(Schema):
@@ -236,11 +243,11 @@ class WindowOut(Schema):
     changed: str
 
 
-class PlanWindow(Schema):
+class PlanWindow(Given):
     """A window in a plan; `key` names it within the plan, `after` the one that comes before it."""
 
-    key: str = Field(min_length=1, max_length=64, examples=["w1"])
-    after: str | None = Field(default=None, max_length=64)
+    key: str = Field(min_length=1, max_length=64, pattern=LINE_PATTERN_JSON, examples=["w1"])
+    after: str | None = Field(default=None, max_length=64, pattern=LINE_PATTERN_JSON)
     name: Name
     start: Time
     stop: Time
@@ -249,7 +256,7 @@ class PlanWindow(Schema):
     instance: InstanceName = "flight"
 
 
-class Plan(Schema):
+class Plan(Given):
     """Windows as they are exchanged between services."""
 
     schema_version: Literal[1] = 1

@@ -11,7 +11,7 @@ import numpy as np
 from sqlalchemy import Connection, or_, select
 
 from ground_service.clock import utc_now_ns
-from ground_service.errors import Conflict, InvalidInput, NotFound
+from ground_service.errors import Conflict, InvalidInput, NotFound, StateConflict
 from ground_service.processing.correlation import ticks_of_utc_ns
 from ground_service.processing.planning import (
     Candidate,
@@ -37,6 +37,9 @@ from ground_service.services.pass_data import load_correlations
 from ground_service.services.users import audit
 from ground_service.services.views import candidate_view
 from ground_service.store import repository
+from ground_service.store.counters import lock_spacecraft
+from ground_service.store.states import TELECOMMAND, change_if, move_all
+from ground_service.text import REASON_LIMIT, require_line
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.constants import NANOSECONDS_PER_SECOND
@@ -55,6 +58,13 @@ BATTERY_HISTORY_S = 7200
 """The battery is taken to be full one orbit before a window that is checked by itself."""
 
 VERIFICATION_MARGIN_S = 3600
+
+_DECIDABLE = {
+    "draft": ("approved", "uplinked", "failed"),
+    "approved": ("draft",),
+    "failed": ("draft", "approved", "uplinked", "executing", "executed", "downlinked", "processed"),
+}
+"""States in which a window can be decided on, by the decision."""
 
 
 class PlanConflicts(Conflict):
@@ -152,26 +162,34 @@ def add_window(ground: Ground, entry: WindowEntry, *, actor: str) -> repository.
     PlanConflicts
         If it contradicts committed windows or what the spacecraft has.
     """
-    _check_entry(entry)
     with ground.database.writing() as connection:
-        vehicle = repository.vehicle_id(connection, entry.spacecraft_id, entry.instance)
-        _lock(connection, vehicle)
-        values = _assessed(ground, connection, vehicle, 0, entry, "draft")
-        now = utc_now_ns()
-        key = repository.add(
-            connection,
-            repository.WINDOWS,
-            vehicle_id=vehicle,
-            decision="draft",
-            state="draft",
-            version=1,
-            created_by=actor,
-            created_utc_ns=now,
-            changed_utc_ns=now,
-            **values,
-        )
-        _note(connection, actor, "enter", int(key), "draft", {"name": entry.name})
-        return window_row(connection, int(key))
+        return insert_window(ground, connection, entry, actor=actor)
+
+
+def insert_window(
+    ground: Ground, connection: Connection, entry: WindowEntry, *, actor: str
+) -> repository.Row:
+    """As `add_window`, within the caller's transaction."""
+    _check_entry(entry)
+    vehicle = repository.vehicle_id(connection, entry.spacecraft_id, entry.instance)
+    lock_spacecraft(connection, vehicle)
+    values = _assessed(ground, connection, vehicle, 0, entry, "draft")
+    now = utc_now_ns()
+    key = repository.add(
+        connection,
+        repository.WINDOWS,
+        vehicle_id=vehicle,
+        decision="draft",
+        state="draft",
+        version=1,
+        created_by=actor,
+        edited_by=actor,
+        created_utc_ns=now,
+        changed_utc_ns=now,
+        **values,
+    )
+    _note(connection, actor, "enter", int(key), "draft", {"name": entry.name})
+    return window_row(connection, int(key))
 
 
 def change_window(
@@ -200,19 +218,18 @@ def change_window(
     Conflict
         If the state does not allow it.
     """
+    if reason:
+        require_line(reason, "window", "reason", REASON_LIMIT)
     with ground.database.writing() as connection:
-        row = window_row(connection, window_id)
-        _lock(connection, row["vehicle_id"])
-        row = window_row(connection, window_id)
+        row = _locked_window(connection, window_id)
         if expected is not None:
             expected(row)
         if changes and row["state"] != "draft":
-            raise Conflict(f"window {window_id}: expected state draft to be changed, found {row['state']}")
-        commands = _command_states(connection, window_id)
-        if decision == "draft" and {"sent"} & commands:
-            raise Conflict(f"window {window_id}: telecommands of it were sent; it cannot be a draft again")
-        if decision == "approved" and row["state"] not in ("draft", "approved"):
-            raise Conflict(f"window {window_id}: expected state draft to be approved, found {row['state']}")
+            raise StateConflict("window", window_id, "draft", row["state"])
+        if decision is not None and row["state"] not in _DECIDABLE[decision]:
+            raise StateConflict("window", window_id, " or ".join(_DECIDABLE[decision]), row["state"])
+        if decision == "draft" and "sent" in _command_states(connection, window_id):
+            raise StateConflict("telecommands of window", window_id, "released, rejected or none", "sent")
         entry = replace(entry_of(row), **changes)
         _check_entry(entry)
         wanted = decision or row["decision"]
@@ -221,10 +238,15 @@ def change_window(
             values = _assessed(ground, connection, row["vehicle_id"], window_id, entry, wanted)
         if decision in ("draft", "failed"):
             _withdraw(connection, window_id, actor)
-        repository.change(
+        if changes:
+            values["edited_by"] = actor
+        if decision is not None:
+            values["decided_by"] = actor
+        changed = change_if(
             connection,
             repository.WINDOWS,
             window_id,
+            {"version": row["version"], "state": row["state"]},
             **values,
             decision=wanted,
             state=wanted if decision else row["state"],
@@ -232,12 +254,22 @@ def change_window(
             version=row["version"] + 1,
             changed_utc_ns=utc_now_ns(),
         )
+        if not changed:
+            raise StateConflict("window", window_id, row["state"], window_row(connection, window_id)["state"])
         _note(connection, actor, decision or "change", window_id, wanted, {"reason": reason or ""})
         return window_row(connection, window_id)
 
 
-def delete_window(ground: Ground, window_id: int, *, actor: str) -> None:
+def delete_window(
+    ground: Ground,
+    window_id: int,
+    *,
+    actor: str,
+    expected: Callable[[repository.Row], None] | None = None,
+) -> None:
     """Take a window off the plan; one whose telecommands were sent stays on record.
+
+    `expected` is as in `change_window`.
 
     Raises
     ------
@@ -245,7 +277,9 @@ def delete_window(ground: Ground, window_id: int, *, actor: str) -> None:
         If telecommands of it were sent, or another window names it as its predecessor.
     """
     with ground.database.writing() as connection:
-        row = window_row(connection, window_id)
+        row = _locked_window(connection, window_id)
+        if expected is not None:
+            expected(row)
         if "sent" in _command_states(connection, window_id) or row["pass_id"] is not None:
             raise Conflict(f"window {window_id}: was uplinked; it can be declared failed, not deleted")
         follower = repository.find(connection, repository.WINDOWS, predecessor_id=window_id)
@@ -270,8 +304,7 @@ def uplink_window(ground: Ground, window_id: int, *, actor: str) -> list[int]:
         If the window is not approved, begins too soon, or its predecessor is in the way.
     """
     with ground.database.writing() as connection:
-        row = window_row(connection, window_id)
-        _lock(connection, row["vehicle_id"])
+        row = _locked_window(connection, window_id)
         table = repository.TELECOMMANDS
         known = connection.execute(
             select(table.c.id)
@@ -282,7 +315,7 @@ def uplink_window(ground: Ground, window_id: int, *, actor: str) -> list[int]:
         if ids:
             return ids
         if row["state"] != "approved":
-            raise Conflict(f"window {window_id}: expected state approved, found {row['state']}")
+            raise StateConflict("window", window_id, "approved", row["state"])
         conflicts = _span_conflicts(connection, row["vehicle_id"], window_id, entry_of(row))
         if conflicts:
             raise PlanConflicts(f"window {window_id}", conflicts)
@@ -294,9 +327,16 @@ def uplink_window(ground: Ground, window_id: int, *, actor: str) -> list[int]:
             (row["start_utc_ns"], ("start_observation", duration_s, row["cadence_s"])),
             (row["stop_utc_ns"], ("stop_observation", 0.0, 0.0)),
         )
+        approval = commanding.Approval(row["edited_by"], row["decided_by"])
         ids = [
             commanding.add_released(
-                connection, row["vehicle_id"], "enable_schedule", {}, actor=actor, window_id=window_id
+                connection,
+                row["vehicle_id"],
+                "enable_schedule",
+                {},
+                actor=actor,
+                window_id=window_id,
+                approval=approval,
             )
         ]
         for utc_ns, (function, first, second) in activities:
@@ -310,6 +350,7 @@ def uplink_window(ground: Ground, window_id: int, *, actor: str) -> list[int]:
                     actor=actor,
                     timeout_s=timeout_s,
                     window_id=window_id,
+                    approval=approval,
                 )
             )
         _note(connection, actor, "uplink", window_id, row["state"], {"telecommands": ids})
@@ -507,6 +548,7 @@ def _check_span(start: int, stop: int, step_s: float, row: Mapping[str, Any]) ->
 
 
 def _check_entry(entry: WindowEntry) -> None:
+    require_line(entry.name, "window", "name")
     duration = (entry.stop_utc_ns - entry.start_utc_ns) / NS
     if duration <= 0:
         raise InvalidInput("window", "stop", "a time after the start", "one before it")
@@ -583,21 +625,22 @@ def _command_states(connection: Connection, window_id: int) -> set[str]:
 
 def _withdraw(connection: Connection, window_id: int, actor: str) -> None:
     """Reject the telecommands of a window that were not sent."""
-    table = repository.TELECOMMANDS
-    connection.execute(
-        table.update()
-        .where(table.c.window_id == window_id, table.c.state.in_(("queued", "released", "carried")))
-        .values(
-            state="rejected", decided_by=actor, decided_utc_ns=utc_now_ns(), reason="the window was withdrawn"
-        )
+    move_all(
+        connection,
+        TELECOMMAND,
+        [TELECOMMAND.table.c.window_id == window_id],
+        "rejected",
+        decided_by=actor,
+        decided_utc_ns=utc_now_ns(),
+        reason="the window was withdrawn",
     )
 
 
-def _lock(connection: Connection, vehicle: int) -> None:
-    """Let one change of a spacecraft's plan at a time be judged."""
-    connection.execute(
-        select(repository.VEHICLES.c.id).where(repository.VEHICLES.c.id == vehicle).with_for_update()
-    )
+def _locked_window(connection: Connection, window_id: int) -> repository.Row:
+    """A window as it stands once nobody else can change the plan of its spacecraft until the transaction ends."""
+    row = repository.get(connection, repository.WINDOWS, window_id, "window")
+    lock_spacecraft(connection, row["vehicle_id"])
+    return window_row(connection, window_id)
 
 
 def _note(

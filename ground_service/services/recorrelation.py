@@ -147,7 +147,7 @@ def enter_receptions(
         key = (report.ticks, report.sequence_count, report.station)
         first[key] = min(first.get(key, report.earth_utc_ns), report.earth_utc_ns)
     with ground.database.writing() as connection:
-        vehicle = _locked(connection, repository.vehicle_id(connection, spacecraft_id, instance))
+        vehicle = lock_vehicle(connection, repository.vehicle_id(connection, spacecraft_id, instance))
         rows = connection.execute(select(table).where(table.c.vehicle_id == vehicle)).mappings()
         known = {(r["ticks"], r["sequence_count"], r["station"]): r["earth_utc_ns"] for r in rows}
         new = [
@@ -187,7 +187,7 @@ def recorrelate(ground: Ground, vehicle: int, *, over_manual: bool = False) -> b
     with ground.database.writing() as connection:
         if not _has_receptions(connection, vehicle):
             return False
-        _locked(connection, vehicle)
+        lock_vehicle(connection, vehicle)
         table = repository.CORRELATIONS
         mine = (table.c.vehicle_id == vehicle, table.c.superseded == 0)
         old = [dict(row) for row in connection.execute(select(table).where(*mine)).mappings()]
@@ -324,7 +324,7 @@ def time_reports(ground: Ground, connection: Connection, vehicle: int) -> TimeRe
     )
 
 
-def _locked(connection: Connection, vehicle: int) -> int:
+def lock_vehicle(connection: Connection, vehicle: int) -> int:
     """The vehicle, which nobody else correlates until this transaction ends."""
     table = repository.VEHICLES
     connection.execute(select(table.c.id).where(table.c.id == vehicle).with_for_update())

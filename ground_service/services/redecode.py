@@ -44,6 +44,9 @@ def redecode_all(ground: Ground) -> int:
 
 def catch_up(ground: Ground, vehicle: int) -> int:
     """Decode a vehicle that an older dictionary decoded with that of this version; how many rows that gave."""
+    with ground.database.reading() as connection:
+        if not _behind(repository.get(connection, repository.VEHICLES, vehicle, "vehicle")):
+            return 0
     with ground.database.writing() as connection:
         row = _locked(connection, vehicle)
         if not _behind(row):
@@ -57,7 +60,11 @@ def note_dictionary(connection: Connection, vehicle: int) -> None:
     """Before packets are stored, inside the same transaction: note which dictionary decodes them.
 
     A vehicle that an older version decoded is to be decoded again up to here; what comes now is decoded already.
+    Its row is locked only where something has to be noted: several transactions may store packets at once.
     """
+    row = repository.get(connection, repository.VEHICLES, vehicle, "vehicle")
+    if row["decoded_version"] is not None and not _behind(row):
+        return
     row = _locked(connection, vehicle)
     if row["decoded_version"] is None:
         repository.change(connection, repository.VEHICLES, vehicle, decoded_version=DICTIONARY.version)

@@ -26,9 +26,14 @@ from ground_service.services.archive_import import checked_files, read_manifest
 from ground_service.services.archive_zip import unpacked
 from ground_service.services.ground import Ground
 from ground_service.store import repository
-from ground_service.store.files import FileArchive
+from ground_service.store.counters import hold
+from ground_service.store.files import FileArchive, replace_durably
+from ground_service.store.states import change_if
 
 MANIFEST = "manifest.json"
+_FILES_LOCK = "files of regression archives"
+"""Held while the files of archives are counted on, so that none is removed that another process has just kept."""
+
 INPUTS = "payload/inputs.jsonl"
 _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 _PNG_HEADER = struct.Struct(">8s4x4sII")
@@ -143,7 +148,7 @@ def pack_archive(folder: Path, target: Path) -> None:
                 entry.external_attr = 0o644 << 16
                 entry.compress_type = zipfile.ZIP_STORED if name.endswith(".png") else zipfile.ZIP_DEFLATED
                 packed.writestr(entry, (folder / name).read_bytes())
-        partial.replace(target)
+        replace_durably(partial, target)
     except OSError as error:
         raise storage_error(error, target) from None
     finally:
@@ -175,31 +180,33 @@ def coding_of(manifest: dict[str, Any]) -> str:
 
 def keep_archive(ground: Ground, path: Path, *, pinned: bool = False) -> PassArchive:
     """Check an archive and keep it by content; keeping it again changes nothing but the pin."""
+    table = repository.REGRESSION_ARCHIVES
     with opened_archive(path) as folder:
         archive = check_archive(folder)
         files = store_of(ground)
-        octets = sum(files.put_file(folder / name).octets for name in archive.manifest["files"])
-        manifest = files.put_file(folder / MANIFEST)
-    now = utc_now_ns()
-    with ground.database.writing() as connection:
-        table = repository.REGRESSION_ARCHIVES
-        if repository.find(connection, table, digest=archive.digest) is None:
-            repository.add(
+        stored = {name: files.put_file(folder / name) for name in (*archive.manifest["files"], MANIFEST)}
+        now = utc_now_ns()
+        with ground.database.writing() as connection:
+            hold(connection, _FILES_LOCK)
+            for name, file in stored.items():
+                if not file.path.exists():  # it was removed with another archive meanwhile
+                    files.put_file(folder / name)
+            added = repository.add_new(
                 connection,
                 table,
                 digest=archive.digest,
                 name=archive.name,
-                manifest_sha256=manifest.sha256,
+                manifest_sha256=stored[MANIFEST].sha256,
                 frames=archive.frames,
-                octets=octets + manifest.octets,
+                octets=sum(file.octets for file in stored.values()),
                 pinned=int(pinned),
                 used_utc_ns=now,
                 created_utc_ns=now,
             )
-        else:
-            repository.change(
-                connection, table, archive.digest, used_utc_ns=now, **({"pinned": 1} if pinned else {})
-            )
+            if not added:
+                repository.change(
+                    connection, table, archive.digest, used_utc_ns=now, **({"pinned": 1} if pinned else {})
+                )
     return archive
 
 
@@ -220,8 +227,10 @@ def check_out(ground: Ground, digest: str, folder: Path) -> PassArchive:
         No archive of this identity is kept.
     """
     with ground.database.writing() as connection:
-        row = repository.get(connection, repository.REGRESSION_ARCHIVES, digest, "archive")
-        repository.change(connection, repository.REGRESSION_ARCHIVES, digest, used_utc_ns=utc_now_ns())
+        table = repository.REGRESSION_ARCHIVES
+        if not change_if(connection, table, digest, {}, used_utc_ns=utc_now_ns()):
+            raise NotFound("archive", digest)
+        row = repository.get(connection, table, digest, "archive")
     files = store_of(ground)
     manifest = json.loads(files.get(row["manifest_sha256"]))
     try:
@@ -240,8 +249,8 @@ def check_out(ground: Ground, digest: str, folder: Path) -> PassArchive:
 def pin_archive(ground: Ground, digest: str, pinned: bool) -> None:
     """Keep an archive whatever its age, or let retention have it."""
     with ground.database.writing() as connection:
-        repository.get(connection, repository.REGRESSION_ARCHIVES, digest, "archive")
-        repository.change(connection, repository.REGRESSION_ARCHIVES, digest, pinned=int(pinned))
+        if not change_if(connection, repository.REGRESSION_ARCHIVES, digest, {}, pinned=int(pinned)):
+            raise NotFound("archive", digest)
 
 
 def let_go(ground: Ground, *, unused_for_ns: int) -> list[str]:
@@ -250,20 +259,21 @@ def let_go(ground: Ground, *, unused_for_ns: int) -> list[str]:
     Files that another archive holds too stay.
     """
     table = repository.REGRESSION_ARCHIVES
-    with ground.database.writing() as connection:
-        old = connection.execute(
-            select(table.c.digest, table.c.manifest_sha256).where(
-                table.c.pinned == 0, table.c.used_utc_ns <= utc_now_ns() - unused_for_ns
-            )
-        ).all()
-        connection.execute(delete(table).where(table.c.digest.in_([row[0] for row in old])))
-        kept = [row[0] for row in connection.execute(select(table.c.manifest_sha256))]
     files = store_of(ground)
-    needed = set[str]().union(*(_held(files, sha256) for sha256 in kept))
-    for _, sha256 in old:
-        for one in _held(files, sha256) - needed:
-            files.path(one).unlink(missing_ok=True)
-    return [row[0] for row in old]
+    with ground.database.writing() as connection:
+        hold(connection, _FILES_LOCK)
+        # One statement: an archive that somebody uses or pins at this moment stays.
+        old = connection.execute(
+            delete(table)
+            .where(table.c.pinned == 0, table.c.used_utc_ns <= utc_now_ns() - unused_for_ns)
+            .returning(table.c.digest, table.c.manifest_sha256)
+        ).all()
+        kept = [row[0] for row in connection.execute(select(table.c.manifest_sha256))]
+        needed = set[str]().union(*(_held(files, sha256) for sha256 in kept))
+        unneeded = set[str]().union(*(_held(files, sha256) for _, sha256 in old)) - needed
+        for sha256 in unneeded:
+            files.path(sha256).unlink(missing_ok=True)
+    return sorted(row[0] for row in old)
 
 
 def store_of(ground: Ground) -> FileArchive:

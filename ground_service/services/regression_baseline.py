@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from ground_service.processing.regression_figures import figures_of, joined
+from ground_service.processing.regression_gates import metric_interval
 from ground_service.processing.regression_samples import PassFrames
-from ground_service.processing.regression_statistics import block_weights, interval
 from ground_service.services.regressions import RegressionOutcome, pass_figures
 from ground_service.services.reports import plain
 
@@ -53,14 +53,15 @@ def baseline_text(figures: dict[str, Any]) -> str:
 
 
 def _figures(passes: list[PassFrames], outcome: RegressionOutcome) -> dict[str, Any]:
-    policy = outcome.policy.policy
     frames = joined(passes)
-    weights = block_weights(tuple(len(one) for one in passes), policy.block_frames, policy.resamples)
+    sizes = [len(one) for one in passes]
     whole = np.ones((1, len(frames)))
     return {
         figure.name: {
             "value": float(figure.compute(frames, whole)[0]),
-            "interval_95": list(interval(figure.compute(frames, weights))),
+            "interval_95": list(
+                metric_interval(figure.sample(frames), sizes, outcome.policy.policy.resamples)
+            ),
             "unit": figure.unit,
         }
         for figure in figures_of(passes)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from ground_service.missions.model import weakest_evidence
 from ground_service.processing.alignment import reference_states
 from ground_service.processing.drift import navigation_statistics
 from ground_service.processing.recall import expected_craters, match_detections
-from ground_service.processing.regression_gates import Gate
+from ground_service.processing.regression_gates import FAIL, INCONCLUSIVE, PASS, Gate
 from ground_service.services.ground import Ground
 from ground_service.services.pass_data import read_image
 from ground_service.services.regression_archives import store_of
@@ -19,6 +21,7 @@ from ground_service.services.regression_samples import PassContext, ReadDownlink
 from ground_service.services.regressions import PassVerdict, RegressionOutcome, pass_figures
 from ground_service.services.reports import plain
 from ground_service.store import repository
+from lunar.timescales import format_utc
 from reports.values import (
     CampaignPass,
     ChangedFrame,
@@ -43,8 +46,11 @@ def regression_json(outcome: RegressionOutcome) -> dict[str, Any]:
             "policy": {
                 "version": outcome.policy.policy.version,
                 "sha256": outcome.policy.sha256,
-                "alpha": outcome.policy.policy.alpha,
+                "confidence": outcome.policy.policy.confidence,
+                "power": outcome.policy.policy.power,
             },
+            "frames": outcome.frames_judged,
+            "frames_needed": outcome.frames_needed,
             "gates": [_gate(gate) for gate in outcome.gates],
             "passes": [_pass(one) for one in outcome.passes],
             "remarks": list(outcome.remarks),
@@ -54,57 +60,125 @@ def regression_json(outcome: RegressionOutcome) -> dict[str, Any]:
 
 
 def regression_text(outcome: RegressionOutcome) -> str:
-    """A few lines for a terminal: the verdict, what failed, what could not be judged."""
+    """A few lines for a terminal: the verdict, what failed, what is open and how many frames would decide it."""
     lines = [f"{outcome.candidate.title} against {outcome.baseline.title}: {outcome.verdict}"]
     for one in outcome.passes:
         if one.state != "judged":
             lines.append(f"  {one.name}: {one.state}: {one.detail}")
-    failed = [gate for gate in outcome.gates if not gate.passed]
-    for gate in failed:
+    for gate in sorted(outcome.gates, key=lambda gate: (FAIL, INCONCLUSIVE, PASS).index(gate.outcome)):
+        if gate.passed:
+            continue
         where = f" on {gate.pass_name}" if gate.pass_name else ""
-        state = f"waived: {gate.waived}" if gate.waived else "failed"
-        lines.append(
-            f"  {gate.name}{where}: {gate.baseline:.4g} -> {gate.candidate:.4g} {gate.unit}, "
-            f"limit {gate.limit:.4g}: {state}"
-        )
+        state = f"waived ({gate.outcome}): {gate.waived}" if gate.waived else gate.outcome
+        lines.append(f"  {state}: {gate.name}{where}: {gate_text(gate)}")
+    counts = {
+        name: sum(gate.outcome == name for gate in outcome.gates) for name in (PASS, FAIL, INCONCLUSIVE)
+    }
     lines.append(
-        f"  {len(outcome.gates) - len(failed)} of {len(outcome.gates)} gates passed over "
-        f"{sum(one.state == 'judged' for one in outcome.passes)} of {len(outcome.passes)} passes"
+        f"  {counts[PASS]} of {len(outcome.gates)} gates passed, {counts[FAIL]} failed, "
+        f"{counts[INCONCLUSIVE]} inconclusive, over "
+        f"{sum(one.state == 'judged' for one in outcome.passes)} of {len(outcome.passes)} passes "
+        f"({outcome.frames_judged} frames)"
     )
+    if not outcome.gates:
+        lines.append("  No gate was judged: the passes above give no metric to compare")
+    if needed_text(outcome):
+        lines.append(f"  {needed_text(outcome)}")
     lines += [f"  {remark}" for remark in outcome.remarks]
     return "\n".join(lines)
 
 
-def regression_junit(outcome: RegressionOutcome) -> str:
-    """JUnit XML: a case for every gate and for every pass."""
-    cases = [
-        (f"pass {one.name}", "passes", "" if one.state == "judged" else one.detail, one.state)
-        for one in outcome.passes
+def gate_text(gate: Gate) -> str:
+    """Return the values of a gate, why it is open, and the frames that would decide it."""
+    parts = [
+        f"{_number(gate.baseline)} -> {_number(gate.candidate)} {gate.unit}".rstrip(),
+        f"limit {_number(gate.limit)}",
     ]
+    if gate.outcome == INCONCLUSIVE:
+        parts.append(gate.reason)
+        if not gate.reason.startswith("unknown"):
+            parts.append(f"resolution {_number(gate.resolution)}, margin {gate.margin:.3g}")
+            parts.append(f"{gate.frames} frames, {_needed(gate.frames_needed)}")
+    elif gate.reason:
+        parts.append(gate.reason)
+    return ", ".join(parts)
+
+
+def needed_text(outcome: RegressionOutcome) -> str:
+    """Return how many frames and passes would decide every gate over the suite; empty where none is open."""
+    needed, frames = outcome.frames_needed, outcome.frames_judged
+    judged = sum(one.state == "judged" for one in outcome.passes)
+    if needed is None or needed <= frames or not judged:
+        return ""
+    passes = math.ceil(needed * judged / frames)
+    return f"{needed:,} frames are needed to decide every gate over the suite (about {passes:,} passes of this length)"
+
+
+def _needed(frames: int | None) -> str:
+    return "needs an unknown number" if frames is None else f"needs {frames:,}"
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if math.isfinite(value) else "unknown"
+
+
+def regression_junit(outcome: RegressionOutcome, finished_utc_ns: int) -> str:
+    """JUnit XML: a case for every gate and for every pass.
+
+    Elements, their order and their attributes are valid in the schema of the Jenkins xUnit plugin (junit-10.xsd) and in
+    the stricter one of Apache Ant (JUnit.xsd). An inconclusive case is an error, which is neither a pass nor a failure;
+    a waived case is skipped with its reason.
+    """
+    cases: list[tuple[str, str, str, str]] = []
+    for one in outcome.passes:
+        kind = "" if one.state == "judged" else "failure" if one.state == "candidate failed" else "error"
+        cases.append((f"pass {one.name}", "passes", kind, one.detail and f"{one.state}: {one.detail}"))
     for gate in outcome.gates:
-        told = f"{gate.baseline:.6g} -> {gate.candidate:.6g} {gate.unit}, limit {gate.limit:.6g}"
-        name = f"{gate.name} ({gate.pass_name or 'suite'})"
-        cases.append((name, "gates", "" if gate.passed else told, "waived" if gate.waived else "failed"))
-    suite = ET.Element("testsuite", name="linna regress", tests=str(len(cases)))
-    failures = errors = skipped = 0
-    for name, kind, message, state in cases:
-        case = ET.SubElement(suite, "testcase", name=name, classname=f"regress.{kind}")
-        if not message:
-            continue
-        if state == "waived":
-            ET.SubElement(case, "skipped", message=message)
-            skipped += 1
-        elif state in ("unusable", "baseline failed"):
-            ET.SubElement(case, "error", message=message, type=state)
-            errors += 1
-        else:
-            ET.SubElement(case, "failure", message=message, type=state)
-            failures += 1
-    suite.set("failures", str(failures))
-    suite.set("errors", str(errors))
-    suite.set("skipped", str(skipped))
+        kind = {PASS: "", FAIL: "failure", INCONCLUSIVE: "error"}[gate.outcome]
+        text = f"{gate.outcome}: {gate_text(gate)}"
+        if gate.waived:
+            kind, text = "skipped", f"waived: {gate.waived}; {text}"
+        cases.append((f"{gate.name} ({gate.pass_name or 'suite'})", "gates", kind, text))
+    if not outcome.gates:
+        cases.append(("gates", "gates", "error", "inconclusive: no gate was judged"))
+    kinds = [kind for _, _, kind, _ in cases]
+    suite = ET.Element(
+        "testsuite",
+        name="linna regress",
+        # The schema of Apache Ant permits neither fractions of a second nor a time zone: this is UTC.
+        timestamp=format_utc(finished_utc_ns)[:19],
+        hostname="localhost",
+        tests=str(len(cases)),
+        failures=str(kinds.count("failure")),
+        errors=str(kinds.count("error")),
+        skipped=str(kinds.count("skipped")),
+        time="0",
+    )
+    properties = ET.SubElement(suite, "properties")
+    for name, value in (
+        ("verdict", outcome.verdict),
+        ("candidate", outcome.candidate.digest),
+        ("baseline", outcome.baseline.digest),
+        ("policy", outcome.policy.sha256),
+        ("frames", str(outcome.frames_judged)),
+        ("frames_needed", "unknown" if outcome.frames_needed is None else str(outcome.frames_needed)),
+    ):
+        ET.SubElement(properties, "property", name=name, value=value)
+    for name, group, kind, text in cases:
+        case = ET.SubElement(suite, "testcase", name=_xml(name), classname=f"regress.{group}", time="0")
+        if kind == "skipped":
+            ET.SubElement(case, kind, message=_xml(text))
+        elif kind:
+            ET.SubElement(case, kind, message=_xml(text), type="inconclusive" if kind == "error" else "fail")
+    ET.SubElement(suite, "system-out").text = _xml(regression_text(outcome))
+    ET.SubElement(suite, "system-err")
     ET.indent(suite)
     return ET.tostring(suite, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _xml(text: str) -> str:
+    """Text without the control characters that XML cannot hold."""
+    return "".join(c if c in "\t\n" or ord(c) >= 32 else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
 def regression_html(ground: Ground, outcome: RegressionOutcome, identity: str) -> str:
@@ -117,7 +191,6 @@ def regression_html(ground: Ground, outcome: RegressionOutcome, identity: str) -
 def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str) -> RegressionReport:
     """The report of a regression as a value."""
     judged = [one for one in outcome.passes if one.state == "judged"]
-    failed = [gate for gate in outcome.gates if not gate.counts_as_passed]
     troubled = [one for one in outcome.passes if one.state != "judged"]
     sources = sorted(
         {str(name) for one in judged if one.context for name in one.context.manifest.get("data_sources", ())}
@@ -132,9 +205,9 @@ def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str)
         candidate_passes=tuple(_campaign_pass(one, "candidate") for one in judged),
         baseline_passes=tuple(_campaign_pass(one, "baseline") for one in judged),
         changed_frames=tuple(changed_frames(ground, judged)),
-        verdict=_verdict_text(outcome, failed, troubled),
-        verdict_level={"pass": "good", "fail": "bad", "incomplete": "caution"}[outcome.verdict],
-        evidence_rung=_rung(sources),
+        verdict=_verdict_text(outcome, troubled),
+        verdict_level={PASS: "good", FAIL: "bad", INCONCLUSIVE: "caution"}[outcome.verdict],
+        evidence_level=weakest_evidence([one.context.evidence for one in judged if one.context]),
         headline=_headline(outcome),
         provenance={
             "candidate": outcome.candidate.digest,
@@ -147,11 +220,11 @@ def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str)
         remarks=(
             *(f"{one.name}: {one.state}: {one.detail}" for one in troubled),
             *outcome.remarks,
-            "A gate fails when the worsening exceeds what the policy tolerates by more than chance explains: one-sided "
-            "t on a bootstrap over blocks of "
-            f"{outcome.policy.policy.block_frames} frames, both builds resampled together, Holm's procedure over the "
-            f"gates of the suite and over those of single passes, {outcome.policy.policy.alpha:g} in all.",
-            *_coarse(outcome),
+            "A gate passes if the frames resolve the margin of the policy and the upper confidence bound of the "
+            "degradation is within it. It fails if the degradation exceeds the margin by more than chance explains "
+            "(paired by frame, one-sided Student's t with the autocorrelation of the frames, Holm's procedure over "
+            "all gates). Otherwise it is inconclusive. "
+            f"Confidence {outcome.policy.policy.confidence:g}, power {outcome.policy.policy.power:g}.",
         ),
     )
 
@@ -198,7 +271,8 @@ def _side(context: PassContext, read: ReadDownlink, frame: int, image: Any, labe
     d = slice(int(detections.offsets[at]), int(detections.offsets[at + 1])) if present else slice(0, 0)
     utc = context.frame_utc_ns[frame : frame + 1]
     track = reference_states(context.reference, context.orientation, utc)
-    expected = expected_craters(context.catalogue, context.camera, track.position_mcmf_m)
+    rotations = context.viewing.camera_from_mcmf(utc, track.position_mcmf_m, track.mcmf_from_icrf)
+    expected = expected_craters(context.catalogue, context.camera, track.position_mcmf_m, rotations)
     single = _one_frame(detections, d)
     matches = match_detections(single, expected)
     scored = np.isin(expected.size_class, (0, 1, 2))
@@ -252,15 +326,20 @@ def _gate(gate: Gate) -> dict[str, Any]:
     return {
         "name": gate.name,
         "pass": gate.pass_name or None,
+        "outcome": gate.outcome,
+        "passed": gate.passed,
         "baseline": gate.baseline,
         "candidate": gate.candidate,
+        "margin": gate.margin,
         "limit": gate.limit,
-        "passed": gate.passed,
         "unit": gate.unit,
-        "change_95": [gate.low, gate.high],
+        "change_bounds": [gate.change_low, gate.change_high],
         "p_value": gate.p_value,
         "level": gate.level,
         "resolution": gate.resolution,
+        "frames": gate.frames,
+        "frames_needed": gate.frames_needed,
+        "reason": gate.reason or None,
         "waived": gate.waived or None,
     }
 
@@ -292,9 +371,20 @@ def _pass(one: PassVerdict) -> dict[str, Any]:
 
 
 def _report_gate(gate: Gate) -> RegressionGate:
-    name = f"{gate.name} (waived)" if gate.waived and not gate.passed else gate.name
     return RegressionGate(
-        name, gate.baseline, gate.candidate, gate.limit, gate.counts_as_passed, gate.unit, gate.pass_name
+        name=gate.name,
+        baseline=gate.baseline,
+        candidate=gate.candidate,
+        limit=gate.limit,
+        outcome=gate.outcome,
+        unit=gate.unit,
+        pass_id=gate.pass_name,
+        margin=gate.margin,
+        resolution=gate.resolution,
+        frames=gate.frames,
+        frames_needed=gate.frames_needed,
+        reason=gate.reason,
+        waived=gate.waived,
     )
 
 
@@ -354,29 +444,29 @@ def _headline(outcome: RegressionOutcome) -> tuple[HeadlineFigure, ...]:
     return tuple(figures)
 
 
-def _verdict_text(outcome: RegressionOutcome, failed: list[Gate], troubled: list[PassVerdict]) -> str:
-    parts = []
+def _verdict_text(outcome: RegressionOutcome, troubled: list[PassVerdict]) -> str:
+    failed = [gate for gate in outcome.gates if gate.outcome == FAIL and not gate.waived]
+    unresolved = [gate for gate in outcome.gates if gate.outcome == INCONCLUSIVE and not gate.waived]
+    waived = [gate for gate in outcome.gates if gate.waived]
+    parts = [outcome.verdict.capitalize() + "."]
     if failed:
-        names = list(dict.fromkeys(gate.name for gate in failed))
-        parts.append(
-            f"{len(failed)} gates failed: {', '.join(names[:6])}{' and others' if len(names) > 6 else ''}."
-        )
-    else:
-        parts.append(f"All {len(outcome.gates)} gates passed.")
+        parts.append(f"{_counted(failed, 'failed')}.")
+    if unresolved:
+        parts.append(f"{_counted(unresolved, 'inconclusive')}.")
+    if not outcome.gates:
+        parts.append("No gate was judged.")
+    elif not failed and not unresolved:
+        parts.append(f"{sum(gate.passed for gate in outcome.gates)} of {len(outcome.gates)} gates passed.")
+    if waived:
+        parts.append(f"{_counted(waived, 'waived')}.")
+    if needed_text(outcome):
+        parts.append(needed_text(outcome) + ".")
     if troubled:
         parts.append(f"{len(troubled)} of {len(outcome.passes)} passes were not judged: see the remarks.")
     return " ".join(parts)
 
 
-def _coarse(outcome: RegressionOutcome) -> list[str]:
-    """What the passes were too few to see."""
-    gate = next((g for g in outcome.gates if g.name == "detector.recall" and not g.pass_name), None)
-    if gate is None or not np.isfinite(gate.resolution):
-        return []
-    return [
-        f"These passes show a loss of recall of {gate.resolution:.3f} or more with a probability of nine in ten."
-    ]
-
-
-def _rung(sources: list[str]) -> str:
-    return "2" if any("procedural" in name for name in sources) else "3" if sources else ""
+def _counted(gates: Sequence[Gate], state: str) -> str:
+    names = list(dict.fromkeys(gate.name for gate in gates))
+    more = f" and {len(names) - 6} others" if len(names) > 6 else ""
+    return f"{len(gates)} {'gate' if len(gates) == 1 else 'gates'} {state}: {', '.join(names[:6])}{more}"

@@ -22,6 +22,7 @@ from ground_service.services.regressions import (
     run_regression,
 )
 from ground_service.store import repository
+from ground_service.store.states import change_if
 
 
 def prepared(ground: Ground, candidate: str, baseline: str, archives: Sequence[str]) -> dict[str, Any]:
@@ -83,8 +84,9 @@ def regression_job(ground: Ground, arguments: Mapping[str, Any], job_id: str) ->
     def progress(items: Any, total: int) -> Iterator[Any]:
         for number, item in enumerate(items, start=1):
             yield item
+            share = 0.95 * number / total
             with ground.database.writing() as connection:
-                repository.change(connection, repository.JOBS, job_id, progress=0.95 * number / total)
+                change_if(connection, repository.JOBS, job_id, {"state": "running"}, progress=share)
 
     outcome = run_regression(
         ground,

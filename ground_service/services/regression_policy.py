@@ -3,18 +3,72 @@
 from __future__ import annotations
 
 import datetime
+import difflib
 import hashlib
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from ground_service.errors import InvalidInput, storage_error
-from ground_service.processing.regression_gates import GatePolicy, GateRule, Waiver
+from ground_service.processing.regression_gates import EXACT_METRICS, GatePolicy, GateRule, Waiver
 
 SHIPPED = Path(__file__).with_name("regression_policy.toml")
-SCHEMA_VERSION = 1
-_KEYS = ("schema_version", "version", "alpha", "block_frames", "resamples", "per_pass", "gate", "waiver")
+SCHEMA_VERSION = 2
+
+Text = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+class ConfidenceTable(_Table):
+    """Confidence of the decisions: of each pass, and of all failures together."""
+
+    value: float = Field(ge=0.8, le=0.9999)
+    reason: Text
+
+
+class PowerTable(_Table):
+    """Probability with which a degradation as large as the resolution is detected."""
+
+    value: float = Field(ge=0.5, le=0.999)
+    reason: Text
+
+
+class GateTable(_Table):
+    """One rule: the metrics it applies to, and the degradation that is tolerated."""
+
+    figure: Text
+    margin: float = Field(ge=0.0, le=1e9)
+    pass_margin: float | None = Field(default=None, gt=0.0, le=1e9)
+    reason: Text
+    required: bool | None = None
+
+
+class WaiverTable(_Table):
+    """A gate that need not pass until a day."""
+
+    gate: Text
+    pass_name: Text = Field(default="*", alias="pass")
+    reason: Text
+    until: datetime.date
+
+
+class PolicyTable(_Table):
+    """The whole file."""
+
+    schema_version: int = Field(ge=SCHEMA_VERSION, le=SCHEMA_VERSION)
+    version: Text
+    resamples: int = Field(default=400, ge=50, le=10_000)
+    confidence: ConfidenceTable
+    power: PowerTable
+    gate: list[GateTable] = Field(min_length=1)
+    waiver: list[WaiverTable] = []
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,12 +81,12 @@ class PolicyFile:
 
 
 def load_policy(path: Path | None = None) -> PolicyFile:
-    """The policy in a file; the shipped one by default.
+    """Return the policy in a file; the shipped one by default.
 
     Raises
     ------
     InvalidInput
-        The file is missing or no policy; the message names the key.
+        The file is missing or is no policy; the message names the key.
     """
     where = path or SHIPPED
     source = str(where)
@@ -45,74 +99,83 @@ def load_policy(path: Path | None = None) -> PolicyFile:
         raise storage_error(error, where) from None
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InvalidInput(source, "", "a policy file (TOML)", str(error)) from None
-    for key in table:
-        if key not in _KEYS:
-            raise InvalidInput(source, key, f"one of {', '.join(_KEYS)}", "an unknown key")
     if table.get("schema_version") != SCHEMA_VERSION:
         raise InvalidInput(source, "schema_version", str(SCHEMA_VERSION), repr(table.get("schema_version")))
+    for waiver in table.get("waiver", []) if isinstance(table.get("waiver"), list) else []:
+        # A day may be written as a TOML date or as text.
+        if isinstance(waiver, dict) and isinstance(waiver.get("until"), str):
+            waiver["until"] = _day(waiver["until"])
+    try:
+        read = PolicyTable.model_validate(table)
+    except ValidationError as error:
+        raise _invalid(error, source) from None
+    for i, item in enumerate(read.gate):
+        if item.margin == 0.0 and item.figure not in EXACT_METRICS:
+            raise InvalidInput(
+                source,
+                f"gate[{i}].margin",
+                "a number above 0: no number of frames shows that nothing at all has changed",
+                "0",
+            )
     policy = GatePolicy(
-        version=_value(table, "version", str, source),
-        alpha=_number(table, "alpha", source, 1e-6, 0.2),
-        block_frames=int(_number(table, "block_frames", source, 1, 1000)),
-        resamples=int(_number(table, "resamples", source, 50, 10_000)),
-        rules=tuple(
-            _rule(item, f"gate[{i}]", source) for i, item in enumerate(_tables(table, "gate", source))
-        ),
-        per_pass=tuple(str(item) for item in _value(table, "per_pass", list, source)),
+        version=read.version,
+        confidence=read.confidence.value,
+        power=read.power.value,
+        resamples=read.resamples,
+        rules=tuple(_rule(item) for item in read.gate),
         waivers=tuple(
-            _waiver(item, f"waiver[{i}]", source) for i, item in enumerate(_tables(table, "waiver", source))
+            Waiver(item.gate, item.reason, item.until.isoformat(), item.pass_name) for item in read.waiver
         ),
     )
     return PolicyFile(policy, hashlib.sha256(octets).hexdigest(), "shipped" if path is None else source)
 
 
-def _rule(item: dict[str, Any], place: str, source: str) -> GateRule:
-    _only(item, ("figure", "margin"), place, source)
-    return GateRule(
-        _value(item, "figure", str, source, place), _number(item, "margin", source, 0.0, 1e9, place)
-    )
+def _rule(item: GateTable) -> GateRule:
+    wild = any(character in item.figure for character in "*?[")
+    required = not wild if item.required is None else item.required
+    return GateRule(item.figure, item.margin, item.pass_margin, item.reason, required)
 
 
-def _waiver(item: dict[str, Any], place: str, source: str) -> Waiver:
-    _only(item, ("gate", "pass", "reason", "until"), place, source)
-    until = item.get("until")
-    text = until.isoformat() if isinstance(until, datetime.date) else until
+def _day(text: str) -> datetime.date | str:
     try:
-        day = datetime.date.fromisoformat(str(text))
+        return datetime.date.fromisoformat(text)
     except ValueError:
-        raise InvalidInput(source, f"{place}.until", "a day such as 2029-12-31", repr(until)) from None
-    reason = _value(item, "reason", str, source, place)
-    if not reason.strip():
-        raise InvalidInput(source, f"{place}.reason", "why the gate may fail", "nothing")
-    return Waiver(
-        _value(item, "gate", str, source, place), reason, day.isoformat(), str(item.get("pass", "*"))
-    )
+        return text
 
 
-def _tables(table: dict[str, Any], key: str, source: str) -> list[dict[str, Any]]:
-    found = table.get(key, [])
-    if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
-        raise InvalidInput(source, key, f"tables [[{key}]]", type(found).__name__)
-    return found
+def _invalid(error: ValidationError, source: str) -> InvalidInput:
+    """Return the first fault as one line: an unknown key with the nearest known one."""
+    # A misspelt key is also a missing one: the unknown key names the cause.
+    first = min(error.errors(include_url=False), key=lambda item: item["type"] != "extra_forbidden")
+    place = _place(first["loc"])
+    if first["type"] == "extra_forbidden":
+        known = _keys_at(first["loc"][:-1])
+        close = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
+        expected = f"'{close[0]}'" if close else f"one of {', '.join(known)}"
+        return InvalidInput(source, place, expected, "an unknown key")
+    found = "nothing" if first["type"] == "missing" else repr(first["input"])[:80]
+    expected = "a value" if first["type"] == "missing" else _lower(first["msg"])
+    return InvalidInput(source, place, expected, found)
 
 
-def _only(item: dict[str, Any], keys: tuple[str, ...], place: str, source: str) -> None:
-    for key in item:
-        if key not in keys:
-            raise InvalidInput(source, f"{place}.{key}", f"one of {', '.join(keys)}", "an unknown key")
+def _place(location: Sequence[int | str]) -> str:
+    text = ""
+    for part in location:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return text
 
 
-def _value(table: dict[str, Any], key: str, kind: type, source: str, place: str = "") -> Any:
-    value = table.get(key)
-    if not isinstance(value, kind) or isinstance(value, bool):
-        raise InvalidInput(source, f"{place}.{key}".strip("."), f"a {kind.__name__}", repr(value)[:80])
-    return value
+def _keys_at(location: Sequence[int | str]) -> list[str]:
+    """Keys of the table at a place."""
+    tables: dict[str, type[BaseModel]] = {
+        "confidence": ConfidenceTable,
+        "power": PowerTable,
+        "gate": GateTable,
+        "waiver": WaiverTable,
+    }
+    model = tables[str(location[0])] if location else PolicyTable
+    return [item.alias or name for name, item in model.model_fields.items()]
 
 
-def _number(table: dict[str, Any], key: str, source: str, low: float, high: float, place: str = "") -> float:
-    value = table.get(key)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        raise InvalidInput(
-            source, f"{place}.{key}".strip("."), f"a number from {low:g} to {high:g}", repr(value)[:80]
-        )
-    return float(value)
+def _lower(message: str) -> str:
+    return message.removeprefix("Input should be ").removeprefix("Value error, ")

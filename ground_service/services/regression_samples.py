@@ -12,12 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_service.errors import InvalidInput
+from ground_service.missions.model import Camera, Evidence
 from ground_service.processing.regression_samples import PassFrames, pass_frames
 from ground_service.processing.samples import DetectionSamples, NavigationSamples
-from ground_service.services.pass_data import camera_of
+from ground_service.processing.viewing import Viewing
+from ground_service.services.archive_import import ATTITUDE_FILE, archived_mission
+from ground_service.services.attitudes import load_attitudes, no_attitudes
+from ground_service.services.pass_data import camera_of, orientation_of
 from ground_service.services.regression_archives import PassArchive, frame_inputs
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, load_catalogue
+from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris, load_ephemeris
 from lunar.frames import Orientation
 from lunar.timescales import utc_ns_from_ticks
@@ -46,6 +51,8 @@ class PassContext:
     catalogue: CraterCatalogue
     camera: PinholeCamera
     orientation: Orientation
+    viewing: Viewing
+    evidence: Evidence
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,23 +63,55 @@ class ReadDownlink:
     frames: PassFrames
 
 
-def pass_context(archive: PassArchive, orientation: Orientation) -> PassContext:
-    """What is known of a pass that was archived."""
+def pass_context(archive: PassArchive, data: DataFolder) -> PassContext:
+    """Return what is known of a pass that was archived, in the lunar orientation that it declares.
+
+    Raises
+    ------
+    EvaluationError
+        The archive does not declare its lunar orientation, or it is not available on this machine.
+    """
     folder = archive.folder
+    mission = archived_mission(folder, archive.manifest)
     rows = frame_inputs(folder)
     ticks = np.array([row["ticks"] for row in rows], dtype=np.int64)
     text = (folder / "payload/dictionary.json").read_text(encoding="utf-8")
+    utc_ns = _frame_times(folder, [row["frame"] for row in rows], ticks)
+    camera = camera_of(mission.camera)
     return PassContext(
         name=archive.name,
         manifest=archive.manifest,
         frame_ticks=ticks,
-        frame_utc_ns=_frame_times(folder, [row["frame"] for row in rows], ticks),
+        frame_utc_ns=utc_ns,
         frame_names=tuple(row["image"] or "" for row in rows),
         dictionary=parse_dictionary(text, str(folder / "payload/dictionary.json")),
         reference=load_ephemeris(folder / "reference.oem"),
         catalogue=load_catalogue(folder / "catalogue.csv"),
-        camera=camera_of(archive.manifest),
-        orientation=orientation,
+        camera=camera,
+        orientation=orientation_of(mission, data),
+        viewing=_viewing(folder, mission.camera, camera, ticks, utc_ns),
+        evidence=mission.evidence,
+    )
+
+
+def _viewing(
+    folder: Path, declared: Camera, camera: PinholeCamera, ticks: IntArray, utc_ns: IntArray
+) -> Viewing:
+    """How the camera looked at the frames of an archive."""
+    path = folder / ATTITUDE_FILE
+    table = load_attitudes(path, str(path)) if path.is_file() else no_attitudes()
+    order = np.argsort(ticks, kind="stable")
+    rows = np.searchsorted(ticks[order], table.image_ticks)
+    known = rows < len(ticks)
+    known[known] = ticks[order][rows[known]] == table.image_ticks[known]
+    frames = order[rows[known]]
+    in_time = np.argsort(utc_ns[frames], kind="stable")
+    return Viewing(
+        camera,
+        math.radians(declared.tilt_deg or 0.0),
+        math.radians(declared.yaw_deg or 0.0),
+        utc_ns[frames][in_time],
+        table.q_wxyz[known][in_time],
     )
 
 
@@ -114,6 +153,7 @@ def read_downlink(
         context.catalogue,
         context.camera,
         context.orientation,
+        context.viewing,
     )
     latency, latency_ms = _latency(performance, len(context.frame_ticks))
     return ReadDownlink(

@@ -21,12 +21,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy import true, update
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, InvalidInput
-from ground_service.processing.regression_figures import outcome_shares
-from ground_service.processing.regression_gates import Gate, judge
+from ground_service.processing.regression_figures import outcome_shares, same_telemetry
+from ground_service.processing.regression_gates import FAIL, INCONCLUSIVE, PASS, Gate, judge, verdict_of
 from ground_service.processing.regression_samples import PassFrames
 from ground_service.services.build_runs import OK, OUTCOMES, PERFORMANCE, read_performance, run_build
 from ground_service.services.builds import Build
@@ -38,7 +38,7 @@ from ground_service.store import repository
 from lunar.errors import LunarError
 from lunar.timescales import format_utc
 
-PASS, FAIL, INCOMPLETE = "pass", "fail", "incomplete"
+EXIT_STATUS = {PASS: 0, FAIL: 1, INCONCLUSIVE: 3}
 Progress = Callable[[Sequence[Any], int], Iterator[Any]]
 
 
@@ -93,17 +93,41 @@ class RegressionOutcome:
 
     @property
     def verdict(self) -> str:
-        """ "fail": a gate or a pass failed; "incomplete": a pass could not be judged; else "pass"."""
-        failed = any(not gate.counts_as_passed for gate in self.gates)
-        if failed or any(one.state == "candidate failed" for one in self.passes):
+        """Pass, fail or inconclusive.
+
+        "fail": a gate failed, or the candidate failed on a pass. "inconclusive": there is no gate, a gate is
+        inconclusive, or a pass could not be judged for its archive or its baseline.
+        """
+        of_gates = verdict_of(self.gates)
+        if of_gates == FAIL or any(one.state == "candidate failed" for one in self.passes):
             return FAIL
-        judged = [one for one in self.passes if one.state == "judged"]
-        return PASS if judged and len(judged) == len(self.passes) else INCOMPLETE
+        return of_gates if all(one.state == "judged" for one in self.passes) else INCONCLUSIVE
 
     @property
     def exit_status(self) -> int:
-        """0 pass, 1 fail, 2 a pass that could not be judged for its archive or its baseline."""
-        return {PASS: 0, FAIL: 1, INCOMPLETE: 2}[self.verdict]
+        """0 pass, 1 fail, 3 inconclusive."""
+        return EXIT_STATUS[self.verdict]
+
+    @property
+    def frames_judged(self) -> int:
+        """Frames that both builds flew."""
+        return sum(
+            len(one.baseline_read.frames)
+            for one in self.passes
+            if one.state == "judged" and one.baseline_read
+        )
+
+    @property
+    def frames_needed(self) -> int | None:
+        """Frames with which every gate over the suite would be decided; None where no gate states a number."""
+        return max(
+            (
+                gate.frames_needed
+                for gate in self.gates
+                if gate.frames_needed is not None and not gate.pass_name and not gate.waived
+            ),
+            default=None,
+        )
 
 
 def run_regression(
@@ -171,15 +195,22 @@ def do_replay(ground: Ground, digest: str, build: Build) -> KeptReplay:
             return _keep(
                 ground, digest, build, KeptReplay("refused", refusal, None, None, 0, 0, 0, "", _machine())
             )
-        run = run_build(build, archive.folder, Path(folder) / "out")
+        run = run_build(
+            build, archive.folder, Path(folder) / "out", runner=ground.runner, private=(ground.home,)
+        )
         outcome, detail = run.outcome, run.detail
         stored: dict[str, str | None] = {"downlink": None, "performance": None}
         if run.downlink is not None:
             octets = run.downlink.read_bytes()
             try:
-                read_downlink(pass_context(archive, ground.orientation), octets, None, 0.0)
-            except InvalidInput as error:
-                outcome, detail = "garbage", str(error)
+                context = pass_context(archive, ground.data)
+            except (GroundError, LunarError):
+                pass  # a fault of the archive or of the ground's data, not of the build: the verdict reports it
+            else:
+                try:
+                    read_downlink(context, octets, None, 0.0)
+                except InvalidInput as error:
+                    outcome, detail = "garbage", str(error)
             stored["downlink"] = store_of(ground).put_octets(octets).sha256
         if run.performance is not None:
             stored["performance"] = store_of(ground).put_file(Path(folder) / "out" / PERFORMANCE).sha256
@@ -254,7 +285,9 @@ def judge_regression(
             f"{elsewhere} passes were flown on different machines by the two builds: their latencies are not compared"
         )
     gates = judge(before, after, policy.policy, today=format_utc(utc_now_ns())[:10])
-    waived = [gate for gate in gates if gate.waived and not gate.passed]
+    if before and all(same_telemetry(before[name], after[name]) for name in before):
+        remarks.append("Both builds sent identical telemetry in every frame: it is compared exactly")
+    waived = [gate for gate in gates if gate.waived]
     remarks += [f"waived: {gate.name} {gate.pass_name}: {gate.waived}".replace(" :", ":") for gate in waived]
     isolations = sorted(
         {
@@ -264,7 +297,7 @@ def judge_regression(
             if replay and replay.isolation
         }
     )
-    remarks += [f"builds were shut off by: {name}" for name in isolations]
+    remarks += [f"builds were confined by: {name}" for name in isolations]
     return RegressionOutcome(baseline, candidate, policy, tuple(gates), passes, tuple(remarks))
 
 
@@ -277,18 +310,17 @@ def keep_regression(ground: Ground, outcome: RegressionOutcome, *, regression_id
     now = utc_now_ns()
     with ground.database.writing() as connection:
         repository.register_file(connection, html, "report", f"regression {identity}", now)
-        if repository.find(connection, repository.REGRESSIONS, id=identity) is None:
-            repository.add(
-                connection,
-                repository.REGRESSIONS,
-                id=identity,
-                baseline_digest=outcome.baseline.digest,
-                candidate_digest=outcome.candidate.digest,
-                verdict=outcome.verdict,
-                result=regression_json(outcome),
-                html_sha256=html.sha256,
-                created_utc_ns=now,
-            )
+        repository.add_new(  # a verdict that was kept stays
+            connection,
+            repository.REGRESSIONS,
+            id=identity,
+            baseline_digest=outcome.baseline.digest,
+            candidate_digest=outcome.candidate.digest,
+            verdict=outcome.verdict,
+            result=regression_json(outcome),
+            html_sha256=html.sha256,
+            created_utc_ns=now,
+        )
     return identity
 
 
@@ -336,7 +368,7 @@ def _pass_verdict(ground: Ground, archive: PassArchive, candidate: Build, baseli
             return PassVerdict(archive.name, archive.digest, state, told, old, new)
     try:
         with tempfile.TemporaryDirectory(prefix="judge-", dir=_scratch(ground)) as folder:
-            context = pass_context(check_out(ground, archive.digest, Path(folder) / "a"), ground.orientation)
+            context = pass_context(check_out(ground, archive.digest, Path(folder) / "a"), ground.data)
         read = [_read(ground, context, replay) for replay in (old, new)]
     except (GroundError, LunarError) as error:
         return PassVerdict(archive.name, archive.digest, "unusable", str(error), old, new)
@@ -353,26 +385,23 @@ def _read(ground: Ground, context: PassContext, replay: KeptReplay) -> ReadDownl
 
 
 def _keep(ground: Ground, digest: str, build: Build, replay: KeptReplay) -> KeptReplay:
+    """Keep a replay; one that succeeded is never replaced by one that another worker did at the same time."""
     values = {item.name: getattr(replay, item.name) for item in dataclasses.fields(replay)}
     identity = replay_id(digest, build)
     table = repository.REPLAYS
     with ground.database.writing() as connection:
-        try:
-            with connection.begin_nested():
-                if repository.find(connection, table, id=identity) is not None:
-                    repository.change(connection, table, identity, **values)
-                else:
-                    repository.add(
-                        connection,
-                        table,
-                        id=identity,
-                        archive_digest=digest,
-                        build_digest=build.digest,
-                        created_utc_ns=utc_now_ns(),
-                        **values,
-                    )
-        except IntegrityError:
-            pass  # another worker was first: its replay is as good
+        added = repository.add_new(
+            connection,
+            table,
+            id=identity,
+            archive_digest=digest,
+            build_digest=build.digest,
+            created_utc_ns=utc_now_ns(),
+            **values,
+        )
+        if not added:
+            condition = table.c.outcome != OK if replay.outcome != OK else true()
+            connection.execute(update(table).where(table.c.id == identity, condition).values(**values))
     return replay
 
 

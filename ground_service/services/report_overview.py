@@ -15,7 +15,7 @@ from ground_service.services.ground import Ground
 from ground_service.store import repository
 from ground_service.store.files import FileArchive
 
-_TEXTS = ("title", "verdict", "verdict_level", "evidence_rung", "created_utc", "headline", "not_available")
+_TEXTS = ("title", "verdict", "verdict_level", "evidence_level", "created_utc", "headline", "not_available")
 
 
 def report_overview(ground: Ground, report_id: str, max_points: int) -> dict[str, Any]:
@@ -42,6 +42,8 @@ def _overview(files: FileArchive, sha256: str, max_points: int) -> dict[str, Any
     document = json.loads(files.get(sha256))
     return {
         **{name: document.get(name) for name in _TEXTS},
+        # Reports made before there was a table have none.
+        "requirements": document.get("requirements") or [],
         "navigation": [_series(one, max_points) for one in document["navigation"]],
     }
 

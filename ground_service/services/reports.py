@@ -19,12 +19,13 @@ from ground_service.services.press import Press, worthwhile
 from ground_service.services.surface import surface_map
 from ground_service.services.window_progress import advance_windows
 from ground_service.store import repository
+from ground_service.store.files import make_durable_folder, replace_durably
 from lunar.timescales import format_utc
-from reports.document import rung_number
+from reports.document import evidence_number
 from reports.values import PassReport
 
-REAL_TERRAIN_RUNG = 3
-"""From this rung of the evidence ladder on, what was flown over is the real Moon."""
+REAL_TERRAIN_LEVEL = 3
+"""From this evidence level on, what was flown over is the real Moon."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +47,8 @@ def evaluate(ground: Ground, pass_id: int, *, created_utc: str = "") -> PassRepo
 
 def _evaluated(ground: Ground, inputs: PassInputs) -> PassReport:
     # The face of the real Moon belongs under tracks over the real Moon only.
-    rung = rung_number(inputs.evidence_rung)
-    if ground.data.albedo is not None and rung is not None and rung >= REAL_TERRAIN_RUNG:
+    level = evidence_number(inputs.evidence_level)
+    if ground.data.albedo is not None and level is not None and level >= REAL_TERRAIN_LEVEL:
         inputs = replace(inputs, surface=surface_map(ground.data.albedo))
     return evaluate_pass(inputs)
 
@@ -89,18 +90,17 @@ def make_report(
     with ground.database.writing() as connection:
         for kind, file in stored.items():
             repository.register_file(connection, file, "report", f"report of pass {pass_id} ({kind})", now)
-        if repository.find(connection, repository.REPORTS, id=identity) is None:
-            repository.add(
-                connection,
-                repository.REPORTS,
-                id=identity,
-                pass_id=pass_id,
-                html_sha256=stored["html"].sha256,
-                json_sha256=stored["json"].sha256,
-                pdf_sha256=stored["pdf"].sha256 if pdf else None,
-                summary=summary,
-                created_utc_ns=now,
-            )
+        repository.add_new(
+            connection,
+            repository.REPORTS,
+            id=identity,
+            pass_id=pass_id,
+            html_sha256=stored["html"].sha256,
+            json_sha256=stored["json"].sha256,
+            pdf_sha256=stored["pdf"].sha256 if pdf else None,
+            summary=summary,
+            created_utc_ns=now,
+        )
         vehicle = int(repository.get(connection, repository.PASSES, pass_id, "pass")["vehicle_id"])
     advance_windows(ground, vehicle)
     folder = out if out is not None else ground.home / "reports" / f"pass-{pass_id}"
@@ -154,9 +154,9 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
 def _write_whole(path: Path, octets: bytes) -> None:
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_durable_folder(path.parent)
         temporary.write_bytes(octets)
-        temporary.replace(path)
+        replace_durably(temporary, path)
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise storage_error(error, path.parent) from None

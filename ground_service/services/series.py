@@ -17,7 +17,7 @@ from ground_service.processing.downsampling import (
     downsample_aggregates,
     join,
 )
-from ground_service.services.pass_data import PassSpan
+from ground_service.services.pass_span import PassSpan
 from ground_service.store import repository, rollups
 from ground_service.store.rollups import HOUSEKEEPING_VALUES as PARAMETERS
 from ground_service.store.rollups import STATE_VALUES

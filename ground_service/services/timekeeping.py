@@ -18,7 +18,7 @@ from ground_service.errors import InvalidInput, NotFound
 from ground_service.processing.correlation import CorrelationFit, fit_correlation
 from ground_service.services.ground import Ground
 from ground_service.services.plan_schemas import time_of
-from ground_service.services.recorrelation import in_force, recorrelate, residuals
+from ground_service.services.recorrelation import in_force, lock_vehicle, recorrelate, residuals
 from ground_service.services.users import audit
 from ground_service.services.window_progress import advance_windows
 from ground_service.store import repository
@@ -59,6 +59,7 @@ def correlate(
     now = utc_now_ns()
     with ground.database.writing() as connection:
         repository.get(connection, repository.VEHICLES, vehicle, "vehicle")
+        lock_vehicle(connection, vehicle)
         connection.execute(
             update(table).where(table.c.vehicle_id == vehicle, table.c.superseded == 0).values(superseded=1)
         )

@@ -7,7 +7,6 @@ The raw telemetry, what is decoded from it, reports and the audit log are kept f
 from __future__ import annotations
 
 import hashlib
-import time
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
@@ -19,10 +18,12 @@ from ground_service.errors import NotFound
 from ground_service.processing.trends import Trend, trend_of
 from ground_service.services.feed import publish
 from ground_service.services.ground import Ground
-from ground_service.services.pass_data import PassSpan, load_correlations, readable_version
+from ground_service.services.pass_data import load_correlations, readable_version
+from ground_service.services.pass_span import PassSpan
 from ground_service.services.remembered import remembered
 from ground_service.services.series import PARAMETERS, SeriesReading
 from ground_service.store import repository, rollups
+from ground_service.store.files import UNPACKING, remove_leftovers
 from lunar.timescales import format_utc
 from tmtc.dictionary import DICTIONARY
 
@@ -126,25 +127,5 @@ def tidy(ground: Ground, retention_days: int) -> dict[str, int]:
             ).rowcount,
             "answers": connection.execute(delete(answers).where(answers.c.created_utc_ns < before)).rowcount,
         }
-    removed["files"] = _sweep(ground)
+    removed["files"] = ground.files.remove_leftovers() + remove_leftovers(ground.home, UNPACKING)
     return removed
-
-
-def _sweep(ground: Ground) -> int:
-    """Temporary files that a killed process left."""
-    import shutil
-
-    count = 0
-    old = time.time() - ABANDONED_S
-    for path in (*ground.files.root.glob(".incoming-*"), *ground.home.glob(".unpacking-*")):
-        try:
-            if path.stat().st_mtime > old:
-                continue
-            if path.is_dir():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink()
-            count += 1
-        except OSError:
-            continue
-    return count

@@ -76,6 +76,8 @@ def pass_detail_view(row: Row) -> View:
         "spacecraft_id": row["spacecraft_id"],
         "instance": row["instance"],
         "archive_sha256": row["archive_digest"],
+        "mission": row["mission"],
+        "mission_revision": row["mission_revision"],
         "manifest": row["manifest"],
         "reports": row["reports"],
     }

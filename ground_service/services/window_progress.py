@@ -12,6 +12,7 @@ from typing import Any
 from sqlalchemy import Connection, func, select
 
 from ground_service.clock import utc_now_ns
+from ground_service.missions import store as missions
 from ground_service.processing.correlation import TimeCorrelation, ticks_of_utc_ns
 from ground_service.processing.sequence import account_sequence
 from ground_service.processing.window_states import WindowFacts, state_of
@@ -20,6 +21,8 @@ from ground_service.services.feed import publish
 from ground_service.services.ground import Ground
 from ground_service.services.pass_data import load_correlations, readable_version
 from ground_service.store import repository
+from ground_service.store.counters import lock_spacecraft
+from ground_service.store.states import change_if
 from lunar.constants import NANOSECONDS_PER_SECOND
 from tmtc.dictionary import EVENTS
 
@@ -42,23 +45,26 @@ def advance_windows(ground: Ground, vehicle: int) -> int:
         ).scalar_one()
     if not pending:
         return 0
-    changed = 0
+    changed: list[tuple[int, str]] = []
     with ground.database.writing() as connection:
-        connection.execute(
-            select(repository.VEHICLES.c.id).where(repository.VEHICLES.c.id == vehicle).with_for_update()
-        )
+        lock_spacecraft(connection, vehicle)
         correlations = load_correlations(connection, vehicle)
         rows = connection.execute(
             select(table).where(*_open(vehicle)).order_by(table.c.start_utc_ns)
         ).mappings()
         for row in [dict(row) for row in rows]:
-            changed += _advance(connection, row, correlations)
-    return changed
+            state = _advance(connection, row, correlations)
+            if state is not None:
+                changed.append((row["id"], state))
+        for window_id, state in changed:  # last: others wait for the end of a transaction that has published
+            publish(connection, "window", {"id": window_id, "state": state})
+    return len(changed)
 
 
 def _advance(
     connection: Connection, row: Mapping[str, Any], correlations: tuple[TimeCorrelation, ...]
-) -> bool:
+) -> str | None:
+    """The new state of a window; None where it has not changed, or somebody decided on the window meanwhile."""
     facts = _facts(connection, row, correlations)
     state, reason = state_of(facts)
     values: dict[str, Any] = {}
@@ -66,12 +72,10 @@ def _advance(
         values["pass_id"] = _pass_of(connection, row)
     if state != row["state"]:
         values |= {"state": state, "reason": reason, "changed_utc_ns": utc_now_ns()}
-    if values:
-        repository.change(connection, repository.WINDOWS, row["id"], **values)
-    if state == row["state"]:
-        return False
-    publish(connection, "window", {"id": row["id"], "state": state})
-    return True
+    found = {"version": row["version"], "state": row["state"], "pass_id": row["pass_id"]}
+    if values and not change_if(connection, repository.WINDOWS, row["id"], found, **values):
+        return None
+    return None if state == row["state"] else state
 
 
 def _facts(
@@ -185,6 +189,14 @@ def _pass_of(connection: Connection, row: Mapping[str, Any]) -> int:
             },
             ephemeris_id=row["ephemeris_id"],
             catalogue_sha256=None,
+            attitude_sha256=None,
+            mission_id=missions.newest_of_spacecraft(
+                connection, _spacecraft_of(connection, row["vehicle_id"])
+            ),
             created_utc_ns=utc_now_ns(),
         )
     )
+
+
+def _spacecraft_of(connection: Connection, vehicle: int) -> int:
+    return int(repository.get(connection, repository.VEHICLES, vehicle, "vehicle")["ccsds_id"])

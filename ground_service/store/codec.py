@@ -1,4 +1,4 @@
-"""How the detections of one image lie in one column: packed records, little-endian, engineering values."""
+"""How the detections, pairs and filter states of one image lie in one column: little-endian engineering values."""
 
 from __future__ import annotations
 
@@ -53,6 +53,24 @@ def unpack_detections(columns: Sequence[bytes]) -> tuple[NDArray[np.void], NDArr
 def unpack_identifications(columns: Sequence[bytes]) -> tuple[NDArray[np.void], NDArray[np.int64]]:
     """As `unpack_detections`, of pairs of detection and crater."""
     return _unpack(columns, IDENTIFICATION_ITEM)
+
+
+def pack_filter_states(state: NDArray[np.float64], covariance: NDArray[np.float64]) -> list[bytes]:
+    """One octet string per state (n, k): the state and the lower triangle of its covariance (n, k, k), float64."""
+    rows, columns = np.tril_indices(state.shape[1])
+    packed = np.concatenate([state, covariance[:, rows, columns]], axis=1).astype("<f8")
+    return [row.tobytes() for row in packed]
+
+
+def unpack_filter_states(
+    columns: Sequence[bytes], size: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """States (n, size) and covariances (n, size, size) of packed octet strings."""
+    rows, places = np.tril_indices(size)
+    values = np.frombuffer(b"".join(columns), dtype="<f8").reshape(len(columns), size + len(rows))
+    covariance = np.zeros((len(columns), size, size))
+    covariance[:, rows, places] = covariance[:, places, rows] = values[:, size:]
+    return values[:, :size].astype(np.float64), covariance
 
 
 def _unpack(columns: Sequence[bytes], kind: np.dtype[Any]) -> tuple[NDArray[np.void], NDArray[np.int64]]:

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
+import json
+import logging
 import os
 import sqlite3
 from collections.abc import Iterator
@@ -17,24 +20,34 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Connection, Engine, create_engine, event, inspect, make_url, text
-from sqlalchemy.exc import DBAPIError, SQLAlchemyError
+from sqlalchemy.engine import ExceptionContext
+from sqlalchemy.exc import DataError, DBAPIError, SQLAlchemyError
 
 import ground_service
 from ground_service.errors import (
+    DatabaseBusy,
     DatabaseNotMigrated,
     DatabaseTooNew,
+    DatabaseTooOld,
     DatabaseUnavailable,
     GroundError,
+    InvalidInput,
     StorageFull,
     StorageReadOnly,
     storage_error,
 )
-from ground_service.store.rollups import build_rollups
+from ground_service.store import audit, row_digests
+from ground_service.store.files import make_durable_folder
 
 if TYPE_CHECKING:
     from alembic.config import Config
 
+log = logging.getLogger(__name__)
+
 BUSY_TIMEOUT_MS = 30_000
+
+REVISIONS_BEFORE_1_0 = tuple(f"{number:04d}" for number in range(1, 12))
+"""Schema revisions of the development versions; their chain of migrations is not kept."""
 
 PAGE_CACHE_KIB = 16_384
 """SQLite's own cache of each connection; what falls out of it is still in the system's, which all of them share."""
@@ -63,13 +76,27 @@ class Database:
             yield connection
 
     @contextmanager
-    def writing(self) -> Iterator[Connection]:
-        """A connection inside one write transaction, committed at the end, undone on an error."""
+    def snapshot(self) -> Iterator[Connection]:
+        """A connection to read with that sees one state of the database, whatever is written meanwhile."""
         with self._translated(), self.engine.connect() as connection:
-            if self.dialect == "sqlite":
-                connection.execution_options(linna_write=True)
+            if self.dialect == "postgresql":
+                connection = connection.execution_options(isolation_level="REPEATABLE READ")
             with connection.begin():
                 yield connection
+
+    @contextmanager
+    def writing(self) -> Iterator[Connection]:
+        """A connection inside one write transaction, committed at the end, undone on an error.
+
+        Audit entries of the transaction are appended to their chain just before the commit.
+        """
+        with self._translated(), self.engine.connect() as connection:
+            connection.execution_options(**{audit.PENDING: []}, linna_write=True)
+            if self.dialect == "sqlite":
+                self._prepare_writer(connection)
+            with connection.begin():
+                yield connection
+                audit.append_pending(connection)
 
     def require_writable(self) -> None:
         """Refuse a SQLite file that may not be written to; nobody who writes now is waited for.
@@ -102,6 +129,13 @@ class Database:
                     with contextlib.suppress(SQLAlchemyError):
                         connection.execute(text("SELECT pg_advisory_unlock(:key)"), {"key": key})
 
+    def _prepare_writer(self, connection: Connection) -> None:
+        driver: Any = connection.connection.driver_connection
+        try:
+            row_digests.prepare_sqlite(driver)
+        except sqlite3.Error as error:
+            raise DatabaseUnavailable(self.label, str(error).splitlines()[0]) from error
+
     @contextmanager
     def _translated(self) -> Iterator[None]:
         try:
@@ -119,12 +153,20 @@ def open_database(url: str) -> Database:
     if parsed.get_backend_name() == "sqlite":
         if parsed.database and parsed.database != ":memory:":
             _make_folder(Path(parsed.database))
-        engine = create_engine(parsed, connect_args={"timeout": BUSY_TIMEOUT_MS / 1000})
+        engine = create_engine(
+            parsed, connect_args={"timeout": BUSY_TIMEOUT_MS / 1000}, json_serializer=_json_text
+        )
+        event.listen(engine, "handle_error", _refuse_values)
         event.listen(engine, "connect", _prepare_sqlite)
         event.listen(engine, "begin", _begin_sqlite)
         return Database(engine)
     try:
-        return Database(create_engine(parsed, pool_pre_ping=True, pool_size=10, max_overflow=20))
+        engine = create_engine(
+            parsed, pool_pre_ping=True, pool_size=10, max_overflow=20, json_serializer=_json_text
+        )
+        event.listen(engine, "handle_error", _refuse_values)
+        event.listen(engine, "connect", _prepare_postgresql)
+        return Database(engine)
     except (SQLAlchemyError, ImportError) as error:
         raise DatabaseUnavailable(parsed.render_as_string(), str(error).splitlines()[0]) from None
 
@@ -139,6 +181,8 @@ def prepare_database(url: str, *, upgrade: bool | None = None) -> Database:
     ------
     DatabaseTooNew
         If a newer version of the program wrote it.
+    DatabaseTooOld
+        If a version before 1.0 wrote it: only an export can be read.
     DatabaseNotMigrated
         If it is older and may not be upgraded here.
     DatabaseUnavailable, StorageReadOnly, StorageFull
@@ -146,16 +190,17 @@ def prepare_database(url: str, *, upgrade: bool | None = None) -> Database:
     """
     database = open_database(url)
     try:
+        _warn_of_unsafe_server(database)
         found, head, known = schema_revisions(database)
         if found == head:
             return database
+        if found in REVISIONS_BEFORE_1_0:
+            raise DatabaseTooOld(database.label, head, str(found))
         if found is not None and found not in known:
             raise DatabaseTooNew(database.label, head, found)
         if upgrade is False or (upgrade is None and database.dialect != "sqlite"):
             raise DatabaseNotMigrated(database.label, head, found or "none")
         upgrade_database(database)
-        with database.writing() as connection:
-            build_rollups(connection)
     except BaseException:
         database.engine.dispose()
         raise
@@ -175,14 +220,21 @@ def schema_revisions(database: Database) -> tuple[str | None, str, tuple[str, ..
     return found, known[0], known
 
 
-def upgrade_database(database: Database, revision: str = "head") -> None:
-    """Bring the schema to `revision`, in one transaction; another process doing the same is waited for."""
-    _migrate(database, "upgrade", revision)
+def upgrade_database(database: Database) -> None:
+    """Bring the schema to the newest revision in one transaction; wait for another process that does the same."""
+    _migrate(database, "upgrade", "head")
 
 
-def downgrade_database(database: Database, revision: str) -> None:
-    """Take the schema back to `revision` ("base": remove everything)."""
-    _migrate(database, "downgrade", revision)
+def empty_database(database: Database) -> None:
+    """Drop every table and with it every row; the files of the archive stay."""
+    _migrate(database, "downgrade", "base")
+
+
+def install_triggers(connection: Connection) -> None:
+    """Install the triggers of this version; without the tables they belong to, do nothing."""
+    if inspect(connection).has_table("audit"):
+        audit.install_guards(connection)
+        row_digests.install(connection)
 
 
 def migrations_folder() -> Path:
@@ -209,9 +261,29 @@ def database_error(error: DBAPIError, label: str) -> GroundError:
         return StorageFull(label)
     if name.startswith("SQLITE_READONLY") or getattr(original, "sqlstate", None) == "25006":
         return StorageReadOnly(label)
+    state = str(getattr(original, "sqlstate", None) or "")
+    if state in ("40001", "40P01", "55P03") or name.startswith("SQLITE_BUSY"):
+        return DatabaseBusy(message)
+    if isinstance(error, DataError) or state.startswith("22"):
+        return _refused(message)
     if name.startswith(("SQLITE_NOTADB", "SQLITE_CORRUPT")):
         return DatabaseUnavailable(label, f"{message}; expected a SQLite database")
     return DatabaseUnavailable(label, message)
+
+
+_json_text = functools.partial(json.dumps, allow_nan=False)
+"""JSON has no NaN and no infinities, and PostgreSQL takes none: SQLite is kept to the same rule."""
+
+
+def _refuse_values(context: ExceptionContext) -> None:
+    """Raise the error of this package where a value cannot be handed to the database at all."""
+    error = context.original_exception
+    if isinstance(error, (ValueError, OverflowError)):  # NaN in JSON, integers over 64 bits, half surrogates
+        raise _refused(str(error)) from error
+
+
+def _refused(message: str) -> InvalidInput:
+    return InvalidInput("request", "", "text and numbers that the database can hold", message[:200])
 
 
 def _migrate(database: Database, direction: str, revision: str) -> None:
@@ -228,7 +300,7 @@ def _migrate(database: Database, direction: str, revision: str) -> None:
 def _make_folder(path: Path) -> None:
     folder = path.parent
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_durable_folder(folder)
         if not os.access(folder, os.W_OK):
             raise OSError(errno.EACCES, "read-only", str(folder))
     except OSError as error:
@@ -236,15 +308,39 @@ def _make_folder(path: Path) -> None:
 
 
 def _prepare_sqlite(connection: sqlite3.Connection, _record: object) -> None:
-    """WAL, and no transaction handling by the driver: `_begin_sqlite` says BEGIN."""
+    """Select WAL and durable commits, and no transaction handling by the driver: `_begin_sqlite` says BEGIN."""
     connection.isolation_level = None
     cursor = connection.cursor()
     cursor.execute("PRAGMA journal_mode=WAL")
-    cursor.execute("PRAGMA synchronous=NORMAL")
+    cursor.execute("PRAGMA synchronous=FULL")  # a commit is on the disk before it is acknowledged
     cursor.execute("PRAGMA foreign_keys=ON")
     cursor.execute("PRAGMA temp_store=MEMORY")
     cursor.execute(f"PRAGMA cache_size=-{PAGE_CACHE_KIB}")
     cursor.close()
+
+
+def _prepare_postgresql(connection: Any, _record: object) -> None:
+    """Mark the session as one of this program; ask for durable commits where the server's default is otherwise."""
+    with connection.cursor() as cursor:
+        cursor.execute(f"SET {row_digests.WRITER_SETTING} = 'on'")
+        cursor.execute("SHOW synchronous_commit")
+        if cursor.fetchone()[0] == "off":
+            cursor.execute("SET synchronous_commit = on")
+    connection.commit()
+
+
+def _warn_of_unsafe_server(database: Database) -> None:
+    """Log a warning where the server itself does not synchronise its files, which no session can change."""
+    if database.dialect != "postgresql":
+        return
+    with database.reading() as connection:
+        for setting in ("fsync", "full_page_writes"):
+            if connection.execute(text(f"SHOW {setting}")).scalar() == "off":
+                log.warning(
+                    "database %s: %s is off; acknowledged data can be lost in a power failure; set it on",
+                    database.label,
+                    setting,
+                )
 
 
 def _begin_sqlite(connection: Connection) -> None:

@@ -1,18 +1,36 @@
-"""The archive of files: each stored once, immutable, under the SHA-256 of its octets."""
+"""The archive of files: each stored once, immutable, under the SHA-256 of its octets.
+
+A stored file survives a power failure: its octets, its name and every folder made for it are synchronised to the disk
+before `FileArchive.put` returns.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
 import os
+import shutil
+import socket
 import tempfile
+import threading
+import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
-from ground_service.errors import FileDamaged, NotFound, storage_error
+from ground_service.errors import FileDamaged, NotFound, StoreError, storage_error
 
 BLOCK_OCTETS = 1 << 20
+
+INCOMING = ".incoming-"
+"""Prefix of files that are still being written; host and process follow, so that leftovers can be told."""
+
+UNPACKING = ".unpacking-"
+"""Prefix of folders that an archive is being unpacked into."""
+
+UNFINISHED_AGE_S = 86_400.0
+"""What a process of another host has not finished after a day is a leftover."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,35 +52,21 @@ class FileArchive:
         """Where the file of this content lies, or would lie."""
         return self.root / sha256[:2] / sha256
 
+    def incoming(self) -> IncomingFile:
+        """A new file, to be appended to and then kept."""
+        return IncomingFile(self)
+
     def put(self, blocks: Iterable[bytes]) -> StoredFile:
         """Store the octets of `blocks`; storing the same octets again changes nothing."""
-        digest = hashlib.sha256()
-        octets = 0
-        temporary: Path | None = None
+        incoming = self.incoming()
         try:
-            self.root.mkdir(parents=True, exist_ok=True)
-            descriptor, name = tempfile.mkstemp(dir=self.root, prefix=".incoming-")
-            temporary = Path(name)
-            with os.fdopen(descriptor, "wb") as stream:
-                for block in blocks:
-                    digest.update(block)
-                    octets += len(block)
-                    stream.write(block)
-                stream.flush()
-                os.fsync(stream.fileno())
-            sha256 = digest.hexdigest()
-            target = self.path(sha256)
-            if not target.exists():
-                target.parent.mkdir(parents=True, exist_ok=True)
-                temporary.chmod(0o444)
-                os.replace(temporary, target)
-            return StoredFile(sha256, octets, target)
-        except OSError as error:
+            for block in blocks:
+                incoming.append(block)
+            return incoming.keep()
+        except OSError as error:  # of whoever makes the blocks
             raise storage_error(error, self.root) from None
         finally:
-            if temporary is not None:
-                with contextlib.suppress(OSError):
-                    temporary.unlink()
+            incoming.discard()
 
     def require_writable(self) -> None:
         """Store nothing, to see that something could be stored.
@@ -73,11 +77,15 @@ class FileArchive:
             If it could not.
         """
         try:
-            self.root.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=self.root, prefix=".incoming-") as stream:
+            make_durable_folder(self.root)
+            with tempfile.TemporaryFile(dir=self.root, prefix=unfinished_prefix(INCOMING)) as stream:
                 stream.write(bytes(4096))
         except OSError as error:
             raise storage_error(error, self.root) from None
+
+    def remove_leftovers(self, now_s: float | None = None) -> int:
+        """Remove files that a process left half-written when it ended; how many those were."""
+        return remove_leftovers(self.root, INCOMING, now_s)
 
     def put_file(self, path: Path) -> StoredFile:
         """Store a copy of the file at `path`."""
@@ -109,6 +117,96 @@ class FileArchive:
             raise FileDamaged(path, sha256, found)
         return octets
 
+    def read(self, sha256: str, start: int, stop: int) -> bytes:
+        """Octets [start, stop) of a stored file, fewer where it ends before.
+
+        Raises
+        ------
+        NotFound
+            If nothing of this content is stored.
+        """
+        path = self.path(sha256)
+        try:
+            with path.open("rb") as stream:
+                stream.seek(start)
+                return stream.read(stop - start)
+        except FileNotFoundError:
+            raise NotFound("file", sha256) from None
+        except OSError as error:
+            raise storage_error(error, path) from None
+
+
+class IncomingFile:
+    """A file on its way into the archive: it is appended to, then kept whole, or discarded.
+
+    The functions may be called from different threads. After `discard` nothing can be appended any more, so that a
+    write which was under way when its upload was given up leaves nothing.
+    """
+
+    def __init__(self, archive: FileArchive) -> None:
+        self._archive = archive
+        self._digest = hashlib.sha256()
+        self._octets = 0
+        self._temporary: Path | None = None
+        self._stream: BinaryIO | None = None
+        self._lock = threading.Lock()
+        self._over = False
+
+    def append(self, block: bytes) -> None:
+        """Write the next octets; the first call makes the file."""
+        with self._lock:
+            try:
+                stream = self._stream or self._open()
+                stream.write(block)
+            except OSError as error:
+                raise storage_error(error, self._archive.root) from None
+            self._digest.update(block)
+            self._octets += len(block)
+
+    def keep(self) -> StoredFile:
+        """Make the file part of the archive, durably; storing the same octets again changes nothing."""
+        with self._lock:
+            try:
+                stream = self._stream or self._open()
+                assert self._temporary is not None
+                stream.flush()
+                os.fsync(stream.fileno())
+                stream.close()
+                sha256 = self._digest.hexdigest()
+                target = self._archive.path(sha256)
+                if not target.exists():
+                    target.parent.mkdir(exist_ok=True)
+                    self._temporary.chmod(0o400)
+                    os.replace(self._temporary, target)
+                    self._temporary = None
+                # also where another process stored it: its own synchronisation may still be under way
+                sync_folder(target.parent)
+                sync_folder(self._archive.root)
+                return StoredFile(sha256, self._octets, target)
+            except OSError as error:
+                raise storage_error(error, self._archive.root) from None
+
+    def discard(self) -> None:
+        """Remove what was not kept."""
+        with self._lock:
+            self._over = True
+            with contextlib.suppress(OSError):
+                if self._stream is not None:
+                    self._stream.close()
+            if self._temporary is not None:
+                with contextlib.suppress(OSError):
+                    self._temporary.unlink()
+                self._temporary = None
+
+    def _open(self) -> BinaryIO:
+        if self._over:
+            raise StoreError("incoming file: expected no octets after it was discarded, found some")
+        make_durable_folder(self._archive.root)
+        descriptor, name = tempfile.mkstemp(dir=self._archive.root, prefix=unfinished_prefix(INCOMING))
+        self._temporary = Path(name)
+        self._stream = os.fdopen(descriptor, "wb")
+        return self._stream
+
 
 def read_blocks(path: Path) -> Iterator[bytes]:
     """The octets of a file, block by block."""
@@ -118,3 +216,102 @@ def read_blocks(path: Path) -> Iterator[bytes]:
                 yield block
     except OSError as error:
         raise storage_error(error, path) from None
+
+
+def sync_folder(folder: Path) -> None:
+    """Synchronise the names in a folder to the disk."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def make_durable_folder(folder: Path) -> None:
+    """Make a folder and those above it that are missing; what was made survives a power failure."""
+    missing = []
+    for one in (folder, *folder.parents):
+        if one.exists():
+            break
+        missing.append(one)
+    for one in reversed(missing):
+        one.mkdir(exist_ok=True)
+        sync_folder(one.parent)
+
+
+def replace_durably(written: Path, target: Path) -> None:
+    """Give a written file or folder its name: after a power failure it is there whole, or what was there before."""
+    for folder, _, names in os.walk(written):
+        for path in (Path(folder, name) for name in names):
+            if path.is_file() and not path.is_symlink():
+                _sync_file(path)
+        sync_folder(Path(folder))
+    if written.is_file():
+        _sync_file(written)
+    os.replace(written, target)
+    sync_folder(target.parent)
+
+
+def remove_leftovers(folder: Path, prefix: str, now_s: float | None = None) -> int:
+    """Remove files and folders that a process left unfinished in `folder` when it ended; how many those were.
+
+    Those of this host whose process still runs are kept, and those of other hosts for `UNFINISHED_AGE_S`.
+    """
+    removed = 0
+    now_s = time.time() if now_s is None else now_s
+    with contextlib.suppress(FileNotFoundError):
+        for path in list(folder.glob(f"{prefix}*")):
+            with contextlib.suppress(OSError):
+                if not _is_leftover(path, prefix, now_s):
+                    continue
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink()
+                removed += 1
+    return removed
+
+
+def unfinished_prefix(prefix: str) -> str:
+    """A prefix for the name of what this process is writing, by which `remove_leftovers` knows whose it is."""
+    return f"{prefix}{_host()}.{os.getpid()}.{_start_of(os.getpid())}-"
+
+
+def _sync_file(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _host() -> str:
+    return hashlib.blake2b(socket.gethostname().encode(), digest_size=4).hexdigest()
+
+
+def _is_leftover(path: Path, prefix: str, now_s: float) -> bool:
+    host, _, process = path.name.removeprefix(prefix).split("-")[0].partition(".")
+    number, _, start = process.partition(".")
+    if host == _host() and number.isdigit():
+        # a container that is started again gives its processes the numbers that they had before
+        found = _start_of(int(number))
+        return not _runs(int(number)) or (start != found and not {"", "0"} & {start, found})
+    return now_s - path.stat().st_mtime > UNFINISHED_AGE_S
+
+
+def _start_of(process: int) -> str:
+    """When a process was started, in the kernel's ticks since boot; 0 where the kernel does not tell."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[19]
+    except (OSError, IndexError):
+        return "0"
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True

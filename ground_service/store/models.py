@@ -110,22 +110,70 @@ class Packet(Base):
     octets: Mapped[bytes] = mapped_column(LargeBinary)
 
 
-class StreamEdge(Base):
-    """How an ingested file begins and ends, so that what was cut apart between two files can be put together.
+class Piece(Base):
+    """A file of a downlink as it was ingested, and where in its stream it stands.
 
-    `head_loose` and `tail_loose` are octets before the first and behind the last whole unit (CADU or packet);
-    `head_count` and `tail_count` the master channel counts of the first and last frame, NULL where not known.
+    Pieces of one `scope` (instance of a spacecraft) can be joined. `stream` and `position` (octets from its beginning)
+    are what the sender said; without, `stream` is empty and `position` the number of the ingest, so that neighbours are
+    those that came one after another. `links_tried` counts the known links of the scope that could not read it; NULL
+    where one could.
+    """
+
+    __tablename__ = "pieces"
+    __table_args__ = (
+        Index("ix_pieces_place", "scope", "stream", "position"),
+        Index("ix_pieces_unread", "scope", "links_tried"),
+    )
+    ingest_id: Mapped[int] = mapped_column(ForeignKey("ingests.id"), primary_key=True, autoincrement=False)
+    scope: Mapped[str] = mapped_column(String(128))
+    file_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"), index=True)
+    octets: Mapped[int] = mapped_column(BigInteger)
+    stream: Mapped[str] = mapped_column(String(200))
+    position: Mapped[int] = mapped_column(BigInteger)
+    links_tried: Mapped[int | None] = mapped_column(Integer)
+
+
+class KnownLink(Base):
+    """How downlinks of a scope were found to travel; `settings` NULL: bare packets."""
+
+    __tablename__ = "known_links"
+    __table_args__ = (UniqueConstraint("scope", "digest"),)
+    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    scope: Mapped[str] = mapped_column(String(128))
+    digest: Mapped[str] = mapped_column(String(16))
+    settings: Mapped[dict[str, Any] | None] = mapped_column(JSON)
+
+
+class StreamEdge(Base):
+    """Octets of a CADU or packet that was cut apart, kept until those next to them are there.
+
+    `domain` says what may be joined: the raw octets of one link, or one virtual channel. `role`, `count`, `next_count`
+    and `fit` are those of `link.edges.Edge`, -1 where not known; the `count` of an opener is its `next_count`. `open`
+    is 0 when the octets have been used; they are not kept then. `start` is where they stand in `file_sha256`, NULL for
+    those of a channel.
     """
 
     __tablename__ = "stream_edges"
-    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"), primary_key=True)
-    file_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"), primary_key=True)
-    link: Mapped[dict[str, Any] | None] = mapped_column(JSON)
-    octets: Mapped[int] = mapped_column(BigInteger)
-    head_loose: Mapped[int] = mapped_column(Integer)
-    tail_loose: Mapped[int] = mapped_column(Integer)
-    head_count: Mapped[int | None] = mapped_column(SmallInteger)
-    tail_count: Mapped[int | None] = mapped_column(SmallInteger)
+    __table_args__ = (
+        UniqueConstraint("domain", "identity"),
+        Index("ix_stream_edges_fit", "domain", "role", "open", "fit", "count"),
+        Index("ix_stream_edges_count", "domain", "role", "open", "count"),
+        Index("ix_stream_edges_next", "domain", "role", "open", "next_count"),
+        Index("ix_stream_edges_newest", "domain", "role", "open", "id"),
+        Index("ix_stream_edges_file", "file_sha256", "open"),
+    )
+    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
+    domain: Mapped[str] = mapped_column(String(200))
+    identity: Mapped[bytes] = mapped_column(LargeBinary(16))
+    role: Mapped[int] = mapped_column(SmallInteger)
+    open: Mapped[int] = mapped_column(SmallInteger)
+    count: Mapped[int] = mapped_column(SmallInteger)
+    next_count: Mapped[int] = mapped_column(SmallInteger)
+    fit: Mapped[int] = mapped_column(Integer)
+    file_sha256: Mapped[str | None] = mapped_column(String(64))
+    start: Mapped[int | None] = mapped_column(BigInteger)
+    length: Mapped[int] = mapped_column(Integer)
+    octets: Mapped[bytes] = mapped_column(LargeBinary)
 
 
 class Sample:
@@ -261,9 +309,10 @@ class Verification(Sample, Base):
 
 
 class FilterState(Sample, Base):
-    """State of the navigation filter with its covariance; `ticks` is the image's time.
+    """Estimate of the navigation filter with its covariance; `ticks` is the image's time.
 
-    `values` packs position (3), velocity (3), acceleration (3) and the lower triangle of the covariance (45), float64.
+    `values` holds the state and its covariance as `store.codec.pack_filter_states` packs them; `innovation_degrees`
+    are those of the NIS of the frame, None where the packet does not tell (dictionary version 2).
     """
 
     __tablename__ = "filter_states"
@@ -271,6 +320,7 @@ class FilterState(Sample, Base):
     packet_ticks: Mapped[int] = mapped_column(BigInteger)
     frame_number: Mapped[int] = mapped_column(BigInteger)
     values: Mapped[bytes] = mapped_column(LargeBinary)
+    innovation_degrees: Mapped[int | None] = mapped_column(Integer)
 
 
 class Identification(Sample, Base):
@@ -336,7 +386,7 @@ class Correlation(Base):
     residual_rms_ns: Mapped[float | None] = mapped_column(Double)
     residual_max_ns: Mapped[float | None] = mapped_column(Double)
     points: Mapped[int] = mapped_column(Integer)
-    rejected: Mapped[int] = mapped_column(Integer, default=0, server_default="0")
+    rejected: Mapped[int] = mapped_column(Integer, default=0)
     superseded: Mapped[int] = mapped_column(Flag, default=0)
     created_utc_ns: Mapped[int] = mapped_column(BigInteger)
 
@@ -372,8 +422,25 @@ class EphemerisRecord(Base):
     created_utc_ns: Mapped[int] = mapped_column(BigInteger)
 
 
+class MissionRecord(Base):
+    """A revision of a mission description, entered once by the hash of what it states and never changed."""
+
+    __tablename__ = "missions"
+    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    revision: Mapped[str] = mapped_column(String(64), unique=True)
+    name: Mapped[str] = mapped_column(Text)
+    ccsds_id: Mapped[int | None] = mapped_column(Integer, index=True)
+    text: Mapped[str] = mapped_column(Text)
+    entered_by: Mapped[str] = mapped_column(String(64))
+    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+
+
 class Pass(Base):
-    """An observation window of one vehicle: an interval of time that samples belong to by on-board time."""
+    """An observation window of one vehicle: an interval of time that samples belong to by on-board time.
+
+    `mission_id` is the revision of the mission description that was in force, `attitude_sha256` the table of the
+    attitude of each frame; NULL where none is known.
+    """
 
     __tablename__ = "passes"
     __table_args__ = (Index("ix_passes_vehicle_id_start_utc_ns", "vehicle_id", "start_utc_ns"),)
@@ -386,6 +453,8 @@ class Pass(Base):
     manifest: Mapped[dict[str, Any]] = mapped_column(JSON)
     ephemeris_id: Mapped[int | None] = mapped_column(ForeignKey("ephemerides.id"))
     catalogue_sha256: Mapped[str | None] = mapped_column(ForeignKey("files.sha256"))
+    attitude_sha256: Mapped[str | None] = mapped_column(ForeignKey("files.sha256"))
+    mission_id: Mapped[int | None] = mapped_column(ForeignKey("missions.id"))
     created_utc_ns: Mapped[int] = mapped_column(BigInteger)
 
 
@@ -429,37 +498,64 @@ class Report(Base):
 
 
 class User(Base):
-    """Somebody who may use the service, with one role."""
+    """Somebody who may use the service, with one role; `state` is active or disabled."""
 
     __tablename__ = "users"
     id: Mapped[int] = mapped_column(Integer, primary_key=True)
     name: Mapped[str] = mapped_column(String(64), unique=True)
     role: Mapped[str] = mapped_column(String(16))
+    state: Mapped[str] = mapped_column(String(16))
     created_utc_ns: Mapped[int] = mapped_column(BigInteger)
 
 
 class Token(Base):
-    """A bearer token of a user; only its hash is kept."""
+    """A bearer token of a user; only its hash is kept.
+
+    `hint` is the beginning of the token, to tell tokens apart; `used_utc_ns` is kept to the hour.
+    """
 
     __tablename__ = "tokens"
     id: Mapped[int] = mapped_column(Integer, primary_key=True)
     user_id: Mapped[int] = mapped_column(ForeignKey("users.id"), index=True)
     token_sha256: Mapped[str] = mapped_column(String(64), unique=True)
     created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    hint: Mapped[str] = mapped_column(String(16))
     expires_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
     revoked_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
+    used_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
 
 
 class AuditEntry(Base):
-    """Something that somebody did; entries are only ever added."""
+    """Something that somebody did; entries are only ever added, numbered from 1 without gaps (see `store.audit`)."""
 
     __tablename__ = "audit"
-    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
+    id: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
     utc_ns: Mapped[int] = mapped_column(BigInteger, index=True)
     actor: Mapped[str] = mapped_column(String(64))
     action: Mapped[str] = mapped_column(String(48))
     target: Mapped[str] = mapped_column(Text)
     detail: Mapped[dict[str, Any]] = mapped_column(JSON)
+    previous_sha256: Mapped[str] = mapped_column(String(64))
+    sha256: Mapped[str] = mapped_column(String(64))
+
+
+class AuditHead(Base):
+    """Number and hash of the newest audit entry: one row, locked while entries are appended."""
+
+    __tablename__ = "audit_head"
+    id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
+    number: Mapped[int] = mapped_column(BigInteger)
+    sha256: Mapped[str] = mapped_column(String(64))
+
+
+class RowDigest(Base):
+    """SHA-256 of a row as the program wrote it, kept by triggers (see `store.row_digests`)."""
+
+    __tablename__ = "row_digests"
+    __table_args__ = CLUSTERED
+    table_name: Mapped[str] = mapped_column(String(64), primary_key=True)
+    row_key: Mapped[str] = mapped_column(Text, primary_key=True)
+    sha256: Mapped[str] = mapped_column(String(64))
 
 
 class FeedItem(Base):
@@ -507,15 +603,25 @@ class Telecommand(Base):
     octets: Mapped[bytes | None] = mapped_column(LargeBinary)
     sent_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
     sent_after_ticks: Mapped[int | None] = mapped_column(BigInteger)
+    timeout_noted_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
     window_id: Mapped[int | None] = mapped_column(Integer, index=True)
     carrier_id: Mapped[int | None] = mapped_column(BigInteger)
+
+
+class CommandCounter(Base):
+    """How many sequence counts the telecommands of a vehicle were given; locked by whoever commands it."""
+
+    __tablename__ = "command_counters"
+    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"), primary_key=True)
+    telecommands: Mapped[int] = mapped_column(BigInteger)
 
 
 class Window(Base):
     """A planned observation.
 
     `decision` is what people decided (draft, approved, failed), `state` where the window has come with what telemetry
-    says, kept up to date by `services.window_progress`; `version` counts changes by people.
+    says, kept up to date by `services.window_progress`; `version` counts changes by people. `edited_by` entered it or
+    changed it last, `decided_by` took the decision.
     """
 
     __tablename__ = "windows"
@@ -536,6 +642,8 @@ class Window(Base):
     predicted: Mapped[dict[str, Any]] = mapped_column(JSON)
     version: Mapped[int] = mapped_column(Integer)
     created_by: Mapped[str] = mapped_column(String(64))
+    edited_by: Mapped[str] = mapped_column(String(64))
+    decided_by: Mapped[str | None] = mapped_column(String(64))
     created_utc_ns: Mapped[int] = mapped_column(BigInteger)
     changed_utc_ns: Mapped[int] = mapped_column(BigInteger)
 

@@ -8,10 +8,10 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, bindparam, func, select, text
+from sqlalchemy import Connection, bindparam, func, select
 
 from ground_service.store.bulk import insert_columns
-from ground_service.store.codec import pack_detections, pack_identifications
+from ground_service.store.codec import pack_detections, pack_filter_states, pack_identifications
 from ground_service.store.models import SAMPLE_TABLES, Packet, Vehicle
 from ground_service.store.rollups import add_to_rollups
 
@@ -52,6 +52,21 @@ class Batch(Protocol):
     def rows(self) -> Mapping[str, Mapping[str, Any]]: ...
 
 
+_KEEP_VEHICLE = (
+    select(Vehicle.id).where(Vehicle.id == bindparam("vehicle_id")).with_for_update(read=True, key_share=True)
+)
+
+_INSERT_POSTGRESQL = """
+INSERT INTO packets (vehicle_id, apid, sequence_count, ticks, digest, octets)
+SELECT %(vehicle_id)s, * FROM unnest(
+    %(apid)b::int2[], %(sequence_count)b::int2[], %(ticks)b::int8[], %(digest)b::bytea[], %(octets)b::bytea[]
+)
+ON CONFLICT (vehicle_id, apid, ticks, sequence_count, digest) DO NOTHING
+RETURNING id, digest
+"""
+"""Inserts in the order given; a row that another transaction inserts now is waited for."""
+
+
 @dataclass(frozen=True, slots=True)
 class Stored:
     """What storing a batch changed."""
@@ -65,31 +80,20 @@ def store_batch(connection: Connection, vehicle_id: int, batch: Batch) -> Stored
     """Store what of the batch is not stored yet, inside the caller's write transaction.
 
     Storing the same packets again, in other batches or in another order, changes nothing: a packet is known by its
-    vehicle and its octets.
+    vehicle and its octets. Several transactions may store at once. Packets are inserted in the order of their key, so
+    that of two transactions with the same packets one waits for the other and none in a circle. The row of the vehicle
+    is only kept from being locked: whoever locks it waits for the packets that are being stored.
     """
     count = len(batch.octets)
     if count == 0:
         return Stored(0, 0, 0)
-    connection.execute(select(Vehicle.id).where(Vehicle.id == vehicle_id).with_for_update())
+    connection.execute(_KEEP_VEHICLE, {"vehicle_id": vehicle_id})
     new = _new_packets(connection, vehicle_id, batch)
     ids = np.zeros(count, dtype=np.int64)
-    ids[new] = _reserve_ids(connection, len(new))
-    chosen = new.tolist()
-    insert_columns(
-        connection,
-        _PACKETS,
-        {
-            "id": ids[new],
-            "vehicle_id": np.full(len(new), vehicle_id),
-            "apid": batch.apid[new],
-            "sequence_count": batch.sequence_count[new],
-            "ticks": batch.ticks[new],
-            "digest": [batch.digest[i] for i in chosen],
-            "octets": [batch.octets[i] for i in chosen],
-        },
-    )
+    ids[new] = _insert_packets(connection, vehicle_id, batch, new)
+    added = int(np.count_nonzero(ids))
     samples = store_samples(connection, vehicle_id, batch.dictionary_version, batch.rows, ids)
-    return Stored(len(new), count - len(new), samples)
+    return Stored(added, count - added, samples)
 
 
 def store_samples(
@@ -101,6 +105,7 @@ def store_samples(
 ) -> int:
     """Insert decoded rows whose packet has an id in `packet_ids` (n,), 0 meaning: leave its rows out."""
     stored = 0
+    counted: list[tuple[str, dict[str, Any]]] = []
     for kind, columns in rows.items():
         owner = packet_ids[columns["packet"]]
         keep = np.flatnonzero(owner > 0)
@@ -110,11 +115,13 @@ def store_samples(
         chosen = {
             name: column[keep]
             for name, column in columns.items()
-            if name not in ("packet", "items", "offsets")
+            if name not in ("packet", "items", "offsets", "state", "covariance")
         }
         if kind in _PACKED:
             packed = _PACKED[kind](columns["items"], columns["offsets"])
             chosen["items"] = [packed[i] for i in keep.tolist()]
+        if kind == "filter_states":
+            chosen["values"] = pack_filter_states(columns["state"][keep], columns["covariance"][keep])
         stored += insert_columns(
             connection,
             _TABLES[kind],
@@ -125,12 +132,14 @@ def store_samples(
                 **chosen,
             },
         )
+        counted.append((kind, chosen))
+    for kind, chosen in counted:
         add_to_rollups(connection, vehicle_id, dictionary_version, kind, chosen)
     return stored
 
 
 def _new_packets(connection: Connection, vehicle_id: int, batch: Batch) -> IntArray:
-    """Indices of packets that are neither stored nor earlier in the same batch, in order of time."""
+    """Indices of packets that are neither stored nor earlier in the same batch, in the order of their key."""
     stored: set[bytes] = set()
     for apid, first, last in _time_ranges(batch.apid, batch.ticks):
         found = connection.execute(
@@ -140,7 +149,9 @@ def _new_packets(connection: Connection, vehicle_id: int, batch: Batch) -> IntAr
     fresh = []
     seen = stored
     digests: Sequence[bytes] = batch.digest
-    for index in np.lexsort((batch.sequence_count, batch.apid, batch.ticks)).tolist():
+    columns = (batch.ticks.tolist(), batch.apid.tolist(), batch.sequence_count.tolist(), digests)
+    keys = list(zip(*columns, strict=True))
+    for index in sorted(range(len(keys)), key=keys.__getitem__):
         digest = digests[index]
         if digest not in seen:
             seen.add(digest)
@@ -160,14 +171,27 @@ def _time_ranges(apid: IntArray, ticks: IntArray) -> list[tuple[int, int, int]]:
     return ranges
 
 
-def _reserve_ids(connection: Connection, count: int) -> IntArray:
-    """Ids for `count` new packets, taken for good within this transaction."""
-    if count == 0:
+def _insert_packets(connection: Connection, vehicle_id: int, batch: Batch, new: IntArray) -> IntArray:
+    """Insert the packets at `new` (n,); their ids (n,), 0 for one that another transaction has stored meanwhile."""
+    if not len(new):
         return np.zeros(0, dtype=np.int64)
+    chosen = new.tolist()
+    columns = {
+        "apid": batch.apid[new].tolist(),
+        "sequence_count": batch.sequence_count[new].tolist(),
+        "ticks": batch.ticks[new].tolist(),
+        "digest": [batch.digest[i] for i in chosen],
+        "octets": [batch.octets[i] for i in chosen],
+    }
     if connection.dialect.name == "postgresql":
-        values = connection.execute(
-            text("SELECT nextval('packets_id_seq') FROM generate_series(1, :count)"), {"count": count}
-        )
-        return np.fromiter(values.scalars(), dtype=np.int64, count=count)
+        driver: Any = connection.connection.driver_connection
+        with driver.cursor() as cursor:
+            cursor.execute(_INSERT_POSTGRESQL, {"vehicle_id": vehicle_id, **columns})
+            ids = {bytes(digest): key for key, digest in cursor.fetchall()}
+        return np.array([ids.get(digest, 0) for digest in columns["digest"]], dtype=np.int64)
     highest = connection.execute(select(func.max(_PACKETS.c.id))).scalar() or 0
-    return np.arange(highest + 1, highest + 1 + count, dtype=np.int64)
+    found = np.arange(highest + 1, highest + 1 + len(chosen), dtype=np.int64)
+    insert_columns(
+        connection, _PACKETS, {"id": found, "vehicle_id": np.full(len(chosen), vehicle_id), **columns}
+    )
+    return found

@@ -12,15 +12,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, Table, and_, func, insert, select, update
+from sqlalchemy.dialects.postgresql import insert as postgresql_insert
+from sqlalchemy.dialects.sqlite import insert as sqlite_insert
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.sql import Select
 
-from ground_service.errors import NotFound
+from ground_service.errors import InvalidInput, NotFound
 from ground_service.store import models
 from ground_service.store.files import StoredFile
+from ground_service.text import require_line
 
 Row = dict[str, Any]
 IntArray = NDArray[np.int64]
+
+SPACECRAFT_ID_MAX = 1023
+"""A transfer frame has ten bits for it (CCSDS 132.0-B)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +48,9 @@ VEHICLES = _table(models.Vehicle)
 INGESTS = _table(models.Ingest)
 PACKETS = _table(models.Packet)
 PASSES = _table(models.Pass)
+MISSIONS = _table(models.MissionRecord)
+PIECES = _table(models.Piece)
+KNOWN_LINKS = _table(models.KnownLink)
 STREAM_EDGES = _table(models.StreamEdge)
 PASS_FRAMES = _table(models.PassFrame)
 EPHEMERIDES = _table(models.EphemerisRecord)
@@ -52,9 +61,12 @@ REPORTS = _table(models.Report)
 USERS = _table(models.User)
 TOKENS = _table(models.Token)
 AUDIT = _table(models.AuditEntry)
+AUDIT_HEAD = _table(models.AuditHead)
+ROW_DIGESTS = _table(models.RowDigest)
 FEED = _table(models.FeedItem)
 ANSWERS = _table(models.Answer)
 TELECOMMANDS = _table(models.Telecommand)
+COMMAND_COUNTERS = _table(models.CommandCounter)
 WINDOWS = _table(models.Window)
 BUILDS = _table(models.RegisteredBuild)
 REGRESSION_ARCHIVES = _table(models.RegressionArchive)
@@ -70,8 +82,18 @@ def add(connection: Connection, table: Table, **values: Any) -> Any:
     return key[0] if key is not None and len(key) == 1 else key
 
 
+def add_new(connection: Connection, table: Table, **values: Any) -> Any | None:
+    """Insert one row and return its primary key; None where a row with a unique value of it exists already.
+
+    A row that another process is adding at this moment counts, too: its end is waited for.
+    """
+    make = postgresql_insert if connection.dialect.name == "postgresql" else sqlite_insert
+    key = next(iter(table.primary_key.columns))
+    return connection.execute(make(table).values(**values).on_conflict_do_nothing().returning(key)).scalar()
+
+
 def change(connection: Connection, table: Table, key: Any, **values: Any) -> None:
-    """Change columns of the row with this primary key."""
+    """Change columns of the row with this primary key; states are changed by `states.move` alone."""
     column = next(iter(table.primary_key.columns))
     connection.execute(update(table).where(column == key).values(**values))
 
@@ -124,7 +146,16 @@ def page(
 
 
 def vehicle_id(connection: Connection, ccsds_id: int, instance: str) -> int:
-    """The id of a spacecraft in one instance, made when it is new."""
+    """The id of a spacecraft in one instance, made when it is new.
+
+    Raises
+    ------
+    InvalidInput
+        If the id is none that a transfer frame can carry, or the instance no printable line.
+    """
+    if isinstance(ccsds_id, bool) or not 0 <= ccsds_id <= SPACECRAFT_ID_MAX:
+        raise InvalidInput("spacecraft", "id", f"0 to {SPACECRAFT_ID_MAX}", str(ccsds_id)[:40])
+    require_line(instance, "spacecraft", "instance")
     found = find(connection, VEHICLES, ccsds_id=ccsds_id, instance=instance)
     if found is not None:
         return int(found["id"])

@@ -8,14 +8,15 @@ order samples come. (Sums are of floating-point numbers: their last bits may dep
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, LargeBinary, delete, func, select
+from sqlalchemy import Connection, LargeBinary, bindparam, delete, func, select
 
 from ground_service.store.bulk import insert_columns
+from ground_service.store.counters import hold
 from ground_service.store.models import SAMPLE_TABLES, Rollup
 
 IntArray = NDArray[np.int64]
@@ -49,6 +50,17 @@ _TABLE: Any = Rollup.__table__
 _SAMPLES: dict[str, Any] = {table.__tablename__: table.__table__ for table in SAMPLE_TABLES}
 _BLOCK_ROWS = 50_000
 
+_KEY = ("vehicle_id", "dictionary_version", "kind", "part", "level")
+_STORED = select(
+    _TABLE.c.bucket, _TABLE.c.first_ticks, _TABLE.c.last_ticks, _TABLE.c.rows, _TABLE.c.statistics
+).where(
+    *(_TABLE.c[name] == bindparam(name) for name in _KEY),
+    _TABLE.c.bucket.between(bindparam("first_bucket"), bindparam("last_bucket")),
+)
+_DELETED = delete(_TABLE).where(
+    *(_TABLE.c[name] == bindparam(f"of_{name}") for name in _KEY), _TABLE.c.bucket == bindparam("of_bucket")
+)
+
 
 def width_ticks(level: int) -> int:
     """Length of the buckets of a level."""
@@ -58,9 +70,13 @@ def width_ticks(level: int) -> int:
 def add_to_rollups(
     connection: Connection, vehicle_id: int, dictionary_version: int, kind: str, columns: Mapping[str, Any]
 ) -> None:
-    """Count new samples, within the transaction that stores them; columns (n,) as they are stored."""
+    """Count new samples, within the transaction that stores them; columns (n,) as they are stored.
+
+    The roll-ups of a vehicle are locked until the transaction ends: they are the last that it writes.
+    """
     if kind not in KINDS or len(columns["ticks"]) == 0:
         return
+    hold(connection, f"rollups {vehicle_id}")
     code, part_column, names = KINDS[kind]
     ticks = np.asarray(columns["ticks"], dtype=np.int64)
     parts = (
@@ -69,19 +85,16 @@ def add_to_rollups(
         else np.asarray(columns[part_column], dtype=np.int64)
     )
     values = np.column_stack([np.asarray(columns[name], dtype=np.float64) for name in names])
+    found: list[tuple[dict[str, int], _Level]] = []
     for part in np.unique(parts).tolist():
         mine = parts == part
-        key = {
-            "vehicle_id": vehicle_id,
-            "dictionary_version": dictionary_version,
-            "kind": code,
-            "part": part,
-        }
         level_values = _buckets(ticks[mine], values[mine])
         for level in range(LEVELS):
             if level:
                 level_values = _merged(*level_values, 4)
-            _store(connection, {**key, "level": level}, *level_values)
+            numbers = (vehicle_id, dictionary_version, code, part, level)
+            found.append((dict(zip(_KEY, numbers, strict=True)), level_values))
+    _store(connection, found)
 
 
 def forget_rollups(connection: Connection, vehicle_id: int, dictionary_version: int) -> None:
@@ -229,50 +242,44 @@ def _merged(
     )
 
 
-def _store(
-    connection: Connection,
-    key: Mapping[str, int],
-    number: IntArray,
-    first: IntArray,
-    last: IntArray,
-    rows: IntArray,
-    statistics: FloatArray,
-) -> None:
-    """Add buckets to those that are stored."""
-    mine = [_TABLE.c[name] == value for name, value in key.items()]
-    stored = connection.execute(
-        select(
-            _TABLE.c.bucket, _TABLE.c.first_ticks, _TABLE.c.last_ticks, _TABLE.c.rows, _TABLE.c.statistics
-        ).where(*mine, _TABLE.c.bucket.between(int(number[0]), int(number[-1])))
-    ).all()
-    wanted = set(number.tolist())
-    stored = [row for row in stored if row[0] in wanted]
-    if stored:
-        shape = (len(stored), -1, STATISTICS)
-        old = np.frombuffer(b"".join(bytes(row[4]) for row in stored), "<f8").reshape(shape)
-        heads = np.array([row[:4] for row in stored], dtype=np.int64)
-        order = np.argsort(np.concatenate([heads[:, 0], number]), kind="stable")
-        number, first, last, rows, statistics = _merged(
-            np.concatenate([heads[:, 0], number])[order],
-            np.concatenate([heads[:, 1], first])[order],
-            np.concatenate([heads[:, 2], last])[order],
-            np.concatenate([heads[:, 3], rows])[order],
-            np.concatenate([old, statistics])[order],
-            1,
-        )
-        for row in range(0, len(stored), 500):
-            chosen = [int(bucket) for bucket in heads[row : row + 500, 0]]
-            connection.execute(delete(_TABLE).where(*mine, _TABLE.c.bucket.in_(chosen)))
-    flat = np.ascontiguousarray(statistics, dtype="<f8")
+def _store(connection: Connection, found: Sequence[tuple[Mapping[str, int], _Level]]) -> None:
+    """Add buckets, by the rest of their key, to those that are stored."""
+    merged: list[tuple[Mapping[str, int], _Level]] = []
+    replaced: list[dict[str, int]] = []
+    for key, (number, first, last, rows, statistics) in found:
+        span = {"first_bucket": int(number[0]), "last_bucket": int(number[-1])}
+        wanted = set(number.tolist())
+        stored = [row for row in connection.execute(_STORED, {**key, **span}) if row[0] in wanted]
+        if stored:
+            shape = (len(stored), -1, STATISTICS)
+            old = np.frombuffer(b"".join(bytes(row[4]) for row in stored), "<f8").reshape(shape)
+            heads = np.array([row[:4] for row in stored], dtype=np.int64)
+            order = np.argsort(np.concatenate([heads[:, 0], number]), kind="stable")
+            number, first, last, rows, statistics = _merged(
+                np.concatenate([heads[:, 0], number])[order],
+                np.concatenate([heads[:, 1], first])[order],
+                np.concatenate([heads[:, 2], last])[order],
+                np.concatenate([heads[:, 3], rows])[order],
+                np.concatenate([old, statistics])[order],
+                1,
+            )
+            of_key = {f"of_{name}": value for name, value in key.items()}
+            replaced += [{**of_key, "of_bucket": int(row[0])} for row in stored]
+        merged.append((key, (number, first, last, rows, statistics)))
+    if replaced:
+        connection.execute(_DELETED, replaced)
+    sizes = [len(level[0]) for _, level in merged]
     insert_columns(
         connection,
         _TABLE,
         {
-            **{name: np.full(len(number), value) for name, value in key.items()},
-            "bucket": number,
-            "first_ticks": first,
-            "last_ticks": last,
-            "rows": rows,
-            "statistics": [one.tobytes() for one in flat],
+            **{name: np.repeat([key[name] for key, _ in merged], sizes) for name in _KEY},
+            "bucket": np.concatenate([level[0] for _, level in merged]),
+            "first_ticks": np.concatenate([level[1] for _, level in merged]),
+            "last_ticks": np.concatenate([level[2] for _, level in merged]),
+            "rows": np.concatenate([level[3] for _, level in merged]),
+            "statistics": [
+                one.tobytes() for _, level in merged for one in np.ascontiguousarray(level[4], dtype="<f8")
+            ],
         },
     )

@@ -15,7 +15,7 @@ from fastapi import APIRouter, Request, Response
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
 from ground_service.errors import NotFound
-from ground_service.services.commanding import CRITICAL_COMMANDS
+from ground_service.processing.approval import DEFAULT_POLICY
 from ground_service.services.passes import PARAMETERS, STATE_VALUES
 from ground_service.web.basemap import basemap_jpeg
 from tmtc.dictionary import DICTIONARY
@@ -56,6 +56,7 @@ PAGES = (
     Page("/commands", "commands", "Commands", "Commands"),
     Page("/regression", "regression", "Regression", "Regression"),
     Page("/live", "live", "Live", "Live"),
+    Page("/audit", "audit", "Audit log", "Audit"),
     Page("/licences", "licences", "Licences", ""),
 )
 
@@ -160,7 +161,7 @@ def _telecommand(definition: PacketDefinition) -> dict[str, Any]:
         "description": definition.description,
         "service": definition.service,
         "subtype": definition.subtype,
-        "critical": definition.name in CRITICAL_COMMANDS,
+        "critical": definition.name in DEFAULT_POLICY.second_person_for,
         "fields": [_field(field) for field in definition.fields],
         "repeats": [_field(field) for field in definition.group.fields] if definition.group else [],
         "group": definition.group.name if definition.group else None,

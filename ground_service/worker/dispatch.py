@@ -93,9 +93,11 @@ class ThreadDispatcher:
         except PASSING as error:
             wait_s = min(2.0 * self._held.get(job_id, (0.0, FIRST_WAIT_S / 2.0))[1], LONGEST_WAIT_S)
             self._held[job_id] = (time.monotonic() + wait_s, wait_s)
-            log.warning("job %s came to no end: %s", job_id, error)
-        except Exception:  # the thread's outermost loop: the job stays unfinished and is taken up again
-            log.exception("job %s came to no end", job_id)
+            log.warning("job %s did not finish: %s", job_id, error)
+        except (
+            Exception
+        ):  # the thread's outermost loop: the job could not even be ended and is taken up again
+            log.exception("job %s did not finish", job_id)
         finally:
             with self._lock:
                 self._waiting.discard(job_id)

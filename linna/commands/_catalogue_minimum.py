@@ -8,7 +8,7 @@ from pathlib import Path
 
 from linna.output import add_json_flag, emit, log
 
-RUNG = "rung 2: simulated detections over craters of the paper's density, no images"
+LEVEL = "level 2: simulated detections over craters of the paper's density, no images"
 SHARES = (1.0, 0.3, 0.1, 0.05, 0.02, 0.01)
 
 
@@ -55,13 +55,13 @@ def run(arguments: argparse.Namespace) -> int:
         "landmark_map": not arguments.no_map,
         "hours": arguments.hours,
         "seed": arguments.seed,
-        "rung": RUNG,
+        "level": LEVEL,
         "data": ["synthetic craters of the paper's density", f"gravity {case.gravity.name}"],
     }
     if arguments.plot is not None:
         from reports.studies import save_anchoring_study
 
-        save_anchoring_study(arguments.plot, figures["scores"], f"{len(case.craters)} craters; {RUNG}")
+        save_anchoring_study(arguments.plot, figures["scores"], f"{len(case.craters)} craters; {LEVEL}")
         figures["plot"] = str(arguments.plot)
     lines = [
         f"{'chosen':<9}{'craters':>8}{'per image':>11}{'median m':>10}{'p95 m':>9}{'max m':>9}{'fixed':>8}"
@@ -71,5 +71,5 @@ def run(arguments: argparse.Namespace) -> int:
         f"{score.largest_m:>9.0f}{100 * score.fixed_share:>7.0f}%"
         for score in scores
     ]
-    emit(arguments, figures, text="\n".join([*lines, RUNG]))
+    emit(arguments, figures, text="\n".join([*lines, LEVEL]))
     return 0

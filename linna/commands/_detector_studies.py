@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,11 +50,12 @@ def configure(verbs: Any) -> None:
     landmarks.set_defaults(handler=_landmarks)
 
     trials = verbs.add_parser(
-        "trials", help="ways of showing frames to the network, each with its effect on held-out frames"
+        "trials", help="ways of showing frames to the network, compared on the validation split"
     )
     add_model(trials)
     trials.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
-    trials.add_argument("--source", default="", help="only the test frames of this source")
+    _add_test(trials, "way")
+    trials.add_argument("--source", default="", help="with --test: only the test frames of this source")
     trials.add_argument(
         "--two-suns",
         action="store_true",
@@ -89,7 +91,13 @@ def configure(verbs: Any) -> None:
         metavar=("REAL", "PROCEDURAL"),
         help="training frames of every variant (default: 480 240)",
     )
-    ablate.add_argument("--test-frames", type=int, default=160, help="at most, of each kind of terrain")
+    ablate.add_argument(
+        "--validation-frames", type=int, default=150, help="at most, of each kind of terrain (default: 150)"
+    )
+    _add_test(ablate, "variant")
+    ablate.add_argument(
+        "--test-frames", type=int, default=160, help="with --test: at most, of each kind of terrain"
+    )
     ablate.add_argument(
         "--seeds", type=int, nargs="+", default=[1, 2], help="of the baseline; the others take the first"
     )
@@ -102,6 +110,14 @@ def configure(verbs: Any) -> None:
     )
     add_json_flag(ablate)
     ablate.set_defaults(handler=_ablate)
+
+
+def _add_test(parser: argparse.ArgumentParser, what: str) -> None:
+    parser.add_argument(
+        "--test",
+        action="store_true",
+        help=f"afterwards score the test split once, for the {what} chosen on the validation split",
+    )
 
 
 def _choose(arguments: argparse.Namespace) -> int:
@@ -128,7 +144,9 @@ def _ablate(arguments: argparse.Namespace) -> int:
         AblationParameters,
         Material,
         ablate,
+        choose_variant,
         format_ablation,
+        score_chosen_variant,
     )
     from payload_emulator.training.dataset import Dataset
     from payload_emulator.training.refits import load_refitted
@@ -141,27 +159,27 @@ def _ablate(arguments: argparse.Namespace) -> int:
     if arguments.steps < 1:
         raise UsageError(f"--steps: expected 1 or more, found {arguments.steps}")
     restart_for_training()
-    rows = ablate(
-        Material(
-            [Dataset(folder) for folder in arguments.datasets],
-            None if arguments.plain is None else Dataset(arguments.plain),
-            None if arguments.rims is None else load_refitted(arguments.rims),
-        ),
-        arguments.out,
-        [known[name] for name in wanted],
-        AblationParameters(
-            steps=arguments.steps,
-            crop_px=arguments.crop,
-            real_frames=arguments.frames[0],
-            procedural_frames=arguments.frames[1],
-            validation_frames=arguments.test_frames,
-            test_frames=arguments.test_frames,
-            seeds=tuple(arguments.seeds),
-            every_seed=arguments.every_seed,
-        ),
-        log,
+    material = Material(
+        [Dataset(folder) for folder in arguments.datasets],
+        None if arguments.plain is None else Dataset(arguments.plain),
+        None if arguments.rims is None else load_refitted(arguments.rims),
     )
-    emit(arguments, {"variants": rows}, format_ablation(rows))
+    parameters = AblationParameters(
+        steps=arguments.steps,
+        crop_px=arguments.crop,
+        real_frames=arguments.frames[0],
+        procedural_frames=arguments.frames[1],
+        validation_frames=arguments.validation_frames,
+        test_frames=arguments.test_frames,
+        seeds=tuple(arguments.seeds),
+        every_seed=arguments.every_seed,
+    )
+    rows = ablate(material, arguments.out, [known[name] for name in wanted], parameters, log)
+    document: dict[str, Any] = {"variants": rows, "chosen": choose_variant(rows)}
+    test = score_chosen_variant(material, arguments.out, rows, parameters) if arguments.test else None
+    if test is not None:
+        document["test"] = test
+    emit(arguments, document, format_ablation(rows, test))
     return 0
 
 
@@ -188,8 +206,8 @@ def _quantise(arguments: argparse.Namespace) -> int:
     scores = {
         name: {key: figures["micro"][key] for key in kept}
         for name, figures in (
-            ("float32", evaluate(octets, datasets)),
-            ("int8", evaluate(small, datasets)),
+            ("float32", evaluate(octets, datasets, "val")),
+            ("int8", evaluate(small, datasets, "val")),
         )
     }
     emit(
@@ -199,7 +217,7 @@ def _quantise(arguments: argparse.Namespace) -> int:
             "bytes": {"float32": len(octets), "int8": len(small)},
             "network_ms": {name: row["network_ms"] for name, row in times.items()},
             "latency_ratio": times["int8"]["of_first"],
-            "strict": scores,
+            "strict_validation": scores,
         },
     )
     return 0
@@ -242,24 +260,25 @@ def _trials(arguments: argparse.Namespace) -> int:
     from linna.output import emit, progress
     from payload_emulator.training.dataset import Dataset
     from payload_emulator.training.evaluate import open_for_evaluation, run
-    from payload_emulator.training.trials import TRIALS, format_trials, run_trials
-    from payload_emulator.training.two_suns import format_two_suns, study_two_suns
+    from payload_emulator.training.trials import format_trials, run_trials, score_chosen_trial
+    from payload_emulator.training.two_suns import format_two_suns, score_chosen_way, study_two_suns
+
+    def shown(frames: Sequence[Any]) -> Any:
+        return progress(frames, len(frames), "trial", "frames")
 
     detector = open_for_evaluation(model_octets(arguments.model))
     datasets = [Dataset(folder) for folder in arguments.dataset]
-    rows = run_trials(
-        detector,
-        datasets,
-        TRIALS[:1] if arguments.two_suns else TRIALS,
-        source=arguments.source,
-        progress=lambda frames: progress(frames, len(frames), "trial", "frames"),
-    )
-    text = format_trials(rows)
-    figures = {"trials": rows, "model_sha256": detector.sha256}
+    test: dict[str, Any] | None = None
     if arguments.two_suns:
-        figures["two_suns"] = study_two_suns(
-            run(detector, datasets, "val"), run(detector, datasets, "test", arguments.source)
-        )
-        text = f"{text}\n{format_two_suns(figures['two_suns'])}"
-    emit(arguments, figures, text)
+        study = study_two_suns(run(detector, datasets, "val", progress=shown))
+        if arguments.test:
+            test = score_chosen_way(run(detector, datasets, "test", arguments.source, progress=shown), study)
+        text = format_two_suns(study, test)
+    else:
+        study = run_trials(detector, datasets, progress=shown)
+        if arguments.test:
+            test = score_chosen_trial(detector, datasets, study, arguments.source, progress=shown)
+        text = format_trials(study, test)
+    document = {**study, "model_sha256": detector.sha256} | ({} if test is None else {"test": test})
+    emit(arguments, document, text)
     return 0

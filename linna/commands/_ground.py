@@ -48,7 +48,15 @@ def operations(arguments: argparse.Namespace) -> Any:
         return Client(server, arguments.token or os.environ.get("LINNA_TOKEN"))
     from ground_service.operations import LocalOperations
 
-    return LocalOperations(open_service(arguments), str(arguments.actor or getpass.getuser()))
+    return LocalOperations(open_service(arguments), str(arguments.actor or local_actor()))
+
+
+def local_actor() -> str:
+    """Name of the user of this machine for the audit log; its number where it has no name."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):
+        return f"uid {os.getuid()}"
 
 
 def settings_of(arguments: argparse.Namespace, **given: object) -> Settings:
@@ -64,4 +72,9 @@ def open_service(arguments: argparse.Namespace) -> Ground:
     from linna.data import data_folder
 
     settings = settings_of(arguments)
-    return open_ground(settings.home, data_folder(), database_url=settings.resolved_database_url())
+    return open_ground(
+        settings.home,
+        data_folder(),
+        database_url=settings.resolved_database_url(),
+        runner=settings.runner_exchange,
+    )

@@ -25,6 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
     from payload_emulator.flight.detector import DetectorParameters, OnnxDetector
     from payload_emulator.flight.lost_in_space import FRAMES_COMBINED, LostParameters
     from payload_emulator.flight.models import load_shipped_model
+    from payload_emulator.mission import level_of, level_text, unseen_share
     from payload_emulator.scenario import format_scenario, load_scenario
     from payload_emulator.world import build_world
 
@@ -69,9 +70,9 @@ def run(arguments: argparse.Namespace) -> int:
     errors = np.array([row.error_m for row in single])
     right = errors[errors <= study.WRONG_PLACE_M]
     spent = np.array([row.cpu_s for row in single])
-    made = world.terrain.catalogue.source.startswith("synthetic")
-    moon = "rung 2, procedural Moon" if made else "rung 3, real terrain"
-    rung = f"{moon}: frames rendered along {scenario.name}, the shipped detector"
+    unseen = unseen_share(world)
+    found = level_of("real-terrain" if world.terrain.is_real else "procedural", unseen)
+    level = f"level {level_text(found, unseen)}: frames rendered along {scenario.name}, the shipped detector"
     figures: dict[str, Any] = {
         "single_correct_share": rows[f"frames, {LEAST_CATALOGUED} known"].correct_share,
         "four_frames_correct_share": rows[f"sets, {LEAST_CATALOGUED} known in each"].correct_share,
@@ -96,7 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
         "scenario": scenario.name,
         "seed": scenario.seed,
         "model_sha256": detector.sha256,
-        "rung": rung,
+        "level": level,
         "data": list(world.data_names),
     }
     lines = [f"{'':<24}{'searches':>9}{'correct':>9}{'share':>8}{'wrong':>7}"]
@@ -114,7 +115,7 @@ def run(arguments: argparse.Namespace) -> int:
         f"the {len(board)} craters of the map; {figures['median_cpu_s']:.2f} s "
         f"(largest {figures['largest_cpu_s']:.2f}) a search"
     )
-    emit(arguments, figures, text="\n".join([*lines, rung]))
+    emit(arguments, figures, text="\n".join([*lines, level]))
     return 0
 
 

@@ -1,20 +1,29 @@
-"""`linna db upgrade | downgrade | status | backup | restore | tidy | redecode`: the database of the ground."""
+"""`linna db`: the database; its schema, roles, backup, export and import, retention."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from linna.commands._ground import add_service_options, open_service, settings_of
-from linna.output import add_json_flag, emit
+from linna.output import add_json_flag, emit, log
+
+if TYPE_CHECKING:
+    from ground_service.settings import Settings
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(metavar="ACTION", required=True)
     upgrade = actions.add_parser("upgrade", help="bring the schema to this version")
     upgrade.set_defaults(handler=run_upgrade)
-    downgrade = actions.add_parser("downgrade", help="take the schema back to an earlier revision")
-    downgrade.add_argument("revision", help="the revision, or base for an empty database")
+    granting = actions.add_parser("grant", help="give a database role what the service needs, and no more")
+    granting.add_argument("--role", metavar="NAME", help="default: the user of $LINNA_DATABASE_URL")
+    granting.add_argument("--print", action="store_true", help="print the SQL instead")
+    granting.set_defaults(handler=run_grant)
+    downgrade = actions.add_parser("downgrade", help="delete every table and row of the database")
+    downgrade.add_argument("revision", help="base: there is no revision before the first")
+    downgrade.add_argument("--yes", action="store_true", help="delete everything")
     downgrade.set_defaults(handler=run_downgrade)
     status = actions.add_parser("status", help="which revision the database has")
     status.set_defaults(handler=run_status)
@@ -24,34 +33,102 @@ def configure(parser: argparse.ArgumentParser) -> None:
     restoring = actions.add_parser("restore", help="fill an empty service from a backup")
     restoring.add_argument("folder", type=Path)
     restoring.set_defaults(handler=run_restore)
+    exporting = actions.add_parser("export", help="write all rows and files into one portable file")
+    exporting.add_argument("--no-files", action="store_true", help="rows only; the files are named by hash")
+    exporting.set_defaults(handler=run_export)
+    importing = actions.add_parser("import", help="fill an empty service from an export, on either database")
+    importing.set_defaults(handler=run_import)
+    for action in (exporting, importing):
+        action.add_argument("file", type=Path)
     tidying = actions.add_parser("tidy", help="take away the feed and finished jobs that are old")
     tidying.add_argument("--days", type=int, help="older than this (default: $LINNA_RETENTION_DAYS)")
     tidying.set_defaults(handler=run_tidy)
     decoding = actions.add_parser("redecode", help="decode the archive again with this version's dictionary")
     decoding.set_defaults(handler=run_redecode)
-    for action in (upgrade, downgrade, status, saving, restoring, tidying, decoding):
+    for action in (
+        upgrade,
+        granting,
+        downgrade,
+        status,
+        saving,
+        restoring,
+        exporting,
+        importing,
+        tidying,
+        decoding,
+    ):
         add_service_options(action)
         add_json_flag(action)
 
 
 def run_upgrade(arguments: argparse.Namespace) -> int:
     from ground_service.store.database import prepare_database, schema_revisions
+    from ground_service.store.roles import grant_service
 
-    url = settings_of(arguments).resolved_database_url()
-    database = prepare_database(url, upgrade=True)
-    return _show(arguments, *schema_revisions(database)[:2], database.label)
+    settings = settings_of(arguments)
+    database = prepare_database(settings.resolved_migration_url(), upgrade=True)
+    try:
+        role = _service_role(settings)
+        if role is not None:
+            grant_service(database, role)
+        return _show(arguments, *schema_revisions(database)[:2], database.label)
+    finally:
+        database.engine.dispose()
+
+
+def run_grant(arguments: argparse.Namespace) -> int:
+    from ground_service.store.database import prepare_database
+    from ground_service.store.models import Base
+    from ground_service.store.roles import READ_ONLY, grant_service, grant_statements
+    from linna.errors import UsageError
+
+    settings = settings_of(arguments)
+    role = arguments.role or _service_role(settings)
+    if role is None:
+        raise UsageError("--role: expected the database role of the service, found none")
+    if arguments.print:
+        statements = list(grant_statements(role, [*Base.metadata.tables, *READ_ONLY]))
+        emit(arguments, {"role": role, "statements": statements}, text=";\n".join(statements) + ";")
+        return 0
+    database = prepare_database(settings.resolved_migration_url())
+    try:
+        grant_service(database, role)
+    finally:
+        database.engine.dispose()
+    emit(arguments, {"role": role, "database": database.label}, text=f"{database.label}: granted to {role}")
+    return 0
+
+
+def _service_role(settings: Settings) -> str | None:
+    """Role of the service where it is another than that of migrations."""
+    from sqlalchemy import make_url
+
+    service, owner = (
+        make_url(url) for url in (settings.resolved_database_url(), settings.resolved_migration_url())
+    )
+    if settings.migration_database_url is None or service.username == owner.username:
+        return None
+    return service.username
 
 
 def run_downgrade(arguments: argparse.Namespace) -> int:
-    from ground_service.store.database import downgrade_database, open_database, schema_revisions
+    from ground_service.store.database import empty_database, open_database, schema_revisions
     from linna.errors import UsageError
 
-    database = open_database(settings_of(arguments).resolved_database_url())
-    known = schema_revisions(database)[2]
-    if arguments.revision not in (*known, "base"):
-        raise UsageError(f"revision: expected one of {', '.join(known)} or base, found {arguments.revision}")
-    downgrade_database(database, arguments.revision)
-    return _show(arguments, *schema_revisions(database)[:2], database.label)
+    if arguments.revision != "base":
+        raise UsageError(
+            f"revision: expected base, as a downgrade to another revision would lose rows, found {arguments.revision}"
+        )
+    database = open_database(settings_of(arguments).resolved_migration_url())
+    if not arguments.yes:
+        raise UsageError(f"--yes: expected it, as base deletes every row of {database.label}, found nothing")
+    try:
+        found = schema_revisions(database)[0]
+        if found is not None:
+            empty_database(database)
+        return _show(arguments, *schema_revisions(database)[:2], database.label)
+    finally:
+        database.engine.dispose()
 
 
 def run_status(arguments: argparse.Namespace) -> int:
@@ -67,7 +144,13 @@ def run_backup(arguments: argparse.Namespace) -> int:
 
     with open_service(arguments) as ground:
         manifest = backup(ground, arguments.out, now_utc_ns=utc_now_ns())
-    text = f"{arguments.out}: {sum(manifest['rows'].values())} rows, {manifest['files']} files"
+    for line in manifest["damaged"]:
+        log(f"damaged before the backup: {line}")
+    head = manifest["audit_head"]
+    text = (
+        f"{arguments.out}: {sum(manifest['rows'].values())} rows, {manifest['files']} files, "
+        f"audit head {head['number']}:{head['sha256']}"
+    )
     emit(arguments, {"folder": str(arguments.out), **manifest}, text=text)
     return 0
 
@@ -80,6 +163,44 @@ def run_restore(arguments: argparse.Namespace) -> int:
         label = ground.database.label
     text = f"{label}: {sum(manifest['rows'].values())} rows, {manifest['files']} files"
     emit(arguments, {"database": label, **manifest}, text=text)
+    return 0
+
+
+def run_export(arguments: argparse.Namespace) -> int:
+    from ground_service.clock import utc_now_ns
+    from ground_service.services.exchange import export_database
+    from ground_service.store.database import open_database
+    from ground_service.store.files import FileArchive
+
+    settings = settings_of(arguments)
+    database = open_database(settings.resolved_database_url())
+    manifest = export_database(
+        database,
+        FileArchive(settings.home.expanduser().absolute() / "files"),
+        arguments.file,
+        now_utc_ns=utc_now_ns(),
+        with_files=not arguments.no_files,
+        say=log,
+    )
+    count = sum(table.rows for table in manifest.tables.values())
+    emit(
+        arguments,
+        {"file": str(arguments.file), **manifest.model_dump()},
+        text=f"{arguments.file}: {count} rows, {manifest.files.count} files, audit head {manifest.audit_head}",
+    )
+    return 0
+
+
+def run_import(arguments: argparse.Namespace) -> int:
+    from ground_service.services.exchange import import_database
+
+    with open_service(arguments) as ground:
+        result = import_database(ground, arguments.file, say=log)
+        label = ground.database.label
+    text = f"{label}: {sum(result.rows.values())} rows, {result.files} files of revision {result.revision}"
+    if result.decoded:
+        text += f"; {result.decoded} values decoded again"
+    emit(arguments, {"database": label, **result.model_dump()}, text=text)
     return 0
 
 

@@ -6,6 +6,7 @@ import argparse
 import time
 from pathlib import Path
 
+from linna.commands.pass_ import requirement_lines
 from linna.output import add_json_flag, emit, log, progress
 
 
@@ -78,8 +79,10 @@ def describe(figures: dict) -> str:
             f"{name:<28}{_number(row['median_3d_m'], '.0f'):>10}{_number(row['p95_3d_m'], '.0f'):>10}"
             f"{_number(row['max_3d_m'], '.0f'):>10}{_number(row['drift_percent'], '.3f'):>10}"
         )
+    lines += ["", figures["verdict"], *requirement_lines(figures.get("requirements") or [])]
     lines += [
         "",
+        f"evidence: level {figures['evidence_level'] or 'not stated'}",
         f"data: {'; '.join(figures['data'])}",
         f"{figures['wall_s']:.1f} s",
         f"report: {figures['report']}",

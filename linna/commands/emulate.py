@@ -145,7 +145,7 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
         raise UsageError(f"--rate: expected a number from 0, found {arguments.rate}")
     data = data_folder()
     world = build_world(scenario, data)
-    loaded, _, _ = load_scenario_payload(world, data)
+    loaded, _, catalogue = load_scenario_payload(world, data)
     live = LivePayload(
         world,
         new_spacecraft(world, loaded),
@@ -157,6 +157,7 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
         arguments.paused,
         arguments.stop_at_end,
         not arguments.no_operator,
+        catalogue,
     )
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: live.stopping.set())

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from linna.output import add_json_flag, emit, log
 
-RUNG = "rung 1-2: simulated detections of the craters of a catalogue (recall, precision, errors as stated), no images"
+LEVEL = "level 1-2: simulated detections of the craters of a catalogue (recall, precision, errors as stated), no images"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -103,7 +103,7 @@ def run_lost(arguments: argparse.Namespace) -> int:
             f"{score.kind:<12}{score.frames:>9}{score.correct:>9}{score.wrong:>7}{none:>8}"
             f"{score.median_error_m:>9.0f}{score.p95_error_m:>7.0f}{score.median_cpu_s:>7.2f}"
         )
-    emit(arguments, figures, text="\n".join([*lines, f"{world.name}, {len(world.board)} craters; {RUNG}"]))
+    emit(arguments, figures, text="\n".join([*lines, f"{world.name}, {len(world.board)} craters; {LEVEL}"]))
     return 0
 
 
@@ -142,7 +142,7 @@ def run_tracking(arguments: argparse.Namespace) -> int:
         f"wrong associations {100 * figures['wrong_association_share']:.2f} %; "
         f"{100 * figures['fixed_of_four_or_more']:.1f} % of frames with four findable craters fixed"
     )
-    emit(arguments, figures, text="\n".join([*lines, f"{world.name}, {len(world.board)} craters; {RUNG}"]))
+    emit(arguments, figures, text="\n".join([*lines, f"{world.name}, {len(world.board)} craters; {LEVEL}"]))
     return 0
 
 
@@ -150,7 +150,7 @@ def _provenance(arguments: argparse.Namespace, name: str, model) -> dict[str, ob
     return {
         "detections": asdict(model),
         "seed": arguments.seed,
-        "rung": RUNG,
+        "level": LEVEL,
         "data": [f"crater catalogue {name}"],
     }
 

@@ -28,30 +28,50 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="whose the files are; needed for bare packets, 0 to 1023",
     )
     parser.add_argument("--instance", default="flight", help="instance of the spacecraft (default: flight)")
+    parser.add_argument(
+        "--stream",
+        metavar="NAME",
+        help="the files are pieces of this stream, one behind another (default: joined in order and by content)",
+    )
+    parser.add_argument(
+        "--offset", type=int, metavar="N", help="where in --stream the first file begins, octets (default: 0)"
+    )
     add_operator_options(parser)
     add_json_flag(parser)
     parser.set_defaults(handler=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
+    from ground_service.errors import InvalidInput
     from linna.errors import UsageError
 
     if arguments.spacecraft_id is not None and not 0 <= arguments.spacecraft_id <= 1023:
         raise UsageError(f"--spacecraft-id: expected 0 to 1023, found {arguments.spacecraft_id}")
     if sum((bool(arguments.files), arguments.tcp is not None, arguments.watch is not None)) != 1:
         raise UsageError("ingest: expected one of FILE..., --tcp and --watch")
+    if arguments.offset is not None and (arguments.stream is None or arguments.offset < 0):
+        raise UsageError(
+            f"--offset: expected octets from the beginning of --stream, found {arguments.offset}"
+        )
+    if arguments.stream is not None and not arguments.files:
+        raise UsageError("--stream: expected the files of the stream, found none")
     done: list[dict[str, Any]] = []
+    offset = arguments.offset or 0
     with operations(arguments) as service:
 
         def ingest(path: Path) -> dict[str, Any]:
             if path.is_dir():
                 return {"file": str(path), "pass_id": service.import_archive(path)}
             result = service.ingest_file(
-                path, spacecraft_id=arguments.spacecraft_id, instance=arguments.instance
+                path,
+                spacecraft_id=arguments.spacecraft_id,
+                instance=arguments.instance,
+                stream=arguments.stream,
+                offset=offset,
             )
             kept = (
-                "ingest_id", "packets", "packets_new", "crc_errors", "octets_skipped", "frames_bad",
-                "symbols_corrected",
+                "ingest_id", "packets", "packets_new", "crc_errors", "octets_skipped", "octets_pending",
+                "frames_bad", "symbols_corrected",
             )  # fmt: skip
             return {"file": str(path), **{name: result[name] for name in kept}}
 
@@ -67,9 +87,18 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             for path in arguments.files:
                 log(f"ingesting {path} ...")
-                done.append(ingest(path))
+                try:
+                    done.append(ingest(path))
+                except InvalidInput as error:
+                    if len(arguments.files) == 1:
+                        raise
+                    log(str(error))
+                    done.append({"file": str(path), "error": str(error)})
+                if arguments.stream is not None and path.is_file():
+                    offset += path.stat().st_size
     if arguments.files:
         emit(arguments, {"ingested": done}, text="\n".join(_line(one) for one in done))
+        return 2 if any("error" in one for one in done) else 0
     else:
         figures = _totals(done)
         text = f"{figures['packets']} packets, {figures['packets_new']} new, in {figures['ingests']} ingests"
@@ -123,4 +152,5 @@ def _line(one: dict[str, Any]) -> str:
     return (
         f"{one['file']}: {one['packets']} packets, {one['packets_new']} new, {one['crc_errors']} damaged, "
         f"{one['frames_bad']} bad frames, {one['octets_skipped']} octets skipped"
+        + (f", {one['octets_pending']} of them wait for neighbours" if one["octets_pending"] else "")
     )

@@ -14,9 +14,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--hours", type=float, default=3.0, metavar="H", help="length of a run (default: 3)")
     parser.add_argument(
         "--track",
-        choices=("test", "tuning"),
+        choices=("test", "tuning", "inclined", "limb"),
         default="test",
-        help="orbit flown: that of the paper, or the one noise is tuned on (default: test)",
+        help="orbit flown: that of the paper (test), the one noise is tuned on, or one of two that nothing was "
+        "chosen on (default: test)",
     )
     parser.add_argument(
         "--noise-factor", type=float, default=1.0, metavar="F", help="factor on the filter's process noise"

@@ -65,6 +65,7 @@ def describe(figures: dict[str, Any]) -> str:
                 f"  {name:<16} median {_metres(row['median_3d_m'])}, 95 % {_metres(row['p95_3d_m'])}, "
                 f"largest {_metres(row['max_3d_m'])}, drift {'-' if drift is None else f'{drift:.3f} %'}"
             )
+    lines += requirement_lines(figures.get("requirements") or [])
     detector = figures["detector"]
     if detector["recall"] is not None:
         lines.append(
@@ -72,6 +73,21 @@ def describe(figures: dict[str, Any]) -> str:
             f"localisation {detector['loc_px']:.2f} px"
         )
     return "\n".join(lines)
+
+
+def requirement_lines(requirements: list[dict[str, Any]]) -> list[str]:
+    """The judged requirements as lines of text, failures first."""
+    order = ("not met", "unknown", "met")
+    judged = [one for one in requirements if one["status"] in order]
+    return [
+        f"  {one['status']:<8} {one['name']}: {_figure(one['value'], one['unit'])}, "
+        f"limit {one['relation']} {_figure(one['limit'], one['unit'])}"
+        for one in sorted(judged, key=lambda one: order.index(one["status"]))
+    ]
+
+
+def _figure(value: float | None, unit: str) -> str:
+    return "unknown" if value is None else f"{value:.4g} {unit}".rstrip()
 
 
 def _metres(value: float | None) -> str:

@@ -11,7 +11,12 @@ from linna.output import add_json_flag, emit, log, progress
 
 def configure(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="what", metavar="COMMAND", required=True)
-    run = commands.add_parser("run", help="fly archives with two builds and judge the candidate")
+    run = commands.add_parser(
+        "run",
+        help="fly archives with two builds and judge the candidate",
+        description="Fly archives with two builds and judge the candidate. Exit status: 0 pass, 1 fail, "
+        "3 inconclusive (too few frames, or a value is unknown), 2 bad usage or input.",
+    )
     _archives(run)
     run.add_argument(
         "--build", required=True, metavar="BUILD", help="candidate: build file, 'current' or identity"
@@ -64,6 +69,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     build.add_argument("action", choices=("register", "list"))
     build.add_argument("file", nargs="?", help="build file")
     _finish(build, _build)
+    sandbox = commands.add_parser("sandbox", help="what confines builds here, or why they are not run")
+    add_json_flag(sandbox)
+    sandbox.set_defaults(handler=_sandbox)
 
 
 def _archives(parser: argparse.ArgumentParser) -> None:
@@ -85,6 +93,7 @@ def _finish(parser: argparse.ArgumentParser, handler) -> None:  # type: ignore[n
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    from ground_service.clock import utc_now_ns
     from ground_service.services.builds import build_of
     from ground_service.services.regression_documents import (
         regression_html,
@@ -109,11 +118,37 @@ def _run(arguments: argparse.Namespace) -> int:
         )
         identity = keep_regression(ground, outcome)
         if arguments.junit:
-            arguments.junit.write_text(regression_junit(outcome), encoding="utf-8")
+            arguments.junit.write_text(regression_junit(outcome, utc_now_ns()), encoding="utf-8")
         if arguments.report:
             arguments.report.write_text(regression_html(ground, outcome, identity), encoding="utf-8")
         emit(arguments, {"id": identity, **regression_json(outcome)}, text=regression_text(outcome))
     return outcome.exit_status
+
+
+def _sandbox(arguments: argparse.Namespace) -> int:
+    from ground_service.sandbox.host import REMEDY, protection
+    from ground_service.services.runner import alive
+    from ground_service.settings import load_settings
+
+    exchange = load_settings().runner_exchange
+    here = protection()
+    answers = exchange is not None and alive(exchange)
+    if exchange is not None:
+        told = f"builds run in the runner of {exchange}"
+        refusal = "" if answers else f"runner exchange {exchange}: expected a runner, found none that answers"
+    else:
+        told, refusal = f"builds are confined by: {here.isolation}", here.refusal
+    lines = [f"builds are refused: {refusal}; remedy: {REMEDY}" if refusal else told]
+    lines += [f"  {'in force' if held else 'NOT in force'}: {name}" for name, held in here.checks.items()]
+    figures = {
+        "confined": not refusal,
+        "isolation": here.isolation,
+        "refusal": refusal,
+        "runner": str(exchange) if exchange else None,
+        "checks": dict(here.checks),
+    }
+    emit(arguments, figures, text="\n".join(lines))
+    return 1 if refusal else 0
 
 
 def _baseline(arguments: argparse.Namespace) -> int:

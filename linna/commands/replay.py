@@ -9,12 +9,16 @@ from linna.output import add_json_flag, emit, progress
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("archive", type=Path, help="pass archive: a folder, or a zip of one")
+    parser.add_argument("archive", type=Path, nargs="?", help="pass archive: a folder, or a zip of one")
     parser.add_argument(
         "--build", default="current", help="build file (TOML), or 'current': this flight code and its network"
     )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for downlink and summary")
     parser.add_argument(
-        "--out", required=True, type=Path, metavar="DIR", help="folder for downlink and summary"
+        "--check-build",
+        type=Path,
+        metavar="BUILD",
+        help="fly nothing; check the parameters of a build file against this flight code",
     )
     parser.add_argument(
         "--complete",
@@ -31,6 +35,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    if arguments.check_build is not None:
+        return _check(arguments)
+    if arguments.archive is None or arguments.out is None:
+        from linna.errors import UsageError
+
+        lacking = "ARCHIVE" if arguments.archive is None else "--out DIR"
+        raise UsageError(f"replay: expected {lacking}, or --check-build BUILD, found neither")
     if arguments.archive.is_dir():
         return _fly(arguments, arguments.archive)
     from ground_service.services.regression_archives import opened_archive
@@ -58,6 +69,20 @@ def _fly(arguments: argparse.Namespace, archive: Path) -> int:
     return 0
 
 
+def _check(arguments: argparse.Namespace) -> int:
+    from payload_emulator.errors import ParameterError
+    from payload_emulator.replay import check_parameters
+
+    try:
+        check_parameters(arguments.check_build)
+    except ParameterError as error:
+        fault = {name: getattr(error, name) for name in ("file", "key", "expected", "found")}
+        emit(arguments, {"fault": fault}, text=str(error))
+        return 2
+    emit(arguments, {"fault": None}, text=f"{arguments.check_build}: parameters are in order")
+    return 0
+
+
 def _complete(arguments: argparse.Namespace, archive: Path) -> int:
     from linna.data import data_folder
     from payload_emulator.replay import complete_archive
@@ -75,8 +100,10 @@ def _complete(arguments: argparse.Namespace, archive: Path) -> int:
 def _run_command(arguments: argparse.Namespace, archive: Path) -> int:
     from ground_service.services.build_runs import run_build
     from ground_service.services.builds import load_build
+    from ground_service.settings import load_settings
 
-    summary = run_build(load_build(arguments.build), archive, arguments.out).summary()
+    runner = load_settings().runner_exchange
+    summary = run_build(load_build(arguments.build), archive, arguments.out, runner=runner).summary()
     emit(arguments, summary, text=summary["text"])
     return 0 if summary["outcome"] == "ok" else 1
 

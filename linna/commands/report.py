@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from linna.commands._ground import add_operator_options, operations
+from linna.commands.pass_ import requirement_lines
 from linna.output import add_json_flag, emit, log
 
 
@@ -23,5 +24,6 @@ def run(arguments: argparse.Namespace) -> int:
     log("evaluating the pass ...")
     with operations(arguments) as service:
         figures = service.make_report(arguments.pass_id, arguments.out)
-    emit(arguments, figures, text=f"{figures['report']}\n{figures['verdict']}")
+    lines = [figures["report"], figures["verdict"], *requirement_lines(figures.get("requirements") or [])]
+    emit(arguments, figures, text="\n".join(lines))
     return 0

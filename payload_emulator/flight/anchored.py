@@ -64,14 +64,71 @@ Index = NDArray[np.int64]
 
 _NAN = float("nan")
 _NO_CRATERS = np.empty(0, dtype=np.int64)
-# No detector repeats itself better than this: without a floor two sightings of a crater would be one equation twice.
-_SMALLEST_VARIANCE_PX2 = 0.04
-# Distances from the Moon's centre outside which no estimate is one.
-_RADIUS_LIMITS_M = (MOON_RADIUS_M - 10e3, MOON_RADIUS_M + 1_000e3)
-# A correction this many times larger than its uncertainty is no correction.
-_CORRECTION_SIGMAS = 7.0
-# A crater crosses the image in at most this time from the altitudes flown; afterwards it is not in view any more.
-_CRATER_MEMORY_S = 240.0
+# Motion of a low orbit about the Moon's centre (2 pi in 111 minutes): a place that is off by a distance along the orbit
+# comes with a velocity that is off by this times the distance.
+_ORBITAL_RATE_RAD_S = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class AnchoredLimits:
+    """Limits of plausibility, of gaps and of gates in the anchored mode, each with its reason.
+
+    Attributes
+    ----------
+    lowest_radius_m, highest_radius_m
+        Distances from the Moon's centre outside which no estimate is one: 10 km below the sphere of the maps, deeper
+        than any ground, and 1,000 km above it, far beyond the altitudes at which craters are resolved.
+    correction_sigmas
+        A correction of the position larger than so many predicted standard deviations is refused: chance exceeds 7 once
+        in 1e10 fixes (chi-square of 3 degrees above 49), so it comes of a wrong identification.
+    crater_memory_s
+        Longest gap over which craters stay among the states. At 50 km altitude a crater crosses the image in 105 s, at
+        100 km in 215 s; afterwards it is not in view any more.
+    search_sigmas, search_margin_px
+        Craters outside the predicted image are searched up to so many standard deviations of the position (3.5 misses
+        1 in 2,000 per axis), and at most so far outside: with 200 px around 512 the area searched, and with it the
+        number of chance pairs, is three times that of the image.
+    map_margin_px
+        Craters up to so far outside the predicted image claim detections at its edge before the map takes them.
+    lowest_altitude_m
+        Altitude that scales pixels to metres is never taken as less, so that a poor prediction divides by no zero.
+    smallest_variance_px2
+        No detector repeats itself better than 0.2 px: without a floor two sightings of a crater would be one equation
+        twice.
+    frame_gate_sigmas
+        Normal quantile of the probability with which the NIS of a right fix passes: 4.265 is 1 - 1e-5, one right fix
+        refused in 35 days with a frame each 15 s half of the time.
+    agreement_share
+        A fix must explain this share of the detections or craters that it could, whichever are fewer, else image and
+        map disagree. A right fix explains the recall of the detector, 0.6, a chance one a few craters.
+    judged_craters
+        Frames with fewer craters or detections say nothing about whether image and map agree.
+    lost_search_every
+        Of frames in which the place is searched without a prior, one in so many is: a search takes up to a second.
+    search_radius_sigmas
+        The half width of the widened search counts as so many standard deviations.
+    found_sigmas, found_position_m, found_velocity_m_s
+        Start of the filter at a place found without a prior: so many times the standard deviation of the place plus a
+        floor, which covers what the shift of the catalogue adds, and a floor of the velocity.
+    """
+
+    lowest_radius_m: float = MOON_RADIUS_M - 10e3
+    highest_radius_m: float = MOON_RADIUS_M + 1_000e3
+    correction_sigmas: float = 7.0
+    crater_memory_s: float = 240.0
+    search_sigmas: float = 3.5
+    search_margin_px: float = 200.0
+    map_margin_px: float = 20.0
+    lowest_altitude_m: float = 1_000.0
+    smallest_variance_px2: float = 0.04
+    frame_gate_sigmas: float = 4.265
+    agreement_share: float = 0.25
+    judged_craters: int = 4
+    lost_search_every: int = 3
+    search_radius_sigmas: float = 3.0
+    found_sigmas: float = 3.0
+    found_position_m: float = 200.0
+    found_velocity_m_s: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +159,8 @@ class AnchoredParameters:
         Whether craters that the catalogue lacks are mapped and used on later passes, and how.
     relative
         Whether the move between two frames is measured on detections that no catalogue names, and how.
+    limits
+        Of plausibility, gaps and gates.
     crater_limit
         Craters used of one frame: more than these, the surest, say little more, since attitude and catalogue err alike
         for all of them.
@@ -126,6 +185,7 @@ class AnchoredParameters:
     mapping: MappingParameters = field(default_factory=MappingParameters)
     crater_limit: int = 32
     relative: RelativeParameters = field(default_factory=RelativeParameters)
+    limits: AnchoredLimits = field(default_factory=AnchoredLimits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,19 +288,20 @@ class AnchoredNavigator:
         camera_from_icrf
             Attitude, shape (3, 3); None where the ADCS gave none: the frame is then coasted over.
         """
+        limits = self.parameters.limits
         self.last_fix = None
         elapsed_s = (ticks - self.state.ticks) / TICKS_PER_SECOND
         mcmf_from_icrf = self.model.mcmf_from_icrf(ticks)
         prior = self._predict(ticks)
-        if prior is None or mcmf_from_icrf is None or not _usable(prior):
+        if prior is None or mcmf_from_icrf is None or not _usable(prior, limits):
             # Without the Moon's orientation neither dynamics nor catalogue can be used: the old state is all there is.
             return self._report(Outcome.refused, None, 0, 0)
         self.new_landmarks = ()
-        if elapsed_s > _CRATER_MEMORY_S or elapsed_s <= 0.0:
+        if elapsed_s > limits.crater_memory_s or elapsed_s <= 0.0:
             prior = prior.only_craters(_NO_CRATERS)
         if found is not None:
             unseen_s = (ticks - self._image_ticks) / TICKS_PER_SECOND
-            if unseen_s > _CRATER_MEMORY_S or unseen_s < 0.0:
+            if unseen_s > limits.crater_memory_s or unseen_s < 0.0:
                 prior = prior.only_craters(_NO_CRATERS)
                 self._end_pass()
             self._image_ticks = ticks
@@ -257,8 +318,7 @@ class AnchoredNavigator:
         if fix is None and self._disagreements >= self.parameters.suspicion_frames:
             fix = self._reacquire(prior, pose, found)
             since = self._disagreements - self.parameters.lost_frames
-            # A search takes up to a second: one frame in three is tried.
-            if fix is None and since >= 0 and since % 3 == 0:
+            if fix is None and since >= 0 and since % limits.lost_search_every == 0:
                 fix = self._found_anywhere(prior, pose, found)
         if fix is not None:
             self.state, self.last_fix = fix.update.state, fix
@@ -289,7 +349,7 @@ class AnchoredNavigator:
             self.parameters.errors.attitude_noise_rad,
             self.parameters.relative,
         )
-        return tied if _usable(tied) else without_clone(prior)
+        return tied if _usable(tied, self.parameters.limits) else without_clone(prior)
 
     def _remember(self, found: Detections, camera_from_icrf: Float, mcmf_from_icrf: Float) -> None:
         """Keep the detections that no catalogue explains, and the position that they were seen from."""
@@ -313,7 +373,7 @@ class AnchoredNavigator:
         """Give the map what the catalogue does not explain."""
         mean, fix = self.state.mean, self.last_fix
         pose = kalman.pose_of(mean, camera_from_icrf, mcmf_from_icrf)
-        seen = in_view(self.landmarks, pose, self._camera, 20.0)
+        seen = in_view(self.landmarks, pose, self._camera, self.parameters.limits.map_margin_px)
         listed = self.landmarks.ids[seen.index] < FIRST_LANDMARK_ID
         used = _NO_CRATERS
         if fix is not None:
@@ -376,7 +436,14 @@ class AnchoredNavigator:
             tried = len(found) if len(found) >= SEARCHABLE_DETECTIONS else 0
             return fix, tried if fix is None else fix.identification.candidates, expected
         altitude_m = float(np.linalg.norm(prior.mean[:3])) - MOON_RADIUS_M
-        margin_px = min(3.5 * sigma_m / max(altitude_m, 1_000.0) * self._camera.focal_px, 200.0)
+        limits = self.parameters.limits
+        margin_px = min(
+            limits.search_sigmas
+            * sigma_m
+            / max(altitude_m, limits.lowest_altitude_m)
+            * self._camera.focal_px,
+            limits.search_margin_px,
+        )
         sighting = in_view(self.landmarks, pose, self._camera, margin_px)
         prior = prior.only_craters(sighting.index)
         self.state = prior
@@ -444,9 +511,10 @@ class AnchoredNavigator:
             self._camera,
             self.parameters.errors,
         )
-        if update is None or update.nis > _frame_limit(2 * len(identification)):
+        limits = self.parameters.limits
+        if update is None or update.nis > frame_limit(2 * len(identification), limits.frame_gate_sigmas):
             return None
-        if not _plausible(prior, update.state):
+        if not _plausible(prior, update.state, limits):
             return None
         return Fix(identification, index, update, reacquired)
 
@@ -473,10 +541,9 @@ class AnchoredNavigator:
     def _reacquire(self, prior: FilterState, pose: Pose, found: Detections) -> Fix | None:
         """Return a fix from a search far beyond what the estimate believes of itself."""
         wide = prior.covariance.copy()
-        extra = self.parameters.search_radius_m / 3.0
+        extra = self.parameters.search_radius_m / self.parameters.limits.search_radius_sigmas
         wide[:3, :3] += np.eye(3) * extra**2
-        # A jump of position by Kepler motion comes with one of velocity: 1e-3 rad/s times the distance.
-        wide[3:6, 3:6] += np.eye(3) * (1e-3 * extra) ** 2
+        wide[3:6, 3:6] += np.eye(3) * (_ORBITAL_RATE_RAD_S * extra) ** 2
         return self._acquired(replace(prior, covariance=wide), pose, found, extra)
 
     def _found_anywhere(self, prior: FilterState, pose: Pose, found: Detections) -> Fix | None:
@@ -495,12 +562,13 @@ class AnchoredNavigator:
         velocity = (
             velocity + np.cross(axis, velocity) + np.cross(axis, np.cross(axis, velocity)) / (1.0 + cosine)
         )
+        limits = self.parameters.limits
         fresh = kalman.initial_filter_state(
             prior.ticks,
             new,
             velocity,
-            3.0 * float(place.sigma_m.max()) + 200.0,
-            1e-3 * float(np.linalg.norm(new - old)) + 1.0,
+            limits.found_sigmas * float(place.sigma_m.max()) + limits.found_position_m,
+            _ORBITAL_RATE_RAD_S * float(np.linalg.norm(new - old)) + limits.found_velocity_m_s,
             self._markov_sigma_m_s2,
             self.parameters.errors,
         )
@@ -512,10 +580,10 @@ class AnchoredNavigator:
 
     def _judge(self, fix: Fix | None, expected: int, detections: int) -> None:
         """Count frames in a row in which the map and the image disagree."""
-        usable = min(expected, detections)
-        if fix is not None and len(fix.index) >= max(1, 0.25 * usable):
+        usable, limits = min(expected, detections), self.parameters.limits
+        if fix is not None and len(fix.index) >= max(1, limits.agreement_share * usable):
             self._disagreements = 0
-        elif usable >= 4:
+        elif usable >= limits.judged_craters:
             self._disagreements += 1
 
     def _crater_sigma_m(self, index: Index, variance_px2: Float) -> Float:
@@ -523,7 +591,10 @@ class AnchoredNavigator:
 
         That is the catalogue's, and the part of the detector's error that stays with the crater.
         """
-        altitude_m = max(float(np.linalg.norm(self.state.mean[:3])) - MOON_RADIUS_M, 1_000.0)
+        altitude_m = max(
+            float(np.linalg.norm(self.state.mean[:3])) - MOON_RADIUS_M,
+            self.parameters.limits.lowest_altitude_m,
+        )
         lasting_px = np.sqrt(variance_px2 * self.parameters.detection_persistence)
         sigma_m = self.landmarks.sigma_m[index].copy()
         sigma_m[:, :2] = np.hypot(sigma_m[:, :2], (lasting_px * altitude_m / self._camera.focal_px)[:, None])
@@ -539,7 +610,7 @@ class AnchoredNavigator:
     def _fresh(self, variance_px2: Float) -> Float:
         """Return the part of each detection's variance that is new in every frame."""
         fresh = variance_px2 * (1.0 - self.parameters.detection_persistence)
-        return np.maximum(fresh, _SMALLEST_VARIANCE_PX2)
+        return np.maximum(fresh, self.parameters.limits.smallest_variance_px2)
 
     def _report(
         self,
@@ -574,20 +645,25 @@ class AnchoredNavigator:
         )
 
 
-def _usable(state: FilterState) -> bool:
+def _usable(state: FilterState, limits: AnchoredLimits) -> bool:
     """Return whether a state is finite and somewhere near the Moon."""
-    low, high = _RADIUS_LIMITS_M
-    return state.finite and low < float(np.linalg.norm(state.mean[:3])) < high
+    radius_m = float(np.linalg.norm(state.mean[:3]))
+    return state.finite and limits.lowest_radius_m < radius_m < limits.highest_radius_m
 
 
-def _plausible(prior: FilterState, posterior: FilterState) -> bool:
+def _plausible(prior: FilterState, posterior: FilterState, limits: AnchoredLimits) -> bool:
     """Return whether a correction is one that the prediction's uncertainty allows, to a place near the Moon."""
     change = float(np.linalg.norm(posterior.mean[:3] - prior.mean[:3]))
     positive = bool(np.all(np.diag(posterior.covariance) >= 0.0))
-    return _usable(posterior) and positive and change < _CORRECTION_SIGMAS * prior.position_sigma_m
+    return (
+        _usable(posterior, limits) and positive and change < limits.correction_sigmas * prior.position_sigma_m
+    )
 
 
-def _frame_limit(degrees: int) -> float:
-    """Return the chi-square quantile at 1 - 1e-5 (Wilson and Hilferty's cube-root approximation)."""
+def frame_limit(degrees: int, sigmas: float) -> float:
+    """Return the chi-square quantile at the probability of a normal quantile.
+
+    By Wilson and Hilferty's cube root: too wide by 7 % at two degrees of freedom and by 2 % at ten.
+    """
     share = 2.0 / (9.0 * degrees)
-    return float(degrees * (1.0 - share + 4.265 * np.sqrt(share)) ** 3)
+    return float(degrees * (1.0 - share + sigmas * np.sqrt(share)) ** 3)

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar.constants import GM_EARTH_M3_S2, GM_SUN_M3_S2
+from lunar.constants import GM_EARTH_M3_S2, GM_SUN_M3_S2, MOON_RADIUS_M
 from lunar.gravity import GravityField, packed, packed_gradient
-from lunar.gravity_omission import FAR_SIDE_COSINE, field_psd_m2_s3
+from lunar.gravity_omission import FAR_SIDE_COSINE, REFERENCE_ALTITUDE_M, field_noise
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns, utc_ns_from_ticks
 from payload_emulator.flight.tables import TICKS_PER_SECOND, BurnTable, GravityTable, OrientationTable
@@ -25,6 +25,8 @@ Float = NDArray[np.float64]
 _ARC_S = 60.0
 # RK4 at 5 s differs from 1 s by less than a millimetre over an orbit.
 _STEP_S = 5.0
+# Altitudes beyond which the law by which noise falls with altitude was not measured.
+_LOWEST_M, _HIGHEST_M = 10_000.0, 100_000.0
 # The gradient of a field of degree 12 is right to a few parts in a thousand at 15 km.
 _GRADIENT_DEGREE = 12
 
@@ -42,18 +44,30 @@ class ProcessNoise:
     far_side_psd_m2_s3
         White acceleration over the far side in place of the other, for a field that was made without tracking there;
         None where the field knows both sides alike.
+    scale_height_m, far_side_scale_height_m
+        Height over which the density of either side falls to 1/e: what a field lacks are its finest waves, and between
+        15 and 45 km their power falls by a factor of 50 (degree 100). Densities are those at 30 km; None: the same at
+        any altitude.
     """
 
     white_psd_m2_s3: tuple[float, float, float] = (6e-8, 3e-8, 3e-8)
     markov_sigma_m_s2: tuple[float, float, float] = (2e-6, 2e-6, 2e-6)
     correlation_s: float = 900.0
     far_side_psd_m2_s3: tuple[float, float, float] | None = None
+    scale_height_m: float | None = None
+    far_side_scale_height_m: float | None = None
 
 
 def process_noise(degree: int, field: str = "") -> ProcessNoise:
     """Return the process noise that goes with a gravity table, by its name, used to a degree."""
-    near, far = field_psd_m2_s3(field, degree)
-    return ProcessNoise(white_psd_m2_s3=near, far_side_psd_m2_s3=None if far == near else far)
+    found = field_noise(field, degree)
+    same = found.far_psd_m2_s3 == found.near_psd_m2_s3
+    return ProcessNoise(
+        white_psd_m2_s3=found.near_psd_m2_s3,
+        far_side_psd_m2_s3=None if same else found.far_psd_m2_s3,
+        scale_height_m=found.near_scale_height_m,
+        far_side_scale_height_m=found.far_scale_height_m,
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,11 +146,16 @@ class OrbitModel:
         return Prediction(state, total, noise)
 
     def _white_psd(self, position_mcmf_m: Float) -> tuple[float, float, float]:
-        """Return the spectral density of white acceleration over a place."""
-        far = self._noise.far_side_psd_m2_s3
-        if far is None or position_mcmf_m[0] > FAR_SIDE_COSINE * float(np.linalg.norm(position_mcmf_m)):
-            return self._noise.white_psd_m2_s3
-        return far
+        """Return the spectral density of white acceleration at a place."""
+        noise, radius_m = self._noise, float(np.linalg.norm(position_mcmf_m))
+        psd, height_m = noise.white_psd_m2_s3, noise.scale_height_m
+        if noise.far_side_psd_m2_s3 is not None and position_mcmf_m[0] <= FAR_SIDE_COSINE * radius_m:
+            psd, height_m = noise.far_side_psd_m2_s3, noise.far_side_scale_height_m
+        if height_m is None:
+            return psd
+        altitude_m = min(max(radius_m - MOON_RADIUS_M, _LOWEST_M), _HIGHEST_M)
+        factor = float(np.exp((REFERENCE_ALTITUDE_M - altitude_m) / height_m))
+        return factor * psd[0], factor * psd[1], factor * psd[2]
 
 
 def flown(model: OrbitModel, state: Float, from_ticks: int, to_ticks: int, burns: BurnTable) -> Float | None:

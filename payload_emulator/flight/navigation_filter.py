@@ -1,4 +1,4 @@
-"""Extended Kalman filter of orbit, common errors and the craters in view, iterated, in Joseph form.
+"""Extended Kalman filter of orbit, common errors and the craters in view, iterated, covariance in Joseph form.
 
 The first 18 states are position and velocity (ICRF), empirical acceleration (radial, transverse, normal), attitude
 bias (camera axes), pixel bias, catalogue offset (east, north, up) and image scale. Behind them stand three for each
@@ -287,7 +287,7 @@ def update(
     count = 2 * index.size
     prior = prior.with_craters(_TURN, np.full((1, 3), errors.attitude_noise_rad))
     turn = int(prior.slots(_TURN)[0])
-    noise = np.diag(np.repeat(variance_px2, 2))
+    noise: Float = np.diag(np.repeat(variance_px2, 2))
     mean = prior.mean
     for step in range(iterations):
         current = FilterState(prior.ticks, mean, prior.covariance, prior.craters)
@@ -308,16 +308,14 @@ def update(
             nis = float(innovation @ np.linalg.solve(spread, innovation))
             spread_of_sum = spread.reshape(index.size, 2, index.size, 2).sum(axis=(0, 2))
             mean_innovation = innovation.reshape(-1, 2).sum(axis=0) / np.sqrt(np.diag(spread_of_sum))
-        gain = np.linalg.solve(spread, crossed).T
+        gain: Float = np.asarray(np.linalg.solve(spread, crossed).T, dtype=np.float64)
         previous, mean = mean, prior.mean + gain @ innovation
         turned = float(np.linalg.norm(mean[turn : turn + 3] - previous[turn : turn + 3]))
         moved = float(np.linalg.norm(mean[POSITION] - previous[POSITION]))
         if moved < _LINEAR_M and turned < _LINEAR_RAD:
             break
-    # Joseph's form, (1 - K H) P (1 - K H)' + K R K', multiplied out: products of n x n by n x m only.
-    taken = gain @ crossed
-    covariance = prior.covariance - taken - taken.T + gain @ spread @ gain.T
-    state = FilterState(prior.ticks, mean, 0.5 * (covariance + covariance.T), prior.craters)
+    covariance = corrected_covariance(prior.covariance, design, gain, noise)
+    state = FilterState(prior.ticks, mean, covariance, prior.craters)
     pose = _pose_with_turn(state, turn, camera_from_icrf, mcmf_from_icrf)
     after = look(landmarks, index, pose, camera, state.shifts(index))
     attitude = np.r_[ATTITUDE, turn : turn + 3]
@@ -333,6 +331,26 @@ def update(
         mean[turn : turn + 3],
         float(np.sqrt(np.max(np.linalg.eigvalsh(left)))),
     )
+
+
+def corrected_covariance(covariance: Float, design: Float, gain: Float, noise: Float) -> Float:
+    """Return the covariance after a measurement in Joseph form, (1 - K H) P (1 - K H)' + K R K', symmetric.
+
+    It holds for any gain, not only the optimal one, so that rounding of the gain does no harm.
+
+    Parameters
+    ----------
+    covariance, design, gain, noise
+        P (n, n), H (m, n), K (n, m) and R (m, m).
+
+    References
+    ----------
+    Bucy, Joseph (1968), Filtering for Stochastic Processes with Applications to Guidance, chapter 16.
+    """
+    reduced = -gain @ design
+    reduced[np.diag_indices_from(reduced)] += 1.0
+    joined = reduced @ covariance @ reduced.T + gain @ noise @ gain.T
+    return np.asarray(0.5 * (joined + joined.T), dtype=np.float64)
 
 
 def _pose_with_turn(state: FilterState, turn: int, camera_from_icrf: Float, mcmf_from_icrf: Float) -> Pose:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lunar.catalogue import size_class
 from lunar.frames import matrix_from_quaternion
 from payload_emulator.errors import TableError
+from payload_emulator.flight import navigation_filter as kalman
 from payload_emulator.flight import odometry
 from payload_emulator.flight.anchored import AnchoredNavigator
 from payload_emulator.flight.detections import Detections, Detector, no_detections
@@ -44,6 +45,7 @@ _PIXEL_LIMIT = 65_535 / 64.0
 _FARTHEST_PX = 1e5
 _MILLISECOND_NS = 1e6
 _LANDMARKS_A_PACKET = 40
+_ORBIT_TRIANGLE = np.triu_indices(kalman.ORBIT.stop)
 
 
 class Observer:
@@ -156,7 +158,7 @@ class Observer:
             "fixes": {**estimators["anchored"]["outcomes"], "reacquired": self.reacquisitions}
             if "anchored" in estimators
             else {},
-            "truth_reads_after_start": chosen.get("anchor_reads_after_start", 0),
+            "anchor_reads_after_start": chosen.get("anchor_reads_after_start", 0),
             "frames_processed": self.counts["frames"],
             "frames_bad": self.counts["frames_bad"],
             "detections": self.counts["detections"],
@@ -282,18 +284,18 @@ class Observer:
     def _send_filter(self, navigator: AnchoredNavigator, found: Detections | None) -> None:
         """Send what the ground needs to judge and to smooth the filter: its orbit in full, the pairs of its fix."""
         frame = {"frame_number": self._telemetry.frame_number, "image_ticks": self._telemetry.ticks}
-        mean, covariance = navigator.state.mean, navigator.state.covariance[:9, :9]
+        mean, fix = navigator.state.mean, navigator.last_fix
         self._telemetry.send(
-            "filter_state",
+            "filter_estimate",
             {
                 **frame,
-                "position_icrf_m": mean[:3],
-                "velocity_icrf_m_s": mean[3:6],
-                "acceleration_rtn_m_s2": mean[6:9],
-                "covariance": covariance[np.tril_indices(9)],
+                "position_icrf_m": mean[kalman.POSITION],
+                "velocity_icrf_m_s": mean[kalman.VELOCITY],
+                "acceleration_rtn_m_s2": mean[kalman.ACCELERATION],
+                "covariance": navigator.state.covariance[kalman.ORBIT, kalman.ORBIT][_ORBIT_TRIANGLE],
+                "innovation_degrees": 0 if fix is None else 2 * fix.index.size,
             },
         )
-        fix = navigator.last_fix
         if fix is not None and found is not None:
             reported = _reported(found)
             sent = np.isin(fix.identification.detection, reported)

@@ -19,7 +19,13 @@ from numpy.typing import NDArray
 from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.flight.detections import Detections
-from payload_emulator.flight.navigation_filter import ATTITUDE, PIXEL, POSITION, FilterState
+from payload_emulator.flight.navigation_filter import (
+    ATTITUDE,
+    PIXEL,
+    POSITION,
+    FilterState,
+    corrected_covariance,
+)
 from payload_emulator.flight.sighting import turned_by
 
 Float = NDArray[np.float64]
@@ -123,11 +129,8 @@ def tie(
     if float(innovation @ np.linalg.solve(spread, innovation)) > parameters.gate * one.size:
         return without_clone(state), 0
     gain = np.linalg.solve(spread, crossed).T
-    taken = gain @ crossed
-    covariance = state.covariance - taken - taken.T + gain @ spread @ gain.T
-    tied = FilterState(
-        state.ticks, state.mean + gain @ innovation, 0.5 * (covariance + covariance.T), state.craters
-    )
+    covariance = corrected_covariance(state.covariance, used, gain, measured)
+    tied = FilterState(state.ticks, state.mean + gain @ innovation, covariance, state.craters)
     return without_clone(tied), int(one.size)
 
 

@@ -16,7 +16,7 @@ _CLASSES = {
     "detections": StoreClass.detections,
     "navigation_state": StoreClass.navigation,
     "frame_outcome": StoreClass.navigation,
-    "filter_state": StoreClass.navigation,
+    "filter_estimate": StoreClass.navigation,
     "identifications": StoreClass.navigation,
     "landmarks": StoreClass.navigation,
     "large_data_first": StoreClass.bulk,

@@ -18,8 +18,9 @@ import numpy.typing as npt
 from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import spherical_from_mcmf
+from lunar.lens import BrownCamera
 from payload_emulator.errors import TerrainError
-from payload_emulator.sim.lens import BrownCamera, pixel_shifts
+from payload_emulator.sim.lens import pixel_shifts
 from payload_emulator.sim.light import SUN_ANGULAR_RADIUS_RAD
 from payload_emulator.sim.photometry import Photometry
 from payload_emulator.sim.terrain.tiles import (

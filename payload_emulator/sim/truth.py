@@ -6,7 +6,9 @@ Everything here is truth: it reaches flight software as images, attitude reading
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +29,26 @@ IntArray = NDArray[np.int64]
 
 _SEARCH_STEP_NS = 20_000_000_000
 _POLAR_NORTH_LIMIT_RAD = np.radians(89.9)
+
+
+@dataclass(slots=True)
+class ReadCount:
+    """Number of reads of the truth while `counted_reads` was in force."""
+
+    count: int = 0
+
+
+_COUNTED: ContextVar[ReadCount | None] = ContextVar("counted_reads_of_truth", default=None)
+
+
+@contextmanager
+def counted_reads(counter: ReadCount) -> Iterator[None]:
+    """Count every read of any truth by this thread; threads that render ahead meanwhile are not counted."""
+    token = _COUNTED.set(counter)
+    try:
+        yield
+    finally:
+        _COUNTED.reset(token)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,6 +75,9 @@ class Truth:
 
     def states(self, utc_ns: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Position (n, 3) in metres and velocity (n, 3) in m/s, Moon-centred ICRF axes, at UTC instants (n,)."""
+        counter = _COUNTED.get()
+        if counter is not None:
+            counter.count += 1
         state = self.state_icrf(np.asarray(tdb_s_from_utc_ns(np.atleast_1d(utc_ns)), dtype=np.float64))
         return state[:, :3], state[:, 3:]
 

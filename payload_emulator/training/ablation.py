@@ -3,7 +3,8 @@
 Every variant is trained from scratch on the same number of crops and, but for the one that is about them, on the same
 frames. The budgets are small: the figures compare variants with each other and say nothing of what a full training
 reaches. The recipe as it stands is trained with every seed; how far its own figures lie apart is the noise below which
-no effect counts. Thresholds are chosen on the validation split, figures are those of the test split.
+no effect counts. Thresholds, figures and the choice of a variant are those of the validation split. The test split is
+scored in a separate step, for the chosen variant only.
 
 Each variant is a run folder of its own, so what was killed goes on from its last checkpoint.
 """
@@ -97,7 +98,7 @@ def ablate(
     parameters: AblationParameters = AblationParameters(),
     report: Callable[[str], None] = lambda line: None,
 ) -> list[dict[str, Any]]:
-    """Train and score each variant in a folder of its own under `folder`; a row of figures each comes back.
+    """Train each variant in a folder of its own under `folder` and score it on the validation split; return the rows.
 
     The baseline runs with every seed, the others with the first unless `every_seed`. Variants whose material is
     not given are left out and said to be. What is finished is not done again.
@@ -105,7 +106,7 @@ def ablate(
     Raises
     ------
     DatasetError
-        The folder holds runs of another budget or other data, or there are no frames to learn from or to test on.
+        The folder holds runs of another budget or other data, or there are no frames to learn from or to validate on.
     """
     rows = []
     for variant in variants:
@@ -197,7 +198,6 @@ def _budget(
         "real_frames": parameters.real_frames,
         "procedural_frames": parameters.procedural_frames,
         "validation_frames": parameters.validation_frames,
-        "test_frames": parameters.test_frames,
         "labels_sha256": [dataset.digest for dataset in data],
     }
 
@@ -235,25 +235,90 @@ def _thin(frames: Sequence[tuple[Dataset, Frame]], count: int) -> list[tuple[Dat
     return [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
 
 
+def choose_variant(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the variant with the greatest strict F1 on the validation split, the mean over its seeds.
+
+    Of equal variants the first is chosen.
+
+    Raises
+    ------
+    DatasetError
+        There are no rows.
+    """
+    if not rows:
+        raise DatasetError("choice of a variant: expected at least one trained variant, found none")
+    return max(
+        dict.fromkeys(str(row["variant"]) for row in rows),
+        key=lambda name: float(np.mean([validation_f1(row) for row in rows if row["variant"] == name])),
+    )
+
+
+def validation_f1(row: Mapping[str, Any]) -> float:
+    """Return the strict F1 of a row on the validation split: on real frames where there are any."""
+    kind = "real" if row["validation"]["real"]["frames"] else "procedural"
+    return float(row["validation"][kind]["strict"]["f1"])
+
+
+def score_chosen_variant(
+    material: Material,
+    folder: Path,
+    rows: Sequence[Mapping[str, Any]],
+    parameters: AblationParameters = AblationParameters(),
+) -> dict[str, Any]:
+    """Return the figures of the chosen variant on the test split, for its first seed, at its validation threshold.
+
+    Parameters
+    ----------
+    rows
+        Result of `ablate` with the same `folder`.
+
+    Raises
+    ------
+    DatasetError
+        There are no rows, or no frames to test on.
+    """
+    from payload_emulator.training.export import load_network
+
+    chosen = choose_variant(rows)
+    row = next(row for row in rows if row["variant"] == chosen)
+    network, _ = load_network(folder / f"{chosen}-{row['seed']}" / "checkpoint.pt")
+    kinds = {
+        name: _thin(_of_kind(material, "test", complete), parameters.test_frames)
+        for name, complete in _KINDS.items()
+    }
+    if not any(kinds.values()):
+        raise DatasetError(f"variant {chosen}: expected frames of the split 'test', found none")
+    return {"variant": chosen, "seed": row["seed"], "threshold": row["threshold"]} | {
+        name: _figures(frames, *_detect(network, frames), row["threshold"], material.rims)
+        for name, frames in kinds.items()
+    }
+
+
+_KINDS = {"real": False, "procedural": True}
+"""Kinds of terrain, and whether their catalogue is complete."""
+
+
+def _of_kind(material: Material, split: str, complete: bool) -> list[tuple[Dataset, Frame]]:
+    return [(d, f) for d in material.datasets for f in d.frames(split) if f.complete == complete]
+
+
 def _score(network: Any, material: Material, parameters: AblationParameters) -> dict[str, Any]:
-    """Validation and test figures; real frames where there are any, procedural ones beside them."""
-    kinds = {}
-    threshold = 0.4
-    for name, split, complete in (
-        ("validation", "val", False),
-        ("real", "test", False),
-        ("procedural", "test", True),
-    ):
-        every = [(d, f) for d in material.datasets for f in d.frames(split)]
-        count = parameters.validation_frames if split == "val" else parameters.test_frames
-        frames = _thin([item for item in every if item[1].complete == complete], count)
-        if split == "val" and not frames:
-            frames = _thin(every, count)
-        truths, found = _detect(network, frames)
-        if split == "val":
-            threshold, _ = best_threshold(tally(truths, found))
-        kinds[name] = _figures(frames, truths, found, threshold, material.rims)
-    return {"threshold": threshold, **kinds}
+    """Return the validation figures by kind of terrain, at the threshold of real frames where there are any."""
+    scored = {}
+    for name, complete in _KINDS.items():
+        frames = _thin(_of_kind(material, "val", complete), parameters.validation_frames)
+        scored[name] = (frames, *_detect(network, frames))
+    decisive = scored["real"] if scored["real"][0] else scored["procedural"]
+    if not decisive[0]:
+        raise DatasetError("ablation: expected frames of the split 'val', found none")
+    threshold, _ = best_threshold(tally(decisive[1], decisive[2]))
+    return {
+        "threshold": threshold,
+        "validation": {
+            name: _figures(frames, truths, found, threshold, material.rims)
+            for name, (frames, truths, found) in scored.items()
+        },
+    }
 
 
 def _detect(
@@ -287,24 +352,33 @@ def _figures(
     }
 
 
-def format_ablation(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The rows as a table, and how far the runs of the baseline lie apart."""
+def format_ablation(rows: Sequence[Mapping[str, Any]], test: Mapping[str, Any] | None = None) -> str:
+    """Return the validation figures as a table, the spread of the baseline, the chosen variant and its test figures."""
     lines = [
-        f"{'variant':16}{'seed':>5}{'weights':>9}{'ms/crop':>9}{'val F1':>8}{'real F1':>9}{'aware':>7}{'R d/D>.06':>11}"
+        f"{'validation':16}{'seed':>5}{'weights':>9}{'ms/crop':>9}{'real F1':>9}{'aware':>7}{'R d/D>.06':>11}"
         f"{'loc px':>8}{'on rims':>9}{'proc. F1':>10}"
     ]
     for row in rows:
-        real, rims = row["real"], row["real"]["refitted"]
         speed = "" if row["cpu_ms_per_crop"] is None else f"{row['cpu_ms_per_crop']:.0f}"
         lines.append(
-            f"{row['variant']:16}{row['seed']:5d}{row['weights']:9d}{speed:>9}"
-            f"{row['validation']['strict']['f1']:8.3f}{real['strict']['f1']:9.3f}{real['ignore_aware']['f1']:7.3f}"
-            f"{real['recall_depth_ratio_006']:11.3f}{real['strict']['loc_median_px']:8.2f}"
-            f"{'' if rims is None else format(rims['refitted']['median_px'], '.2f'):>9}"
-            f"{row['procedural']['strict']['f1']:10.3f}"
+            f"{row['variant']:16}{row['seed']:5d}{row['weights']:9d}{speed:>9}{_columns(row['validation'])}"
         )
     lines += [f"{row['variant']}: {row['title']}" for row in rows if row["variant"] != BASELINE]
-    base = [row["real"]["strict"]["f1"] for row in rows if row["variant"] == BASELINE]
+    base = [validation_f1(row) for row in rows if row["variant"] == BASELINE]
     if len(base) > 1:
-        lines.append(f"real F1 of the recipe by seed: {', '.join(f'{value:.3f}' for value in base)}")
+        lines.append(f"validation F1 of the recipe by seed: {', '.join(f'{value:.3f}' for value in base)}")
+    if rows:
+        lines.append(f"chosen on the validation split: {choose_variant(rows)}")
+    if test is not None:
+        lines.append(f"{'chosen, test':16}{test['seed']:5d}{'':18}{_columns(test)}")
     return "\n".join(lines)
+
+
+def _columns(kinds: Mapping[str, Any]) -> str:
+    real, rims = kinds["real"], kinds["real"]["refitted"]
+    return (
+        f"{real['strict']['f1']:9.3f}{real['ignore_aware']['f1']:7.3f}{real['recall_depth_ratio_006']:11.3f}"
+        f"{real['strict']['loc_median_px']:8.2f}"
+        f"{'' if rims is None else format(rims['refitted']['median_px'], '.2f'):>9}"
+        f"{kinds['procedural']['strict']['f1']:10.3f}"
+    )

@@ -14,7 +14,7 @@ from payload_emulator.errors import DatasetError
 from payload_emulator.training.dataset import Dataset, Frame, frame_truth
 from payload_emulator.training.evaluate import (
     detect_with_model,
-    evidence_rung,
+    evidence_level,
     open_for_evaluation,
     refuse_other_camera,
 )
@@ -70,7 +70,7 @@ def compare_renderers(
         "threshold": chosen,
         "scenes": len(scenes),
         "left_out": len(datasets[0].frames(split)) - len(scenes),
-        "rung": evidence_rung([frames[0] for frames in scenes]),
+        "level": evidence_level([frames[0] for frames in scenes]),
         "data": sorted({str(name) for name in datasets[0].index["data"]}),
         "renderers": [
             {"renderer": renderer_of(dataset), "dataset_sha256": dataset.digest}
@@ -141,8 +141,8 @@ def _figures(
 def format_domains(figures: dict[str, Any]) -> str:
     """The figures as a short table."""
     lines = [
-        f"{figures['scenes']} scenes (evidence rung {figures['rung']}); threshold {figures['threshold']:.2f} (fixed on "
-        "validation); craters of 5-30 km; differences to the first renderer with paired 95 % intervals",
+        f"{figures['scenes']} scenes (evidence level {figures['level']}); threshold {figures['threshold']:.2f} "
+        "(fixed on validation); craters of 5-30 km; differences to the first renderer with paired 95 % intervals",
         f"{'':34}{'P':>7}{'R':>7}{'F1':>7}{'interval':>16}{'difference':>12}{'interval':>18}",
     ]
     for row in figures["renderers"]:

@@ -259,7 +259,7 @@ def _test_figures(octets: bytes, datasets: Sequence[Dataset], paper_classes: boo
         figures = evaluate(octets, datasets, "test", source, paper_classes=paper_classes)
         tested[source] = {
             "frames": figures["frames"],
-            "rung": figures["rung"],
+            "level": figures["level"],
             "strict": {key: round(figures["micro"][key], 4) for key in kept},
             "ignore_aware": {key: round(figures["ignore_aware"][key], 4) for key in kept},
         }

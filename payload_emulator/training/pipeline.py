@@ -249,7 +249,7 @@ def format_made(document: Mapping[str, Any]) -> str:
                 zip(figures["per_class"], both["paper"]["per_class"], strict=True)
             )
         ]
-        lines.append(f"{'':18}evidence rung {figures['rung']}")
+        lines.append(f"{'':18}evidence level {figures['level']}")
     model = document["model"]
     lines.append(
         f"{model['model']}: {model['model_bytes'] / 1e6:.2f} MB, thresholds {model['score_threshold']:.2f} on board, "

@@ -69,7 +69,7 @@ def detector_report(
         worst_frames=tuple(_picture(scored, k, threshold) for k in order[:_WORST_FRAMES]),
         verdict=verdict,
         verdict_level=level,
-        evidence_rung=str(figures["rung"]),
+        evidence_level=str(figures["level"]),
         headline=_headline(figures),
         provenance={
             "Model SHA-256": detector.sha256,

@@ -1,12 +1,12 @@
-"""Ways to close the gap to real terrain that need no new training, each with its effect on frames held out.
+"""Ways to close the gap to real terrain that need no new training, compared on the validation split.
 
-A trial changes how a frame is shown to the network or how its answer is read. Its threshold is chosen on the validation
-split, its figures are those of the test split.
+A trial changes how a frame is shown to the network or how its answer is read. Thresholds and the choice of a trial
+follow from the validation split alone. The test split is scored in a separate step, for the chosen trial only.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,6 +32,8 @@ from payload_emulator.training.scoring import (
 Image = NDArray[np.float32]
 _CLASSES = (0, 1, 2)
 
+PER_CLASS = "a threshold for each class"
+
 
 @dataclass(frozen=True, slots=True)
 class Trial:
@@ -45,35 +47,68 @@ def run_trials(
     detector: OnnxDetector,
     datasets: Sequence[Dataset],
     trials: Sequence[Trial] | None = None,
-    source: str = "",
     progress: Callable[[Sequence[Any]], Any] = iter,
-) -> list[dict[str, Any]]:
-    """Figures of each trial on the real frames of the test split (all of them where none is real).
+) -> dict[str, Any]:
+    """Return the figures of each trial on the validation split, and the trial with the greatest strict F1.
+
+    Real frames are scored where there are any, all frames otherwise. Each trial has the threshold of its own greatest
+    F1. Of equal trials the first is chosen. The test split is not read.
 
     Raises
     ------
     DatasetError
-        The validation or the test split is empty, or the frames are of another camera than the detector's.
+        The validation split is empty, or the frames are of another camera than the detector's.
     """
     for dataset in datasets:
         refuse_other_camera(detector, dataset)
-    chosen = {split: _frames(datasets, split, source if split == "test" else "") for split in ("val", "test")}
-    truths = {split: [frame_truth(d, f) for d, f in frames] for split, frames in chosen.items()}
+    frames = _frames(datasets, "val")
+    truths = [frame_truth(d, f) for d, f in frames]
     rows = []
     for trial in TRIALS if trials is None else trials:
-        found = {
-            split: [_look(trial, detector, d, f) for d, f in progress(frames)]
-            for split, frames in chosen.items()
-        }
-        threshold, _ = best_threshold(tally(truths["val"], found["val"]))
-        rows.append(_row(trial.name, truths["test"], found["test"], threshold))
+        found = [_look(trial, detector, d, f) for d, f in progress(frames)]
+        threshold, _ = best_threshold(tally(truths, found))
+        rows.append(_row(trial.name, truths, found, threshold))
         if trial is AS_FLOWN:
-            limits = [best_threshold(tally(truths["val"], found["val"], classes=(k,)))[0] for k in _CLASSES]
-            lifted = [_lifted(part, limits, threshold) for part in found["test"]]
-            rows.append(
-                _row("a threshold for each class", truths["test"], lifted, threshold) | {"thresholds": limits}
-            )
-    return rows
+            limits = [best_threshold(tally(truths, found, classes=(k,)))[0] for k in _CLASSES]
+            lifted = [_lifted(part, limits, threshold) for part in found]
+            rows.append(_row(PER_CLASS, truths, lifted, threshold) | {"thresholds": limits})
+    chosen = max(rows, key=lambda row: float(row["strict"]["f1"]))
+    return {"validation_frames": len(frames), "trials": rows, "chosen": chosen["trial"]}
+
+
+def score_chosen_trial(
+    detector: OnnxDetector,
+    datasets: Sequence[Dataset],
+    study: Mapping[str, Any],
+    source: str = "",
+    trials: Sequence[Trial] | None = None,
+    progress: Callable[[Sequence[Any]], Any] = iter,
+) -> dict[str, Any]:
+    """Return the figures of the chosen trial on the test split, at the threshold fixed on the validation split.
+
+    Parameters
+    ----------
+    study
+        Result of `run_trials`.
+    source
+        Only the test frames of this source.
+
+    Raises
+    ------
+    DatasetError
+        The test split is empty.
+    """
+    row = next(row for row in study["trials"] if row["trial"] == study["chosen"])
+    per_class = row["trial"] == PER_CLASS
+    known = {trial.name: trial for trial in (TRIALS if trials is None else trials)}
+    trial = AS_FLOWN if per_class else known[row["trial"]]
+    frames = _frames(datasets, "test", source)
+    found = [_look(trial, detector, d, f) for d, f in progress(frames)]
+    if per_class:
+        found = [_lifted(part, row["thresholds"], row["threshold"]) for part in found]
+    return {"test_frames": len(frames)} | _row(
+        row["trial"], [frame_truth(d, f) for d, f in frames], found, row["threshold"]
+    )
 
 
 def _row(
@@ -89,7 +124,7 @@ def _row(
     }
 
 
-def _frames(datasets: Sequence[Dataset], split: str, source: str) -> list[tuple[Dataset, Frame]]:
+def _frames(datasets: Sequence[Dataset], split: str, source: str = "") -> list[tuple[Dataset, Frame]]:
     every = [(d, f) for d in datasets for f in d.frames(split, source)]
     if not every:
         where = f"split {split!r}" + (f", source {source!r}" if source else "")
@@ -212,14 +247,23 @@ TRIALS = (
 )
 
 
-def format_trials(rows: Sequence[dict[str, Any]]) -> str:
-    """Trials as a table."""
-    lines = [f"{'trial':38}{'threshold':>10}{'P':>7}{'R':>7}{'F1':>7}{'F1 ign.':>9}{'AP':>7}{'loc px':>8}"]
-    for row in rows:
-        strict = row["strict"]
-        lines.append(
-            f"{row['trial']:38}{row['threshold']:10.2f}{strict['precision']:7.3f}{strict['recall']:7.3f}"
-            f"{strict['f1']:7.3f}{row['ignore_aware']['f1']:9.3f}{row['average_precision']:7.3f}"
-            f"{strict['loc_px']:8.2f}"
-        )
+def format_trials(study: Mapping[str, Any], test: Mapping[str, Any] | None = None) -> str:
+    """Return the trials on the validation split as a table, the chosen one, and its test figures where given."""
+    title = f"validation, {study['validation_frames']} frames"
+    lines = [
+        f"{title:38}{'threshold':>10}{'P':>7}{'R':>7}{'F1':>7}{'F1 ign.':>9}{'AP':>7}{'loc px':>8}",
+        *(_line(row["trial"], row) for row in study["trials"]),
+        f"chosen on the validation split: {study['chosen']}",
+    ]
+    if test is not None:
+        lines.append(_line(f"chosen, test, {test['test_frames']} frames", test))
     return "\n".join(lines)
+
+
+def _line(title: str, row: Mapping[str, Any]) -> str:
+    strict = row["strict"]
+    return (
+        f"{title:38}{row['threshold']:10.2f}{strict['precision']:7.3f}{strict['recall']:7.3f}"
+        f"{strict['f1']:7.3f}{row['ignore_aware']['f1']:9.3f}{row['average_precision']:7.3f}"
+        f"{strict['loc_px']:8.2f}"
+    )

@@ -3,14 +3,14 @@
 Frames of a data set that look at the same ground are paired; detections of the second are put on the mean ground and
 from there into the first. A crater found in both keeps the mean of its scores, one found in only one of two frames that
 both show its place half of its score; where only the first frame looks, scores stay. Places are those of the first.
-Judged on the frames that have a partner, against the first frame alone, thresholds chosen on the validation split for
-each way.
+Judged on the frames that have a partner, against the first frame alone. Thresholds and the choice between the two ways
+follow from the validation split alone; the test split is scored in a separate step, for the chosen way only.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,43 +39,64 @@ class PairRule:
     size_ratio: float = 1.6
 
 
-def study_two_suns(validation: Scored, test: Scored, rule: PairRule = PairRule()) -> dict[str, Any]:
-    """Figures of single frames and of pairs over the test frames that have a partner.
+WAYS = {"one_sun": "the first frame alone", "two_suns": "both frames"}
+
+
+def study_two_suns(validation: Scored, rule: PairRule = PairRule()) -> dict[str, Any]:
+    """Return the figures of single frames and of pairs over the validation frames with a partner, and the better way.
 
     Raises
     ------
     DatasetError
-        No frame of the validation or of the test split has a partner.
+        No frame of the validation split has a partner.
     """
-    chosen = {"val": _paired(validation, rule), "test": _paired(test, rule)}
-    for split, (truths, _, _) in chosen.items():
-        if not truths:
-            raise DatasetError(
-                f"two Suns: expected frames of the split {split!r} that show {100 * rule.overlap:.0f} % of each "
-                f"other's ground under Suns {rule.suns_apart_deg:g} degrees apart, found none"
-            )
+    truths, *found = _paired(validation, rule, "val")
     result: dict[str, Any] = {
-        "frames": len(chosen["test"][0]),
-        "of_frames": len(test.frames),
-        "validation_frames": len(chosen["val"][0]),
+        "validation_frames": len(truths),
+        "of_validation_frames": len(validation.frames),
     }
-    for name, k in (("one_sun", 1), ("two_suns", 2)):
-        threshold, _ = best_threshold(tally(chosen["val"][0], chosen["val"][k]))
-        truths, found = chosen["test"][0], chosen["test"][k]
-        result[name] = {
-            "threshold": threshold,
-            "strict": tally(truths, found).figures(threshold).to_dict(),
-            "ignore_aware": tally(truths, found, ignore_aware=True).figures(threshold).to_dict(),
-        }
-    return result
+    for name, detections in zip(WAYS, found, strict=True):
+        threshold, _ = best_threshold(tally(truths, detections))
+        result[name] = _figures(truths, detections, threshold)
+    return result | {"chosen": max(WAYS, key=lambda name: float(result[name]["strict"]["f1"]))}
+
+
+def score_chosen_way(test: Scored, study: Mapping[str, Any], rule: PairRule = PairRule()) -> dict[str, Any]:
+    """Return the figures of the way that `study_two_suns` chose, over the test frames with a partner.
+
+    Raises
+    ------
+    DatasetError
+        No frame of the test split has a partner.
+    """
+    chosen = str(study["chosen"])
+    truths, *found = _paired(test, rule, "test")
+    return {"test_frames": len(truths), "of_test_frames": len(test.frames), "way": chosen} | _figures(
+        truths, found[list(WAYS).index(chosen)], study[chosen]["threshold"]
+    )
+
+
+def _figures(
+    truths: Sequence[FrameTruth], found: Sequence[FrameDetections], threshold: float
+) -> dict[str, Any]:
+    return {
+        "threshold": threshold,
+        "strict": tally(truths, found).figures(threshold).to_dict(),
+        "ignore_aware": tally(truths, found, ignore_aware=True).figures(threshold).to_dict(),
+    }
 
 
 def _paired(
-    scored: Scored, rule: PairRule
+    scored: Scored, rule: PairRule, split: str
 ) -> tuple[list[FrameTruth], list[FrameDetections], list[FrameDetections]]:
     """Truths, single and fused detections of the frames with a partner, of real terrain where there is any."""
     partner = _partners(scored.frames, rule)
     first = [k for k, other in enumerate(partner) if other >= 0]
+    if not first:
+        raise DatasetError(
+            f"two Suns: expected frames of the split {split!r} that show {100 * rule.overlap:.0f} % of each "
+            f"other's ground under Suns {rule.suns_apart_deg:g} degrees apart, found none"
+        )
     real = [k for k in first if not scored.frames[k][1].complete]
     first = real or first
     fused = [
@@ -160,16 +181,21 @@ def _in_view(dataset: Dataset, frame: Frame, points: Floats) -> tuple[Floats, ND
         return uv, np.asarray(camera.contains(uv))
 
 
-def format_two_suns(figures: dict[str, Any]) -> str:
-    """Both ways in two lines."""
+def format_two_suns(study: Mapping[str, Any], test: Mapping[str, Any] | None = None) -> str:
+    """Return both ways on the validation split, the chosen one, and its test figures where given."""
     lines = [
-        f"two Suns: {figures['frames']} of {figures['of_frames']} test frames share most of their ground with another "
-        f"under a Sun elsewhere"
+        f"two Suns: {study['validation_frames']} of {study['of_validation_frames']} validation frames share most of "
+        "their ground with another under a Sun elsewhere",
+        *(_line(title, study[name]) for name, title in WAYS.items()),
+        f"chosen on the validation split: {WAYS[study['chosen']]}",
     ]
-    for name, title in (("one_sun", "the first frame alone"), ("two_suns", "both frames")):
-        row = figures[name]
-        lines.append(
-            f"{title:38}{row['threshold']:10.2f}{row['strict']['precision']:7.3f}{row['strict']['recall']:7.3f}"
-            f"{row['strict']['f1']:7.3f}{row['ignore_aware']['f1']:9.3f}"
-        )
+    if test is not None:
+        lines.append(_line(f"chosen, test, {test['test_frames']} frames", test))
     return "\n".join(lines)
+
+
+def _line(title: str, row: Mapping[str, Any]) -> str:
+    return (
+        f"{title:38}{row['threshold']:10.2f}{row['strict']['precision']:7.3f}{row['strict']['recall']:7.3f}"
+        f"{row['strict']['f1']:7.3f}{row['ignore_aware']['f1']:9.3f}"
+    )

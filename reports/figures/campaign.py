@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 Styles = Mapping[str, tuple[str, tuple[float, ...] | None]]
 
-_LEFT, _RIGHT, _BOTTOM, _TOP = 0.72, 1.55, 0.50, 0.28
+_LEFT, _RIGHT, _BOTTOM, _TOP = 0.72, 1.85, 0.50, 0.28
 _FEW = 60
 
 

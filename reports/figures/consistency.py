@@ -15,10 +15,11 @@ from reports.statistics import (
     chi2_quantile,
     error_3d_m,
     quantiles,
+    reference_at,
     round_edges,
     running_mean,
 )
-from reports.values import FloatArray, NavigationSeries, TimeSpan
+from reports.values import FloatArray, NavigationSeries, TimeSpan, TrackSeries
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,13 +29,26 @@ Styles = Mapping[str, tuple[str, tuple[float, ...] | None]]
 _LEFT, _RIGHT, _BOTTOM = 0.72, 1.85, 0.50
 
 
+DIAGONAL = "sum of squared normalised errors (diagonal)"
+"""What stands in place of the NEES where only standard deviations came down."""
+
+
+def squared_errors(one: NavigationSeries) -> tuple[str, FloatArray] | None:
+    """Return the name and values (n,) of the squared errors that are known: NEES, or a sum over the diagonal."""
+    for name, values in (("NEES", one.nees), (DIAGONAL, one.squared_normalised_errors)):
+        if values is not None and np.isfinite(values).any():
+            return name, values
+    return None
+
+
 def draw_consistency(
     canvas: Canvas, one: NavigationSeries, styles: Styles, time: TimeScale, arcs: Sequence[TimeSpan]
 ) -> None:
     """Normalised errors and innovations, each divided by its degrees of freedom, with the 95 % bounds of one sample."""
     parts: list[tuple[str, FloatArray, FloatArray]] = []
-    if one.nees is not None and np.isfinite(one.nees).any():
-        parts.append(("NEES per degree of freedom", one.nees, np.full(len(one.nees), 3.0)))
+    errors = squared_errors(one)
+    if errors is not None:
+        parts.append((f"{errors[0]} per degree of freedom", errors[1], np.full(len(errors[1]), 3.0)))
     if one.nis is not None and one.nis_dof is not None and np.isfinite(one.nis).any():
         parts.append(("NIS per degree of freedom", one.nis, np.maximum(one.nis_dof, 1).astype(np.float64)))
     gap = 0.34
@@ -77,11 +91,15 @@ def draw_consistency(
         )  # fmt: skip
 
 
-def dependences(one: NavigationSeries) -> list[tuple[str, str, Binned]]:
-    """Error of one solution by what it may depend on: name, axis label and bins of each quantity known."""
+def dependences(one: NavigationSeries, track: TrackSeries | None) -> list[tuple[str, str, Binned]]:
+    """Error of one solution by what it may depend on: name, axis label and bins of each quantity known.
+
+    The altitude is that of the reference: an estimated altitude would sort the errors by themselves.
+    """
     error = error_3d_m(one.error_rtn_m)
+    altitude_m = None if track is None else reference_at(track, one.utc_ns)[2]
     quantities: list[tuple[str, str, FloatArray | None]] = [
-        ("altitude", "altitude, km", one.altitude_m / 1e3),
+        ("altitude", "reference altitude, km", None if altitude_m is None else altitude_m / 1e3),
         ("sun_elevation", "Sun elevation, degrees", one.sun_elevation_deg),
         ("matched", "craters matched", None if one.matched is None else one.matched.astype(np.float64)),
         (
@@ -103,9 +121,11 @@ def dependences(one: NavigationSeries) -> list[tuple[str, str, Binned]]:
     return found
 
 
-def draw_dependence(canvas: Canvas, series: Sequence[NavigationSeries], styles: Styles) -> None:
+def draw_dependence(
+    canvas: Canvas, series: Sequence[NavigationSeries], track: TrackSeries | None, styles: Styles
+) -> None:
     """Median (dot) and 95th percentile (bar) of the error by altitude, light, matches and time since a fix."""
-    known = {one.name: dependences(one) for one in series}
+    known = {one.name: dependences(one, track) for one in series}
     names = [n for n in ("altitude", "sun_elevation", "matched", "time_since_fix")
              if any(n == name for items in known.values() for name, _, _ in items)]  # fmt: skip
     terrain = sorted({t for one in series for t in one.terrain if t})

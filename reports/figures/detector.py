@@ -130,7 +130,7 @@ def draw_bins(canvas: Canvas, parts: Sequence[tuple[str, Sequence[BinScore]]]) -
 def draw_residuals(canvas: Canvas, residuals: ResidualSeries) -> None:
     """Mean signed residual by Sun octant and by place in the image."""
     height = canvas.height_in - 0.85
-    has_sun = residuals.sun_azimuth_deg is not None
+    has_sun = bool(np.isfinite(octant_bias(residuals)[0]).any())
     size = height
     left = 0.75
     if has_sun:
@@ -185,7 +185,7 @@ def _octants(canvas: Canvas, axes: Axes, residuals: ResidualSeries) -> None:
         nudged = ends[mine] * (1 + 0.06 * limit / out[mine, None])
         heights = spread(nudged[:, 1].tolist(), 0.115 * limit)
         for k, across, down in zip(np.flatnonzero(finite)[mine], nudged[:, 0], heights, strict=True):
-            axes.text(across, down, OCTANTS[k], ha=align, va="center", fontsize="x-small", color=color("ink"))
+            axes.text(across, down, OCTANTS[k], ha=align, va="center", fontsize="small", color=color("ink"))
     axes.set_title("mean residual by Sun azimuth from the top")
     axes.set_xlabel("du, px (right)")
     axes.set_ylabel("dv, px (down)")
@@ -217,6 +217,10 @@ def _image_map(canvas: Canvas, axes: Axes, residuals: ResidualSeries) -> None:
     for side in ("top", "right"):
         axes.spines[side].set_visible(True)
     if not vectors:
+        axes.text(
+            size / 2, size / 2, "no data: no cell holds\nfive matched craters", ha="center", va="center",
+            fontsize="small", color=color("muted"),
+        )  # fmt: skip
         return
     place, vector = np.array(where), np.array(vectors)
     key = _nice(float(np.hypot(vector[:, 0], vector[:, 1]).max()))

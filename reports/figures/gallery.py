@@ -21,7 +21,7 @@ FALSE_TINT = "#ff5a36"
 SMALL_TINT = "#b9c1cb"
 SCORED_CLASSES = (0, 1, 2)
 _NO_CLASS_TINT = "#ffffff"
-_LETTER_IN = 0.052
+_LETTER_IN = 0.0605
 
 
 def draw_gallery(canvas: Canvas, frames: Sequence[GalleryFrame], columns: int) -> None:
@@ -45,7 +45,7 @@ def draw_gallery(canvas: Canvas, frames: Sequence[GalleryFrame], columns: int) -
             top - 0.33,
             _fitted(frame.caption, size),
             va="center_baseline",
-            fontsize="x-small",
+            fontsize="small",
             color=color("muted"),
         )
         _draw_frame(canvas, sheet, left, top - head - size, size, frame)

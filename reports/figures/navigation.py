@@ -17,7 +17,7 @@ from reports.figures.canvas import (
     thinned,
     time_axis,
 )
-from reports.figures.theme import TRIGGERS, color
+from reports.figures.theme import REFERENCE, TRIGGERS, color
 from reports.statistics import (
     containment,
     cumulative,
@@ -71,7 +71,7 @@ def mark_resets(
                 rotation=90,
                 ha="left",
                 va="top",
-                fontsize="x-small",
+                fontsize="small",
                 color=color("muted"),
             )
 
@@ -169,6 +169,8 @@ def draw_rtn(
             step = max(1, len(x) // 900)
             bound = 3 * sigma[::step] / factor
             axes.fill_between(x[::step], -bound, bound, color=color("silver"), alpha=0.45, linewidth=0)
+            for edge in (-bound, bound):
+                axes.plot(x[::step], edge, color=color("gray2"), linewidth=canvas.pt(0.9))
         axes.axhline(0.0, color=color("faint"), linewidth=canvas.pt(0.7))
         draw_lines(canvas, axes, x, error / factor, (tint, None))
         axes.set_ylim(-limit / factor, limit / factor)
@@ -206,8 +208,10 @@ def _usual_limit(error: FloatArray, bound: FloatArray) -> tuple[float, float, st
     usual = 1.25 * float(np.quantile(error, 0.97))
     if len(bound):
         usual = max(usual, 1.15 * float(np.quantile(bound, 0.9)))
-    everything = 1.08 * float(error.max())
-    return _symmetric_limit(np.array([everything / 1.08 if everything < 2.0 * usual else usual / 1.08]))
+    largest = float(error.max())
+    # The usual bounds are always inside the axis, however small the errors are.
+    shown = max(1.08 * largest, usual) if 1.08 * largest < 2.0 * usual else usual
+    return _symmetric_limit(np.array([shown / 1.08]))
 
 
 def draw_ground_error(
@@ -270,9 +274,9 @@ def draw_altitude(
     axes.plot(
         time.x(track.utc_ns[keep]),
         track.altitude_m[keep] / 1e3,
-        color=color("green"),
-        linewidth=canvas.pt(4.0),
-        alpha=0.45,
+        color=color(REFERENCE),
+        linewidth=canvas.pt(5.0),
+        alpha=0.3,
     )
     entries, errors = [("reference", _last_finite(track.altitude_m[keep] / 1e3))], []
     for one in series:
@@ -282,7 +286,7 @@ def draw_altitude(
         error = np.abs(one.altitude_m[kept] - reference_at(track, one.utc_ns[kept])[2])
         errors.append((one, x, _positive(error)))
         entries.append((one.name, _last_finite(one.altitude_m[kept] / 1e3)))
-    with_reference = {**styles, "reference": (color("green"), None)}
+    with_reference = {**styles, "reference": (color(REFERENCE), None)}
     low, top = axes.get_ylim()
     axes.set_ylim(max(0.0, low) if low > -1e6 else 0.0, top)
     _name_lines(canvas, axes, high, entries, with_reference)
@@ -396,14 +400,27 @@ def _log_percent_axis(axes: Axes, values: FloatArray) -> None:
     axes.set_yticks([], minor=True)
 
 
-def zoom_span(time: TimeScale, arcs: Sequence[TimeSpan], hours: float = 1.0) -> TimeScale | None:
-    """The hour that begins a little before the imaging arc nearest the middle; None for spans under two hours."""
+def zoom_span(
+    time: TimeScale, arcs: Sequence[TimeSpan], hours: float = 1.0, resets: Sequence[int] = ()
+) -> TimeScale | None:
+    """Return the hour that shows a reset, or else an imaging arc; None for spans under two hours.
+
+    Parameters
+    ----------
+    resets
+        Times (UTC ns) of the resets. The one nearest the middle, except one at the start, lies at two thirds of the
+        hour, so that the growth of the error before it shows. Without one, the hour begins a little before the
+        imaging arc nearest the middle.
+    """
     length_ns = int(hours * 3.6e12)
     if time.stop_utc_ns - time.start_utc_ns < 2 * length_ns:
         return None
     middle = (time.start_utc_ns + time.stop_utc_ns) // 2
     start = middle - length_ns // 2
-    if arcs:
+    later = [utc_ns for utc_ns in resets if utc_ns > time.start_utc_ns + length_ns // 60]
+    if later:
+        start = min(later, key=lambda utc_ns: abs(utc_ns - middle)) - 2 * length_ns // 3
+    elif arcs:
         arc = min(arcs, key=lambda a: abs((a.start_utc_ns + a.stop_utc_ns) // 2 - middle))
         start = arc.start_utc_ns - 480_000_000_000
     start = min(max(start, time.start_utc_ns), time.stop_utc_ns - length_ns)

@@ -70,6 +70,9 @@ TRIGGERS = {
     "safety_timeout": "safety timeout",
 }
 
+REFERENCE = "ink"
+"""Role of the colour of the reference, which no estimate or baseline has."""
+
 _KNOWN_SERIES = {"paper": "vermillion", "spherical": "purple", "anchored": "blue"}
 _OTHER_SERIES = ("green", "orange", "sky", "gray1")
 _BASELINE_STYLES: tuple[tuple[str, tuple[float, ...]], ...] = (

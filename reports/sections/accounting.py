@@ -7,7 +7,7 @@ import numpy as np
 from reports.document import Block, Column, Facts, Heading, Paragraph, Picture, Table
 from reports.figures import accounting
 from reports.sections.common import PassView, arc_words
-from reports.text import count_text, duration_text, percent_text, utc_text
+from reports.text import NOT_A_VALUE, computed_text, count_text, duration_text, percent_text, utc_text
 from reports.values import FrameAccounting
 
 _MOST_GAPS = 40
@@ -53,29 +53,33 @@ def frames_and_packets(view: PassView) -> list[Block]:
     if packets is None:
         blocks.append(view.absent("packets", "Packet accounting"))
         return blocks
-    whole = packets.packets + packets.lost
     blocks.append(Heading("Downlink", 3))
     blocks.append(
         Facts(
             (
                 (
                     "Packets received",
-                    f"{count_text(packets.packets)} ({percent_text(packets.packets, whole, 2)} of those sent)",
+                    f"{count_text(packets.packets)} ({percent_text(packets.packets, packets.expected, 2)} of "
+                    f"{count_text(packets.expected)} expected)",
                 ),
-                ("Packets lost", count_text(packets.lost)),
+                ("Packets lost in gaps", count_text(packets.lost)),
+                (
+                    "Packets lost at the edges",
+                    computed_text(packets.lost_at_edges, "not known without a plan"),
+                ),
                 (
                     "Duplicates, conflicts",
-                    f"{count_text(packets.duplicates)}, {count_text(packets.conflicts)}",
+                    f"{computed_text(packets.duplicates)}, {count_text(packets.conflicts)}",
                 ),
-                ("Packets with CRC errors", count_text(packets.crc_errors)),
+                ("Packets with CRC errors", computed_text(packets.crc_errors)),
                 (
                     "Transfer frames, of these bad",
-                    f"{count_text(packets.frames)}, {count_text(packets.frames_bad)}",
+                    f"{computed_text(packets.frames)}, {computed_text(packets.frames_bad)}",
                 ),
-                ("Symbols corrected", count_text(packets.symbols_corrected)),
+                ("Symbols corrected", computed_text(packets.symbols_corrected)),
                 (
                     "Octets, of these skipped",
-                    f"{count_text(packets.octets)}, {count_text(packets.octets_skipped)}",
+                    f"{computed_text(packets.octets)}, {computed_text(packets.octets_skipped)}",
                 ),
             )
         )
@@ -107,9 +111,10 @@ def frames_and_packets(view: PassView) -> list[Block]:
                 a.name,
                 count_text(a.packets),
                 count_text(a.lost),
-                count_text(a.duplicates),
+                computed_text(a.lost_at_edges, NOT_A_VALUE),
+                computed_text(a.duplicates),
                 count_text(a.conflicts),
-                count_text(a.crc_errors),
+                computed_text(a.crc_errors),
             )
             for apid, a in sorted(packets.by_apid.items())
         )
@@ -120,12 +125,16 @@ def frames_and_packets(view: PassView) -> list[Block]:
                     Column("APID", numeric=False),
                     Column("packet", numeric=False),
                     Column("received"),
-                    Column("lost"),
+                    Column("in gaps", group="lost"),
+                    Column("at edges", group="lost"),
                     Column("duplicates"),
                     Column("conflicts"),
                     Column("CRC errors"),
                 ),
                 rows,
+                note="Lost in gaps: missing sequence counts between packets that came. Lost at edges: packets of "
+                "planned frames before the first and after the last that came. Duplicates and CRC errors are counted "
+                "in the raw files over the on-board time of the pass.",
             )
         )
     if report.gaps:

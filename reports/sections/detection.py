@@ -89,13 +89,27 @@ def detector_blocks(score: DetectorScore) -> list[Block]:
         )
         if bins
     ]
+    # One bin shows no dependence: a sentence replaces the plot.
+    single = [(label, bins) for label, bins in parts if sum(b.expected > 0 for b in bins) == 1]
+    parts = [(label, bins) for label, bins in parts if sum(b.expected > 0 for b in bins) > 1]
+    for label, bins in single:
+        only = next(b for b in bins if b.expected > 0)
+        name, _, unit = label.partition(", ")
+        blocks.append(
+            Paragraph(
+                f"All craters were expected at one {name}, {only.low:g} to {only.high:g} {unit}: nothing can be "
+                "said about how the detector depends on it.",
+                small=True,
+            )
+        )
     if parts:
+        by = {"altitude, km": "altitude", "Sun elevation, degrees": "light"}
         blocks.append(
             Picture(
                 "detector-bins",
-                "Precision and recall by altitude and by light, over the craters expected in each bin (gray, "
-                "to its own scale).",
-                "Precision and recall in bins of altitude and Sun elevation.",
+                f"Precision and recall by {' and by '.join(by[label] for label, _ in parts)}, over the craters "
+                "expected in each bin (gray, to its own scale).",
+                f"Precision and recall in bins of {' and '.join(by[label] for label, _ in parts)}.",
                 2.3,
                 lambda c: detector.draw_bins(c, parts),
             )
@@ -104,9 +118,7 @@ def detector_blocks(score: DetectorScore) -> list[Block]:
         blocks.append(
             Picture(
                 "curves",
-                "Left: precision against recall as the threshold moves. Right: how often a detection of a "
-                "given score is true; on the "
-                "dashed line a score could be read as a probability.",
+                _curves_caption(bool(score.curves), bool(score.calibration)),
                 "Precision-recall curves and calibration.",
                 2.95,
                 lambda c: detector.draw_curves(c, score.curves, score.calibration),
@@ -143,6 +155,16 @@ def detector_blocks(score: DetectorScore) -> list[Block]:
             )
         )
     return blocks
+
+
+def _curves_caption(curves: bool, calibration: bool) -> str:
+    """Caption of the panels that there are."""
+    left = "precision against recall as the threshold moves"
+    right = "how often a detection of a given score is true; on the dashed line a score could be read as a probability"
+    if curves and calibration:
+        return f"Left: {left}. Right: {right}."
+    only = left if curves else right
+    return f"{only[0].upper()}{only[1:]}."
 
 
 def detector_section(view: PassView) -> list[Block]:
@@ -187,13 +209,14 @@ def galleries(view: PassView) -> list[Block]:
     else:
         blocks.append(view.absent("gallery", "Gallery of detections"))
     if report.worst_frames:
-        worst = report.worst_frames[:10]
+        worst = report.worst_frames[:9]
         blocks.append(
             gallery_picture(
                 "worst",
                 worst,
-                5 if len(worst) > 4 else 4,
-                f"The worst {len(worst)} frames, chosen by number, not by hand.",
+                3,
+                f"The {len(worst)} frames with the lowest recall, of all frames of the pass. A plain ground stands for "
+                "an image that did not come down.",
             )
         )
     return blocks

@@ -12,7 +12,7 @@ from reports.sections.common import PassView, role_of, slug
 from reports.sections.summary import error_picture
 from reports.statistics import chi2_quantile, containment, error_3d_m, inside, quantiles
 from reports.text import NOT_A_VALUE, count_text, number_text
-from reports.values import NavigationSeries
+from reports.values import FloatArray, IntArray, NavigationSeries
 
 
 def errors(view: PassView) -> list[Block]:
@@ -36,12 +36,13 @@ def errors(view: PassView) -> list[Block]:
         )
     )
     blocks.append(_arc_table(view))
+    blocks += _budget_table(view)
     for one in view.estimates:
         if not np.isfinite(one.error_rtn_m).any():
             continue
         bounds = one.sigma_rtn_m is not None and np.isfinite(one.sigma_rtn_m).any()
         text = (
-            "The gray band is three times the uncertainty that the estimator itself reports."
+            "The gray band, with its edges, is three times the uncertainty that the estimator itself reports."
             if bounds
             else ("This estimator reports no uncertainty of its own.")
         )
@@ -56,6 +57,34 @@ def errors(view: PassView) -> list[Block]:
             )
         )
     return blocks
+
+
+def _budget_table(view: PassView) -> list[Block]:
+    """What the reference contributes to the observed errors."""
+    rows = []
+    for one in view.with_error:
+        budget = one.error_budget
+        if budget is not None:
+            rest = budget.estimate_rms_m
+            rows.append(
+                (
+                    Cell(one.name, swatch=role_of(view.styles[one.name][0])),
+                    number_text(budget.observed_rms_m, 0),
+                    number_text(budget.reference_rms_m, 0),
+                    "below the reference" if math.isnan(rest) else number_text(rest, 0),
+                )
+            )
+    if not rows:
+        return []
+    return [
+        Table(
+            "Error budget: root mean square of the 3-D error, m.",
+            (Column("solution", numeric=False), Column("observed"), Column("reference"), Column("estimate")),
+            tuple(rows),
+            note="Observed² = estimate² + reference², with the 1-sigma error of the reference that the mission "
+            "declares. It holds where the two are independent: not for odometry that is reset to the anchor ephemeris.",
+        )
+    ]
 
 
 def _arc_table(view: PassView) -> Table:
@@ -123,7 +152,8 @@ def drift(view: PassView) -> list[Block]:
         blocks.append(view.absent("error", "Error in latitude and longitude"))
     elif track is not None and len(track.utc_ns):
         spans = [("ground-error", view.time, "")]
-        zoom = navigation.zoom_span(view.time, report.imaging_arcs)
+        times = [utc_ns for utc_ns, _ in navigation.resets_of(odometry, view.time)]
+        zoom = navigation.zoom_span(view.time, report.imaging_arcs, resets=times)
         if zoom is not None:
             spans.append(("ground-error-hour", zoom, " One hour of it."))
         for key, time, extra in spans:
@@ -200,7 +230,8 @@ def altitude(view: PassView) -> list[Block]:
         return blocks
     series = tuple(s for s in view.estimates if np.isfinite(s.altitude_m).any())
     spans = [("altitude", view.time, "")]
-    zoom = navigation.zoom_span(view.time, report.imaging_arcs)
+    times = [utc_ns for utc_ns, _ in navigation.resets_of(series, view.time)]
+    zoom = navigation.zoom_span(view.time, report.imaging_arcs, resets=times)
     if zoom is not None:
         spans.append(("altitude-hour", zoom, " One hour of it."))
     low, high = quantiles(track.altitude_m, (0.0, 1.0))
@@ -210,7 +241,7 @@ def altitude(view: PassView) -> list[Block]:
         else "The reference has no altitude."
     )
     what = (
-        "Estimated altitude over the reference (wide green line), and the magnitude of its error (form of the "
+        "Estimated altitude over the reference (wide gray line), and the magnitude of its error (form of the "
         "paper's Fig. 10)."
         if series
         else "Altitude of the reference; no estimate of it came down."
@@ -230,11 +261,18 @@ def altitude(view: PassView) -> list[Block]:
     return blocks
 
 
+_ERRORS_IN_WORDS = {
+    "NEES": "Normalised estimation error squared of the position",
+    consistency.DIAGONAL: "Squared position errors over their variances, summed over the axes (no covariance "
+    "came down),",
+}
+
+
 def consistency_section(view: PassView) -> list[Block]:
     series = tuple(
         s
         for s in view.estimates
-        if (s.nees is not None and np.isfinite(s.nees).any())
+        if consistency.squared_errors(s) is not None
         or (s.nis is not None and s.nis_dof is not None and np.isfinite(s.nis).any())
     )
     if not series:
@@ -243,9 +281,9 @@ def consistency_section(view: PassView) -> list[Block]:
         return [Heading("Filter consistency"), view.absent("consistency", "NEES and NIS")]
     blocks: list[Block] = [Heading("Filter consistency")]
     for one in series:
+        squared = consistency.squared_errors(one)
         both = (
-            one.nees is not None
-            and np.isfinite(one.nees).any()
+            squared is not None
             and one.nis is not None
             and one.nis_dof is not None
             and np.isfinite(one.nis).any()
@@ -253,12 +291,13 @@ def consistency_section(view: PassView) -> list[Block]:
         blocks.append(
             Picture(
                 f"consistency-{slug(one.name)}",
-                f"Normalised estimation error squared and normalised innovation squared of {one.name}, each "
+                f"{_ERRORS_IN_WORDS[squared[0] if squared else 'NEES']} and normalised innovation squared of "
+                f"{one.name}, each "
                 "divided by its degrees of "
                 "freedom, so that one is right. Dots: samples; line: running mean; band: where 95 % of the "
                 "samples of a consistent filter "
                 "lie. NIS alone cannot see an error common to all craters of a frame.",
-                f"NEES and NIS of {one.name} over time.",
+                f"{squared[0] if squared else 'NEES'} and NIS of {one.name} over time.",
                 3.4 if both else 2.1,
                 lambda c, one=one: consistency.draw_consistency(
                     c, one, view.styles, view.time, view.report.imaging_arcs
@@ -267,10 +306,13 @@ def consistency_section(view: PassView) -> list[Block]:
         )
     rows: list[tuple[Cell | str, ...]] = []
     for one in series:
-        for name, value, dof in (
-            ("NEES", one.nees, np.full(len(one.utc_ns), 3.0)),
-            ("NIS", one.nis, one.nis_dof),
-        ):
+        squared = consistency.squared_errors(one)
+        candidates: list[tuple[str, FloatArray | None, FloatArray | IntArray | None]] = [
+            ("NIS", one.nis, one.nis_dof)
+        ]
+        if squared is not None:
+            candidates.insert(0, (*squared, np.full(len(one.utc_ns), 3.0)))
+        for name, value, dof in candidates:
             if value is None or dof is None or not np.isfinite(value).any():
                 continue
             good = np.isfinite(value) & (dof > 0)
@@ -306,7 +348,8 @@ def consistency_section(view: PassView) -> list[Block]:
 
 def dependence(view: PassView) -> list[Block]:
     series = tuple(s for s in view.estimates if np.isfinite(s.error_rtn_m).any())
-    found = {name for s in series for name, _, _ in consistency.dependences(s)}
+    track = view.report.reference
+    found = {name for s in series for name, _, _ in consistency.dependences(s, track)}
     terrain = navigation.terrain_kinds(series)
     panels = len(found) + bool(terrain)
     if not panels or sum(len(s.utc_ns) for s in series) < 20:
@@ -316,12 +359,12 @@ def dependence(view: PassView) -> list[Block]:
         Heading("What the error depends on"),
         Picture(
             "dependence",
-            "3-D error by altitude, light, number of craters matched, time since the last fix and terrain, as "
-            "far as they are known. "
+            "3-D error by altitude of the reference, light, number of craters matched, time since the last fix and "
+            "terrain, as far as they are known. "
             "Dot: median of a bin; line above it: up to the 95th percentile. Bins with fewer than five "
             "samples are left out.",
             "Median and 95th percentile of the error in bins of each quantity.",
             0.86 + rows * 1.75 + (rows - 1) * 0.66,
-            lambda c: consistency.draw_dependence(c, series, view.styles),
+            lambda c: consistency.draw_dependence(c, series, track, view.styles),
         ),
     ]

@@ -14,8 +14,8 @@ from reports.document import (
     Headline,
     Paragraph,
     Verdict,
-    rung_number,
-    rung_text,
+    evidence_number,
+    evidence_text,
 )
 from reports.sections.common import is_hash, setting_text
 from reports.text import hash_text
@@ -34,7 +34,7 @@ class Judged(Protocol):
     @property
     def created_utc(self) -> str: ...
     @property
-    def evidence_rung(self) -> str: ...
+    def evidence_level(self) -> str: ...
     @property
     def headline(self) -> tuple[HeadlineFigure, ...]: ...
     @property
@@ -54,7 +54,7 @@ def about(report: Judged, *facts: tuple[str, str]) -> tuple[tuple[str, str], ...
 
 
 def judgement(report: Judged, *, counts_only: bool = False) -> list[Block]:
-    """Verdict and figures; figures that only count things stand on no rung of evidence unless one is given."""
+    """Verdict and figures; figures that only count things have no evidence level unless one is given."""
     blocks: list[Block] = []
     if report.verdict:
         blocks.append(Verdict(report.verdict[0].upper() + report.verdict[1:], report.verdict_level))
@@ -63,7 +63,7 @@ def judgement(report: Judged, *, counts_only: bool = False) -> list[Block]:
     if report.headline:
         blocks.append(
             Headline(
-                report.headline, None if counts_only and not report.evidence_rung else report.evidence_rung
+                report.headline, None if counts_only and not report.evidence_level else report.evidence_level
             )
         )
     else:
@@ -92,12 +92,11 @@ def missing_and_remarks(report: Judged) -> list[Block]:
 def provenance_and_data(report: Judged) -> list[Block]:
     """Where the figures come from and what they rest on."""
     blocks: list[Block] = [Heading("Provenance and data")]
-    if rung_number(report.evidence_rung) is not None:
+    if evidence_number(report.evidence_level) is not None:
         blocks.append(
             Paragraph(
-                f"The accuracy figures stand on {rung_text(report.evidence_rung)}. A figure on a lower rung "
-                "says less "
-                "about flight than one on a higher rung, and is not to be quoted without its rung."
+                f"The accuracy figures are at {evidence_text(report.evidence_level)}. A figure at a lower level "
+                "says less about flight than one at a higher level, and is not to be quoted without its level."
             )
         )
     if report.provenance:

@@ -39,7 +39,7 @@ def payload_map(view: PassView) -> list[Block]:
         Heading("The payload's own map"),
         Table(
             "Craters that no catalogue on board holds, mapped by the payload and compared on the ground.",
-            (Column("", numeric=False), Column("")),
+            (Column("quantity", numeric=False), Column("value")),
             tuple(rows),
             note="The last row is 1 where the payload's claims hold. A landmark serves on passes after its own.",
         ),

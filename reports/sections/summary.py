@@ -10,18 +10,67 @@ from reports.figures.canvas import TimeScale
 from reports.sections.common import PassView, arc_words, role_of
 from reports.sections.opening import judgement, missing_and_remarks
 from reports.statistics import completed, error_3d_m, quantiles
-from reports.text import NOT_A_VALUE, count_text, length_text, number_text
+from reports.text import NOT_A_VALUE, count_text, length_text, number_text, significant_text
+
+NO_BREAK_SPACE = "\u00a0"
 
 
 def summary(view: PassView) -> list[Block]:
     """Verdict and figures, errors at a glance, what is missing."""
-    blocks: list[Block] = [*judgement(view.report), Heading("At a glance")]
+    blocks: list[Block] = [*judgement(view.report), *requirements_table(view), Heading("At a glance")]
     if view.with_error:
         blocks.append(error_picture(view, "glance", 2.75, view.time))
         blocks.append(_statistics_table(view))
     else:
         blocks.append(view.no_error())
     return [*blocks, *missing_and_remarks(view.report)]
+
+
+def requirements_table(view: PassView) -> list[Block]:
+    """Requirement, limit, value, margin and status of everything that the verdict rests on."""
+    rows: list[tuple[Cell | str, ...]] = []
+    for one in view.report.requirements:
+        judged = one.status != "not judged"
+        limit = NOT_A_VALUE
+        if one.limit is not None:
+            limit = f"{'≤' if one.at_most else '≥'} {_with_unit(one.limit, one.unit)}"
+        rows.append(
+            (
+                one.name,
+                Cell(one.status.replace(" ", NO_BREAK_SPACE), strong=one.status == "not met"),
+                "unknown" if one.value is None else _with_unit(one.value, one.unit),
+                limit,
+                NOT_A_VALUE if one.margin is None or not judged else _with_unit(one.margin, ""),
+                one.note,
+            )
+        )
+    if not rows:
+        return []
+    return [
+        Heading("Requirements"),
+        Table(
+            "Requirements of the mission description, and what this pass gave.",
+            (
+                Column("requirement", numeric=False),
+                Column("status", numeric=False),
+                Column("value"),
+                Column("limit"),
+                Column("margin"),
+                Column("of", numeric=False),
+            ),
+            tuple(rows),
+            note="Accuracy is that of the estimator that the mission declares. A requirement without a limit is not "
+            "judged; an unknown value never counts as met. The limit of a comparison is the median error of the "
+            "baseline.",
+        ),
+    ]
+
+
+def _with_unit(value: float, unit: str) -> str:
+    """Return a number with three significant digits and its unit; whole numbers below a thousand as they are."""
+    whole = float(value).is_integer() and abs(value) < 1000.0
+    text = number_text(value, 0) if whole else significant_text(value)
+    return f"{text}{NO_BREAK_SPACE}{unit}" if unit else text
 
 
 def _statistics_table(view: PassView) -> Table:

@@ -7,7 +7,15 @@ noise and known faults, and the navigation states carry errors put in on purpose
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
+import os
+import re
+import shutil
+import socket
+import subprocess
+import tempfile
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +23,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sqlalchemy import create_engine, text
 
 from ground_service.services.ground import Ground, open_ground
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
@@ -36,8 +45,17 @@ ALTITUDE_M = 30_000.0
 RESET_FRAME = 20
 PAPER_DRIFT_PER_FRAME_M = 400.0
 SPHERICAL_ERROR_RTN_M = np.array([30.0, -40.0, 120.0])  # 130 m in 3-D
+FILTER_ERROR_RTN_M = np.array([10.0, 20.0, -20.0])  # 30 m in 3-D
 PIXEL_OFFSET = (0.5, -1.25)
 FALSE_ALARMS_PER_FRAME = 1
+
+
+@pytest.fixture(scope="session", autouse=True)
+def name_of_the_test_client() -> Iterator[None]:
+    """Allow the host name that the test client of the web framework gives itself."""
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("LINNA_ALLOWED_HOSTS", "testserver")
+        yield
 
 
 @dataclass(frozen=True)
@@ -95,7 +113,13 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
     """A function that writes a synthetic pass archive of `frames` frames."""
 
     def make(
-        frames: int = 40, seed: int = 1, encode: Callable[[list[bytes]], bytes] = encode_downlink
+        frames: int = 40,
+        seed: int = 1,
+        encode: Callable[[list[bytes]], bytes] = encode_downlink,
+        camera: PinholeCamera = PinholeCamera(),  # noqa: B008
+        tilt_rad: float = 0.0,
+        filter_nis: float | None = None,
+        mission: str = "",
     ) -> SyntheticPass:
         folder = tmp_path_factory.mktemp("archive")
         rng = np.random.default_rng(seed)
@@ -109,7 +133,6 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
         catalogue = _catalogue(latitude, longitude, rng)
         save_catalogue(catalogue, folder / "catalogue.csv")
 
-        camera = PinholeCamera()
         classes = size_class(catalogue.diameter_m)
         sequencer, packets = PacketSequencer(), []
         tally = {"expected": 0, "missed": 0}
@@ -120,11 +143,15 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
 
         for k in range(frames):
             ticks = int(ticks_from_utc_ns(int(utc_ns[k])))
-            in_camera = (catalogue.position_mcmf_m - position_mcmf[k]) @ nadir_camera_from_mcmf(
-                position_mcmf[k]
-            ).T
+            # Leaning from nadir toward image up turns the camera about its x axis.
+            c, s = np.cos(tilt_rad), np.sin(tilt_rad)
+            lean = np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
+            pointing = lean @ nadir_camera_from_mcmf(position_mcmf[k])
+            in_camera = (catalogue.position_mcmf_m - position_mcmf[k]) @ pointing.T
             uv = camera.project(in_camera)
-            inside = np.flatnonzero(camera.contains(uv) & (in_camera[:, 2] > 0) & (in_camera[:, 2] < 1.2e5))
+            crater = catalogue.position_mcmf_m
+            above = np.einsum("ni,ni->n", position_mcmf[k] - crater, crater) > 0.0  # its own horizon
+            inside = np.flatnonzero(camera.contains(uv) & (in_camera[:, 2] > 0) & above)
             scored = inside[classes[inside] != 3]
             missed = scored[::4]
             seen = np.setdiff1d(inside, missed)
@@ -145,10 +172,14 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
             frame = {"frame_number": k, "image_ticks": ticks}
             send("detections", {**frame, "image_quality": 0, "items": items}, ticks + 100)
             since = k - (RESET_FRAME if k >= RESET_FRAME else 0)
-            for estimator, error in (
+            flown = [
                 (0, np.array([0.0, PAPER_DRIFT_PER_FRAME_M * since, 0.0])),
                 (1, SPHERICAL_ERROR_RTN_M),
-            ):
+            ]
+            if filter_nis is not None:
+                flown.append((2, FILTER_ERROR_RTN_M))
+            for estimator, error in flown:
+                filtered = estimator == 2
                 rtn = rtn_from_inertial(position[k], velocity[k])
                 place = spherical_from_mcmf(rotation[k] @ (position[k] + rtn.T @ error))
                 send(
@@ -156,13 +187,13 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
                     {
                         **frame,
                         "estimator": estimator,
-                        "outcome": "multi",
+                        "outcome": "fixed" if filtered else "multi",
                         "latitude_deg": float(np.degrees(place[0])),
                         "longitude_deg": float(np.degrees(place[1])),
                         "altitude_m": float(place[2]),
                         "velocity_icrf_m_s": [np.nan] * 3,
-                        "sigma_rtn_m": [np.nan] * 3,
-                        "nis": np.nan,
+                        "sigma_rtn_m": [1.0] * 3 if filtered else [np.nan] * 3,
+                        "nis": filter_nis if filtered else np.nan,
                         "matched": 5,
                     },
                     ticks + 200 + estimator,
@@ -177,14 +208,14 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
                     {
                         **frame,
                         "estimator": estimator,
-                        "outcome": "multi",
+                        "outcome": "fixed" if filtered else "multi",
                         "reset_trigger": reset,
                         "detections": len(seen) + 1,
                         "candidate_pairs": 9,
                         "pairs": 5,
                         "shift_east_m": 0.0,
                         "shift_north_m": 24_500.0,
-                        "anchor_reads": (1 + (k >= RESET_FRAME)) if estimator == 0 else 1,
+                        "anchor_reads": (1 + (k >= RESET_FRAME)) if estimator == 0 else int(not filtered),
                     },
                     ticks + 300 + estimator,
                 )
@@ -201,6 +232,8 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
             "position_icrf_m": list(position[0]),
             "velocity_icrf_m_s": list(velocity[0]),
         }
+        if mission:
+            (folder / "mission.toml").write_text(mission)
         write_manifest(
             folder,
             {
@@ -215,7 +248,7 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
                     "model_sha256": "00" * 32,
                     "parameters_sha256": "11" * 32,
                 },
-                "data_sources": ["circular orbit", "synthetic craters"],
+                "data_sources": ["circular orbit", "synthetic craters", "orientation IAU WGCCRE 2009"],
                 "start_utc": format_utc(int(utc_ns[0])),
                 "stop_utc": format_utc(int(utc_ns[-1])),
                 "cadence_s": CADENCE_S,
@@ -224,7 +257,7 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
                 "camera": {"width_px": 512, "height_px": 512, "fov_deg": 120.0},
                 "estimators": ["paper", "spherical"],
                 "start_state": start,
-                "gravity": {"truth": "two-body", "degree": 0},
+                "gravity": {"truth": "GRGM1200L (12x12, built in)", "degree": 12},
             },
         )
         return SyntheticPass(folder, packets, utc_ns, tally["expected"], tally["missed"])
@@ -346,8 +379,8 @@ def make_build(tmp_path: Path) -> Callable[..., Path]:
         folder = tmp_path / f"build-{name}"
         folder.mkdir()
         files = {"fly.py": program, "costs.json": json.dumps({"network": network_ms})}
-        for file, text in files.items():
-            (folder / file).write_text(text)
+        for file, content in files.items():
+            (folder / file).write_text(content)
         for pass_name, octets in (packets or {}).items():
             (folder / f"{pass_name.replace(' ', '-')}.packets").write_bytes(b"".join(octets))
         names = sorted(path.name for path in folder.iterdir())
@@ -358,3 +391,125 @@ def make_build(tmp_path: Path) -> Callable[..., Path]:
         return folder / "build.toml"
 
     return make
+
+
+def free_port() -> int:
+    """A port that nobody listens on now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def wait_for(ready: Callable[[], bool], what: str, seconds: float = 60.0) -> None:
+    """Wait until `ready` says so; fail when it never does."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        if ready():
+            return
+        time.sleep(0.1)
+    pytest.fail(f"{what} was not ready within {seconds:.0f} s")
+
+
+def _postgres_binaries() -> Path | None:
+    found = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
+    return found[-1].parent if found else None
+
+
+@pytest.fixture(scope="module")
+def redis_url() -> Iterator[str]:
+    """A Redis server of the tests' own, its user as restricted as in the distributed form."""
+    program = shutil.which("redis-server")
+    if program is None:
+        pytest.skip("redis-server is not installed")
+    port = free_port()
+    script = (Path(__file__).resolve().parents[2] / "deploy/redis.sh").read_text()
+    (rights,) = re.findall(r"^rights='(.*)'$", script, re.MULTILINE)
+    with tempfile.TemporaryDirectory() as folder:
+        users = Path(folder) / "users.acl"
+        users.write_text(f"user default off\nuser linna on >tests ~* &* {rights}\n")
+        server = subprocess.Popen(
+            [
+                program,
+                "--aclfile",
+                str(users),
+                "--port",
+                str(port),
+                "--bind",
+                "127.0.0.1",
+                "--dir",
+                folder,
+                "--save",
+                "",
+                "--appendonly",
+                "no",
+            ],
+            stdout=subprocess.DEVNULL,
+        )
+
+        def answers() -> bool:
+            with socket.socket() as probe:
+                return probe.connect_ex(("127.0.0.1", port)) == 0
+
+        try:
+            wait_for(answers, "redis-server")
+            yield f"redis://linna:tests@127.0.0.1:{port}/0"
+        finally:
+            server.terminate()
+            server.wait(20)
+
+
+@pytest.fixture(scope="session")
+def postgres_server() -> Iterator[str]:
+    """URL of a PostgreSQL server of the tests' own, without the name of a database."""
+    binaries = _postgres_binaries()
+    if binaries is None:
+        pytest.skip("PostgreSQL is not installed")
+    as_user = ["runuser", "-u", "postgres", "--"] if os.geteuid() == 0 else []
+    port = free_port()
+    folder = Path(tempfile.mkdtemp(prefix="linna-postgres-"))
+    if as_user:
+        shutil.chown(folder, "postgres", "postgres")
+    data = folder / "data"
+
+    def run(program: str, *arguments: str) -> None:
+        subprocess.run(
+            [*as_user, str(binaries / program), *arguments], check=True, cwd=folder, stdout=subprocess.DEVNULL
+        )
+
+    try:
+        run("initdb", "-D", str(data), "-U", "linna", "-A", "trust", "-E", "UTF8", "--no-sync")
+        run(
+            "pg_ctl", "-D", str(data), "-w", "-l", str(folder / "log"), "start",
+            "-o", f"-p {port} -k {folder} -h 127.0.0.1 -c fsync=off -c synchronous_commit=off",
+        )  # fmt: skip
+        yield f"postgresql+psycopg://linna@127.0.0.1:{port}"
+    finally:
+        subprocess.run(
+            [*as_user, str(binaries / "pg_ctl"), "-D", str(data), "-m", "immediate", "-w", "stop"],
+            cwd=folder,
+            stdout=subprocess.DEVNULL,
+            check=False,
+        )
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="session")
+def new_postgres_database(postgres_server: str) -> Callable[[], str]:
+    """A function that makes an empty database on the PostgreSQL server and returns its URL."""
+    numbers = itertools.count(1)
+
+    def make() -> str:
+        name = f"linna_{next(numbers)}"
+        engine = create_engine(f"{postgres_server}/postgres", isolation_level="AUTOCOMMIT")
+        with engine.connect() as connection:
+            connection.execute(text(f"CREATE DATABASE {name}"))
+        engine.dispose()
+        return f"{postgres_server}/{name}"
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def postgres_url(new_postgres_database: Callable[[], str]) -> str:
+    """URL of an empty PostgreSQL database that the tests of one module share."""
+    return new_postgres_database()

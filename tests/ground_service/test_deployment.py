@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,13 @@ ROOT = Path(__file__).resolve().parents[2]
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
-SECRETS = ("LINNA_DB_PASSWORD", "LINNA_REDIS_PASSWORD", "LINNA_ADMIN_TOKEN", "REDISCLI_AUTH")
+SECRETS = (
+    "database_superuser_password",
+    "database_owner_password",
+    "database_password",
+    "broker_password",
+    "admin_token",
+)
 EXACT = re.compile(r"[a-z]+:\d+\.\d+(\.\d+)?-[a-z-]+")
 
 
@@ -30,7 +38,8 @@ def test_every_service_is_confined(name: str) -> None:
     assert "no-new-privileges:true" in service["security_opt"]
     assert service["pids_limit"] and service["mem_limit"]
     assert service["logging"]["options"]["max-size"]
-    assert not {"privileged", "network_mode", "pid", "ipc", "devices"} & set(service)
+    assert not {"privileged", "pid", "ipc", "devices"} & set(service)
+    assert service.get("network_mode", "none") == "none"
     assert not any("docker.sock" in volume for volume in service["volumes"])
 
 
@@ -61,19 +70,78 @@ def test_only_the_interface_is_reached_from_outside_and_from_this_machine_alone(
     assert [name for name in SERVICES if "ports" in SERVICES[name]] == ["api"]
     assert all(port.startswith("127.0.0.1:") for port in SERVICES["api"]["ports"])
     assert COMPOSE["networks"]["inner"] == {"internal": True}
-    assert all(SERVICES[name]["networks"] == ["inner"] for name in SERVICES if name != "api")
+    assert all(SERVICES[name]["networks"] == ["inner"] for name in SERVICES if name not in ("api", "runner"))
 
 
-def test_secrets_have_no_default_and_are_in_no_command() -> None:
+def test_secrets_are_files_of_those_who_need_them_and_in_no_command_or_environment() -> None:
+    assert set(COMPOSE["secrets"]) == set(SECRETS)
+    for name, secret in COMPOSE["secrets"].items():
+        # A file: contents of variables cannot be given to a container with a read-only root.
+        assert secret == {"file": f"${{LINNA_SECRETS_DIR:-./secrets}}/{name}"}
     text = (ROOT / "docker-compose.yml").read_text()
-    for secret in SECRETS[:3]:
-        uses = re.findall(rf"\$\{{{secret}([^}}]*)\}}", text)
-        assert uses and all(use.startswith(":?") for use in uses)
+    assert not re.search(r"\$\{?LINNA_[A-Z_]*(PASSWORD|TOKEN)", text)
+    holders = {
+        name: {user for user in SERVICES if name in SERVICES[user].get("secrets", [])} for name in SECRETS
+    }
+    assert holders == {
+        "database_superuser_password": {"db"},
+        "database_owner_password": {"db", "migrate"},
+        "database_password": {"db", "migrate", "api", "worker", "scheduler"},
+        "broker_password": {"broker", "migrate", "api", "worker", "scheduler"},
+        "admin_token": {"migrate"},
+    }
     for service in SERVICES.values():
-        words = [*service.get("command", []), *service.get("entrypoint", [])]
-        words += service.get("healthcheck", {}).get("test", [])
-        # A shell may expand a variable inside of the container ($$), where compose does not put its value.
-        assert not any(secret in str(word).replace(f"$${secret}", "") for word in words for secret in SECRETS)
+        for name, value in service.get("environment", {}).items():
+            # A password or token is named by a file, and no URL holds one.
+            secret = any(word in name for word in ("PASSWORD", "TOKEN", "SECRET"))
+            assert not secret or (name.endswith("_FILE") and str(value).startswith("/run/secrets/"))
+            assert not re.search(r"://[^/@]*:[^/@]*@", str(value))
+
+
+def test_the_service_is_not_the_owner_of_its_schema() -> None:
+    for name in ("api", "worker", "scheduler"):
+        environment = SERVICES[name]["environment"]
+        assert environment["LINNA_DATABASE_URL"].startswith("postgresql+psycopg://linna@")
+        assert not {key for key in environment if "MIGRATION" in key or "ALLOW" in key}
+    owner = SERVICES["migrate"]["environment"]["LINNA_MIGRATION_DATABASE_URL"]
+    assert owner.startswith("postgresql+psycopg://linna_owner@")
+    roles = (ROOT / "deploy/postgres-roles.sh").read_text()
+    assert roles.count("LOGIN NOSUPERUSER NOCREATEDB NOCREATEROLE NOREPLICATION") == 2
+    assert "ALTER SCHEMA public OWNER TO linna_owner" in roles
+
+
+def test_the_runner_has_no_secret_no_network_and_no_archive() -> None:
+    runner = SERVICES["runner"]
+    assert runner["network_mode"] == "none" and "networks" not in runner and "secrets" not in runner
+    assert runner["volumes"] == ["exchange:/exchange"]
+    assert not {name for name in runner["environment"] if name != "LINNA_LOG_FORMAT"}
+    # A user for each build, and an end to its processes; user 0 can do nothing else.
+    assert set(runner["cap_add"]) == {"SETUID", "SETGID", "KILL"} and runner["user"] == "0:10001"
+    assert all("size=" in place for place in runner["tmpfs"])
+    assert runner["memswap_limit"] == runner["mem_limit"]
+    (exchange,) = re.findall(r"chmod (\d+) /exchange", DOCKERFILE)
+    assert int(exchange, 8) & 0o007 == 0
+    for name in ("worker", "scheduler"):
+        assert "exchange:/exchange" in SERVICES[name]["volumes"]
+        assert SERVICES[name]["environment"]["LINNA_RUNNER_EXCHANGE"] == "/exchange"
+
+
+def test_the_secrets_that_are_missing_are_made_and_those_that_are_there_are_kept(tmp_path: Path) -> None:
+    folder = tmp_path / "secrets"
+    script = ["sh", str(ROOT / "deploy/secrets.sh")]
+    environment = {
+        "PATH": os.environ["PATH"],
+        "LINNA_SECRETS_DIR": str(folder),
+        "LINNA_ADMIN_TOKEN": "given" * 5,
+    }
+    subprocess.run(script, check=True, env=environment, capture_output=True)
+    made = {path.name: path.read_text() for path in folder.iterdir()}
+    assert set(made) == set(SECRETS) and made["admin_token"] == "given" * 5
+    drawn = [made[name] for name in SECRETS if name != "admin_token"]
+    assert len(set(drawn)) == 4 and all(re.fullmatch("[0-9a-f]{48}", one) for one in drawn)
+    assert folder.stat().st_mode & 0o077 == 0
+    subprocess.run(script, check=True, env={**environment, "LINNA_ADMIN_TOKEN": "other"}, capture_output=True)
+    assert {path.name: path.read_text() for path in folder.iterdir()} == made
 
 
 def test_one_scheduler_and_workers_without_one() -> None:

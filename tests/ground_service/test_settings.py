@@ -47,6 +47,20 @@ def test_secrets_can_come_from_files_and_are_not_printed(
     assert "geheim" not in repr(settings)
 
 
+def test_a_password_can_come_from_a_file_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "password").write_text("a/b@c\n")
+    for name in ("DATABASE", "MIGRATION_DATABASE", "BROKER"):
+        monkeypatch.setenv(f"LINNA_{name}_PASSWORD_FILE", str(tmp_path / "password"))
+    monkeypatch.setenv("LINNA_DATABASE_URL", "postgresql://linna@db/linna")
+    monkeypatch.setenv("LINNA_MIGRATION_DATABASE_URL", "postgresql://owner:own@db/linna")
+    monkeypatch.setenv("LINNA_BROKER_URL", "redis://linna@broker:6379/0")
+    settings = load_settings()
+    assert settings.resolved_database_url() == "postgresql+psycopg://linna:a%2Fb%40c@db/linna"
+    # One that is there already is kept.
+    assert settings.resolved_migration_url() == "postgresql+psycopg://owner:own@db/linna"
+    assert settings.resolved_broker_url() == "redis://linna:a%2Fb%40c@broker:6379/0"
+
+
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [

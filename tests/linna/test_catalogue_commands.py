@@ -74,7 +74,7 @@ def test_tracking_identification_is_measured_on_an_anchoring_table(
     assert figures["craters"] == count
     assert figures["frames"] == 60
     assert figures["wrong_fixes"] == 0
-    assert figures["rung"].startswith("rung 1-2")
+    assert figures["level"].startswith("level 1-2")
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,14 @@ import pytest
 from scipy.special import eval_legendre
 
 from lunar.datafolder import find_data
-from lunar.gravity import GravityField, load_gravity
-from lunar.gravity_omission import measured_omission, omission_psd_m2_s3
+from lunar.gravity import GravityField, acceleration, load_gravity
+from lunar.gravity_omission import (
+    REFERENCE_ALTITUDE_M,
+    field_noise,
+    field_psd_m2_s3,
+    measured_omission,
+    omission_psd_m2_s3,
+)
 
 GM, RADIUS = 4.902800118e12, 1_738_000.0
 
@@ -47,6 +53,48 @@ def test_density_of_a_zonal_term_against_its_closed_form() -> None:
         3.0 * GM / 1_768_180.0**2 * (RADIUS / 1_768_180.0) ** 2 * c * np.sqrt(5.0) * np.sqrt(11.0 / 32.0)
     )
     assert found.rms_m_s2[0] == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize(("name", "degree"), [("GRGM", 20), ("GRGM", 100), ("LP165P", 100)])
+def test_noise_by_altitude_has_the_mean_over_the_orbit_that_the_table_gives(name: str, degree: int) -> None:
+    """Averaged over the paper's orbit (30.8 km, +-12.2 km), by adding it up; the far side is one field's alone."""
+    noise, near, far = field_noise(name, degree), *field_psd_m2_s3(name, degree)
+    altitude_m = (
+        1_768_180.0 * (1.0 - 0.006908 * np.cos(np.linspace(0.0, 2.0 * np.pi, 720, endpoint=False)))
+        - 1_737_400.0
+    )
+    for psd, height_m, mean in (
+        (noise.near_psd_m2_s3, noise.near_scale_height_m, near),
+        (noise.far_psd_m2_s3, noise.far_scale_height_m, far),
+    ):
+        factor = np.exp((REFERENCE_ALTITUDE_M - altitude_m) / height_m).mean()
+        # Two exponentials stand as one where a field has errors of its own.
+        np.testing.assert_allclose(np.array(psd) * factor, mean, rtol=1e-3 if name == "GRGM" else 0.05)
+    assert (noise.near_psd_m2_s3 == noise.far_psd_m2_s3) is (name == "GRGM")
+
+
+@pytest.mark.real_data
+def test_what_a_cut_omits_falls_with_altitude_as_the_filter_holds(data_path: Path) -> None:
+    named = find_data(data_path).gravity
+    assert named is not None
+    truth = load_gravity(named).truncated(150)
+    position = []
+    for altitude_m in (15e3, 46e3):
+        angle = np.linspace(0.0, 2.0 * np.pi, 1_024, endpoint=False)
+        turned = []
+        for node in np.radians([10.0, 75.0, 140.0]):
+            out = np.array([np.cos(node), np.sin(node), 0.0])
+            ring = np.cos(angle)[:, None] * out + np.sin(angle)[:, None] * np.array([0.0, 0.0, 1.0])
+            turned.append((1_737_400.0 + altitude_m) * ring)
+        position.append(np.concatenate(turned))
+    for degree in (50, 100):
+        low, high = (
+            np.mean(np.sum((acceleration(truth, p) - acceleration(truth.truncated(degree), p)) ** 2, axis=1))
+            for p in position
+        )
+        # Mean squares fall a little faster than the slow waves: by the ratio over 31 km to a tenth.
+        found = 31e3 / np.log(low / high)
+        assert field_noise("GRGM", degree).near_scale_height_m == pytest.approx(found, rel=0.12)
 
 
 @pytest.mark.real_data

@@ -12,8 +12,10 @@ import pytest
 
 from lunar.datafolder import find_data
 from lunar.timescales import parse_utc
+from payload_emulator import emulator
 from payload_emulator.emulator import emulate
 from payload_emulator.errors import TableError
+from payload_emulator.flight.payload import Payload
 from payload_emulator.flight.tables import CatalogueTable, pack_catalogue_table
 from payload_emulator.scenario import parse_scenario
 from tmtc.downlink import decode
@@ -186,3 +188,36 @@ def test_an_anchoring_table_that_is_none_is_refused_before_the_flight(tmp_path: 
             tmp_path / "pass",
         )
     assert not (tmp_path / "pass").exists()
+
+
+@pytest.mark.parametrize("reads", [0, 2])
+def test_reads_of_the_truth_are_counted_where_they_happen(
+    reads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A payload cannot read the truth; one that is handed it behind its back is found out."""
+    stolen: list[Any] = []
+    build, step = emulator.build_world, Payload.step
+
+    def seen(*given: Any) -> Any:
+        stolen.append(build(*given))
+        return stolen[0]
+
+    def stealing(self: Payload, *given: Any) -> Any:
+        for _ in range(reads):
+            stolen[0].truth.states(int(stolen[0].frame_utc_ns[0]))
+        return step(self, *given)
+
+    monkeypatch.setattr(emulator, "build_world", seen)
+    monkeypatch.setattr(Payload, "step", stealing)
+    text = SCENARIO.replace("duration_s = 6600.0", "duration_s = 90.0").replace(
+        'name = "lossy"', 'name = "short"'
+    )
+    text = text.replace('estimators = ["spherical"]', 'estimators = ["paper"]')
+    text = text.replace("2029-08-08T02:30:00Z", "2029-08-07T01:40:00Z")
+    summary = emulate(parse_scenario(text), find_data(None), tmp_path / "pass")
+    frames = summary["frames"]
+    assert frames >= 2
+    assert summary["truth_reads_after_start"] >= reads * frames
+    assert (summary["truth_reads_after_start"] > 0) is (reads > 0)
+    # The odometry reads its anchor ephemeris at every frame: that is another count.
+    assert summary["anchor_reads_after_start"] >= frames - 1

@@ -7,9 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
+from lunar.datafolder import DataFolder
+from lunar.timescales import tdb_s_from_utc_ns
+from payload_emulator import montecarlo
 from payload_emulator.flight.anchored import AnchoredParameters
-from payload_emulator.flight.dynamics import ProcessNoise
+from payload_emulator.flight.dynamics import ProcessNoise, process_noise
 from payload_emulator.flight.navigation_filter import CommonErrors
 from payload_emulator.flight.outcomes import Outcome
 from payload_emulator.montecarlo import (
@@ -23,6 +27,7 @@ from payload_emulator.montecarlo import (
     fly_many,
     verdict,
 )
+from payload_emulator.montecarlo_world import TRACKS, standard_case
 
 # Tuned on other seeds than the tests use: what degree 50 leaves out of the field of degree 60 in the fixture.
 NOISE = ProcessNoise(
@@ -205,3 +210,69 @@ def test_the_same_seed_gives_the_same_run_on_any_number_of_processes(navigation_
     for one, other in zip(alone, together, strict=True):
         np.testing.assert_array_equal(one.error_rtn_m, other.error_rtn_m)
         np.testing.assert_array_equal(one.outcome, other.outcome)
+
+
+SHIPPED_RUNS, SHIPPED_HOURS = 4, 0.5
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Any:
+    """The standard case with everything as shipped: bias states, catalogue offset, scale, persistence, noise."""
+    case = standard_case(DataFolder(), "tuning", SHIPPED_HOURS)
+    assert case.parameters == replace(
+        AnchoredParameters(), noise=case.parameters.noise
+    ) and case.parameters.noise == process_noise(100, case.filter_gravity.name)
+    return case
+
+
+def shipped_consistency(case: Any) -> Consistency:
+    return consistency([fly(case, seed) for seed in range(31, 31 + SHIPPED_RUNS)], settle_frames=40)
+
+
+def test_the_shipped_filter_knows_its_errors(shipped: Any) -> None:
+    result = shipped_consistency(shipped)
+    # Errors that last count once a run: chi-square of 4 x 6 degrees over 4, from SciPy.
+    low, high = np.array(chi2.ppf([0.025, 0.975], 6 * SHIPPED_RUNS)) / SHIPPED_RUNS
+    assert low <= result.anees <= high
+    assert 0.85 <= result.nis_per_degree <= 1.15
+    assert result.fixed_share >= 0.95 and result.wrong_share <= 0.01
+
+
+def test_a_filter_that_leaves_out_what_detections_share_is_found_out_by_its_errors(shipped: Any) -> None:
+    errors = CommonErrors(pixel_bias_px=1e-3)
+    case = replace(shipped, parameters=replace(shipped.parameters, errors=errors))
+    runs = [fly(case, seed) for seed in (31, 32)]
+    assert consistency(runs, settle_frames=40).anees > chi2.ppf(0.975, 12) / 2.0
+
+
+def test_slow_errors_wander_with_the_memory_they_are_given() -> None:
+    elapsed_s = np.full(40_000, 15.0)
+    rng = np.random.default_rng(0)
+    values = montecarlo._wandering(np.zeros(2), 0.5, 150.0, elapsed_s, rng)[200:]
+    assert np.std(values) == pytest.approx(0.5, rel=0.05)
+    # Ten steps of 15 s: exp(-1).
+    assert np.mean(values[10:] * values[:-10]) / 0.25 == pytest.approx(np.exp(-1.0), abs=0.05)
+    still = montecarlo._wandering(np.array([0.3, -0.2]), 0.5, float("inf"), elapsed_s, rng)
+    np.testing.assert_array_equal(still, np.broadcast_to([0.3, -0.2], still.shape))
+
+
+def test_tracks_differ_and_draw_their_nodes_where_they_say() -> None:
+    axis = np.array([0.0, 0.0, 1.0])
+    inclinations, altitudes = {}, {}
+    for track in TRACKS:
+        case = standard_case(DataFolder(), track, 0.2)
+        longitudes = []
+        for seed in range(12):
+            drawn = montecarlo._with_drawn_node(case, np.random.default_rng((seed, 2)))
+            rotation = case.orientation.mcmf_from_icrf(float(tdb_s_from_utc_ns(case.epoch_utc_ns)))
+            normal = rotation @ np.cross(drawn.position_icrf_m, drawn.velocity_icrf_m_s)
+            node = np.cross(axis, normal)
+            longitudes.append(float(np.degrees(np.arctan2(node[1], node[0]))) % 360.0)
+            inclinations[track] = float(np.degrees(np.arccos(normal[2] / np.linalg.norm(normal))))
+            altitudes[track] = float(np.linalg.norm(drawn.position_icrf_m)) - 1_737.4e3
+        spread = np.ptp(longitudes)
+        assert spread > 150.0 if track != "limb" else 75.0 <= min(longitudes) <= max(longitudes) <= 105.0
+    assert inclinations["inclined"] == pytest.approx(60.0, abs=2.0)
+    assert inclinations["limb"] == pytest.approx(80.0, abs=2.0)
+    assert inclinations["test"] == pytest.approx(89.1, abs=2.0)
+    assert min(altitudes.values()) > 14e3

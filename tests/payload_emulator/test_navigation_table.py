@@ -38,15 +38,17 @@ def _summary(**changes: Any) -> dict[str, Any]:
     } | changes
 
 
-def _archive(folder: Path, summary: dict[str, Any]) -> Path:
+def _archive(folder: Path, summary: dict[str, Any], evidence: str = 'world = "procedural"') -> Path:
     folder.mkdir()
+    if evidence:
+        (folder / "mission.toml").write_text(f"schema_version = 1\n[evidence]\n{evidence}\n")
     (folder / "summary.json").write_text(json.dumps(summary))
     return folder
 
 
-def test_a_row_has_the_altitude_the_rung_and_the_figures_of_its_summary(tmp_path: Path) -> None:
+def test_a_row_has_the_altitude_the_level_and_the_figures_of_its_summary(tmp_path: Path) -> None:
     row = load_row(_archive(tmp_path / "a", _summary()))
-    assert (row.rung, row.altitude_km, row.recovery_frames) == (2, (18.7, 31.3, 43.1), 5)
+    assert (row.level, row.altitude_km, row.recovery_frames) == ("2", (18.7, 31.3, 43.1), 5)
     line = format_markdown([row]).splitlines()[2]
     assert line == (
         "| kidnapped-silently | 2034 | 2 | 31 (19 to 43) | 165 | 41 | 83 | 1,204 |  | 0.25 | 98.2 % | 0 | 5.4 | 0.98 "
@@ -54,9 +56,29 @@ def test_a_row_has_the_altitude_the_rung_and_the_figures_of_its_summary(tmp_path
     )
 
 
-def test_real_terrain_is_the_third_rung(tmp_path: Path) -> None:
-    real = _summary(data=["heights GLD100", "crater catalogue LU1319381"])
-    assert load_row(_archive(tmp_path / "a", real)).rung == 3
+@pytest.mark.parametrize(
+    ("evidence", "level", "cell"),
+    [
+        ('world = "procedural"', "2", "2"),
+        ('world = "real-terrain"\nunseen_share = 1.0', "3", "3"),
+        ('world = "real-terrain"\nunseen_share = 0.29', "3s", "3s, 29 % of frames unseen"),
+        ('world = "real-terrain"\nunseen_share = 0.0', "3s", "3s, 0 % of frames unseen"),
+        ('world = "real-terrain"', "", "not stated"),
+        ("", "", "not stated"),
+    ],
+)
+def test_the_level_is_that_of_the_declared_world(
+    tmp_path: Path, evidence: str, level: str, cell: str
+) -> None:
+    # The names of the data do not decide: they say "procedural" in every case.
+    row = load_row(_archive(tmp_path / "a", _summary(), evidence))
+    assert row.level == level
+    assert format_markdown([row]).splitlines()[2].split(" | ")[2] == cell
+
+
+def test_a_damaged_mission_description_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordError, match=r"mission\.toml: expected a mission description, found"):
+        load_row(_archive(tmp_path / "a", _summary(), "world ="))
 
 
 def test_the_columns_of_the_text_are_aligned(tmp_path: Path) -> None:

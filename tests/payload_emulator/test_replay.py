@@ -198,17 +198,48 @@ def test_every_parameter_has_a_dotted_name_and_can_be_set_by_it() -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("flight.anchored.gravity_degre = 3", "did you mean 'gravity_degree'"),
-        ("flight.anchored.gravity_degree = 'x'", "must be a int"),
-        ('flight.modes = ["sideways"]', "must be one of"),
-        ("flight = 3", "must be a table"),
-        ("flight = ", "not TOML"),
+        (
+            "flight.anchored.gravity_degre = 3",
+            ", flight.anchored.gravity_degre: expected gravity_degree (nearest known key), found an unknown key",
+        ),
+        ("flight.anchored.gravity_degree = 'x'", "expected a whole number, found 'x'"),
+        ('flight.modes = ["sideways"]', ", flight.modes[0]: expected one of"),
+        ("flight = 3", ", flight: expected a table, found 3"),
+        ("flight = ", ": expected parameters (TOML), found "),
+        (
+            "detector.score_threshold = 1.5",
+            ", detector.score_threshold: expected a finite number from 0 to 1, found 1.5",
+        ),
+        ("detector.score_threshold = nan", "expected a finite number from 0 to 1, found nan"),
+        ("flight.anchored.search_radius_m = inf", "expected a finite number from 0, found inf"),
+        ("flight.anchored.detection_sigma_px = -0.1", "expected a finite number from 0, found -0.1"),
+        (
+            "flight.anchored.errors.catalogue_offset_m = [1.0, -1.0, 1.0]",
+            "catalogue_offset_m[1]: expected a finite",
+        ),
+        ("flight.housekeeping_interval_s = 0", "expected a finite number from 0.001, found 0"),
+        ("detector.max_detections = 0", "expected a finite number from 1, found 0"),
+        (
+            "flight.anchored.lost.minimum_altitude_m = 60000",
+            "flight.anchored.lost.minimum_altitude_m: expected at most maximum_altitude_m = 55000.0, found 60000.0",
+        ),
+        (
+            "flight.anchored.limits.highest_radius_m = 1",
+            "lowest_radius_m: expected at most highest_radius_m = 1.0",
+        ),
     ],
 )
 def test_a_bad_parameter_is_told_by_its_name(text: str, told: str) -> None:
     with pytest.raises(ParameterError) as error:
         parse_parameters(text, source="p.toml")
-    assert told in str(error.value) and str(error.value).startswith("p.toml: ")
+    assert told in str(error.value) and str(error.value).startswith(("p.toml: ", "p.toml, "))
+
+
+def test_every_shipped_default_lies_in_its_range() -> None:
+    defaults = {
+        name: value for name, value in flat_parameters(BuildParameters()).items() if value is not None
+    }
+    assert with_values(BuildParameters(), defaults) == BuildParameters()
 
 
 def test_the_shipped_suite_has_a_pass_of_every_kind() -> None:

@@ -455,14 +455,14 @@ def pass_report(
         "as published.",
         verdict_level="good",
         generated_for="LINNA payload review",
-        evidence_rung="3",
+        evidence_level="3",
         headline=(
             HeadlineFigure("Position error, anchored, median", 51.2, "m", "3-D, all samples, no alignment"),
             HeadlineFigure("Position error, anchored, 95 %", 148.0, "m", "3-D, all samples"),
             HeadlineFigure(
                 "Odometry drift, paper mode", 1.71, "% of path", "at the instant before each reset"
             ),
-            HeadlineFigure("Detector recall", 0.704, "", "5–30 km, precision 0.853", evidence_rung="3"),
+            HeadlineFigure("Detector recall", 0.704, "", "5–30 km, precision 0.853", evidence_level="3"),
             HeadlineFigure("Packets lost", 9, "of 1 204", "one gap of 42 s"),
         ),
         provenance={
@@ -626,7 +626,7 @@ def campaign_report(seed: int = 11, count: int = 40) -> CampaignReport:
         passes=tuple(_campaign_pass(i, rng, "0.2.0" if i > count // 2 else "0.1.0") for i in range(count)),
         verdict="The catalogue filter held under 60 m in every pass; nothing trends.",
         verdict_level="good",
-        evidence_rung="3",
+        evidence_level="3",
         headline=(
             HeadlineFigure("Median over passes, anchored", 41.0, "m"),
             HeadlineFigure("Worst pass, anchored", 58.0, "m", "95 %: 190 m"),
@@ -649,15 +649,15 @@ def regression_report(seed: int = 12, count: int = 24) -> RegressionReport:
         candidate="flight 0.2.0",
         baseline="flight 0.1.0",
         gates=(
-            RegressionGate("median error, anchored", 45.0, 38.0, 50.0, True, "m"),
-            RegressionGate("95 % error, anchored", 130.0, 121.0, 143.0, True, "m"),
-            RegressionGate("recall, class 0", 0.71, 0.66, 0.69, False, "", "W-0007"),
+            RegressionGate("median error, anchored", 45.0, 38.0, 50.0, "pass", "m", "", 0.1, 0.06, 3_552),
+            RegressionGate("95 % error, anchored", 130.0, 121.0, 143.0, "pass", "m", "", 0.1, 0.09, 3_552),
+            RegressionGate("recall, class 0", 0.71, 0.66, 0.69, "fail", "", "W-0007", 0.02, 0.015, 148),
         ),
         candidate_passes=tuple(_campaign_pass(i, new, "0.2.0", 0.85) for i in range(count)),
         baseline_passes=tuple(_campaign_pass(i, old, "0.1.0") for i in range(count)),
         verdict="One gate failed: recall of the smallest class in W-0007 fell below its limit.",
         verdict_level="bad",
-        evidence_rung="3",
+        evidence_level="3",
         headline=(
             HeadlineFigure("Gates failed", 1, "of 3"),
             HeadlineFigure("Median error", 38.0, "m", "was 45"),
@@ -716,7 +716,7 @@ def detector_report(seed: int = 13) -> DetectorReport:
         gallery=tuple(gallery_frame(seed + 7 * i, i) for i in range(3)),
         verdict="Every class beats the paper in precision, recall and localisation on held-out procedural terrain.",
         verdict_level="caution",
-        evidence_rung="2",
+        evidence_level="2",
         headline=(
             HeadlineFigure("Precision", 0.853),
             HeadlineFigure("Recall", 0.704),

@@ -98,7 +98,7 @@ def test_failed_gates_stand_first() -> None:
     words = Page(render_html(example.regression_report())).text
     table = words[words.index("Gates, those that failed first.") :]
     assert table.index("recall, class 0") < table.index("median error, anchored")
-    assert "gates failed 1 of 3" in words
+    assert "gates 1 failed, 0 inconclusive, 2 passed" in words
 
 
 def test_a_data_set_stands_beside_the_counts_printed_in_the_paper() -> None:
@@ -108,11 +108,11 @@ def test_a_data_set_stands_beside_the_counts_printed_in_the_paper() -> None:
         assert figure in words
 
 
-def test_counts_need_no_rung_of_evidence_but_accuracies_do() -> None:
+def test_counts_need_no_evidence_level_but_accuracies_do() -> None:
     figures = (HeadlineFigure("Frames", 3),)
-    assert "rung" not in Page(render_html(DatasetReport("D", "d", headline=figures))).text.lower()
+    assert "level" not in Page(render_html(DatasetReport("D", "d", headline=figures))).text.lower()
     assert (
-        "No rung of evidence was stated" in Page(render_html(DetectorReport("M", "m", headline=figures))).text
+        "No evidence level was stated" in Page(render_html(DetectorReport("M", "m", headline=figures))).text
     )
 
 

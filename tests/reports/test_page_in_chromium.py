@@ -1,6 +1,7 @@
 """The page in a real browser: silent, self-contained, legible in both themes, whole on paper."""
 
 import base64
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -137,6 +138,69 @@ def test_the_other_reports_are_as_silent_and_as_legible(browser: Tab, kind: str,
         browser.theme(scheme)
         assert browser.value(_CONTRAST.replace("LIMIT", "3.0")) == []
     browser.theme("light")
+    browser.open(path)
+
+
+FONTS = ("DejaVu Sans", "Liberation Sans")
+"""The widest of the usual faces, and the metrics of Arial. A face that is not installed falls back to another."""
+
+_GEOMETRY = """
+(() => {
+  const cut = [], small = [], outside = [];
+  for (const wrap of document.querySelectorAll('.tablewrap'))
+    if (wrap.scrollWidth > wrap.clientWidth + 1)
+      cut.push([wrap.querySelector('caption').textContent.slice(0, 60), wrap.scrollWidth, wrap.clientWidth]);
+  for (const cell of document.querySelectorAll('td, th, dd, dt'))
+    if (cell.scrollWidth > cell.clientWidth + 1 && getComputedStyle(cell).display !== 'inline')
+      cut.push([cell.textContent.slice(0, 60), cell.scrollWidth, cell.clientWidth]);
+  for (const svg of document.querySelectorAll('figure svg')) {
+    const scale = svg.getBoundingClientRect().width / svg.viewBox.baseVal.width;
+    const frame = svg.getBoundingClientRect();
+    for (const text of svg.querySelectorAll('text')) {
+      if (!text.textContent.trim()) continue;
+      const size = parseFloat(getComputedStyle(text).fontSize) * scale;
+      if (size < 9.5) small.push([text.textContent.slice(0, 30), size]);
+      const box = text.getBoundingClientRect();
+      if (box.right > frame.right + 8 || box.left < frame.left - 8)
+        outside.push([text.textContent.slice(0, 30), box.right - frame.right, frame.left - box.left]);
+    }
+  }
+  return {cut, small, outside, width: document.documentElement.scrollWidth};
+})()
+"""
+
+
+@pytest.mark.parametrize("kind", ["pass", "campaign", "regression", "detector", "dataset"])
+def test_nothing_is_cut_and_every_number_can_be_read(browser: Tab, kind: str, path: Path) -> None:
+    """At 1,280 px every table is whole; at 390 px tables and figures scroll in their frames, the page does not."""
+    other = path.with_name(f"{kind}-geometry.html")
+    other.write_text(render_html(getattr(example, f"{kind}_report")()), encoding="utf-8")
+    browser.open(other)
+    for font in FONTS:
+        browser.value(f"document.documentElement.style.setProperty('--sans', '\"{font}\", sans-serif')")
+        for width in (1280, 390):
+            browser.size(width, 900)
+            found = browser.value(_GEOMETRY)
+            assert found["width"] <= width, (font, width)
+            assert found["small"] == [], (font, width)
+            assert found["outside"] == [], (font, width)
+            if width == 1280:
+                assert found["cut"] == [], font
+    browser.size(1280, 900)
+    browser.open(path)
+
+
+def test_long_names_of_solutions_cut_no_column(browser: Tab, path: Path) -> None:
+    report = example.pass_report()
+    renamed = tuple(
+        dataclasses.replace(one, name=f"{one.name}, propagate-only with a perfect start")
+        for one in report.navigation
+    )
+    other = path.with_name("long-names.html")
+    other.write_text(render_html(dataclasses.replace(report, navigation=renamed)), encoding="utf-8")
+    browser.open(other)
+    browser.value("document.documentElement.style.setProperty('--sans', '\"DejaVu Sans\", sans-serif')")
+    assert browser.value(_GEOMETRY)["cut"] == []
     browser.open(path)
 
 

@@ -153,3 +153,18 @@ def test_only_long_spans_are_zoomed() -> None:
     zoom = zoom_span(day, (arc,))
     assert zoom is not None and zoom.start_utc_ns < arc.start_utc_ns < arc.stop_utc_ns < zoom.stop_utc_ns
     assert zoom.length_s == 3_600.0
+
+
+def test_a_zoom_shows_the_reset_nearest_the_middle_and_what_led_to_it() -> None:
+    start = 1_880_964_840_000_000_000
+    day = TimeScale(start, start + 86_400_000_000_000)
+    arc = TimeSpan(start + 43_000_000_000_000, start + 45_000_000_000_000)
+    reset = start + 60_000_000_000_000
+    zoom = zoom_span(day, (arc,), resets=[start, start + 10_000_000_000_000, reset])
+    assert zoom is not None and zoom.length_s == 3_600.0
+    assert zoom.start_utc_ns == reset - 2_400_000_000_000
+    # The initialisation at the start is no reset to be shown.
+    assert zoom_span(day, (arc,), resets=[start]) == zoom_span(day, (arc,))
+    late = day.stop_utc_ns - 60_000_000_000
+    zoom = zoom_span(day, (), resets=[late])
+    assert zoom is not None and zoom.start_utc_ns < late < zoom.stop_utc_ns == day.stop_utc_ns

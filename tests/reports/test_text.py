@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from reports.document import rung_number, rung_text
+from reports.document import evidence_label, evidence_number, evidence_text
 from reports.text import (
     count_text,
     duration_text,
@@ -79,23 +79,41 @@ def test_hashes_can_break_over_lines() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rung", "number"),
+    ("level", "number"),
     [
         ("3", 3),
-        ("rung 2", 2),
+        ("level 2", 2),
         ("(4) another renderer", 4),
-        ("real terrain", 3),
+        ("3s (real terrain seen in training)", 3),
+        ("real terrain", None),
+        ("flown over 3 craters", None),
+        ("31", None),
         ("", None),
         ("9", None),
         ("?", None),
     ],
 )
-def test_rungs_of_evidence_are_read_from_their_number_or_name(rung: str, number: int | None) -> None:
-    assert rung_number(rung) == number
+def test_evidence_levels_are_read_from_their_number_and_never_guessed_from_words(
+    level: str, number: int | None
+) -> None:
+    assert evidence_number(level) == number
 
 
-def test_an_unstated_rung_is_said_to_be_unstated() -> None:
-    assert rung_text("") == "evidence not stated"
+def test_a_level_on_terrain_seen_in_training_keeps_its_mark_and_words() -> None:
+    text = "3s (real terrain seen in training; 25 % of frames over unseen terrain)"
+    assert (
+        evidence_label(text) == "3s"
+        and evidence_label("3 (real terrain)") == "3"
+        and evidence_label("") == ""
+    )
+    assert evidence_text(text) == f"level 3s of 5, {text[4:-1]}"
+    assert evidence_text("3s") == "level 3s of 5, real terrain seen in training"
+    assert evidence_text("3") == "level 3 of 5, real terrain never used in training"
+    assert evidence_text("2") == "level 2 of 5, procedural Moon"
+
+
+def test_an_unstated_level_is_said_to_be_unstated() -> None:
+    assert evidence_text("") == "evidence not stated"
 
 
 @pytest.mark.parametrize(

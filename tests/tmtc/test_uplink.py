@@ -195,3 +195,18 @@ def test_whatever_the_link_does_no_command_is_invented(flips, cuts):
 def test_any_octets_at_all_are_survived(octets):
     decoded = UplinkDecoder(76).decode(octets + CLTU_START + octets)
     assert decoded.octets_skipped <= 2 * len(octets) + 2
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\x01", b"\x00\x00", CONTROL_SET_COUNT, CONTROL_SET_COUNT + b"\x01\x02", b"\x82\x01\x05"]
+)
+def test_an_invalid_control_command_is_not_counted(data):
+    farm = Farm(lockout=True)
+    assert not farm.accept(TcFrame(1, 0, 0, data, bypass=True, control=True))
+    assert farm.farm_b_counter == 0 and farm.lockout
+
+
+def test_a_count_that_is_set_in_lockout_is_counted_and_not_obeyed():
+    farm = Farm(lockout=True)
+    assert not farm.accept(TcFrame(1, 0, 0, CONTROL_SET_COUNT + b"\x07", bypass=True, control=True))
+    assert (farm.farm_b_counter, farm.expected, farm.lockout) == (1, 0, True)

@@ -1,6 +1,8 @@
-"""Create the archive: files, packets, decoded samples, passes, jobs and reports.
+"""Create the schema of version 1.0: files, packets, decoded samples, passes, commands, windows, users, audit, builds.
 
-Revision: 0001, the first
+Databases of the eleven revisions before it cannot be migrated; `linna db export` and `linna db import` carry them over.
+
+Revision: 1.0, the first
 """
 
 from __future__ import annotations
@@ -8,13 +10,64 @@ from __future__ import annotations
 import sqlalchemy as sa
 from alembic import op
 
-revision = "0001"
+revision = "1.0"
 down_revision = None
 branch_labels = None
 depends_on = None
 
 
 def upgrade() -> None:
+    op.create_table(
+        "answers",
+        sa.Column("key", sa.String(length=64), nullable=False),
+        sa.Column("request", sa.String(length=64), nullable=False),
+        sa.Column("answer", sa.JSON(), nullable=True),
+        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.PrimaryKeyConstraint("key", name=op.f("pk_answers")),
+    )
+    op.create_table(
+        "audit",
+        sa.Column("id", sa.BigInteger(), autoincrement=False, nullable=False),
+        sa.Column("utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("actor", sa.String(length=64), nullable=False),
+        sa.Column("action", sa.String(length=48), nullable=False),
+        sa.Column("target", sa.Text(), nullable=False),
+        sa.Column("detail", sa.JSON(), nullable=False),
+        sa.Column("previous_sha256", sa.String(length=64), nullable=False),
+        sa.Column("sha256", sa.String(length=64), nullable=False),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_audit")),
+    )
+    op.create_index(op.f("ix_audit_utc_ns"), "audit", ["utc_ns"], unique=False)
+    head = op.create_table(
+        "audit_head",
+        sa.Column("id", sa.Integer(), autoincrement=False, nullable=False),
+        sa.Column("number", sa.BigInteger(), nullable=False),
+        sa.Column("sha256", sa.String(length=64), nullable=False),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_audit_head")),
+    )
+    op.bulk_insert(head, [{"id": 1, "number": 0, "sha256": "0" * 64}])
+    op.create_table(
+        "row_digests",
+        sa.Column("table_name", sa.String(length=64), nullable=False),
+        sa.Column("row_key", sa.Text(), nullable=False),
+        sa.Column("sha256", sa.String(length=64), nullable=False),
+        sa.PrimaryKeyConstraint("table_name", "row_key", name=op.f("pk_row_digests")),
+        sqlite_with_rowid=False,
+    )
+    op.create_table(
+        "builds",
+        sa.Column("digest", sa.String(length=64), nullable=False),
+        sa.Column("name", sa.Text(), nullable=False),
+        sa.Column("version", sa.Text(), nullable=False),
+        sa.Column("description", sa.Text(), nullable=False),
+        sa.Column("kind", sa.String(length=16), nullable=False),
+        sa.Column("files", sa.JSON(), nullable=False),
+        sa.Column("flight_code", sa.String(length=64), nullable=True),
+        sa.Column("provenance", sa.JSON(), nullable=False),
+        sa.Column("registered_by", sa.String(length=64), nullable=False),
+        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.PrimaryKeyConstraint("digest", name=op.f("pk_builds")),
+    )
     op.create_table(
         "detections",
         sa.Column("vehicle_id", sa.Integer(), autoincrement=False, nullable=False),
@@ -48,6 +101,14 @@ def upgrade() -> None:
         sqlite_with_rowid=False,
     )
     op.create_table(
+        "feed",
+        sa.Column("id", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=False),
+        sa.Column("utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("kind", sa.String(length=32), nullable=False),
+        sa.Column("payload", sa.JSON(), nullable=False),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_feed")),
+    )
+    op.create_table(
         "files",
         sa.Column("sha256", sa.String(length=64), nullable=False),
         sa.Column("kind", sa.String(length=32), nullable=False),
@@ -55,6 +116,21 @@ def upgrade() -> None:
         sa.Column("octets", sa.BigInteger(), nullable=False),
         sa.Column("received_utc_ns", sa.BigInteger(), nullable=False),
         sa.PrimaryKeyConstraint("sha256", name=op.f("pk_files")),
+    )
+    op.create_table(
+        "filter_states",
+        sa.Column("vehicle_id", sa.Integer(), autoincrement=False, nullable=False),
+        sa.Column("dictionary_version", sa.SmallInteger(), autoincrement=False, nullable=False),
+        sa.Column("ticks", sa.BigInteger(), autoincrement=False, nullable=False),
+        sa.Column("packet_id", sa.BigInteger(), autoincrement=False, nullable=False),
+        sa.Column("packet_ticks", sa.BigInteger(), nullable=False),
+        sa.Column("frame_number", sa.BigInteger(), nullable=False),
+        sa.Column("values", sa.LargeBinary(), nullable=False),
+        sa.Column("innovation_degrees", sa.Integer(), nullable=True),
+        sa.PrimaryKeyConstraint(
+            "vehicle_id", "dictionary_version", "ticks", "packet_id", name=op.f("pk_filter_states")
+        ),
+        sqlite_with_rowid=False,
     )
     op.create_table(
         "frame_outcomes",
@@ -109,6 +185,21 @@ def upgrade() -> None:
         sa.Column("watchdog_resets", sa.Integer(), nullable=False),
         sa.PrimaryKeyConstraint(
             "vehicle_id", "dictionary_version", "ticks", "packet_id", name=op.f("pk_housekeeping")
+        ),
+        sqlite_with_rowid=False,
+    )
+    op.create_table(
+        "identifications",
+        sa.Column("vehicle_id", sa.Integer(), autoincrement=False, nullable=False),
+        sa.Column("dictionary_version", sa.SmallInteger(), autoincrement=False, nullable=False),
+        sa.Column("ticks", sa.BigInteger(), autoincrement=False, nullable=False),
+        sa.Column("packet_id", sa.BigInteger(), autoincrement=False, nullable=False),
+        sa.Column("packet_ticks", sa.BigInteger(), nullable=False),
+        sa.Column("frame_number", sa.BigInteger(), nullable=False),
+        sa.Column("count", sa.SmallInteger(), nullable=False),
+        sa.Column("items", sa.LargeBinary(), nullable=False),
+        sa.PrimaryKeyConstraint(
+            "vehicle_id", "dictionary_version", "ticks", "packet_id", name=op.f("pk_identifications")
         ),
         sqlite_with_rowid=False,
     )
@@ -174,6 +265,68 @@ def upgrade() -> None:
         ),
     )
     op.create_table(
+        "regression_archives",
+        sa.Column("digest", sa.String(length=64), nullable=False),
+        sa.Column("name", sa.Text(), nullable=False),
+        sa.Column("manifest_sha256", sa.String(length=64), nullable=False),
+        sa.Column("frames", sa.Integer(), nullable=False),
+        sa.Column("octets", sa.BigInteger(), nullable=False),
+        sa.Column("pinned", sa.SmallInteger(), nullable=False),
+        sa.Column("used_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.PrimaryKeyConstraint("digest", name=op.f("pk_regression_archives")),
+    )
+    op.create_index(
+        op.f("ix_regression_archives_used_utc_ns"), "regression_archives", ["used_utc_ns"], unique=False
+    )
+    op.create_table(
+        "regressions",
+        sa.Column("id", sa.String(length=32), nullable=False),
+        sa.Column("baseline_digest", sa.String(length=64), nullable=False),
+        sa.Column("candidate_digest", sa.String(length=64), nullable=False),
+        sa.Column("verdict", sa.String(length=16), nullable=False),
+        sa.Column("result", sa.JSON(), nullable=False),
+        sa.Column("html_sha256", sa.String(length=64), nullable=True),
+        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_regressions")),
+    )
+    op.create_table(
+        "replays",
+        sa.Column("id", sa.String(length=64), nullable=False),
+        sa.Column("archive_digest", sa.String(length=64), nullable=False),
+        sa.Column("build_digest", sa.String(length=64), nullable=False),
+        sa.Column("outcome", sa.String(length=16), nullable=False),
+        sa.Column("detail", sa.Text(), nullable=False),
+        sa.Column("downlink_sha256", sa.String(length=64), nullable=True),
+        sa.Column("performance_sha256", sa.String(length=64), nullable=True),
+        sa.Column("wall_s", sa.Double(), nullable=False),
+        sa.Column("cpu_s", sa.Double(), nullable=False),
+        sa.Column("peak_rss_mib", sa.Double(), nullable=False),
+        sa.Column("isolation", sa.Text(), nullable=False),
+        sa.Column("machine", sa.Text(), nullable=False),
+        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_replays")),
+    )
+    op.create_index(op.f("ix_replays_archive_digest"), "replays", ["archive_digest"], unique=False)
+    op.create_index(op.f("ix_replays_build_digest"), "replays", ["build_digest"], unique=False)
+    op.create_table(
+        "rollups",
+        sa.Column("vehicle_id", sa.Integer(), autoincrement=False, nullable=False),
+        sa.Column("dictionary_version", sa.SmallInteger(), autoincrement=False, nullable=False),
+        sa.Column("kind", sa.SmallInteger(), autoincrement=False, nullable=False),
+        sa.Column("part", sa.SmallInteger(), autoincrement=False, nullable=False),
+        sa.Column("level", sa.SmallInteger(), autoincrement=False, nullable=False),
+        sa.Column("bucket", sa.BigInteger(), autoincrement=False, nullable=False),
+        sa.Column("first_ticks", sa.BigInteger(), nullable=False),
+        sa.Column("last_ticks", sa.BigInteger(), nullable=False),
+        sa.Column("rows", sa.BigInteger(), nullable=False),
+        sa.Column("statistics", sa.LargeBinary(), nullable=False),
+        sa.PrimaryKeyConstraint(
+            "vehicle_id", "dictionary_version", "kind", "part", "level", "bucket", name=op.f("pk_rollups")
+        ),
+        sqlite_with_rowid=False,
+    )
+    op.create_table(
         "time_reports",
         sa.Column("vehicle_id", sa.Integer(), autoincrement=False, nullable=False),
         sa.Column("dictionary_version", sa.SmallInteger(), autoincrement=False, nullable=False),
@@ -187,10 +340,24 @@ def upgrade() -> None:
         sqlite_with_rowid=False,
     )
     op.create_table(
+        "users",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("name", sa.String(length=64), nullable=False),
+        sa.Column("role", sa.String(length=16), nullable=False),
+        sa.Column("state", sa.String(length=16), nullable=False),
+        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_users")),
+        sa.UniqueConstraint("name", name=op.f("uq_users_name")),
+    )
+    op.create_table(
         "vehicles",
         sa.Column("id", sa.Integer(), nullable=False),
         sa.Column("ccsds_id", sa.Integer(), nullable=False),
         sa.Column("instance", sa.String(length=96), nullable=False),
+        sa.Column("decoded_version", sa.SmallInteger(), nullable=True),
+        sa.Column("redecoding_version", sa.SmallInteger(), nullable=True),
+        sa.Column("redecoded_to", sa.BigInteger(), nullable=True),
+        sa.Column("redecode_until", sa.BigInteger(), nullable=True),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_vehicles")),
         sa.UniqueConstraint("ccsds_id", "instance", name=op.f("uq_vehicles_ccsds_id_instance")),
     )
@@ -221,7 +388,9 @@ def upgrade() -> None:
         sa.Column("reference_utc_ns", sa.BigInteger(), nullable=False),
         sa.Column("drift_ppb", sa.Double(), nullable=False),
         sa.Column("residual_rms_ns", sa.Double(), nullable=True),
+        sa.Column("residual_max_ns", sa.Double(), nullable=True),
         sa.Column("points", sa.Integer(), nullable=False),
+        sa.Column("rejected", sa.Integer(), nullable=False),
         sa.Column("superseded", sa.SmallInteger(), nullable=False),
         sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
         sa.ForeignKeyConstraint(
@@ -248,17 +417,6 @@ def upgrade() -> None:
         sa.PrimaryKeyConstraint("id", name=op.f("pk_ephemerides")),
     )
     op.create_table(
-        "fragments",
-        sa.Column("vehicle_id", sa.Integer(), nullable=False),
-        sa.Column("digest", sa.LargeBinary(length=16), nullable=False),
-        sa.Column("place", sa.String(length=8), nullable=False),
-        sa.Column("octets", sa.LargeBinary(), nullable=False),
-        sa.ForeignKeyConstraint(
-            ["vehicle_id"], ["vehicles.id"], name=op.f("fk_fragments_vehicle_id_vehicles")
-        ),
-        sa.PrimaryKeyConstraint("vehicle_id", "digest", name=op.f("pk_fragments")),
-    )
-    op.create_table(
         "ingests",
         sa.Column("id", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=False),
         sa.Column("vehicle_id", sa.Integer(), nullable=True),
@@ -276,6 +434,141 @@ def upgrade() -> None:
     op.create_index(op.f("ix_ingests_file_sha256"), "ingests", ["file_sha256"], unique=False)
     op.create_index(op.f("ix_ingests_vehicle_id"), "ingests", ["vehicle_id"], unique=False)
     op.create_table(
+        "receptions",
+        sa.Column("vehicle_id", sa.Integer(), nullable=False),
+        sa.Column("ticks", sa.BigInteger(), nullable=False),
+        sa.Column("sequence_count", sa.SmallInteger(), nullable=False),
+        sa.Column("station", sa.String(length=64), nullable=False),
+        sa.Column("earth_utc_ns", sa.BigInteger(), nullable=False),
+        sa.ForeignKeyConstraint(
+            ["vehicle_id"], ["vehicles.id"], name=op.f("fk_receptions_vehicle_id_vehicles")
+        ),
+        sa.PrimaryKeyConstraint(
+            "vehicle_id", "ticks", "sequence_count", "station", name=op.f("pk_receptions")
+        ),
+    )
+    op.create_table(
+        "pieces",
+        sa.Column(
+            "ingest_id",
+            sa.BigInteger().with_variant(sa.Integer(), "sqlite"),
+            autoincrement=False,
+            nullable=False,
+        ),
+        sa.Column("scope", sa.String(length=128), nullable=False),
+        sa.Column("file_sha256", sa.String(length=64), nullable=False),
+        sa.Column("octets", sa.BigInteger(), nullable=False),
+        sa.Column("stream", sa.String(length=200), nullable=False),
+        sa.Column("position", sa.BigInteger(), nullable=False),
+        sa.Column("links_tried", sa.Integer(), nullable=True),
+        sa.ForeignKeyConstraint(["file_sha256"], ["files.sha256"], name=op.f("fk_pieces_file_sha256_files")),
+        sa.ForeignKeyConstraint(["ingest_id"], ["ingests.id"], name=op.f("fk_pieces_ingest_id_ingests")),
+        sa.PrimaryKeyConstraint("ingest_id", name=op.f("pk_pieces")),
+    )
+    op.create_index(op.f("ix_pieces_file_sha256"), "pieces", ["file_sha256"])
+    op.create_index("ix_pieces_place", "pieces", ["scope", "stream", "position"])
+    op.create_index("ix_pieces_unread", "pieces", ["scope", "links_tried"])
+    op.create_table(
+        "known_links",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("scope", sa.String(length=128), nullable=False),
+        sa.Column("digest", sa.String(length=16), nullable=False),
+        sa.Column("settings", sa.JSON(), nullable=True),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_known_links")),
+        sa.UniqueConstraint("scope", "digest", name=op.f("uq_known_links_scope_digest")),
+    )
+    op.create_table(
+        "stream_edges",
+        sa.Column("id", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=False),
+        sa.Column("domain", sa.String(length=200), nullable=False),
+        sa.Column("identity", sa.LargeBinary(length=16), nullable=False),
+        sa.Column("role", sa.SmallInteger(), nullable=False),
+        sa.Column("open", sa.SmallInteger(), nullable=False),
+        sa.Column("count", sa.SmallInteger(), nullable=False),
+        sa.Column("next_count", sa.SmallInteger(), nullable=False),
+        sa.Column("fit", sa.Integer(), nullable=False),
+        sa.Column("file_sha256", sa.String(length=64), nullable=True),
+        sa.Column("start", sa.BigInteger(), nullable=True),
+        sa.Column("length", sa.Integer(), nullable=False),
+        sa.Column("octets", sa.LargeBinary(), nullable=False),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_stream_edges")),
+        sa.UniqueConstraint("domain", "identity", name=op.f("uq_stream_edges_domain_identity")),
+    )
+    op.create_index("ix_stream_edges_fit", "stream_edges", ["domain", "role", "open", "fit", "count"])
+    op.create_index("ix_stream_edges_count", "stream_edges", ["domain", "role", "open", "count"])
+    op.create_index("ix_stream_edges_next", "stream_edges", ["domain", "role", "open", "next_count"])
+    op.create_index("ix_stream_edges_newest", "stream_edges", ["domain", "role", "open", "id"])
+    op.create_index("ix_stream_edges_file", "stream_edges", ["file_sha256", "open"])
+    op.create_table(
+        "command_counters",
+        sa.Column("vehicle_id", sa.Integer(), nullable=False),
+        sa.Column("telecommands", sa.BigInteger(), nullable=False),
+        sa.ForeignKeyConstraint(
+            ["vehicle_id"], ["vehicles.id"], name=op.f("fk_command_counters_vehicle_id_vehicles")
+        ),
+        sa.PrimaryKeyConstraint("vehicle_id", name=op.f("pk_command_counters")),
+    )
+    op.create_table(
+        "telecommands",
+        sa.Column("id", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=False),
+        sa.Column("vehicle_id", sa.Integer(), nullable=False),
+        sa.Column("name", sa.String(length=64), nullable=False),
+        sa.Column("arguments", sa.JSON(), nullable=False),
+        sa.Column("state", sa.String(length=16), nullable=False),
+        sa.Column("critical", sa.SmallInteger(), nullable=False),
+        sa.Column("timeout_s", sa.Integer(), nullable=False),
+        sa.Column("requested_by", sa.String(length=64), nullable=False),
+        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("decided_by", sa.String(length=64), nullable=True),
+        sa.Column("decided_utc_ns", sa.BigInteger(), nullable=True),
+        sa.Column("reason", sa.Text(), nullable=True),
+        sa.Column("sequence_count", sa.SmallInteger(), nullable=True),
+        sa.Column("request_id", sa.BigInteger(), nullable=True),
+        sa.Column("octets", sa.LargeBinary(), nullable=True),
+        sa.Column("sent_utc_ns", sa.BigInteger(), nullable=True),
+        sa.Column("sent_after_ticks", sa.BigInteger(), nullable=True),
+        sa.Column("timeout_noted_utc_ns", sa.BigInteger(), nullable=True),
+        sa.Column("window_id", sa.Integer(), nullable=True),
+        sa.Column("carrier_id", sa.BigInteger(), nullable=True),
+        sa.ForeignKeyConstraint(
+            ["vehicle_id"], ["vehicles.id"], name=op.f("fk_telecommands_vehicle_id_vehicles")
+        ),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_telecommands")),
+    )
+    op.create_index(op.f("ix_telecommands_state"), "telecommands", ["state"], unique=False)
+    op.create_index(
+        "ix_telecommands_vehicle_id_request_id", "telecommands", ["vehicle_id", "request_id"], unique=False
+    )
+    op.create_index(op.f("ix_telecommands_window_id"), "telecommands", ["window_id"], unique=False)
+    op.create_table(
+        "tokens",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("user_id", sa.Integer(), nullable=False),
+        sa.Column("token_sha256", sa.String(length=64), nullable=False),
+        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("hint", sa.String(length=16), nullable=False),
+        sa.Column("expires_utc_ns", sa.BigInteger(), nullable=True),
+        sa.Column("revoked_utc_ns", sa.BigInteger(), nullable=True),
+        sa.Column("used_utc_ns", sa.BigInteger(), nullable=True),
+        sa.ForeignKeyConstraint(["user_id"], ["users.id"], name=op.f("fk_tokens_user_id_users")),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_tokens")),
+        sa.UniqueConstraint("token_sha256", name=op.f("uq_tokens_token_sha256")),
+    )
+    op.create_index(op.f("ix_tokens_user_id"), "tokens", ["user_id"], unique=False)
+    op.create_table(
+        "missions",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("revision", sa.String(length=64), nullable=False),
+        sa.Column("name", sa.Text(), nullable=False),
+        sa.Column("ccsds_id", sa.Integer(), nullable=True),
+        sa.Column("text", sa.Text(), nullable=False),
+        sa.Column("entered_by", sa.String(length=64), nullable=False),
+        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_missions")),
+        sa.UniqueConstraint("revision", name=op.f("uq_missions_revision")),
+    )
+    op.create_index(op.f("ix_missions_ccsds_id"), "missions", ["ccsds_id"], unique=False)
+    op.create_table(
         "passes",
         sa.Column("id", sa.Integer(), nullable=False),
         sa.Column("vehicle_id", sa.Integer(), nullable=False),
@@ -286,13 +579,19 @@ def upgrade() -> None:
         sa.Column("manifest", sa.JSON(), nullable=False),
         sa.Column("ephemeris_id", sa.Integer(), nullable=True),
         sa.Column("catalogue_sha256", sa.String(length=64), nullable=True),
+        sa.Column("attitude_sha256", sa.String(length=64), nullable=True),
+        sa.Column("mission_id", sa.Integer(), nullable=True),
         sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.ForeignKeyConstraint(
+            ["attitude_sha256"], ["files.sha256"], name=op.f("fk_passes_attitude_sha256_files")
+        ),
         sa.ForeignKeyConstraint(
             ["catalogue_sha256"], ["files.sha256"], name=op.f("fk_passes_catalogue_sha256_files")
         ),
         sa.ForeignKeyConstraint(
             ["ephemeris_id"], ["ephemerides.id"], name=op.f("fk_passes_ephemeris_id_ephemerides")
         ),
+        sa.ForeignKeyConstraint(["mission_id"], ["missions.id"], name=op.f("fk_passes_mission_id_missions")),
         sa.ForeignKeyConstraint(["vehicle_id"], ["vehicles.id"], name=op.f("fk_passes_vehicle_id_vehicles")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_passes")),
         sa.UniqueConstraint("archive_digest", name=op.f("uq_passes_archive_digest")),
@@ -317,6 +616,7 @@ def upgrade() -> None:
         sa.Column("pass_id", sa.Integer(), nullable=False),
         sa.Column("html_sha256", sa.String(length=64), nullable=False),
         sa.Column("json_sha256", sa.String(length=64), nullable=False),
+        sa.Column("pdf_sha256", sa.String(length=64), nullable=True),
         sa.Column("summary", sa.JSON(), nullable=False),
         sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
         sa.ForeignKeyConstraint(["html_sha256"], ["files.sha256"], name=op.f("fk_reports_html_sha256_files")),
@@ -325,30 +625,80 @@ def upgrade() -> None:
         sa.PrimaryKeyConstraint("id", name=op.f("pk_reports")),
     )
     op.create_index(op.f("ix_reports_pass_id"), "reports", ["pass_id"], unique=False)
+    op.create_table(
+        "windows",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("vehicle_id", sa.Integer(), nullable=False),
+        sa.Column("name", sa.Text(), nullable=False),
+        sa.Column("start_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("stop_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("cadence_s", sa.Double(), nullable=False),
+        sa.Column("decision", sa.String(length=16), nullable=False),
+        sa.Column("state", sa.String(length=16), nullable=False),
+        sa.Column("reason", sa.Text(), nullable=True),
+        sa.Column("predecessor_id", sa.Integer(), nullable=True),
+        sa.Column("ephemeris_id", sa.Integer(), nullable=True),
+        sa.Column("pass_id", sa.Integer(), nullable=True),
+        sa.Column("data_octets", sa.BigInteger(), nullable=False),
+        sa.Column("predicted", sa.JSON(), nullable=False),
+        sa.Column("version", sa.Integer(), nullable=False),
+        sa.Column("created_by", sa.String(length=64), nullable=False),
+        sa.Column("edited_by", sa.String(length=64), nullable=False),
+        sa.Column("decided_by", sa.String(length=64), nullable=True),
+        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("changed_utc_ns", sa.BigInteger(), nullable=False),
+        sa.ForeignKeyConstraint(
+            ["ephemeris_id"], ["ephemerides.id"], name=op.f("fk_windows_ephemeris_id_ephemerides")
+        ),
+        sa.ForeignKeyConstraint(["pass_id"], ["passes.id"], name=op.f("fk_windows_pass_id_passes")),
+        sa.ForeignKeyConstraint(
+            ["predecessor_id"], ["windows.id"], name=op.f("fk_windows_predecessor_id_windows")
+        ),
+        sa.ForeignKeyConstraint(["vehicle_id"], ["vehicles.id"], name=op.f("fk_windows_vehicle_id_vehicles")),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_windows")),
+    )
+    op.create_index(
+        "ix_windows_vehicle_id_start_utc_ns", "windows", ["vehicle_id", "start_utc_ns"], unique=False
+    )
 
 
 def downgrade() -> None:
-    op.drop_index(op.f("ix_reports_pass_id"), table_name="reports")
+    op.drop_table("windows")
     op.drop_table("reports")
     op.drop_table("pass_frames")
-    op.drop_index("ix_passes_vehicle_id_start_utc_ns", table_name="passes")
     op.drop_table("passes")
-    op.drop_index(op.f("ix_ingests_vehicle_id"), table_name="ingests")
-    op.drop_index(op.f("ix_ingests_file_sha256"), table_name="ingests")
+    op.drop_table("missions")
+    op.drop_table("tokens")
+    op.drop_table("telecommands")
+    op.drop_table("command_counters")
+    op.drop_table("stream_edges")
+    op.drop_table("known_links")
+    op.drop_table("pieces")
+    op.drop_table("receptions")
     op.drop_table("ingests")
-    op.drop_table("fragments")
     op.drop_table("ephemerides")
-    op.drop_index(op.f("ix_correlations_vehicle_id"), table_name="correlations")
     op.drop_table("correlations")
     op.drop_table("verifications")
     op.drop_table("vehicles")
+    op.drop_table("users")
     op.drop_table("time_reports")
+    op.drop_table("rollups")
+    op.drop_table("replays")
+    op.drop_table("regressions")
+    op.drop_table("regression_archives")
     op.drop_table("packets")
     op.drop_table("navigation_states")
-    op.drop_index(op.f("ix_jobs_state"), table_name="jobs")
     op.drop_table("jobs")
+    op.drop_table("identifications")
     op.drop_table("housekeeping")
     op.drop_table("frame_outcomes")
+    op.drop_table("filter_states")
     op.drop_table("files")
+    op.drop_table("feed")
     op.drop_table("events")
     op.drop_table("detections")
+    op.drop_table("builds")
+    op.drop_table("row_digests")
+    op.drop_table("audit_head")
+    op.drop_table("audit")
+    op.drop_table("answers")

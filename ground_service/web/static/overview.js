@@ -89,7 +89,7 @@ byId("upload").addEventListener(
     const answer = await request(`${kind}?name=${encodeURIComponent(file.name)}`, {
       method: "POST",
       body: file,
-      headers: { "Content-Type": kind === "telemetry" ? "application/octet-stream" : "text/plain" },
+      headers: { "Content-Type": "application/octet-stream" },
     });
     const accepted = await answer.json();
     if (kind === "telemetry") {

@@ -119,7 +119,9 @@ export function pager(load, size = 25) {
   }
   byId("previous").addEventListener("click", acting(() => go(offset - size)));
   byId("next").addEventListener("click", acting(() => go(offset + size)));
-  return () => go(offset);
+  const again = () => go(offset);
+  again.first = () => go(0);
+  return again;
 }
 
 // Sign-in, clock and feed of every page.

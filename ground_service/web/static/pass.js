@@ -31,7 +31,18 @@ function showReport(report, id) {
         ),
       ),
     ),
-    element("p", { class: "hint" }, `Evidence: ${report.evidence_rung ? `rung ${report.evidence_rung}` : "no rung stated"}.`),
+    table(
+      "Requirements",
+      [
+        ["Requirement", (row) => row.name],
+        ["Status", (row) => row.status],
+        ["Value", (row) => (row.value === null ? "unknown" : `${figure(row.value)} ${row.unit}`), "num"],
+        ["Limit", (row) => (row.limit === null ? "–" : `${row.at_most ? "≤" : "≥"} ${figure(row.limit)} ${row.unit}`), "num"],
+      ],
+      report.requirements,
+      "No requirement was evaluated.",
+    ),
+    element("p", { class: "hint" }, `Evidence: ${report.evidence_level ? `level ${report.evidence_level}` : "no level stated"}.`),
   );
   show(
     "report-links",
@@ -67,7 +78,8 @@ function showErrors(report) {
 
 function showCompleteness(found) {
   const rows = found.by_apid.map((one) => {
-    const share = one.packets + one.lost ? one.packets / (one.packets + one.lost) : 1;
+    const expected = one.packets + one.lost + (one.lost_at_edges ?? 0);
+    const share = expected ? one.packets / expected : 1;
     return { ...one, share };
   });
   show(
@@ -75,7 +87,8 @@ function showCompleteness(found) {
     element(
       "p",
       { class: "lead" },
-      `${figure(found.packets)} packets, ${figure(found.lost)} lost, ${figure(found.duplicates)} repeated, ` +
+      `${figure(found.packets)} of ${figure(found.expected)} packets expected, ${figure(found.lost)} lost in gaps, ` +
+        `${figure(found.lost_at_edges)} at the edges of the pass, ${figure(found.duplicates)} repeated, ` +
         `${figure(found.conflicts)} in conflict, ${figure(found.crc_errors)} with a bad checksum; ` +
         `${figure(found.octets_skipped)} octets skipped, ${figure(found.symbols_corrected)} symbols corrected.`,
     ),
@@ -87,6 +100,9 @@ function showCompleteness(found) {
         ["", (row) => element("meter", { min: 0, max: 1, low: 0.99, optimum: 1, value: row.share, "aria-label": `share of ${row.name} that came` })],
         ["Came", (row) => figure(row.packets), "num"],
         ["Lost", (row) => figure(row.lost), "num"],
+        ["Lost at edges", (row) => figure(row.lost_at_edges), "num"],
+        ["Repeated", (row) => figure(row.duplicates), "num"],
+        ["Bad checksum", (row) => figure(row.crc_errors), "num"],
         ["Complete", (row) => `${(100 * row.share).toFixed(2)} %`, "num"],
       ],
       rows,

@@ -17,9 +17,17 @@ async function openReport(id) {
 }
 
 const verdictMark = (verdict) => stateMark({ pass: "passed", fail: "failed" }[verdict] ?? verdict);
+const OUTCOMES = ["fail", "inconclusive", "pass"];
+
+// What would decide an open gate, or why its outcome does not count.
+function remarkOf(gate) {
+  if (gate.waived) return `waived: ${gate.waived}`;
+  if (gate.outcome !== "inconclusive") return gate.reason ?? "";
+  if (gate.frames_needed == null) return gate.reason;
+  return `${gate.reason}: ${figure(gate.frames_needed)} frames needed, ${figure(gate.frames)} compared`;
+}
 
 function gateRows(regression) {
-  const failed = regression.result.gates.filter((gate) => !gate.passed);
   return table(
     "Gates",
     [
@@ -27,10 +35,12 @@ function gateRows(regression) {
       ["Baseline", (row) => figure(row.baseline), "num"],
       ["Candidate", (row) => figure(row.candidate), "num"],
       ["Limit", (row) => figure(row.limit), "num"],
-      ["", (row) => stateMark(row.passed ? "passed" : "failed")],
+      ["Pass", (row) => row.pass ?? "all"],
+      ["Outcome", (row) => verdictMark(row.outcome)],
+      ["Remark", remarkOf],
     ],
-    [...failed, ...regression.result.gates.filter((gate) => gate.passed)],
-    "No gate could be judged.",
+    OUTCOMES.flatMap((outcome) => regression.result.gates.filter((gate) => gate.outcome === outcome)),
+    regression.result.passes.map((pass) => `${pass.name}: ${pass.detail || pass.state}`).join("; ") || "No gate was judged.",
   );
 }
 
@@ -46,8 +56,12 @@ async function regressionRows() {
 }
 
 function outcomeOf({ job, verdict }) {
-  if (verdict && !verdict.gates) return "no gate could be judged";
-  if (verdict) return `${figure(verdict.gates - verdict.gates_failed)} of ${figure(verdict.gates)} gates passed`;
+  if (verdict && !verdict.gates) return "no gate was judged: see the report for the reason";
+  if (verdict) {
+    const open = verdict.gates_inconclusive ? `, ${figure(verdict.gates_inconclusive)} inconclusive` : "";
+    const needed = verdict.frames_needed == null ? "" : `: ${figure(verdict.frames_needed)} frames needed, ${figure(verdict.frames)} compared`;
+    return `${figure(verdict.gates_failed)} of ${figure(verdict.gates)} gates failed${open}${needed}`;
+  }
   return job.state === "running" ? element("progress", { max: 1, value: job.progress, "aria-label": "regression" }) : (job.error ?? "");
 }
 

@@ -63,6 +63,8 @@ CATALOGUE_DENSITY_2KM = 0.0080
 class RasterTerrain(TiledTerrain):
     """Terrain of georeferenced height rasters on a grid of 256 pixels per degree."""
 
+    is_real = True
+
     def __init__(
         self,
         paths: Sequence[Path | str],
@@ -91,6 +93,8 @@ class RasterTerrain(TiledTerrain):
         self._fine = open_layers(paths)
         self._layers = [*open_layers(coarse_paths), *self._fine]
         self._layers.sort(key=lambda layer: layer.pixels_per_degree)
+        self.registration_north_m = registration_north_m
+        self.registration_east_m = registration_east_m
         self._shift_north_deg = math.degrees(registration_north_m / MOON_RADIUS_M)
         self._shift_east_m = registration_east_m
         self._smoothing = smoothing_pixels

@@ -136,6 +136,12 @@ class TiledTerrain(ABC):
     ones.  Other threads are refused; each opens a terrain of its own, which gives the same bits.
     """
 
+    is_real: bool = False
+    """Whether the heights are those of the Moon."""
+    registration_north_m: float | None = None
+    registration_east_m: float | None = None
+    """Shift that registers the heights to the catalogue; None where it does not apply."""
+
     _small: SmallCraters | None = None
     """Craters below the catalogue's limit, where the source draws any."""
 

@@ -69,7 +69,8 @@ def test_a_build_is_registered_held_against_another_and_judged(
     ]
     failed, passed = listed["items"]
     # A program that gives up leaves nothing to hold a gate against.
-    assert (failed["gates"], failed["gates_failed"]) == (0, 0)
+    assert (failed["gates"], failed["gates_failed"], failed["gates_inconclusive"]) == (0, 0, 0)
+    assert (failed["frames"], passed["frames"], passed["frames_needed"]) == (0, 12, None)
     whole = client.get(f"{V1}/regressions/{passed['id']}").json()
     assert (passed["gates"], passed["gates_failed"]) == (len(whole["result"]["gates"]), 0)
     assert passed["gates"] > 0

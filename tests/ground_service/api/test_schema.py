@@ -2,6 +2,7 @@
 answer is one that the schema tells of."""
 
 import json
+import os
 import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import pytest
 import schemathesis
 from hypothesis import HealthCheck, Phase, given, settings
+from pydantic import SecretStr
 from schemathesis import GenerationMode
 from schemathesis.checks import not_a_server_error
 from schemathesis.specs.openapi.checks import (
@@ -23,6 +25,7 @@ from ground_service.services.archive_import import import_archive
 from ground_service.services.ground import ground_from_settings
 from ground_service.services.jobs import enter_job
 from ground_service.settings import Settings
+from ground_service.store.database import prepare_database
 
 with warnings.catch_warnings():
     # The test client's next version wants another HTTP library.
@@ -34,7 +37,8 @@ CHECKS = [
     not_a_server_error, status_code_conformance, content_type_conformance, response_headers_conformance,
     response_schema_conformance,
 ]  # fmt: skip
-EXAMPLES = 5
+EXAMPLES = int(os.environ.get("SCHEMA_EXAMPLES", "3"))
+"""Requests to each operation, of each kind; more are asked with SCHEMA_EXAMPLES=50, for instance."""
 
 
 @schemathesis.serializer("application/zip")
@@ -63,9 +67,15 @@ class Queue:
         pass
 
 
-@pytest.fixture(scope="module")
-def client(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+def client(
+    request: pytest.FixtureRequest, synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[TestClient]:
     deployment = Settings(home=tmp_path_factory.mktemp("fuzz"), rate_limit_per_s=0)
+    if request.param == "postgresql":
+        url = request.getfixturevalue("new_postgres_database")()
+        prepare_database(url, upgrade=True).engine.dispose()
+        deployment = deployment.model_copy(update={"database_url": SecretStr(url)})
     with ground_from_settings(deployment) as ground:
         import_archive(ground, synthetic_pass.folder)
     with TestClient(create_app(deployment, inline_jobs=True), raise_server_exceptions=False) as opened:
@@ -73,6 +83,7 @@ def client(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> Ite
         yield opened
 
 
+@pytest.mark.timeout(60 + 240 * EXAMPLES)
 @pytest.mark.parametrize("mode", [GenerationMode.POSITIVE, GenerationMode.NEGATIVE])
 def test_every_operation_answers_as_its_schema_says(client: TestClient, mode: GenerationMode) -> None:
     document = client.get(f"{V1}/openapi.json").json()

@@ -1,6 +1,8 @@
-"""Binding: a port in use and an address beyond this machine are refused in one line."""
+"""Starting the server: what is imported, and the addresses that are refused in one line."""
 
 import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -34,3 +36,12 @@ def test_binding_beyond_this_machine_needs_users(tmp_path: Path) -> None:
 def test_the_listener_names_its_protocol_so_that_answers_are_not_held_back_by_nagle() -> None:
     with bind("127.0.0.1", 0) as listener:
         assert listener.proto == socket.IPPROTO_TCP
+
+
+def test_the_service_starts_without_libraries_that_only_computations_need() -> None:
+    code = (
+        "import sys, ground_service.api.server; "
+        "print([m for m in sys.modules if m in ('scipy', 'matplotlib', 'cv2', 'numba', 'torch', 'celery')])"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"

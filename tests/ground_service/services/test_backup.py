@@ -1,20 +1,24 @@
 """Backup and restore: everything comes back, damage is told, nothing is overwritten."""
 
 import json
-from collections.abc import Iterator
+import re
+import sqlite3
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from sqlalchemy import select
 
-from ground_service.errors import Conflict, FileDamaged, InvalidInput
+from ground_service.errors import Conflict, FileDamaged, InvalidInput, NotFound
 from ground_service.services.archive_import import import_archive
 from ground_service.services.backup import backup, restore
 from ground_service.services.ground import Ground, open_ground
+from ground_service.services.integrity import verify
 from ground_service.services.planning import WindowEntry, add_window, change_window
 from ground_service.services.reports import pass_summary
 from ground_service.services.users import add_user, authenticate
+from ground_service.store.database import prepare_database
 from ground_service.store.models import Base
 
 NS = 1_000_000_000
@@ -24,11 +28,17 @@ START = 2_000_000_000 * NS
 def everything(ground: Ground) -> dict[str, list[Any]]:
     with ground.database.reading() as connection:
         return {
-            table.name: [
-                tuple(row) for row in connection.execute(select(table).order_by(*table.primary_key.columns))
-            ]
+            table.name: sorted(map(tuple, connection.execute(select(table))), key=str)
             for table in Base.metadata.sorted_tables
+            if table.name != "row_digests"  # each database has its own
         }
+
+
+def rows_of_an_empty_service(ground: Ground) -> bool:
+    """Whether nothing is in the database but the head of an empty audit chain."""
+    return {name: rows for name, rows in everything(ground).items() if rows} == {
+        "audit_head": [(1, 0, "0" * 64)]
+    }
 
 
 @pytest.fixture
@@ -72,19 +82,79 @@ def test_a_backup_overwrites_nothing(filled: tuple[Ground, str], saved: Path) ->
     assert (saved / "linna.db").read_bytes() == before
 
 
-def test_damage_is_found(saved: Path, tmp_path: Path) -> None:
-    damaged = next(path for path in (saved / "files").rglob("*") if path.is_file())
+@pytest.mark.parametrize("file", [0, -1])
+def test_a_damaged_file_is_found_before_anything_is_restored(saved: Path, tmp_path: Path, file: int) -> None:
+    damaged = sorted(path for path in (saved / "files").rglob("*") if path.is_file())[file]
     damaged.chmod(0o644)
     damaged.write_bytes(b"x" + damaged.read_bytes())
     with open_ground(tmp_path / "again") as other:
         with pytest.raises(FileDamaged):
             restore(saved, other)
-        assert not any(everything(other).values())
-    (saved / "backup.json").write_text(json.dumps({"schema_version": 99}))
-    with (
-        open_ground(tmp_path / "third") as other,
-        pytest.raises(InvalidInput, match="schema_version: expected 1"),
+        assert rows_of_an_empty_service(other)
+        assert not [path for path in other.files.root.rglob("*") if path.is_file()]
+        damaged.unlink()
+        with pytest.raises(NotFound):
+            restore(saved, other)
+
+
+@pytest.mark.parametrize(
+    ("statement", "reason"),
+    [
+        ("UPDATE windows SET cadence_s = 15.000000000000002", "windows: expected the rows that were saved"),
+        ("UPDATE packets SET ticks = ticks + 1 WHERE id = 3", "packets: expected the rows that were saved"),
+        ("UPDATE housekeeping SET power_w = power_w + 1e-9", "housekeeping: expected the rows that were saved"),
+        ("DELETE FROM tokens", "tokens: expected 1 rows, found 0"),
+        ("INSERT INTO vehicles (ccsds_id, instance) VALUES (3, 'x')", "vehicles: expected"),
+        ("UPDATE audit_head SET number = 2", "audit_head: expected the rows that were saved"),
+    ],
+)  # fmt: skip
+def test_a_changed_row_of_a_backup_is_not_restored(
+    saved: Path, tmp_path: Path, statement: str, reason: str
+) -> None:
+    with sqlite3.connect(saved / "linna.db") as connection:
+        connection.execute(statement)
+    connection.close()
+    with open_ground(tmp_path / "again") as other:
+        with pytest.raises(InvalidInput, match=re.escape(reason)):
+            restore(saved, other)
+        assert rows_of_an_empty_service(other)
+
+
+def test_a_changed_list_of_a_backup_is_not_believed(saved: Path, tmp_path: Path) -> None:
+    manifest = json.loads((saved / "backup.json").read_text())
+    assert manifest["audit_head"]["number"] == manifest["rows"]["audit"] == 5
+    assert manifest["damaged"] == []
+    for changes, reason in (
+        ({"schema_version": 1}, "schema_version: expected 2"),
+        ({"files_sha256": "0" * 64}, "expected the files that were saved"),
+        ({"audit_head": {"number": 4, "sha256": "0" * 64}}, "expected the head of the audit chain"),
+        ({"tables": {}}, "expected the rows that were saved"),
     ):
-        restore(saved, other)
-    with open_ground(tmp_path / "fourth") as other, pytest.raises(InvalidInput, match="expected a backup"):
+        (saved / "backup.json").write_text(json.dumps({**manifest, **changes}))
+        with open_ground(tmp_path / "again") as other, pytest.raises(InvalidInput, match=reason):
+            restore(saved, other)
+    with open_ground(tmp_path / "again") as other, pytest.raises(InvalidInput, match="expected a backup"):
         restore(tmp_path, other)
+
+
+def test_a_backup_names_rows_that_were_damaged_before(filled: tuple[Ground, str], tmp_path: Path) -> None:
+    with sqlite3.connect(filled[0].home / "linna.db") as connection:
+        connection.execute("UPDATE users SET role = 'admin'")
+    connection.close()
+    manifest = backup(filled[0], tmp_path / "saved", now_utc_ns=START)
+    assert manifest["damaged"] == ["users 1: expected content that gives its digest, found changed content"]
+
+
+def test_a_backup_goes_from_either_database_into_either(
+    filled: tuple[Ground, str], saved: Path, tmp_path: Path, new_postgres_database: Callable[[], str]
+) -> None:
+    url = new_postgres_database()
+    prepare_database(url, upgrade=True).engine.dispose()
+    with open_ground(tmp_path / "pg", database_url=url) as other:
+        restore(saved, other)
+        assert everything(other) == everything(filled[0])
+        first = json.loads((saved / "backup.json").read_text())
+        second = backup(other, tmp_path / "again", now_utc_ns=START)
+        assert (second["tables"], second["audit_head"]) == (first["tables"], first["audit_head"])
+        add_window(other, WindowEntry("new", START, START + NS, 1.0, 76), actor="bob")
+        assert verify(other, deep=True).damaged == []

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ground_service.missions.service import add_mission
 from ground_service.services.ephemerides import add_ephemeris
 from ground_service.services.ground import Ground
 from ground_service.services.ingest import ingest_file
@@ -22,6 +23,13 @@ NS = 1_000_000_000
 DAY = 86_400
 START = parse_utc("2029-08-07T06:00:00Z")
 FRAMES = 200
+MISSION = b"""
+name = "test"
+[spacecraft]
+id = 76
+[frames]
+orientation = "IAU WGCCRE 2009"
+"""
 
 
 def housekeeping(day: int) -> list[bytes]:
@@ -70,6 +78,7 @@ def test_a_reference_that_does_not_cover_gives_figures_where_it_does(
     times = times[(times >= whole.start_utc_ns) & (times <= whole.stop_utc_ns)]
     save_oem(ephemeris_from_states(times, *whole.at(times)), tmp_path / "part.oem")
     add_ephemeris(ground, ground.files.put_file(tmp_path / "part.oem"), name="part")
+    add_mission(ground, MISSION)
     ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
     key = define_pass(ground, name="p", start_utc_ns=first, stop_utc_ns=last, spacecraft_id=76)
     figures = pass_summary(ground, key)["navigation"]

@@ -10,6 +10,7 @@ from sqlalchemy import select
 
 from ground_service.errors import Conflict, InvalidInput, NotFound
 from ground_service.processing.verification import SentCommand, VerificationReport, fate_of
+from ground_service.services import commanding
 from ground_service.services.commanding import (
     enter_command,
     get_command,
@@ -22,7 +23,15 @@ from ground_service.services.commanding import (
 from ground_service.services.feed import read_feed
 from ground_service.services.ground import Ground
 from ground_service.services.ingest import ingest_file
+from ground_service.services.planning import (
+    WindowEntry,
+    add_window,
+    change_window,
+    list_windows,
+    uplink_window,
+)
 from ground_service.store import repository
+from lunar.timescales import parse_utc
 from tmtc.dictionary import DICTIONARY
 from tmtc.stream import cut_packets
 from tmtc.uplink import UplinkDecoder
@@ -101,6 +110,33 @@ def test_bare_packets_can_be_taken_instead_of_frames(ground: Ground) -> None:
         ("set_housekeeping_interval", {"structure_id": 1, "interval_s": 0}, "interval_s: expected"),
         ("set_parameter", {"parameter_id": "x", "value": []}, "expected"),
         ("test_connection", {"extra": 1}, "no such field"),
+        *(
+            (
+                "set_parameter",
+                {"parameter_id": 1, "value": value},
+                "set_parameter.value: expected a finite number",
+            )
+            for value in (float("nan"), float("inf"), -float("inf"), 1e400, True, False)
+        ),
+        (
+            "set_parameter",
+            {"parameter_id": True, "value": 1.0},
+            "parameter_id: expected a finite number, found True",
+        ),
+        ("set_parameter", {"parameter_id": 1, "value": 10**400}, "value: expected a number"),
+        (
+            "set_housekeeping_interval",
+            {"structure_id": 1, "interval_s": True},
+            "interval_s: expected a finite number",
+        ),
+        ("delete_activity", {"request_id": -1}, "request_id: expected"),
+        ("delete_activity", {"request_id": 1e20}, "request_id: expected"),
+        (
+            "insert_activity",
+            {"release_ticks": 1, "items": [{"octet": 1}, {"octet": True}]},
+            "items.octet: expected a finite number",
+        ),
+        ("test_connection\x00", {}, "name: expected enable_housekeeping, "),
     ],
 )
 def test_what_the_dictionary_refuses_is_not_queued(
@@ -218,3 +254,112 @@ def test_the_order_in_which_reports_arrive_does_not_matter(subtypes: list[int], 
     shuffled = list(reports)
     random.shuffle(shuffled)
     assert fate_of(COMMAND, shuffled, 0) == fate_of(COMMAND, reports, 0)
+
+
+@pytest.mark.parametrize("spacecraft_id", [-1, 1024, 10**20, True])
+def test_an_id_that_no_transfer_frame_can_carry_is_refused(ground: Ground, spacecraft_id: int) -> None:
+    for work in (
+        lambda: enter_command(ground, "test_connection", {}, spacecraft_id=spacecraft_id, actor="ann"),
+        lambda: take_uplink(ground, spacecraft_id=spacecraft_id, actor="ann"),
+    ):
+        with pytest.raises(InvalidInput, match="spacecraft, id: expected 0 to 1023"):
+            work()
+
+
+@pytest.mark.parametrize("reason", ["", "two\nlines", "\x1b[2Jgone", "nul\x00", "x" * 501])
+def test_a_reason_is_one_printable_line(ground: Ground, reason: str) -> None:
+    command = entered(ground)
+    with pytest.raises(InvalidInput, match="reason: expected a line of 1 to 500 characters"):
+        reject_command(ground, command, actor="bob", reason=reason)
+    assert get_command(ground, command).state == "queued"
+
+
+def test_arguments_nested_without_end_are_refused(ground: Ground) -> None:
+    nested: Any = 1
+    for _ in range(3000):
+        nested = [nested]
+    with pytest.raises(InvalidInput, match="set_parameter"):
+        entered(ground, "set_parameter", parameter_id=1, value=nested)
+
+
+def test_an_instance_is_one_printable_line(ground: Ground) -> None:
+    with pytest.raises(InvalidInput, match="spacecraft, instance"):
+        enter_command(ground, "test_connection", {}, spacecraft_id=1, instance="a\nb", actor="ann")
+
+
+def carrying(name: str, **arguments: Any) -> dict[str, Any]:
+    octets = DICTIONARY.pack_command(name, arguments, sequence_count=0)
+    return {"release_ticks": 1, "items": [{"octet": octet} for octet in octets]}
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "critical"),
+    [
+        ("set_parameter", {"parameter_id": 1, "value": 2.0}, True),
+        ("disable_schedule", {}, True),
+        ("perform_function", {"function_id": "set_mode", "argument_1": 1, "argument_2": 0}, True),
+        ("perform_function", {"function_id": "synchronise_clock", "argument_1": 0, "argument_2": 0}, True),
+        ("uplink_first", {"transaction": 1, "part": 1, "table": "parameters", "items": [{"octet": 1}]}, True),
+        ("insert_activity", carrying("set_parameter", parameter_id=1, value=2.0), True),
+        ("insert_activity", carrying("perform_function", **START), False),
+        ("perform_function", START, False),
+        ("enable_schedule", {}, False),
+        ("test_connection", {}, False),
+    ],
+)
+def test_what_changes_the_state_of_the_payload_needs_a_second_person(
+    ground: Ground, name: str, arguments: dict[str, Any], critical: bool
+) -> None:
+    command = enter_command(ground, name, arguments, spacecraft_id=SPACECRAFT, actor="ann")
+    assert bool(get_command(ground, command).row["critical"]) == critical
+    if critical:
+        with pytest.raises(
+            Conflict, match=r"is critical; expected .* \((changes on-board state|destroys data): "
+        ):
+            release_command(ground, command, actor="ann")
+        release_command(ground, command, actor="bob")
+    else:
+        release_command(ground, command, actor="ann")
+    assert get_command(ground, command).state == "released"
+
+
+def raise_rule(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = commanding.DEFAULT_POLICY.raised("perform_function/start_observation")
+    monkeypatch.setattr(commanding, "policy_of", lambda *_: policy)
+
+
+def planned(ground: Ground, entered_by: str, approved_by: str) -> int:
+    start = parse_utc("2029-08-07T06:00:00Z")
+    entry = WindowEntry("window", start, start + 600 * 10**9, 15.0, SPACECRAFT)
+    window = int(add_window(ground, entry, actor=entered_by)["id"])
+    change_window(ground, window, actor=approved_by, changes={}, decision="approved")
+    return window
+
+
+def test_one_person_plans_approves_and_uplinks_a_routine_window(ground: Ground) -> None:
+    assert len(uplink_window(ground, planned(ground, "ann", "ann"), actor="ann")) == 3
+
+
+def test_the_approval_of_a_window_by_somebody_else_is_the_second_person_of_its_telecommands(
+    ground: Ground, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raise_rule(monkeypatch)
+    with pytest.raises(
+        Conflict, match="expected a window that another person than who entered it has approved"
+    ):
+        uplink_window(ground, planned(ground, "ann", "ann"), actor="bob")
+    assert list_commands(ground)[1] == 0
+    [window] = [row["id"] for row in list_windows(ground)[0]]
+    change_window(ground, window, actor="bob", changes={}, decision="draft")
+    change_window(ground, window, actor="bob", changes={}, decision="approved")
+    assert len(uplink_window(ground, window, actor="ann")) == 3
+
+
+def test_who_changes_a_window_has_entered_it(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+    raise_rule(monkeypatch)
+    start = parse_utc("2029-08-07T06:00:00Z")
+    entry = WindowEntry("window", start, start + 600 * 10**9, 15.0, SPACECRAFT)
+    window = int(add_window(ground, entry, actor="ann")["id"])
+    change_window(ground, window, actor="bob", changes={"cadence_s": 20.0}, decision="approved")
+    with pytest.raises(Conflict, match="another person"):
+        uplink_window(ground, window, actor="ann")

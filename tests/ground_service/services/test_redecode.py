@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import select, update
+from sqlalchemy import select
 
 from ground_service.api.app import create_app
 from ground_service.link.packets import batch_of_cut
@@ -19,7 +19,6 @@ from ground_service.services.redecode import catch_up, redecode, vehicles_behind
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
-from ground_service.store.database import downgrade_database, open_database, prepare_database
 from ground_service.store.packets import store_batch
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
@@ -119,19 +118,3 @@ def test_what_comes_in_meanwhile_and_a_kill_in_the_middle_change_nothing(
             with ground.database.reading() as connection:
                 hashes.append(archive_hash(connection, 1))
     assert hashes[0] == hashes[1]
-
-
-def test_a_database_of_the_schema_before_knows_what_it_was_decoded_with(
-    tmp_path: Path, synthetic_pass: Any
-) -> None:
-    fill_with_the_old(tmp_path / "home", synthetic_pass)
-    with open_ground(tmp_path / "home") as ground, ground.database.writing() as connection:
-        connection.execute(update(repository.VEHICLES).values(decoded_version=None))
-    url = Settings(home=tmp_path / "home").resolved_database_url()
-    database = open_database(url)
-    downgrade_database(database, "0009")
-    database.engine.dispose()
-    prepare_database(url).engine.dispose()
-    with open_ground(tmp_path / "home") as ground:
-        assert vehicles_behind(ground) == [1]
-        assert looked_at(ground) == (1, 40, 40)

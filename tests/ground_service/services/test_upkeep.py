@@ -49,13 +49,14 @@ def test_the_night_tells_trends_and_broken_limits(ground: Ground, synthetic_pass
     assert done["result"]["limits_broken"] == []
 
 
-def test_what_is_old_goes_and_the_record_stays(ground: Ground) -> None:
+def test_what_is_old_goes_and_the_record_stays(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
     with ground.database.writing() as connection:
         for _ in range(3):
             publish(connection, "note", {})
-        audit(connection, "ann", "look", "", {})
+        with monkeypatch.context() as long_ago:
+            long_ago.setattr("ground_service.services.users.utc_now_ns", lambda: 0)
+            audit(connection, "ann", "look", "", {})
         connection.execute(repository.FEED.update().values(utc_ns=0))
-        connection.execute(repository.AUDIT.update().values(utc_ns=0))
     with ground.database.writing() as connection:
         connection.execute(
             repository.ANSWERS.insert().values(key="k", request="r", answer={"id": 1}, created_utc_ns=0)

@@ -13,6 +13,7 @@ from sqlalchemy import inspect, text
 from ground_service.errors import (
     DatabaseNotMigrated,
     DatabaseTooNew,
+    DatabaseTooOld,
     DatabaseUnavailable,
     FileDamaged,
     NotFound,
@@ -21,7 +22,7 @@ from ground_service.errors import (
     storage_error,
 )
 from ground_service.store.database import (
-    downgrade_database,
+    empty_database,
     open_database,
     prepare_database,
     schema_revisions,
@@ -29,6 +30,7 @@ from ground_service.store.database import (
 )
 from ground_service.store.files import FileArchive
 from ground_service.store.models import Base
+from tests.ground_service.schema import described_schema
 
 
 def url(path: Path) -> str:
@@ -44,17 +46,24 @@ def test_a_new_database_is_made_with_the_newest_schema(tmp_path: Path) -> None:
     database.engine.dispose()
 
 
-def test_every_migration_can_be_undone_and_done_again(tmp_path: Path) -> None:
+def test_a_migrated_database_has_the_schema_of_the_models(tmp_path: Path) -> None:
+    migrated = prepare_database(url(tmp_path / "migrated"))
+    made = open_database(url(tmp_path / "made"))
+    with made.writing() as connection:
+        Base.metadata.create_all(connection)
+    assert described_schema(migrated) == described_schema(made)
+    for database in (migrated, made):
+        database.engine.dispose()
+
+
+def test_a_database_that_is_emptied_can_be_filled_again(tmp_path: Path) -> None:
     database = prepare_database(url(tmp_path))
-    revisions = schema_revisions(database)[2]
-    for revision in (*revisions[1:], "base"):
-        downgrade_database(database, revision)
-    with database.reading() as connection:
-        assert set(inspect(connection).get_table_names()) <= {"alembic_version"}
-    for revision in reversed(revisions):
-        upgrade_database(database, revision)
-    with database.reading() as connection:
-        assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
+    before = described_schema(database)
+    empty_database(database)
+    assert described_schema(database) == {}
+    assert schema_revisions(database)[0] is None
+    upgrade_database(database)
+    assert described_schema(database) == before
     database.engine.dispose()
 
 
@@ -76,20 +85,30 @@ def test_a_database_of_a_newer_version_is_left_alone(tmp_path: Path) -> None:
     with database.writing() as connection:
         connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
     database.engine.dispose()
-    with pytest.raises(DatabaseTooNew, match=r"linna\.db: expected schema revision \d+ or older, found 9999"):
+    with pytest.raises(DatabaseTooNew, match=r"linna\.db: expected schema revision \S+ or older, found 9999"):
         prepare_database(url(tmp_path))
 
 
-def test_an_older_database_is_upgraded_or_says_what_to_do(tmp_path: Path) -> None:
+@pytest.mark.parametrize("revision", ["0001", "0011"])
+def test_a_database_before_version_1_is_refused_with_the_way_to_carry_it_over(
+    tmp_path: Path, revision: str
+) -> None:
     database = prepare_database(url(tmp_path))
-    downgrade_database(database, "0001")
+    with database.writing() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = :found"), {"found": revision})
     database.engine.dispose()
-    with pytest.raises(DatabaseNotMigrated, match="found 0001; run 'linna db upgrade'"):
+    for upgrade in (None, True, False):
+        with pytest.raises(DatabaseTooOld) as caught:
+            prepare_database(url(tmp_path), upgrade=upgrade)
+    assert f"found {revision} of a version before 1.0" in str(caught.value)
+    assert "run 'linna db export FILE'" in str(caught.value)
+    assert "'linna db import FILE'" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_empty_database_is_left_empty_where_it_may_not_be_upgraded(tmp_path: Path) -> None:
+    with pytest.raises(DatabaseNotMigrated, match="found none; run 'linna db upgrade'"):
         prepare_database(url(tmp_path), upgrade=False)
-    upgraded = prepare_database(url(tmp_path))
-    found, head, _ = schema_revisions(upgraded)
-    assert found == head
-    upgraded.engine.dispose()
 
 
 def test_a_file_that_is_no_database_is_refused_in_one_line(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from ground_service.services.archive_import import import_archive
 from ground_service.services.ground import open_ground
 
 CHROMIUM = "/usr/bin/chromium"
+START_S = 180.0
 FLAGS = [
     "--no-sandbox",
     "--disable-gpu",
@@ -130,7 +131,8 @@ class Service:
             raise
 
     def _wait_for_address(self, log: Path) -> str:
-        for _ in range(300):
+        until = time.monotonic() + START_S
+        while time.monotonic() < until:
             text = log.read_text(errors="replace")
             if "startup complete" in text:
                 return text.split("ground service on ", 1)[1].split()[0].rstrip("/")

@@ -191,7 +191,7 @@ def test_words_that_could_do_harm_do_not_reach_the_payload(page, console):
     answer = page.evaluate(
         """() => new Promise((resolve) => {
           const socket = new WebSocket(`ws://${location.host}/api/v1/payload`);
-          socket.onopen = () => ["quit", "run\\nquit", "rate -1", "x".repeat(5000)].forEach((one) => socket.send(one));
+          socket.onopen = () => ["quit", "run\\nquit", "rate -1", "x".repeat(3000)].forEach((one) => socket.send(one));
           const heard = [];
           socket.onmessage = (event) => {
             const message = JSON.parse(event.data);

@@ -125,7 +125,7 @@ def test_the_payload_navigates_by_its_catalogue_and_reads_no_anchor(flight: Flig
     np.testing.assert_allclose(last["velocity_icrf_m_s"], flight.states[-1, 3:], atol=0.5)
     assert max(last["sigma_rtn_m"]) < 150.0
     summary = payload.summary()
-    assert summary["truth_reads_after_start"] == 0
+    assert summary["anchor_reads_after_start"] == 0
     assert summary["fixes"]["fixed"] == FRAMES
 
 
@@ -165,7 +165,7 @@ def test_detections_with_numbers_that_are_none_are_passed_over_and_nothing_becom
         flight.frames[k] = (ImageQuality.OK, Detections(**columns))
     packets = flight.fly(flight.payload())
     assert {values["outcome"] for values in named(packets, "frame_outcome")} == {int(Outcome.fixed)}
-    for values in named(packets, "filter_state"):
+    for values in named(packets, "filter_estimate"):
         assert np.all(np.isfinite(values["position_icrf_m"])) and np.all(np.isfinite(values["covariance"]))
     position = flight.rotations[-1] @ flight.states[-1, :3]
     altitude_m = named(packets, "navigation_state")[-1]["altitude_m"]

@@ -89,3 +89,23 @@ def test_outside_the_orientation_table_there_is_no_prediction() -> None:
 def test_less_gravity_on_board_means_more_process_noise() -> None:
     densities = [process_noise(degree).white_psd_m2_s3[0] for degree in (8, 20, 50, 70, 100)]
     assert densities == sorted(densities, reverse=True)
+
+
+def test_noise_falls_with_altitude_and_differs_by_side() -> None:
+    noise = ProcessNoise((4e-7, 2e-7, 1e-7), (1e-12,) * 3, 900.0, (9e-7, 9e-7, 9e-7), 8_000.0, 30_000.0)
+    orbit = model(noise)
+
+    def density(altitude_m: float, longitude_deg: float) -> tuple[float, float, float]:
+        radius = 1_737_400.0 + altitude_m
+        longitude = np.radians(longitude_deg)
+        return orbit._white_psd(radius * np.array([np.cos(longitude), np.sin(longitude), 0.0]))
+
+    np.testing.assert_allclose(density(30_000.0, 20.0), [4e-7, 2e-7, 1e-7], rtol=1e-9)
+    np.testing.assert_allclose(density(38_000.0, 20.0), np.array([4e-7, 2e-7, 1e-7]) / np.e, rtol=1e-9)
+    np.testing.assert_allclose(density(22_000.0, 104.0), np.array([4e-7, 2e-7, 1e-7]) * np.e, rtol=1e-9)
+    np.testing.assert_allclose(density(60_000.0, 106.0), 9e-7 / np.e, rtol=1e-9)
+    # Beyond the altitudes at which it was measured it stays as it is there.
+    assert density(2_000.0, 0.0) == density(10_000.0, 0.0)
+    assert density(100e3, 180.0) == density(500e3, 180.0)
+    flat = model(ProcessNoise((4e-7, 2e-7, 1e-7)))
+    assert flat._white_psd(np.array([1_800e3, 0.0, 0.0])) == (4e-7, 2e-7, 1e-7)

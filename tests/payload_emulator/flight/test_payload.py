@@ -108,7 +108,7 @@ def test_housekeeping_counts_what_happened(moon: Any) -> None:
         "anchored": 1, "multi": 4, "single": 0, "predicted": 1, "missed": 0, "rejected": 0
     }  # fmt: skip
     assert summary["estimators"]["paper"]["reset_triggers"] == {"initialization": 1}
-    assert summary["truth_reads_after_start"] == 5
+    assert summary["anchor_reads_after_start"] == 5
 
 
 def test_sequence_counts_of_each_apid_have_no_gaps(moon: Any) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import struct
 from collections.abc import Callable
 from typing import Any
 
@@ -65,6 +67,15 @@ def test_counts_go_forward_only_and_each_source_has_its_own(rig: Any) -> None:
     assert rig.refusals(rig.step(ping(16_001))) == []
 
 
+def with_number(command: bytes, packed: float, sent: float) -> bytes:
+    """A telecommand with another number than the dictionary would pack, and a right checksum."""
+    for form in (">d", ">f"):
+        if struct.pack(form, packed) in command:
+            changed = command.replace(struct.pack(form, packed), struct.pack(form, sent), 1)
+            return append_crc(changed[:-2])
+    raise AssertionError("the number is not in the telecommand")
+
+
 def test_values_out_of_range_are_refused_at_acceptance(rig: Any) -> None:
     good = rig.command("set_time_report_rate", rate_exponent=8)
     values = bytearray(good)
@@ -72,10 +83,12 @@ def test_values_out_of_range_are_refused_at_acceptance(rig: Any) -> None:
     assert rig.refusals(rig.step(append_crc(bytes(values[:-2])))) == ["value_out_of_range"]
     for order in (
         rig.function("set_mode", 4.0),
-        rig.function("start_observation", float("nan")),
+        with_number(rig.function("start_observation", 1.5), 1.5, math.nan),
         rig.function("widen_estimate", -1.0),
         rig.command("replay_store", start_ticks=5, stop_ticks=5),
-        rig.command("set_parameter", parameter_id=NUMBERS["scrub_interval_s"], value=float("inf")),
+        with_number(
+            rig.command("set_parameter", parameter_id=NUMBERS["scrub_interval_s"], value=1.5), 1.5, math.inf
+        ),
         rig.command("set_parameter", parameter_id=NUMBERS["store_overwrite"], value=0.5),
     ):
         assert rig.refusals(rig.step(order)) == ["value_out_of_range"]

@@ -8,11 +8,12 @@ import pytest
 
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import make_catalogue
+from lunar.errors import LensError
 from lunar.frames import mcmf_from_spherical
-from payload_emulator.errors import PayloadError
+from lunar.lens import BrownCamera, pointed_camera_from_mcmf
 from payload_emulator.sim import raymarch, renderer
 from payload_emulator.sim.labels import project_craters
-from payload_emulator.sim.lens import BrownCamera, pixel_shifts, pointed_camera_from_mcmf
+from payload_emulator.sim.lens import pixel_shifts
 from payload_emulator.sim.light import sun_direction_mcmf
 
 BARREL = {"k1": -0.02, "k2": 1.0e-3, "k3": 1.0e-4, "p1": 1.0e-3, "p2": -5.0e-4}
@@ -49,7 +50,7 @@ def test_what_lies_beyond_the_fold_of_the_lens_is_not_folded_back_into_the_pictu
 
 
 def test_a_lens_that_folds_the_picture_is_refused():
-    with pytest.raises(PayloadError, match="folds it"):
+    with pytest.raises(LensError, match="folds it"):
         BrownCamera(k1=-0.2)
 
 

@@ -5,9 +5,9 @@ import pytest
 
 from lunar.camera import PinholeCamera
 from lunar.frames import mcmf_from_spherical
+from lunar.lens import pointed_camera_from_mcmf
 from payload_emulator.errors import PayloadError
 from payload_emulator.sim import raymarch, renderer
-from payload_emulator.sim.lens import pointed_camera_from_mcmf
 from payload_emulator.sim.light import sun_direction_mcmf
 from payload_emulator.sim.photometry import LAWS, TABLE_SIZE, Photometry
 

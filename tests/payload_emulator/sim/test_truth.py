@@ -1,5 +1,7 @@
 """When the spacecraft observes and how it points, on an orbit simple enough to check by hand."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -9,8 +11,10 @@ from lunar.frames import matrix_from_quaternion, spherical_from_mcmf
 from lunar.timescales import tdb_s_from_utc_ns
 from payload_emulator.errors import ScenarioError
 from payload_emulator.sim.truth import (
+    ReadCount,
     Truth,
     attitude_message,
+    counted_reads,
     find_windows,
     frame_times,
     perturbed,
@@ -140,3 +144,16 @@ def test_a_trajectory_below_the_terrain_is_refused_with_epoch_and_depth(polar_tr
         require_above_ground(
             polar_truth, times, lambda latitude, longitude: np.full(latitude.shape, 31_000.0)
         )
+
+
+def test_reads_of_the_truth_are_counted_by_the_thread_that_asks_for_it(polar_truth: Truth) -> None:
+    counter = ReadCount()
+    polar_truth.states(START_NS)
+    with counted_reads(counter):
+        polar_truth.states(START_NS)
+        polar_truth.positions_mcmf([START_NS, START_NS + NS])
+        # Frames are rendered ahead in other threads: what they read is not read by the payload.
+        with ThreadPoolExecutor(1) as pool:
+            pool.submit(polar_truth.states, START_NS).result()
+    polar_truth.states(START_NS)
+    assert counter.count == 2

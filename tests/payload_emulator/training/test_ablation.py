@@ -19,7 +19,9 @@ from payload_emulator.training.ablation import (
     Variant,
     ablate,
     choose_frames,
+    choose_variant,
     format_ablation,
+    score_chosen_variant,
 )
 from payload_emulator.training.dataset import Dataset
 from payload_emulator.training.feeder import Feeder, TrainParameters
@@ -70,8 +72,7 @@ def test_variants_are_trained_once_and_shown_side_by_side(halves, tmp_path):
     assert [row["variant"] for row in rows] == [BASELINE, "stride-2"]
     assert any("plain-terrain: left out" in line for line in lines)
     assert rows[1]["weights"] > rows[0]["weights"]
-    for kind in ("validation", "real", "procedural"):
-        assert rows[0][kind]["frames"] == 1
+    assert [rows[0]["validation"][kind]["frames"] for kind in ("real", "procedural")] == [1, 1]
     # Training again would rewrite the checkpoint.
     before = (tmp_path / "recipe-1" / "checkpoint.pt").stat().st_mtime_ns
     again = ablate(Material([halves]), tmp_path, variants[:2], TINY)
@@ -81,6 +82,46 @@ def test_variants_are_trained_once_and_shown_side_by_side(halves, tmp_path):
         ablate(Material([halves]), tmp_path, variants[:1], replace(TINY, steps=2))
     table = format_ablation(rows)
     assert "stride-2" in table and "twice the resolution" in table
+    test = score_chosen_variant(Material([halves]), tmp_path, rows, replace(TINY, test_frames=2))
+    assert test["variant"] == choose_variant(rows) and test["real"]["frames"] == 2
+    assert test["threshold"] == next(r["threshold"] for r in rows if r["variant"] == test["variant"])
+    assert "chosen, test" in format_ablation(rows, test)
+
+
+class WithoutTest(Halves):
+    """A data set that refuses to show its test split."""
+
+    def frames(self, split="", source=""):
+        assert split != "test"
+        return super().frames(split, source)
+
+
+def test_variants_are_trained_scored_and_chosen_without_the_test_split(halves, tmp_path):
+    rows = ablate(Material([WithoutTest(halves.folder)]), tmp_path, [NAMED[BASELINE]], TINY)
+    assert choose_variant(rows) == BASELINE and "test" not in json.dumps(rows)
+    assert 0.0 < rows[0]["threshold"] < 1.0
+
+
+def row(variant, seed, real_f1, procedural_f1=0.5, real_frames=1):
+    figures = {"real": (real_frames, real_f1), "procedural": (1, procedural_f1)}
+    return {
+        "variant": variant,
+        "seed": seed,
+        "validation": {kind: {"frames": n, "strict": {"f1": f1}} for kind, (n, f1) in figures.items()},
+    }
+
+
+def test_the_greatest_mean_validation_f1_over_the_seeds_is_chosen():
+    rows = [
+        row(BASELINE, 1, 0.30),
+        row(BASELINE, 2, 0.20),
+        row("narrow", 1, 0.26, 0.1),
+        row("wide", 1, 0.26, 0.9),
+    ]
+    assert choose_variant(rows) == "narrow"  # .26 against a mean of .25; procedural frames do not decide
+    assert choose_variant([row(BASELINE, 1, 0.9, 0.1, 0), row("wide", 1, 0.0, 0.2, 0)]) == "wide"
+    with pytest.raises(DatasetError, match="at least one trained variant"):
+        choose_variant([])
 
 
 def test_the_baseline_alone_runs_with_every_seed(halves, tmp_path, monkeypatch):

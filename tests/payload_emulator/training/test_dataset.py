@@ -9,6 +9,7 @@ import pytest
 from lunar.catalogue import size_class
 from payload_emulator.errors import DatasetError
 from payload_emulator.training import dataset as store
+from payload_emulator.training.finishing import clipped, ellipse_polygon, polygon_area
 from payload_emulator.training.integrity import check
 from payload_emulator.training.sheet import CLASS_COLOURS, draw_frame, draw_sheet
 from payload_emulator.training.summary import summarise
@@ -160,11 +161,72 @@ def test_a_damaged_shard_is_refused(copy):
         store.Dataset(copy)
 
 
+def far_corner(annotation):
+    x, y, w, h = annotation["bbox"]
+    return x + w, y + h
+
+
+@pytest.mark.parametrize("split", ["train", "val", "test"])
+def test_coco_has_the_fields_that_its_readers_need(blob_dataset, split):
+    coco = json.loads((blob_dataset.folder / f"coco_{split}.json").read_text())
+    assert set(coco) == {"info", "licenses", "images", "annotations", "categories"}
+    images = {image["id"]: image for image in coco["images"]}
+    categories = {category["id"] for category in coco["categories"]}
+    numbers = [frame.number for frame in blob_dataset.frames(split)]
+    assert [images[number + 1]["file_name"] for number in numbers] == [f"images/{n:06d}.png" for n in numbers]
+    assert min(images) >= 1 and min(categories) == 1
+    assert all((i["width"], i["height"]) == (512, 512) for i in images.values())
+    assert [a["id"] for a in coco["annotations"]] == list(range(1, len(coco["annotations"]) + 1))
+    names = {c["id"]: c["name"] for c in coco["categories"]}
+    assert names == {1: "5-10 km", 2: "10-15 km", 3: "15-30 km", 4: "3-5 km"}
+    for a in coco["annotations"]:
+        assert a["image_id"] in images and a["category_id"] in categories and a["iscrowd"] == 0
+        x, y, w, h = a["bbox"]
+        assert min(x, y) >= 0.0 and w > 0.0 and h > 0.0 and max(far_corner(a)) <= 512.0 + 0.01  # rounded
+        (ring,) = a["segmentation"]
+        points = np.array(ring).reshape(-1, 2)
+        assert len(points) >= 3 and points.min() >= 0.0 and points.max() <= 512.0
+        np.testing.assert_allclose([*points.min(axis=0), *np.ptp(points, axis=0)], a["bbox"], atol=0.015)
+        assert 0.0 < a["area"] <= w * h
+        assert names[a["category_id"]] in ("5-10 km", "10-15 km")  # blobs are 5.3 to 10.1 km wide
+
+
+def test_an_ellipse_in_the_image_keeps_its_box_and_area():
+    # Half-axes 20 and 10, turned by 30 degrees: half extents sqrt(300 + 25) and sqrt(100 + 75).
+    rim = clipped(ellipse_polygon(100.0, 50.0, 20.0, 10.0, np.radians(30.0)), 512, 512)
+    half = np.sqrt([325.0, 175.0])
+    np.testing.assert_allclose(rim.min(axis=0), np.array([100.0, 50.0]) - half, atol=1e-9)
+    np.testing.assert_allclose(rim.max(axis=0), np.array([100.0, 50.0]) + half, atol=1e-9)
+    assert polygon_area(rim) == pytest.approx(np.pi * 200.0, rel=0.0065)
+
+
+@pytest.mark.parametrize(
+    ("centre", "box", "share"),
+    [
+        ((0.0, 40.0), (0.0, 30.0, 10.0, 50.0), 0.5),
+        ((200.0, 40.0), (190.0, 30.0, 200.0, 50.0), 0.5),
+        ((100.0, 0.0), (90.0, 0.0, 110.0, 10.0), 0.5),
+        ((100.0, 80.0), (90.0, 70.0, 110.0, 80.0), 0.5),
+        ((200.0, 80.0), (190.0, 70.0, 200.0, 80.0), 0.25),
+    ],
+)
+def test_a_crater_on_the_border_is_clipped_to_the_image(centre, box, share):
+    rim = clipped(ellipse_polygon(*centre, 10.0, 10.0, 0.0), 200, 80)
+    np.testing.assert_allclose([*rim.min(axis=0), *rim.max(axis=0)], box, atol=1e-9)
+    assert polygon_area(rim) == pytest.approx(share * np.pi * 100.0, rel=0.0065)
+
+
+def test_nothing_is_left_of_a_crater_outside_of_the_image():
+    assert clipped(ellipse_polygon(-20.0, 5.0, 10.0, 5.0, 0.3), 200, 80).shape == (0, 2)
+
+
 def test_coco_boxes_surround_their_centres(blob_dataset):
     coco = json.loads((blob_dataset.folder / "coco_train.json").read_text())
     assert len(coco["images"]) == 24
-    assert {c["id"] for c in coco["categories"]} == {0, 1, 2, 3}
-    for a in coco["annotations"]:
+    assert {c["id"] for c in coco["categories"]} == {1, 2, 3, 4}
+    whole = [a for a in coco["annotations"] if min(a["bbox"][:2]) > 0.0 and max(far_corner(a)) < 512.0]
+    assert len(whole) > 100
+    for a in whole:
         x, y, w, h = a["bbox"]
         # COCO counts from the corner of the first pixel, labels from its centre; both are rounded to 0.01 px.
         assert x + w / 2 == pytest.approx(a["centre"][0] + 0.5, abs=0.02)

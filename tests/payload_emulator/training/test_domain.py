@@ -48,11 +48,11 @@ def test_craters_that_one_renderer_does_not_show_are_missed_against_the_referenc
     assert low < -0.3 and high >= -0.2
 
 
-def test_figures_name_the_renderers_the_rung_and_the_data(figures):
+def test_figures_name_the_renderers_the_level_and_the_data(figures):
     assert [row["renderer"] for row in figures["renderers"]] == ["fast", "cycles"]
-    assert figures["rung"] == "2 (procedural Moon, held out)" and figures["data"] == ["blobs"]
+    assert figures["level"] == "2 (procedural Moon, held out)" and figures["data"] == ["blobs"]
     text = format_domains(figures)
-    assert "cycles, all, ignore-aware" in text and "rung 2" in text
+    assert "cycles, all, ignore-aware" in text and "level 2" in text
 
 
 def test_scenes_that_differ_are_left_out_and_none_in_common_is_an_error(pair):

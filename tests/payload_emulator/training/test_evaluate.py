@@ -10,11 +10,12 @@ from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.training import choice
 from payload_emulator.training.choice import choose, format_choice
-from payload_emulator.training.dataset import frame_truth
+from payload_emulator.training.dataset import Dataset, frame_truth
 from payload_emulator.training.evaluate import (
     Scored,
     detect_by_class,
     evaluate,
+    evidence_level,
     format_figures,
     open_for_evaluation,
     run,
@@ -23,8 +24,15 @@ from payload_emulator.training.evaluate import (
 from payload_emulator.training.figures import Scene, Thresholds
 from payload_emulator.training.report import detector_report
 from payload_emulator.training.scoring import FrameDetections
-from payload_emulator.training.trials import TRIALS, format_trials, run_trials
-from payload_emulator.training.two_suns import format_two_suns, fuse, study_two_suns
+from payload_emulator.training.trials import (
+    AS_FLOWN,
+    PER_CLASS,
+    TRIALS,
+    format_trials,
+    run_trials,
+    score_chosen_trial,
+)
+from payload_emulator.training.two_suns import format_two_suns, fuse, score_chosen_way, study_two_suns
 from reports.json_form import to_json
 from reports.render import render_html
 
@@ -39,9 +47,9 @@ def scored(detector, blob_dataset):
     return run(detector, [blob_dataset], "test")
 
 
-def test_figures_name_their_data_their_rung_and_both_ways_of_scoring(detector, blob_dataset, scored):
+def test_figures_name_their_data_their_level_and_both_ways_of_scoring(detector, blob_dataset, scored):
     figures = summary(detector, [blob_dataset], scored, "test")
-    assert figures["rung"] == "2 (procedural Moon, held out)"
+    assert figures["level"] == "2 (procedural Moon, held out)"
     assert figures["dataset_sha256"] == [blob_dataset.digest]
     expected = sum(frame.craters["id"].size for frame in blob_dataset.frames("test"))
     # Blobs of 26 to 50 px from 30 km are 5.3 to 10.1 km wide: all of the paper's classes.
@@ -49,7 +57,7 @@ def test_figures_name_their_data_their_rung_and_both_ways_of_scoring(detector, b
     for key in ("micro", "ignore_aware", "micro_half_radius", "ignore_aware_half_radius"):
         assert {"precision", "recall", "f1", "loc_px"} <= set(figures[key])
     text = format_figures(figures)
-    assert "strict" in text and "ignore-aware" in text and "rung 2" in text
+    assert "strict" in text and "ignore-aware" in text and "level 2" in text
 
 
 def test_the_report_shows_the_worst_frames_and_says_what_it_lacks(detector, blob_dataset, scored):
@@ -102,7 +110,9 @@ def test_a_higher_threshold_never_finds_more(blob_dataset):
 
 
 def test_trials_give_places_in_the_frame_as_it_came(detector, blob_dataset):
-    rows = run_trials(detector, [blob_dataset])
+    study = run_trials(detector, [blob_dataset])
+    rows = study["trials"]
+    assert study["validation_frames"] == 6
     assert len(rows) == len(TRIALS) + 1  # the one more: a threshold for each class
     by_name = {row["trial"]: row for row in rows}
     # The Sun of these frames is at the top, so turning changes nothing; the exact turn is by zero degrees.
@@ -110,16 +120,68 @@ def test_trials_give_places_in_the_frame_as_it_came(detector, blob_dataset):
     assert by_name["not turned"]["strict"] == plain
     assert by_name["turned exactly Sun-up"]["strict"]["loc_px"] == pytest.approx(plain["loc_px"], abs=1e-6)
     assert plain["detected_true"] >= 10
+    mirrored, enlarged = "averaged with its mirror image", "enlarged 1.5 times, four tiles"
+    on_test = {
+        name: score_chosen_trial(detector, [blob_dataset], study | {"chosen": name})
+        for name in ("as flown (quarter turns to Sun-up)", mirrored, enlarged)
+    }
     # Enlarging or mirroring keeps centres: a wrong convention would shift them by half a pixel or more.
-    for name in ("averaged with its mirror image", "enlarged 1.5 times, four tiles"):
-        assert by_name[name]["strict"]["loc_median_px"] < plain["loc_median_px"] + 0.5
-    assert "as flown" in format_trials(rows)
+    for name in (mirrored, enlarged):
+        shown = on_test[name]["strict"]["loc_median_px"]
+        assert shown < on_test["as flown (quarter turns to Sun-up)"]["strict"]["loc_median_px"] + 0.5
+    best = max(row["strict"]["f1"] for row in rows)
+    assert by_name[study["chosen"]]["strict"]["f1"] == best
+    assert "as flown" in format_trials(
+        study
+    ) and f"chosen on the validation split: {study['chosen']}" in format_trials(study)
+    test = score_chosen_trial(detector, [blob_dataset], study)
+    assert test["trial"] == study["chosen"] and test["threshold"] == by_name[study["chosen"]]["threshold"]
+    assert test["test_frames"] == 4
+    assert test["strict"]["expected"] == sum(f.craters["id"].size for f in blob_dataset.frames("test"))
+    assert "chosen, test, 4 frames" in format_trials(study, test)
+
+
+class OtherTestLabels(Dataset):
+    """The same data set with the labels of the test split moved to where nothing is drawn."""
+
+    def __init__(self, folder):
+        super().__init__(folder)
+        self._frames = [
+            replace(f, craters={**f.craters, "u_px": 511.0 - f.craters["u_px"]}) if f.split == "test" else f
+            for f in self._frames
+        ]
+
+
+def test_the_chosen_trial_does_not_depend_on_the_labels_of_the_test_split(detector, blob_dataset):
+    other = OtherTestLabels(blob_dataset.folder)
+    study, again = (run_trials(detector, [data], TRIALS[:2]) for data in (blob_dataset, other))
+    assert again == study
+    figures, moved = (score_chosen_trial(detector, [data], study) for data in (blob_dataset, other))
+    assert moved["strict"]["f1"] < 0.5 * figures["strict"]["f1"]
+    assert moved["threshold"] == figures["threshold"]
+
+
+def test_thresholds_for_each_class_are_those_of_the_validation_split(detector, blob_dataset):
+    study = run_trials(detector, [blob_dataset], TRIALS[:1])
+    row = next(row for row in study["trials"] if row["trial"] == PER_CLASS)
+    per_class = score_chosen_trial(detector, [blob_dataset], study | {"chosen": PER_CLASS})
+    # With one limit for all classes nothing is shifted: the figures are those of the network as flown.
+    equal = dict(row, thresholds=[row["threshold"]] * 3)
+    as_flown = score_chosen_trial(detector, [blob_dataset], study | {"chosen": AS_FLOWN.name})
+    same = score_chosen_trial(detector, [blob_dataset], {"trials": [equal], "chosen": PER_CLASS})
+    assert same["strict"] == as_flown["strict"]
+    assert per_class["trial"] == PER_CLASS and per_class["threshold"] == row["threshold"]
+    assert len(row["thresholds"]) == 3
 
 
 def test_trials_need_frames_to_choose_on_and_to_judge_by(detector, make_blob_dataset, tmp_path):
     unvalidated = make_blob_dataset(tmp_path / "set", {"test": 1})
     with pytest.raises(DatasetError, match="trials: expected frames of split 'val', found none"):
         run_trials(detector, [unvalidated])
+    untested = make_blob_dataset(tmp_path / "other", {"val": 1})
+    study = run_trials(detector, [untested], TRIALS[:1])
+    with pytest.raises(DatasetError, match="trials: expected frames of split 'test', source 'x', found none"):
+        score_chosen_trial(detector, [untested], study, "x")
 
 
 def test_trials_and_eight_bits_refuse_frames_of_another_camera(detector, make_blob_dataset, tmp_path):
@@ -197,12 +259,35 @@ def test_pairs_are_judged_on_frames_that_have_a_partner(detector, make_blob_data
     dataset = make_blob_dataset(tmp_path / "set", {"val": 2, "test": 3})
     for k, frame in enumerate(dataset.frames()):
         frame.values["sun_azimuth_deg"] = 90.0 * (k % 2)
-    parts = [run(detector, [dataset], split) for split in ("val", "test")]
-    figures = study_two_suns(*parts)
-    assert figures["frames"] == figures["of_frames"] == 3 and figures["validation_frames"] == 2
-    assert figures["one_sun"]["strict"]["expected"] == figures["two_suns"]["strict"]["expected"] > 0
-    assert "both frames" in format_two_suns(figures)
+    validation, test = (run(detector, [dataset], split) for split in ("val", "test"))
+    study = study_two_suns(validation)
+    assert study["validation_frames"] == study["of_validation_frames"] == 2
+    assert study["one_sun"]["strict"]["expected"] == study["two_suns"]["strict"]["expected"] > 0
+    f1 = {name: study[name]["strict"]["f1"] for name in ("one_sun", "two_suns")}
+    assert f1[study["chosen"]] == max(f1.values())
+    other = {"one_sun": "two_suns", "two_suns": "one_sun"}[study["chosen"]]
+    figures = score_chosen_way(test, study)
+    assert figures["test_frames"] == figures["of_test_frames"] == 3
+    assert figures["way"] == study["chosen"] and figures["threshold"] == study[study["chosen"]]["threshold"]
+    assert score_chosen_way(test, study | {"chosen": other})["way"] == other
+    text = format_two_suns(study, figures)
+    assert "both frames" in text and "chosen, test, 3 frames" in text
     for frame in dataset.frames():
         frame.values["sun_azimuth_deg"] = 0.0
     with pytest.raises(DatasetError, match="two Suns: expected frames of the split 'val'"):
-        study_two_suns(*parts)
+        study_two_suns(validation)
+    with pytest.raises(DatasetError, match="two Suns: expected frames of the split 'test'"):
+        score_chosen_way(test, study)
+
+
+def test_real_terrain_that_fixed_thresholds_or_weights_counts_as_seen(blob_dataset):
+    def level(*frames):
+        return evidence_level([replace(f, complete=complete) for f, complete in frames])
+
+    train, val, test = (blob_dataset.frames(split)[0] for split in ("train", "val", "test"))
+    assert level((test, False)).startswith("3 (real terrain, held out")
+    for seen in (train, val):
+        assert level((seen, False)).startswith("3s (real terrain, seen in training")
+        assert level((test, False), (seen, False)).startswith("3s")
+        assert level((test, True), (seen, False)).startswith("2 and 3s mixed")
+    assert level((test, True)) == "2 (procedural Moon, held out)"

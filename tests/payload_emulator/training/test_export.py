@@ -41,7 +41,7 @@ def test_an_exported_network_agrees_with_torch_and_carries_its_origin(exported, 
     assert json.loads(metadata["data"])[0]["labels_sha256"] == blob_dataset.digest
     assert float(metadata["score_threshold"]) == figures["score_threshold"]
     tested = json.loads(metadata["test_figures"])["test"]
-    assert set(tested) == {"frames", "rung", "strict", "ignore_aware"}
+    assert set(tested) == {"frames", "level", "strict", "ignore_aware"}
 
 
 def test_the_papers_variant_keeps_its_class_heatmaps_and_is_scored_by_them(exported, blob_dataset):

@@ -62,7 +62,7 @@ def test_both_models_lie_in_the_folder_with_their_figures_and_report(job, made):
     assert set(json.loads(detector.metadata["test_figures"])) == {"test"}
     assert "By Sun azimuth" in (job.out / "report-test.html").read_text(encoding="utf-8")
     table = format_made(made)
-    assert "paper's design" in table and "evidence rung 2 (procedural Moon, held out)" in table
+    assert "paper's design" in table and "evidence level 2 (procedural Moon, held out)" in table
 
 
 def test_the_same_command_again_does_nothing_twice(job, made, monkeypatch):

@@ -1,0 +1,226 @@
+"""Clients of the service that upload pieces and enter, decide and fetch telecommands while its parts are killed."""
+
+from __future__ import annotations
+
+import http.client
+import itertools
+import json
+import random
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from benchmarks.campaigns._ledger import Entered, HandOut, Ledger, Told, mark_of
+
+PATIENCE_S = 900.0
+LOOK_AFTER_S = 1.0
+"""What a killed process had asked the database for is done by then."""
+
+FUNCTIONS = ("start_observation", "reboot")
+"""One that a single person may release, and one that needs a second person."""
+
+TIMEOUT_S = 86_400
+
+RECENT = 12
+"""Clients decide on so many of the newest telecommands, and so on the same ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What the service answered; no answer of its was about something being away."""
+
+    status: int
+    body: bytes
+    headers: Mapping[str, str]
+
+    def json(self) -> Any:
+        """The body as JSON."""
+        return json.loads(self.body)
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """Octets of a downlink, and where they begin if the client tells that."""
+
+    name: str
+    octets: bytes
+    offset: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """One user at the processes of a service."""
+
+    apis: tuple[str, ...]
+    token: str
+
+    def ask(self, method: str, path: str, body: bytes | None = None, key: str = "") -> Answer:
+        """Ask until there is an answer that is not about something being away, one process after another.
+
+        Raises
+        ------
+        SystemExit
+            If there is none within `PATIENCE_S`.
+        """
+        headers = {"Authorization": f"Bearer {self.token}"}
+        if body is not None:
+            headers["Content-Type"] = (
+                "application/octet-stream" if path.startswith("/telemetry") else "application/json"
+            )
+        if key:
+            headers["Idempotency-Key"] = key
+        until = time.monotonic() + PATIENCE_S
+        for api in itertools.cycle(random.sample(self.apis, len(self.apis))):
+            request = urllib.request.Request(f"{api}/api/v1{path}", data=body, method=method, headers=headers)
+            try:
+                with urllib.request.urlopen(request, timeout=60) as answer:
+                    return Answer(answer.status, answer.read(), dict(answer.headers))
+            except urllib.error.HTTPError as error:
+                if error.code < 500:
+                    return Answer(error.code, error.read(), dict(error.headers))
+            except (OSError, ValueError, http.client.HTTPException):  # cut off in the middle of an answer
+                pass
+            if time.monotonic() > until:
+                raise SystemExit(f"{method} {path}: no answer within {PATIENCE_S:.0f} s")
+            time.sleep(0.3)
+        raise AssertionError
+
+    def get(self, path: str) -> Any:
+        """What a path holds."""
+        answer = self.ask("GET", path)
+        if answer.status != 200:
+            raise SystemExit(f"GET {path}: {answer.status} {answer.body[:300]!r}")
+        return answer.json()
+
+
+class Client(threading.Thread):
+    """A user who uploads pieces and commands the spacecraft until there are no more pieces."""
+
+    def __init__(
+        self,
+        name: str,
+        session: Session,
+        spacecraft: int,
+        pieces: deque[Piece],
+        ledger: Ledger,
+        rng: random.Random,
+        over: threading.Event,
+    ) -> None:
+        super().__init__(name=name)
+        self.broken: BaseException | None = None
+        self._session, self._spacecraft, self._pieces = session, spacecraft, pieces
+        self._ledger, self._rng, self._over = ledger, rng, over
+
+    def run(self) -> None:
+        actions = self._actions()
+        try:
+            while not self._over.is_set():
+                try:
+                    piece = self._pieces.popleft()
+                except IndexError:
+                    self._over.wait(self._rng.uniform(0.0, 0.6))
+                else:
+                    self._upload(piece)
+                next(actions)()
+        except BaseException as error:
+            self.broken = error
+            self._over.set()
+
+    def _actions(self) -> Iterator[Callable[[], None]]:
+        """What a client does between pieces: each once, then at random."""
+        every = (self._enter, self._decide, self._fetch, self._note_head)
+        yield from every
+        while True:
+            yield self._rng.choices(every, (3, 4, 2, 1))[0]
+
+    def _upload(self, piece: Piece) -> None:
+        path = f"/telemetry?spacecraft_id={self._spacecraft}"
+        if piece.offset is not None:
+            path += f"&stream=downlink&offset={piece.offset}"
+        answer = self._session.ask("POST", path, piece.octets, piece.name)
+        if answer.status != 202:
+            raise SystemExit(f"POST {path}: {answer.status} {answer.body[:300]!r}")
+        self._ledger.jobs.append(answer.json()["job_id"])
+
+    def _enter(self) -> None:
+        """Enter a telecommand; where it is open whether it was, look, and enter it again under another key."""
+        mark = self._ledger.new_mark()
+        function = self._rng.choice(FUNCTIONS)
+        given = {
+            "name": "perform_function",
+            "arguments": {"function_id": function, "argument_1": float(mark), "argument_2": 0.0},
+            "spacecraft_id": self._spacecraft,
+            "timeout_s": TIMEOUT_S,
+        }
+        for attempt in range(20):
+            answer = self._session.ask(
+                "POST", "/telecommands", json.dumps(given).encode(), f"enter {mark} {attempt}"
+            )
+            if answer.status == 201:
+                self._ledger.entered.append(Entered(mark, int(answer.json()["id"]), self.name))
+                return
+            if answer.status != 409:
+                raise SystemExit(f"POST /telecommands: {answer.status} {answer.body[:300]!r}")
+            time.sleep(LOOK_AFTER_S)
+            for row in self._session.get("/telecommands?limit=200")["items"]:
+                if mark_of(row) == mark:
+                    self._ledger.entered.append(Entered(mark, int(row["id"]), self.name))
+                    return
+        raise SystemExit("POST /telecommands: its end was left open 20 times")
+
+    def _decide(self) -> None:
+        """Release or reject one of the newest telecommands, as other clients do at the same time."""
+        recent = self._ledger.entered[-RECENT:]
+        if not recent:
+            return
+        command = self._rng.choice(recent).command
+        state = self._rng.choices(("released", "rejected"), (4, 1))[0]
+        verb, body = ("release", b"") if state == "released" else ("reject", b'{"reason": "campaign"}')
+        answer = self._session.ask("POST", f"/telecommands/{command}/{verb}", body)
+        if answer.status == 200:
+            self._ledger.told.append(Told(command, state, self.name))
+        elif answer.status != 409:
+            raise SystemExit(f"POST /telecommands/{command}/{verb}: {answer.status} {answer.body[:300]!r}")
+        elif found := answer.json().get("state"):
+            self._ledger.told.append(Told(command, found))
+
+    def _fetch(self) -> None:
+        """Take what is to be sent now, at times twice under one key."""
+        key = f"uplink {self._rng.getrandbits(64):x}"
+        path = f"/uplink?spacecraft_id={self._spacecraft}&format=packets"
+        answer = self._session.ask("POST", path, key=key)
+        if answer.status == 409:  # taken by a process that was killed before it answered
+            self._ledger.count_unanswered()
+            return
+        if answer.status != 200:
+            raise SystemExit(f"POST {path}: {answer.status} {answer.body[:300]!r}")
+        named = {name.lower(): text for name, text in answer.headers.items()}.get("x-telecommands", "")
+        commands = tuple(int(one) for one in named.split(",") if one)
+        self._ledger.hand_outs.append(HandOut(self.name, commands, answer.body))
+        if self._rng.random() < 0.3 and self._session.ask("POST", path, key=key).body != answer.body:
+            self._ledger.count_changed()
+
+    def _note_head(self) -> None:
+        head = self._session.get("/audit/head")
+        self._ledger.heads.append((int(head["number"]), str(head["sha256"])))
+
+
+def cut_pieces(stream: bytes, pieces: int, rng: random.Random, name: str) -> list[Piece]:
+    """A stream cut at random octets, in random order; every other piece tells where it begins."""
+    places = sorted(rng.sample(range(1, len(stream)), pieces - 1))
+    made = [
+        Piece(f"{name} {start}", stream[start:stop], start if rng.random() < 0.5 else None)
+        for start, stop in itertools.pairwise([0, *places, len(stream)])
+    ]
+    rng.shuffle(made)
+    return made
+
+
+def broken_of(clients: Sequence[Client]) -> BaseException | None:
+    """What ended a client before its time."""
+    return next((one.broken for one in clients if one.broken is not None), None)

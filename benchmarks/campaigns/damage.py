@@ -1,0 +1,480 @@
+"""Deliberate damage to every kind of row and file: does `linna verify --all` find it?
+
+    python -m benchmarks.campaigns.damage [--postgresql] [--quick] [--single] [--packets N] [--only TABLE...] [--json]
+
+Fills an archive with telemetry and with rows of every table, and then, on copies of it: changes every column of a row,
+removes a row, puts a row in, changes, shortens, lengthens, exchanges and removes files, and puts a file in, each as
+another program would. A copy takes at most one damage of each table and is then verified; with `--single` one damage
+in all. Exit status 1 where damage was not found. `--quick`: without ingesting the raw files again, as `linna verify`
+without `--all`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sqlalchemy import (
+    JSON,
+    Connection,
+    Engine,
+    Float,
+    LargeBinary,
+    SmallInteger,
+    String,
+    Table,
+    create_engine,
+    insert,
+    select,
+    text,
+)
+from sqlalchemy.exc import SQLAlchemyError
+
+from benchmarks.campaigns._deployment import PostgresServer
+from benchmarks.ground import START, mixed_downlink
+from ground_service.services.commanding import enter_command, release_command
+from ground_service.services.ground import Ground, open_ground
+from ground_service.services.ingest import ingest_file
+from ground_service.services.integrity import Verification, verify
+from ground_service.services.passes import define_pass
+from ground_service.services.planning import WindowEntry, add_window
+from ground_service.services.users import add_user
+from ground_service.store.audit import GUARD_NAMES
+from ground_service.store.models import Base
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import encode_cadus
+from tmtc.packets import PacketSequencer
+
+SPACECRAFT = 76
+NS = 1_000_000_000
+CHANGES = ("changed", "removed", "put in")
+
+
+@dataclass(frozen=True, slots=True)
+class Harm:
+    """One piece of damage: what it is done to, how, and the function that does it."""
+
+    kind: str
+    change: str
+    place: str
+    do: Callable[[Connection, Path], None]
+
+
+def fill(ground: Ground, folder: Path, packets: int) -> None:
+    """Fill an archive with telemetry, and with rows of every table, as the program writes them."""
+    (folder / "mixed.cadu").write_bytes(mixed_downlink(packets))
+    (folder / "rest.cadu").write_bytes(_rest_of_the_dictionary())
+    for name in ("mixed.cadu", "rest.cadu"):
+        ingest_file(ground, folder / name)
+    define_pass(
+        ground, name="pass", start_utc_ns=START, stop_utc_ns=START + NS, spacecraft_id=SPACECRAFT, instance="flight"
+    )  # fmt: skip
+    for name, role in (("ann", "admin"), ("bob", "operator")):
+        add_user(ground, name, role)
+    add_window(ground, WindowEntry("w", START, START + NS, 15.0, SPACECRAFT), actor="ann")
+    command = enter_command(
+        ground, "test_connection", {}, actor="ann", spacecraft_id=SPACECRAFT, instance="flight", timeout_s=600
+    )
+    release_command(ground, command, actor="bob")
+    with ground.database.writing() as connection:
+        for table in Base.metadata.sorted_tables:
+            if connection.execute(select(*table.primary_key.columns).limit(1)).first() is None:
+                connection.execute(insert(table), [_invented(connection, table)])
+
+
+def _rest_of_the_dictionary() -> bytes:
+    """One packet of every kind that `mixed_downlink` does not hold."""
+    sequencer, packets = PacketSequencer(), []
+    for definition in DICTIONARY.telemetry:
+        if definition.name in ("housekeeping", "detections", "navigation_state", "event_info"):
+            continue
+        values: dict[str, Any] = {field.name: _value(field) for field in definition.fields}
+        if definition.group is not None:
+            values[definition.group.name] = [{field.name: _value(field) for field in definition.group.fields}]
+            del values[definition.group.count]
+        packets.append(
+            DICTIONARY.pack(
+                definition.name, values, ticks=1 << 40, sequence_count=sequencer.next(definition.apid)
+            )
+        )
+    return encode_cadus(packets, spacecraft_id=SPACECRAFT)
+
+
+def _value(field: Any) -> Any:
+    one = field.labels[0][0] if field.labels else max(field.minimum or 0.0, 0.0)
+    value = float(one) if field.is_float or field.is_calibrated else int(one)
+    return value if field.size == 1 else [value] * field.size
+
+
+def _invented(connection: Connection, table: Table) -> dict[str, Any]:
+    """A row of a table with a value of its type in every column, naming rows that are there."""
+    row: dict[str, Any] = {}
+    for column in table.columns:
+        if column.foreign_keys:
+            parent = next(iter(column.foreign_keys)).column
+            row[column.name] = connection.execute(select(parent).order_by(parent).limit(1)).scalar()
+        elif not (column.primary_key and column.autoincrement is not False and len(table.primary_key) == 1
+                  and _is_integer(column)):  # fmt: skip
+            row[column.name] = _plain_value(column)
+    return row
+
+
+def _is_integer(column: Any) -> bool:
+    return not isinstance(column.type, (JSON, Float, LargeBinary, String))
+
+
+def _plain_value(column: Any) -> Any:
+    if isinstance(column.type, JSON):
+        return {"a": [1, 0.5, None, "ü"]}
+    if isinstance(column.type, Float):
+        return 0.1
+    if isinstance(column.type, LargeBinary):
+        return b"\x00\x01\xfe\xff"
+    if isinstance(column.type, String):
+        return "x"
+    return 1
+
+
+# Damage
+
+
+def harms(engine: Engine, home: Path, only: Sequence[str] = ()) -> Iterator[Harm]:
+    """All damage to be done: to each column and row of each table, and to files."""
+    for table in Base.metadata.sorted_tables:
+        if only and table.name not in only:
+            continue
+        with engine.connect() as connection:
+            rows = connection.execute(select(table).order_by(*table.primary_key.columns)).mappings().all()
+        row = dict(rows[len(rows) // 2])
+        here = _where(table, row)
+        for column in table.columns:
+            yield Harm(table.name, "changed", column.name, _change(table, here, column, row[column.name]))
+        yield Harm(table.name, "removed", "one row", _statement(table.delete().where(here)))
+        other = dict(row)
+        for column in table.primary_key.columns:
+            other[column.name] = _another(column, row[column.name], far=True)
+        yield Harm(table.name, "put in", "one row", _put_in(table, other))
+        if table.name == "audit":
+            last = dict(rows[-1])
+            yield Harm(table.name, "removed", "newest", _statement(table.delete().where(_where(table, last))))
+    if only and "files on disk" not in only:
+        return
+    for path in (file for file in sorted((home / "files").rglob("*")) if file.is_file()):
+        for place, change, do in FILE_HARM:
+            yield Harm("files on disk", change, place, _file_harm(path.relative_to(home), do))
+    yield Harm("files on disk", "put in", "a file of another name", _foreign_file)
+
+
+def _where(table: Table, row: dict[str, Any]) -> Any:
+    condition = None
+    for column in table.primary_key.columns:
+        one = column == row[column.name]
+        condition = one if condition is None else condition & one
+    return condition
+
+
+def _another(column: Any, value: Any, *, far: bool = False) -> Any:
+    """A value of the same type that differs as little as it can."""
+    if value is None:
+        return _plain_value(column)
+    if isinstance(column.type, JSON):
+        return {**value, "damage": 1} if isinstance(value, dict) else {"damage": 1}
+    if isinstance(column.type, Float):
+        return float(np.nextafter(value, np.inf))
+    if isinstance(column.type, LargeBinary):
+        octets = bytes(value)
+        return bytes([octets[0] ^ 1, *octets[1:]]) if octets else b"\x00"
+    if isinstance(column.type, String):
+        return ("y" if value[:1] != "y" else "z") + value[1:]
+    step = 17 if isinstance(column.type, SmallInteger) else 100_003
+    return value + step if far else value ^ 1
+
+
+def _statement(statement: Any) -> Callable[[Connection, Path], None]:
+    def do(connection: Connection, _home: Path) -> None:
+        if connection.execute(statement).rowcount not in (1, -1):  # -1: the database does not say
+            raise RuntimeError(f"expected one row to be damaged by {statement}")
+
+    return do
+
+
+def _change(table: Table, here: Any, column: Any, value: Any) -> Callable[[Connection, Path], None]:
+    return _statement(
+        table.update().where(here).values({column.name: _another(column, value, far=column.primary_key)})
+    )
+
+
+def _put_in(table: Table, row: dict[str, Any]) -> Callable[[Connection, Path], None]:
+    unique = {
+        column.name
+        for constraint in (*table.constraints, *table.indexes)
+        if constraint.__class__.__name__ == "UniqueConstraint" or getattr(constraint, "unique", False)
+        for column in constraint.columns
+    }
+    for name in unique:
+        if not table.c[name].primary_key and not table.c[name].foreign_keys:
+            row[name] = _another(table.c[name], row[name], far=True)
+    return _statement(insert(table).values(row))
+
+
+def _flip(path: Path) -> None:
+    octets = bytearray(path.read_bytes())
+    octets[len(octets) // 2] ^= 0x10
+    path.write_bytes(octets)
+
+
+def _shorten(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-1])
+
+
+def _lengthen(path: Path) -> None:
+    path.write_bytes(path.read_bytes() + b"\x00")
+
+
+def _exchange(path: Path) -> None:
+    path.write_bytes(bytes(len(path.read_bytes())))
+
+
+FILE_HARM: tuple[tuple[str, str, Callable[[Path], None]], ...] = (
+    ("one bit", "changed", _flip),
+    ("one octet less", "changed", _shorten),
+    ("one octet more", "changed", _lengthen),
+    ("all octets", "changed", _exchange),
+    ("the file", "removed", Path.unlink),
+)
+
+
+def _file_harm(name: Path, do: Callable[[Path], None]) -> Callable[[Connection, Path], None]:
+    def harm(_connection: Connection, home: Path) -> None:
+        path = home / name
+        path.chmod(0o644)
+        do(path)
+
+    return harm
+
+
+def _foreign_file(_connection: Connection, home: Path) -> None:
+    (home / "files" / "notes.txt").write_text("what somebody left here")
+
+
+@contextmanager
+def outside(url: Any, *, guards: bool = False) -> Iterator[Connection]:
+    """A connection of another program, whose changes no trigger and no foreign key stops unless `guards`."""
+    engine = create_engine(url)
+    try:
+        with engine.begin() as connection:
+            if not guards and engine.dialect.name == "postgresql":
+                connection.execute(text("SET session_replication_role = replica"))
+            elif not guards:
+                for name in GUARD_NAMES:
+                    connection.execute(text(f"DROP TRIGGER IF EXISTS {name}"))
+            yield connection
+            if not guards and engine.dialect.name == "sqlite":
+                _guards_again(connection)
+    finally:
+        engine.dispose()
+
+
+def _guards_again(connection: Connection) -> None:
+    """Put the triggers of the audit table back, so that their absence does not give the damage away."""
+    from ground_service.store.audit import install_guards
+
+    install_guards(connection)
+
+
+# The campaign
+
+
+class SqliteCopies:
+    """Fresh copies of a filled archive on SQLite."""
+
+    def __init__(self, folder: Path, packets: int) -> None:
+        self._folder = folder
+        self._pristine = folder / "pristine"
+        with open_ground(self._pristine) as ground:
+            fill(ground, folder, packets)
+        with create_engine(f"sqlite:///{self._pristine / 'linna.db'}").connect() as connection:
+            connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")
+
+    @property
+    def pristine(self) -> Ground:
+        return open_ground(self._pristine)
+
+    @contextmanager
+    def copy(self) -> Iterator[Ground]:
+        home = self._folder / "copy"
+        shutil.rmtree(home, ignore_errors=True)
+        shutil.copytree(self._pristine, home)
+        with open_ground(home) as ground:
+            yield ground
+
+
+class PostgresCopies:
+    """Fresh copies of a filled archive on PostgreSQL: databases made from a template."""
+
+    def __init__(self, folder: Path, packets: int, server_url: str) -> None:
+        self._folder, self._server = folder, server_url
+        self._pristine = folder / "pristine"
+        self._admin = create_engine(f"{server_url}/postgres", isolation_level="AUTOCOMMIT")
+        self._create("pristine", "template1")
+        from ground_service.store.database import prepare_database
+
+        prepare_database(f"{server_url}/pristine", upgrade=True).engine.dispose()
+        with self.pristine as ground:
+            fill(ground, folder, packets)
+
+    def _create(self, name: str, template: str) -> None:
+        with self._admin.connect() as connection:
+            connection.execute(text(f"DROP DATABASE IF EXISTS {name} WITH (FORCE)"))
+            connection.execute(text(f"CREATE DATABASE {name} TEMPLATE {template}"))
+
+    @property
+    def pristine(self) -> Ground:
+        return open_ground(self._pristine, database_url=f"{self._server}/pristine")
+
+    @contextmanager
+    def copy(self) -> Iterator[Ground]:
+        home = self._folder / "copy"
+        shutil.rmtree(home, ignore_errors=True)
+        shutil.copytree(self._pristine, home)
+        self._create("copy", "pristine")
+        with open_ground(home, database_url=f"{self._server}/copy") as ground:
+            yield ground
+
+
+SOURCES = frozenset({"files", "ingests", "vehicles"})
+"""Rows that say what is to be ingested again: damaged together with values they would hide those."""
+
+ALONE = frozenset({"row_digests", "audit_head", "files on disk"})
+"""Kinds whose damage shows in other kinds."""
+
+
+def rounds(wanted: Sequence[Harm], *, single: bool) -> list[list[Harm]]:
+    """Damage to be done to one copy together: at most one of each kind, each told apart by its kind."""
+    if single:
+        return [[harm] for harm in wanted]
+    made: dict[tuple[Any, ...], list[Harm]] = {}
+    turns: Counter[tuple[str, str]] = Counter()
+    for number, harm in enumerate(wanted):
+        turns[harm.kind, harm.change] += 1
+        group: tuple[Any, ...] = (harm.change, harm.kind in SOURCES, turns[harm.kind, harm.change])
+        made.setdefault((number,) if harm.kind in ALONE else group, []).append(harm)
+    return list(made.values())
+
+
+def campaign(
+    copies: SqliteCopies | PostgresCopies, *, deep: bool, single: bool = False, only: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Do every damage to a copy and verify it; what was found and what was not."""
+    with copies.pristine as ground:
+        clean = verify(ground, deep=deep)
+        if clean.damaged:
+            raise SystemExit(f"expected an archive without damage, found {clean.damaged[0]}")
+        wanted = list(harms(ground.database.engine, ground.home, only))
+    done: Counter[tuple[str, str]] = Counter()
+    missed, refused, seconds = [], [], []
+    for together in rounds(wanted, single=single):
+        applied = []
+        with copies.copy() as ground:
+            for harm in together:
+                try:
+                    with outside(ground.database.engine.url) as connection:
+                        harm.do(connection, ground.home)
+                    applied.append(harm)
+                except SQLAlchemyError as error:
+                    line = str(error).splitlines()[0][:120]
+                    refused.append(f"{harm.kind}, {harm.place} {harm.change}: {line}")
+            began = time.monotonic()
+            result = verify(ground, deep=deep)
+            seconds.append(time.monotonic() - began)
+        for harm in applied:
+            done[harm.kind, harm.change] += 1
+            if not _names(result, harm):
+                missed.append(f"{harm.kind}, {harm.place} {harm.change}")
+        print(f"{sum(done.values())} of {len(wanted)} done, {len(missed)} not found", file=sys.stderr)
+    table = {
+        kind: {change: done[kind, change] for change in CHANGES if done[kind, change]}
+        for kind in dict.fromkeys(harm.kind for harm in wanted)
+    }
+    return {
+        "damage": sum(done.values()), "found": sum(done.values()) - len(missed), "missed": missed,
+        "refused_by_the_database": refused, "kinds": table, "rows_and_files": sum(clean.checked.values()),
+        "verify_s_median": round(float(np.median(seconds)), 3) if seconds else None,
+    }  # fmt: skip
+
+
+def _names(result: Verification, harm: Harm) -> bool:
+    """Whether the damage is found, and told where it is; a digest stands for the table of its row."""
+    kinds = {one.kind for one in result.damaged}
+    if harm.kind == "files on disk":
+        return "files" in kinds
+    if harm.kind == "audit_head":
+        return "audit" in kinds
+    return bool(kinds) if harm.kind == "row_digests" else harm.kind in kinds
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--postgresql", action="store_true", help="on a PostgreSQL server of its own")
+    parser.add_argument("--quick", action="store_true", help="without ingesting the raw files again")
+    parser.add_argument(
+        "--single", action="store_true", help="one damage to each copy (default: at most one of each kind)"
+    )
+    parser.add_argument(
+        "--packets", type=int, default=400, metavar="N", help="packets of the archive (default: 400)"
+    )
+    parser.add_argument(
+        "--only", nargs="*", default=[], metavar="TABLE", help="only these tables, or 'files on disk'"
+    )
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args(words)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        if arguments.postgresql:
+            with PostgresServer(folder) as server:
+                url = server.url.rpartition("/")[0]
+                copies: Any = PostgresCopies(folder, arguments.packets, url)
+                figures = campaign(
+                    copies, deep=not arguments.quick, single=arguments.single, only=arguments.only
+                )
+        else:
+            figures = campaign(
+                SqliteCopies(folder, arguments.packets),
+                deep=not arguments.quick,
+                single=arguments.single,
+                only=arguments.only,
+            )
+    print(json.dumps(figures) if arguments.json else _as_text(figures))
+    return 1 if figures["missed"] else 0
+
+
+def _as_text(figures: dict[str, Any]) -> str:
+    lines = [f"{'':<22}" + "".join(f"{change:>10}" for change in CHANGES)]
+    lines += [
+        f"{kind:<22}" + "".join(f"{counts.get(change, 0) or '':>10}" for change in CHANGES)
+        for kind, counts in figures["kinds"].items()
+    ]
+    lines += [f"not found: {text_}" for text_ in figures["missed"]]
+    lines += [f"refused by the database: {text_}" for text_ in figures["refused_by_the_database"]]
+    lines.append(
+        f"{figures['found']} of {figures['damage']} found; an archive of {figures['rows_and_files']} rows and files "
+        f"is verified in {figures['verify_s_median']} s (median)"
+    )
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

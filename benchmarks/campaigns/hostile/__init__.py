@@ -1,0 +1,1 @@
+"""A hostile payload build, and the profiles under which the service meets it."""

@@ -1,0 +1,120 @@
+"""Profiles under which a process of the service runs: who it is, what it may do, and what the engine refuses.
+
+    python -m benchmarks.campaigns.hostile.profiles PROFILE [--keep PATH ...] -- COMMAND ...
+
+Without a container engine: `runner` makes what the engine would, as docker-compose.yml describes the service, from
+namespaces, a read-only root and the engine's system call filter. All profiles but `user` need root.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import stat
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from ground_service.sandbox import kernel
+
+PROFILES = {
+    "user": "the user that runs the campaign, unchanged",
+    "root": "root, as on a laptop",
+    "uid 10001": "user 10001, as a service without a container",
+    "image": "user 10001, no capability, no-new-privileges: the image as compose runs it",
+    "no unshare": "the same, and the engine's filter refuses namespaces",
+    "runner": "user 0 with SETUID, SETGID and KILL, no network, read-only root, the engine's filter",
+}
+SERVICE_UID = 10_001
+RUNNER_CAPABILITIES = (5, 6, 7)
+TMP_MIB = 256
+
+
+def enter(profile: str, keep: Sequence[Path], exchange: Path | None = None) -> None:
+    """Turn this process into one of the profile, with `keep` reachable for every user."""
+    if profile in ("user", "root"):
+        return
+    kernel.unshare(kernel.CLONE_NEWNS)
+    kernel.mount("", "/", "", kernel.MS_REC | kernel.MS_PRIVATE)
+    reveal([Path(sys.prefix), Path(sys.base_prefix), *keep])
+    if profile == "runner":
+        assert exchange is not None
+        become_container(exchange)
+        os.setgroups([])
+        os.setresgid(SERVICE_UID, SERVICE_UID, SERVICE_UID)
+        kernel.drop_bounding_set(RUNNER_CAPABILITIES)
+        kernel.drop_capabilities(RUNNER_CAPABILITIES)
+    else:
+        if profile != "uid 10001":
+            kernel.drop_bounding_set()
+        os.setgroups([])
+        os.setresgid(SERVICE_UID, SERVICE_UID, SERVICE_UID)
+        os.setresuid(SERVICE_UID, SERVICE_UID, SERVICE_UID)
+    # A change of the user cancels it.
+    kernel.die_with_parent()
+    if profile != "uid 10001":
+        kernel.forbid_new_privileges()
+    if profile in ("no unshare", "runner"):
+        kernel.install_filter(kernel.seccomp_filter(kernel.ENGINE_DENIED, sockets=True))
+
+
+def become_container(exchange: Path) -> None:
+    """A container without network: own namespaces, everything read-only but /tmp, /dev/shm and the exchange folder."""
+    kernel.unshare(
+        kernel.CLONE_NEWPID
+        | kernel.CLONE_NEWNET
+        | kernel.CLONE_NEWIPC
+        | kernel.CLONE_NEWUTS
+        | kernel.CLONE_NEWCGROUP
+    )
+    child = os.fork()
+    if child:
+        status = os.waitpid(child, 0)[1]
+        os._exit(os.waitstatus_to_exitcode(status) & 0xFF)
+    kernel.die_with_parent()
+    kernel.mount("proc", "/proc", "proc")
+    held = os.open(exchange, os.O_PATH)
+    kernel.restrict_mount("/", kernel.MOUNT_ATTR_RDONLY)
+    kernel.mount("tmpfs", "/tmp", "tmpfs", kernel.MS_NOSUID | kernel.MS_NODEV, f"size={TMP_MIB}m,mode=1777")
+    kernel.mount("tmpfs", "/dev/shm", "tmpfs", kernel.MS_NOSUID | kernel.MS_NODEV, "size=64m,mode=1777")
+    # The same folder at the path that the service knows, writable, without the rest of the disk.
+    exchange.mkdir(parents=True, exist_ok=True)
+    kernel.mount(f"/proc/self/fd/{held}", str(exchange), "", kernel.MS_BIND)
+    kernel.restrict_mount(str(exchange), 0, cleared=kernel.MOUNT_ATTR_RDONLY)
+    os.close(held)
+
+
+def reveal(paths: Sequence[Path]) -> None:
+    """Make paths reachable whose parent folders are closed to others, in this mount namespace only."""
+    closed: dict[Path, list[Path]] = {}
+    for path in dict.fromkeys(path.resolve() for path in paths):
+        for parent in reversed(path.parents):
+            if not parent.stat().st_mode & stat.S_IXOTH:
+                closed.setdefault(parent, []).append(path)
+                break
+    for parent, inside in closed.items():
+        held = [os.open(path, os.O_PATH) for path in inside]
+        kernel.mount("tmpfs", str(parent), "tmpfs", 0, "mode=755")
+        for path, descriptor in zip(inside, held, strict=True):
+            if not path.exists():
+                path.mkdir(parents=True)
+                with contextlib.suppress(OSError):
+                    kernel.mount(f"/proc/self/fd/{descriptor}", str(path), "", kernel.MS_BIND | kernel.MS_REC)
+            os.close(descriptor)
+
+
+def main(words: Sequence[str]) -> int:
+    """Enter a profile and become a command."""
+    parser = argparse.ArgumentParser(prog="profiles")
+    parser.add_argument("profile", choices=PROFILES)
+    parser.add_argument("--keep", type=Path, action="append", default=[])
+    parser.add_argument("--exchange", type=Path)
+    parser.add_argument("command", nargs="+")
+    arguments = parser.parse_args(words)
+    enter(arguments.profile, [*arguments.keep, Path.cwd()], arguments.exchange)
+    os.execvp(arguments.command[0], arguments.command)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

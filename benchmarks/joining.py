@@ -1,0 +1,143 @@
+"""Cost of joining one piece when very many edges wait: python -m benchmarks.joining [--edges 100000] [--postgresql].
+
+The edges of so many pieces are put into the table: beginnings and ends of CADUs with lengths and frame counts as random
+cuts leave them, and of packets of a channel. Then pieces of a downlink are ingested that each join the one before. The
+time of joining is taken with an empty and with a full table, without and with the commits in it; so are the processor
+time of joining, and the number and time of all commits of a piece.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.campaigns._deployment import PostgresServer
+from benchmarks.ground import mixed_downlink
+from ground_service.link.edges import CLOSER, OPENER, UNKNOWN, Edge
+from ground_service.link.stream import DownlinkReader, Link
+from ground_service.services.ground import Ground, open_ground
+from ground_service.services.ingest import ingest_file
+from ground_service.services.joining import Joiner, raw_domain
+from ground_service.store import edges, repository
+from ground_service.store.database import prepare_database
+
+SPACECRAFT = 76
+SCOPE = "flight/*"
+BLOCK = 5_000
+
+
+def fill(ground: Ground, link: Link, count: int, channel: str) -> None:
+    """Put `count` edges of CADUs and of a channel each into the table."""
+    assert link.settings is not None
+    rng = np.random.default_rng(1)
+    length = link.settings.cadu_length
+    domain = raw_domain(SCOPE, link)
+    for first in range(0, count, BLOCK):
+        raw, packets = [], []
+        for number in range(first, min(first + BLOCK, count)):
+            size, frame = int(rng.integers(1, length)), int(rng.integers(256))
+            octets = rng.bytes(size)
+            if number % 2:
+                raw.append(Edge(OPENER, UNKNOWN, frame, octets, number, length - size))
+                packets.append(Edge(OPENER, UNKNOWN, frame, octets[:200], None, 1 + size % 300))
+            else:
+                raw.append(Edge(CLOSER, frame, UNKNOWN, octets, number))
+                packets.append(Edge(CLOSER, frame, UNKNOWN, octets[:300]))
+        with ground.database.writing() as connection:
+            edges.add_edges(connection, domain, raw, "0" * 64)
+            edges.add_edges(connection, channel, packets)
+
+
+def measure(database_url: str | None, count: int, pieces: int) -> dict[str, Any]:
+    """Milliseconds of joining a piece, with an empty and with a full table."""
+    stream = mixed_downlink(40 * pieces)
+    taken: dict[str, list[float]] = {}
+    commits: list[float] = []
+    join = Joiner.join
+
+    def note(name: str, value: float) -> None:
+        taken.setdefault(name, []).append(value)
+
+    def timed(self: Joiner) -> None:
+        begun, processor, before = time.perf_counter(), time.process_time(), len(commits)
+        join(self)
+        whole = 1e3 * (time.perf_counter() - begun)
+        synced = sum(commits[before:])
+        note("join_ms", whole - synced)
+        note("join_commits_ms", synced)
+        note("join_processor_ms", 1e3 * (time.process_time() - processor))
+
+    figures: dict[str, Any] = {"edges": 2 * count, "pieces": pieces}
+    with tempfile.TemporaryDirectory() as name:
+        if database_url:
+            prepare_database(database_url, upgrade=True).engine.dispose()
+        with open_ground(Path(name) / "home", database_url=database_url) as ground:
+            commit = ground.database.engine.dialect.do_commit
+
+            def timed_commit(connection: Any) -> None:
+                begun = time.perf_counter()
+                commit(connection)
+                commits.append(1e3 * (time.perf_counter() - begun))
+
+            ground.database.engine.dialect.do_commit = timed_commit  # type: ignore[method-assign]
+            reader = DownlinkReader()
+            for _ in reader.batches([stream[:100_000]]):
+                pass
+            assert reader.link is not None
+            size = len(stream) // (2 * pieces + 2)
+            path = Path(name) / "piece"
+
+            def take(first: int, last: int) -> None:
+                for number in range(first, last):
+                    path.write_bytes(stream[number * size : (number + 1) * size])
+                    begun, before = time.perf_counter(), len(commits)
+                    ingest_file(ground, path)
+                    note("piece_ms", 1e3 * (time.perf_counter() - begun))
+                    note("piece_commits", float(len(commits) - before))
+                    note("piece_commits_ms", sum(commits[before:]))
+
+            take(0, 2)  # compiles
+            Joiner.join = timed  # type: ignore[method-assign]
+            try:
+                for state, begin in (("empty", 2), ("full", 2 + pieces)):
+                    taken.clear()
+                    take(begin, begin + pieces)
+                    figures[state] = {
+                        name: {
+                            "median": round(float(np.median(values)), 2),
+                            "p95": round(float(np.percentile(values, 95)), 2),
+                        }
+                        for name, values in sorted(taken.items())
+                    }
+                    if state == "empty":
+                        with ground.database.reading() as connection:
+                            vehicle = repository.find(connection, repository.VEHICLES, ccsds_id=SPACECRAFT)
+                        assert vehicle is not None
+                        fill(ground, reader.link, count, f"channel {vehicle['id']} 0 6 1113")
+            finally:
+                Joiner.join = join  # type: ignore[method-assign]
+    return figures
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--edges", type=int, default=100_000)
+    parser.add_argument("--pieces", type=int, default=40)
+    parser.add_argument("--postgresql", action="store_true", help="on a PostgreSQL server of its own")
+    given = parser.parse_args()
+    if given.postgresql:
+        with tempfile.TemporaryDirectory() as name, PostgresServer(Path(name)) as server:
+            figures = measure(server.url, given.edges, given.pieces)
+    else:
+        figures = measure(None, given.edges, given.pieces)
+    print(json.dumps(figures, indent=2))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,256 @@
+"""Mutation testing of the code that decides: `python -m benchmarks.mutation [--group NAME] [--sample N] [--seed S]`.
+
+mutmut changes one expression at a time in a copy of the tree and runs the tests that reach it. Each group names its
+modules and the tests that must protect them. A seeded sample of the mutants of every group estimates its score; the
+interval is Wilson's at 95 %. Survivors are printed as differences, so that each can be judged.
+
+Two kinds of mutant are left out because no test should detect them: the element type of an array that NumPy would
+choose anyway, and the wording of a message (a text with blanks).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from scipy.stats import binomtest
+
+ROOT = Path(__file__).resolve().parent.parent
+SOURCES = (
+    "tmtc",
+    "lunar",
+    "reports",
+    "ground_service",
+    "payload_emulator",
+    "linna",
+    "db",
+    "scenarios",
+    "benchmarks",
+)
+KILLED = frozenset({"killed", "timeout", "suspicious", "segfault"})
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Modules of one responsibility and the tests that protect them (paths from the root of the tree)."""
+
+    modules: tuple[str, ...]
+    tests: tuple[str, ...]
+
+
+_PROCESSING = "ground_service/processing"
+_FLIGHT = "payload_emulator/flight"
+_GROUND_TESTS = "tests/ground_service"
+_FLIGHT_TESTS = "tests/payload_emulator/flight"
+
+GROUPS = {
+    "accounting": Group(
+        (f"{_PROCESSING}/sequence.py", f"{_PROCESSING}/downlink_accounting.py", "tmtc/sequence.py"),
+        (
+            f"{_GROUND_TESTS}/processing/test_sequence.py",
+            f"{_GROUND_TESTS}/processing/test_downlink_accounting.py",
+            "tests/tmtc/test_sequence.py",
+        ),
+    ),
+    "verdicts": Group(
+        tuple(f"{_PROCESSING}/{name}.py" for name in ("verdict", "reference_error", "viewing")),
+        tuple(f"{_GROUND_TESTS}/processing/test_{name}.py" for name in ("verdict", "viewing")),
+    ),
+    "evaluation": Group(
+        tuple(
+            f"{_PROCESSING}/{name}.py"
+            for name in ("pass_evaluation", "alignment", "drift", "recall", "baseline", "fixes", "trajectory")
+        ),
+        (
+            f"{_GROUND_TESTS}/processing",
+            f"{_GROUND_TESTS}/services/test_evaluation.py",
+            f"{_GROUND_TESTS}/services/test_golden_reports.py",
+        ),
+    ),
+    "smoother": Group((f"{_PROCESSING}/smoother.py",), (f"{_GROUND_TESTS}/processing/test_smoother.py",)),
+    "gates": Group(
+        (f"{_PROCESSING}/regression_gates.py", f"{_PROCESSING}/regression_statistics.py"),
+        (
+            f"{_GROUND_TESTS}/processing/test_regression_gates.py",
+            f"{_GROUND_TESTS}/processing/test_regression_statistics.py",
+        ),
+    ),
+    "filter": Group(
+        tuple(
+            f"{_FLIGHT}/{name}.py" for name in ("navigation_filter", "anchored", "observer", "acquisition")
+        ),
+        (_FLIGHT_TESTS,),
+    ),
+    "authorisation": Group(
+        ("ground_service/services/users.py", "ground_service/api/security.py"),
+        (f"{_GROUND_TESTS}/services", f"{_GROUND_TESTS}/api/test_limits.py"),
+    ),
+    "commanding": Group(
+        (
+            "ground_service/services/commanding.py",
+            f"{_PROCESSING}/verification.py",
+            f"{_FLIGHT}/commanding.py",
+        ),
+        (f"{_GROUND_TESTS}/services/test_commanding.py", _FLIGHT_TESTS),
+    ),
+}
+
+_LEFT_OUT = (
+    (
+        re.compile(r"dtype=|astype\("),
+        re.compile(r",? ?dtype=[\w.]+|\.astype\([\w.]+\)"),
+        "element type that NumPy chooses anyway",
+    ),
+    (
+        re.compile(r"[\"'][^\"']* [^\"']*[\"']"),
+        re.compile(r"f?\"[^\"]* [^\"]*\"|f?'[^']* [^']*'"),
+        "wording of a message (a text with blanks)",
+    ),
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the groups asked for and print one line for each; status 1 if a score is below the limit."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.mutation", description=__doc__.splitlines()[0]
+    )
+    parser.add_argument("--group", action="append", choices=sorted(GROUPS), help="group to run; default: all")
+    parser.add_argument(
+        "--sample", type=int, default=60, help="mutants of a group; 0: every one (default 60)"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="seed of the sample (default 1)")
+    parser.add_argument("--limit", type=float, default=0.85, help="lowest score accepted (default 0.85)")
+    parser.add_argument("--children", type=int, default=1, help="mutants tested at once (default 1)")
+    parser.add_argument("--json", type=Path, help="file for the figures and the survivors")
+    options = parser.parse_args(arguments)
+    results = {}
+    for name in options.group or GROUPS:
+        results[name] = run_group(name, options.sample, options.seed, options.children)
+        print(line_of(name, results[name]), flush=True)
+        for survivor in results[name]["survivors"]:
+            print(f"  survived: {survivor['name']}\n{survivor['difference']}", file=sys.stderr)
+        if options.json is not None:
+            options.json.write_text(json.dumps(results, indent=1) + "\n")
+    return int(any(result["score"] < options.limit for result in results.values()))
+
+
+def run_group(name: str, sample: int, seed: int, children: int) -> dict[str, object]:
+    """Return the mutants, the killed ones, the score with its interval and the survivors of a group."""
+    group = GROUPS[name]
+    with tempfile.TemporaryDirectory(prefix="linna-mutation-") as folder:
+        tree = Path(folder)
+        _copy_tree(tree, group)
+        generated = _mutmut(tree, "run", "--max-children", str(children), "no such mutant")
+        known = sorted(_states(tree))
+        if not known:
+            raise SystemExit(f"mutation: group {name}: no mutants were made:\n{generated[-2000:]}")
+        random.Random(seed).shuffle(known)
+        chosen: list[str] = []
+        for mutant in known:
+            if len(chosen) == (sample or len(known)):
+                break
+            if reason_left_out(_difference(tree, mutant)) is None:
+                chosen.append(mutant)
+        _mutmut(tree, "run", "--max-children", str(children), *chosen)
+        found = _states(tree)
+        states = {mutant: found.get(mutant, "not checked") for mutant in chosen}
+        survivors = [
+            {"name": mutant, "state": state, "difference": _difference(tree, mutant)}
+            for mutant, state in sorted(states.items())
+            if state not in KILLED
+        ]
+    killed = len(chosen) - len(survivors)
+    low, high = binomtest(killed, len(chosen)).proportion_ci(method="wilson")
+    return {
+        "mutants": len(known),
+        "tested": len(chosen),
+        "killed": killed,
+        "score": killed / len(chosen),
+        "interval": [low, high],
+        "states": dict(Counter(states.values())),
+        "survivors": survivors,
+    }
+
+
+def line_of(name: str, result: dict[str, object]) -> str:
+    """Return the figures of a group on one line."""
+    low, high = result["interval"]  # type: ignore[misc]
+    return (
+        f"{name}: {result['killed']} of {result['tested']} mutants killed "
+        f"(score {result['score']:.2f}, 95 % interval {low:.2f} to {high:.2f}; {result['mutants']} mutants in all)"
+    )
+
+
+def _copy_tree(tree: Path, group: Group) -> None:
+    """Copy the tracked files and write mutmut's settings for a group."""
+    files = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True, text=True
+    ).stdout.split("\0")
+    for file in filter(None, files):
+        if (ROOT / file).is_file():
+            target = tree / file
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(ROOT / file, target)
+    settings = {
+        "source_paths": [source for source in SOURCES if (tree / source).is_dir()],
+        "only_mutate": list(group.modules),
+        "pytest_add_cli_args_test_selection": list(group.tests),
+        "pytest_add_cli_args": ["-p", "no:cacheprovider", "-p", "no:randomly"],
+        "also_copy": ["docs", "requirements", "docker-compose.yml", "Dockerfile", "Makefile", "README.md"],
+    }
+    lines = ["", "[tool.mutmut]", *(f"{key} = {json.dumps(value)}" for key, value in settings.items())]
+    with (tree / "pyproject.toml").open("a") as project:
+        project.write("\n".join(lines) + "\n")
+
+
+def _difference(tree: Path, mutant: str) -> str:
+    """Return the changed lines of a mutant, without the headers of the difference."""
+    shown = _mutmut(tree, "show", mutant)
+    return "\n".join(line for line in shown.splitlines() if re.match(r"[-+](?![-+]{2})", line))
+
+
+def reason_left_out(difference: str) -> str | None:
+    """Return why a mutant is not tested; None if it is."""
+    before = [line[1:] for line in difference.splitlines() if line.startswith("-")]
+    after = [line[1:] for line in difference.splitlines() if line.startswith("+")]
+    for present, part, reason in _LEFT_OUT:
+        if present.search("".join(before)) and _without(before, part) == _without(after, part):
+            return reason
+    return None
+
+
+def _without(lines: Iterable[str], part: re.Pattern[str]) -> str:
+    return re.sub(r"[\s,]", "", part.sub("", " ".join(lines)))
+
+
+def _states(tree: Path) -> dict[str, str]:
+    """Return the state of every mutant of the copy by its name."""
+    listing = _mutmut(tree, "results", "--all", "true")
+    return {name: state.strip() for name, state in re.findall(r"^\s*(\S+__mutmut_\d+): (.+)$", listing, re.M)}
+
+
+def _mutmut(tree: Path, *arguments: str) -> str:
+    """Return what mutmut prints, run in a copy of the tree."""
+    done = subprocess.run(
+        [sys.executable, "-m", "mutmut", *arguments],
+        cwd=tree,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": "", "COLUMNS": "200"},
+    )
+    return done.stdout + done.stderr
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

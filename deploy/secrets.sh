@@ -1,0 +1,22 @@
+#!/bin/sh
+# Makes the secrets of docker-compose.yml in a folder that only its owner can enter; those that are there are kept.
+# A variable gives a secret its value; the others are drawn at random.
+set -eu
+folder="${LINNA_SECRETS_DIR:-secrets}"
+umask 077
+mkdir -p "$folder"
+chmod 700 "$folder"
+secret() {
+  [ -s "$folder/$1" ] && return
+  value="$2"
+  [ -n "$value" ] || value="$(od -An -N24 -tx1 /dev/urandom | tr -d ' \n')"
+  printf '%s' "$value" > "$folder/$1"
+  # Containers read it as users of their own, through a mount of this file alone.
+  chmod 444 "$folder/$1"
+}
+secret database_superuser_password ''
+secret database_owner_password "${LINNA_DB_OWNER_PASSWORD:-}"
+secret database_password "${LINNA_DB_PASSWORD:-}"
+secret broker_password "${LINNA_REDIS_PASSWORD:-}"
+secret admin_token "${LINNA_ADMIN_TOKEN:-}"
+echo "secrets are in $folder; the token of the user admin is in $folder/admin_token"

@@ -1,0 +1,1 @@
+"""Mission descriptions: what the ground knows about a spacecraft, as immutable revisions of one document."""

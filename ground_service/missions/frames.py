@@ -1,0 +1,98 @@
+"""The lunar orientation and the gravity fields that a mission description declares.
+
+The data folder of this machine decides only whether a declared model can be used, never which one is used.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from ground_service.missions.model import Frames
+from lunar.datafolder import DataFolder
+from lunar.frames import IauOrientation, Orientation, load_orientation
+from lunar.gravity import GravityField, builtin_gravity, load_gravity
+
+REMEDY = "set LINNA_DATA to a folder that has it, or run linna data fetch"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DeclaredFrames:
+    """Models to evaluate with; None where one is not stated or not available, with the reason in `refused`.
+
+    Attributes
+    ----------
+    gravity
+        Field of the reference, cut to the declared degree.
+    onboard_gravity
+        Field of the on-board filter, cut to the declared degree.
+    refused
+        Reason by name of the model: "orientation", "gravity", "onboard_gravity".
+    """
+
+    orientation: Orientation | None = None
+    gravity: GravityField | None = None
+    onboard_gravity: GravityField | None = None
+    refused: Mapping[str, str] = field(default_factory=dict)
+
+
+def declared_frames(frames: Frames, data: DataFolder) -> DeclaredFrames:
+    """Return the models that a mission declares, as far as they are available."""
+    refused: dict[str, str] = {}
+    orientation = _orientation(frames.orientation, data)
+    if orientation is None:
+        refused["orientation"] = _reason("lunar orientation", frames.orientation, "frames.orientation")
+    gravity = _gravity(frames.gravity_field, frames.gravity_degree, data)
+    if gravity is None:
+        refused["gravity"] = _reason("gravity field", frames.gravity_field, "frames.gravity_field")
+    onboard = _gravity(frames.onboard_gravity_field, frames.onboard_gravity_degree, data)
+    if onboard is None:
+        refused["onboard_gravity"] = _reason(
+            "gravity field of the filter", frames.onboard_gravity_field, "frames.onboard_gravity_field"
+        )
+    return DeclaredFrames(orientation, gravity, onboard, refused)
+
+
+def _reason(what: str, declared: str | None, key: str) -> str:
+    if declared is None:
+        return f"the mission description does not state the {what} ({key})"
+    return f"the mission declares the {what} {declared}, which is not available on this machine ({REMEDY})"
+
+
+def _orientation(name: str | None, data: DataFolder) -> Orientation | None:
+    built_in = IauOrientation()
+    if name == built_in.name:
+        return built_in
+    if name is None or data.orientation_bpc is None:
+        return None
+    kernel = _kernel(data)
+    return kernel if kernel.name == name else None
+
+
+def _gravity(name: str | None, degree: int | None, data: DataFolder) -> GravityField | None:
+    if name is None:
+        return None
+    field_named = _named_field(name, data)
+    if field_named is None or degree is None or degree >= field_named.degree:
+        return field_named
+    return field_named.truncated(degree)
+
+
+@functools.lru_cache(maxsize=4)
+def _kernel(data: DataFolder) -> Orientation:
+    assert data.orientation_bpc is not None
+    return load_orientation(data.orientation_bpc, data.orientation_tf)
+
+
+@functools.lru_cache(maxsize=8)
+def _named_field(name: str, data: DataFolder) -> GravityField | None:
+    built_in = builtin_gravity()
+    if name == built_in.name:
+        return built_in
+    for path in (data.gravity, data.gravity_alternative):
+        if path is not None:
+            found = load_gravity(path)
+            if found.name == name:
+                return found
+    return None

@@ -1,0 +1,395 @@
+"""The mission description: `mission.toml` as a typed value, and its revisions.
+
+A value that the document does not state is None ("not stated"); nothing is filled in. Unknown keys are refused with the
+nearest known key. Angles are degrees, lengths metres or kilometres as the key says.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+import tomllib
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from ground_service.errors import InvalidInput
+from tmtc.effects import EFFECTS
+
+SCHEMA_VERSION = 1
+MISSION_LIMIT_OCTETS = 1 << 20
+NOT_STATED = "not stated"
+
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+Percent = Annotated[float, Field(ge=0.0, le=100.0)]
+Array = Field(strict=False)
+Estimator = Literal["paper", "spherical", "anchored"]
+
+
+def _known_subject(subject: str) -> str:
+    if subject not in EFFECTS:
+        near = difflib.get_close_matches(subject, EFFECTS, n=1)
+        raise ValueError(f"'{near[0]}'" if near else "a telecommand or function of the dictionary")
+    return subject
+
+
+CommandSubject = Annotated[str, AfterValidator(_known_subject)]
+
+
+class Section(BaseModel):
+    """Base of the sections: frozen, no keys but those declared, no numbers that are not finite.
+
+    No value is taken for one of another type, such as true for 1; TOML arrays are read as tuples.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+
+
+class Spacecraft(Section):
+    """The spacecraft."""
+
+    id: Annotated[int, Field(ge=0, le=1023)] | None = None
+    name: str | None = None
+
+
+class DictionarySection(Section):
+    """The packet dictionary of the telemetry."""
+
+    version: int | None = None
+    hash: str | None = None
+
+
+class Link(Section):
+    """How telemetry frames travel; `frame_checksum` is the frame error control field (FECF)."""
+
+    frame_length: int | None = None
+    coding: Literal["rs", "none"] | None = None
+    randomiser: Literal["legacy", "long", "none"] | None = None
+    interleave: int | None = None
+    rs_errors: int | None = None
+    dual_basis: bool | None = None
+    frame_checksum: bool | None = None
+    packet_checksum: Literal["crc16", "none"] | None = None
+    virtual_channels: Annotated[tuple[int, ...], Array] | None = None
+    record_formats: dict[str, str] | None = None
+
+
+class Time(Section):
+    """On-board time and its correlation with UTC."""
+
+    epoch: str | None = None
+    ticks_per_second: int | None = None
+    clock: str | None = None
+    correlation: Literal["automatic", "manual", "ideal"] | None = None
+
+
+class Frames(Section):
+    """Orientation of the Moon and gravity fields, by name.
+
+    The `onboard` values are those of the tables that the payload flies with; the smoother of the ground uses its field.
+    """
+
+    orientation: str | None = None
+    gravity_field: str | None = None
+    gravity_degree: Annotated[int, Field(ge=0)] | None = None
+    onboard_orientation: str | None = None
+    onboard_gravity_field: str | None = None
+    onboard_gravity_degree: Annotated[int, Field(ge=0)] | None = None
+
+
+class Camera(Section):
+    """Intrinsics, lens, mounting and exposure.
+
+    `pointing` "nadir": the body points to the centre of the Moon with north up. The camera is turned from there by
+    `yaw_deg` clockwise and then by `tilt_deg` from the boresight toward image up. `k1` to `p2` are Brown's
+    coefficients of the lens.
+    """
+
+    width_px: Annotated[int, Field(ge=1)] | None = None
+    height_px: Annotated[int, Field(ge=1)] | None = None
+    fov_deg: Annotated[float, Field(gt=0.0, lt=180.0)] | None = None
+    k1: float | None = None
+    k2: float | None = None
+    k3: float | None = None
+    p1: float | None = None
+    p2: float | None = None
+    pointing: Literal["nadir", "attitude"] | None = None
+    tilt_deg: float | None = None
+    yaw_deg: float | None = None
+    exposure_s: NotNegative | None = None
+    frame_interval_s: Positive | None = None
+
+
+class Catalogue(Section):
+    """The crater catalogue and its registration to the terrain."""
+
+    source: str | None = None
+    registration_north_m: float | None = None
+    registration_east_m: float | None = None
+
+
+class Reference(Section):
+    """Where the reference ephemeris comes from, and its 1-sigma error in radial, transverse and normal."""
+
+    source: str | None = None
+    sigma_rtn_m: Annotated[tuple[NotNegative, NotNegative, NotNegative], Array] | None = None
+    correlation_time_s: Positive | None = None
+
+
+World = Literal["unit-geometry", "procedural", "real-terrain", "other-renderer", "photographs"]
+Level = Literal["1", "2", "3s", "3", "4", "5"]
+
+LEVEL_WORDS: dict[Level, str] = {
+    "1": "unit geometry",
+    "2": "procedural Moon",
+    "3s": "real terrain seen in training",
+    "3": "real terrain never used in training",
+    "4": "another renderer",
+    "5": "real photographs",
+}
+
+
+class Evidence(Section):
+    """The world that was flown.
+
+    `unseen_share` is the share of frames over real terrain that was not used in training.
+    """
+
+    world: World | None = None
+    seed: int | None = None
+    unseen_share: Share | None = None
+
+    @property
+    def level(self) -> Level | None:
+        """Evidence level; None where it does not follow from what is stated."""
+        if self.world == "real-terrain":
+            if self.unseen_share is None:
+                return None
+            return "3" if self.unseen_share == 1.0 else "3s"
+        levels: dict[str | None, Level] = {
+            "unit-geometry": "1", "procedural": "2", "other-renderer": "4", "photographs": "5",
+        }  # fmt: skip
+        return levels.get(self.world)
+
+    @property
+    def text(self) -> str:
+        """Level with its words, such as "3s (real terrain seen in training; 25 % of frames unseen)"; "" if unknown."""
+        level = self.level
+        if level is None:
+            return ""
+        words = LEVEL_WORDS[level]
+        if level == "3s" and self.unseen_share:
+            words += f"; {100.0 * self.unseen_share:.0f} % of frames over unseen terrain"
+        return f"{level} ({words})"
+
+
+def weakest_evidence(worlds: Sequence[Evidence]) -> str:
+    """Return the text of the lowest level among several; "" if one of them does not state its level, or without any."""
+    order = list(LEVEL_WORDS)
+    levels = [one.level for one in worlds]
+    if not levels or None in levels:
+        return ""
+    return min(worlds, key=lambda one: order.index(one.level or "1")).text
+
+
+class Requirements(Section):
+    """Limits of the verdict; a requirement without a limit is shown without judgement.
+
+    Attributes
+    ----------
+    estimator
+        The estimator whose accuracy is judged.
+    better_than
+        Baselines whose median error the estimator has to beat, by name.
+    consistency_inside_percent
+        Least share of NEES and of NIS values inside their two-sided 95 % bounds.
+    """
+
+    estimator: Estimator | None = None
+    median_error_m: Positive | None = None
+    p95_error_m: Positive | None = None
+    better_than: Annotated[tuple[str, ...], Array] | None = None
+    consistency_inside_percent: Percent | None = None
+    packets_percent: Percent | None = None
+    frames_percent: Percent | None = None
+    images_percent: Percent | None = None
+    recall: Share | None = None
+    precision: Share | None = None
+    anchor_reads: NotNegative | None = None
+    resets: NotNegative | None = None
+    cpu_percent: Percent | None = None
+    memory_mib: Positive | None = None
+    storage_percent: Percent | None = None
+    temperature_max_c: float | None = None
+    temperature_min_c: float | None = None
+
+
+class Automation(Section):
+    """Rules of automatic operation."""
+
+    accept: Literal["all", "declared", "none"] | None = None
+    keep_days: Positive | None = None
+    evaluate: bool | None = None
+
+
+class Approval(Section):
+    """What people have to approve.
+
+    `second_person_for` and `one_person_for` change the rule of the packet dictionary. They list telecommands, or
+    functions such as ``perform_function/set_mode``, that two persons or one person release.
+    """
+
+    windows: Literal["manual", "automatic"] | None = None
+    second_person_for: Annotated[tuple[CommandSubject, ...], Array] | None = None
+    one_person_for: Annotated[tuple[CommandSubject, ...], Array] | None = None
+
+    @model_validator(mode="after")
+    def _not_both(self) -> Approval:
+        both = set(self.second_person_for or ()) & set(self.one_person_for or ())
+        if both:
+            raise ValueError(f"each telecommand in one list, found {min(both)} in both")
+        return self
+
+
+class Mission(Section):
+    """The mission description of one spacecraft."""
+
+    schema_version: Literal[1] = SCHEMA_VERSION  # type: ignore[assignment]
+    name: Annotated[str, Field(min_length=1, max_length=200)]
+    spacecraft: Spacecraft = Spacecraft()
+    dictionary: DictionarySection = DictionarySection()
+    link: Link = Link()
+    time: Time = Time()
+    frames: Frames = Frames()
+    camera: Camera = Camera()
+    catalogue: Catalogue = Catalogue()
+    reference: Reference = Reference()
+    evidence: Evidence = Evidence()
+    requirements: Requirements = Requirements()
+    automation: Automation = Automation()
+    approval: Approval = Approval()
+
+    @property
+    def revision(self) -> str:
+        """SHA-256 of the stated values: the same content has the same revision, whatever its layout."""
+        stated = self.model_dump(mode="json", exclude_none=True)
+        text = json.dumps({k: v for k, v in stated.items() if v != {}}, sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """Keys that are not stated, as ``section.key``, in the order of the document."""
+        return tuple(_not_stated(self))
+
+
+class MissionRevision(BaseModel):
+    """An entered revision of a mission description."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    id: int = Field(examples=[1])
+    mission: str = Field(examples=["selenita"])
+    revision: str = Field(description="SHA-256 of the stated values")
+    spacecraft_id: int | None = Field(examples=[76])
+    unknown: tuple[str, ...] = Field(description="Keys that the document does not state")
+    entered: str = Field(examples=["2029-08-07T00:00:00.000000000Z"])
+    entered_by: str
+
+
+class MissionDetail(MissionRevision):
+    """An entered revision with its document."""
+
+    document: Mission
+    text: str = Field(description="mission.toml as it was entered")
+
+
+def parse_mission(text: str, source: str = "mission.toml") -> Mission:
+    """Return the mission description written in `text`.
+
+    Raises
+    ------
+    InvalidInput
+        The text is not TOML, has an unknown key or a value that is not allowed; the first fault is named.
+    """
+    result = _read(text, source)
+    if isinstance(result, Mission):
+        return result
+    raise result[0]
+
+
+def mission_faults(text: str, source: str = "mission.toml") -> list[str]:
+    """Return one line for each fault of a mission description; none for a good one."""
+    result = _read(text, source)
+    return [] if isinstance(result, Mission) else [str(fault) for fault in result]
+
+
+def _read(text: str, source: str) -> Mission | list[InvalidInput]:
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        return [InvalidInput(source, "", "TOML", str(error))]
+    unknown = list(_unknown_keys(Mission, table, source, ""))
+    if unknown:
+        return unknown
+    try:
+        return Mission.model_validate(table)
+    except ValidationError as error:
+        return [_fault(source, one) for one in error.errors()]
+
+
+def _unknown_keys(kind: type[BaseModel], table: Any, source: str, path: str) -> Iterator[InvalidInput]:
+    if not isinstance(table, dict):
+        return
+    for key, value in table.items():
+        place = f"{path}.{key}" if path else key
+        field = kind.model_fields.get(key)
+        if field is None:
+            known = list(kind.model_fields)
+            near = difflib.get_close_matches(key, known, n=1)
+            yield InvalidInput(
+                source, place, f"'{near[0]}'" if near else ", ".join(known), f"unknown key '{key}'"
+            )
+        elif isinstance(field.annotation, type) and issubclass(field.annotation, Section):
+            yield from _unknown_keys(field.annotation, value, source, place)
+
+
+def _fault(source: str, error: Any) -> InvalidInput:
+    place = ".".join(str(part) for part in error["loc"])
+    message = str(error["msg"])
+    expected = (message[:1].lower() + message[1:]).removeprefix("value error, ")
+    return InvalidInput(source, place, expected.removeprefix("input should be "), repr(error["input"])[:80])
+
+
+def _not_stated(section: BaseModel, path: str = "") -> Iterator[str]:
+    for name in type(section).model_fields:
+        value = getattr(section, name)
+        place = f"{path}{name}"
+        if isinstance(value, Section):
+            yield from _not_stated(value, f"{place}.")
+        elif value is None:
+            yield place
+
+
+def format_mission(mission: Mission) -> str:
+    """Return TOML text that parses to an equal mission; values that are not stated are left out."""
+    stated = mission.model_dump(mode="json", exclude_none=True)
+    lines = [f"{key} = {_toml(value)}" for key, value in stated.items() if not isinstance(value, dict)]
+    for name, section in stated.items():
+        if isinstance(section, dict) and section:
+            lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in section.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, list):
+        return "[" + ", ".join(_toml(item) for item in value) + "]"
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{json.dumps(k)} = {_toml(v)}" for k, v in value.items()) + " }"
+    return json.dumps(value)
+
+
+assert set(LEVEL_WORDS) == set(get_args(Level))

@@ -1,0 +1,101 @@
+"""Use cases of mission descriptions: enter, list, show, and the description that a pass refers to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sqlalchemy import Connection
+
+from ground_service.clock import utc_now_ns
+from ground_service.errors import Forbidden, InvalidInput
+from ground_service.missions import store
+from ground_service.missions.declared import mission_of_manifest
+from ground_service.missions.model import (
+    MISSION_LIMIT_OCTETS,
+    Approval,
+    Mission,
+    MissionDetail,
+    MissionRevision,
+    format_mission,
+    parse_mission,
+)
+from ground_service.services.ground import Ground
+from ground_service.services.users import audit
+
+
+def read_mission(octets: bytes, source: str = "mission.toml") -> tuple[Mission, str]:
+    """Return a mission description and its text from the octets of a file.
+
+    Raises
+    ------
+    InvalidInput
+        The octets are no mission description.
+    """
+    if len(octets) > MISSION_LIMIT_OCTETS:
+        raise InvalidInput(source, "", f"at most {MISSION_LIMIT_OCTETS} octets", str(len(octets)))
+    try:
+        text = octets.decode("utf-8")
+    except UnicodeDecodeError as error:
+        found = f"octet {error.object[error.start]:#04x} at {error.start}"
+        raise InvalidInput(source, "", "UTF-8 text", found) from None
+    return parse_mission(text, source), text
+
+
+def add_mission(
+    ground: Ground,
+    octets: bytes,
+    *,
+    source: str = "mission.toml",
+    actor: str = "local",
+    may_change_approval: bool = True,
+) -> MissionDetail:
+    """Enter a mission description as a revision; the same content again gives the same revision.
+
+    Raises
+    ------
+    Forbidden
+        It changes for which telecommands a second person is needed, and the caller may not do that.
+    """
+    mission, text = read_mission(octets, source)
+    with ground.database.writing() as connection:
+        if not may_change_approval and mission.spacecraft.id is not None:
+            in_force = store.approval_in_force(connection, mission.spacecraft.id)
+            if _persons(mission.approval) != _persons(in_force):
+                raise Forbidden(
+                    f"{source}: changes which telecommands need a second person; expected an administrator"
+                )
+        return store.detail(connection, enter(connection, mission, text, actor=actor))
+
+
+def _persons(approval: Approval) -> tuple[frozenset[str], frozenset[str]]:
+    return frozenset(approval.second_person_for or ()), frozenset(approval.one_person_for or ())
+
+
+def enter(connection: Connection, mission: Mission, text: str | None = None, *, actor: str) -> int:
+    """Enter a revision in the caller's transaction; its id."""
+    key, new = store.add_revision(
+        connection, mission, text or format_mission(mission), actor=actor, now_utc_ns=utc_now_ns()
+    )
+    if new:
+        audit(connection, actor, "add mission", mission.name, {"id": key, "revision": mission.revision})
+    return key
+
+
+def list_missions(ground: Ground, *, limit: int = 100, offset: int = 0) -> tuple[list[MissionRevision], int]:
+    """Return a page of the revisions, the newest first, and the number of all."""
+    with ground.database.reading() as connection:
+        return store.list_revisions(connection, limit=limit, offset=offset)
+
+
+def get_mission(ground: Ground, revision: str) -> MissionDetail:
+    """Return the revision whose hash begins with `revision`."""
+    with ground.database.reading() as connection:
+        return store.find_revision(connection, revision)
+
+
+def mission_of_pass(connection: Connection, record: Mapping[str, Any]) -> Mission:
+    """Return the description that a pass refers to, else what its manifest declares."""
+    if record["mission_id"] is not None:
+        return store.get_mission(connection, record["mission_id"])
+    return mission_of_manifest(record["manifest"])

@@ -1,0 +1,129 @@
+"""All SQL of mission descriptions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import Connection, select
+from sqlalchemy.exc import IntegrityError
+
+from ground_service.errors import NotFound
+from ground_service.missions.model import Approval, Mission, MissionDetail, MissionRevision, parse_mission
+from ground_service.store import repository
+from lunar.timescales import format_utc
+
+MISSIONS = repository.MISSIONS
+ARCHIVE_ACTOR = "archive"
+"""Who enters the mission descriptions that come with pass archives."""
+
+REVISION_PREFIX = 8
+"""A revision may be named by so many digits or more of its hash."""
+
+
+def add_revision(
+    connection: Connection, mission: Mission, text: str, *, actor: str, now_utc_ns: int
+) -> tuple[int, bool]:
+    """Enter a revision; its id, and whether it is new. The same content again gives the same entry."""
+    known = repository.find(connection, MISSIONS, revision=mission.revision)
+    if known is not None:
+        return int(known["id"]), False
+    try:
+        with connection.begin_nested():
+            return int(
+                repository.add(
+                    connection,
+                    MISSIONS,
+                    revision=mission.revision,
+                    name=mission.name,
+                    ccsds_id=mission.spacecraft.id,
+                    text=text,
+                    entered_by=actor,
+                    created_utc_ns=now_utc_ns,
+                )
+            ), True
+    except IntegrityError:  # another process entered the same content at the same time
+        known = repository.find(connection, MISSIONS, revision=mission.revision)
+        if known is None:
+            raise
+        return int(known["id"]), False
+
+
+def get_mission(connection: Connection, mission_id: int) -> Mission:
+    """Return the document of an entered revision."""
+    return _document(repository.get(connection, MISSIONS, mission_id, "mission revision"))
+
+
+def find_revision(connection: Connection, revision: str) -> MissionDetail:
+    """Return the revision whose hash begins with `revision`.
+
+    Raises
+    ------
+    NotFound
+        None begins so, or several do.
+    """
+    wanted = revision.strip().lower()
+    rows: list[Any] = []
+    if len(wanted) >= REVISION_PREFIX and all(c in "0123456789abcdef" for c in wanted):
+        query = select(MISSIONS).where(MISSIONS.c.revision.startswith(wanted, autoescape=True)).limit(2)
+        rows = list(connection.execute(query).mappings())
+    if len(rows) != 1:
+        raise NotFound("mission revision", revision[:80])
+    return _detail(dict(rows[0]))
+
+
+def detail(connection: Connection, mission_id: int) -> MissionDetail:
+    """Return an entered revision with its document."""
+    return _detail(repository.get(connection, MISSIONS, mission_id, "mission revision"))
+
+
+def list_revisions(connection: Connection, *, limit: int, offset: int) -> tuple[list[MissionRevision], int]:
+    """Return a page of the revisions, the newest first, and the number of all."""
+    page = repository.page(connection, MISSIONS, limit=limit, offset=offset)
+    return [_revision(row, _document(row)) for row in page.rows], page.total
+
+
+def newest_of_spacecraft(connection: Connection, ccsds_id: int) -> int | None:
+    """Return the id of the revision of a spacecraft that was entered last; None without any."""
+    found = connection.execute(
+        select(MISSIONS.c.id).where(MISSIONS.c.ccsds_id == ccsds_id).order_by(MISSIONS.c.id.desc()).limit(1)
+    ).scalar()
+    return None if found is None else int(found)
+
+
+def approval_in_force(connection: Connection, ccsds_id: int) -> Approval:
+    """Return the approval rules of the newest revision of a spacecraft that a person entered.
+
+    Descriptions that come with archives change nothing of what people have to approve.
+    """
+    found = connection.execute(
+        select(MISSIONS.c.id)
+        .where(MISSIONS.c.ccsds_id == ccsds_id, MISSIONS.c.entered_by != ARCHIVE_ACTOR)
+        .order_by(MISSIONS.c.id.desc())
+        .limit(1)
+    ).scalar()
+    return Approval() if found is None else get_mission(connection, int(found)).approval
+
+
+def _document(row: repository.Row) -> Mission:
+    return parse_mission(row["text"], f"mission revision {row['revision'][:REVISION_PREFIX]}")
+
+
+def _revision(row: repository.Row, document: Mission) -> MissionRevision:
+    return MissionRevision(**_columns(row, document))
+
+
+def _detail(row: repository.Row) -> MissionDetail:
+    document = _document(row)
+    return MissionDetail(**_columns(row, document), document=document, text=row["text"])
+
+
+def _columns(row: repository.Row, document: Mission) -> dict[str, Any]:
+    return {
+        "id": row["id"],
+        "mission": row["name"],
+        "revision": row["revision"],
+        "spacecraft_id": row["ccsds_id"],
+        "unknown": document.unknown,
+        "entered": format_utc(int(row["created_utc_ns"]), 9),
+        "entered_by": row["entered_by"],
+    }

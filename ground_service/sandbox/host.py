@@ -1,0 +1,240 @@
+"""The service's side of a confined run: what a build may see, the launcher, and a check that the sandbox holds."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import stat
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+GRACE_S = 180.0
+"""Time beyond the time limit of a run in which its launcher must have ended."""
+
+PACKAGES = ("lunar", "tmtc", "reports", "payload_emulator", "ground_service", "linna")
+"""Packages that the flight code of this project needs; scenarios, migrations and tests stay outside."""
+
+_SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib64", "/lib32")
+_SYSTEM_FILES = ("/etc/ld.so.cache", "/etc/alternatives", "/sys/devices/system/cpu")
+_LAUNCH = "import sys; sys.path.insert(0, sys.argv.pop(1)); from ground_service.sandbox.launcher import main; main()"
+REMEDY = (
+    "let the kernel grant user namespaces to this process, or run builds in the runner: "
+    "set LINNA_RUNNER_EXCHANGE and start `linna runner` (docs/build-contract.md)"
+)
+
+
+class SandboxRefused(Exception):
+    """A run that did not happen, because it could not be confined."""
+
+    def __init__(self, reason: str, remedy: str = REMEDY) -> None:
+        super().__init__(f"{reason}; remedy: {remedy}" if remedy else reason)
+        self.reason = reason
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A part of the file system of a run: `bind` a path read-only, a `link`, or a file of some `text`."""
+
+    kind: Literal["bind", "link", "text"]
+    source: str
+    target: str
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A confined run, as the launcher reads it.
+
+    Attributes
+    ----------
+    mode
+        `namespaces`, or `user` in a machine that is nothing but a runner.
+    limits
+        As in the build file; see `ground_service.services.builds.Limits`.
+    outputs
+        Names in the output folder that are taken out.
+    deliver, printed
+        Folder for the outputs, and file for the end of what the program prints, both of the caller.
+    """
+
+    mode: Literal["namespaces", "user"]
+    command: tuple[str, ...]
+    cwd: str
+    environment: Mapping[str, str]
+    limits: Mapping[str, int]
+    outputs: tuple[str, ...]
+    deliver: str
+    printed: str
+    view: tuple[Part, ...] = field(default=())
+
+
+@dataclass(frozen=True, slots=True)
+class Protection:
+    """What confines builds here.
+
+    Attributes
+    ----------
+    isolation
+        The parts of the sandbox in force; "" if it is refused.
+    refusal
+        Why a run would be refused; "" if it would not. The remedy is `REMEDY`.
+    checks
+        Result of each check that a probe made inside the sandbox, by name.
+    """
+
+    isolation: str
+    refusal: str
+    checks: Mapping[str, bool]
+
+
+def execute(run: Run) -> dict[str, Any]:
+    """Run a program confined; what became of it.
+
+    Raises
+    ------
+    SandboxRefused
+        It was not run, because a protection could not be put in force.
+    """
+    reading, writing = os.pipe()
+    try:
+        with subprocess.Popen(
+            [sys.executable, "-I", "-S", "-c", _LAUNCH, str(package_root()), str(writing)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            env={},
+            pass_fds=(writing,),
+            start_new_session=True,
+        ) as launcher:
+            os.close(writing)
+            writing = -1
+            try:
+                job = json.dumps({**asdict(run), "environment": dict(run.environment)}).encode()
+                _, failure = launcher.communicate(job, timeout=run.limits["wall_s"] + GRACE_S)
+            except BaseException:
+                launcher.kill()
+                raise
+        with os.fdopen(reading) as stream:
+            reading = -1
+            told = stream.read()
+    finally:
+        for descriptor in (reading, writing):
+            if descriptor >= 0:
+                os.close(descriptor)
+    if not told:
+        lines = failure.decode(errors="replace").strip().splitlines() or ["no report"]
+        raise SandboxRefused(f"the launcher failed: {lines[-1][:200]}")
+    report: dict[str, Any] = json.loads(told)
+    if "refused" in report:
+        raise SandboxRefused(str(report["refused"]))
+    if report.get("unconfined"):
+        raise SandboxRefused(tail(Path(run.printed)).strip().splitlines()[-1][:200])
+    return report
+
+
+def program_view() -> tuple[Part, ...]:
+    """Everything a program needs of this machine: system libraries, Python, the packages of this project."""
+    parts: list[Part] = []
+    for name in _SYSTEM:
+        path = Path(name)
+        if path.is_symlink():
+            parts.append(Part("link", os.readlink(path), name))
+        elif path.is_dir():
+            parts.append(Part("bind", os.path.realpath(path), name))
+    parts += [Part("bind", os.path.realpath(name), name) for name in _SYSTEM_FILES if Path(name).exists()]
+    parts.append(Part("text", "build:x:{uid}:{uid}::/home/build:/bin/sh\n", "/etc/passwd"))
+    parts.append(Part("text", "build:x:{uid}:\n", "/etc/group"))
+    for folder in [*_python_folders(), *(package_root() / name for name in PACKAGES)]:
+        for target in dict.fromkeys((str(folder), os.path.realpath(folder))):
+            if os.path.isdir(target) and not _covered(target, parts):
+                parts.append(Part("bind", os.path.realpath(target), target))
+    return tuple(parts)
+
+
+def check_private(folders: Sequence[Path]) -> None:
+    """Refuse a layout in which a folder of the service lies inside of what a build can read.
+
+    Raises
+    ------
+    SandboxRefused
+        If one does.
+    """
+    parts = [*program_view()]
+    for folder in folders:
+        if _covered(os.path.realpath(folder), parts):
+            raise SandboxRefused(
+                f"{folder}: expected outside of the folders of Python and of the system, which builds can read"
+            )
+
+
+def package_root() -> Path:
+    """Folder that holds the packages of this checkout or installation."""
+    return Path(__file__).resolve().parents[2]
+
+
+def tail(path: Path, octets: int = 2000) -> str:
+    """The end of a text file; "" if there is none."""
+    try:
+        return path.read_text(errors="replace")[-octets:]
+    except OSError:
+        return ""
+
+
+def make_readable(folder: Path) -> None:
+    """Let every user read a folder of copies; only who can reach the folder itself gets there."""
+    for where, _, names in os.walk(folder):
+        Path(where).chmod(0o755)
+        for name in names:
+            path = Path(where) / name
+            path.chmod(0o755 if path.stat().st_mode & stat.S_IXUSR else 0o644)
+
+
+@functools.cache
+def protection() -> Protection:
+    """What confines builds here, by a probe that tries from inside."""
+    from ground_service.sandbox import probe
+
+    with tempfile.TemporaryDirectory(prefix="sandbox-") as folder:
+        printed = Path(folder) / "printed.txt"
+        limits = {
+            "wall_s": 30, "cpu_s": 20, "memory_mib": 512, "file_mib": 1, "folder_mib": 8, "open_files": 64,
+            "processes": 16,
+        }  # fmt: skip
+        run = Run(
+            "namespaces",
+            (sys.executable, "-I", "-S", probe.__file__, str(os.getpid())),
+            "/out",
+            {},
+            limits,
+            ("result.json",),
+            folder,
+            str(printed),
+            program_view(),
+        )
+        try:
+            report = execute(run)
+            checks = json.loads((Path(folder) / "result.json").read_text())
+        except SandboxRefused as error:
+            return Protection("", error.reason, {})
+        except (OSError, ValueError):
+            return Protection("", f"the probe failed: {tail(printed)[-200:]}", {})
+    failed = [name for name, held in checks.items() if held is not True]
+    if failed:
+        return Protection("", f"not in force: {', '.join(failed)}", checks)
+    return Protection(str(report["isolation"]), "", checks)
+
+
+def _python_folders() -> list[Path]:
+    names = ("stdlib", "platstdlib", "purelib", "platlib")
+    found = [sys.base_prefix, sys.prefix, *(sysconfig.get_path(name) for name in names)]
+    return [Path(name) for name in dict.fromkeys(found) if Path(name) != Path("/")]
+
+
+def _covered(path: str, parts: Sequence[Part]) -> bool:
+    return any(part.kind == "bind" and (path + "/").startswith(part.target + "/") for part in parts)

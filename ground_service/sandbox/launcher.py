@@ -1,0 +1,685 @@
+"""The process that sets a confined run up, watches it, and takes its outputs out.
+
+It is started by `ground_service.sandbox.host` with an empty environment and the standard library only, reads one JSON
+object from standard input (`host.Run`) and writes one to the descriptor named by its first argument. Two ways:
+
+`namespaces`: processes A, B, C and D. A (this one, outside) watches time, memory and processor time. B enters new
+namespaces, whose users A maps. C, forked by B, is process 1 of the new process namespace: it builds a file system
+of read-only parts of this machine and one limited tmpfs, and starts D, the program. When D has ended, C kills
+everything else inside and sends the output files through a pipe. When C ends, the kernel removes the rest.
+
+`user`: for a machine that is nothing but a runner (a container without network, secrets and other programs). A gives D
+a user of its own for this run. What that user left running is killed, and what it left in files is removed.
+
+In both, D has no capability, cannot gain one, and runs under a system call filter and resource limits.
+"""
+
+import contextlib
+import json
+import os
+import resource
+import select
+import signal
+import stat
+import struct
+import sys
+import time
+
+from ground_service.sandbox import kernel
+
+POLL_S = 0.02
+SAMPLE_S = 0.1
+SETUP_S = 30.0
+COLLECT_S = 60.0
+PRINTED_OCTETS = 65_536
+"""What is kept of the end of what a program prints."""
+
+INODES = 65_536
+BASE = "/tmp"
+DEVICES = ("null", "zero", "full", "random", "urandom")
+WRITABLE = ("/out", "/tmp", "/home/build", "/dev/shm")
+_CHUNK = 1 << 16
+
+
+class Refused(Exception):
+    """A protection that cannot be put in force."""
+
+
+def main() -> None:
+    kernel.die_with_parent()
+    kernel.hide_memory()
+    kernel.adopt_orphans()
+    run = json.load(sys.stdin)
+    os.umask(0o077)
+    try:
+        report = {"namespaces": run_in_namespaces, "user": run_as_user}[run["mode"]](run)
+    except Refused as error:
+        report = {"refused": str(error)}
+    with os.fdopen(int(sys.argv[1]), "w") as stream:
+        json.dump(report, stream)
+
+
+# Mode "namespaces"
+
+
+def run_in_namespaces(run):
+    mapping, uid = user_map()
+    entered, mapped, control, reports, printed = (os.pipe() for _ in range(5))
+    b = os.fork()
+    if b == 0:
+        try:
+            close(entered[0], mapped[1], control[1], reports[0], printed[0])
+            enter_namespaces(run, uid, entered[1], mapped[0], control[0], reports[1], printed[1])
+        finally:
+            os._exit(1)
+    close(entered[1], mapped[0], control[0], reports[1], printed[1])
+    watch = Watch(run, b, reports[0], printed[0], lambda: os.write(control[1], b"x"), own=1)
+    try:
+        failure = read_some(entered[0], SETUP_S)
+        if failure == b"":
+            raise Refused("the process that enters the namespaces did not start")
+        if failure != b"ok":
+            raise Refused(failure.decode(errors="replace"))
+        for name, lines in mapping:
+            if lines is not None:
+                try:
+                    with open(f"/proc/{b}/{name}", "w") as stream:
+                        stream.write(lines)
+                except OSError as error:
+                    raise Refused(f"user namespace: {name}: {error.strerror}") from None
+        os.write(mapped[1], b"x")
+        report = watch.until_done()
+        wait_for(b, SETUP_S)
+        return report
+    finally:
+        # Where B is gone, so are C, and with it everything in the process namespace.
+        with contextlib.suppress(ProcessLookupError, ChildProcessError):
+            os.kill(b, signal.SIGKILL)
+        reap()
+        close(entered[0], mapped[1], control[1], reports[0], printed[0])
+
+
+def user_map():
+    """What to write into the maps of the user namespace, and the user of the build inside.
+
+    A service that runs as root gives the build a user that exists nowhere else, chosen by process number: limits by
+    user bind it, and files of others are closed to it. Any other service can map its own user only; limits by user
+    are then counted in the new namespace.
+    """
+    me, group = os.geteuid(), os.getegid()
+    with open("/proc/self/uid_map") as stream:
+        ranges = [[int(word) for word in line.split()] for line in stream]
+    if me == 0:
+        uid = build_uid()
+        if any(first <= uid < first + length for first, _, length in ranges):
+            lines = f"0 0 1\n{uid} {uid} 1\n"
+            return (("uid_map", lines), ("setgroups", None), ("gid_map", lines)), uid
+        if any(first == 0 and outside == 0 for first, outside, _ in ranges):
+            raise Refused(f"user namespace: expected user {uid} to be mapped, found root alone")
+    return (
+        ("uid_map", f"{me} {me} 1\n"),
+        ("setgroups", "deny"),
+        ("gid_map", f"{group} {group} 1\n"),
+    ), me
+
+
+def build_uid():
+    """A user for this run: above the ranges of systemd and of user namespaces."""
+    return 1_900_000_000 + os.getpid()
+
+
+def enter_namespaces(run, uid, entered, mapped, control, reports, printed):
+    """Process B."""
+    kernel.die_with_parent()
+    try:
+        # A writes the maps, which belong to root while the memory is hidden.
+        kernel.hide_memory(False)
+        kernel.unshare(kernel.NAMESPACES)
+        kernel.die_with_parent()  # again: a change of credentials can cancel it
+    except OSError as error:
+        os.write(entered, f"namespaces: {error.strerror}".encode())
+        return
+    os.write(entered, b"ok")
+    if not read_some(mapped, SETUP_S):
+        return
+    kernel.hide_memory()
+    c = os.fork()
+    if c == 0:
+        try:
+            close(entered, mapped)
+            be_init(run, uid, control, reports, printed)
+        finally:
+            os._exit(1)
+    close(entered, mapped, control, reports, printed)
+    os._exit(os.waitstatus_to_exitcode(os.waitpid(c, 0)[1]) & 0xFF)
+
+
+def be_init(run, uid, control, reports, printed):
+    """Process C: process 1 of the namespace."""
+    try:
+        kernel.die_with_parent()
+        if os.getpid() != 1:
+            raise Refused("process namespace: this is not its first process")
+        isolation = build_root(run, uid)
+        check_network()
+        os.chdir("/")
+    except (OSError, Refused) as error:
+        send(reports, {"refused": str(getattr(error, "strerror", None) or error)})
+        return
+    d = os.fork()
+    if d == 0:
+        close(control, reports)
+        become_build(run, uid, uid if os.getuid() == 0 else os.getgid(), printed, os.getuid() == 0)
+    close(printed)
+    send(reports, {"started": True, "isolation": isolation})
+    status = None
+    while status is None:
+        stopped = bool(select.select([control], [], [], POLL_S)[0])
+        status = reaped(d)
+        if stopped:
+            break
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(-1, signal.SIGKILL)
+    while True:
+        try:
+            process, found = os.waitpid(-1, 0)
+        except ChildProcessError:
+            break
+        if process == d:
+            status = found
+    room = os.statvfs("/out")
+    full = room.f_bavail == 0 or room.f_favail == 0
+    send(reports, {"ended": status, "full": full, **usage()})
+    send_outputs(reports, run)
+
+
+def build_root(run, uid):
+    """Make a root of nothing but what the run needs; the kernel forgets every other path."""
+    limits = run["limits"]
+    kernel.mount("", "/", "", kernel.MS_REC | kernel.MS_PRIVATE)
+    kernel.mount("tmpfs", BASE, "tmpfs", kernel.MS_NOSUID | kernel.MS_NODEV, "mode=755,size=1m")
+    os.mkdir(f"{BASE}/old")
+    os.mkdir(f"{BASE}/new")
+    kernel.pivot_root(BASE, f"{BASE}/old")
+    os.chdir("/")
+    os.umask(0o022)
+    options = f"mode=755,size={limits['folder_mib']}m,nr_inodes={INODES}"
+    kernel.mount("tmpfs", "/new", "tmpfs", kernel.MS_NOSUID | kernel.MS_NODEV, options)
+    for entry in run["view"]:
+        target = "/new" + entry["target"]
+        os.makedirs(os.path.dirname(target), exist_ok=True)
+        if entry["kind"] == "link":
+            os.symlink(entry["source"], target)
+        elif entry["kind"] == "text":
+            with open(target, "w") as stream:
+                stream.write(entry["source"].replace("{uid}", str(uid)))
+        else:
+            bind("/old" + entry["source"], target)
+            kernel.restrict_mount(
+                target, kernel.MOUNT_ATTR_RDONLY | kernel.MOUNT_ATTR_NOSUID | kernel.MOUNT_ATTR_NODEV
+            )
+    for path in WRITABLE:
+        os.makedirs("/new" + path, exist_ok=True)
+        # A mount of its own, so that it stays writable when the root is not; the limit is one for all of them.
+        kernel.mount("/new" + path, "/new" + path, "", kernel.MS_BIND)
+        if os.getuid() == 0:
+            os.chown("/new" + path, uid, uid)
+        os.chmod("/new" + path, 0o700)
+    for name in DEVICES:
+        bind(f"/old/dev/{name}", f"/new/dev/{name}")
+    os.makedirs("/new/proc")
+    has_proc = True
+    try:
+        kernel.mount("proc", "/new/proc", "proc", kernel.MS_NOSUID | kernel.MS_NODEV | kernel.MS_NOEXEC)
+        kernel.restrict_mount("/new/proc", kernel.MOUNT_ATTR_RDONLY)
+    except OSError:
+        has_proc = False  # An engine hides parts of its own: the folder stays empty.
+    kernel.unmount("/old")
+    os.chdir("/new")
+    kernel.pivot_root(".", ".")
+    kernel.unmount(".")
+    os.chdir("/")
+    root_only = kernel.MOUNT_ATTR_RDONLY | kernel.MOUNT_ATTR_NOSUID | kernel.MOUNT_ATTR_NODEV
+    kernel.restrict_mount("/", root_only, below=False)
+    whose = f"user {uid}" if os.getuid() == 0 else f"user {uid} in a user namespace"
+    parts = ["namespaces", "private root", whose, "system call filter"]
+    return ", ".join(parts if has_proc else [*parts, "no /proc"])
+
+
+def bind(source, target):
+    if os.path.isdir(source):
+        os.makedirs(target, exist_ok=True)
+    else:
+        os.makedirs(os.path.dirname(target), exist_ok=True)
+        close(os.open(target, os.O_CREAT | os.O_WRONLY, 0o644))
+    kernel.mount(source, target, "", kernel.MS_BIND | kernel.MS_REC)
+
+
+def check_network():
+    """Refuse to go on with any network interface besides an own loopback that is down."""
+    try:
+        with open("/proc/net/route") as stream:
+            routes = stream.read().splitlines()[1:]
+    except OSError:
+        return  # There is no /proc; the namespace is new in any case.
+    if routes:
+        raise Refused("network namespace: expected no route, found some")
+
+
+# Mode "user"
+
+
+def run_as_user(run):
+    """Run in a machine that is nothing but a runner, as a user that exists for this run only."""
+    if os.geteuid() != 0:
+        raise Refused("separate user: expected a runner with CAP_SETUID, CAP_SETGID and CAP_KILL")
+    uid = build_uid()
+    home = f"/tmp/build-{uid}"
+    reports, printed = os.pipe(), os.pipe()
+    as_user(uid, lambda: prepare_home(home))
+    d = os.fork()
+    if d == 0:
+        close(reports[0], reports[1], printed[0])
+        become_build(json.loads(json.dumps(run).replace("{private}", home)), uid, uid, printed[1], True)
+    close(printed[1])
+    watch = Watch(run, os.getpid(), reports[0], printed[0], lambda: kill_user(uid), shared_disk=True)
+    try:
+        send(reports[1], {"started": True, "isolation": f"runner, user {uid}, system call filter"})
+        status = None
+        while status is None:
+            watch.turn(POLL_S)
+            status = reaped(d)
+            if watch.expired:
+                raise Refused("separate user: processes of the build cannot be ended")
+        kill_user(uid)
+        reap()
+        folder = f"{home}/out"
+        send(reports[1], {"ended": status, "full": watch.folder_full(), **usage()})
+        collector = os.fork()
+        if collector == 0:
+            try:
+                put_on_user(uid)
+                send_outputs(reports[1], {**run, "collect": folder})
+            finally:
+                os._exit(1)
+        close(reports[1])
+        report = watch.until_done()
+        os.waitpid(collector, 0)
+        return report
+    finally:
+        kill_user(uid)
+        reap()
+        as_user(uid, lambda: remove_owned(uid))
+        close(reports[0], printed[0])
+
+
+def prepare_home(home):
+    for path in ("", "/out", "/tmp", "/home"):
+        os.mkdir(home + path, 0o700)
+
+
+def kill_user(uid):
+    """Kill every process of a user."""
+    as_user(uid, lambda: os.kill(-1, signal.SIGKILL))
+
+
+def as_user(uid, action):
+    """Do something in a process that has become this user, and wait for it."""
+    child = os.fork()
+    if child == 0:
+        try:
+            put_on_user(uid)
+            with contextlib.suppress(ProcessLookupError):
+                action()
+        finally:
+            os._exit(0)
+    # The action may be to kill all processes of the user, itself included on some systems.
+    os.waitpid(child, 0)
+
+
+def put_on_user(uid):
+    os.setgroups([])
+    os.setresgid(uid, uid, uid)
+    os.setresuid(uid, uid, uid)
+
+
+def remove_owned(uid):
+    """Remove what this user owns in the places where anybody may write."""
+    for place in ("/tmp", "/dev/shm", "/var/tmp", "/run"):
+        for folder, names, files in os.walk(place, topdown=False):
+            for name in files + names:
+                path = os.path.join(folder, name)
+                with contextlib.suppress(OSError):
+                    state = os.lstat(path)
+                    if state.st_uid == uid:
+                        (os.rmdir if stat.S_ISDIR(state.st_mode) else os.unlink)(path)
+
+
+# Both
+
+
+def become_build(run, uid, gid, printed, change_user):
+    """Turn this forked process into the program (process D)."""
+    limits = run["limits"]
+    try:
+        os.setsid()
+        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        os.dup2(printed, 1)
+        os.dup2(printed, 2)
+        os.closerange(3, 1 << 20)
+        if change_user:
+            os.setgroups([])
+        with contextlib.suppress(PermissionError):
+            # Without CAP_SETPCAP there is nothing in the sets that no_new_privs would let a program gain.
+            kernel.drop_bounding_set()
+            kernel.lock_securebits()
+        if change_user:
+            os.setresgid(gid, gid, gid)
+            os.setresuid(uid, uid, uid)
+        kernel.drop_capabilities()
+        kernel.forbid_new_privileges()
+        os.umask(0o077)
+        os.chdir(run["cwd"])
+        for kind, value in (
+            (resource.RLIMIT_AS, limits["memory_mib"] << 20),
+            (resource.RLIMIT_CPU, limits["cpu_s"]),
+            (resource.RLIMIT_FSIZE, limits["file_mib"] << 20),
+            (resource.RLIMIT_NOFILE, limits["open_files"]),
+            (resource.RLIMIT_NPROC, limits["processes"]),
+            (resource.RLIMIT_MEMLOCK, 0),
+            (resource.RLIMIT_MSGQUEUE, 0),
+            (resource.RLIMIT_CORE, 0),
+        ):
+            # The processor time has a second of warning, by a signal that tells it from other kills.
+            hard = value + (kind == resource.RLIMIT_CPU)
+            resource.setrlimit(kind, (value, hard))
+        kernel.install_filter(kernel.seccomp_filter())
+    except BaseException as error:
+        os.write(2, f"the sandbox is not complete: {error}\n".encode())
+        os._exit(126)
+    try:
+        os.execvpe(run["command"][0], run["command"], run["environment"])
+    except BaseException as error:
+        os.write(2, f"cannot be started: {error}\n".encode())
+        os._exit(127)
+
+
+class Watch:
+    """Process A while a program runs: its limits, what it prints, and the report of process C."""
+
+    def __init__(self, run, root, reports, printed, stop, *, own=0, shared_disk=False):
+        # `own`: how many of the first descendants belong to the sandbox, whose memory does not count.
+        self.run, self.root, self.stop, self.own, self.shared_disk = run, root, stop, own, shared_disk
+        self.occupied_before = occupied()
+        self.reports, self.printed = reports, printed
+        self.tail, self.octets_printed = b"", 0
+        self.buffer, self.file, self.left = b"", None, 0
+        self.report = {"cause": "", "exit_status": None, "signal": None, "cpu_s": 0.0, "peak_rss_mib": 0.0}
+        self.started, self.deadline, self.next_sample = None, time.monotonic() + SETUP_S, 0.0
+        self.open = {reports, printed}
+        self.done = False
+        self.most_mib = self.cpu_s = 0.0
+
+    @property
+    def expired(self):
+        return time.monotonic() > self.deadline
+
+    def until_done(self):
+        while not self.done and not self.expired and self.reports in self.open:
+            self.turn(POLL_S)
+        if self.file is not None:
+            self.file.close()
+        self.drain()
+        if "refused" in self.report:
+            return {"refused": self.report["refused"]}
+        if self.started is None:
+            raise Refused("the sandbox was not set up in time")
+        if not self.done:
+            self.report["cause"] = self.report["cause"] or "crashed"
+        with open(self.run["printed"], "wb") as stream:
+            stream.write(self.tail)
+        self.report["peak_rss_mib"] = max(self.report["peak_rss_mib"], self.most_mib)
+        self.report["cpu_s"] = max(self.report["cpu_s"], self.cpu_s)
+        self.report.setdefault("wall_s", time.monotonic() - self.started)
+        return self.report
+
+    def turn(self, timeout_s):
+        for descriptor in select.select(list(self.open), [], [], timeout_s)[0]:
+            octets = os.read(descriptor, _CHUNK)
+            if not octets:
+                self.open.discard(descriptor)
+            elif descriptor == self.printed:
+                self.keep(octets)
+            else:
+                self.take(octets)
+        now = time.monotonic()
+        if self.started is not None and "wall_s" not in self.report and not self.report["cause"]:
+            if now > self.next_sample:
+                self.next_sample = now + SAMPLE_S
+                self.sample()
+            if now - self.started > self.run["limits"]["wall_s"]:
+                self.end("timeout")
+
+    def keep(self, octets):
+        self.octets_printed += len(octets)
+        self.tail = (self.tail + octets)[-PRINTED_OCTETS:]
+
+    def drain(self):
+        """Take what is left in the pipe: nobody writes to it any more."""
+        while self.printed in self.open and select.select([self.printed], [], [], 0)[0]:
+            octets = os.read(self.printed, _CHUNK)
+            if not octets:
+                return
+            self.keep(octets)
+
+    def end(self, cause):
+        self.report["cause"] = cause
+        self.deadline = time.monotonic() + COLLECT_S
+        self.stop()
+
+    def sample(self):
+        limits = self.run["limits"]
+        rss, cpu, counted = 0, 0.0, []
+        for place, process in enumerate(descendants(self.root)):
+            with contextlib.suppress(OSError, IndexError, ValueError):
+                with open(f"/proc/{process}/stat") as stream:
+                    words = stream.read().rpartition(")")[2].split()
+                cpu += sum(map(int, words[11:15])) / os.sysconf("SC_CLK_TCK")
+                if place >= self.own:
+                    rss += int(words[21]) * os.sysconf("SC_PAGE_SIZE")
+                    counted.append(process)
+        limit = limits["memory_mib"] << 20
+        if rss > limit:
+            # Pages that processes share count for each of them above; ask the kernel, which takes longer.
+            rss = sum(map(proportional_memory, counted))
+        self.cpu_s = max(self.cpu_s, cpu)
+        self.most_mib = max(self.most_mib, rss / (1 << 20))
+        if rss > limit:
+            self.end("memory")
+        elif cpu > limits["cpu_s"] + 1:
+            self.end("cpu")
+        elif self.folder_full():
+            self.end("disk")
+
+    def folder_full(self):
+        """Whether a run without a file system of its own has written more than it may, deleted files included."""
+        written = occupied() - self.occupied_before
+        return self.shared_disk and written > self.run["limits"]["folder_mib"] << 20
+
+    def take(self, octets):
+        """Octets of the report: messages, and files behind the messages that announce them."""
+        self.buffer += octets
+        while self.buffer:
+            if self.file is not None:
+                part = self.buffer[: self.left]
+                self.file.write(part)
+                self.buffer = self.buffer[len(part) :]
+                self.left -= len(part)
+                if self.left == 0:
+                    self.file.close()
+                    self.file = None
+                continue
+            if len(self.buffer) < 4:
+                return
+            length = struct.unpack(">I", self.buffer[:4])[0]
+            if len(self.buffer) < 4 + length:
+                return
+            message = json.loads(self.buffer[4 : 4 + length])
+            self.buffer = self.buffer[4 + length :]
+            self.obey(message)
+
+    def obey(self, message):
+        now = time.monotonic()
+        if "started" in message:
+            self.started, self.deadline = now, float("inf")
+            self.report["isolation"] = message["isolation"]
+        elif "ended" in message:
+            self.deadline = now + COLLECT_S
+            status = message["ended"]
+            self.report["wall_s"] = now - self.started
+            self.report["cpu_s"], self.report["peak_rss_mib"] = message["cpu_s"], message["peak_rss_mib"]
+            self.report["full"] = message["full"]
+            if status is not None and os.WIFEXITED(status):
+                self.report["exit_status"] = os.WEXITSTATUS(status)
+            elif status is not None:
+                self.report["signal"] = os.WTERMSIG(status)
+            if self.report["exit_status"] == 126 and not self.report["cause"]:
+                self.report["unconfined"] = True
+        elif "file" in message:
+            wanted = message["file"] in self.run["outputs"]
+            if not wanted or message["octets"] > self.run["limits"]["file_mib"] << 20:
+                raise Refused("an output that was not asked for")
+            self.left = message["octets"]
+            path = os.path.join(self.run["deliver"], message["file"])
+            self.file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb")
+            if self.left == 0:
+                self.file.close()
+                self.file = None
+        elif "done" in message:
+            self.done = True
+        else:
+            self.report.update(message)
+            self.done = True
+
+
+def send_outputs(reports, run):
+    """Send the output files: regular files of a permitted size under the names asked for, nothing else."""
+    folder = os.open(run.get("collect", "/out"), os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    for name in run["outputs"]:
+        try:
+            descriptor = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=folder)
+        except OSError:
+            continue
+        state = os.fstat(descriptor)
+        if stat.S_ISREG(state.st_mode) and state.st_size <= run["limits"]["file_mib"] << 20:
+            send(reports, {"file": name, "octets": state.st_size})
+            left = state.st_size
+            while left:
+                part = os.read(descriptor, min(left, _CHUNK))
+                if not part:
+                    raise Refused("an output that became shorter")
+                write_all(reports, part)
+                left -= len(part)
+        close(descriptor)
+    send(reports, {"done": True})
+
+
+def send(descriptor, message):
+    octets = json.dumps(message).encode()
+    write_all(descriptor, struct.pack(">I", len(octets)) + octets)
+
+
+def write_all(descriptor, octets):
+    while octets:
+        octets = octets[os.write(descriptor, octets) :]
+
+
+def read_some(descriptor, timeout_s):
+    """What can be read within a time; nothing when the other end is closed or silent."""
+    return os.read(descriptor, _CHUNK) if select.select([descriptor], [], [], timeout_s)[0] else b""
+
+
+def reaped(wanted):
+    """Status of a child that has ended, reaping all others that have; None while it runs."""
+    status = None
+    while True:
+        try:
+            process, found = os.waitpid(-1, os.WNOHANG)
+        except ChildProcessError:
+            return status
+        if process == 0:
+            return status
+        if process == wanted:
+            status = found
+
+
+def wait_for(child, timeout_s):
+    """Wait for a child to end, without reaping it."""
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        if os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+            return
+        time.sleep(POLL_S)
+
+
+def reap():
+    """Wait for all children that have ended."""
+    deadline = time.monotonic() + 5.0
+    while time.monotonic() < deadline:
+        try:
+            if os.waitpid(-1, os.WNOHANG)[0] == 0:
+                time.sleep(POLL_S)
+        except ChildProcessError:
+            return
+
+
+def usage():
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return {"cpu_s": used.ru_utime + used.ru_stime, "peak_rss_mib": used.ru_maxrss / 1024.0}
+
+
+def occupied():
+    """Octets in the places where anybody may write."""
+    total = 0
+    for place in ("/tmp", "/dev/shm"):
+        with contextlib.suppress(OSError):
+            room = os.statvfs(place)
+            total += (room.f_blocks - room.f_bfree) * room.f_frsize
+    return total
+
+
+def proportional_memory(process):
+    """Resident octets of a process, shared pages divided by those who share them where that can be read."""
+    with (
+        contextlib.suppress(OSError, IndexError, ValueError),
+        open(f"/proc/{process}/smaps_rollup") as stream,
+    ):
+        for line in stream:
+            if line.startswith("Pss:"):
+                return int(line.split()[1]) << 10
+    with contextlib.suppress(OSError, IndexError, ValueError), open(f"/proc/{process}/statm") as stream:
+        return int(stream.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return 0
+
+
+def descendants(root):
+    """Processes below another one, parents first."""
+    children = {}
+    for name in os.listdir("/proc"):
+        if name.isdigit():
+            with contextlib.suppress(OSError, IndexError, ValueError), open(f"/proc/{name}/stat") as stream:
+                parent = int(stream.read().rpartition(")")[2].split()[1])
+                children.setdefault(parent, []).append(int(name))
+    found = list(children.get(root, ()))
+    for process in found:
+        found += children.get(process, ())
+    return found
+
+
+def close(*descriptors):
+    for descriptor in descriptors:
+        os.close(descriptor)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,105 @@
+"""What must hold in a runner that cannot make namespaces: it has to be a container with nothing in it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+_PERMITTED = {5: "CAP_KILL", 6: "CAP_SETGID", 7: "CAP_SETUID", 8: "CAP_SETPCAP"}
+_NEEDED = (5, 6, 7)
+_SECRET_WORDS = ("PASSWORD", "SECRET", "TOKEN", "URL", "CREDENTIAL")
+_MEMORY_KINDS = ("tmpfs", "proc", "sysfs", "devpts", "mqueue", "cgroup", "cgroup2", "devtmpfs", "ramfs")
+# Files of an engine, owned by root, which a build cannot change.
+_ENGINE_FILES = ("/etc/hosts", "/etc/hostname", "/etc/resolv.conf", "/sbin/docker-init")
+_LISTENING = "0A"
+
+
+def runner_faults(exchange: Path) -> list[str]:
+    """Return what is missing for builds to be confined by a user of their own; nothing if all holds."""
+    status = dict(
+        line.split(":\t", 1) for line in Path("/proc/self/status").read_text().splitlines() if ":\t" in line
+    )
+    held = int(status["CapEff"], 16)
+    names = sorted(name for name in os.environ if set(name.upper().split("_")) & set(_SECRET_WORDS))
+    faults = {
+        "user 0 of a container (a build gets a user of its own)": os.geteuid() == 0,
+        "the capabilities SETUID, SETGID and KILL": all(held >> bit & 1 for bit in _NEEDED),
+        "no other capability": held & ~sum(1 << bit for bit in _PERMITTED) == 0,
+        "no-new-privileges": status["NoNewPrivs"].strip() == "1",
+        f"no secrets in its environment (found {', '.join(names)})": not names,
+        "a read-only root": bool(os.statvfs("/").f_flag & os.ST_RDONLY),
+        "a /tmp in memory with a size limit": _limited_memory("/tmp"),
+        "no other writable disk": not _writable_disks(exchange),
+        "no network": not _routes(),
+        "no listening socket": not _listeners(),
+        "no process but its own": not _foreign_processes(),
+        f"an exchange folder closed to others ({exchange})": _closed(exchange),
+    }
+    return [name for name, holds in faults.items() if not holds]
+
+
+def _mounts() -> list[tuple[str, str, set[str]]]:
+    """Mount point, kind and options of every mount."""
+    rows = [line.split() for line in Path("/proc/self/mounts").read_text().splitlines()]
+    return [(row[1].replace("\\040", " "), row[2], set(row[3].split(","))) for row in rows]
+
+
+def _limited_memory(path: str) -> bool:
+    return any(
+        point == path and kind == "tmpfs" and any(option.startswith("size=") for option in options)
+        for point, kind, options in _mounts()
+    )
+
+
+def _writable_disks(exchange: Path) -> list[str]:
+    own = os.path.realpath(exchange)
+    return [
+        point
+        for point, kind, options in _mounts()
+        if "rw" in options and kind not in _MEMORY_KINDS and point not in (own, *_ENGINE_FILES)
+    ]
+
+
+def _routes() -> list[str]:
+    """Interfaces besides the loopback that have a route."""
+    found = [line.split()[0] for line in Path("/proc/net/route").read_text().splitlines()[1:]]
+    six = Path("/proc/net/ipv6_route")
+    if six.exists():
+        found += [line.split()[-1] for line in six.read_text().splitlines()]
+    return [name for name in found if name != "lo"]
+
+
+def _listeners() -> list[str]:
+    found = []
+    for name in ("tcp", "tcp6"):
+        path = Path("/proc/net") / name
+        if path.exists():
+            rows = [line.split() for line in path.read_text().splitlines()[1:]]
+            found += [row[1] for row in rows if row[3] == _LISTENING]
+    # __SO_ACCEPTCON: a socket that others can connect to.
+    rows = [line.split() for line in Path("/proc/net/unix").read_text().splitlines()[1:]]
+    return found + [row[-1] for row in rows if int(row[3], 16) & 0x1_0000]
+
+
+def _foreign_processes() -> list[int]:
+    """Processes that are neither above nor below this one."""
+    parents: dict[int, int] = {}
+    for entry in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parents[int(entry.parent.name)] = int(entry.read_text().rpartition(")")[2].split()[1])
+        except (OSError, ValueError):
+            continue
+    family = {os.getpid()}
+    process = os.getpid()
+    while process in parents:
+        family.add(process)
+        process = parents[process]
+    before = 0
+    while len(family) != before:
+        before = len(family)
+        family |= {one for one, parent in parents.items() if parent in family and parent not in (0, 1)}
+    return sorted(set(parents) - family - {1})
+
+
+def _closed(exchange: Path) -> bool:
+    return exchange.is_dir() and not exchange.stat().st_mode & 0o007

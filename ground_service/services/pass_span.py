@@ -1,0 +1,28 @@
+"""The stretch of on-board time of a pass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ground_service.processing.correlation import TimeCorrelation, utc_ns_of_ticks
+
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class PassSpan:
+    """The stretch of on-board time that belongs to a pass, how it maps to UTC, the dictionary version to read it in."""
+
+    vehicle: int
+    start_ticks: int
+    stop_ticks: int
+    correlations: tuple[TimeCorrelation, ...]
+    dictionary_version: int
+
+    def utc_ns(self, ticks: Sequence[int]) -> IntArray:
+        """Correlated UTC (n,) of on-board ticks."""
+        return utc_ns_of_ticks(np.array(ticks, dtype=np.int64), self.correlations)[0]

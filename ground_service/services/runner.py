@@ -1,0 +1,420 @@
+"""Runs of builds in a sandbox of this machine, or in a runner that shares nothing but an exchange folder.
+
+The exchange folder holds `jobs`, `running` and `results`. A job is a folder with `request.json`, `archive` and `build`,
+and appears under its final name only when it is complete. The runner moves it to `running`, copies it, runs it, and
+publishes a folder of the same name in `results` with `report.json`, `printed.txt` and the outputs. `runner.json` is
+touched every few seconds while the runner lives. docs/build-contract.md describes the files.
+
+The service treats everything that comes back as hostile: names it asked for, regular files with one name, within the
+limits, opened without following links, and a report that is checked field by field.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import logging
+import os
+import shutil
+import stat
+import sys
+import tempfile
+import threading
+import time
+import uuid
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.dataclasses import dataclass
+
+from ground_service.sandbox import host
+from ground_service.sandbox.host import Run, SandboxRefused
+from ground_service.sandbox.runner_checks import runner_faults
+
+DOWNLINKS = ("downlink.cadu", "downlink.packets")
+PERFORMANCE = "performance.json"
+OUTPUTS = (*DOWNLINKS, PERFORMANCE)
+
+PROTOCOL_VERSION = 1
+REQUEST, REPORT, PRINTED, ALIVE = "request.json", "report.json", "printed.txt", "runner.json"
+REPORT_LIMIT_OCTETS = 1 << 16
+PRINTED_LIMIT_OCTETS = 1 << 17
+POLL_S = 0.1
+HEARTBEAT_S = 2.0
+SILENT_S = 30.0
+"""A runner that has not been heard of for this long is not there."""
+
+_log = logging.getLogger(__name__)
+Seconds = Annotated[float, Field(ge=0.0, le=1e7, allow_inf_nan=False)]
+
+
+@dataclass(frozen=True, slots=True)
+class RunRequest:
+    """What to run: words with the places {python}, {archive}, {out} and {folder}, and limits."""
+
+    words: tuple[str, ...]
+    limits: Mapping[str, int]
+    version: int = PROTOCOL_VERSION
+
+
+class RunReport(BaseModel):
+    """What became of a run."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    cause: Literal["", "timeout", "cpu", "memory", "disk", "crashed"] = ""
+    exit_status: Annotated[int, Field(ge=0, le=255)] | None = None
+    signal: Annotated[int, Field(ge=0, le=64)] | None = None
+    full: bool = False
+    wall_s: Seconds = 0.0
+    cpu_s: Seconds = 0.0
+    peak_rss_mib: Annotated[float, Field(ge=0.0, le=1e9, allow_inf_nan=False)] = 0.0
+    isolation: Annotated[str, Field(max_length=200, pattern=r"^[\w ,./-]*$")] = ""
+    refused: Annotated[str, Field(max_length=2000)] = ""
+
+
+def run_in_sandbox(
+    request: RunRequest,
+    staged: Path,
+    written: Path,
+    printed: Path,
+    *,
+    mode: Literal["namespaces", "user"] = "namespaces",
+) -> dict[str, Any]:
+    """Run in a sandbox of this machine.
+
+    Parameters
+    ----------
+    staged
+        Folder with `archive` and `build`, copies that belong to this run.
+    written, printed
+        Where the outputs go, and the end of what the program prints.
+
+    Raises
+    ------
+    SandboxRefused
+        It cannot be confined.
+    """
+    host.make_readable(staged / "archive")
+    host.make_readable(staged / "build")
+    if mode == "namespaces":
+        confined = host.protection()
+        if confined.refusal:
+            raise SandboxRefused(confined.refusal)
+        archive, folder, private = "/archive", "/build", ""
+        inputs = tuple(
+            host.Part("bind", str((staged / name).absolute()), f"/{name}") for name in ("archive", "build")
+        )
+        view = (*host.program_view(), *inputs)
+        home = "/home/build"
+    else:
+        archive, folder, private = str(staged / "archive"), str(staged / "build"), "{private}"
+        view, home = (), "{private}/home"
+    places = {
+        "{python}": sys.executable,
+        "{archive}": archive,
+        "{out}": f"{private}/out",
+        "{folder}": folder,
+    }
+    run = Run(
+        mode,
+        tuple(_placed(word, places) for word in request.words),
+        f"{private}/out",
+        environment(home, f"{private}/tmp"),
+        dict(request.limits),
+        OUTPUTS,
+        str(written.absolute()),
+        str(printed.absolute()),
+        view,
+    )
+    return host.execute(run)
+
+
+def run_by_runner(
+    exchange: Path, request: RunRequest, staged: Path, written: Path, printed: Path
+) -> dict[str, Any]:
+    """Have a runner run it; parameters as in `run_in_sandbox`.
+
+    Raises
+    ------
+    SandboxRefused
+        There is no runner, or it refuses, or what it gave back cannot be trusted.
+    """
+    identity = uuid.uuid4().hex
+    try:
+        for name in ("jobs", "running", "results"):
+            _make_shared(exchange / name)
+        job = exchange / "jobs" / identity
+        partial = job.with_name("." + identity)
+        _make_shared(partial)
+        try:
+            for name in ("archive", "build"):
+                shutil.copytree(staged / name, partial / name)
+            (partial / REQUEST).write_text(json.dumps(asdict(request)))
+            _share(partial)
+            partial.rename(job)
+            result = _awaited(exchange, identity, request.limits["wall_s"] + host.GRACE_S)
+            return _taken(result, request, written, printed)
+        finally:
+            for place in (partial, job, exchange / "results" / identity):
+                shutil.rmtree(place, ignore_errors=True)
+    except OSError as error:
+        raise SandboxRefused(f"runner exchange {exchange}: {error.strerror}") from None
+
+
+def environment(home: str, temporary: str) -> dict[str, str]:
+    """Everything that a program is told of the world: no data folder, no proxies, one thread."""
+    path = [os.path.dirname(sys.executable), "/usr/local/bin", "/usr/bin", "/bin"]
+    return {
+        "PATH": ":".join(path),
+        "PYTHONPATH": str(host.package_root()),
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "PYTHONHASHSEED": "0",
+        "HOME": home,
+        "TMPDIR": temporary,
+        "XDG_DATA_HOME": home,
+        "LANG": "C.UTF-8",
+        "TZ": "UTC",
+        "OMP_NUM_THREADS": "1",
+        "OMP_WAIT_POLICY": "PASSIVE",
+        "OPENBLAS_NUM_THREADS": "1",
+        "NUMBA_NUM_THREADS": "1",
+    }
+
+
+# The runner
+
+
+def serve_exchange(
+    exchange: Path, *, jobs: int | None = None, stopping: threading.Event | None = None
+) -> int:
+    """Run jobs of an exchange folder one after another, until `jobs` of them are done or `stopping` is set.
+
+    Returns
+    -------
+    int
+        Jobs done.
+
+    Raises
+    ------
+    SandboxRefused
+        Nothing confines builds here, another runner serves the folder, or a build left something behind.
+    """
+    mode = runner_mode(exchange)
+    stopping = stopping or threading.Event()
+    for name in ("jobs", "running", "results"):
+        _make_shared(exchange / name)
+    done = 0
+    with _alone(exchange), _heartbeat(exchange, mode, stopping):
+        for left in sorted((exchange / "running").iterdir()):
+            # The runner ended in the middle of it.
+            _publish(exchange, left.name, {"cause": "crashed"}, None)
+        while not stopping.is_set() and (jobs is None or done < jobs):
+            job = _next_job(exchange)
+            if job is None:
+                stopping.wait(POLL_S)
+                continue
+            _run_job(exchange, job, mode)
+            done += 1
+    return done
+
+
+def runner_mode(exchange: Path) -> Literal["namespaces", "user"]:
+    """How builds are confined in this runner: namespaces where the kernel grants them, else a user for each run.
+
+    Raises
+    ------
+    SandboxRefused
+        Neither is possible; the message says what is missing.
+    """
+    confined = host.protection()
+    if not confined.refusal:
+        return "namespaces"
+    faults = runner_faults(exchange)
+    if faults:
+        raise SandboxRefused(f"{confined.refusal}; without namespaces a runner needs: " + "; ".join(faults))
+    return "user"
+
+
+def _next_job(exchange: Path) -> Path | None:
+    """The oldest job, taken over."""
+    waiting = [path for path in (exchange / "jobs").iterdir() if not path.name.startswith(".")]
+    for path in sorted(waiting, key=lambda path: path.stat().st_mtime_ns):
+        with contextlib.suppress(OSError):
+            return path.rename(exchange / "running" / path.name)
+    return None
+
+
+def _run_job(exchange: Path, job: Path, mode: Literal["namespaces", "user"]) -> None:
+    with tempfile.TemporaryDirectory(prefix="runner-") as name:
+        folder = Path(name)
+        # Whoever gets here can read; the build's own copies are all that is inside.
+        folder.chmod(0o711)
+        out = folder / "out"
+        out.mkdir(mode=0o700)
+        report: dict[str, Any]
+        try:
+            request = RunRequest(**json.loads((job / REQUEST).read_text()))
+            if request.version != PROTOCOL_VERSION:
+                raise SandboxRefused(f"request: expected version {PROTOCOL_VERSION}, found {request.version}")
+            for part in ("archive", "build"):
+                shutil.copytree(job / part, folder / part)
+            report = run_in_sandbox(request, folder, out, out / PRINTED, mode=mode)
+        except SandboxRefused as error:
+            report = {"refused": str(error)}
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            report = {"refused": f"request: {type(error).__name__}: {error}"[:500]}
+        _publish(exchange, job.name, report, out)
+
+
+def _publish(exchange: Path, identity: str, report: Mapping[str, Any], out: Path | None) -> None:
+    partial = exchange / "results" / f".{identity}"
+    shutil.rmtree(partial, ignore_errors=True)
+    _make_shared(partial)
+    for name in (*OUTPUTS, PRINTED):
+        if out is not None and (out / name).is_file():
+            shutil.copyfile(out / name, partial / name)
+    (partial / REPORT).write_text(json.dumps(report))
+    _share(partial)
+    partial.rename(exchange / "results" / identity)
+    shutil.rmtree(exchange / "running" / identity, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _alone(exchange: Path) -> Iterator[None]:
+    with (exchange / "runner.lock").open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise SandboxRefused(f"{exchange}: expected no other runner, found one") from None
+        yield
+
+
+@contextlib.contextmanager
+def _heartbeat(exchange: Path, mode: str, stopping: threading.Event) -> Iterator[None]:
+    ended = threading.Event()
+    alive = exchange / ALIVE
+    alive.write_text(json.dumps({"version": PROTOCOL_VERSION, "mode": mode}))
+
+    def beat() -> None:
+        while not ended.wait(HEARTBEAT_S):
+            with contextlib.suppress(OSError):
+                os.utime(alive)
+
+    thread = threading.Thread(target=beat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        alive.unlink(missing_ok=True)
+
+
+# The service
+
+
+def _awaited(exchange: Path, identity: str, run_s: float) -> Path:
+    """The folder of a result, waited for while the runner lives."""
+    result, running = exchange / "results" / identity, exchange / "running" / identity
+    started: float | None = None
+    quiet_since = time.monotonic()
+    while not result.exists():
+        now = time.monotonic()
+        if alive(exchange):
+            quiet_since = now
+        elif now - quiet_since > SILENT_S or not (started or _ever_heard_of(exchange)):
+            raise SandboxRefused(f"runner exchange {exchange}: expected a runner, found none that answers")
+        if started is None and running.exists():
+            started = now
+        if started is not None and now - started > run_s:
+            raise SandboxRefused(f"runner exchange {exchange}: the runner did not answer in time")
+        time.sleep(POLL_S)
+    return result
+
+
+def alive(exchange: Path) -> bool:
+    """Whether a runner serves the folder now."""
+    try:
+        return time.time() - os.lstat(exchange / ALIVE).st_mtime < SILENT_S
+    except OSError:
+        return False
+
+
+def _ever_heard_of(exchange: Path) -> bool:
+    return os.path.lexists(exchange / ALIVE) or any((exchange / "running").iterdir())
+
+
+def _taken(result: Path, request: RunRequest, written: Path, printed: Path) -> dict[str, Any]:
+    """Copy what a runner gave back out of the exchange folder, checked."""
+    folder = os.open(result, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        octets = _octets(folder, REPORT, REPORT_LIMIT_OCTETS)
+        if octets is None:
+            raise SandboxRefused("runner: expected a report, found none")
+        try:
+            report = RunReport.model_validate_json(octets)
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(map(str, first["loc"]))
+            raise SandboxRefused(f"runner: {REPORT}: {where}: {first['msg'].lower()}") from None
+        if report.refused:
+            raise SandboxRefused("runner: " + " ".join(report.refused.split()), remedy="")
+        limit = request.limits["file_mib"] << 20
+        for name in OUTPUTS:
+            octets = _octets(folder, name, limit)
+            if octets is not None:
+                (written / name).write_bytes(octets)
+        printed.write_bytes(_octets(folder, PRINTED, PRINTED_LIMIT_OCTETS) or b"")
+    finally:
+        os.close(folder)
+    return report.model_dump(exclude={"refused"})
+
+
+def _octets(folder: int, name: str, limit: int) -> bytes | None:
+    """Contents of a regular file with one name and a permitted size; None where there is no file.
+
+    Raises
+    ------
+    SandboxRefused
+        There is something else under this name.
+    """
+    try:
+        descriptor = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=folder)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise SandboxRefused(f"runner: {name}: expected a regular file, found {error.strerror}") from None
+    with os.fdopen(descriptor, "rb") as stream:
+        state = os.fstat(descriptor)
+        if not stat.S_ISREG(state.st_mode) or state.st_nlink != 1:
+            raise SandboxRefused(f"runner: {name}: expected a regular file with one name, found another")
+        octets = stream.read(limit + 1)
+    if len(octets) > limit:
+        raise SandboxRefused(f"runner: {name}: expected at most {limit} octets, found more")
+    return octets
+
+
+def _make_shared(folder: Path) -> None:
+    """A folder that service and runner, which share a group, may both change, and nobody else may read."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with contextlib.suppress(PermissionError):  # made by the other side
+        folder.chmod(0o2770)
+
+
+def _share(folder: Path) -> None:
+    for where, _, names in os.walk(folder):
+        os.chmod(where, 0o2770)
+        for name in names:
+            path = os.path.join(where, name)
+            os.chmod(path, 0o770 if os.stat(path).st_mode & stat.S_IXUSR else 0o660)
+
+
+def _placed(word: str, places: Mapping[str, str]) -> str:
+    for place, value in places.items():
+        word = word.replace(place, value)
+    return word

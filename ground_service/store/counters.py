@@ -1,0 +1,47 @@
+"""Counters and locks of a spacecraft's operations: one row for each spacecraft, locked while it is counted on.
+
+Whoever changes the telecommands or the plan of a spacecraft locks its row first, and rows of telecommands and windows
+only afterwards. All processes lock in this order, so none waits for another in a circle.
+"""
+
+from __future__ import annotations
+
+import hashlib
+
+from sqlalchemy import Connection, select, text, update
+
+from ground_service.store.repository import COMMAND_COUNTERS, add_new
+
+
+def lock_spacecraft(connection: Connection, vehicle: int) -> int:
+    """Lock the operations of a vehicle until the transaction ends; how many sequence counts were given so far."""
+    query = (
+        select(COMMAND_COUNTERS.c.telecommands)
+        .where(COMMAND_COUNTERS.c.vehicle_id == vehicle)
+        .with_for_update()
+    )
+    given = connection.execute(query).scalar()
+    if given is None:
+        add_new(connection, COMMAND_COUNTERS, vehicle_id=vehicle, telecommands=0)
+        given = connection.execute(query).scalar_one()
+    return int(given)
+
+
+def next_telecommand(connection: Connection, vehicle: int) -> int:
+    """Return the number of the next telecommand of a vehicle, from 0, unwrapped; no two transactions get the same."""
+    lock_spacecraft(connection, vehicle)
+    taken = connection.execute(
+        update(COMMAND_COUNTERS)
+        .where(COMMAND_COUNTERS.c.vehicle_id == vehicle)
+        .values(telecommands=COMMAND_COUNTERS.c.telecommands + 1)
+        .returning(COMMAND_COUNTERS.c.telecommands)
+    ).scalar_one()
+    return int(taken) - 1
+
+
+def hold(connection: Connection, name: str) -> None:
+    """Let one transaction at a time hold `name`, until it ends; SQLite has one writer anyway."""
+    if connection.dialect.name == "postgresql":
+        digest = hashlib.blake2b(name.encode(), digest_size=8).digest()
+        key = int.from_bytes(digest, "big", signed=True)
+        connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": key})

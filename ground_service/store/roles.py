@@ -1,0 +1,129 @@
+"""Two roles of a PostgreSQL database: the owner of the schema, and the service, which can only work in it.
+
+The service reads and writes rows. It is no superuser, owns nothing, cannot change the schema, and can add entries to
+the audit log but neither change nor remove them. Migrations run as the owner, who then grants the service its rights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from sqlalchemy import Connection, text
+from sqlalchemy.exc import DBAPIError
+
+from ground_service.errors import DatabaseUnavailable, StoreError
+from ground_service.store.database import Database
+
+READ_ONLY = ("alembic_version",)
+APPEND_ONLY = ("audit",)
+
+
+class PowerfulRole(StoreError):
+    """The service runs as a database role that can do more than the service needs."""
+
+    def __init__(self, label: str, powers: list[str]) -> None:
+        super().__init__(
+            f"database {label}: expected a role that can only read and write rows, found one that "
+            f"{', '.join(powers)}; remedy: run `linna db upgrade` with LINNA_MIGRATION_DATABASE_URL of the owner, "
+            "which grants the role of LINNA_DATABASE_URL its rights, or set LINNA_ALLOW_DATABASE_OWNER=true"
+        )
+        self.powers = tuple(powers)
+
+
+def grant_statements(role: str, tables: list[str]) -> Iterator[str]:
+    """Yield the SQL that gives a role what the service needs, and takes everything else from it.
+
+    Parameters
+    ----------
+    role
+        Name of the role, which exists already.
+    tables
+        Names of all tables of the schema.
+    """
+    name = quoted(role)
+    yield "REVOKE ALL ON SCHEMA public FROM PUBLIC"
+    yield f"REVOKE ALL ON SCHEMA public FROM {name}"
+    yield f"GRANT USAGE ON SCHEMA public TO {name}"
+    yield f"REVOKE ALL ON ALL TABLES IN SCHEMA public FROM PUBLIC, {name}"
+    for table in sorted(tables):
+        rights = "SELECT, INSERT, UPDATE, DELETE"
+        if table in READ_ONLY:
+            rights = "SELECT"
+        elif table in APPEND_ONLY:
+            rights = "SELECT, INSERT"
+        yield f"GRANT {rights} ON {quoted(table)} TO {name}"
+    yield f"GRANT USAGE, SELECT, UPDATE ON ALL SEQUENCES IN SCHEMA public TO {name}"
+
+
+def grant_service(database: Database, role: str) -> None:
+    """Give a role what the service needs, as the owner of the schema; doing it again changes nothing.
+
+    Raises
+    ------
+    DatabaseUnavailable
+        There is no such role, or it is the owner.
+    """
+    with database.writing() as connection:
+        owner = connection.execute(text("SELECT current_user")).scalar_one()
+        if owner == role:
+            raise DatabaseUnavailable(database.label, f"expected another role than the owner {role}")
+        known = connection.execute(
+            text("SELECT 1 FROM pg_roles WHERE rolname = :name"), {"name": role}
+        ).scalar()
+        if known is None:
+            raise DatabaseUnavailable(
+                database.label,
+                f"expected the role {role}, found none; CREATE ROLE {quoted(role)} LOGIN PASSWORD ...",
+            )
+        tables = connection.execute(
+            text("SELECT tablename FROM pg_tables WHERE schemaname = 'public'")
+        ).scalars()
+        for statement in grant_statements(role, list(tables)):
+            connection.execute(text(statement))
+
+
+def powers_of(connection: Connection) -> list[str]:
+    """Return what the role of this connection can do that the service has no need of."""
+    questions = {
+        "is a superuser": "SELECT rolsuper FROM pg_roles WHERE rolname = current_user",
+        "can make roles": "SELECT rolcreaterole FROM pg_roles WHERE rolname = current_user",
+        "can replicate": "SELECT rolreplication FROM pg_roles WHERE rolname = current_user",
+        "can run programs or read files of the server": (
+            "SELECT bool_or(pg_has_role(current_user, oid, 'USAGE')) FROM pg_roles WHERE rolname IN "
+            "('pg_execute_server_program', 'pg_read_server_files', 'pg_write_server_files')"
+        ),
+        "owns tables": (
+            "SELECT EXISTS (SELECT 1 FROM pg_class WHERE relnamespace = 'public'::regnamespace "
+            "AND pg_has_role(current_user, relowner, 'USAGE'))"
+        ),
+        "can add to the schema": "SELECT has_schema_privilege(current_user, 'public', 'CREATE')",
+        "can change the audit log": (
+            "SELECT bool_or(has_table_privilege(current_user, c.oid, 'UPDATE, DELETE, TRUNCATE, TRIGGER')) "
+            "FROM pg_class c WHERE c.relname = 'audit' AND c.relnamespace = 'public'::regnamespace"
+        ),
+    }
+    return [name for name, query in questions.items() if connection.execute(text(query)).scalar()]
+
+
+def check_role(database: Database) -> None:
+    """Refuse a role that can do more than the service needs; SQLite has no roles.
+
+    Raises
+    ------
+    PowerfulRole
+        It can.
+    """
+    if database.dialect != "postgresql":
+        return
+    with database.reading() as connection:
+        try:
+            powers = powers_of(connection)
+        except DBAPIError as error:
+            raise DatabaseUnavailable(database.label, str(error.orig).splitlines()[0]) from None
+    if powers:
+        raise PowerfulRole(database.label, powers)
+
+
+def quoted(name: str) -> str:
+    """A name as SQL."""
+    return '"' + name.replace('"', '""') + '"'

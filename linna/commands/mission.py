@@ -1,0 +1,105 @@
+"""`linna mission write | check | add | list | show`: mission descriptions."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from linna.commands._ground import add_operator_options, operations
+from linna.output import add_json_flag, emit
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    actions = parser.add_subparsers(metavar="ACTION", required=True)
+    writing = actions.add_parser("write", help="write the mission description of a scenario")
+    writing.add_argument("scenario", metavar="SCENARIO", help="scenario file or name")
+    writing.add_argument("--out", type=Path, default=Path("mission.toml"), metavar="FILE")
+    writing.set_defaults(handler=write)
+    checking = actions.add_parser("check", help="check a mission description; one line for each fault")
+    checking.add_argument("file", type=Path, metavar="FILE")
+    checking.set_defaults(handler=check)
+    adding = actions.add_parser("add", help="enter a mission description as a revision")
+    adding.add_argument("file", type=Path, metavar="FILE")
+    adding.set_defaults(handler=add)
+    listing = actions.add_parser("list", help="list the revisions, the newest first")
+    listing.add_argument("--limit", type=int, default=50, help="how many (default: 50)")
+    listing.set_defaults(handler=list_missions)
+    showing = actions.add_parser("show", help="show a revision")
+    showing.add_argument("revision", metavar="REVISION", help="the hash or its first eight digits")
+    showing.set_defaults(handler=show)
+    for action in (adding, listing, showing):
+        add_operator_options(action)
+    for action in (writing, checking, adding, listing, showing):
+        add_json_flag(action)
+
+
+def write(arguments: argparse.Namespace) -> int:
+    from ground_service.missions.model import parse_mission
+    from linna.data import data_folder
+    from payload_emulator.mission import scenario_mission_text
+    from payload_emulator.scenario import load_scenario
+
+    text = scenario_mission_text(load_scenario(arguments.scenario), data_folder())
+    mission = parse_mission(text, str(arguments.out))
+    arguments.out.write_text(text, encoding="utf-8")
+    figures = {**_figures(mission), "file": str(arguments.out)}
+    emit(arguments, figures, text=f"{arguments.out}\n{_described(figures)}")
+    return 0
+
+
+def check(arguments: argparse.Namespace) -> int:
+    from ground_service.errors import InvalidInput
+    from ground_service.missions.model import mission_faults, parse_mission
+
+    try:
+        text = arguments.file.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise InvalidInput(str(arguments.file), "", "UTF-8 text", "other octets") from None
+    faults = mission_faults(text, str(arguments.file))
+    if faults:
+        figures: dict[str, Any] = {"mission": None, "revision": None, "unknown": [], "faults": faults}
+        emit(arguments, figures, text="\n".join(faults))
+        return 2
+    figures = {**_figures(parse_mission(text, str(arguments.file))), "faults": []}
+    emit(arguments, figures, text=_described(figures))
+    return 0
+
+
+def add(arguments: argparse.Namespace) -> int:
+    with operations(arguments) as service:
+        figures = service.add_mission(arguments.file)
+    emit(arguments, figures, text=_described(figures))
+    return 0
+
+
+def list_missions(arguments: argparse.Namespace) -> int:
+    with operations(arguments) as service:
+        page = service.list_missions(max(arguments.limit, 1))
+    lines = [
+        f"{one['revision'][:16]}  {one['entered'][:19]}Z  {one['mission']}  ({len(one['unknown'])} not stated)"
+        for one in page["items"]
+    ]
+    figures = {"missions": page["items"], "total": page["total"]}
+    emit(arguments, figures, text="\n".join(lines) or "no mission descriptions")
+    return 0
+
+
+def show(arguments: argparse.Namespace) -> int:
+    with operations(arguments) as service:
+        figures = service.get_mission(arguments.revision)
+    emit(arguments, figures, text=f"{_described(figures)}\n\n{figures['text'].rstrip()}")
+    return 0
+
+
+def _figures(mission: Any) -> dict[str, Any]:
+    return {"mission": mission.name, "revision": mission.revision, "unknown": list(mission.unknown)}
+
+
+def _described(figures: Mapping[str, Any]) -> str:
+    unknown = figures["unknown"]
+    lines = [f"mission {figures['mission']}, revision {figures['revision'][:16]}"]
+    if unknown:
+        lines.append(f"not stated ({len(unknown)}): {', '.join(unknown)}")
+    return "\n".join(lines)

@@ -1,0 +1,47 @@
+"""`linna runner`: runs payload builds for a service, in a container that has nothing else."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--exchange",
+        type=Path,
+        metavar="DIR",
+        help="folder shared with the service (default: $LINNA_RUNNER_EXCHANGE)",
+    )
+    parser.add_argument("--jobs", type=int, metavar="N", help="end after N builds (default: never)")
+    parser.add_argument("--check", action="store_true", help="only say whether builds can be confined here")
+    parser.set_defaults(handler=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    import logging.config
+    import signal
+    import threading
+
+    from ground_service.logs import logging_config
+    from ground_service.sandbox.host import SandboxRefused
+    from ground_service.services.runner import alive, runner_mode, serve_exchange
+    from ground_service.settings import load_settings
+    from linna.errors import UsageError
+
+    settings = load_settings()
+    exchange = arguments.exchange or settings.runner_exchange
+    if exchange is None:
+        raise UsageError("--exchange: expected a folder shared with the service, found none")
+    try:
+        if arguments.check:
+            return 0 if alive(exchange) else 1
+        logging.config.dictConfig(logging_config(settings.log_format))
+        stopping = threading.Event()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: stopping.set())
+        print(f"builds are confined by: {runner_mode(exchange)}", flush=True)
+        serve_exchange(exchange, jobs=arguments.jobs, stopping=stopping)
+    except SandboxRefused as error:
+        raise UsageError(str(error)) from None
+    return 0

@@ -1,0 +1,48 @@
+"""`linna verify`: the archive of the ground service checked against itself."""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+from linna.commands._ground import add_service_options, open_service
+from linna.output import add_json_flag, emit, log
+
+LINES = 50
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--all",
+        action="store_true",
+        help="ingest every raw file again and compare (default: decode the stored packets again)",
+    )
+    parser.add_argument(
+        "--head",
+        metavar="NUMBER:SHA256",
+        help="a head of the audit chain that was kept elsewhere ('linna audit head')",
+    )
+    add_service_options(parser)
+    add_json_flag(parser)
+    parser.set_defaults(handler=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from ground_service.services.audit_log import parse_head
+    from ground_service.services.integrity import verify
+
+    head = parse_head(arguments.head) if arguments.head is not None else None
+    began = time.monotonic()
+    with open_service(arguments) as ground:
+        result = verify(ground, deep=arguments.all, expected_head=head, say=log)
+    figures = {**result.model_dump(), "wall_s": round(time.monotonic() - began, 3)}
+    lines = [f"{one.kind} {one.key}: {one.reason}" for one in result.damaged[:LINES]]
+    if result.damaged_total > len(lines):
+        lines.append(f"… {result.damaged_total - len(lines)} more")
+    lines += [f"not checked: {count} {reason}" for reason, count in result.unchecked.items()]
+    lines.append(
+        f"{result.verdict}: {sum(result.checked.values())} checked, {result.damaged_total} damaged; "
+        f"audit head {result.audit_head}"
+    )
+    emit(arguments, figures, text="\n".join(lines))
+    return 1 if result.damaged_total else 0

@@ -1,0 +1,44 @@
+"""The hostile build against the sandbox; the campaign takes every profile, this the shortest way through each."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from benchmarks.campaigns.hostile.attack_kinds import KINDS
+from benchmarks.campaigns.hostile_build import ProfileResult, campaign, went_well
+
+root_only = pytest.mark.skipif(os.geteuid() != 0, reason="the profile can be taken by root only")
+
+
+def held(result: ProfileResult) -> bool:
+    for finding in result.successes:
+        print(f"{finding.kind}, {finding.name}: {finding.seen}")
+    return went_well(result)
+
+
+def test_a_hostile_build_achieves_nothing_as_the_user_of_the_tests() -> None:
+    result = campaign("user", KINDS)
+    assert held(result)
+    assert result.attempts > 150 and "private root" in result.isolation
+
+
+@root_only
+def test_a_hostile_build_achieves_nothing_with_the_profile_of_the_image() -> None:
+    assert held(campaign("image", ("explore", "daemon")))
+
+
+@root_only
+def test_a_hostile_build_is_refused_where_the_engine_refuses_namespaces() -> None:
+    result = campaign("no unshare", ("leave files",))
+    assert held(result) and result.refusals == 1
+    assert "unshare: Operation not permitted; remedy: " in result.refusal
+    assert "LINNA_RUNNER_EXCHANGE" in result.refusal
+
+
+@root_only
+def test_a_hostile_build_achieves_nothing_in_the_runner() -> None:
+    kinds = ("explore", "leave files", "disk fill", "daemon", "link out", "flood")
+    result = campaign("no unshare, runner", kinds)
+    assert held(result) and result.isolation.startswith("runner, user 19")

@@ -1,0 +1,126 @@
+"""Users, tokens and the audit log over HTTP."""
+
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from ground_service.api.app import create_app
+from ground_service.services.users import add_user
+from ground_service.settings import Settings
+
+with warnings.catch_warnings():
+    # It recommends another HTTP library than the installed one; both serve it.
+    warnings.simplefilter("ignore")
+    from fastapi.testclient import TestClient
+
+V1 = "/api/v1"
+
+Tokens = dict[str, dict[str, str]]
+
+
+@pytest.fixture
+def service(tmp_path: Path) -> Iterator[tuple[TestClient, Tokens]]:
+    """An empty service with one user of each role, and the headers of each."""
+    with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as client:
+        ground = client.app.state.ground  # type: ignore[attr-defined]
+        yield (
+            client,
+            {
+                role: {"Authorization": f"Bearer {add_user(ground, role, role)}"}
+                for role in ("viewer", "operator", "admin")
+            },
+        )
+
+
+def test_an_administrator_manages_users(service: tuple[TestClient, Tokens]) -> None:
+    client, heads = service
+    admin = heads["admin"]
+    made = client.post(f"{V1}/users", json={"name": "ann", "role": "viewer", "days_valid": 2}, headers=admin)
+    assert made.status_code == 201, made.text
+    mine = {"Authorization": f"Bearer {made.json()['token']}"}
+    assert client.get(f"{V1}/passes", headers=mine).status_code == 200
+    assert client.get(f"{V1}/users/ann", headers=admin).json() == made.json()["user"]
+    assert [one["name"] for one in client.get(f"{V1}/users", headers=admin).json()["items"]] == [
+        "admin", "ann", "operator", "viewer",
+    ]  # fmt: skip
+    (token,) = client.get(f"{V1}/tokens?user=ann", headers=admin).json()["items"]
+    assert set(token) == {"id", "user", "hint", "state", "created", "expires", "revoked", "used"}
+    assert made.json()["token"] not in str(token)
+    changed = client.patch(f"{V1}/users/ann", json={"state": "disabled"}, headers=admin)
+    assert changed.json()["state"] == "disabled"
+    assert client.get(f"{V1}/passes", headers=mine).status_code == 401
+    again = client.patch(f"{V1}/users/ann", json={"state": "disabled"}, headers=admin)
+    assert again.status_code == 409
+    assert again.json()["detail"] == "user ann: expected state active, found disabled"
+    client.patch(f"{V1}/users/ann", json={"state": "active", "role": "operator"}, headers=admin)
+    assert client.get(f"{V1}/passes", headers=mine).status_code == 200
+    assert client.delete(f"{V1}/tokens/{token['id']}", headers=admin).status_code == 204
+    assert client.delete(f"{V1}/tokens/{token['id']}", headers=admin).status_code == 409
+    assert client.get(f"{V1}/passes", headers=mine).status_code == 401
+    fresh = client.post(f"{V1}/users/ann/tokens", json={"revoke_others": True}, headers=admin).json()["token"]
+    assert client.get(f"{V1}/passes", headers={"Authorization": f"Bearer {fresh}"}).status_code == 200
+
+
+@pytest.mark.parametrize("role", ["viewer", "operator"])
+def test_nobody_else_does(service: tuple[TestClient, Tokens], role: str) -> None:
+    client, heads = service
+    for method, path, body in (
+        ("GET", "users", None), ("GET", "users/admin", None), ("GET", "tokens", None), ("DELETE", "tokens/1", None),
+        ("POST", "users", {"name": "x", "role": "admin"}), ("PATCH", "users/admin", {"state": "disabled"}),
+        ("POST", "users/admin/tokens", {}),
+    ):  # fmt: skip
+        answer = client.request(method, f"{V1}/{path}", json=body, headers=heads[role])
+        assert answer.status_code == 403, (method, path)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {"name": "a\nb", "role": "viewer"},
+        {"name": "ann", "role": "root"},
+        {"name": "ann", "role": "viewer", "days_valid": True},
+        {"name": "ann", "role": "viewer", "days_valid": -1},
+        {"name": "ann", "role": "viewer", "days_valid": "3"},
+        {"name": 5, "role": "viewer"},
+        {"name": "ann", "role": "viewer", "admin": True},
+    ],
+)
+def test_a_user_that_cannot_be_added_is_refused(
+    service: tuple[TestClient, Tokens], body: dict[str, object]
+) -> None:
+    client, heads = service
+    assert client.post(f"{V1}/users", json=body, headers=heads["admin"]).status_code == 422
+    assert client.get(f"{V1}/users", headers=heads["admin"]).json()["total"] == 3
+
+
+def test_operators_read_who_did_what(service: tuple[TestClient, Tokens]) -> None:
+    client, heads = service
+    client.patch(f"{V1}/users/viewer", json={"state": "disabled"}, headers=heads["admin"])
+    page = client.get(f"{V1}/audit?limit=2", headers=heads["operator"]).json()
+    assert (page["total"], [one["number"] for one in page["items"]]) == (4, [4, 3])
+    newest = page["items"][0]
+    assert (newest["actor"], newest["action"], newest["target"]) == ("admin", "disable user", "viewer")
+    head = client.get(f"{V1}/audit/head", headers=heads["operator"]).json()
+    assert head == {"number": 4, "sha256": newest["sha256"]}
+    for query, numbers in (
+        ("actor=admin", [4]),
+        ("action=user", [4, 3, 2, 1]),
+        ("action=add", [3, 2, 1]),
+        ("action=%25", []),
+        ("target=viewer", [4, 1]),
+        (f"since={newest['time']}", [4]),
+        (f"until={newest['time']}", [3, 2, 1]),
+        ("offset=3", [1]),
+    ):
+        found = client.get(f"{V1}/audit?{query}", headers=heads["operator"]).json()
+        assert [one["number"] for one in found["items"]] == numbers, query
+    for query in (
+        "since=yesterday",
+        "actor=%00",
+        "limit=0",
+        f"since={newest['time']}&until=2020-01-01T00:00:00Z",
+    ):
+        assert client.get(f"{V1}/audit?{query}", headers=heads["operator"]).status_code == 422, query
+    assert client.get(f"{V1}/audit", headers=heads["admin"]).status_code == 200

@@ -1,0 +1,141 @@
+"""Pages of other origins can neither read the API nor change anything through the browser of a user."""
+
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.websockets import WebSocketDisconnect
+
+from ground_service.api.app import create_app
+from ground_service.settings import Settings
+
+with warnings.catch_warnings():
+    # It recommends another HTTP library than the installed one; both serve it.
+    warnings.simplefilter("ignore")
+    from fastapi.testclient import TestClient
+
+V1 = "/api/v1"
+BASE = "http://127.0.0.1:8042"
+OWN = {"Origin": BASE}
+PING = {"name": "test_connection", "arguments": {}, "spacecraft_id": 76}
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    """A service without users, as on a laptop."""
+    settings = Settings(home=tmp_path_factory.mktemp("origins"), allowed_hosts=("ground.example",))
+    with TestClient(create_app(settings, inline_jobs=True), base_url=BASE) as opened:
+        yield opened
+
+
+def refused(answer: Any, status: int) -> bool:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    return bool(answer.json()["status"] == status)
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["attacker.example", "attacker.example:8042", "127.0.0.1.attacker.example", "localhost.attacker.example",
+     "192.0.2.7:8042", "user@127.0.0.1", "[::2]:8042", "0.0.0.0:8042"],
+)  # fmt: skip
+def test_a_name_that_is_not_ours_reads_nothing(client: TestClient, host: str) -> None:
+    for path in (f"{V1}/passes", "/", "/metrics", f"{V1}/openapi.json"):
+        answer = client.get(path, headers={"Host": host})
+        assert answer.status_code in (400, 421), (path, answer.text)
+    with pytest.raises(WebSocketDisconnect), client.websocket_connect(f"{V1}/live", headers={"Host": host}):
+        pass
+
+
+@pytest.mark.parametrize(
+    "host", ["127.0.0.1", "localhost:8042", "LOCALHOST.", "[::1]:8042", "[0:0::1]", "ground.example:443"]
+)
+def test_our_own_names_are_served(client: TestClient, host: str) -> None:
+    assert client.get(f"{V1}/passes", headers={"Host": host}).status_code == 200
+
+
+def test_a_supervisor_may_ask_for_health_by_any_name(client: TestClient) -> None:
+    assert client.get("/healthz", headers={"Host": "10.1.2.3:8042"}).status_code == 200
+    assert client.get("/readyz", headers={"Host": "api"}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "browser",
+    [
+        {"Origin": "https://attacker.example"},
+        {"Origin": "null"},
+        {"Origin": "http://127.0.0.1:3000"},
+        {"Origin": "http://127.0.0.1"},
+        {"Origin": "http://localhost:8042"},
+        {"Origin": "file://"},
+        {"Sec-Fetch-Site": "cross-site"},
+        {"Sec-Fetch-Site": "same-site"},
+        {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Origin": BASE},
+        {"Cookie": "session=1"},
+        {**OWN, "Content-Type": "text/plain"},
+        {**OWN, "Content-Type": "application/x-www-form-urlencoded; charset=utf-8"},
+    ],
+)
+def test_a_page_of_another_origin_changes_nothing(client: TestClient, browser: dict[str, str]) -> None:
+    queued = client.post(f"{V1}/telecommands", json=PING).json()["id"]
+    for method, path, body in (
+        ("POST", f"/telecommands/{queued}/release", None),
+        ("POST", "/telecommands", PING),
+        ("POST", "/uplink?spacecraft_id=76", None),
+        ("DELETE", "/windows/1", None),
+        ("PATCH", "/windows/1", {"state": "approved"}),
+    ):
+        kind = {} if body is None else {"Content-Type": "application/json"}
+        assert refused(client.request(method, V1 + path, json=body, headers={**kind, **browser}), 403), path
+    assert client.get(f"{V1}/telecommands/{queued}").json()["state"] == "queued"
+    assert refused(client.post(f"{V1}/telemetry", content=b"x", headers=browser), 403)
+
+
+def test_pages_of_this_service_and_programs_may_change_what_they_like(client: TestClient) -> None:
+    same = {**OWN, "Sec-Fetch-Site": "same-origin", "Cookie": "other=1"}
+    for headers in (same, OWN, {}, {"Sec-Fetch-Site": "none"}, {"User-Agent": "curl/8"}):
+        assert client.post(f"{V1}/telecommands", json=PING, headers=headers).status_code == 201
+    # What `curl --data-binary @file` sends.
+    form = {"Content-Type": "application/x-www-form-urlencoded"}
+    assert client.post(f"{V1}/telemetry", content=b"hello", headers=form).status_code == 202
+    other = {"Host": "ground.example", "Origin": "https://ground.example"}
+    assert client.post(f"{V1}/telecommands", json=PING, headers=other).status_code == 201
+
+
+def test_only_pages_of_this_service_and_programs_watch_the_feed(client: TestClient) -> None:
+    for path in (f"{V1}/live", f"{V1}/payload"):
+        for origin in ("https://attacker.example", "null", "http://127.0.0.1:3000"):
+            headers = {"Origin": origin, "Host": "127.0.0.1:8042"}
+            with pytest.raises(WebSocketDisconnect), client.websocket_connect(path, headers=headers):
+                pass
+    for headers in ({}, OWN):
+        with client.websocket_connect(f"{V1}/live", headers={"Host": "127.0.0.1:8042", **headers}):
+            pass
+
+
+def test_a_page_of_another_site_does_not_read_but_may_link(client: TestClient) -> None:
+    cross = {"Sec-Fetch-Site": "cross-site"}
+    assert refused(client.get(f"{V1}/passes", headers={**cross, "Sec-Fetch-Mode": "no-cors"}), 403)
+    assert client.get("/passes", headers={**cross, "Sec-Fetch-Mode": "navigate"}).status_code == 200
+
+
+def ask_through(tmp_path: Path, proxies: tuple[str, ...], headers: dict[str, str]) -> Any:
+    settings = Settings(home=tmp_path, trusted_proxies=proxies, allowed_hosts=("ground.example",))
+    with TestClient(create_app(settings), base_url=BASE, client=("10.0.0.5", 1)) as opened:
+        return opened.post(f"{V1}/telecommands", json=PING, headers=headers)
+
+
+def test_forwarded_headers_count_only_from_a_trusted_proxy(tmp_path: Path) -> None:
+    forwarded = {
+        "Host": "127.0.0.1:8042",
+        "X-Forwarded-Host": "ground.example",
+        "X-Forwarded-Proto": "https",
+        "Origin": "https://ground.example",
+    }
+    assert ask_through(tmp_path, ("10.0.0.0/24",), forwarded).status_code == 201
+    assert refused(ask_through(tmp_path, (), forwarded), 403)
+    assert refused(ask_through(tmp_path, ("10.0.1.0/24",), forwarded), 403)
+    rebound = {**forwarded, "X-Forwarded-Host": "ground.example, attacker.example"}
+    assert refused(ask_through(tmp_path, ("10.0.0.0/24",), rebound), 421)

@@ -1,0 +1,345 @@
+"""Mission descriptions: what is refused, what is not stated, revisions, and the passes that refer to them."""
+
+import json
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from ground_service.api.app import create_app
+from ground_service.errors import Conflict, Forbidden, InvalidInput, NotFound
+from ground_service.missions.declared import mission_of_manifest
+from ground_service.missions.model import (
+    Evidence,
+    Mission,
+    format_mission,
+    mission_faults,
+    parse_mission,
+    weakest_evidence,
+)
+from ground_service.missions.service import (
+    add_mission,
+    enter,
+    get_mission,
+    list_missions,
+    mission_of_pass,
+    read_mission,
+)
+from ground_service.services.archive_import import import_archive
+from ground_service.services.commanding import enter_command, release_command
+from ground_service.services.ground import open_ground
+from ground_service.services.passes import define_pass, get_pass
+from ground_service.settings import Settings
+from ground_service.store import repository
+from ground_service.store.database import prepare_database
+from linna import cli
+from tests.ground_service.conftest import write_manifest
+
+with warnings.catch_warnings():
+    # It recommends another HTTP library than the installed one; both serve it.
+    warnings.simplefilter("ignore")
+    from fastapi.testclient import TestClient
+
+TEXT = """
+schema_version = 1
+name = "test"
+[spacecraft]
+id = 76
+[frames]
+orientation = "DE421"
+[camera]
+fov_deg = 120
+[reference]
+sigma_rtn_m = [10, 30, 15.5]
+"""
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("fow_deg = 90", "m.toml, camera.fow_deg: expected 'fov_deg', found unknown key 'fow_deg'"),
+        ("fov_deg = 190", "m.toml, camera.fov_deg: expected less than 180, found 190"),
+        ('fov_deg = "wide"', "m.toml, camera.fov_deg: expected a valid number"),
+        ("fov_deg = nan", "m.toml, camera.fov_deg: expected a finite number, found nan"),
+        ("fov_deg = true", "m.toml, camera.fov_deg: expected a valid number, found True"),
+        ("width_px = true", "m.toml, camera.width_px: expected a valid integer, found True"),
+        ('width_px = "5"', "m.toml, camera.width_px: expected a valid integer, found '5'"),
+        ("fov_deg =", "m.toml: expected TOML"),
+    ],
+)
+def test_a_fault_is_named_with_its_place_what_was_expected_and_what_was_found(
+    line: str, message: str
+) -> None:
+    text = f'name = "test"\n[camera]\n{line}\n'
+    with pytest.raises(InvalidInput) as caught:
+        parse_mission(text, "m.toml")
+    assert str(caught.value).startswith(message)
+    assert mission_faults(text, "m.toml") == [str(caught.value)]
+
+
+def test_every_unknown_key_has_a_line_of_its_own() -> None:
+    faults = mission_faults('name = "test"\nlinc = 1\n[camera]\nwidht_px = 5\n', "m.toml")
+    assert faults == [
+        "m.toml, linc: expected 'link', found unknown key 'linc'",
+        "m.toml, camera.widht_px: expected 'width_px', found unknown key 'widht_px'",
+    ]
+
+
+def test_what_is_not_stated_is_none_and_listed() -> None:
+    mission = parse_mission(TEXT)
+    assert mission.camera.width_px is None and mission.frames.gravity_field is None
+    assert "camera.width_px" in mission.unknown and "camera.fov_deg" not in mission.unknown
+    assert mission.evidence.level is None and mission.evidence.text == ""
+
+
+def test_a_revision_depends_on_what_is_stated_and_not_on_its_layout() -> None:
+    other = TEXT.replace("[10, 30, 15.5]", "[10.0, 30.0, 15.50] # rounded").replace("\n[", "\n\n[")
+    assert parse_mission(other).revision == parse_mission(TEXT).revision
+    assert parse_mission(TEXT.replace("15.5", "15.6")).revision != parse_mission(TEXT).revision
+
+
+def test_a_formatted_mission_parses_to_itself() -> None:
+    mission = parse_mission(TEXT)
+    assert parse_mission(format_mission(mission)) == mission
+
+
+@pytest.mark.parametrize(
+    ("values", "level"),
+    [
+        ({}, None),
+        ({"world": "unit-geometry"}, "1"),
+        ({"world": "procedural"}, "2"),
+        ({"world": "real-terrain"}, None),
+        ({"world": "real-terrain", "unseen_share": 0.0}, "3s"),
+        ({"world": "real-terrain", "unseen_share": 0.999}, "3s"),
+        ({"world": "real-terrain", "unseen_share": 1.0}, "3"),
+        ({"world": "other-renderer"}, "4"),
+        ({"world": "photographs"}, "5"),
+    ],
+)
+def test_the_evidence_level_follows_from_the_world_that_was_flown(values: dict, level: str | None) -> None:
+    assert Evidence(**values).level == level
+
+
+def test_a_pass_over_both_kinds_of_terrain_tells_the_share() -> None:
+    text = Evidence(world="real-terrain", unseen_share=0.25).text
+    assert text == "3s (real terrain seen in training; 25 % of frames over unseen terrain)"
+
+
+def test_several_passes_stand_on_the_weakest_evidence_among_them() -> None:
+    seen, unseen = (Evidence(world="real-terrain", unseen_share=share) for share in (0.5, 1.0))
+    assert weakest_evidence([unseen, seen]).startswith("3s (")
+    assert weakest_evidence([unseen, Evidence(world="photographs")]).startswith("3 (")
+    assert weakest_evidence([seen, Evidence(world="procedural")]).startswith("2 (")
+    assert weakest_evidence([seen, Evidence()]) == weakest_evidence([]) == ""
+
+
+def test_entering_the_same_content_again_gives_the_same_revision(ground) -> None:
+    first = add_mission(ground, TEXT.encode(), actor="ada")
+    again = add_mission(ground, (TEXT + "# a remark\n").encode(), actor="bob")
+    assert again == first and first.entered_by == "ada" and first.text == TEXT
+    other = add_mission(ground, TEXT.replace('"DE421"', '"IAU WGCCRE 2009"').encode())
+    listed, total = list_missions(ground)
+    assert [one.revision for one in listed] == [other.revision, first.revision] and total == 2
+    assert get_mission(ground, first.revision[:8]) == first
+
+
+@pytest.mark.parametrize("name", ["", "xyz", "0000000", "00000000", "%" * 8, "a" * 65])
+def test_a_revision_that_is_not_entered_is_not_found(ground, name: str) -> None:
+    add_mission(ground, TEXT.encode())
+    with pytest.raises(NotFound):
+        get_mission(ground, name)
+
+
+def test_a_pass_refers_to_the_newest_description_of_its_spacecraft(ground) -> None:
+    def define(spacecraft: int) -> dict:
+        return get_pass(
+            ground,
+            define_pass(ground, name="p", start_utc_ns=0, stop_utc_ns=10**9, spacecraft_id=spacecraft),
+        )
+
+    assert define(76)["mission_revision"] is None
+    first = add_mission(ground, TEXT.encode())
+    add_mission(ground, TEXT.replace("id = 76", "id = 77").encode())
+    before = define(76)
+    assert before["mission_revision"] == first.revision
+    second = add_mission(ground, TEXT.replace("120", "90").encode())
+    assert define(76)["mission_revision"] == second.revision
+    assert get_pass(ground, before["id"])["mission_revision"] == first.revision
+
+
+def test_an_archive_without_a_description_states_what_its_manifest_declares(ground, synthetic_pass) -> None:
+    key = import_archive(ground, synthetic_pass.folder)
+    with ground.database.reading() as connection:
+        record = repository.get(connection, repository.PASSES, key, "pass")
+        mission = mission_of_pass(connection, record)
+    assert record["mission_id"] is not None
+    assert (mission.name, mission.spacecraft.id) == ("synthetic", 76)
+    assert (mission.camera.width_px, mission.camera.fov_deg, mission.camera.k1) == (512, 120.0, None)
+    assert mission.frames.orientation == "IAU WGCCRE 2009"
+    assert mission.requirements.median_error_m is None and mission.link.coding is None
+
+
+def test_the_description_in_an_archive_becomes_a_revision(ground, make_pass) -> None:
+    folder = make_pass(frames=2, seed=31).folder
+    (folder / "mission.toml").write_text(TEXT)
+    _manifest_again(folder)
+    detail = get_pass(ground, import_archive(ground, folder))
+    assert (detail["mission"], detail["mission_revision"]) == ("test", parse_mission(TEXT).revision)
+
+
+def test_a_description_of_another_spacecraft_is_refused_and_nothing_is_stored(ground, make_pass) -> None:
+    folder = make_pass(frames=2, seed=32).folder
+    (folder / "mission.toml").write_text(TEXT.replace("id = 76", "id = 5"))
+    _manifest_again(folder)
+    with pytest.raises(InvalidInput, match=r"mission\.toml, spacecraft\.id: expected 76 .*, found 5"):
+        import_archive(ground, folder)
+    assert list_missions(ground) == ([], 0)
+
+
+@pytest.mark.parametrize(
+    ("manifest", "expected"),
+    [
+        ({"data_sources": ["orientation DE421"]}, "DE421"),
+        ({"data_sources": ["the orientation DE421 is not meant"]}, None),
+        ({"data_sources": ["orientation DE421", "orientation IAU WGCCRE 2009"]}, None),
+        ({"data_sources": "orientation DE421"}, None),
+        ({}, None),
+    ],
+)
+def test_the_orientation_of_an_old_archive_is_read_where_it_was_declared(manifest, expected) -> None:
+    assert mission_of_manifest(manifest).frames.orientation == expected
+
+
+def test_text_that_mentions_terrain_does_not_decide_the_evidence_level() -> None:
+    def level(**manifest: object) -> tuple[str | None, str | None]:
+        evidence = mission_of_manifest({"seed": 7, **manifest}).evidence
+        return evidence.world, evidence.level
+
+    assert level(data_sources=["height model LROC WAC GLD100"]) == (None, None)
+    assert level(terrain="LROC WAC GLD100") == ("real-terrain", None)
+    assert level(terrain="procedural Moon, seed 7") == ("procedural", "2")
+    assert level(terrain="a procedural Moon beside GLD100") == (None, None)
+
+
+def test_values_of_a_wrong_type_in_a_manifest_are_not_stated() -> None:
+    mission = mission_of_manifest({"gravity": "none", "camera": {"fov_deg": "wide", "width_px": 512}})
+    assert mission.camera.width_px == 512 and mission.camera.fov_deg is None
+
+
+def approval_text(*lines: str) -> bytes:
+    return "\n".join((TEXT, "[approval]", *lines)).encode()
+
+
+RAISED = 'second_person_for = ["replay_store"]'
+RELAXED = 'one_person_for = ["perform_function/set_mode"]'
+
+
+def released_by_one(ground, name: str, arguments: dict) -> bool:
+    command = enter_command(ground, name, arguments, spacecraft_id=76, actor="ann")
+    try:
+        release_command(ground, command, actor="ann")
+    except Conflict as error:
+        assert "expected another person than ann" in str(error)
+        return False
+    return True
+
+
+REPLAY = ("replay_store", {"start_ticks": 0, "stop_ticks": 1})
+SET_MODE = ("perform_function", {"function_id": "set_mode", "argument_1": 1.0, "argument_2": 0.0})
+
+
+def test_the_mission_changes_which_telecommands_need_a_second_person(ground) -> None:
+    assert (released_by_one(ground, *REPLAY), released_by_one(ground, *SET_MODE)) == (True, False)
+    add_mission(ground, approval_text(RAISED, RELAXED))
+    assert (released_by_one(ground, *REPLAY), released_by_one(ground, *SET_MODE)) == (False, True)
+
+
+def test_a_description_in_an_archive_changes_nothing_of_what_people_approve(ground) -> None:
+    mission, text = read_mission(approval_text(RELAXED))
+    with ground.database.writing() as connection:
+        enter(connection, mission, text, actor="archive")
+    assert not released_by_one(ground, *SET_MODE)
+
+
+def test_only_an_administrator_changes_which_telecommands_need_a_second_person(ground) -> None:
+    with pytest.raises(Forbidden, match="expected an administrator"):
+        add_mission(ground, approval_text(RELAXED), actor="ann", may_change_approval=False)
+    add_mission(ground, approval_text(RAISED), actor="root")
+    with pytest.raises(Forbidden):
+        add_mission(ground, TEXT.encode(), actor="ann", may_change_approval=False)
+    changed = approval_text(RAISED).replace(b"fov_deg = 120", b"fov_deg = 119")
+    assert add_mission(ground, changed, actor="ann", may_change_approval=False).entered_by == "ann"
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ('one_person_for = ["replay_stor"]', "expected 'replay_store', found 'replay_stor'"),
+        ('one_person_for = ["replay_store"]\n' + RAISED, "found replay_store in both"),
+    ],
+)
+def test_a_rule_about_a_telecommand_that_does_not_exist_or_twice_is_refused(line: str, message: str) -> None:
+    faults = mission_faults(approval_text(line).decode())
+    assert len(faults) == 1 and message in faults[0]
+
+
+def test_descriptions_are_entered_and_read_over_http(tmp_path: Path) -> None:
+    settings = Settings(home=tmp_path / "home", data=None)
+    with TestClient(create_app(settings, inline_jobs=True)) as client:
+        made = client.post("/api/v1/missions", content=TEXT, headers={"Content-Type": "text/plain"})
+        assert made.status_code == 201, made.text
+        revision = made.json()["revision"]
+        assert revision == parse_mission(TEXT).revision
+        page = client.get("/api/v1/missions").json()
+        assert [one["revision"] for one in page["items"]] == [revision] and page["total"] == 1
+        assert client.get(f"/api/v1/missions/{revision[:8]}").json()["document"]["camera"]["fov_deg"] == 120.0
+        refused = client.post("/api/v1/missions", content="name = 5", headers={"Content-Type": "text/plain"})
+        assert refused.status_code == 422
+        assert "body, name: expected a valid string" in refused.json()["detail"]
+        assert client.get("/api/v1/missions/00000000").status_code == 404
+
+
+def test_commands_check_enter_list_and_show_a_description(tmp_path: Path, capsys) -> None:
+    file, home = tmp_path / "mission.toml", ["--home", str(tmp_path / "home"), "--json"]
+    file.write_text(TEXT)
+    revision = parse_mission(TEXT).revision
+
+    def run(*arguments: str) -> dict:
+        assert cli.run(["mission", *arguments]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    for figures in (run("check", str(file), "--json"), run("add", str(file), *home)):
+        assert (figures["mission"], figures["revision"]) == ("test", revision)
+        assert "camera.width_px" in figures["unknown"]
+    assert [one["revision"] for one in run("list", *home)["missions"]] == [revision]
+    assert run("show", revision[:8], *home)["document"]["frames"]["orientation"] == "DE421"
+    file.write_text("name = 5")
+    assert cli.run(["mission", "check", str(file)]) == 2
+    assert "name: expected a valid string, found 5" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_several_that_enter_one_description_at_once_get_one_revision(
+    kind: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    url = request.getfixturevalue("new_postgres_database")() if kind == "postgresql" else None
+    if url is not None:
+        prepare_database(url, upgrade=True).engine.dispose()
+    with open_ground(tmp_path / "home", database_url=url) as ground, ThreadPoolExecutor(4) as pool:
+        entered = list(pool.map(lambda _: add_mission(ground, TEXT.encode()), range(8)))
+        assert len({one.id for one in entered}) == 1
+        assert list_missions(ground)[1] == 1
+
+
+def test_a_description_names_a_mission() -> None:
+    with pytest.raises(InvalidInput, match="name: expected"):
+        parse_mission("schema_version = 1")
+    assert Mission(name="x").unknown
+
+
+def _manifest_again(folder: Path) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    del manifest["files"]
+    write_manifest(folder, manifest)

@@ -1,0 +1,96 @@
+"""Raw files accounted for by on-board time, against streams whose every frame and packet is known."""
+
+import numpy as np
+
+from ground_service.processing.downlink_accounting import account_raw, read_raw
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import LinkSettings, encode_cadus
+
+SPACECRAFT = 76
+CADU = LinkSettings().cadu_length
+HOUR = 3600 << 16
+HOUSEKEEPING, EVENTS = 0x0A0, 0x0A4
+
+
+def event(ticks: int, count: int) -> bytes:
+    values = {"event_id": "observation_stopped", "frame_number": count, "value_1": 0.0, "value_2": 0.0}
+    return DICTIONARY.pack("event_info", values, ticks=ticks, sequence_count=count)
+
+
+def stream(start_ticks: int, packets: int) -> bytes:
+    """Events a second apart from `start_ticks` on, in one stream of CADUs."""
+    return encode_cadus([event(start_ticks + (k << 16), k) for k in range(packets)], spacecraft_id=SPACECRAFT)
+
+
+LENGTH = len(event(0, 0))
+FIRST, SECOND = stream(10 * HOUR, 300), stream(20 * HOUR, 90)
+"""Two passes; an event is 39 octets or so, a frame holds 28 of them."""
+
+
+def test_two_passes_in_one_file_are_told_apart() -> None:
+    file = read_raw(FIRST + SECOND, SPACECRAFT)
+    one = account_raw([file], 10 * HOUR, 11 * HOUR)
+    two = account_raw([file], 20 * HOUR, 21 * HOUR)
+    assert (one.frames, two.frames) == (len(FIRST) // CADU, len(SECOND) // CADU)
+    assert (one.octets, two.octets) == (len(FIRST), len(SECOND))
+    assert account_raw([file], 12 * HOUR, 13 * HOUR).frames == 0
+    assert file.span == (10 * HOUR, 20 * HOUR + (89 << 16))
+
+
+def test_frames_that_cannot_be_used_lie_where_their_neighbours_lie() -> None:
+    octets = bytearray(FIRST + SECOND)
+    middle = 3 * CADU
+    octets[middle + 50 : middle + 400] = bytes(350)  # beyond repair, in the first pass
+    octets[len(FIRST) + CADU + 60] ^= 0xFF  # one symbol to repair, in the second
+    file = read_raw(bytes(octets), SPACECRAFT)
+    one, two = account_raw([file], 0, 11 * HOUR), account_raw([file], 19 * HOUR, 30 * HOUR)
+    assert (one.frames, one.frames_bad, one.symbols_corrected) == (len(FIRST) // CADU, 1, 0)
+    assert (two.frames, two.frames_bad, two.symbols_corrected) == (len(SECOND) // CADU, 0, 1)
+    assert one.octets == len(FIRST) and two.octets == len(SECOND)
+
+
+def test_octets_between_frames_are_skipped_octets_of_the_frame_before() -> None:
+    file = read_raw(FIRST[: 2 * CADU] + bytes(777) + FIRST[2 * CADU :] + SECOND, SPACECRAFT)
+    one, two = account_raw([file], 0, 11 * HOUR), account_raw([file], 19 * HOUR, 30 * HOUR)
+    assert one.octets_skipped == 777 and one.octets == len(FIRST) + 777
+    assert two.octets_skipped == 0
+
+
+def test_a_packet_that_came_twice_is_a_duplicate_of_its_process_in_its_pass() -> None:
+    again = encode_cadus([event(10 * HOUR, 0), event(10 * HOUR + (5 << 16), 5)], spacecraft_id=SPACECRAFT)
+    files = [read_raw(FIRST, SPACECRAFT), read_raw(again, SPACECRAFT), read_raw(SECOND, SPACECRAFT)]
+    assert account_raw(files, 0, 11 * HOUR).duplicates == {EVENTS: 2}
+    assert account_raw(files, 19 * HOUR, 30 * HOUR).duplicates == {EVENTS: 0}
+    assert account_raw(files[:1], 0, 11 * HOUR).duplicates == {EVENTS: 0}
+
+
+def test_a_packet_put_together_from_parts_leaves_no_octets_unused() -> None:
+    """Two frames are exchanged: the packets across their borders are put together, and none of their octets is left."""
+    octets = FIRST[: 2 * CADU] + FIRST[3 * CADU : 4 * CADU] + FIRST[2 * CADU : 3 * CADU] + FIRST[4 * CADU :]
+    found = account_raw([read_raw(octets, SPACECRAFT)], 0, 11 * HOUR)
+    assert (found.frames, found.frames_bad, found.octets) == (len(FIRST) // CADU, 0, len(FIRST))
+    assert (found.octets_skipped, found.duplicates) == (0, {EVENTS: 0})
+
+
+def test_packets_with_a_wrong_checksum_are_counted_by_process() -> None:
+    good = [event(10 * HOUR + (k << 16), k) for k in range(5)]
+    bad = bytearray(good[2])
+    bad[-5] ^= 1
+    file = read_raw(b"".join([*good[:2], bytes(bad), *good[3:]]), SPACECRAFT)
+    found = account_raw([file], 0, 11 * HOUR)
+    assert (found.crc_errors, found.duplicates) == ({EVENTS: 1}, {EVENTS: 0})
+    assert found.frames is None
+
+
+def test_frames_of_another_spacecraft_are_left_out() -> None:
+    other = encode_cadus([event(10 * HOUR + (k << 16), k) for k in range(60)], spacecraft_id=5)
+    found = account_raw([read_raw(FIRST + other, SPACECRAFT)], 0, 11 * HOUR)
+    assert found.frames == len(FIRST) // CADU and found.frames_bad == 0
+
+
+def test_a_file_without_a_readable_packet_belongs_to_no_pass() -> None:
+    noise = np.random.default_rng(1).integers(0, 256, 5000, dtype=np.uint8).tobytes()
+    file = read_raw(noise, SPACECRAFT)
+    assert file.span is None
+    assert account_raw([file], 0, 1 << 48).octets_skipped == 0
+    assert account_raw([], 0, 1 << 48).frames is None

@@ -1,0 +1,209 @@
+"""Verdict tables: every requirement at, below and past its limit, and the sentence on them."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from ground_service.missions.model import Requirements
+from ground_service.processing.reference_error import error_budget, reference_covariance_m2
+from ground_service.processing.verdict import Evaluated, Limits, requirements, verdict_of
+from reports.values import (
+    ClassScore,
+    DetectorScore,
+    FrameAccounting,
+    HousekeepingParameter,
+    NavigationSeries,
+    NavigationStatistics,
+    PacketAccounting,
+    Requirement,
+)
+
+N = 10
+
+
+def series(
+    name: str, kind: str = "estimate", median: float = 50.0, p95: float = 90.0, **more
+) -> NavigationSeries:
+    nothing = np.zeros(N)
+    return NavigationSeries(
+        name,
+        kind,
+        np.arange(N, dtype=np.int64),
+        nothing,
+        nothing,
+        nothing,
+        np.zeros((N, 3)),
+        statistics=NavigationStatistics(median_3d_m=median, p95_3d_m=p95),
+        **more,
+    )
+
+
+def found(*navigation: NavigationSeries, **more) -> Evaluated:
+    return Evaluated(navigation or (series("anchored"),), **more)
+
+
+def row(key: str, limits: Limits, evaluated: Evaluated) -> Requirement:
+    return next(one for one in requirements(limits, evaluated) if one.key == key)
+
+
+def test_the_limits_are_those_of_the_mission_description() -> None:
+    assert {field.name for field in fields(Limits)} == set(Requirements.model_fields)
+
+
+DETECTOR = DetectorScore(micro=ClassScore(-1, "5–30 km", 200, 60, 20, 0.75, 0.3, 1.0))
+HOUSEKEEPING = tuple(
+    HousekeepingParameter(name, "", np.arange(3), np.array(values))
+    for name, values in (
+        ("temperature_c", [10.0, 45.5, np.nan]),
+        ("memory_used_kib", [1024.0, 4096.0, 2048.0]),
+        ("storage_used_permille", [100.0, 250.0, 30.0]),
+    )
+)
+CONSISTENT = series(
+    "anchored",
+    nees=np.array([0.2, 0.22, 3.0, 3.0, 3.0, 3.0, 9.3, 9.4, np.nan, np.nan]),
+    nis=np.array([0.04, 0.06, 2.0, 7.3, 7.5, np.nan, 2.0, 2.0, 2.0, 2.0]),
+    nis_dof=np.array([2, 2, 2, 2, 2, 2, 2, 2, 2, 0]),
+    anchor_reads_after_start=3,
+    reset_trigger=("initialization", "time_gap", "none", "none", "manual_step", *["none"] * 5),
+)
+"""With 95 % chi-square lies in 0.0506 to 7.378 for two degrees of freedom, in 0.2158 to 9.348 for three (tables)."""
+
+
+@pytest.mark.parametrize(
+    ("key", "limit", "at_limit", "value", "evaluated"),
+    [
+        ("accuracy.median", "median_error_m", 50.0, 50.0, found()),
+        ("accuracy.p95", "p95_error_m", 90.0, 90.0, found()),
+        ("consistency.nees", "consistency_inside_percent", 75.0, 75.0, found(CONSISTENT)),
+        ("consistency.nis", "consistency_inside_percent", 75.0, 75.0, found(CONSISTENT)),
+        (
+            "completeness.packets", "packets_percent", 80.0, 80.0,
+            found(packets=PacketAccounting(80, lost=15, lost_at_edges=5)),
+        ),
+        ("completeness.frames", "frames_percent", 75.0, 75.0, found(frames=FrameAccounting(40, 30, processed=10))),
+        ("completeness.images", "images_percent", 25.0, 25.0, found(frames=FrameAccounting(40, 30, processed=10))),
+        ("detector.recall", "recall", 0.3, 0.3, found(detector=DETECTOR)),
+        ("detector.precision", "precision", 0.75, 0.75, found(detector=DETECTOR)),
+        ("anchor_reads", "anchor_reads", 3.0, 3.0, found(CONSISTENT)),
+        ("resets", "resets", 2.0, 2.0, found(CONSISTENT)),
+        ("resources.cpu", "cpu_percent", 40.0, 40.0, found(cpu_percent=40.0)),
+        ("resources.memory", "memory_mib", 4.0, 4.0, found(housekeeping=HOUSEKEEPING)),
+        ("resources.storage", "storage_percent", 25.0, 25.0, found(housekeeping=HOUSEKEEPING)),
+        ("resources.temperature_max", "temperature_max_c", 45.5, 45.5, found(housekeeping=HOUSEKEEPING)),
+        ("resources.temperature_min", "temperature_min_c", 10.0, 10.0, found(housekeeping=HOUSEKEEPING)),
+    ],
+)  # fmt: skip
+def test_a_requirement_is_met_at_its_limit_not_past_it_and_unknown_without_a_value(
+    key: str, limit: str, at_limit: float, value: float, evaluated: Evaluated
+) -> None:
+    def judged(bound: float | None, what: Evaluated = evaluated) -> Requirement:
+        return row(key, Limits(**{"estimator": "anchored", limit: bound}), what)
+
+    exact = judged(at_limit)
+    assert exact.value == pytest.approx(value) and exact.status == "met"
+    assert exact.margin == pytest.approx(0.0, abs=1e-9)
+    step = 0.01 * at_limit
+    tighter, looser = (-step, step) if exact.at_most else (step, -step)
+    assert judged(at_limit + tighter).status == "not met"
+    assert judged(at_limit + tighter).margin == pytest.approx(-step)
+    assert judged(at_limit + looser).status == "met"
+    assert judged(at_limit, Evaluated()).status == "unknown"
+    assert judged(None).status == "not judged" and judged(None).value == pytest.approx(value)
+
+
+def test_the_declared_estimator_is_judged_and_not_the_best_one() -> None:
+    evaluated = found(series("anchored", median=70.0), series("spherical", median=30.0))
+    limits = Limits(estimator="anchored", median_error_m=50.0)
+    assert (row("accuracy.median", limits, evaluated).value, verdict_of(requirements(limits, evaluated))[1]) == (
+        70.0, "bad",
+    )  # fmt: skip
+    undeclared = row("accuracy.median", replace(limits, estimator=None), evaluated)
+    assert (undeclared.value, undeclared.status) == (None, "unknown")
+    assert undeclared.note == "the mission description declares no estimator"
+
+
+@pytest.mark.parametrize(
+    ("baseline", "status"), [(51.0, "met"), (50.0, "not met"), (49.0, "not met"), (float("nan"), "unknown")]
+)
+def test_a_baseline_has_to_be_beaten_and_not_only_matched(baseline: float, status: str) -> None:
+    limits = Limits(estimator="anchored", better_than=("snapshot",))
+    evaluated = found(series("anchored"), series("snapshot", "baseline", baseline))
+    assert row("better_than.snapshot", limits, evaluated).status == status
+
+
+def test_every_baseline_is_shown_and_one_that_is_missing_is_unknown() -> None:
+    limits = Limits(estimator="anchored", better_than=("snapshot",))
+    evaluated = found(
+        series("anchored"), series("Kepler", "baseline", 1.0), series("smoothed", "smoothed", 1.0)
+    )
+    assert row("better_than.snapshot", limits, evaluated).status == "unknown"
+    for name in ("Kepler", "smoothed"):
+        shown = row(f"better_than.{name}", limits, evaluated)
+        assert (shown.status, shown.value, shown.limit) == ("not judged", 50.0, 1.0)
+
+
+def test_packets_whose_loss_at_the_edges_is_not_known_are_never_complete() -> None:
+    limits = Limits(packets_percent=99.0)
+    assert row("completeness.packets", limits, found(packets=PacketAccounting(100))).status == "unknown"
+    assert (
+        row("completeness.packets", limits, found(packets=PacketAccounting(50, lost=50))).status == "not met"
+    )
+    assert row("completeness.packets", limits, found(packets=PacketAccounting(0))).value is None
+
+
+def test_one_frame_is_not_judged() -> None:
+    one = replace(series("anchored", median=0.0), utc_ns=np.zeros(1, dtype=np.int64))
+    judged = row("accuracy.median", Limits(estimator="anchored", median_error_m=10.0), found(one))
+    assert (judged.status, judged.note) == ("unknown", "one frame was navigated: too little to judge by")
+
+
+def test_resets_of_other_estimators_are_shown_without_judgement() -> None:
+    evaluated = found(series("anchored"), replace(CONSISTENT, name="paper"))
+    shown = row("resets.paper", Limits(estimator="anchored", resets=0.0), evaluated)
+    assert (shown.value, shown.status) == (2.0, "not judged")
+
+
+def table(*statuses: str) -> list[Requirement]:
+    return [Requirement(f"k{i}", f"thing {i}", "m", 2.0, 1.0, True, s) for i, s in enumerate(statuses)]
+
+
+@pytest.mark.parametrize(
+    ("statuses", "level", "sentence"),
+    [
+        (["met", "met", "not judged"], "good", "2 of 2 requirements met."),
+        (
+            ["met", "unknown", "not met", "not judged"], "bad",
+            "1 of 3 requirements not met: thing 2 2.00 m (at most 1.00). 1 unknown: thing 1. 1 of 3 requirements met.",
+        ),
+        (["met", "unknown"], "caution", "1 unknown: thing 1. 1 of 2 requirements met."),
+        (["not judged"], "caution", "No requirement has a limit in the mission description: nothing is judged."),
+        ([], "caution", "No requirement has a limit in the mission description: nothing is judged."),
+    ],
+)  # fmt: skip
+def test_the_sentence_is_derived_from_the_table_and_names_failures_first(
+    statuses: list[str], level: str, sentence: str
+) -> None:
+    assert verdict_of(table(*statuses)) == (sentence, level)
+
+
+def test_many_failures_are_counted_and_the_first_five_named() -> None:
+    text, _ = verdict_of(table(*["not met"] * 7))
+    assert text.startswith("7 of 7 requirements not met: thing 0") and "; and 2 more." in text
+    assert "thing 4" in text and "thing 5" not in text
+
+
+def test_the_error_budget_takes_the_reference_off_in_squares() -> None:
+    """A 3-4-12 error is 13 m long; a reference of 3, 4 and 0 m takes 5 m off in squares: 12 m are left."""
+    error = np.array([[3.0, 4.0, 12.0], [-3.0, 4.0, -12.0], [np.nan, 0.0, 0.0]])
+    budget = error_budget(error, (3.0, 4.0, 0.0))
+    assert budget is not None
+    assert (budget.observed_rms_m, budget.reference_rms_m, budget.estimate_rms_m) == pytest.approx(
+        (13.0, 5.0, 12.0)
+    )
+    below = error_budget(error, (30.0, 0.0, 0.0))
+    assert below is not None and np.isnan(below.estimate_rms_m)
+    assert error_budget(error, None) is None and error_budget(error[2:], (1.0, 1.0, 1.0)) is None
+    assert reference_covariance_m2((1.0, 2.0, 3.0)).tolist() == [[1, 0, 0], [0, 4, 0], [0, 0, 9]]
+    assert not reference_covariance_m2(None).any()

@@ -1,0 +1,110 @@
+"""Parameters of builds on the flight code are checked, confined, before a build is registered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ground_service.errors import BuildNotChecked, InvalidInput
+from ground_service.sandbox.host import SandboxRefused
+from ground_service.services import builds
+from ground_service.services.builds import build_of, registered_builds
+from ground_service.services.ground import Ground, open_ground
+from linna.cli import run as run_command
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Ground:
+    return open_ground(tmp_path / "home")
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[[str], str]:
+    def build(parameters: str) -> str:
+        (tmp_path / "p.toml").write_text(parameters)
+        (tmp_path / "build.toml").write_text('name = "b"\nparameters = "p.toml"\n')
+        return str(tmp_path / "build.toml")
+
+    return build
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (
+            "flight.anchored.gravity_degre = 60",
+            "p.toml, flight.anchored.gravity_degre: expected gravity_degree (nearest known key), "
+            "found an unknown key",
+        ),
+        (
+            "detector.score_threshold = 7.0",
+            "p.toml, detector.score_threshold: expected a finite number from 0 to 1, found 7.0",
+        ),
+    ],
+)
+def test_a_wrong_parameter_is_refused_in_one_line_and_nothing_is_registered(
+    home: Ground, write: Callable[[str], str], text: str, told: str
+) -> None:
+    with pytest.raises(InvalidInput) as error:
+        build_of(home, write(text))
+    assert str(error.value) == told
+    assert registered_builds(home) == []
+    assert not list((home.home / "regression" / "builds").glob("*"))
+
+
+def test_right_parameters_are_registered_and_checked_once(
+    home: Ground, write: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = write("flight.anchored.gravity_degree = 60")
+    first = build_of(home, file)
+    assert [row["digest"] for row in registered_builds(home)] == [first.digest]
+    monkeypatch.setattr(builds, "run_in_sandbox", None)
+    assert build_of(home, file).digest == first.digest
+
+
+def _refused(*_: Any) -> dict[str, Any]:
+    raise SandboxRefused("no user namespaces")
+
+
+def _ended(**changes: Any) -> Callable[..., dict[str, Any]]:
+    def run(request: Any, staged: Path, written: Path, printed: Path) -> dict[str, Any]:
+        printed.write_text("Traceback\nMemoryError\n")
+        return {"cause": "", "exit_status": 0, "signal": None} | changes
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("run", "told"),
+    [
+        (_refused, "no user namespaces"),
+        (_ended(exit_status=1), "status 1, signal None: MemoryError"),
+        (_ended(exit_status=2), "status 2, signal None: MemoryError"),
+        (_ended(exit_status=None, signal=9), "signal 9"),
+        (_ended(cause="timeout"), "ended with timeout"),
+    ],
+)
+def test_a_build_that_cannot_be_checked_is_not_registered(
+    home: Ground,
+    write: Callable[[str], str],
+    monkeypatch: pytest.MonkeyPatch,
+    run: Callable[..., dict[str, Any]],
+    told: str,
+) -> None:
+    monkeypatch.setattr(builds, "run_in_sandbox", run)
+    with pytest.raises(BuildNotChecked, match=told):
+        build_of(home, write("flight.anchored.gravity_degree = 60"))
+    assert registered_builds(home) == []
+
+
+def test_the_command_checks_a_build_file(
+    write: Callable[[str], str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command(["replay", "--check-build", write("detector.max_detection = 3")]) == 2
+    assert "expected max_detections (nearest known key), found an unknown key" in capsys.readouterr().out
+    assert run_command(["replay", "--check-build", write("detector.max_detections = 3")]) == 0
+    assert run_command(["replay", "--out", "x"]) == 2
+    assert "expected ARCHIVE, or --check-build BUILD" in capsys.readouterr().err

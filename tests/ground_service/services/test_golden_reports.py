@@ -1,0 +1,309 @@
+"""Golden reports: constructed passes of which every figure is known before they are evaluated."""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ground_service.processing.pass_evaluation import summary_of
+from ground_service.services.archive_import import import_archive, instance_of, read_manifest
+from ground_service.services.ground import Ground
+from ground_service.services.ingest import ingest_file
+from ground_service.services.passes import completeness, define_pass
+from ground_service.services.reports import evaluate
+from lunar.lens import BrownCamera
+from reports.render import render_html, to_json
+from reports.values import PassReport, Requirement
+from tests.ground_service.conftest import CADENCE_S, NS, SPACECRAFT, encode_downlink, write_manifest
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import LinkSettings, encode_cadus
+
+FRAMES = 12
+PACKETS_PER_FRAME = 6  # detections, two states, two outcomes, housekeeping
+DETECTIONS, STATES, OUTCOMES, HOUSEKEEPING = 0x0A1, 0x0A2, 0x0A3, 0x0A0
+HOUR_NS = 3600 * NS
+
+MISSION = """
+schema_version = 1
+name = "golden"
+[spacecraft]
+id = 76
+[frames]
+orientation = "IAU WGCCRE 2009"
+gravity_field = "GRGM1200L (12x12, built in)"
+[camera]
+pointing = "nadir"
+k1 = 0.0
+[reference]
+sigma_rtn_m = [3.0, 4.0, 0.0]
+[evidence]
+world = "real-terrain"
+unseen_share = 0.25
+[requirements]
+estimator = "spherical"
+median_error_m = 129.0
+p95_error_m = 131.0
+better_than = ["propagate-only"]
+packets_percent = 100.0
+frames_percent = 100.0
+images_percent = 100.0
+recall = 0.5
+precision = 0.5
+anchor_reads = 0.0
+resets = 0.0
+temperature_max_c = 21.0
+cpu_percent = 50.0
+"""
+
+
+def rows(report: PassReport) -> dict[str, Requirement]:
+    return {one.key: one for one in report.requirements}
+
+
+def statuses(report: PassReport) -> dict[str, str]:
+    return {key: one.status for key, one in rows(report).items() if one.status != "not judged"}
+
+
+def evaluated(ground: Ground, folder: Path) -> PassReport:
+    return evaluate(ground, import_archive(ground, folder))
+
+
+def test_a_whole_pass(make_pass: Callable[..., Any], ground: Ground) -> None:
+    """130 m in 3-D put in, the reference good to 5 m: 129.9 m are the estimate's. Two thirds of four craters found."""
+    made = make_pass(frames=FRAMES, seed=41, mission=MISSION)
+    report = evaluated(ground, made.folder)
+    table = rows(report)
+    assert table["accuracy.median"].value == pytest.approx(130.0, abs=2e-3)
+    assert table["accuracy.median"].margin == pytest.approx(-1.0, abs=2e-3)
+    assert report.detector is not None and report.detector.micro is not None
+    hits = made.expected - made.missed
+    assert table["detector.recall"].value == pytest.approx(hits / made.expected)
+    assert table["detector.precision"].value == pytest.approx(hits / (hits + FRAMES))
+    assert table["resources.temperature_max"].value == pytest.approx(20.0 + 0.1 * (FRAMES - 1))
+    assert statuses(report) == {
+        "accuracy.median": "not met",
+        "accuracy.p95": "met",
+        "better_than.propagate-only": "not met",
+        "completeness.packets": "met",
+        "completeness.frames": "met",
+        "completeness.images": "met",
+        "detector.recall": "met",
+        "detector.precision": "met",
+        "anchor_reads": "met",
+        "resets": "met",
+        "resources.cpu": "unknown",
+        "resources.temperature_max": "not met",
+    }
+    assert report.verdict_level == "bad"
+    assert report.verdict.startswith("3 of 12 requirements not met: median 3-D error 130 m (at most 129);")
+    assert report.verdict.endswith("1 unknown: CPU load. 8 of 12 requirements met.")
+    assert report.evidence_level.startswith("3s (real terrain seen in training; 25 %")
+    budget = next(s for s in report.navigation if s.name == "spherical").error_budget
+    assert budget is not None
+    assert (budget.observed_rms_m, budget.reference_rms_m) == (pytest.approx(130.0, abs=2e-3), 5.0)
+    assert budget.estimate_rms_m == pytest.approx(math.sqrt(130.0**2 - 25.0), abs=2e-3)
+    assert report.headline[0].value == table["accuracy.median"].value
+    assert report.remarks == ()
+    page = render_html(report)
+    assert "Requirements of the mission description" in page and "not met" in page and "Error budget" in page
+    assert {one["key"]: one["status"] for one in summary_of(report)["requirements"]} == {
+        key: one.status for key, one in table.items()
+    }
+
+
+def test_half_a_downlink(make_pass: Callable[..., Any], ground: Ground) -> None:
+    """Six of twelve frames came: no count has a gap, and yet half of the packets of images are missing."""
+    made = make_pass(
+        frames=FRAMES,
+        seed=42,
+        encode=lambda packets: encode_downlink(packets[: 6 * PACKETS_PER_FRAME]),
+        mission=MISSION,
+    )
+    report = evaluated(ground, made.folder)
+    assert report.packets is not None and report.accounting is not None
+    assert (report.packets.packets, report.packets.lost, report.packets.lost_at_edges) == (36, 0, 30)
+    edges = {apid: one.lost_at_edges for apid, one in report.packets.by_apid.items()}
+    assert edges == {HOUSEKEEPING: None, DETECTIONS: 6, STATES: 12, OUTCOMES: 12}
+    table = rows(report)
+    assert table["completeness.packets"].value == pytest.approx(100.0 * 36 / 66)
+    assert table["completeness.frames"].value == table["completeness.images"].value == 50.0
+    assert {table[f"completeness.{k}"].status for k in ("packets", "frames", "images")} == {"not met"}
+    assert summary_of(report)["packets_lost"] == 30
+
+
+def test_a_gap_is_not_counted_twice(make_pass: Callable[..., Any], ground: Ground) -> None:
+    """Frames 4 and 5 are lost in between, frames 10 and 11 at the end: 12 packets in gaps, 2 x 5 at the edge."""
+    n = PACKETS_PER_FRAME
+
+    def cut(packets: list[bytes]) -> bytes:
+        return encode_downlink([*packets[: 4 * n], *packets[6 * n : 10 * n]])
+
+    report = evaluated(ground, make_pass(frames=FRAMES, seed=43, encode=cut, mission=MISSION).folder)
+    assert report.packets is not None
+    assert (report.packets.packets, report.packets.lost, report.packets.lost_at_edges) == (48, 12, 10)
+    assert rows(report)["completeness.frames"].value == pytest.approx(100.0 * 8 / 12)
+
+
+def test_frames_that_were_never_made_are_no_lost_packets(
+    make_pass: Callable[..., Any], ground: Ground
+) -> None:
+    """Twelve frames were planned; the payload counted from 0 to 6, and all of its packets came."""
+
+    def six(packets: list[bytes]) -> bytes:
+        ticks = [int.from_bytes(packets[k][14:20], "big") for k in (0, 6 * PACKETS_PER_FRAME)]
+        events = [
+            DICTIONARY.pack(
+                "event_info",
+                {"event_id": f"observation_{name}", "frame_number": number, "value_1": 0.0, "value_2": 0.0},
+                ticks=tick,
+                sequence_count=count,
+            )
+            for count, (name, number, tick) in enumerate(
+                zip(("started", "stopped"), (0, 6), ticks, strict=True)
+            )
+        ]
+        return encode_downlink([events[0], *packets[: 6 * PACKETS_PER_FRAME], events[1]])
+
+    report = evaluated(ground, make_pass(frames=FRAMES, seed=52, encode=six, mission=MISSION).folder)
+    assert report.packets is not None
+    assert (report.packets.packets, report.packets.missing) == (38, 0)
+    assert statuses(report)["completeness.packets"] == "met"
+    assert rows(report)["completeness.frames"].value == 50.0
+
+
+def test_packets_that_came_twice(make_pass: Callable[..., Any], ground: Ground) -> None:
+    def again(packets: list[bytes]) -> bytes:
+        return encode_downlink([*packets, *packets[: 2 * PACKETS_PER_FRAME]])
+
+    report = evaluated(ground, make_pass(frames=FRAMES, seed=44, encode=again, mission=MISSION).folder)
+    assert report.packets is not None
+    assert (report.packets.packets, report.packets.duplicates) == (FRAMES * PACKETS_PER_FRAME + 1, 12)
+    came_again = {apid: one.duplicates for apid, one in report.packets.by_apid.items() if one.duplicates}
+    assert came_again == {HOUSEKEEPING: 2, DETECTIONS: 2, STATES: 4, OUTCOMES: 4}
+    assert rows(report)["completeness.packets"].status == "met"
+
+
+def test_a_damaged_file_of_another_pass_changes_nothing(
+    make_pass: Callable[..., Any], ground: Ground, tmp_path: Path
+) -> None:
+    made = make_pass(frames=FRAMES, seed=45, mission=MISSION)
+    key = import_archive(ground, made.folder)
+    before = to_json(evaluate(ground, key))
+    counted = completeness(ground, key)
+    manifest, digest = read_manifest(made.folder)
+    later = int(made.utc_ns[-1]) + 90 * 24 * HOUR_NS
+    octets = bytearray(later_events(later, 300))
+    for k in range(0, len(octets), 3 * LinkSettings().cadu_length):
+        octets[k + 40 : k + 600] = bytes(len(octets[k + 40 : k + 600]))
+    (tmp_path / "november.cadu").write_bytes(octets)
+    result = ingest_file(
+        ground, tmp_path / "november.cadu", spacecraft_id=SPACECRAFT, instance=instance_of(manifest, digest)
+    )
+    assert result.frames_bad > 0 and result.packets_new > 0
+    assert to_json(evaluate(ground, key)) == before
+    assert replace(completeness(ground, key), completeness=None) == replace(counted, completeness=None)
+
+
+def test_two_passes_in_one_file(make_pass: Callable[..., Any], ground: Ground, tmp_path: Path) -> None:
+    """Each pass has its own frames and octets, and together they have those of the file."""
+    made = make_pass(frames=FRAMES, seed=46)
+    first, stop = int(made.utc_ns[0]), int(made.utc_ns[-1]) + CADENCE_S * NS
+    later = stop + 10 * HOUR_NS
+    streams = (made.folder / "downlink.cadu").read_bytes(), later_events(later, 90)
+    (tmp_path / "both.cadu").write_bytes(streams[0] + streams[1])
+    ingest_file(ground, tmp_path / "both.cadu", spacecraft_id=SPACECRAFT)
+    found = []
+    for start, end in ((first, stop), (later, later + HOUR_NS)):
+        key = define_pass(ground, name="p", start_utc_ns=start, stop_utc_ns=end, spacecraft_id=SPACECRAFT)
+        found.append(completeness(ground, key))
+    length = LinkSettings().cadu_length
+    assert [one.octets for one in found] == [len(one) for one in streams]
+    assert [one.frames for one in found] == [len(one) // length for one in streams]
+    assert [one.packets for one in found] == [FRAMES * PACKETS_PER_FRAME + 1, 90]
+    assert [one.lost_at_edges for one in found] == [None, None]
+
+
+def later_events(start_utc_ns: int, count: int) -> bytes:
+    from lunar.timescales import ticks_from_utc_ns
+
+    values = {"event_id": "observation_stopped", "frame_number": 0, "value_1": 0.0, "value_2": 0.0}
+    start = int(ticks_from_utc_ns(start_utc_ns))
+    packets = [
+        DICTIONARY.pack("event_info", values, ticks=start + (k << 16), sequence_count=k) for k in range(count)
+    ]
+    return encode_cadus(packets, spacecraft_id=SPACECRAFT)
+
+
+def test_no_reference(make_pass: Callable[..., Any], ground: Ground) -> None:
+    made = make_pass(frames=FRAMES, seed=47, mission=MISSION)
+    (made.folder / "reference.oem").unlink()
+    manifest = json.loads((made.folder / "manifest.json").read_text())
+    del manifest["files"]
+    write_manifest(made.folder, manifest)
+    report = evaluated(ground, made.folder)
+    judged = statuses(report)
+    for key in ("accuracy.median", "accuracy.p95", "better_than.propagate-only", "detector.recall"):
+        assert judged[key] == "unknown" and rows(report)[key].value is None
+    assert judged["completeness.packets"] == "met"
+    assert "not met" in judged.values() and "median 3-D error" in report.verdict.partition("unknown")[2]
+
+
+def test_the_wrong_orientation_is_refused(make_pass: Callable[..., Any], ground: Ground) -> None:
+    """Nothing that needs the Moon's orientation is known where the declared one is not there."""
+    mission = MISSION.replace("IAU WGCCRE 2009", "DE421")
+    report = evaluated(ground, make_pass(frames=FRAMES, seed=48, mission=mission).folder)
+    judged = statuses(report)
+    assert {judged[k] for k in ("accuracy.median", "detector.recall", "better_than.propagate-only")} == {
+        "unknown"
+    }
+    assert "DE421, which is not available on this machine" in render_html(report)
+
+
+LENS = BrownCamera(512, 512, math.radians(120.0), k1=-0.02, p1=5e-4)
+TILT_DEG = 10.0
+"""Corners of the image then look up to 78 degrees from nadir; the horizon lies at 79."""
+
+
+def test_a_tilted_camera_with_a_lens(make_pass: Callable[..., Any], ground: Ground) -> None:
+    """Seen as declared, all that was put in comes back; seen as a nadir pinhole, next to nothing would."""
+    tilted = MISSION.replace("k1 = 0.0", f"k1 = -0.02\np1 = 5e-4\ntilt_deg = {TILT_DEG}\nyaw_deg = 0.0")
+
+    def pass_of(seed: int, mission: str) -> Any:
+        return make_pass(
+            frames=FRAMES, seed=seed, camera=LENS, tilt_rad=math.radians(TILT_DEG), mission=mission
+        )
+
+    made = pass_of(49, tilted)
+    report = evaluated(ground, made.folder)
+    assert report.detector is not None and report.detector.micro is not None
+    assert report.detector.micro.expected == made.expected
+    assert report.detector.micro.detected_true == made.expected - made.missed
+    assert report.detector.micro.localisation_px == pytest.approx(np.hypot(0.5, 1.25), abs=1 / 64)
+    assert "the camera as declared" in report.detector.method
+    nadir = evaluated(ground, pass_of(50, MISSION).folder)
+    assert nadir.detector is not None and nadir.detector.micro is not None
+    assert nadir.detector.micro.recall < 0.2
+
+
+@pytest.mark.parametrize(
+    ("nis", "inside", "status"), [(10.0, 100.0, "met"), (100.0, 0.0, "not met"), (0.5, 0.0, "not met")]
+)
+def test_an_overconfident_filter(
+    make_pass: Callable[..., Any], ground: Ground, nis: float, inside: float, status: str
+) -> None:
+    """Five craters give ten degrees of freedom, whose NIS lies between 3.25 and 20.48 with 95 %."""
+    mission = MISSION.replace('"spherical"', '"anchored"').replace(
+        "median_error_m = 129.0", "median_error_m = 100.0\nconsistency_inside_percent = 90.0"
+    )
+    made = make_pass(frames=FRAMES, seed=51, filter_nis=nis, mission=mission)
+    report = evaluated(ground, made.folder)
+    table = rows(report)
+    assert table["accuracy.median"].value == pytest.approx(30.0, abs=2e-3)
+    assert (table["consistency.nis"].value, table["consistency.nis"].status) == (inside, status)
+    # No covariance came down: sums over the diagonal are no NEES.
+    assert (table["consistency.nees"].value, table["consistency.nees"].status) == (None, "unknown")

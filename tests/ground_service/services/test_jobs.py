@@ -1,0 +1,152 @@
+"""Jobs: every one comes to an end, once, and says what went wrong in a line that anybody may read."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ground_service.errors import (
+    Conflict,
+    DatabaseUnavailable,
+    FileDamaged,
+    InvalidInput,
+    StorageFull,
+    public_text,
+)
+from ground_service.services import jobs
+from ground_service.services.ground import Ground
+from ground_service.services.jobs import add_job, enter_ingest, enter_job, run_job
+from ground_service.store import repository
+from ground_service.store.states import JOB, move
+
+Row = dict[str, Any]
+
+
+def job_that(monkeypatch: pytest.MonkeyPatch, ground: Ground, work: Any) -> str:
+    monkeypatch.setitem(jobs.WORK, "nightly", work)
+    return enter_job(ground, "nightly", {})
+
+
+def row_of(ground: Ground, job: str) -> Row:
+    with ground.database.reading() as connection:
+        return repository.get(connection, repository.JOBS, job, "job")
+
+
+@pytest.mark.parametrize(
+    ("error", "shown"),
+    [
+        (
+            OverflowError("Python int too large to convert to SQLite INTEGER"),
+            "OverflowError: Python int too large to convert to SQLite INTEGER",
+        ),
+        (KeyError("vehicle"), "KeyError: 'vehicle'"),
+        (ValueError("first\nsecond"), "ValueError: first second"),
+        (MemoryError(), "MemoryError"),
+        (
+            FileNotFoundError(errno.ENOENT, "No such file or directory", "/srv/linna/files/ab"),
+            "FileNotFoundError: No such file or directory",
+        ),
+        (InvalidInput("/srv/linna/a.zip", "", "a zip", "none"), "a.zip: expected a zip, found none"),
+    ],
+)
+def test_whatever_error_a_job_meets_it_ends_as_failed_and_is_not_repeated(
+    ground: Ground, monkeypatch: pytest.MonkeyPatch, error: Exception, shown: str
+) -> None:
+    tries = []
+
+    def work(*_: Any) -> Row:
+        tries.append(1)
+        raise error
+
+    job = job_that(monkeypatch, ground, work)
+    for _ in range(3):
+        row = run_job(ground, job)
+    assert (row["state"], row["error"], row["attempts"], len(tries)) == ("failed", shown, 1, 1)
+    assert jobs.unfinished_jobs(ground) == []
+
+
+def test_the_traceback_of_an_unexpected_error_is_in_the_log(
+    ground: Ground, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    job = job_that(monkeypatch, ground, lambda *_: {}["missing"])
+    run_job(ground, job)
+    [record] = [one for one in caplog.records if one.levelname == "ERROR"]
+    assert record.exc_info is not None and job in record.getMessage()
+
+
+def test_a_full_disk_is_no_fault_of_the_job(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+    def work(*_: Any) -> Row:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    job = job_that(monkeypatch, ground, work)
+    with pytest.raises(StorageFull):
+        run_job(ground, job)
+    assert (row_of(ground, job)["state"], row_of(ground, job)["attempts"]) == ("queued", 0)
+
+
+def test_a_result_that_the_database_cannot_hold_fails_the_job(
+    ground: Ground, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = run_job(ground, job_that(monkeypatch, ground, lambda *_: {"median": float("nan")}))
+    assert row["state"] == "failed"
+    assert "JSON" in row["error"]
+
+
+def test_an_attempt_that_another_has_overtaken_changes_nothing(
+    ground: Ground, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after a network failure, when the database gives the lock of the first worker to a second one."""
+
+    def work(_ground: Ground, _arguments: Any, job_id: str) -> Row:
+        with ground.database.writing() as connection:
+            move(connection, JOB, job_id, "running", attempts=2)
+        return {"made by": "the first"}
+
+    row = run_job(ground, job_that(monkeypatch, ground, work))
+    assert (row["state"], row["attempts"], row["result"]) == ("running", 2, None)
+
+
+def test_an_id_that_stands_for_another_request_is_refused(ground: Ground) -> None:
+    enter_job(ground, "report", {"pass_id": 1}, job_id="a" * 32)
+    assert enter_job(ground, "report", {"pass_id": 1}, job_id="a" * 32) == "a" * 32
+    for kind, arguments in (("report", {"pass_id": 2}), ("nightly", {})):
+        with pytest.raises(Conflict, match="found another"), ground.database.writing() as connection:
+            add_job(connection, kind, arguments, job_id="a" * 32)
+
+
+def test_an_ingest_asked_for_twice_is_one_and_of_another_file_is_refused(ground: Ground) -> None:
+    one, other = (ground.files.put_octets(octets) for octets in (b"one", b"other"))
+    given: Row = {"spacecraft_id": 76, "instance": "flight", "job_id": "b" * 32}
+    first = enter_ingest(ground, one, "one", **given)
+    assert enter_ingest(ground, one, "one", **given) == first
+    for stored, changed in ((other, {}), (one, {"spacecraft_id": 77}), (one, {"instance": "else"})):
+        with pytest.raises(Conflict, match="found another"):
+            enter_ingest(ground, stored, "one", **(given | changed))
+    with ground.database.reading() as connection:
+        assert repository.page(connection, repository.INGESTS).total == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "shown"),
+    [
+        (
+            DatabaseUnavailable("postgresql+psycopg://linna:***@db/linna", "gone"),
+            "database (address) cannot be opened: gone",
+        ),
+        (FileDamaged(Path("/srv/linna/files/ab/cdef"), "1", "2"), "cdef: expected octets with SHA-256 1, found 2"),
+        (InvalidInput("window", "name", "a line", "'\x1b[2J\n'"), "window, name: expected a line, found ' [2J '"),
+        (ValueError(), "ValueError"),
+        (InvalidInput("x", "", "a number from 0/1 to 3", "and/or"), "x: expected a number from 0/1 to 3, found and/or"),
+    ],
+)  # fmt: skip
+def test_what_is_shown_of_an_error_is_one_line_without_places_of_the_server(
+    error: Exception, shown: str
+) -> None:
+    assert public_text(error) == shown
+
+
+def test_a_long_error_is_cut(ground: Ground) -> None:
+    assert len(public_text(ValueError("x" * 9000))) == 500

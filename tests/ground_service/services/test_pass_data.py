@@ -1,0 +1,176 @@
+"""What the evaluation is given: the declared models and camera, whatever this machine has."""
+
+import json
+import math
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ground_service.errors import EvaluationError, InvalidInput
+from ground_service.missions import frames as declared
+from ground_service.missions.frames import declared_frames
+from ground_service.missions.model import Camera, Frames, Mission
+from ground_service.services.archive_import import import_archive
+from ground_service.services.attitudes import HEADER, load_attitudes
+from ground_service.services.ground import Ground, open_ground
+from ground_service.services.pass_data import camera_of, load_pass_inputs, orientation_of
+from ground_service.services.reports import evaluate
+from lunar.camera import PinholeCamera
+from lunar.datafolder import DataFolder
+from lunar.frames import IauOrientation
+from lunar.gravity import builtin_gravity
+from lunar.lens import BrownCamera
+from lunar.timescales import ticks_from_utc_ns
+from reports.render import to_json
+from tests.ground_service.conftest import write_manifest
+
+MISSING_FILES = DataFolder(
+    orientation_bpc=Path("no.bpc"), gravity=Path("no.gfc"), gravity_alternative=Path("no.cof")
+)
+"""A data folder with other models; none of them may even be opened."""
+
+
+@dataclass(frozen=True)
+class TurnedOrientation:
+    """An orientation that turns the ground by 0.01 degrees (300 m) from the IAU series."""
+
+    name: str = "DE421"
+
+    def mcmf_from_icrf(self, tdb_s: Any) -> Any:
+        angle = math.radians(0.01)
+        turn = np.array(
+            [[math.cos(angle), math.sin(angle), 0], [-math.sin(angle), math.cos(angle), 0], [0, 0, 1]]
+        )
+        return turn @ IauOrientation().mcmf_from_icrf(tdb_s)
+
+    def pa_from_icrf(self, tdb_s: Any) -> Any:
+        return IauOrientation().pa_from_icrf(tdb_s)
+
+
+def changed_archive(synthetic_pass: Any, folder: Path, change: Callable[[dict], None]) -> Path:
+    shutil.copytree(synthetic_pass.folder, folder)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    del manifest["files"]
+    change(manifest)
+    write_manifest(folder, manifest)
+    return folder
+
+
+def report_text(home: Path, data: DataFolder, archive: Path) -> str:
+    with open_ground(home, data) as ground:
+        return to_json(evaluate(ground, import_archive(ground, archive)))
+
+
+def test_a_report_does_not_depend_on_the_data_of_the_machine(synthetic_pass: Any, tmp_path: Path) -> None:
+    without = report_text(tmp_path / "a", DataFolder(), synthetic_pass.folder)
+    assert report_text(tmp_path / "b", MISSING_FILES, synthetic_pass.folder) == without
+    assert json.loads(without)["provenance"]["lunar orientation"] == "IAU WGCCRE 2009"
+
+
+@pytest.mark.parametrize("sources", [["orientation DE421"], ["circular orbit"]])
+def test_without_the_declared_orientation_no_figure_that_needs_it_is_given(
+    synthetic_pass: Any, ground: Ground, tmp_path: Path, sources: list[str]
+) -> None:
+    folder = changed_archive(synthetic_pass, tmp_path / "a", lambda m: m.update(data_sources=sources))
+    report = evaluate(ground, import_archive(ground, folder))
+    reason = "declares the lunar orientation DE421, which is not available on this machine"
+    if sources == ["circular orbit"]:
+        reason = "does not state the lunar orientation (frames.orientation)"
+    assert reason in report.not_available["error"] and reason in report.not_available["detector"]
+    assert report.detector is None and report.reference is None
+    assert {one.kind for one in report.navigation} == {"estimate"}
+    assert all(np.isnan(one.error_rtn_m).all() for one in report.navigation)
+    assert report.verdict_level != "good"
+
+
+def test_a_pass_is_evaluated_in_the_orientation_that_it_declares(
+    synthetic_pass: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Turning the ground by 0.01 degrees moves an estimate by 308 m times the cosine of its latitude."""
+    monkeypatch.setattr(declared, "_kernel", lambda data: TurnedOrientation())
+    folder = changed_archive(
+        synthetic_pass, tmp_path / "a", lambda m: m.update(data_sources=["orientation DE421"])
+    )
+    with open_ground(tmp_path / "home", MISSING_FILES) as ground:
+        report = evaluate(ground, import_archive(ground, folder))
+        shift = next(s for s in report.navigation if s.name == "spherical")
+        latitude = np.radians(shift.latitude_deg)
+    moved = shift.error_rtn_m - np.array([30.0, -40.0, 120.0])
+    radius_m = 1_767_400.0
+    np.testing.assert_allclose(
+        np.linalg.norm(moved, axis=1), radius_m * math.radians(0.01) * np.cos(latitude), rtol=2e-3
+    )
+
+
+def test_declared_models_are_used_and_others_are_named_as_missing() -> None:
+    built_in = builtin_gravity()
+    found = declared_frames(
+        Frames(orientation="IAU WGCCRE 2009", gravity_field=built_in.name, gravity_degree=6), DataFolder()
+    )
+    assert found.orientation == IauOrientation()
+    assert found.gravity is not None and found.gravity.degree == 6
+    assert set(found.refused) == {"onboard_gravity"}
+    assert "does not state the gravity field of the filter" in found.refused["onboard_gravity"]
+    lost = declared_frames(Frames(orientation="DE440", gravity_field="GRGM1200L"), DataFolder())
+    assert (lost.orientation, lost.gravity) == (None, None)
+    assert "lunar orientation DE440, which is not available" in lost.refused["orientation"]
+    assert "gravity field GRGM1200L, which is not available" in lost.refused["gravity"]
+
+
+def test_a_kernel_of_another_name_does_not_stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(declared, "_kernel", lambda data: TurnedOrientation("DE440"))
+    assert declared_frames(Frames(orientation="DE421"), MISSING_FILES).orientation is None
+
+
+def test_a_regression_refuses_an_archive_whose_orientation_is_not_there() -> None:
+    with pytest.raises(EvaluationError, match="DE421, which is not available"):
+        orientation_of(Mission(name="m", frames=Frames(orientation="DE421")), DataFolder())
+    assert orientation_of(Mission(name="m", frames=Frames(orientation="IAU WGCCRE 2009")), DataFolder())
+
+
+def test_the_camera_is_the_declared_one_with_its_lens() -> None:
+    assert camera_of(Camera()) == PinholeCamera()
+    assert camera_of(Camera(width_px=256, height_px=128, fov_deg=90.0, k1=0.0)) == PinholeCamera(
+        256, 128, math.pi / 2.0
+    )
+    assert camera_of(Camera(k1=-0.01, p2=1e-4)) == BrownCamera(k1=-0.01, p2=1e-4)
+
+
+def test_the_attitude_of_an_archive_is_found_by_the_time_of_the_image(
+    synthetic_pass: Any, ground: Ground, tmp_path: Path
+) -> None:
+    folder = tmp_path / "a"
+    shutil.copytree(synthetic_pass.folder, folder)
+    ticks = [int(ticks_from_utc_ns(int(synthetic_pass.utc_ns[k]))) for k in (5, 2)]
+    rows = "".join(f"{tick},{q}\n" for tick, q in zip(ticks, ("0,1,0,0", "1,0,0,0"), strict=True))
+    (folder / "attitude.csv").write_text(f"{HEADER}\n{rows}")
+    write_manifest(
+        folder, {k: v for k, v in json.loads((folder / "manifest.json").read_text()).items() if k != "files"}
+    )
+    viewing = load_pass_inputs(ground, import_archive(ground, folder)).viewing
+    assert np.flatnonzero(viewing.known(synthetic_pass.utc_ns)).tolist() == [2, 5]
+    assert viewing.q_wxyz.tolist() == [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "a.csv, line 1: expected image_ticks,q_w"),
+        ("ticks,q\n", "a.csv, line 1: expected image_ticks,q_w"),
+        (f"{HEADER}\n5,1,0,0,0\n6,1,0,0\n", "a.csv, line 3: expected on-board ticks and a unit quaternion"),
+        (f"{HEADER}\n5,2,0,0,0\n", "a.csv, line 2: expected on-board ticks and a unit quaternion"),
+        (f"{HEADER}\n5,nan,0,0,0\n", "a.csv, line 2: expected on-board ticks and a unit quaternion"),
+        (f"{HEADER}\n-1,1,0,0,0\n", "a.csv, line 2: expected on-board ticks and a unit quaternion"),
+        (f"{HEADER}\nx,1,0,0,0\n", "a.csv, line 2: expected on-board ticks and a unit quaternion"),
+    ],
+)
+def test_a_table_of_attitudes_that_cannot_be_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(InvalidInput) as caught:
+        load_attitudes(tmp_path / "a.csv", "a.csv")
+    assert str(caught.value).startswith(message)

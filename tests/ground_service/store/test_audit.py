@@ -1,0 +1,211 @@
+"""The audit chain: entries in the order of commits, changes that break it, and many processes at once."""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import delete, text, update
+from sqlalchemy.exc import DBAPIError
+
+from ground_service.errors import AuditBroken, GroundError
+from ground_service.store import audit
+from ground_service.store.database import Database, prepare_database
+from ground_service.store.models import AuditEntry, AuditHead
+
+PROCESSES, EACH = 4, 25
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
+    if request.param == "sqlite":
+        url = f"sqlite:///{tmp_path / 'linna.db'}"
+    else:
+        url = request.getfixturevalue("new_postgres_database")()
+    opened = prepare_database(url, upgrade=True)
+    yield opened
+    opened.engine.dispose()
+
+
+def add(database: Database, *actions: str, detail: dict[str, Any] | None = None) -> None:
+    with database.writing() as connection:
+        for action in actions:
+            audit.add_note(connection, audit.Note(5, "ann", action, "7", detail or {}))
+
+
+def broken(database: Database) -> list[audit.BrokenEntry]:
+    with database.reading() as connection:
+        return list(audit.broken_entries(connection))
+
+
+def head(database: Database) -> audit.Head | None:
+    with database.reading() as connection:
+        return audit.read_head(connection)
+
+
+def without_guards(database: Database, *statements: Any) -> None:
+    """Change the log as somebody could who may change the schema."""
+    with database.writing() as connection:
+        for name in audit.GUARD_NAMES:
+            on = " ON audit" if database.dialect == "postgresql" else ""
+            connection.execute(text(f"DROP TRIGGER {name}{on}"))
+        for statement in statements:
+            connection.execute(statement)
+
+
+def test_an_entry_is_bound_to_the_one_before_by_a_hash_that_anybody_can_compute(database: Database) -> None:
+    add(database, "first", "second", detail={"b": 1.5, "a": [None, "ü"]})
+    content = ["0" * 64, 1, 5, "ann", "first", "7", {"a": [None, "ü"], "b": 1.5}]
+    first = hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    content = [first, 2, 5, "ann", "second", "7", {"a": [None, "ü"], "b": 1.5}]
+    second = hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    assert head(database) == audit.Head(2, second)
+    assert broken(database) == []
+
+
+def test_what_is_undone_leaves_no_entry(database: Database) -> None:
+    with pytest.raises(RuntimeError), database.writing() as connection:
+        audit.add_note(connection, audit.Note(5, "ann", "look", "", {}))
+        raise RuntimeError
+    assert head(database) == audit.Head(0, audit.GENESIS)
+    with database.reading() as connection, pytest.raises(RuntimeError, match="inside Database"):
+        audit.add_note(connection, audit.Note(5, "ann", "look", "", {}))
+
+
+def test_numbers_that_are_not_finite_and_keys_that_are_no_text_are_kept_as_text(database: Database) -> None:
+    add(database, "look", detail={"value": float("nan"), "items": {1: float("inf")}})
+    assert broken(database) == []
+
+
+@pytest.mark.parametrize("statement", ["UPDATE audit SET actor = 'bob'", "DELETE FROM audit WHERE id = 1"])
+def test_the_database_refuses_to_change_the_log(database: Database, statement: str) -> None:
+    add(database, "first")
+    with (
+        pytest.raises(GroundError, match="audit entries cannot be changed or removed"),
+        database.writing() as one,
+    ):
+        one.execute(text(statement))
+    assert broken(database) == []
+    with database.reading() as connection:
+        assert audit.missing_guards(connection) == []
+
+
+TABLE: Any = AuditEntry.__table__
+HEAD: Any = AuditHead.__table__
+DAMAGE: dict[str, tuple[Any, str]] = {
+    "time": (update(TABLE).where(TABLE.c.id == 2).values(utc_ns=6), "changed content"),
+    "actor": (update(TABLE).where(TABLE.c.id == 2).values(actor="bob"), "changed content"),
+    "action": (update(TABLE).where(TABLE.c.id == 2).values(action="other"), "changed content"),
+    "target": (update(TABLE).where(TABLE.c.id == 2).values(target="8"), "changed content"),
+    "detail": (update(TABLE).where(TABLE.c.id == 2).values(detail={"a": 1}), "changed content"),
+    "hash": (update(TABLE).where(TABLE.c.id == 2).values(sha256="1" * 64), "changed content"),
+    "predecessor": (update(TABLE).where(TABLE.c.id == 2).values(previous_sha256="1" * 64), "found another"),
+    "first entry": (delete(TABLE).where(TABLE.c.id == 1), "entry 1 missing"),
+    "middle entry": (delete(TABLE).where(TABLE.c.id == 2), "entry 2 missing"),
+    "newest entry": (delete(TABLE).where(TABLE.c.id == 3), "expected the head at the newest entry"),
+    "head number": (update(HEAD).values(number=2), "expected the head at the newest entry"),
+    "head hash": (update(HEAD).values(sha256="1" * 64), "expected the head at the newest entry"),
+    "another head": (HEAD.insert().values(id=2, number=1, sha256="1" * 64), "found 1 more"),
+    "head row": (delete(HEAD), "the head of the chain is missing"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", DAMAGE)
+def test_every_change_of_the_log_is_found(tmp_path: Path, what: str) -> None:
+    database = prepare_database(f"sqlite:///{tmp_path / 'linna.db'}")
+    add(database, "first", "second", "third")
+    statement, reason = DAMAGE[what]
+    without_guards(database, statement)
+    found = broken(database)
+    assert found and reason in " ".join(one.reason for one in found)
+    with database.reading() as connection:
+        assert audit.missing_guards(connection) == list(audit.GUARD_NAMES)
+    database.engine.dispose()
+
+
+def test_entries_that_are_put_in_are_found(database: Database) -> None:
+    add(database, "first")
+    row = {
+        "id": 2, "utc_ns": 5, "actor": "eve", "action": "a", "target": "", "detail": {},
+        "previous_sha256": "1" * 64, "sha256": "2" * 64,
+    }  # fmt: skip
+    with database.writing() as connection:
+        connection.execute(TABLE.insert(), [row])
+    assert {one.number for one in broken(database)} == {1, 2}
+
+
+def test_without_its_head_the_log_takes_no_entry_and_nothing_is_stored(database: Database) -> None:
+    add(database, "first")
+    without_guards(database, delete(HEAD))
+    with pytest.raises(AuditBroken), database.writing() as connection:
+        connection.execute(text("INSERT INTO vehicles (ccsds_id, instance) VALUES (1, 'x')"))
+        audit.add_note(connection, audit.Note(5, "ann", "look", "", {}))
+    with database.reading() as connection:
+        assert connection.execute(text("SELECT count(*) FROM vehicles")).scalar_one() == 0
+
+
+def test_a_failed_statement_of_the_database_is_told_as_one(database: Database) -> None:
+    with pytest.raises(GroundError) as caught, database.writing() as connection:
+        connection.execute(text("INSERT INTO nothing VALUES (1)"))
+    assert isinstance(caught.value.__cause__, DBAPIError)
+
+
+PROGRAM = """
+import sys
+from sqlalchemy import text
+from ground_service.store import audit
+from ground_service.store.database import open_database
+database = open_database(sys.argv[1])
+for k in range(int(sys.argv[3])):
+    with database.writing() as connection:
+        connection.execute(text("UPDATE vehicles SET ccsds_id = ccsds_id + 1 WHERE id = :id"), {"id": 1 + k % 3})
+        audit.add_note(connection, audit.Note(k, sys.argv[2], "race", str(k), {"k": k}))
+        audit.add_note(connection, audit.Note(k, sys.argv[2], "race again", str(k), {}))
+"""
+
+
+def test_several_processes_at_once_make_one_chain(database: Database) -> None:
+    with database.writing() as connection:
+        for key in (1, 2, 3):
+            connection.execute(
+                text("INSERT INTO vehicles (id, ccsds_id, instance) VALUES (:k, 0, :i)"),
+                {"k": key, "i": str(key)},
+            )
+    url = database.engine.url.render_as_string(hide_password=False)
+    running = [
+        subprocess.Popen([sys.executable, "-c", PROGRAM, url, f"p{n}", str(EACH)], env=dict(os.environ))
+        for n in range(PROCESSES)
+    ]
+    assert [process.wait(120) for process in running] == [0] * PROCESSES
+    assert broken(database) == []
+    found = head(database)
+    assert found is not None and found.number == 2 * PROCESSES * EACH
+    with database.reading() as connection:
+        rows = connection.execute(TABLE.select().order_by(TABLE.c.id)).mappings().all()
+        assert connection.execute(text("SELECT sum(ccsds_id) FROM vehicles")).scalar_one() == PROCESSES * EACH
+    for one in range(
+        PROCESSES
+    ):  # each process's own entries come in its order, the two of a transaction together
+        mine = [(row["target"], row["action"], row["id"]) for row in rows if row["actor"] == f"p{one}"]
+        assert [target for target, _, _ in mine[::2]] == [str(k) for k in range(EACH)]
+        assert all(b[2] == a[2] + 1 for a, b in zip(mine[::2], mine[1::2], strict=True))
+
+
+def test_the_lock_is_only_held_at_the_end(new_postgres_database: Callable[[], str]) -> None:
+    """A long transaction with an audit entry does not keep another from being committed."""
+    database = prepare_database(new_postgres_database(), upgrade=True)
+    with database.writing() as long:
+        audit.add_note(long, audit.Note(5, "slow", "work", "", {}))
+        with database.writing() as short:
+            short.execute(text("SET LOCAL lock_timeout = '2s'"))
+            audit.add_note(short, audit.Note(5, "quick", "work", "", {}))
+    with database.reading() as connection:
+        actors = [row[0] for row in connection.execute(text("SELECT actor FROM audit ORDER BY id"))]
+    assert actors == ["quick", "slow"]
+    assert broken(database) == []
+    database.engine.dispose()

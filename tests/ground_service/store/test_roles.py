@@ -1,0 +1,185 @@
+"""The database role of the service on real PostgreSQL: what it can do, and what it cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from sqlalchemy import create_engine, make_url, text
+from sqlalchemy.exc import DBAPIError
+
+from ground_service.clock import utc_now_ns
+from ground_service.services.ground import ground_from_settings
+from ground_service.services.ingest import ingest_file
+from ground_service.services.upkeep import tidy
+from ground_service.services.users import audit
+from ground_service.settings import load_settings
+from ground_service.store import repository
+from ground_service.store.database import open_database
+from ground_service.store.roles import PowerfulRole, check_role
+from linna import cli
+
+SERVICE = "linna_service"
+OWNER = "linna_owner"
+
+
+@dataclass(frozen=True)
+class Roles:
+    """URLs of one database as its superuser, the owner of the schema, and the service."""
+
+    superuser: str
+    owner: str
+    service: str
+
+
+@pytest.fixture(scope="module")
+def roles(new_postgres_database: Callable[[], str]) -> Iterator[Roles]:
+    superuser = new_postgres_database()
+    database = make_url(superuser).database
+    engine = create_engine(superuser, isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        for name in (OWNER, SERVICE):
+            connection.execute(text(f"CREATE ROLE {name} LOGIN"))
+        connection.execute(text(f"ALTER DATABASE {database} OWNER TO {OWNER}"))
+        connection.execute(text(f"ALTER SCHEMA public OWNER TO {OWNER}"))
+    urls = [
+        make_url(superuser).set(username=name).render_as_string(hide_password=False)
+        for name in (OWNER, SERVICE)
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LINNA_DATABASE_URL", urls[1])
+        patch.setenv("LINNA_MIGRATION_DATABASE_URL", urls[0])
+        assert cli.run(["db", "upgrade"]) == 0
+    yield Roles(superuser, *urls)
+    # Roles belong to the server, which other modules share.
+    with engine.connect() as connection:
+        for name in (SERVICE, OWNER):
+            connection.execute(text(f"REASSIGN OWNED BY {name} TO CURRENT_USER"))
+            connection.execute(text(f"DROP OWNED BY {name}"))
+            connection.execute(text(f"DROP ROLE {name}"))
+    engine.dispose()
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "UPDATE audit SET actor = 'nobody'",
+        "DELETE FROM audit",
+        "TRUNCATE audit",
+        "ALTER TABLE audit DISABLE TRIGGER ALL",
+        "DROP TRIGGER audit_no_update ON audit",
+        "ALTER TABLE users ADD COLUMN hidden text",
+        "DROP TABLE packets",
+        "TRUNCATE packets",
+        "CREATE TABLE mine (a int)",
+        "CREATE FUNCTION mine() RETURNS int LANGUAGE sql AS 'SELECT 1'",
+        "CREATE TRIGGER mine AFTER INSERT ON users EXECUTE FUNCTION linna_refuse_audit_change()",
+        "UPDATE alembic_version SET version_num = '9'",
+        "CREATE ROLE mine SUPERUSER",
+        "ALTER ROLE linna_service SUPERUSER",
+        "SET ROLE linna_owner",
+        "SET session_replication_role = replica",
+        "COPY (SELECT 1) TO PROGRAM 'true'",
+        "COPY users FROM '/etc/passwd'",
+        "SELECT pg_read_file('/etc/passwd')",
+        "ALTER SYSTEM SET archive_command = 'true'",
+        "CREATE EXTENSION file_fdw",
+    ],
+)
+def test_the_role_of_the_service_is_refused(roles: Roles, statement: str) -> None:
+    engine = create_engine(roles.service, isolation_level="AUTOCOMMIT")
+    try:
+        with pytest.raises(DBAPIError) as error, engine.connect() as connection:
+            connection.execute(text(statement))
+    finally:
+        engine.dispose()
+    # insufficient_privilege, and nothing else, such as a name that is not there.
+    assert getattr(error.value.orig, "sqlstate", None) == "42501"
+
+
+def test_the_service_does_its_work_with_its_role(
+    roles: Roles, tmp_path: Path, synthetic_pass, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LINNA_ALLOW_DATABASE_OWNER", "false")
+    settings = load_settings(home=tmp_path / "home", database_url=roles.service)
+    with ground_from_settings(settings) as ground:
+        result = ingest_file(ground, synthetic_pass.folder / "downlink.cadu", spacecraft_id=76, instance="a")
+        assert result is not None
+        now = utc_now_ns()
+        with ground.database.writing() as connection:
+            audit(connection, "tests", "user.add", "somebody", {})
+            repository.add(connection, repository.FEED, utc_ns=1, kind="test", payload={})
+            repository.add(connection, repository.FEED, utc_ns=now, kind="test", payload={})
+        assert tidy(ground, 30)["feed"] >= 1
+
+
+def test_a_role_with_more_power_than_the_service_needs_is_refused(
+    roles: Roles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LINNA_ALLOW_DATABASE_OWNER", "false")
+    for url, powers in (
+        (roles.superuser, {"is a superuser", "can make roles", "owns tables", "can change the audit log"}),
+        (roles.owner, {"owns tables", "can add to the schema", "can change the audit log"}),
+    ):
+        with pytest.raises(PowerfulRole, match="LINNA_MIGRATION_DATABASE_URL") as error:
+            ground_from_settings(load_settings(home=tmp_path, database_url=url))
+        assert powers <= set(error.value.powers)
+        assert "is a superuser" in error.value.powers or url == roles.owner
+    allowed = load_settings(home=tmp_path, database_url=roles.owner, allow_database_owner=True)
+    ground_from_settings(allowed).close()
+
+
+def test_one_right_too_many_is_noticed(roles: Roles) -> None:
+    owner = create_engine(roles.owner, isolation_level="AUTOCOMMIT")
+    database = open_database(roles.service)
+    check_role(database)
+    with owner.connect() as connection:
+        for right in ("UPDATE", "DELETE", "TRUNCATE", "TRIGGER"):
+            connection.execute(text(f"GRANT {right} ON audit TO {SERVICE}"))
+            with pytest.raises(PowerfulRole, match="can change the audit log"):
+                check_role(database)
+            connection.execute(text(f"REVOKE {right} ON audit FROM {SERVICE}"))
+        connection.execute(text(f"GRANT CREATE ON SCHEMA public TO {SERVICE}"))
+        with pytest.raises(PowerfulRole, match="can add to the schema"):
+            check_role(database)
+    owner.dispose()
+    database.engine.dispose()
+
+
+def test_granting_again_takes_away_what_is_too_much(
+    roles: Roles, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    owner = create_engine(roles.owner, isolation_level="AUTOCOMMIT")
+    with owner.connect() as connection:
+        connection.execute(text(f"GRANT ALL ON ALL TABLES IN SCHEMA public TO {SERVICE}"))
+        connection.execute(text(f"GRANT ALL ON SCHEMA public TO {SERVICE}"))
+    owner.dispose()
+    monkeypatch.setenv("LINNA_DATABASE_URL", roles.service)
+    monkeypatch.setenv("LINNA_MIGRATION_DATABASE_URL", roles.owner)
+    assert cli.run(["db", "grant"]) == 0
+    database = open_database(roles.service)
+    check_role(database)
+    database.engine.dispose()
+    capsys.readouterr()
+    assert cli.run(["db", "grant", "--role", "nobody_known"]) == 2
+    assert "expected the role nobody_known, found none" in capsys.readouterr().err
+    assert cli.run(["db", "grant", "--print"]) == 0
+    printed = capsys.readouterr().out
+    assert f'GRANT SELECT, INSERT ON "audit" TO "{SERVICE}"' in printed
+    assert f'GRANT SELECT ON "alembic_version" TO "{SERVICE}"' in printed
+
+
+def test_the_service_cannot_take_the_schema_away(roles: Roles, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LINNA_DATABASE_URL", roles.service)
+    monkeypatch.delenv("LINNA_MIGRATION_DATABASE_URL", raising=False)
+    assert cli.run(["db", "downgrade", "base", "--yes"]) == 2
+    database = open_database(roles.service)
+    with database.reading() as connection:
+        assert connection.execute(text("SELECT count(*) FROM alembic_version")).scalar() == 1
+    database.engine.dispose()
+
+
+def test_sqlite_has_no_roles(tmp_path: Path) -> None:
+    check_role(open_database(f"sqlite:///{tmp_path / 'a.db'}"))

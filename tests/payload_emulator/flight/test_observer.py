@@ -1,0 +1,281 @@
+"""The observer: what of a frame reaches the estimators, what is reported, and how reads and troubles are counted."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from payload_emulator.flight.anchored import AnchoredReport
+from payload_emulator.flight.detections import Detections
+from payload_emulator.flight.loads import FlightParameters, FlightTables
+from payload_emulator.flight.observer import Observer
+from payload_emulator.flight.outcomes import Mode, Outcome
+from payload_emulator.flight.preprocess import ImageQuality
+from payload_emulator.flight.tables import pack_anchor_table
+
+ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
+IMAGE = np.zeros((4, 4), dtype=np.uint8)
+RNG = np.random.default_rng(4)
+
+
+class Recorder:
+    """Telemetry that keeps what it is sent."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[str, dict[str, Any]]] = []
+        self.events: list[tuple[str, str, float, float]] = []
+        self.ticks, self.frame_number = 65_536 * 1_000, 0
+        self.counts = {"events": 0, "packets": 0}
+
+    def send(self, name: str, values: dict[str, Any]) -> None:
+        self.sent.append((name, values))
+
+    def event(self, severity: str, event: str, value_1: float = 0.0, value_2: float = 0.0) -> None:
+        self.events.append((severity, event, value_1, value_2))
+
+    def named(self, name: str) -> list[dict[str, Any]]:
+        return [values for found, values in self.sent if found == name]
+
+    def names(self) -> list[str]:
+        return [event for _, event, _, _ in self.events]
+
+
+class Clock:
+    """A timer that says how long the detector takes."""
+
+    def __init__(self) -> None:
+        self.now_ns, self.detector_ns = 0, 0
+
+    def enter(self, stage: Any) -> int:
+        if stage.name == "telemetry":
+            self.now_ns += self.detector_ns
+        return self.now_ns
+
+
+class Eye:
+    """A detector that returns what it is told to."""
+
+    def __init__(self) -> None:
+        self.quality, self.found, self.fails = ImageQuality.OK, detections(6), False
+
+    def examine(self, image: Any, sun: Any = None) -> tuple[ImageQuality, Detections]:
+        self.sun = sun
+        if self.fails:
+            raise RuntimeError("twelve chars")
+        return self.quality, self.found
+
+
+class Navigator:
+    """An anchored estimator that keeps what it is given and answers as it is told to."""
+
+    def __init__(self) -> None:
+        self.given: list[tuple[int, Detections | None, Any]] = []
+        self.outcome, self.lost, self.last_fix, self.new_landmarks = Outcome.coasted, False, None, ()
+        self.breaks = self.reacquired = False
+        root = RNG.standard_normal((18, 18))
+        self.state = SimpleNamespace(mean=np.arange(18.0), covariance=root @ root.T)
+        self.landmarks = SimpleNamespace(ids=np.arange(100) + 1_000)
+
+    def step(self, ticks: int, found: Detections | None, camera_from_icrf: Any) -> AnchoredReport:
+        self.given.append((ticks, found, camera_from_icrf))
+        if self.breaks:
+            raise np.linalg.LinAlgError
+        return AnchoredReport(
+            self.outcome, 0.1, -0.2, 30e3, (1.0, 2.0, 3.0), (4.0, 6.0, 5.0), 7.0, 3, 9, 11, self.reacquired
+        )
+
+
+def detections(count: int) -> Detections:
+    return Detections(
+        100.0 + 10.0 * np.arange(count),
+        np.full(count, 200.0),
+        np.full(count, 30.0),
+        np.linspace(0.9, 0.4, count),
+        np.full(count, 0.7),
+    )
+
+
+@pytest.fixture
+def rig() -> SimpleNamespace:
+    eye, telemetry, clock, navigator = Eye(), Recorder(), Clock(), Navigator()
+    observer = Observer(eye, FlightParameters(modes=(Mode.anchored,)), telemetry, clock)  # type: ignore[arg-type]
+    observer._navigator = navigator  # type: ignore[assignment]
+    return SimpleNamespace(eye=eye, telemetry=telemetry, clock=clock, navigator=navigator, observer=observer)
+
+
+def look(
+    rig: SimpleNamespace, score_floor: float = 0.0, attitude: Any = ATTITUDE, quiet: bool = False
+) -> None:
+    rig.observer.frame(IMAGE, attitude, score_floor, 1.0, quiet)
+
+
+def test_the_estimate_goes_down_with_the_upper_triangle_and_the_degrees_of_its_innovation(
+    rig: SimpleNamespace,
+) -> None:
+    rig.navigator.outcome = Outcome.fixed
+    rig.navigator.last_fix = SimpleNamespace(
+        identification=SimpleNamespace(detection=np.array([0, 3, 5])), index=np.array([7, 2, 40])
+    )
+    look(rig)
+    (sent,) = rig.telemetry.named("filter_estimate")
+    covariance = rig.navigator.state.covariance
+    assert sent["covariance"].tolist() == [covariance[i, j] for i in range(9) for j in range(i, 9)]
+    assert [*sent["position_icrf_m"], *sent["velocity_icrf_m_s"], *sent["acceleration_rtn_m_s2"]] == list(
+        range(9)
+    )
+    assert sent["innovation_degrees"] == 6
+    (pairs,) = rig.telemetry.named("identifications")
+    assert pairs["items"]["detection"].tolist() == [0, 3, 5]
+    assert pairs["items"]["crater_id"].tolist() == [1_007, 1_002, 1_040]
+    assert rig.observer.sightings == {1_007: 1, 1_002: 1, 1_040: 1}
+    (state,) = rig.telemetry.named("navigation_state")
+    assert state["latitude_deg"] == pytest.approx(np.degrees(0.1))
+    assert state["longitude_deg"] == pytest.approx(360.0 - np.degrees(0.2))
+    assert (state["nis"], state["matched"], state["sigma_rtn_m"]) == (7.0, 3, (4.0, 6.0, 5.0))
+    (outcome,) = rig.telemetry.named("frame_outcome")
+    assert (outcome["candidate_pairs"], outcome["pairs"], outcome["detections"]) == (9, 3, 6)
+    assert outcome["anchor_reads"] == 0
+
+
+def test_a_frame_without_a_fix_has_no_degrees_and_no_pairs(rig: SimpleNamespace) -> None:
+    look(rig)
+    assert rig.telemetry.named("filter_estimate")[0]["innovation_degrees"] == 0
+    assert rig.telemetry.named("identifications") == []
+
+
+def test_pairs_name_the_detection_by_its_place_among_those_reported(rig: SimpleNamespace) -> None:
+    """Of 300 detections the 255 strongest go down, in their order."""
+    rig.eye.found = detections(300)
+    score = np.linspace(0.2, 0.9, 300)
+    rig.eye.found = Detections(*(np.full(300, 50.0),) * 3, score, np.full(300, 0.7))
+    rig.navigator.outcome = Outcome.fixed
+    rig.navigator.last_fix = SimpleNamespace(
+        identification=SimpleNamespace(detection=np.array([10, 45, 299])), index=np.array([1, 2, 3])
+    )
+    look(rig)
+    (pairs,) = rig.telemetry.named("identifications")
+    # Rows 0 to 44 are the weakest: the first is not reported, row 45 is the first that is.
+    assert pairs["items"]["detection"].tolist() == [0, 254]
+    assert pairs["items"]["crater_id"].tolist() == [1_002, 1_003]
+    (report,) = rig.telemetry.named("detections")
+    np.testing.assert_array_equal(report["items"]["score"], score[45:])
+
+
+def test_weak_detections_and_those_far_outside_reach_nobody(rig: SimpleNamespace) -> None:
+    u = np.array([100.0, 2e5, np.nan, 120.0, 130.0, 140.0])
+    rig.eye.found = Detections(
+        u, *(np.full(6, 50.0),) * 2, np.array([0.9, 0.9, 0.9, 0.3, np.nan, 0.5]), np.ones(6)
+    )
+    look(rig, score_floor=0.5)
+    ((_, given, _),) = rig.navigator.given
+    # A score at the floor is used; one that is no number is not below it.
+    assert given.u_px.tolist() == [100.0, 130.0, 140.0]
+    (report,) = rig.telemetry.named("detections")
+    assert report["items"]["u_px"].tolist() == [100.0, 130.0, 140.0]
+    assert report["items"]["score"].tolist() == [0.9, 0.0, 0.5]
+    assert rig.observer.counts["detections"] == 3
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_a_bad_image_is_counted_reported_and_kept_from_the_filter(rig: SimpleNamespace, quiet: bool) -> None:
+    rig.eye.quality = ImageQuality.DARK
+    look(rig, quiet=quiet)
+    assert rig.navigator.given[0][1] is None
+    assert rig.observer.counts["frames_bad"] == 1 and rig.observer.last_quality is ImageQuality.DARK
+    assert ("image_dark" in rig.telemetry.names()) is not quiet
+
+
+def test_a_detector_that_fails_or_is_late_gives_no_detections(rig: SimpleNamespace) -> None:
+    rig.eye.fails = True
+    look(rig)
+    assert rig.telemetry.events[0] == ("high", "detector_error", 12.0, 0.0)
+    assert rig.observer.detector_failed and rig.navigator.given[-1][1] is None
+    rig.eye.fails, rig.clock.detector_ns = False, 1_000_000_001
+    look(rig)
+    assert rig.telemetry.names()[-1] == "detector_timeout" and rig.navigator.given[-1][1] is None
+    assert rig.observer.counts["detector_timeouts"] == 1
+    rig.clock.detector_ns = 999_999_999
+    look(rig)
+    assert not rig.observer.detector_failed and len(rig.navigator.given[-1][1]) == 6
+
+
+@pytest.mark.parametrize(
+    "attitude, known",
+    [
+        (ATTITUDE, True),
+        (ATTITUDE * np.array([1.0009, 1, 1, 1, 1, 1, 1]), True),
+        (ATTITUDE * np.array([1.0011, 1, 1, 1, 1, 1, 1]), False),
+        (np.array([np.nan, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0]), False),
+        (np.zeros(0), False),
+    ],
+)
+def test_an_attitude_is_a_unit_quaternion_or_none(rig: SimpleNamespace, attitude: Any, known: bool) -> None:
+    look(rig, attitude=attitude)
+    given = rig.navigator.given[0][2]
+    assert (given is not None) is known
+    assert ("attitude_missing" in rig.telemetry.names()) is not known
+    if known:
+        np.testing.assert_allclose(given, np.eye(3), atol=1e-12)
+
+
+def test_the_sun_is_handed_on_where_it_is_known(rig: SimpleNamespace) -> None:
+    look(rig)
+    np.testing.assert_array_equal(rig.eye.sun, [0.0, 0.0, -1.0])
+    look(rig, attitude=np.array([1.0, 0, 0, 0, np.nan, 0, 0]))
+    assert rig.eye.sun is None
+
+
+def test_lasting_trouble_is_reported_at_its_beginning(rig: SimpleNamespace) -> None:
+    for lost, refused in ((False, False), (True, True), (True, True), (False, False), (True, False)):
+        rig.navigator.lost = lost
+        rig.navigator.outcome = Outcome.refused if refused else Outcome.coasted
+        look(rig)
+    names = rig.telemetry.names()
+    assert names.count("filter_divergence") == 2 and names.count("fix_refused") == 1
+    first = next(event for event in rig.telemetry.events if event[1] == "filter_divergence")
+    assert first == ("medium", "filter_divergence", 6.0, 0.0)
+
+
+def test_a_reset_of_the_filter_is_told_and_counted(rig: SimpleNamespace) -> None:
+    rig.navigator.reacquired = True
+    look(rig)
+    assert ("medium", "filter_reset", 3.0, 6.0) in rig.telemetry.events
+    assert rig.observer.summary()["fixes"]["reacquired"] == 1
+
+
+def test_what_cannot_be_inverted_ends_in_a_fresh_start(rig: SimpleNamespace) -> None:
+    rig.navigator.breaks = True
+    look(rig)
+    assert ("high", "estimator_error", 2.0, 0.0) in rig.telemetry.events
+    # No tables are loaded: there is nothing to begin again with, and frames are refused.
+    look(rig)
+    assert [values["outcome"] for values in rig.telemetry.named("frame_outcome")] == [
+        int(Outcome.refused)
+    ] * 2
+    assert rig.observer.summary()["outcomes"]["refused"] == 2
+
+
+def test_reads_of_the_anchor_are_counted_beyond_the_first(moon: Any) -> None:
+    """The odometry reads an altitude every frame and a position at each reset: the first of each is the start."""
+    telemetry = Recorder()
+    observer = Observer(Eye(), FlightParameters(modes=(Mode.paper,)), telemetry, Clock())  # type: ignore[arg-type]
+    seconds = np.arange(0.0, 400.0, 30.0)
+    octets = pack_anchor_table([moon.ticks_at(second) for second in seconds], moon.orbit(seconds))
+    observer.load_tables(FlightTables(anchor_ephemeris=octets))
+    for k in range(5):
+        # A gap of two minutes before the last frame: one more reset.
+        telemetry.ticks = moon.ticks_at(30.0 + 15.0 * k + (120.0 if k == 4 else 0.0))
+        observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
+    assert observer.anchor_reads == 5 + 2
+    summary = observer.summary()
+    assert (
+        summary["estimators"]["paper"]["altitude_reads"] == 5
+        and summary["estimators"]["paper"]["resets"] == 2
+    )
+    assert summary["anchor_reads_after_start"] == 4 + 1
+    assert "truth_reads_after_start" not in summary
+    assert telemetry.names().count("anchor_read") == 2
+    assert [values["anchor_reads"] for values in telemetry.named("frame_outcome")] == [1, 2, 3, 4, 5]

@@ -1,0 +1,192 @@
+"""Streams as stations deliver them: weak stretches, noise, station headers, gaps, slips, several receivers, any order.
+
+For each stream the packets that a decoder with known settings can find at best follow from the construction.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+
+from tests.tmtc.test_downlink import make_packets
+from tmtc.crc import append_crc
+from tmtc.downlink import (
+    FRAME_GOOD,
+    FRAME_UNCHECKED,
+    DownlinkDecode,
+    DownlinkEncoder,
+    LinkSettings,
+    decode,
+    encode_cadus,
+    propose_settings,
+)
+from tmtc.errors import LinkFormatError
+from tmtc.packets import pack_packet
+
+PACKETS = make_packets(1500, seed=5)
+SETTINGS = LinkSettings()
+ZONE = 1115 - 6 - 2
+
+
+@functools.cache
+def cadus() -> np.ndarray:
+    """The undamaged stream, one CADU a row."""
+    octets = encode_cadus(PACKETS, spacecraft_id=76)
+    return np.frombuffer(octets, dtype=np.uint8).reshape(-1, SETTINGS.cadu_length)
+
+
+def with_bit_errors(rows: np.ndarray, rate: float, seed: int) -> np.ndarray:
+    bits = np.unpackbits(rows.reshape(-1))
+    wrong = np.random.default_rng(seed).random(bits.size) < rate
+    return np.packbits(bits ^ wrong).reshape(rows.shape)
+
+
+def packets_within(received: set[int]) -> list[bytes]:
+    """The packets of which every frame was received."""
+    at, whole = 0, []
+    for packet in PACKETS:
+        frames = range(at // ZONE, (at + len(packet) - 1) // ZONE + 1)
+        if received.issuperset(frames):
+            whole.append(packet)
+        at += len(packet)
+    return whole
+
+
+def check(stream: np.ndarray, expected: list[bytes], **options) -> DownlinkDecode:
+    octets = stream.tobytes()
+    decoded = decode(octets, **options)
+    assert set(decoded.cut.packets(decoded.buffer)) == set(expected)
+    assert sum(decoded.octets.values()) == len(octets) and min(decoded.octets.values()) >= 0
+    return decoded
+
+
+@pytest.mark.parametrize("weak", [20, 100, 180])
+def test_weak_frames_at_the_start_hide_neither_the_settings_nor_the_rest(weak):
+    rows = cadus().copy()
+    rows[:weak] = with_bit_errors(rows[:weak], 1.5e-2, seed=weak)
+    known = decode(rows.tobytes(), settings=SETTINGS)
+    decoded = check(rows, list(known.cut.packets(known.buffer)))
+    assert decoded.settings == propose_settings(cadus()).settings
+    assert set(packets_within(set(range(weak, len(rows))))) <= set(decoded.cut.packets(decoded.buffer))
+    assert decoded.frame_count == len(rows) and decoded.frames_bad > weak * 0.8
+
+
+@pytest.mark.parametrize("octets", [77_000, 79_000, 3_000_000])
+def test_noise_before_the_first_frame_hides_nothing(octets):
+    noise = np.random.default_rng(octets).integers(0, 256, octets, dtype=np.uint8)
+    decoded = check(np.concatenate((noise, cadus().reshape(-1))), PACKETS)
+    assert decoded.octets["unsynchronised"] == octets
+
+
+@pytest.mark.parametrize("rate", [0.0, 2e-3])
+def test_a_station_header_before_each_frame_is_told_from_the_frame(rate):
+    header = np.random.default_rng(8).integers(0, 256, (len(cadus()), 8), dtype=np.uint8)
+    decoded = check(np.hstack((header, with_bit_errors(cadus(), rate, seed=9))), PACKETS)
+    assert decoded.settings is not None and decoded.settings.coding == "rs"
+    assert (decoded.symbols_corrected > 0) == (rate > 0)
+
+
+def test_gaps_of_any_length_between_frames_cost_nothing():
+    rng = np.random.default_rng(10)
+    parts = []
+    for row in cadus():
+        parts += [rng.integers(0, 256, int(rng.integers(0, 60)), dtype=np.uint8), row]
+    check(np.concatenate(parts), PACKETS)
+
+
+@pytest.mark.parametrize(("rate", "seed"), [(2e-2, 0), (3e-2, 1)])
+def test_frames_that_no_code_can_repair_are_never_good(rate, seed):
+    rows = with_bit_errors(cadus()[:60], rate, seed)
+    with pytest.raises(LinkFormatError, match="found none"):
+        decode(rows.tobytes())
+    known = decode(rows.tobytes(), settings=SETTINGS)
+    assert known.frames is not None and not (known.frames.verdict == FRAME_GOOD).any()
+
+
+def test_a_frame_without_code_and_checksum_is_unchecked_and_never_good():
+    octets = encode_cadus(PACKETS, spacecraft_id=76, coding="none", checksum=False)
+    decoded = decode(octets)
+    assert decoded.frames is not None and decoded.packets == len(PACKETS)
+    assert set(decoded.frames.verdict.tolist()) == {FRAME_UNCHECKED}
+    assert decoded.accounting()["frames_unchecked"] == decoded.frame_count
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_noise_is_never_a_frame_or_a_packet(seed):
+    noise = np.random.default_rng(seed).integers(0, 256, 20_000, dtype=np.uint8).tobytes()
+    found = decode(noise)
+    assert found.packets == 0 and found.frame_count == 0
+    known = decode(noise, settings=SETTINGS)
+    assert known.packets == 0
+    assert known.frames is not None and not (known.frames.verdict == FRAME_GOOD).any()
+
+
+def test_every_frame_twice_gives_every_packet():
+    decoded = check(np.repeat(cadus(), 2, axis=0), PACKETS)
+    assert (decoded.frames_lost, decoded.packets_missing, decoded.conflicts) == (0, 0, 0)
+
+
+def test_two_receivers_with_losses_give_the_union():
+    rng = np.random.default_rng(12)
+    n = len(cadus())
+    first, second = (np.flatnonzero(rng.random(n) > 0.15) for _ in range(2))
+    received = set(first.tolist()) | set(second.tolist())
+    decoded = check(np.concatenate((cadus()[first], cadus()[second])), packets_within(received))
+    assert decoded.frames_lost <= n - len(received)
+
+
+def test_odd_frames_followed_by_even_frames_give_every_packet():
+    decoded = check(np.concatenate((cadus()[1::2], cadus()[0::2])), PACKETS)
+    assert (decoded.frames_lost, decoded.packets_missing) == (0, 0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_frames_in_any_order_give_every_packet(seed):
+    order = np.random.default_rng(seed).permutation(len(cadus()))
+    decoded = check(cadus()[order], PACKETS)
+    assert decoded.frames_lost == 0
+
+
+def test_copies_of_frames_of_a_long_packet_are_combined():
+    long = append_crc(pack_packet(0x55, bytes(range(256)) * 24, sequence_count=3)[:-2])
+    octets = DownlinkEncoder(5, LinkSettings(frame_length=223)).encode([*PACKETS[:3], long, *PACKETS[3:6]])
+    rows = np.frombuffer(octets, dtype=np.uint8).reshape(-1, 259)
+    mixed = np.concatenate((rows[:5], rows[9:14], rows[4:10], rows[14:], rows[2:7]))
+    decoded = decode(mixed.tobytes())
+    assert long in set(decoded.cut.packets(decoded.buffer))
+    assert sum(decoded.octets.values()) == mixed.size
+
+
+def test_bit_slips_cost_only_the_frames_they_hit():
+    slips = [9 * 8 * 1279 + 4000, 50 * 8 * 1279 + 77, 100 * 8 * 1279 + 9000]
+    stream = np.packbits(np.delete(np.unpackbits(cadus().reshape(-1)), slips))
+    received = set(range(len(cadus()))) - {9, 50, 100}
+    decoded = check(stream, packets_within(received))
+    assert decoded.frames_bad == 3
+
+
+def test_an_inverted_stream_is_read():
+    check(255 - cadus(), PACKETS)
+
+
+def test_foreign_packets_are_not_ordered_by_a_time_they_do_not_carry():
+    # the 14th octet is that of a CUC time of the dictionary, the six octets behind it count down
+    foreign = [
+        pack_packet(
+            0x123,
+            bytes(7) + b"\x2e" + (10**6 - k).to_bytes(6, "big") + bytes(8),
+            sequence_count=k,
+            secondary_header=True,
+        )
+        for k in range(50)
+    ]
+    decoded = decode(b"".join(append_crc(packet) for packet in _with_room(foreign)))
+    assert decoded.packets == 50
+    assert (decoded.gaps, decoded.packets_missing) == (0, 0)
+
+
+def _with_room(packets: list[bytes]) -> list[bytes]:
+    """The packets with two octets more in the length field, for a checksum to be appended."""
+    return [p[:4] + (int.from_bytes(p[4:6], "big") + 2).to_bytes(2, "big") + p[6:] for p in packets]

@@ -1,0 +1,58 @@
+"""Compiled search for sync markers at every bit of a stream."""
+
+# numba wants numpy integers where annotations say int
+# mypy: disable-error-code="return-value,arg-type,no-any-return"
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tmtc._compile import njit
+
+Array = npt.NDArray[Any]
+
+_HIGH, _LOW = 0x1ACF, 0xFC1D
+
+
+@functools.cache
+def tables() -> Array:
+    """(2, 65536) uint8: bits in which each 16-bit word differs from the marker's first and second half."""
+    words = np.arange(1 << 16, dtype=np.uint16)
+    return np.stack([np.bitwise_count(words ^ np.uint16(half)) for half in (_HIGH, _LOW)])
+
+
+@njit
+def find_markers(
+    octets: Array, first: int, stop: int, tolerance: int, distance: Array, found: Array
+) -> tuple[int, int]:
+    """(count, next bit): start bits in [first, stop) with at most `tolerance` wrong bits, upright or inverted.
+
+    They are written to `found`; the search ends early when it is full. 32 bits must stand behind every start bit.
+    """
+    count = 0
+    bit = first
+    size = octets.size
+    while bit < stop:
+        at = bit >> 3
+        word = np.uint64(0)
+        for k in range(5):
+            octet = octets[at + k] if at + k < size else np.uint8(0)
+            word = (word << np.uint64(8)) | np.uint64(octet)
+        for shift in range(bit & 7, 8):
+            if bit >= stop:
+                break
+            here = (word >> np.uint64(8 - shift)) & np.uint64(0xFFFFFFFF)
+            wrong = np.int64(distance[0, here >> np.uint64(16)]) + np.int64(
+                distance[1, here & np.uint64(0xFFFF)]
+            )
+            if wrong <= tolerance or wrong >= 32 - tolerance:
+                found[count] = bit
+                count += 1
+                if count == found.size:
+                    return count, bit + 1
+            bit += 1
+    return count, bit

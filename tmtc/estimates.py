@@ -1,0 +1,93 @@
+"""Estimates of the navigation filter out of the packets of any dictionary version, as states with full covariances."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from tmtc.schema import Table
+
+Float = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+ESTIMATE_PACKETS = ("filter_state", "filter_estimate")
+"""Packets that carry an estimate: that of version 2, and that of version 3 onwards."""
+
+STATES = 9
+TRIANGLE = STATES * (STATES + 1) // 2
+"""Numbers of a covariance of position, velocity and empirical acceleration."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FilterEstimates:
+    """Estimates in the order of their packets.
+
+    Attributes
+    ----------
+    packet_index
+        Place of each packet in the stream it was cut from, shape (n,).
+    image_ticks, frame_number
+        Of the image, shape (n,).
+    packet_ticks
+        On-board time of the packet, shape (n,).
+    state
+        Position (m) and velocity (m/s), Moon-centred ICRF axes; empirical acceleration (m/s^2), radial, transverse,
+        normal; shape (n, 9).
+    covariance
+        Of the state, in its units and axes, shape (n, 9, 9).
+    innovation_degrees
+        Degrees of freedom of the normalised innovation squared, 0 without a fix, -1 where version 2 does not tell.
+    """
+
+    packet_index: Index
+    image_ticks: Index
+    frame_number: Index
+    packet_ticks: Index
+    state: Float
+    covariance: Float
+    innovation_degrees: Index
+
+    def __len__(self) -> int:
+        return len(self.image_ticks)
+
+
+def filter_estimates(tables: Mapping[str, Table]) -> FilterEstimates:
+    """Return the estimates in unpacked tables, those of version 2 first; none where no such packet came down."""
+    parts = [_of_table(tables[name]) for name in ESTIMATE_PACKETS if name in tables]
+    if not parts:
+        return _none()
+    columns = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in FilterEstimates.__dataclass_fields__
+    )
+    return FilterEstimates(*columns)
+
+
+def full_covariance(triangle: Float, *, upper: bool) -> Float:
+    """Return symmetric matrices (n, 9, 9) from triangles by rows (n, 45)."""
+    rows, columns = np.triu_indices(STATES) if upper else np.tril_indices(STATES)
+    covariance = np.zeros((len(triangle), STATES, STATES))
+    covariance[:, rows, columns] = covariance[:, columns, rows] = triangle
+    return covariance
+
+
+def _of_table(table: Table) -> FilterEstimates:
+    columns, upper = table.columns, table.name == "filter_estimate"
+    names = ("position_icrf_m", "velocity_icrf_m_s", "acceleration_rtn_m_s2")
+    return FilterEstimates(
+        table.packet_index,
+        columns["image_ticks"],
+        columns["frame_number"],
+        table.ticks,
+        np.concatenate([columns[name] for name in names], axis=1),
+        full_covariance(columns["covariance"], upper=upper),
+        columns["innovation_degrees"] if upper else np.full(len(table), -1, dtype=np.int64),
+    )
+
+
+def _none() -> FilterEstimates:
+    none = np.zeros(0, dtype=np.int64)
+    return FilterEstimates(none, none, none, none, np.zeros((0, STATES)), np.zeros((0, STATES, STATES)), none)

@@ -1,0 +1,83 @@
+"""Settings of a downlink: frame length, coding, randomiser and frame error control.
+
+References
+----------
+CCSDS 131.0-B (coding, randomiser, marker); CCSDS 132.0-B (TM transfer frame).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from tmtc.cadu import ASM_LENGTH
+from tmtc.errors import LinkFormatError, ValueRefused
+from tmtc.frames import FRAME_MAX_LENGTH
+from tmtc.randomiser import Randomiser
+from tmtc.reed_solomon import ReedSolomon, code_for
+
+Coding = Literal["rs", "none"]
+
+FRAME_MIN_LENGTH = 16
+"""Octets of the shortest frame that is used: header, error control and some data."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkSettings:
+    """Parameters on which both ends of a link have to agree.
+
+    `interleave` None takes the least that fits `frame_length` (octets). `rs_errors`: symbols that a codeword repairs.
+    `checksum`: frames end with frame error control.
+    """
+
+    frame_length: int = 1115
+    coding: Coding = "rs"
+    randomiser: Randomiser = "legacy"
+    interleave: int | None = None
+    rs_errors: int = 16
+    dual_basis: bool = True
+    checksum: bool = True
+
+    def __post_init__(self) -> None:
+        if not FRAME_MIN_LENGTH <= self.frame_length <= FRAME_MAX_LENGTH:
+            wanted = f"{FRAME_MIN_LENGTH}..{FRAME_MAX_LENGTH}"
+            raise ValueRefused("transfer frame", "frame_length", self.frame_length, wanted)
+
+    @property
+    def code(self) -> ReedSolomon | None:
+        """The Reed-Solomon code, or None."""
+        if self.coding == "none":
+            return None
+        if self.coding != "rs":
+            raise LinkFormatError(f"link: expected coding rs or none, found {self.coding!r}")
+        return code_for(self.frame_length, self.rs_errors, self.interleave, self.dual_basis)
+
+    @property
+    def block_length(self) -> int:
+        """Octets between two markers."""
+        code = self.code
+        return self.frame_length if code is None else code.block_length
+
+    @property
+    def cadu_length(self) -> int:
+        """Octets of a CADU, marker included."""
+        return ASM_LENGTH + self.block_length
+
+    @property
+    def proves_frames(self) -> bool:
+        """Whether a damaged frame can be told from a good one: by its code or its checksum."""
+        return self.coding != "none" or self.checksum
+
+    def describe(self) -> dict[str, object]:
+        """The settings by name, with the interleaving depth in force, for output."""
+        code = self.code
+        return {
+            "frame_length": self.frame_length,
+            "cadu_length": self.cadu_length,
+            "coding": self.coding,
+            "interleave": code.interleave if code else None,
+            "rs_errors": code.errors if code else None,
+            "dual_basis": code.dual_basis if code else None,
+            "randomiser": self.randomiser,
+            "checksum": self.checksum,
+        }

@@ -1,0 +1,312 @@
+"""Proposal of link settings from a recorded stream, with the evidence for each candidate.
+
+The whole stream is searched for undamaged markers. Their distances give the lengths of a CADU that are possible; a
+station may have put octets between CADUs, so that shorter lengths are tried when the distances alone give no frame
+that proves itself. For each length every code, basis, interleaving depth and randomiser is tried on a sample of CADUs
+spread over the stream: share of codewords that are right or can be repaired, share of frame checksums that hold,
+regularity of frame headers, and packets with a right checksum. A candidate without a code or checksum that could have
+failed is proposed only when packets prove it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tmtc import cadu, reed_solomon
+from tmtc.errors import LinkFormatError
+from tmtc.frames import FRAME_HEADER_LENGTH, FRAME_MAX_LENGTH, frame_checksums_hold
+from tmtc.link import FRAME_MIN_LENGTH, LinkSettings
+from tmtc.randomiser import Randomiser, randomise
+
+OctetArray = npt.NDArray[np.uint8]
+CountPackets = Callable[[cadu.CaduSync, LinkSettings], tuple[int, float]]
+"""Packets with a right checksum in these CADUs under these settings, and the share of the frames that they fill."""
+
+RANDOMISERS: tuple[Randomiser, ...] = ("legacy", "long", "none")
+SAMPLE = 48
+"""CADUs on which candidates are tried, spread over the stream so that one weak stretch does not decide."""
+
+STRETCH = 64
+"""CADUs in a row from which packets are counted."""
+
+LONGEST_GAP = 64
+"""Octets that a station is assumed to add to each CADU at most when the mission description states nothing."""
+
+LEAST_SHARE = 0.02
+LEAST_REGULAR = 0.9
+"""Share of frames without code and checksum that have regular headers; chance gives one in 128."""
+
+LEAST_FILLED = 0.5
+"""Share of frames without code and checksum that packets with a right checksum have to fill."""
+
+LEAST_PROOFS = 2
+"""Frames that have to prove themselves: a 16-bit checksum holds by chance once in 65,536 trials."""
+
+_STANDARD = tuple(cadu.ASM_LENGTH + depth * reed_solomon.CODEWORD for depth in reed_solomon.INTERLEAVES)
+_REPAIRED = 12
+_FEW = 8
+_SHORTEST_CADU = cadu.ASM_LENGTH + FRAME_HEADER_LENGTH + 2
+
+
+@dataclass(frozen=True, slots=True)
+class LinkEvidence:
+    """What speaks for one candidate: shares of a sample, and packets with a right checksum in a stretch of CADUs.
+
+    `clean` and `repaired`: codewords without error, and those that could be repaired (None: no code, or not tried).
+    `checksums`: frame checksums that hold. `regular`: frame headers of version 0 with the usual flags. `filled`: share
+    of the frames that right packets take up.
+    """
+
+    settings: LinkSettings
+    sampled: int
+    clean: float | None
+    repaired: float | None
+    checksums: float
+    regular: float
+    packets: int
+    filled: float
+
+    def describe(self) -> dict[str, object]:
+        """The evidence by name, for output."""
+        return {
+            "settings": self.settings.describe(),
+            "sampled": self.sampled,
+            "codewords_clean": self.clean,
+            "codewords_repairable": self.repaired,
+            "checksums_hold": self.checksums,
+            "headers_regular": self.regular,
+            "packets": self.packets,
+            "filled": self.filled,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class LinkProposal:
+    """Settings proposed for a stream (None: none can be), and what they rest on.
+
+    `markers`: undamaged markers in the stream. `distances`: octets between two of them and how often, commonest first.
+    `ambiguous`: another candidate is supported as well as the one proposed.
+    """
+
+    settings: LinkSettings | None
+    evidence: tuple[LinkEvidence, ...]
+    markers: int
+    distances: dict[int, int]
+    ambiguous: bool
+
+    @property
+    def has_regular_markers(self) -> bool:
+        """Whether markers stand in the stream more often, or more regularly, than chance puts them there."""
+        return self.markers >= 3 or max(self.distances.values(), default=0) >= 2
+
+
+def propose_link(stream: OctetArray, count_packets: CountPackets) -> LinkProposal:
+    """Return the settings under which a stream of CADUs makes sense, and the evidence.
+
+    Parameters
+    ----------
+    stream : (n,) uint8
+    count_packets
+        Counts the packets with a right checksum in some of the stream's CADUs.
+    """
+    starts, inverted = cadu.undamaged_markers(stream)
+    distances = cadu.distances_of(starts)
+    if not starts.size:
+        return LinkProposal(None, (), 0, distances, False)
+    found: list[LinkEvidence] = []
+    groups = list(_lengths(stream.size, distances))
+    for proved in (True, False):
+        for lengths in groups:
+            for length in lengths:
+                usual = lengths is groups[0]
+                found += _examine(stream, starts, inverted, length, count_packets, proved, usual)
+            if found:
+                break
+        if found:
+            break
+    found.sort(key=_rank, reverse=True)
+    if not found:
+        return LinkProposal(None, (), int(starts.size), distances, False)
+    best = found[0]
+    rivals = [one for one in found[1:] if one.packets >= best.packets > 0 and one.regular >= best.regular]
+    return LinkProposal(best.settings, tuple(found), int(starts.size), distances, bool(rivals))
+
+
+def _rank(evidence: LinkEvidence) -> tuple[float, float]:
+    proof = max(evidence.clean or 0.0, evidence.repaired or 0.0, evidence.checksums)
+    return evidence.packets + evidence.regular, proof
+
+
+def _lengths(octets: int, distances: dict[int, int]) -> Iterator[list[int]]:
+    """Yield lengths of a CADU in octets, the likeliest group first."""
+    longest = cadu.ASM_LENGTH + max(FRAME_MAX_LENGTH, max(reed_solomon.INTERLEAVES) * reed_solomon.CODEWORD)
+    if not distances:
+        yield [octets] if _SHORTEST_CADU <= octets <= longest else []
+        return
+    total = sum(distances.values())
+    usual = [d for d, n in distances.items() if n >= max(total / 50, 2) and _SHORTEST_CADU <= d <= longest][
+        :4
+    ]
+    yield usual or [d for d in list(distances)[:1] if _SHORTEST_CADU <= d <= longest]
+    # a header or a gap between CADUs: lengths below the distance that few markers undercut
+    ordered = sorted(distances)
+    passed = np.cumsum([distances[d] for d in ordered])
+    shortest = ordered[int(np.searchsorted(passed, 0.05 * total))]
+    near = range(max(shortest - LONGEST_GAP, _SHORTEST_CADU), shortest + 1)
+    yield [length for length in {*_STANDARD, *near} if length <= min(shortest, longest)]
+
+
+def _examine(
+    stream: OctetArray,
+    starts: npt.NDArray[np.int64],
+    inverted: npt.NDArray[np.bool_],
+    length: int,
+    count_packets: CountPackets,
+    proved: bool,
+    usual: bool,
+) -> list[LinkEvidence]:
+    """Return the evidence of the candidates for one length of a CADU.
+
+    `proved`: of those whose frames prove themselves by a code or a checksum; else of those without either. `usual`:
+    the length is a distance of markers; of other lengths only the standard ones are tried on codewords with errors.
+    """
+    whole = np.flatnonzero(starts + 8 * length <= 8 * stream.size)
+    if not whole.size:
+        return []
+    rows = whole[np.unique(np.linspace(0, whole.size - 1, min(whole.size, SAMPLE)).astype(np.int64))]
+    sync = cadu.CaduSync(
+        starts[rows], inverted[rows], np.zeros(rows.size, dtype=np.int64), starts[:0], length
+    )
+    blocks = cadu.cadu_octets(stream, sync)[:, cadu.ASM_LENGTH :]
+    plain = {name: randomise(blocks, name) for name in RANDOMISERS}
+    coded, uncoded = _candidates(length - cadu.ASM_LENGTH)
+    if not proved:
+        without = [
+            replace(c, checksum=False)
+            for c in uncoded
+            if _regular(plain[c.randomiser]).mean() >= LEAST_REGULAR
+        ]
+        weighed = [_weigh(stream, sync, plain[c.randomiser], c, count_packets) for c in without]
+        return [one for one in weighed if one.packets >= LEAST_PROOFS and one.filled >= LEAST_FILLED]
+    # a few blocks tell most candidates from the right one
+    few = np.unique(np.linspace(0, rows.size - 1, min(rows.size, _FEW)).astype(np.int64))
+    likely = [c for c in coded if reed_solomon.clean(plain[c.randomiser][few], _code(c)).any()]
+    clean = [(c, reed_solomon.clean(plain[c.randomiser], _code(c))) for c in likely]
+    finalists = _best([(float(words.mean()), c, np.all(words, axis=1)) for c, words in clean])
+    if not finalists:
+        held = [(c, frame_checksums_hold(plain[c.randomiser])) for c in uncoded]
+        finalists = _best([(float(proof.mean()), c, proof) for c, proof in held])
+    if not finalists and (usual or length in _STANDARD):
+        some = np.unique(np.linspace(0, rows.size - 1, min(rows.size, _REPAIRED)).astype(np.int64))
+        finalists = [
+            c for c in coded if _repairable(plain[c.randomiser][some], c) >= min(LEAST_PROOFS, some.size)
+        ]
+    return [_weigh(stream, sync, plain[c.randomiser], c, count_packets) for c in finalists]
+
+
+def _weigh(
+    stream: OctetArray,
+    sync: cadu.CaduSync,
+    blocks: OctetArray,
+    candidate: LinkSettings,
+    count_packets: CountPackets,
+) -> LinkEvidence:
+    """Return the evidence for one candidate, with frame error control when most frames have it."""
+    code = candidate.code
+    settings, frames = candidate, blocks
+    clean = repaired = None
+    good: npt.NDArray[np.bool_] = np.ones(blocks.shape[0], dtype=np.bool_)
+    if code is not None:
+        decoded = reed_solomon.decode(blocks, code)
+        clean = float((decoded.corrected == 0).mean())
+        repaired = float((decoded.corrected > 0).mean())
+        good = np.all(decoded.corrected >= 0, axis=1)
+        frames = decoded.frames
+    held = frame_checksums_hold(frames)
+    if code is not None:
+        settings = replace(candidate, checksum=bool(held[good].sum() > good.sum() / 2))
+    proved = good & held if settings.checksum else good
+    regular = _regular(frames)
+    share = float(regular[proved].mean()) if proved.any() else 0.0
+    first = int(np.argmax(proved)) if proved.any() else 0
+    begin = int(sync.start_bits[first] >> 3)
+    # enough for the stretch with the gaps that a station may have put between CADUs
+    stretch = stream[begin : begin + (STRETCH + 1) * (sync.period + LONGEST_GAP)]
+    consecutive = cadu.synchronise(stretch, sync.period).head(STRETCH)
+    shifted = cadu.CaduSync(
+        consecutive.start_bits + 8 * begin,
+        consecutive.inverted,
+        consecutive.marker_errors,
+        consecutive.truncated[:0],
+        sync.period,
+    )
+    packets, filled = count_packets(shifted, settings)
+    return LinkEvidence(
+        settings=settings,
+        sampled=int(blocks.shape[0]),
+        clean=clean,
+        repaired=repaired,
+        checksums=float(held.mean()),
+        regular=share,
+        packets=packets,
+        filled=filled,
+    )
+
+
+def _regular(frames: OctetArray) -> npt.NDArray[np.bool_]:
+    """Whether each frame (n, length) has version 0, no flags behind the counts and segment length id 11."""
+    regular: npt.NDArray[np.bool_] = (frames[:, 0] >> 6 == 0) & (frames[:, 4] >> 3 == 0b00011)
+    return regular
+
+
+def _best(
+    shares: list[tuple[float, LinkSettings, Any]],
+) -> list[LinkSettings]:
+    """Candidates with at least half of the greatest share and enough frames that prove themselves."""
+    greatest = max((share for share, _, _ in shares), default=0.0)
+    if greatest <= LEAST_SHARE:
+        return []
+    return [
+        settings
+        for share, settings, proof in shares
+        if share >= greatest / 2 and proof.sum() >= min(LEAST_PROOFS, proof.size)
+    ]
+
+
+def _repairable(blocks: OctetArray, settings: LinkSettings) -> int:
+    """Return of how many blocks the first codeword can be repaired."""
+    code = _code(settings)
+    _, corrected = reed_solomon.repair(np.ascontiguousarray(blocks[:, :: code.interleave]), code)
+    return int(np.count_nonzero(corrected >= 0))
+
+
+def _code(settings: LinkSettings) -> reed_solomon.ReedSolomon:
+    code = settings.code
+    if code is None:
+        raise LinkFormatError("link: expected a coded candidate, found none")
+    return code
+
+
+def _candidates(block_length: int) -> tuple[list[LinkSettings], list[LinkSettings]]:
+    """Return the coded and the uncoded settings whose blocks have that length."""
+    coded = []
+    for errors in (16, 8):
+        for depth in reversed(reed_solomon.INTERLEAVES):
+            frame_length = block_length - 2 * errors * depth
+            if (
+                block_length % depth
+                or block_length // depth > reed_solomon.CODEWORD
+                or not (FRAME_MIN_LENGTH <= frame_length <= FRAME_MAX_LENGTH)
+            ):
+                continue
+            for dual in (True, False):
+                for name in RANDOMISERS:
+                    coded.append(LinkSettings(frame_length, "rs", name, depth, errors, dual))
+    if not FRAME_MIN_LENGTH <= block_length <= FRAME_MAX_LENGTH:
+        return coded, []
+    return coded, [LinkSettings(block_length, "none", name) for name in RANDOMISERS]
