@@ -28,7 +28,7 @@ from ground_service.store import edges, repository
 from ground_service.store.database import prepare_database
 
 SPACECRAFT = 76
-SCOPE = "flight/*"
+SCOPE = "flight"
 BLOCK = 5_000
 
 
@@ -37,7 +37,7 @@ def fill(ground: Ground, link: Link, count: int, channel: str) -> None:
     assert link.settings is not None
     rng = np.random.default_rng(1)
     length = link.settings.cadu_length
-    domain = raw_domain(SCOPE, link)
+    domain = raw_domain(edges.Piece(0, SCOPE, None, "0" * 64, 0, "", 0, None), link)
     for first in range(0, count, BLOCK):
         raw, packets = [], []
         for number in range(first, min(first + BLOCK, count)):

@@ -60,7 +60,7 @@ def batch_of_cut(
     tables = dictionary.unpack_many(buffer, cut)
     place = np.full(len(cut), -1, dtype=np.int64)
     place[good] = np.arange(len(good))
-    view = memoryview(as_octets(buffer))
+    view = as_octets(buffer).data
     octets = [
         bytes(view[start : start + length])
         for start, length in zip(cut.offsets[good].tolist(), cut.lengths[good].tolist(), strict=True)

@@ -293,7 +293,7 @@ class Planner:
         battery: tuple[IntArray, FloatArray],
         commitments: Sequence[Commitment],
     ) -> Candidate:
-        frames = int((stop - start) // round(cadence_s * NS)) + 1
+        frames = frames_between(start, stop, cadence_s)
         epochs = np.linspace(start, stop, min(max(frames, 2), 200)).astype(np.int64)
         at = self._geometry(epochs)
         craters = self._craters(at.position_mcmf_m, constraints) if constraints.craters_per_frame else None
@@ -331,6 +331,11 @@ class Planner:
         if constraints.needs_contact and candidate.downlinked_by_utc_ns is None:
             return "no contact to downlink its data"
         return None
+
+
+def frames_between(start_utc_ns: int, stop_utc_ns: int, cadence_s: float) -> int:
+    """Return the number of frames of an observation: one at its start, then one a cadence, none at its stop."""
+    return max(-((start_utc_ns - stop_utc_ns) // round(cadence_s * NS)), 1)
 
 
 def data_octets(frames: int, detections_per_frame: float, estimators: int) -> int:

@@ -16,7 +16,7 @@ from sqlalchemy import Connection
 from ground_service.clock import utc_now_ns
 from ground_service.errors import PASSING, GroundError, InvalidInput
 from ground_service.link.frames import ChannelEdge, is_checked
-from ground_service.link.packets import PacketBatch
+from ground_service.link.packets import NO_TICKS, PacketBatch
 from ground_service.link.stream import (
     BARE,
     CADU_MAX_OCTETS,
@@ -61,8 +61,10 @@ class IngestResult:
     """What one ingest found in its file, and what of it was new.
 
     `packets_joined` came about only together with files that were ingested before, of `frames_joined` frames among
-    others. `octets_pending` cannot be used yet: they wait for the octets before or behind them. `uplink` holds, for
-    each spacecraft and telecommand channel that the frames tell of, what `tmtc.clcw.UplinkSeen` says.
+    others. `octets_pending` cannot be used yet: they wait for the octets before or behind them. `first_ticks` and
+    `last_ticks` are the earliest and the latest on-board time of the whole packets in the file, None without any.
+    `vehicle_ids` are the vehicles whose packets it holds. `uplink` holds, for each spacecraft and telecommand channel
+    that the frames tell of, what `tmtc.clcw.UplinkSeen` says.
     """
 
     ingest_id: int
@@ -81,6 +83,9 @@ class IngestResult:
     frames_joined: int
     symbols_corrected: int
     unknown: int
+    first_ticks: int | None = None
+    last_ticks: int | None = None
+    vehicle_ids: tuple[int, ...] = ()
     uplink: tuple[dict[str, Any], ...] = ()
 
 
@@ -138,7 +143,7 @@ def ingest_stored(
             place=place,
             state="running",
         )
-    return _run(ground, ingest_id, spacecraft_id, instance, again=False)
+    return _run(ground, ingest_id, again=False)
 
 
 def add_ingest(
@@ -170,7 +175,8 @@ def add_ingest(
         connection,
         edges.Piece(
             ingest_id=ingest_id,
-            scope=f"{instance}/{'*' if spacecraft_id is None else spacecraft_id}",
+            scope=instance,
+            spacecraft_id=spacecraft_id,
             file_sha256=stored.sha256,
             octets=stored.octets,
             stream=place.stream if place is not None else "",
@@ -185,8 +191,6 @@ def run_ingest(
     ground: Ground,
     ingest_id: int,
     *,
-    spacecraft_id: int | None = None,
-    instance: str = FLOWN,
     progress: Progress | None = None,
 ) -> IngestResult:
     """Do what was entered with `add_ingest`; running it again is harmless.
@@ -197,20 +201,18 @@ def run_ingest(
         record = repository.get(connection, repository.INGESTS, ingest_id, "ingest")
         repository.change(connection, repository.INGESTS, ingest_id, state="running")
     again = record["state"] != "queued"
-    return _run(ground, ingest_id, spacecraft_id, instance, again=again, progress=progress)
+    return _run(ground, ingest_id, again=again, progress=progress)
 
 
 def _run(
     ground: Ground,
     ingest_id: int,
-    spacecraft_id: int | None,
-    instance: str,
     *,
     again: bool,
     progress: Progress | None = None,
 ) -> IngestResult:
     try:
-        result = _read_piece(ground, ingest_id, spacecraft_id, instance, again, progress)
+        result = _read_piece(ground, ingest_id, again, progress)
     except PASSING:
         raise
     except (GroundError, TmtcError) as error:
@@ -241,18 +243,16 @@ def _run(
 def _read_piece(
     ground: Ground,
     ingest_id: int,
-    spacecraft_id: int | None,
-    instance: str,
     again: bool,
     progress: Progress | None,
 ) -> IngestResult:
     """Store what is in a piece and what comes about together with others, and read those that wait for its link."""
     with ground.database.reading() as connection:
         piece = edges.piece_of(connection, ingest_id)
-    reading = _Reading(ground, piece, spacecraft_id, instance, progress)
+    reading = _Reading(ground, piece, progress)
     learned = reading.read()
     for other in learned:
-        late = _Reading(ground, other, spacecraft_id, instance, None, vehicles=reading.vehicles)
+        late = _Reading(ground, other, None, vehicles=reading.vehicles)
         late.read()
         with ground.database.writing() as connection:
             repository.change(
@@ -281,20 +281,18 @@ class _Reading:
         self,
         ground: Ground,
         piece: edges.Piece,
-        spacecraft_id: int | None,
-        instance: str,
         progress: Progress | None,
         vehicles: dict[int, int] | None = None,
     ) -> None:
         self.ground = ground
         self.piece = piece
-        self.spacecraft_id = spacecraft_id
-        self.instance = instance
+        self.spacecraft_id = piece.spacecraft_id
         self.progress = progress
         self.vehicles: dict[int, int] = {} if vehicles is None else vehicles
-        self.joiner = Joiner(ground, piece, instance, spacecraft_id, self.vehicles)
+        self.joiner = Joiner(ground, piece, self.vehicles)
         self.new = self.samples = self.unknown = 0
-        self.reader = DownlinkReader(spacecraft_id)
+        self.ticks: list[int] = []
+        self.reader = DownlinkReader(piece.spacecraft_id)
 
     def read(self) -> list[edges.Piece]:
         """Read and join the piece; the pieces that can be read now that its link is known."""
@@ -369,6 +367,9 @@ class _Reading:
         self.new += stored.new
         self.samples += stored.samples
         self.unknown += found.packets.unknown
+        timed = found.packets.ticks[found.packets.ticks != NO_TICKS]
+        if timed.size:
+            self.ticks = [min([*self.ticks, int(timed.min())]), max([*self.ticks, int(timed.max())])]
 
     def _link_by_place(self, known: list[Link]) -> Link | None:
         """The link that a piece too small to show it came by, told from the octets around it."""
@@ -441,6 +442,9 @@ class _Reading:
             frames_joined=joined.frames,
             symbols_corrected=found.symbols_corrected,
             unknown=self.unknown,
+            first_ticks=self.ticks[0] if self.ticks else None,
+            last_ticks=self.ticks[-1] if self.ticks else None,
+            vehicle_ids=tuple(sorted(self.vehicles.values())),
             uplink=tuple(
                 {"spacecraft_id": spacecraft_id, **asdict(seen)}
                 for (spacecraft_id, _), seen in sorted(found.uplink.items())

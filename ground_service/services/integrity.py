@@ -21,7 +21,7 @@ from sqlalchemy import Connection, Table, and_, func, select, text
 from ground_service.errors import GroundError, InvalidInput
 from ground_service.link.packets import DIGEST_OCTETS, batch_of_cut
 from ground_service.services.ground import Ground, open_ground
-from ground_service.services.ingest import ingest_stored
+from ground_service.services.ingest import FLOWN, Place, ingest_stored
 from ground_service.store import audit, repository, row_digests
 from ground_service.store.files import FileArchive, StoredFile, read_blocks
 from ground_service.store.packets import store_batch
@@ -212,12 +212,16 @@ def _ingest_again(
     connection: Connection, ground: Ground, scratch: Ground, good: set[str], found: _Findings
 ) -> None:
     """Ingest every raw file into the scratch archive, as each was the first time."""
-    ingests, vehicles, files = repository.INGESTS, repository.VEHICLES, repository.FILES
+    ingests, vehicles, files, pieces = (
+        repository.INGESTS, repository.VEHICLES, repository.FILES, repository.PIECES,
+    )  # fmt: skip
     query = (
         select(
             ingests.c.id, ingests.c.file_sha256, ingests.c.state, vehicles.c.ccsds_id, vehicles.c.instance,
-            files.c.name, files.c.octets,
+            files.c.name, files.c.octets, pieces.c.scope, pieces.c.spacecraft_id, pieces.c.stream,
+            pieces.c.position,
         )
+        .outerjoin(pieces, pieces.c.ingest_id == ingests.c.id)
         .outerjoin(vehicles, vehicles.c.id == ingests.c.vehicle_id)
         .outerjoin(files, files.c.sha256 == ingests.c.file_sha256)
         .order_by(ingests.c.id)
@@ -225,7 +229,8 @@ def _ingest_again(
     seen = set()
     for row in connection.execute(query).mappings().all():
         ground.check_stopping()
-        key = (row["file_sha256"], row["ccsds_id"], row["instance"])
+        place = Place(row["stream"], row["position"]) if row["stream"] else None
+        key = (row["file_sha256"], row["ccsds_id"], row["instance"], row["spacecraft_id"], place)
         if row["state"] not in INGESTED:
             found.skip("ingests that have not come to their end")
             continue
@@ -240,21 +245,25 @@ def _ingest_again(
             linked.symlink_to(source)
         stored = StoredFile(row["file_sha256"], int(row["octets"]), linked)
         try:
-            _ingest_one(scratch, stored, row)
+            _ingest_one(scratch, stored, row, place)
         except (GroundError, TmtcError) as error:
             if row["state"] == "done":
                 found.damage("ingests", row["id"], f"expected a file that can be ingested, found: {error}")
 
 
-def _ingest_one(scratch: Ground, stored: StoredFile, row: Any) -> None:
-    instance = {"instance": row["instance"]} if row["instance"] is not None else {}
-    try:
-        ingest_stored(scratch, stored, name=str(row["name"]), **instance)
-    except GroundError:
-        if row["ccsds_id"] is None:
-            raise
-        # Bare packets do not say whose they are.
-        ingest_stored(scratch, stored, name=str(row["name"]), spacecraft_id=int(row["ccsds_id"]), **instance)
+def _ingest_one(scratch: Ground, stored: StoredFile, row: Any, place: Place | None) -> None:
+    instance = row["scope"] or row["instance"] or FLOWN
+    spacecraft = row["spacecraft_id"]
+    if row["scope"] is None and row["ccsds_id"] is not None:
+        # An ingest from before pieces were recorded: what was stated about it is not known any more.
+        try:
+            ingest_stored(scratch, stored, name=str(row["name"]), instance=instance)
+            return
+        except GroundError:
+            spacecraft = int(row["ccsds_id"])  # bare packets do not say whose they are
+    ingest_stored(
+        scratch, stored, name=str(row["name"]), spacecraft_id=spacecraft, instance=instance, place=place
+    )
 
 
 def _decode_again(connection: Connection, scratch: Ground, found: _Findings) -> None:

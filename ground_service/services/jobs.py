@@ -59,13 +59,7 @@ def _report(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[s
 
 
 def _ingest(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
-    result = run_ingest(
-        ground,
-        int(arguments["ingest_id"]),
-        spacecraft_id=arguments["spacecraft_id"],
-        instance=str(arguments["instance"]),
-        progress=_progress_of(ground, job_id),
-    )
+    result = run_ingest(ground, int(arguments["ingest_id"]), progress=_progress_of(ground, job_id))
     return {"ingest_id": result.ingest_id, "packets": result.packets, "packets_new": result.packets_new}
 
 

@@ -113,8 +113,6 @@ class Joiner:
 
     ground: Ground
     piece: Piece
-    instance: str
-    spacecraft_id: int | None
     vehicles: dict[int, int]
     joined: Joined = field(default_factory=Joined)
     _channels: list[tuple[str, bytes]] = field(default_factory=list)
@@ -124,7 +122,7 @@ class Joiner:
     def vehicle(self, connection: repository.Connection, spacecraft: int) -> int:
         """Return the id of the vehicle of a spacecraft, made when it is new."""
         if spacecraft not in self.vehicles:
-            vehicle = repository.vehicle_id(connection, spacecraft, self.instance)
+            vehicle = repository.vehicle_id(connection, spacecraft, self.piece.scope)
             note_dictionary(connection, vehicle)
             self.vehicles[spacecraft] = vehicle
         return self.vehicles[spacecraft]
@@ -141,7 +139,7 @@ class Joiner:
 
     def keep_edges(self, connection: repository.Connection, link: Link, edges: Sequence[Edge]) -> None:
         """Keep the edges of the piece, which came by `link`, within the caller's transaction."""
-        domain = raw_domain(self.piece.scope, link)
+        domain = raw_domain(self.piece, link)
         if self.piece.stream:
             edges = [replace(one, role=PLACED) if one.role == MIDDLE else one for one in edges]
         mine = store.add_edges(connection, domain, edges, self.piece.file_sha256)
@@ -150,14 +148,14 @@ class Joiner:
     def join(self) -> None:
         """Join the edges that were kept and committed, and all that comes about by it."""
         for link, identities in self._raw:
-            domain = raw_domain(self.piece.scope, link)
+            domain = raw_domain(self.piece, link)
             if link.settings is not None:
                 with self.ground.database.reading() as connection:
                     self._join_cadus_by_place(connection, domain, link.settings)
                     for edge in self._open(connection, domain, identities):
                         self._join_cadu_by_content(connection, domain, link.settings, edge)
                 self._store()
-            elif self.spacecraft_id is not None:
+            elif self.piece.spacecraft_id is not None:
                 with self.ground.database.reading() as connection:
                     self._join_packets_by_place(connection, domain)
                 waiting = [*identities, *self._store()]
@@ -332,7 +330,7 @@ class Joiner:
         used = []
         for index in np.flatnonzero(block.good).tolist():
             spacecraft = int(block.header.spacecraft_id[index])
-            if self.spacecraft_id is not None and spacecraft != self.spacecraft_id:
+            if self.piece.spacecraft_id is not None and spacecraft != self.piece.spacecraft_id:
                 continue
             known = spacecraft in self.vehicles or spacecraft in self._found.packets
             if not is_checked(block.settings) and not (known and block.frames[index, 4] >> 3 == 0b00011):
@@ -455,7 +453,7 @@ class Joiner:
         stream: bytes,
         begin: int,
     ) -> None:
-        assert self.spacecraft_id is not None
+        assert self.piece.spacecraft_id is not None
         end = begin
         packets = []
         while (length := _packet_length(stream, end)) and _is_packet_or_idle(stream[end : end + length]):
@@ -463,7 +461,7 @@ class Joiner:
             end += length
         if end == begin:
             return
-        self._found.packets.setdefault(self.spacecraft_id, []).extend(packets)
+        self._found.packets.setdefault(self.piece.spacecraft_id, []).extend(packets)
         self._found.parts += [(domain, part) for part in _within(parts, begin, end)]
         rest = list(_within(parts, end, len(stream)))
         if rest and not store.open_starts(connection, domain, rest[0]):
@@ -475,7 +473,7 @@ class Joiner:
     def _join_packet_by_content(
         self, connection: repository.Connection, domain: str, edge: StoredEdge
     ) -> None:
-        assert self.spacecraft_id is not None
+        assert self.piece.spacecraft_id is not None
         middles = []
         if not self.piece.stream:
             middles = self._candidates(connection, domain, MIDDLE, limit=MIDDLES_LIMIT)
@@ -493,7 +491,7 @@ class Joiner:
         else:
             return
         chosen, octets = path
-        packets = self._found.packets.setdefault(self.spacecraft_id, [])
+        packets = self._found.packets.setdefault(self.piece.spacecraft_id, [])
         packets.append(octets)
         self._use(chosen)
         last = chosen[-1]
@@ -556,9 +554,14 @@ class Joiner:
         return self.ground.files.read(part.file_sha256, part.start, part.stop)
 
 
-def raw_domain(scope: str, link: Link) -> str:
-    """Name of what may be joined with the raw octets of a link."""
-    return f"{'packets' if link == BARE else 'cadus ' + store.link_digest(link)} {scope}"
+def raw_domain(piece: Piece, link: Link) -> str:
+    """Name of what may be joined with the raw octets of a piece that came by a link.
+
+    CADUs name their spacecraft, bare packets do not.
+    """
+    if link == BARE:
+        return f"packets {piece.spacecraft_id} {piece.scope}"
+    return f"cadus {store.link_digest(link)} {piece.scope}"
 
 
 def _known_beginnings(connection: repository.Connection, domain: str, parts: Sequence[Part]) -> list[int]:

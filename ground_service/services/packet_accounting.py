@@ -22,6 +22,7 @@ from ground_service.services.pass_span import PassSpan
 from ground_service.store import repository
 from ground_service.store.files import FileArchive
 from reports.values import ApidAccounting, CompletenessSeries, PacketAccounting
+from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import APID_DETECTIONS, DICTIONARY
 
 IntArray = NDArray[np.int64]
@@ -50,7 +51,7 @@ def packet_accounting(
         here = headers["apid"] == apid
         accounts[apid] = account_sequence(headers["ticks"][here], headers["sequence_count"][here])
         lost = np.concatenate([lost, *(_spread(gap) for gap in accounts[apid].gaps)])
-    images = _images(connection, span)
+    images = _images(connection, record, span)
     in_gaps = accounts[APID_DETECTIONS].lost if APID_DETECTIONS in accounts else 0
     edges = _frames_at_edges(record["manifest"].get("frames_expected"), images, in_gaps)
     damaged = {} if raw is None else raw.crc_errors
@@ -85,14 +86,14 @@ def packet_accounting(
 
 
 def _raw_account(files: FileArchive, connection: Connection, span: PassSpan) -> RawAccount | None:
-    """Sums over the raw files of the vehicle; None where one of them is too large to be read again."""
+    """Sums over the raw files of the vehicle; None without any, or where one is too large to be read again."""
     vehicle = repository.get(connection, repository.VEHICLES, span.vehicle, "vehicle")
     found = []
     for sha256, octets in _raw_files(connection, span):
         if octets > RAW_LIMIT_OCTETS:
             return None
         found.append(_raw_file(files, sha256, int(vehicle["ccsds_id"])))
-    return account_raw(found, span.start_ticks, span.stop_ticks)
+    return account_raw(found, span.start_ticks, span.stop_ticks) if found else None
 
 
 def _raw_files(connection: Connection, span: PassSpan) -> list[tuple[str, int]]:
@@ -101,11 +102,17 @@ def _raw_files(connection: Connection, span: PassSpan) -> list[tuple[str, int]]:
     query = (
         select(ingests.c.file_sha256, stored.c.octets, ingests.c.accounting)
         .join(stored, stored.c.sha256 == ingests.c.file_sha256)
-        .where(ingests.c.vehicle_id == span.vehicle, ingests.c.state == "done")
+        .where(
+            (ingests.c.vehicle_id == span.vehicle)
+            | ingests.c.accounting["vehicle_ids"][1].as_integer().is_not(None),
+            ingests.c.state == "done",
+        )
         .order_by(ingests.c.file_sha256)
     )
     chosen: dict[str, int] = {}
     for sha256, octets, accounting in connection.execute(query):
+        if span.vehicle not in accounting.get("vehicle_ids", (span.vehicle,)):
+            continue
         first, last = accounting.get("first_ticks"), accounting.get("last_ticks")
         if first is None or last is None or (first <= span.stop_ticks and last >= span.start_ticks):
             chosen[sha256] = int(octets)
@@ -133,14 +140,16 @@ class _Images:
     after_last_made: int | None
 
 
-def _images(connection: Connection, span: PassSpan) -> _Images:
-    def columns(kind: str, *names: str) -> dict[str, list[Any]]:
+def _images(connection: Connection, record: Mapping[str, Any], span: PassSpan) -> _Images:
+    def columns(kind: str, *names: str, after_ticks: int = 0) -> dict[str, list[Any]]:
+        stop = span.stop_ticks + after_ticks
         return repository.samples(
-            connection, kind, span.vehicle, span.start_ticks, span.stop_ticks, span.dictionary_version, names
+            connection, kind, span.vehicle, span.start_ticks, stop, span.dictionary_version, names
         )
 
     images = columns("detections", "ticks", "frame_number")
-    events = columns("events", "event_id", "frame_number")
+    # An observation ends at the first frame time at or after its planned end, so up to one cadence after the span.
+    events = columns("events", "event_id", "frame_number", after_ticks=_cadence_ticks(record))
     counters: dict[int, list[int]] = {STARTED: [], STOPPED: []}
     for event, number in zip(events["event_id"], events["frame_number"], strict=True):
         if event in counters:
@@ -152,6 +161,11 @@ def _images(connection: Connection, span: PassSpan) -> _Images:
         min(counters[STARTED], default=None),
         max(counters[STOPPED], default=None),
     )
+
+
+def _cadence_ticks(record: Mapping[str, Any]) -> int:
+    cadence_s = record["manifest"].get("cadence_s")
+    return 0 if cadence_s is None else round(cadence_s * TICKS_PER_SECOND)
 
 
 def _frames_at_edges(planned: object, images: _Images, in_gaps: int) -> int | None:

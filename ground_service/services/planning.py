@@ -21,6 +21,7 @@ from ground_service.processing.planning import (
     Resources,
     SearchResult,
     data_octets,
+    frames_between,
     storage_peak,
 )
 from ground_service.processing.window_states import (
@@ -400,7 +401,7 @@ def _assessed(
     conflicts = _span_conflicts(connection, vehicle, window_id, entry)
     commitments = _commitments(connection, entry.spacecraft_id, entry.instance, without=window_id)
     prediction = _prediction(ground, connection, entry, commitments)
-    frames = int((entry.stop_utc_ns - entry.start_utc_ns) // round(entry.cadence_s * NS)) + 1
+    frames = frames_between(entry.start_utc_ns, entry.stop_utc_ns, entry.cadence_s)
     octets = data_octets(frames, entry.resources.detections_per_frame, entry.resources.estimators)
     if prediction is not None:
         peak = prediction.storage_peak_octets

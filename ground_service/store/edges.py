@@ -43,6 +43,7 @@ class Piece:
 
     ingest_id: int
     scope: str
+    spacecraft_id: int | None
     file_sha256: str
     octets: int
     stream: str
@@ -101,8 +102,9 @@ def octets_before(connection: Connection, piece: Piece, octets: int) -> list[Par
     end = piece.position
     while octets > 0:
         rows = _pieces(connection, piece, PIECES.c.position < end, newest_first=True)
-        found = 0
         for row in rows:
+            if not _may_follow(piece, row):
+                continue
             covered = row["octets"] if not piece.stream else end - row["position"]
             if covered > row["octets"]:
                 return parts  # octets between the two are not there
@@ -110,10 +112,9 @@ def octets_before(connection: Connection, piece: Piece, octets: int) -> list[Par
             parts.insert(0, Part(row["file_sha256"], covered - taken, covered))
             octets -= taken
             end = row["position"]
-            found += 1
             if octets <= 0:
                 break
-        if found < _BLOCK:
+        if len(rows) < _BLOCK or end != rows[-1]["position"]:
             break
     return parts
 
@@ -126,6 +127,8 @@ def octets_behind(connection: Connection, piece: Piece, octets: int) -> list[Par
     while octets > 0:
         rows = _pieces(connection, piece, PIECES.c.position > after, newest_first=False)
         for row in rows:
+            if not _may_follow(piece, row):
+                continue
             skipped = 0
             if piece.stream:
                 if row["position"] > end:
@@ -140,16 +143,22 @@ def octets_behind(connection: Connection, piece: Piece, octets: int) -> list[Par
             end += taken
             if octets <= 0:
                 return parts
-        if len(rows) < _BLOCK:
+        if len(rows) < _BLOCK or after != rows[-1]["position"]:
             break
     return parts
+
+
+def _may_follow(piece: Piece, row: Any) -> bool:
+    """Whether a piece may hold octets next to those of another: not where other spacecraft were asked for."""
+    asked = {piece.spacecraft_id, row["spacecraft_id"]} - {None}
+    return bool(piece.stream) or len(asked) < 2
 
 
 def _pieces(connection: Connection, piece: Piece, condition: Any, *, newest_first: bool) -> list[Any]:
     order = PIECES.c.position.desc() if newest_first else PIECES.c.position
     return list(
         connection.execute(
-            select(PIECES.c.file_sha256, PIECES.c.octets, PIECES.c.position)
+            select(PIECES.c.file_sha256, PIECES.c.spacecraft_id, PIECES.c.octets, PIECES.c.position)
             .where(PIECES.c.scope == piece.scope, PIECES.c.stream == piece.stream, condition)
             .order_by(order)
             .limit(_BLOCK)

@@ -113,10 +113,10 @@ class Packet(Base):
 class Piece(Base):
     """A file of a downlink as it was ingested, and where in its stream it stands.
 
-    Pieces of one `scope` (instance of a spacecraft) can be joined. `stream` and `position` (octets from its beginning)
-    are what the sender said; without, `stream` is empty and `position` the number of the ingest, so that neighbours are
-    those that came one after another. `links_tried` counts the known links of the scope that could not read it; NULL
-    where one could.
+    Pieces of one `scope` (instance of the spacecraft) can be joined. `spacecraft_id` is whose frames are asked for;
+    NULL: those of every spacecraft. `stream` and `position` (octets from its beginning) are what the sender said;
+    without, `stream` is empty and `position` the number of the ingest, so that neighbours are those that came one
+    after another. `links_tried` counts the known links of the scope that could not read it; NULL where one could.
     """
 
     __tablename__ = "pieces"
@@ -126,6 +126,7 @@ class Piece(Base):
     )
     ingest_id: Mapped[int] = mapped_column(ForeignKey("ingests.id"), primary_key=True, autoincrement=False)
     scope: Mapped[str] = mapped_column(String(128))
+    spacecraft_id: Mapped[int | None] = mapped_column(Integer)
     file_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"), index=True)
     octets: Mapped[int] = mapped_column(BigInteger)
     stream: Mapped[str] = mapped_column(String(200))

@@ -456,6 +456,7 @@ def upgrade() -> None:
             nullable=False,
         ),
         sa.Column("scope", sa.String(length=128), nullable=False),
+        sa.Column("spacecraft_id", sa.Integer(), nullable=True),
         sa.Column("file_sha256", sa.String(length=64), nullable=False),
         sa.Column("octets", sa.BigInteger(), nullable=False),
         sa.Column("stream", sa.String(length=200), nullable=False),

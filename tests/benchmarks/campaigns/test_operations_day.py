@@ -39,7 +39,7 @@ def test_a_day_is_planned_flown_live_and_reported(tmp_path: Path, monkeypatch: p
     assert "report.pdf" in figures["report"]
     assert any(line.startswith("ann $ linna command uplink") for line in lines)
     assert any(line.startswith("# audit: bob release telecommand") for line in lines)
-    assert not went_well({**figures, "packets_lost": 4})
+    assert not went_well({**figures, "packets_lost": 1})
     assert not went_well({**figures, "refused": [200, 401, 421]})
     assert not went_well({**figures, "verify": "damaged"})
     assert not went_well({**figures, "telecommands": {"completed": 4, "sent": 1}})

@@ -13,6 +13,7 @@ from ground_service.processing.planning import (
     Planner,
     Resources,
     data_octets,
+    frames_between,
     storage_peak,
 )
 from ground_service.processing.window_states import (
@@ -116,6 +117,11 @@ def test_craters_are_counted_in_the_camera(make_pass: Callable[..., Any]) -> Non
     # Craters were only placed around the six frames: the search has to find that stretch and no other.
     middle = (many[0].start_utc_ns + many[0].stop_utc_ns) // 2
     assert abs(middle - (START + 38 * NS)) < 60 * NS
+
+
+@pytest.mark.parametrize(("duration_s", "frames"), [(90.0, 6), (90.1, 7), (104.9, 7), (5.0, 1)])
+def test_an_observation_has_a_frame_at_its_start_and_none_at_its_stop(duration_s: float, frames: int) -> None:
+    assert frames_between(START, START + round(duration_s * NS), 15.0) == frames
 
 
 def test_terrain_is_asked_of_the_map() -> None:

@@ -20,6 +20,7 @@ from lunar.lens import BrownCamera
 from reports.render import render_html, to_json
 from reports.values import PassReport, Requirement
 from tests.ground_service.conftest import CADENCE_S, NS, SPACECRAFT, encode_downlink, write_manifest
+from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import LinkSettings, encode_cadus
 
@@ -149,13 +150,19 @@ def test_a_gap_is_not_counted_twice(make_pass: Callable[..., Any], ground: Groun
     assert rows(report)["completeness.frames"].value == pytest.approx(100.0 * 8 / 12)
 
 
+@pytest.mark.parametrize("stopped_s", [None, 0.8 * CADENCE_S])
 def test_frames_that_were_never_made_are_no_lost_packets(
-    make_pass: Callable[..., Any], ground: Ground
+    make_pass: Callable[..., Any], ground: Ground, stopped_s: float | None
 ) -> None:
-    """Twelve frames were planned; the payload counted from 0 to 6, and all of its packets came."""
+    """Twelve frames were planned; the payload counted from 0 to 6, and all of its packets came.
+
+    The observation ends within the span of the pass, or less than a cadence after it.
+    """
 
     def six(packets: list[bytes]) -> bytes:
         ticks = [int.from_bytes(packets[k][14:20], "big") for k in (0, 6 * PACKETS_PER_FRAME)]
+        if stopped_s is not None:
+            ticks[1] = int.from_bytes(packets[-1][14:20], "big") + round(stopped_s * TICKS_PER_SECOND)
         events = [
             DICTIONARY.pack(
                 "event_info",
@@ -228,7 +235,29 @@ def test_two_passes_in_one_file(make_pass: Callable[..., Any], ground: Ground, t
     assert [one.lost_at_edges for one in found] == [None, None]
 
 
-def later_events(start_utc_ns: int, count: int) -> bytes:
+def test_two_spacecraft_in_one_file(
+    make_pass: Callable[..., Any], ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each spacecraft has its own duplicates and frames; only files that may hold something of the pass are read."""
+    made = make_pass(frames=FRAMES, seed=46)
+    first, stop = int(made.utc_ns[0]), int(made.utc_ns[-1]) + CADENCE_S * NS
+    own = (made.folder / "downlink.cadu").read_bytes()
+    other = later_events(first, 20, SPACECRAFT + 1)
+    (tmp_path / "both.cadu").write_bytes(own + other + other)
+    (tmp_path / "later.cadu").write_bytes(later_events(stop + 10 * HOUR_NS, 90))
+    for name in ("both.cadu", "later.cadu"):
+        ingest_file(ground, tmp_path / name)
+    read = []
+    get = type(ground.files).get
+    monkeypatch.setattr(type(ground.files), "get", lambda files, key: read.append(key) or get(files, key))
+    for spacecraft, octets, again in ((SPACECRAFT, len(own), 0), (SPACECRAFT + 1, 2 * len(other), 20)):
+        key = define_pass(ground, name="p", start_utc_ns=first, stop_utc_ns=stop, spacecraft_id=spacecraft)
+        found = completeness(ground, key)
+        assert (found.octets, found.duplicates, found.frames_bad) == (octets, again, 0)
+    assert len(set(read)) == 1
+
+
+def later_events(start_utc_ns: int, count: int, spacecraft_id: int = SPACECRAFT) -> bytes:
     from lunar.timescales import ticks_from_utc_ns
 
     values = {"event_id": "observation_stopped", "frame_number": 0, "value_1": 0.0, "value_2": 0.0}
@@ -236,7 +265,7 @@ def later_events(start_utc_ns: int, count: int) -> bytes:
     packets = [
         DICTIONARY.pack("event_info", values, ticks=start + (k << 16), sequence_count=k) for k in range(count)
     ]
-    return encode_cadus(packets, spacecraft_id=SPACECRAFT)
+    return encode_cadus(packets, spacecraft_id=spacecraft_id)
 
 
 def test_no_reference(make_pass: Callable[..., Any], ground: Ground) -> None:

@@ -196,6 +196,33 @@ def test_a_stream_of_frames_may_be_cut_at_any_octet(
     assert result.octets_pending == 0
 
 
+@pytest.mark.parametrize("placed", [False, True])
+@pytest.mark.parametrize("bare", [False, True])
+def test_pieces_are_joined_whether_or_not_their_spacecraft_is_stated(
+    ground: Ground, packets: list[bytes], expected: str, tmp_path: Path, bare: bool, placed: bool
+) -> None:
+    """Bare packets always need it; another spacecraft's pieces in between are not joined with them."""
+    stream = b"".join(packets) if bare else encode_cadus(packets, spacecraft_id=SPACECRAFT)
+    cuts = np.unique(np.random.default_rng(6).integers(1, len(stream), 8)).tolist()
+    pieces = list(itertools.pairwise([0, *cuts, len(stream)]))
+    if placed:
+        pieces.reverse()
+    for number, (start, stop) in enumerate(pieces):
+        for spacecraft in (SPACECRAFT if bare or number % 2 else None, SPACECRAFT + 1):
+            ingest_file(
+                ground,
+                written(tmp_path, stream[start:stop]),
+                spacecraft_id=spacecraft,
+                place=Place(f"of {spacecraft}" if bare else "stream", start) if placed else None,
+            )
+    assert archive(ground) == expected
+    other = repository.PACKETS
+    with ground.database.reading() as connection:
+        vehicle = repository.vehicle_id(connection, SPACECRAFT + 1, "flight")
+        count = select(func.count()).select_from(other).where(other.c.vehicle_id == vehicle)
+        assert connection.execute(count).scalar_one() == (len(packets) if bare else 0)
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_bare_packets_may_be_cut_at_any_octet(
     ground: Ground, packets: list[bytes], expected: str, tmp_path: Path, seed: int
@@ -329,13 +356,13 @@ def test_a_piece_is_stored_in_few_transactions(ground: Ground, packets: list[byt
     assert len(commits) <= 6
 
 
-def ingest_pieces(url: str, home: str, pieces: list[tuple[int, bytes]]) -> None:
+def ingest_pieces(url: str, home: str, pieces: list[tuple[int, bytes]], placed: bool) -> None:
     """The work of one worker process."""
     with open_ground(Path(home), database_url=url) as ground:
         for number, (start, octets) in enumerate(pieces):
             path = Path(home) / f"piece-{os.getpid()}-{number}"
             path.write_bytes(octets)
-            place = Place("stream", start)
+            place = Place("stream", start) if placed else None
             for attempt in range(20):
                 try:
                     ingest_file(ground, path, place=place)
@@ -344,19 +371,30 @@ def ingest_pieces(url: str, home: str, pieces: list[tuple[int, bytes]]) -> None:
                     assert attempt < 19
 
 
-def test_two_workers_give_the_same_archive_of_placed_pieces(
-    packets: list[bytes], expected: str, tmp_path: Path, new_postgres_database: Callable[[], str]
+@pytest.mark.parametrize("placed", [True, False])
+@pytest.mark.parametrize("seed", [4, 5])
+def test_two_workers_give_the_same_archive(
+    packets: list[bytes],
+    expected: str,
+    tmp_path: Path,
+    new_postgres_database: Callable[[], str],
+    seed: int,
+    placed: bool,
 ) -> None:
-    """Neighbours are ingested at the same time by different processes; every third piece by both."""
+    """Neighbours are ingested at the same time by different processes; every third piece by both.
+
+    Without places no CADU is cut more often than `MIDDLES_IN_A_CADU` allows.
+    """
     url = new_postgres_database()
     prepare_database(url, upgrade=True).engine.dispose()
     stream = encode_cadus(packets, spacecraft_id=SPACECRAFT)
-    cuts = np.unique(np.random.default_rng(4).integers(1, len(stream), 24)).tolist()
+    cuts = np.unique(np.random.default_rng(seed).integers(1, len(stream), 24 if placed else 10)).tolist()
     pieces = [(a, stream[a:b]) for a, b in itertools.pairwise([0, *cuts, len(stream)])]
     shares = [[one for k, one in enumerate(pieces) if k % 2 == half or k % 3 == 0] for half in (0, 1)]
     context = multiprocessing.get_context("spawn")
     workers = [
-        context.Process(target=ingest_pieces, args=(url, str(tmp_path / "home"), share)) for share in shares
+        context.Process(target=ingest_pieces, args=(url, str(tmp_path / "home"), share, placed))
+        for share in shares
     ]
     for worker in workers:
         worker.start()

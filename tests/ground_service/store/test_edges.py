@@ -63,7 +63,7 @@ def plans(database: Database, look_up: Any) -> list[str]:
     return found
 
 
-PIECE = edges.Piece(1, "flight/*", "0" * 64, 100, "s", 500, None)
+PIECE = edges.Piece(1, "flight", None, "0" * 64, 100, "s", 500, None)
 
 LOOK_UPS = {
     "length and count": lambda c: edges.candidates(c, "d", OPENER, fit=(77,), count=(5, UNKNOWN)),
