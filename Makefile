@@ -24,7 +24,7 @@ demo: $(DEMO_STAMPS)
 	$(BIN)/linna demo --out $(DEMO_OUT)
 
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .
