@@ -1,21 +1,29 @@
-"""Cost of joining one piece when very many edges wait: python -m benchmarks.joining [--edges 100000] [--postgresql].
+"""Cost of joining one piece when very many edges wait, and the rate of two workers.
 
-The edges of so many pieces are put into the table: beginnings and ends of CADUs with lengths and frame counts as random
-cuts leave them, and of packets of a channel. Then pieces of a downlink are ingested that each join the one before. The
-time of joining is taken with an empty and with a full table, without and with the commits in it; so are the processor
-time of joining, and the number and time of all commits of a piece.
+    python -m benchmarks.joining [--edges 100000] [--pieces 40] [--postgresql] [--workers]
+
+The edges of `--edges` pieces are put into the table: beginnings and ends of CADUs with lengths and frame counts as
+random cuts leave them, and as many of packets of a channel. Then pieces of a downlink are ingested that each join the
+one before. With an empty and with a full table the benchmark measures, for each piece: the search for neighbours with
+the decoding of what they make up (`find`), the storage of the packets found (`store`), the commits, the processor time
+of all joining, and the whole ingest.
+
+`--workers` measures instead how many pieces a second one and two processes ingest into one PostgreSQL database.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
+import os
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from sqlalchemy import text
 
 from benchmarks.campaigns._deployment import PostgresServer
 from benchmarks.ground import mixed_downlink
@@ -52,6 +60,11 @@ def fill(ground: Ground, link: Link, count: int, channel: str) -> None:
         with ground.database.writing() as connection:
             edges.add_edges(connection, domain, raw, "0" * 64)
             edges.add_edges(connection, channel, packets)
+    # As autovacuum does while a table grows, which would otherwise run during the measurement.
+    with ground.database.engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+        connection.execute(
+            text("VACUUM ANALYZE stream_edges" if ground.database.dialect == "postgresql" else "ANALYZE")
+        )
 
 
 def measure(database_url: str | None, count: int, pieces: int) -> dict[str, Any]:
@@ -59,17 +72,27 @@ def measure(database_url: str | None, count: int, pieces: int) -> dict[str, Any]
     stream = mixed_downlink(40 * pieces)
     taken: dict[str, list[float]] = {}
     commits: list[float] = []
-    join = Joiner.join
+    join, store = Joiner.join, Joiner._store
+    storing: list[float] = []
 
     def note(name: str, value: float) -> None:
         taken.setdefault(name, []).append(value)
 
+    def timed_store(self: Joiner) -> list[bytes]:
+        begun = time.perf_counter()
+        try:
+            return store(self)
+        finally:
+            storing.append(1e3 * (time.perf_counter() - begun))
+
     def timed(self: Joiner) -> None:
+        storing.clear()
         begun, processor, before = time.perf_counter(), time.process_time(), len(commits)
         join(self)
         whole = 1e3 * (time.perf_counter() - begun)
         synced = sum(commits[before:])
-        note("join_ms", whole - synced)
+        note("join_find_ms", whole - sum(storing))
+        note("join_store_ms", sum(storing) - synced)
         note("join_commits_ms", synced)
         note("join_processor_ms", 1e3 * (time.process_time() - processor))
 
@@ -103,7 +126,7 @@ def measure(database_url: str | None, count: int, pieces: int) -> dict[str, Any]
                     note("piece_commits_ms", sum(commits[before:]))
 
             take(0, 2)  # compiles
-            Joiner.join = timed  # type: ignore[method-assign]
+            Joiner.join, Joiner._store = timed, timed_store  # type: ignore[method-assign]
             try:
                 for state, begin in (("empty", 2), ("full", 2 + pieces)):
                     taken.clear()
@@ -121,7 +144,52 @@ def measure(database_url: str | None, count: int, pieces: int) -> dict[str, Any]
                         assert vehicle is not None
                         fill(ground, reader.link, count, f"channel {vehicle['id']} 0 6 1113")
             finally:
-                Joiner.join = join  # type: ignore[method-assign]
+                Joiner.join, Joiner._store = join, store  # type: ignore[method-assign]
+    return figures
+
+
+def work(url: str, home: str, pieces: list[bytes], ready: Any, gate: Any) -> None:
+    """Ingest pieces as one worker process; the first one compiles, before the gate opens."""
+    path = Path(home) / f"piece-{os.getpid()}"
+    with open_ground(Path(home), database_url=url) as ground:
+        for number, octets in enumerate(pieces):
+            if number == 1:
+                ready.release()
+                gate.wait()
+            path.write_bytes(octets)
+            ingest_file(ground, path)
+
+
+def measure_workers(pieces: int) -> dict[str, Any]:
+    """Pieces a second that one and two worker processes ingest, each the pieces of a downlink of its own."""
+    stream = mixed_downlink(40 * pieces)
+    size = len(stream) // (2 * pieces)
+    context = multiprocessing.get_context("spawn")
+    figures: dict[str, Any] = {"pieces": pieces, "piece_octets": size}
+    for workers in (1, 2):
+        with tempfile.TemporaryDirectory() as name, PostgresServer(Path(name)) as server:
+            prepare_database(server.url, upgrade=True).engine.dispose()
+            ready, gate = context.Semaphore(0), context.Event()
+            shares = [
+                [stream[k * size : (k + 1) * size] for k in range(half, 2 * pieces, 2)] for half in (0, 1)
+            ]
+            given = shares if workers == 2 else [shares[0] + shares[1]]
+            processes = [
+                context.Process(target=work, args=(server.url, name, share, ready, gate)) for share in given
+            ]
+            for process in processes:
+                process.start()
+            for _ in processes:
+                ready.acquire()
+            begun = time.perf_counter()
+            gate.set()
+            for process in processes:
+                process.join()
+            taken = time.perf_counter() - begun
+            if any(process.exitcode for process in processes):
+                raise SystemExit("a worker failed")
+            figures[f"workers_{workers}_pieces_s"] = round((2 * pieces - workers) / taken, 2)
+    figures["ratio"] = round(figures["workers_2_pieces_s"] / figures["workers_1_pieces_s"], 2)
     return figures
 
 
@@ -130,8 +198,11 @@ def main() -> None:
     parser.add_argument("--edges", type=int, default=100_000)
     parser.add_argument("--pieces", type=int, default=40)
     parser.add_argument("--postgresql", action="store_true", help="on a PostgreSQL server of its own")
+    parser.add_argument("--workers", action="store_true", help="measure the rate of one and of two workers")
     given = parser.parse_args()
-    if given.postgresql:
+    if given.workers:
+        figures = measure_workers(given.pieces)
+    elif given.postgresql:
         with tempfile.TemporaryDirectory() as name, PostgresServer(Path(name)) as server:
             figures = measure(server.url, given.edges, given.pieces)
     else:

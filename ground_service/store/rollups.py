@@ -9,11 +9,12 @@ order samples come. (Sums are of floating-point numbers: their last bits may dep
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, LargeBinary, bindparam, delete, func, select
+from sqlalchemy import Connection, LargeBinary, and_, bindparam, delete, func, or_, select
 
 from ground_service.store.bulk import insert_columns
 from ground_service.store.counters import hold
@@ -51,12 +52,14 @@ _SAMPLES: dict[str, Any] = {table.__tablename__: table.__table__ for table in SA
 _BLOCK_ROWS = 50_000
 
 _KEY = ("vehicle_id", "dictionary_version", "kind", "part", "level")
-_STORED = select(
-    _TABLE.c.bucket, _TABLE.c.first_ticks, _TABLE.c.last_ticks, _TABLE.c.rows, _TABLE.c.statistics
-).where(
+_BUCKET = (_TABLE.c.bucket, _TABLE.c.first_ticks, _TABLE.c.last_ticks, _TABLE.c.rows, _TABLE.c.statistics)
+_STORED = select(*_BUCKET).where(
     *(_TABLE.c[name] == bindparam(name) for name in _KEY),
     _TABLE.c.bucket.between(bindparam("first_bucket"), bindparam("last_bucket")),
 )
+_FEW = 4
+"""Buckets of one level up to which all levels are looked up together."""
+
 _DELETED = delete(_TABLE).where(
     *(_TABLE.c[name] == bindparam(f"of_{name}") for name in _KEY), _TABLE.c.bucket == bindparam("of_bucket")
 )
@@ -242,14 +245,55 @@ def _merged(
     )
 
 
+def _few_stored(
+    connection: Connection, found: Sequence[tuple[Mapping[str, int], _Level]]
+) -> dict[tuple[int, int], list[Any]]:
+    """Return the stored buckets of the levels with few, by part and level, with one query."""
+    values: dict[str, int] = {}
+    count = 0
+    for key, level in found:
+        if level[0].size <= _FEW:
+            for bucket in level[0].tolist():
+                values |= {
+                    f"part_{count}": key["part"],
+                    f"level_{count}": key["level"],
+                    f"bucket_{count}": bucket,
+                }
+                count += 1
+    stored: dict[tuple[int, int], list[Any]] = {}
+    if count:
+        values |= {name: found[0][0][name] for name in _KEY[:3]}
+        for part, level_number, *row in connection.execute(_buckets_query(count), values):
+            stored.setdefault((part, level_number), []).append(row)
+    return stored
+
+
+@lru_cache(maxsize=256)
+def _buckets_query(count: int) -> Any:
+    """Return the query for `count` buckets by their whole key, each of which both databases find by the index."""
+    common = [_TABLE.c[name] == bindparam(name) for name in _KEY[:3]]
+    each = [
+        and_(
+            *common,
+            *(_TABLE.c[name] == bindparam(f"{name}_{number}") for name in ("part", "level", "bucket")),
+        )
+        for number in range(count)
+    ]
+    return select(_TABLE.c.part, _TABLE.c.level, *_BUCKET).where(or_(*each))
+
+
 def _store(connection: Connection, found: Sequence[tuple[Mapping[str, int], _Level]]) -> None:
-    """Add buckets, by the rest of their key, to those that are stored."""
+    """Add buckets, by the rest of their key (of one vehicle, version and kind), to those that are stored."""
     merged: list[tuple[Mapping[str, int], _Level]] = []
     replaced: list[dict[str, int]] = []
+    few = _few_stored(connection, found)
     for key, (number, first, last, rows, statistics) in found:
-        span = {"first_bucket": int(number[0]), "last_bucket": int(number[-1])}
-        wanted = set(number.tolist())
-        stored = [row for row in connection.execute(_STORED, {**key, **span}) if row[0] in wanted]
+        if number.size <= _FEW:
+            stored = few.get((key["part"], key["level"]), [])
+        else:
+            span = {"first_bucket": int(number[0]), "last_bucket": int(number[-1])}
+            wanted = set(number.tolist())
+            stored = [row for row in connection.execute(_STORED, {**key, **span}) if row[0] in wanted]
         if stored:
             shape = (len(stored), -1, STATISTICS)
             old = np.frombuffer(b"".join(bytes(row[4]) for row in stored), "<f8").reshape(shape)
