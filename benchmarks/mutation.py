@@ -38,6 +38,8 @@ SOURCES = (
     "scenarios",
     "benchmarks",
 )
+UNTESTED = "not checked"
+_PLUGIN = "benchmarks.mutation_plugin"
 KILLED = frozenset({"killed", "timeout", "suspicious", "segfault"})
 
 
@@ -73,8 +75,20 @@ GROUPS = {
             for name in ("pass_evaluation", "alignment", "drift", "recall", "baseline", "fixes", "trajectory")
         ),
         (
-            f"{_GROUND_TESTS}/processing",
-            f"{_GROUND_TESTS}/services/test_evaluation.py",
+            *(
+                f"{_GROUND_TESTS}/processing/test_{name}.py"
+                for name in (
+                    "pass_evaluation",
+                    "worst_frames",
+                    "alignment",
+                    "drift",
+                    "recall",
+                    "baseline",
+                    "fixes",
+                    "viewing",
+                    "trajectory",
+                )
+            ),
             f"{_GROUND_TESTS}/services/test_golden_reports.py",
         ),
     ),
@@ -162,9 +176,11 @@ def run_group(name: str, sample: int, seed: int, children: int) -> dict[str, obj
                 break
             if reason_left_out(_difference(tree, mutant)) is None:
                 chosen.append(mutant)
-        _mutmut(tree, "run", "--max-children", str(children), *chosen)
+        said = _mutmut(tree, "run", "--max-children", str(children), *chosen)
         found = _states(tree)
-        states = {mutant: found.get(mutant, "not checked") for mutant in chosen}
+        states = {mutant: found.get(mutant, UNTESTED) for mutant in chosen}
+        if UNTESTED in states.values():
+            raise SystemExit(f"mutation: group {name}: mutants were not tested:\n{said[-2000:]}")
         survivors = [
             {"name": mutant, "state": state, "difference": _difference(tree, mutant)}
             for mutant, state in sorted(states.items())
@@ -206,7 +222,7 @@ def _copy_tree(tree: Path, group: Group) -> None:
         "source_paths": [source for source in SOURCES if (tree / source).is_dir()],
         "only_mutate": list(group.modules),
         "pytest_add_cli_args_test_selection": list(group.tests),
-        "pytest_add_cli_args": ["-p", "no:cacheprovider", "-p", "no:randomly"],
+        "pytest_add_cli_args": ["-p", "no:cacheprovider", "-p", "no:randomly", "-p", _PLUGIN],
         "also_copy": ["docs", "requirements", "docker-compose.yml", "Dockerfile", "Makefile", "README.md"],
     }
     lines = ["", "[tool.mutmut]", *(f"{key} = {json.dumps(value)}" for key, value in settings.items())]

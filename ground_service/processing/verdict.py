@@ -117,7 +117,7 @@ def _row(
     at_most: bool,
     strict: bool = False,
     known: bool = True,
-    judged: bool = True,
+    judged: bool,
     note: str = "",
 ) -> Requirement:
     """A requirement judged: `strict` excludes equality, `known` False keeps a value from counting as met."""

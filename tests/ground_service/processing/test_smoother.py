@@ -10,7 +10,7 @@ import pytest
 from ground_service.processing.smoother import CommandedBurn, FilterStates, SmootherModel, smooth
 from lunar.elements import Elements, icrf_state_from_elements
 from lunar.frames import IauOrientation
-from lunar.gravity import builtin_gravity
+from lunar.gravity import GravityField, builtin_gravity
 from lunar.propagation import ForceModel, propagate_with_stm
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 
@@ -155,3 +155,126 @@ def test_a_clock_that_went_backwards_parts_the_orbit_in_two() -> None:
 def test_few_states_come_back_as_they_are(count: int) -> None:
     few = Session(7).filtered.select(np.arange(STATES) < count)
     np.testing.assert_array_equal(smooth(few, QUIET).state, few.state)
+
+
+# Nearly nothing pulls, 1e-12 m/s^2, and 1e9 m out at 1 m/s the axes of the orbit stay those of ICRF to 1e-7: the
+# motion is a straight line, and all matrices of the textbook can be written down.
+NOTHING = ForceModel(
+    GravityField("nothing", 1.0, 1e6, np.ones((1, 1)), np.zeros((1, 1))), IauOrientation(), 0, False, False
+)
+WHITE, MARKOV, MEMORY_S = (6e-4, 3e-4, 2e-4), (2e-3, 3e-3, 4e-3), 80.0
+PUSHED = SmootherModel(NOTHING, WHITE, MARKOV, MEMORY_S)
+
+
+def step_matrices(seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    """Transition and noise of constant velocity under white acceleration and under one that decays."""
+    one, q, decay = np.eye(3), np.diag(WHITE), np.exp(-seconds / MEMORY_S)
+    nothing = np.zeros((3, 3))
+    transition = np.block(
+        [[one, seconds * one, 0.5 * seconds**2 * one], [nothing, one, seconds * one], [nothing, nothing, decay * one]]
+    )  # fmt: skip
+    noise = np.block(
+        [
+            [q * seconds**3 / 3.0, q * seconds**2 / 2.0, nothing],
+            [q * seconds**2 / 2.0, q * seconds, nothing],
+            [nothing, nothing, np.diag(np.square(MARKOV)) * (1.0 - decay**2)],
+        ]
+    )
+    return transition, noise
+
+
+def straight(seconds: list[float], seed: int = 9) -> FilterStates:
+    """States near a straight line with covariances that correlate everything."""
+    rng = np.random.default_rng(seed)
+    states, covariances = [], []
+    for t in seconds:
+        line = np.array([1e9, t, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+        # No velocity and no push along z: the plane of the orbit stays.
+        scatter = np.array([3.0, 3.0, 3.0, 0.02, 0.02, 0.0, 1e-3, 1e-3, 0.0])
+        states.append(line + scatter * rng.standard_normal(9))
+        root = np.repeat([5.0, 0.1, 2e-3], 3)[:, None] * rng.standard_normal((9, 9))
+        covariances.append(root @ root.T)
+    times = EPOCH + (np.array(seconds) * 1e9).astype(np.int64)
+    return FilterStates(times, np.array(states), np.array(covariances), np.arange(len(seconds)))
+
+
+def rauch_tung_striebel(
+    filtered: FilterStates,
+    legs: list[list[float]],
+    kicks: list[list[float]] | None = None,
+    sigma_m_s: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return smoothed states and covariances by equations 3.28 to 3.30, with plain inverses.
+
+    `kicks` are the changes of the y velocity at the end of each leg.
+    """
+    state, covariance = filtered.state.copy(), filtered.covariance.copy()
+    for k in range(len(legs))[::-1]:
+        moved, total, noise = filtered.state[k].copy(), np.eye(9), np.zeros((9, 9))
+        for number, seconds in enumerate(legs[k]):
+            transition, added = step_matrices(seconds)
+            moved, total = transition @ moved, transition @ total
+            noise = transition @ noise @ transition.T + added
+            if kicks is not None and kicks[k][number]:
+                moved[4] += kicks[k][number]
+                noise[3:6, 3:6] += np.eye(3) * sigma_m_s**2
+        prior = total @ filtered.covariance[k] @ total.T + noise
+        gain = filtered.covariance[k] @ total.T @ np.linalg.inv(prior)
+        state[k] = filtered.state[k] + gain @ (state[k + 1] - moved)
+        covariance[k] = filtered.covariance[k] + gain @ (covariance[k + 1] - prior) @ gain.T
+    return state, covariance
+
+
+def assert_same(found: FilterStates, expected: tuple[np.ndarray, np.ndarray], start: FilterStates) -> None:
+    state, covariance = expected
+    scale = np.sqrt(np.einsum("nii->ni", start.covariance))
+    # Positions of 1e9 m have seven digits behind the point; the axes are turned by 1e-7.
+    np.testing.assert_allclose((found.state - state) / scale, 0.0, atol=1e-5)
+    np.testing.assert_allclose(
+        (found.covariance - covariance) / (scale[:, :, None] * scale[:, None, :]), 0.0, atol=1e-5
+    )
+    assert np.abs(state - start.state).max() > 0.1  # and there was something to smooth
+
+
+def test_pushed_motion_is_smoothed_as_the_textbook_does_it() -> None:
+    """Half a second, a step of 50 s, and 100 s in two steps of 50 s."""
+    filtered = straight([0.0, 0.5, 50.5, 150.5])
+    found = smooth(filtered, PUSHED)
+    assert_same(found, rauch_tung_striebel(filtered, [[0.5], [50.0], [50.0, 50.0]]), filtered)
+    np.testing.assert_array_equal(found.utc_ns, filtered.utc_ns)
+
+
+def test_burns_part_the_steps_and_count_once() -> None:
+    """One burn at the instant of the second state, one 20 s after it: 0.05 m/s to 0.3 m/s each."""
+    filtered = straight([0.0, 50.0, 130.0])
+    burns = tuple(CommandedBurn(EPOCH + at * 10**9, np.array([0.0, 0.05, 0.0]), 0.3) for at in (50, 70))
+    found = smooth(filtered, replace(PUSHED, burns=burns))
+    expected = rauch_tung_striebel(filtered, [[50.0], [20.0, 60.0]], [[0.05], [0.05, 0.0]], 0.3)
+    assert_same(found, expected, filtered)
+
+
+def test_a_jump_of_a_hundred_in_chi_square_parts_the_orbit() -> None:
+    filtered = straight([0.0, 30.0])
+    transition, noise = step_matrices(30.0)
+    prior = transition @ filtered.covariance[0] @ transition.T + noise
+    for surprise, smoothed in ((99.0, True), (101.0, False)):
+        jump = np.zeros(9)
+        jump[4] = np.sqrt(surprise / np.linalg.inv(prior)[4, 4])
+        after = np.array([filtered.state[0], transition @ filtered.state[0] + jump])
+        found = smooth(replace(filtered, state=after), PUSHED)
+        assert bool(np.any(found.state[0] != filtered.state[0])) is smoothed
+
+
+def test_a_selection_keeps_the_degrees_of_its_states() -> None:
+    some = straight([0.0, 1.0, 2.0]).select(np.array([True, False, True]))
+    assert some.innovation_degrees is not None and some.innovation_degrees.tolist() == [0, 2]
+
+
+def test_sigmas_lie_along_the_axes_of_the_orbit() -> None:
+    """Position along y and velocity along -x: radial is y, transverse -x, normal z."""
+    covariance = np.zeros((1, 9, 9))
+    covariance[0, :3, :3] = np.diag([4.0, 9.0, 16.0])
+    state = np.array([[0.0, 2e6, 0.0, -1.6e3, 0.0, 0.0, 0.0, 0.0, 0.0]])
+    one = FilterStates(TIMES[:1], state, covariance)
+    np.testing.assert_allclose(one.sigma_rtn_m, [[3.0, 2.0, 4.0]])
+    np.testing.assert_allclose(one.position_covariance_rtn_m2[0], np.diag([9.0, 4.0, 16.0]), atol=1e-12)

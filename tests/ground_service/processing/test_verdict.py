@@ -153,7 +153,11 @@ def test_packets_whose_loss_at_the_edges_is_not_known_are_never_complete() -> No
     assert row("completeness.packets", limits, found(packets=PacketAccounting(0))).value is None
 
 
-def test_one_frame_is_not_judged() -> None:
+def test_two_frames_are_judged_and_one_is_not() -> None:
+    two = replace(series("anchored", median=0.0), utc_ns=np.zeros(2, dtype=np.int64))
+    assert (
+        row("accuracy.median", Limits(estimator="anchored", median_error_m=10.0), found(two)).status == "met"
+    )
     one = replace(series("anchored", median=0.0), utc_ns=np.zeros(1, dtype=np.int64))
     judged = row("accuracy.median", Limits(estimator="anchored", median_error_m=10.0), found(one))
     assert (judged.status, judged.note) == ("unknown", "one frame was navigated: too little to judge by")
@@ -207,3 +211,107 @@ def test_the_error_budget_takes_the_reference_off_in_squares() -> None:
     assert error_budget(error, None) is None and error_budget(error[2:], (1.0, 1.0, 1.0)) is None
     assert reference_covariance_m2((1.0, 2.0, 3.0)).tolist() == [[1, 0, 0], [0, 4, 0], [0, 0, 9]]
     assert not reference_covariance_m2(None).any()
+
+
+EVERY_LIMIT = Limits(
+    estimator="anchored",
+    median_error_m=60.0,
+    p95_error_m=80.0,
+    better_than=("snapshot",),
+    consistency_inside_percent=90.0,
+    packets_percent=75.0,
+    frames_percent=90.0,
+    images_percent=25.0,
+    recall=0.25,
+    precision=0.8,
+    anchor_reads=3.0,
+    resets=1.0,
+    cpu_percent=50.0,
+    memory_mib=4.5,
+    storage_percent=20.0,
+    temperature_max_c=45.0,
+    temperature_min_c=5.0,
+)
+
+
+def test_the_table_of_a_pass_in_full() -> None:
+    """Each row as it is printed: key, name, unit, value, limit, whether at most, status and note."""
+    evaluated = Evaluated(
+        (replace(CONSISTENT, statistics=NavigationStatistics(median_3d_m=50.0, p95_3d_m=90.0)),
+         series("snapshot", "baseline", 70.0), series("smoothed", "smoothed", 30.0),
+         series("paper", reset_trigger=("none", "time_gap", "none"))),
+        DETECTOR, FrameAccounting(40, 30, processed=10), PacketAccounting(1500, lost=400, lost_at_edges=100),
+        HOUSEKEEPING, 40.0,
+    )  # fmt: skip
+    cpu = "processor time of a step over the cadence, largest mean between two reports"
+    assert requirements(EVERY_LIMIT, evaluated) == tuple(
+        Requirement(*one)
+        for one in (
+            ("accuracy.median", "median 3-D error", "m", 50.0, 60.0, True, "met", "anchored, 10 samples"),
+            ("accuracy.p95", "95th percentile of the 3-D error", "m", 90.0, 80.0, True, "not met",
+             "anchored, 10 samples"),
+            ("better_than.snapshot", "better than snapshot", "m", 50.0, 70.0, True, "met", "median 3-D error"),
+            ("better_than.smoothed", "better than smoothed", "m", 50.0, 30.0, True, "not judged",
+             "median 3-D error"),
+            ("consistency.nees", "NEES inside 95 % bounds", "%", 75.0, 90.0, False, "not met",
+             "position error against the covariance of estimate and reference"),
+            ("consistency.nis", "NIS inside 95 % bounds", "%", 75.0, 90.0, False, "not met", "image innovations"),
+            ("completeness.packets", "packets received of those expected", "%", 75.0, 75.0, False, "met",
+             "1\u202f500 of 2\u202f000 packets"),
+            ("completeness.frames", "frames reported of those expected", "%", 75.0, 90.0, False, "not met",
+             "30 of 40 frames"),
+            ("completeness.images", "frames with a usable image of those expected", "%", 25.0, 25.0, False, "met",
+             "10 of 40 frames"),
+            ("detector.recall", "detector recall", "", 0.3, 0.25, False, "met", "200 craters of 5–30 km expected"),
+            ("detector.precision", "detector precision", "", 0.75, 0.8, False, "not met",
+             "200 craters of 5–30 km expected"),
+            ("anchor_reads", "anchor reads after the start", "", 3, 3.0, True, "met", ""),
+            ("resets", "resets after the start", "", 2.0, 1.0, True, "not met", ""),
+            ("resets.paper", "resets of paper after the start", "", 1.0, None, True, "not judged", ""),
+            ("resources.cpu", "CPU load", "%", 40.0, 50.0, True, "met", cpu),
+            ("resources.memory", "memory in use", "MiB", 4.0, 4.5, True, "met", ""),
+            ("resources.storage", "packet store in use", "%", 25.0, 20.0, True, "not met", ""),
+            ("resources.temperature_max", "highest temperature", "°C", 45.5, 45.0, True, "not met", ""),
+            ("resources.temperature_min", "lowest temperature", "°C", 10.0, 5.0, False, "met", ""),
+        )
+    )  # fmt: skip
+
+
+def test_the_table_of_a_pass_of_which_nothing_is_known() -> None:
+    table = requirements(EVERY_LIMIT, Evaluated())
+    assert {(one.value, one.status) for one in table} == {(None, "unknown")}
+    assert {one.key: one.note for one in table if one.note} == {
+        "accuracy.median": "anchored reported nothing",
+        "accuracy.p95": "anchored reported nothing",
+        "better_than.snapshot": "this baseline was not computed",
+        "consistency.nees": "position error against the covariance of estimate and reference",
+        "consistency.nis": "image innovations",
+        "completeness.frames": "no plan of the frames",
+        "completeness.images": "no plan of the frames",
+        "resources.cpu": "processor time of a step over the cadence, largest mean between two reports",
+    }
+    assert {one.status for one in requirements(Limits(), Evaluated())} == {"not judged"}
+
+
+def test_packets_without_a_plan_say_what_is_not_known() -> None:
+    said = row("completeness.packets", EVERY_LIMIT, found(packets=PacketAccounting(60, lost=40))).note
+    assert said == "60 of 100 packets; what is missing at the edges is not known without a plan"
+
+
+def test_housekeeping_without_a_finite_value_is_unknown() -> None:
+    cold = (HousekeepingParameter("temperature_c", "", np.arange(2), np.full(2, np.nan)),)
+    for key in ("resources.temperature_max", "resources.temperature_min"):
+        assert (row(key, EVERY_LIMIT, found(housekeeping=cold)).status) == "unknown"
+
+
+def test_the_first_sample_is_no_reset_and_a_series_without_outcomes_has_no_count() -> None:
+    evaluated = found(series("anchored"))
+    assert row("resets", EVERY_LIMIT, evaluated).value is None
+    started = found(series("anchored", reset_trigger=("initialization", "none")))
+    assert row("resets", EVERY_LIMIT, started).value == 0.0
+
+
+@pytest.mark.parametrize("limit", [float("nan"), float("inf")])
+def test_a_limit_that_is_no_number_judges_nothing_as_met(limit: float) -> None:
+    one = row("accuracy.median", replace(EVERY_LIMIT, median_error_m=limit), found())
+    assert (one.limit, one.status) == (None, "unknown")
