@@ -41,9 +41,14 @@ def propagated_positions(
     *,
     third_bodies: bool = True,
 ) -> FloatArray:
-    """ICRF positions (n, 3) at `utc_ns` (n,) of the start state flown on; NaN before the start and after an impact.
+    """Return the ICRF positions (n, 3) of the start state flown on to `utc_ns` (n,), ascending; NaN before the start.
 
     Degree 0 without third bodies is the two-body (Kepler) orbit.
+
+    Raises
+    ------
+    ImpactError
+        If the orbit meets the ground.
     """
     positions = np.full((len(utc_ns), 3), np.nan)
     after = np.asarray(utc_ns) >= start.utc_ns
