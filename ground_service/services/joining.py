@@ -7,7 +7,8 @@ checksums of the CADU or packet decide in every case; octets that fit nowhere ye
 
 Edges are committed before their neighbours are looked for. Of two pieces that are ingested at once, at least the later
 therefore sees the edges of both, and no lock is held while anything is decoded. What joining gives is stored in at most
-two transactions: one for CADUs or bare packets, one for the packets of channels.
+two transactions: one for CADUs or bare packets, one for the packets of channels. The octets of a CADU count as used
+from the second one on, so that an ingest that is cut off in between joins the CADU again and finds the same packets.
 """
 
 from __future__ import annotations
@@ -118,6 +119,7 @@ class Joiner:
     _channels: list[tuple[str, bytes]] = field(default_factory=list)
     _raw: list[tuple[Link, list[bytes]]] = field(default_factory=list)
     _found: _Found = field(default_factory=_Found)
+    _joined_cadus: _Found = field(default_factory=_Found)
 
     def vehicle(self, connection: repository.Connection, spacecraft: int) -> int:
         """Return the id of the vehicle of a spacecraft, made when it is new."""
@@ -166,6 +168,9 @@ class Joiner:
                     waiting = self._store()
         self._raw.clear()
         self._join_channels()
+        self._found.used |= self._joined_cadus.used
+        self._found.parts += self._joined_cadus.parts
+        self._joined_cadus = _Found()
         self._store()
 
     def _store(self) -> list[bytes]:
@@ -176,6 +181,10 @@ class Joiner:
         found, self._found = self._found, _Found()
         if not found:
             return []
+        if found.channel_edges:
+            self._joined_cadus.used |= found.used
+            self._joined_cadus.parts += found.parts
+            found.used, found.parts = {}, []
         batches = {}
         for spacecraft, packets in found.packets.items():
             octets = b"".join(packets)

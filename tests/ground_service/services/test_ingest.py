@@ -1,5 +1,6 @@
 """Ingest: any order, any split, any repetition of the same octets gives the same archive."""
 
+import contextlib
 import itertools
 import multiprocessing
 import os
@@ -354,6 +355,40 @@ def test_a_piece_is_stored_in_few_transactions(ground: Ground, packets: list[byt
     )
     assert ingest(ground, stream[middle:], tmp_path).frames_joined == 1
     assert len(commits) <= 6
+
+
+class PowerFailure(Exception):
+    """The process ends here."""
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_an_ingest_that_ends_after_any_commit_is_made_up_for_by_the_next(
+    packets: list[bytes], expected: str, tmp_path: Path, shuffled: bool
+) -> None:
+    """A CADU of three pieces, with packets that reach into its neighbours; the piece that completes it is cut off."""
+    stream = encode_cadus(packets, spacecraft_id=SPACECRAFT)
+    pieces = [stream[:1700], stream[1700:2300], stream[2300:]]
+    if shuffled:
+        pieces = [pieces[2], pieces[0], pieces[1]]
+    for commits in range(1, 8):
+        with open_ground(tmp_path / f"{commits}") as ground:
+            for piece in pieces[:2]:
+                ingest(ground, piece, tmp_path)
+            dialect, left = ground.database.engine.dialect, [commits]
+            commit = dialect.do_commit
+
+            def failing(connection: Any, commit: Any = commit, left: list[int] = left) -> None:
+                commit(connection)
+                left[0] -= 1
+                if left[0] == 0:
+                    raise PowerFailure
+
+            dialect.do_commit = failing  # type: ignore[method-assign]
+            with contextlib.suppress(PowerFailure):
+                ingest(ground, pieces[2], tmp_path)
+            dialect.do_commit = commit  # type: ignore[method-assign]
+            ingest(ground, pieces[2], tmp_path)
+            assert archive(ground) == expected, f"after commit {commits}"
 
 
 def ingest_pieces(url: str, home: str, pieces: list[tuple[int, bytes]], placed: bool) -> None:
