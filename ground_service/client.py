@@ -21,7 +21,7 @@ from ground_service.errors import GroundError, InvalidInput
 API_PREFIX = "/api/v1"
 TIMEOUT_S = 120.0
 BUSY_S = 120.0
-"""A service that answers 503 with Retry-After is asked again for so long."""
+"""Total time for which requests are repeated after 503 with Retry-After."""
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 2.0
 
@@ -138,11 +138,11 @@ class Client:
     # Mission descriptions
 
     def list_missions(self, limit: int = 100) -> View:
-        """List the revisions of mission descriptions, the newest first."""
+        """List the revisions of mission descriptions, newest first."""
         return self._json("GET", "/missions", query={"limit": limit})
 
     def add_mission(self, path: Path) -> View:
-        """Enter a mission description as a revision."""
+        """Add a mission description as a revision."""
         with path.open("rb") as stream:
             return self._json("POST", "/missions", body=stream, octets=path.stat().st_size)
 
@@ -254,11 +254,11 @@ class Client:
     # Audit log
 
     def list_audit(self, **query: Any) -> View:
-        """A page of the audit log, the newest entry first."""
+        """Return a page of the audit log, newest entry first."""
         return self._json("GET", "/audit", query=query)
 
     def audit_head(self) -> View:
-        """Number and hash of the newest entry of the audit log."""
+        """Return number and hash of the newest entry of the audit log."""
         return self._json("GET", "/audit/head")
 
     # The wire
@@ -327,7 +327,9 @@ class Client:
             return self._opener.open(request, timeout=TIMEOUT_S)
         except urllib.error.HTTPError as error:
             wait = error.headers.get("Retry-After", "")
-            if error.code == 503 and wait.isdigit():  # nothing was done: too many others ask at once
+            if (
+                error.code == 503 and wait.isdigit()
+            ):  # the request was not processed: too many simultaneous requests
                 raise _Busy(_detail(error), float(min(int(wait), 10))) from None
             raise ServiceProblem(error.code, _detail(error)) from None
         except (urllib.error.URLError, http.client.HTTPException, OSError) as error:
@@ -336,7 +338,7 @@ class Client:
 
 
 class _Busy(Exception):
-    """The service asks to come again."""
+    """Busy service that requests a retry."""
 
     def __init__(self, detail: str, wait_s: float) -> None:
         super().__init__(detail)

@@ -4,22 +4,22 @@ GroundError
 ├── SettingsError            a setting that cannot be used
 ├── StoreError
 │   ├── DatabaseUnavailable      the database cannot be opened or reached
-│   ├── DatabaseBusy             the database gave up a transaction in favour of another
+│   ├── DatabaseBusy             the database cancelled a transaction because of a concurrent one
 │   ├── DatabaseTooNew           written by a newer version of this program
-│   ├── DatabaseTooOld           written before version 1.0; has to be exported and imported
-│   ├── DatabaseNotMigrated      older than this program and not migrated by itself
-│   ├── StorageFull              no space left where the archive lives
+│   ├── DatabaseTooOld           written before version 1.0; must be exported and imported
+│   ├── DatabaseNotMigrated      older than this program and not migrated automatically
+│   ├── StorageFull              no space left for the archive
 │   ├── StorageReadOnly          the archive cannot be written
 │   ├── AuditBroken              the audit chain cannot be continued
-│   └── FileDamaged              a stored file no longer has the octets it was stored with
+│   └── FileDamaged              the content of a stored file has changed
 ├── NotFound                 no such pass, ingest, report, job, ...
 ├── Conflict                 the request contradicts what is stored
-│   └── StateConflict            the state of the thing does not allow it (any more)
-├── InvalidInput             what was given cannot be accepted (file, manifest, field)
+│   └── StateConflict            the state of the entity does not permit the request
+├── InvalidInput             invalid input (file, manifest, field)
 ├── BuildNotChecked          the parameters of a payload build cannot be checked here
 ├── EvaluationError          a pass that cannot be evaluated
-├── Stopping                 the service is being stopped in the middle of the work
-├── NotAuthorised            the caller is not known or may not do this
+├── Stopping                 the service is being stopped during the work
+├── NotAuthorised            the caller is unknown or not permitted to do this
 └── ServerError              the HTTP server cannot start (port in use, unsafe address)
 """
 
@@ -59,10 +59,10 @@ class DatabaseUnavailable(StoreError):
 
 
 class DatabaseBusy(StoreError):
-    """The database gave up a transaction in favour of another; the same again may well succeed."""
+    """The database cancelled a transaction because of a concurrent one; a retry may succeed."""
 
     def __init__(self, reason: str) -> None:
-        super().__init__(f"database: nothing was changed, the same again may succeed: {reason}")
+        super().__init__(f"database: nothing was changed, a retry may succeed: {reason}")
 
 
 class DatabaseTooNew(StoreError):
@@ -152,7 +152,7 @@ class Conflict(GroundError):
 
 
 class StateConflict(Conflict):
-    """The state of a thing does not allow the request; `found` is the state that won."""
+    """The state of an entity does not permit the request; `found` is that state."""
 
     def __init__(self, kind: str, key: object, expected: str, found: str) -> None:
         super().__init__(f"{kind} {key}: expected state {expected}, found {found}")
@@ -178,7 +178,7 @@ class BuildNotChecked(GroundError):
     """The parameters of a payload build cannot be checked here, so it is not registered."""
 
     def __init__(self, build: str, reason: str) -> None:
-        super().__init__(f"build {build}: expected its parameters to be checked, found: {reason}")
+        super().__init__(f"build {build}: the parameters cannot be checked: {reason}")
         self.build = build
         self.reason = reason
 
@@ -188,7 +188,7 @@ class EvaluationError(GroundError):
 
 
 class Forbidden(GroundError):
-    """The caller is known and may not do this."""
+    """The caller is known but not permitted to do this."""
 
 
 class NotAuthorised(GroundError):
@@ -209,9 +209,9 @@ def storage_error(error: OSError, where: Path | str) -> GroundError:
 
 
 def public_text(error: BaseException) -> str:
-    """Return what an error says in one line that may be shown to any caller: no URL, and of paths the last part only.
+    """Return the message of an error in one line for any caller: without URLs, and with file names instead of paths.
 
-    The whole text belongs in the log of the service.
+    The complete text is written to the log of the service.
     """
     text = str(error) if str(error) else type(error).__name__
     if not isinstance(error, GroundError) and type(error).__module__ in ("builtins", "numpy"):

@@ -24,7 +24,7 @@ def default_home() -> Path:
 
 
 def _words(value: object) -> object:
-    """The words of a list that is written with commas between them."""
+    """Return the entries of a comma-separated list."""
     return (
         tuple(word.strip() for word in value.split(",") if word.strip()) if isinstance(value, str) else value
     )
@@ -46,12 +46,12 @@ class Settings(BaseSettings):
     )
     migration_database_url: SecretStr | None = Field(
         default=None,
-        description="URL of the owner of the schema, for `linna db upgrade` alone, which then grants the role of "
+        description="URL of the owner of the schema, used only by `linna db upgrade`, which then grants the role of "
         "LINNA_DATABASE_URL its rights; default: LINNA_DATABASE_URL",
     )
     allow_database_owner: bool = Field(
         default=False,
-        description="Serve as a database role that could change the schema or the audit log, as on a laptop",
+        description="Permit a database role that can change the schema or the audit log, for example on a laptop",
     )
     broker_url: SecretStr | None = Field(
         default=None, description="Celery broker such as redis://host:6379/0; default: jobs run in-process"
@@ -72,13 +72,13 @@ class Settings(BaseSettings):
     )
     allowed_hosts: Words = Field(
         default=(),
-        description="Names under which browsers and programs may ask for the service, with commas between them, "
-        "besides localhost and the addresses it listens on",
+        description="Comma-separated host names of the service for browsers and programs, "
+        "in addition to localhost and the addresses it listens on",
     )
     trusted_proxies: Words = Field(
         default=(),
-        description="Addresses or networks of reverse proxies, with commas between them, whose X-Forwarded-For, "
-        "-Proto and -Host headers are believed; nobody else's are",
+        description="Comma-separated addresses or networks of reverse proxies whose X-Forwarded-For, "
+        "-Proto and -Host headers are accepted; headers of other peers are ignored",
     )
     retention_days: int = Field(
         default=90, ge=1, description="Days for which the feed and finished jobs are kept"
@@ -86,26 +86,29 @@ class Settings(BaseSettings):
     runner_exchange: Path | None = Field(
         default=None,
         description="Folder shared with a runner (`linna runner`) that runs payload builds; "
-        "default: builds run in a sandbox of this machine, or are refused",
+        "default: builds run in a local sandbox, or are refused",
     )
     uploads_at_once: int = Field(
-        default=64, ge=1, le=4096, description="Uploads received at once; others wait a little, then get 503"
+        default=64,
+        ge=1,
+        le=4096,
+        description="Simultaneous uploads; further ones wait for a short time, then get 503",
     )
     connections: int = Field(
-        default=4096, ge=16, description="Connections at once, as far as the limit of open files allows"
+        default=4096, ge=16, description="Simultaneous connections, as far as the limit of open files permits"
     )
     connections_per_client: int = Field(
-        default=1024, ge=4, description="Connections at once of one address that is no trusted proxy"
+        default=1024, ge=4, description="Simultaneous connections of one address that is not a trusted proxy"
     )
-    sockets: int = Field(default=500, ge=1, description="WebSockets at once")
+    sockets: int = Field(default=500, ge=1, description="Simultaneous WebSockets")
     sockets_per_user: int = Field(
-        default=30, ge=1, description="WebSockets at once of one user, or of one address without users"
+        default=30, ge=1, description="Simultaneous WebSockets of one user, or of one address without users"
     )
     request_timeout_s: float = Field(
         default=20.0,
         ge=1.0,
         le=3600.0,
-        description="Seconds in which the head of a request has to come, and the next 4 KiB of its body",
+        description="Time limit in seconds for the head of a request, and for every 4 KiB of its body",
     )
     upload_limit_mib: int = Field(default=4096, ge=1, description="Largest upload accepted, MiB")
 
@@ -126,7 +129,7 @@ class Settings(BaseSettings):
         return f"sqlite:///{self.home / 'linna.db'}"
 
     def resolved_migration_url(self) -> str:
-        """The SQLAlchemy URL that changes of the schema are made with."""
+        """Return the SQLAlchemy URL for changes of the schema."""
         if self.migration_database_url is not None:
             return normalised_url(self.migration_database_url.get_secret_value())
         return self.resolved_database_url()
@@ -144,16 +147,16 @@ class Settings(BaseSettings):
 
 
 def load_settings(**given: object) -> Settings:
-    """Settings from the environment, overridden by what is given (None means: not given).
+    """Return the settings of the environment, overridden by the arguments that are not None.
 
     ``LINNA_DATABASE_URL_FILE``, ``LINNA_MIGRATION_DATABASE_URL_FILE`` and ``LINNA_BROKER_URL_FILE`` name files that
-    hold the secret instead; ``LINNA_DATABASE_PASSWORD_FILE`` and the like name files with the password alone, for a URL
-    that has a user and no password.
+    contain the secret instead; ``LINNA_DATABASE_PASSWORD_FILE`` and the like name files with the password alone, for a
+    URL that has a user and no password.
 
     Raises
     ------
     SettingsError
-        If a value cannot be used; the message names the setting.
+        If a value is invalid; the message names the setting.
     """
     values = {name: value for name, value in given.items() if value is not None}
     for name in ("database_url", "migration_database_url", "broker_url"):
@@ -184,7 +187,7 @@ def _secret(name: str, path: str) -> str:
 
 
 def _with_password(url: str, password: str) -> str:
-    """The URL of a user without a password, with this one."""
+    """Return the URL with this password if it has a user without a password."""
     scheme, mark, rest = url.partition("://")
     user, at, place = rest.rpartition("@")
     if not at or ":" in user:

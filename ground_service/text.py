@@ -1,4 +1,4 @@
-"""Names and reasons as one line of text that can be printed anywhere."""
+"""Validation of names and reasons as one line of printable text."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import re
 from ground_service.errors import InvalidInput
 
 LINE_PATTERN = r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]*$"
-"""No control characters (NUL, ESC, line ends), no separators of lines, nothing that turns the direction of writing."""
+"""Pattern without control characters (NUL, ESC, line ends), line separators and bidirectional controls."""
 
 LINE_PATTERN_JSON = r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]*$"
-"""The same without surrogates, which text over the wire cannot hold, as the API documents it."""
+"""The same pattern without surrogates, which UTF-8 cannot encode, for the API documentation."""
 
 NAME_LIMIT = 200
 REASON_LIMIT = 500
@@ -24,7 +24,7 @@ def require_line(text: object, what: str, where: str, limit: int = NAME_LIMIT) -
     Raises
     ------
     InvalidInput
-        If it is anything else; the message shows control characters by their codes.
+        If the text is not such a line; the message shows control characters by their codes.
     """
     expected = f"a line of 1 to {limit} characters without control characters"
     if not isinstance(text, str):

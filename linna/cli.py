@@ -44,9 +44,9 @@ GROUPS: dict[str, tuple[str, str]] = {
     "command": ("command", "telecommands: queue, release, uplink, verification"),
     "serve": ("serve", "run the ground service's HTTP API"),
     "worker": ("worker", "run a job worker of the ground service"),
-    "runner": ("runner", "run payload builds for a service, in a container of their own"),
+    "runner": ("runner", "run payload builds for the ground service, in a separate container"),
     "db": ("db", "the database: schema, backup, export and import"),
-    "verify": ("verify", "check the archive against itself: files, rows, packets, audit chain"),
+    "verify": ("verify", "check the integrity of the archive: files, rows, packets, audit chain"),
     "user": ("user", "users of the ground service and their tokens"),
     "audit": ("audit", "the audit log: who did what, and the head of its hash chain"),
 }

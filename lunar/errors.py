@@ -1,15 +1,15 @@
-"""What can go wrong in ``lunar``, each error one clear line.
+"""Errors of ``lunar``, each with a message of one line.
 
 LunarError
-├── DataFileError            a file is missing, cut short or says something that cannot be
-├── TimeFormatError          a text is not a UTC epoch
+├── DataFileError            a file is missing, truncated or has an invalid value
+├── TimeFormatError          a text that is not a UTC epoch
 ├── UnknownTimeSystemError   a time scale that cannot be converted
 ├── UnknownFrameError        a reference frame or centre that cannot be converted
 ├── EphemerisError           states that form no ephemeris, or that a file format cannot hold
 ├── EphemerisCoverageError   an epoch outside the span of an ephemeris or orientation, or inside a gap of it
-├── LensError                a distortion that gives some pixels no ray
-└── OrbitError               elements or states that are no orbit about the Moon
-    └── ImpactError          the orbit meets the ground, with epoch and place
+├── LensError                a distortion under which some pixels have no unique ray
+└── OrbitError               elements or states that are not an orbit about the Moon
+    └── ImpactError          the orbit intersects the ground, with epoch and place
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class DataFileError(LunarError):
 
 
 class LensError(LunarError):
-    """A lens distortion that gives some pixels of the image no ray, or several."""
+    """A lens distortion under which some pixels of the image have no ray, or several."""
 
 
 class TimeFormatError(LunarError):

@@ -41,37 +41,40 @@ _OMITTED_M2_S3 = {
     70: (7.2e-7, 5e-8, 5.2e-7),
     100: (1.3e-7, 4e-9, 1.2e-7),
 }
-# Fields made before GRAIL: tracked over the near side only, since no orbiter is in sight of the Earth over the other.
+# Fields made before GRAIL: tracked over the near side only, because an orbiter over the far side is not visible from
+# the Earth.
 _OLDER = ("LP", "GLGM", "JGL")
-# LP165P against GRAIL, both to degree 100: 2 to 6 mGal over the near side, 30 to 43 over the far side in waves of some
-# 300 s. The far side is as measured, from means over 208 s on 40 polar circles at 30 km; over the altitudes of the
-# paper's orbit `linna orbit omission --flown FILE --revolutions 40` gives a quarter more. A quarter of it, as once set
-# on the NEES of a polar track, claims too much after a coast over the far side on a track inclined by 60 degrees.
+# LP165P against GRAIL, both to degree 100: the difference is 2 to 6 mGal over the near side, and 30 to 43 mGal with
+# periods of about 300 s over the far side. The far-side values are means over 208 s on 40 circular polar orbits at 30
+# km. Over the altitudes of the paper's orbit, `linna orbit omission --flown FILE --revolutions 40` gives 25 % more. A
+# quarter of these values, tuned on the NEES of a polar track, was too small: the filter was overconfident after a coast
+# over the far side on a track inclined by 60 degrees.
 _NEAR_SIDE_M2_S3 = (5e-8, 3e-9, 5e-8)
 _FAR_SIDE_M2_S3 = (5.3e-6, 1.8e-6, 4.6e-6)
 
 
-# A harmonic of degree n falls with height as (R/r)^(n+2), its density as the square of that. What a cut at degree N
-# omits falls like degree N + 14, measured as `linna orbit omission` does on circles at 15 and 46 km, GRAIL's field to
-# degree 150 cut at 8, 20, 30, 50, 70 and 100, within 6 %.
+# The acceleration of a harmonic of degree n decreases with height as (R/r)^(n+2), its spectral density as the square.
+# The part omitted by a truncation at degree N decreases like degree N + 14 within 6 %. This was measured with the
+# method of `linna orbit omission` on circular orbits at 15 and 46 km, for GRAIL's field to degree 150 truncated at
+# degrees 8 to 100.
 _OMITTED_ABOVE = 14
-# What LP165P has wrong falls like degree 87 over the near side and 27 over the far side, measured in the same way.
+# The error of LP165P decreases like degree 87 over the near side and 27 over the far side, measured in the same way.
 _NEAR_SIDE_DEGREE, _FAR_SIDE_DEGREE = 87, 27
 
 REFERENCE_ALTITUDE_M = 30_000.0
-"""Altitude at which `FieldNoise` gives densities."""
+"""Reference altitude of the densities in `FieldNoise`."""
 
 
 @dataclass(frozen=True, slots=True)
 class FieldNoise:
-    """White acceleration that stands for what a gravity field lacks or has wrong, and how it falls with altitude.
+    """White acceleration that models the omission and commission errors of a gravity field, by side and altitude.
 
     Attributes
     ----------
     near_psd_m2_s3, far_psd_m2_s3
         Two-sided spectral density at `REFERENCE_ALTITUDE_M` over the near and the far side, radial, transverse, normal.
     near_scale_height_m, far_scale_height_m
-        Height over which the density falls to 1/e.
+        Height difference over which the density decreases to 1/e.
     """
 
     near_psd_m2_s3: Densities
@@ -81,11 +84,11 @@ class FieldNoise:
 
 
 def field_noise(name: str, degree: int) -> FieldNoise:
-    """Return what a field by its name, cut at a degree, lacks or has wrong, by side of the Moon and altitude.
+    """Return the error model of a named gravity field truncated at a degree, by side of the Moon and altitude.
 
-    Densities over an orbit like the paper's (`field_psd_m2_s3`) are means over its altitudes. Where the density falls
-    to 1/e in a height H, the mean over an orbit of mean altitude h and amplitude a e is exp((30 km - h) / H) I0(ae / H)
-    times that at 30 km.
+    The densities of `field_psd_m2_s3` are means over the altitudes of an orbit like the paper's. If the density
+    decreases to 1/e over a height H, the mean over an orbit of mean altitude h and amplitude a e is exp((30 km - h) /
+    H) I0(ae / H) times that at 30 km.
     """
     omitted = (omission_psd_m2_s3(degree), _scale_height_m(degree + _OMITTED_ABOVE))
     if not name.upper().startswith(_OLDER):
@@ -95,7 +98,7 @@ def field_noise(name: str, degree: int) -> FieldNoise:
     for wrong, wrong_degree in ((_NEAR_SIDE_M2_S3, _NEAR_SIDE_DEGREE), (_FAR_SIDE_M2_S3, _FAR_SIDE_DEGREE)):
         parts = [omitted, (wrong, _scale_height_m(wrong_degree))]
         densities = [_at_reference(*part) for part in parts]
-        # One exponential for the sum of two: its slope at the reference altitude.
+        # Approximate the sum of two exponentials by one with the same slope at the reference altitude.
         slope = sum(psd[0] / height for psd, (_, height) in zip(densities, parts, strict=True))
         total = _sum(*densities)
         sides.append((total, total[0] / slope))
@@ -108,7 +111,7 @@ def _scale_height_m(degree: float) -> float:
 
 
 def _at_reference(mean: Densities, scale_height_m: float) -> Densities:
-    """Return the density at the reference altitude of one whose mean over the orbit of the study is given."""
+    """Return the density at the reference altitude from its mean over the orbit of the study."""
     altitude_m, amplitude_m = _SEMI_MAJOR_M - MOON_RADIUS_M, _SEMI_MAJOR_M * _ECCENTRICITY
     gain = np.exp((REFERENCE_ALTITUDE_M - altitude_m) / scale_height_m) * np.i0(amplitude_m / scale_height_m)
     return mean[0] / float(gain), mean[1] / float(gain), mean[2] / float(gain)

@@ -25,17 +25,17 @@ Floats = npt.NDArray[np.float64]
 
 NEWTON_STEPS = 12
 SETTLED = 1.0e-10
-"""A ray is found when the lens puts it this close to its pixel, in focal lengths: a millionth of a pixel."""
+"""Convergence limit of the inverse distortion in focal lengths, about a millionth of a pixel."""
 
 
 @dataclass(frozen=True, slots=True)
 class BrownCamera(PinholeCamera):
-    """A camera with a distorting lens; ``fov_rad`` is that of the lens without its distortion.
+    """Camera with a distorting lens; ``fov_rad`` is the field of view without distortion.
 
     Raises
     ------
     LensError
-        The distortion folds the picture: some pixel has no one ray.
+        The distortion is not invertible: some pixel has no unique ray.
     """
 
     k1: float = 0.0
@@ -49,12 +49,12 @@ class BrownCamera(PinholeCamera):
         v = np.linspace(-0.5, self.height_px - 0.5, 33)
         if not np.isfinite(self.rays(np.stack(np.meshgrid(u, v), axis=-1))).all():
             raise LensError(
-                "lens: expected distortion that keeps the picture's points apart, found one that folds it "
+                "lens: expected an invertible distortion, found one that folds the image "
                 f"(k1 {self.k1:g}, k2 {self.k2:g}, k3 {self.k3:g}, p1 {self.p1:g}, p2 {self.p2:g})"
             )
 
     def project(self, points_camera_m: npt.ArrayLike) -> Floats:
-        """Pixel coordinates ``(..., 2)`` of points ``(..., 3)``; NaN behind the camera and where the lens folds."""
+        """Return the pixel coordinates ``(..., 2)`` of points ``(..., 3)``; NaN where there are none."""
         points = np.asarray(points_camera_m, dtype=np.float64)
         depth = np.where(points[..., 2] > 0.0, points[..., 2], np.nan)
         x, y = points[..., 0] / depth, points[..., 1] / depth
@@ -64,13 +64,13 @@ class BrownCamera(PinholeCamera):
         return np.asarray(self.focal_px * place + np.array(self.centre_px))
 
     def rays(self, uv: npt.ArrayLike) -> Floats:
-        """Unit directions ``(..., 3)`` in camera axes of pixel coordinates ``(..., 2)``; NaN where there is none."""
+        """Return unit directions ``(..., 3)`` in camera axes of pixels ``(..., 2)``; NaN if there is none."""
         plane = self.undistorted(uv)
         directions = np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
         return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
 
     def undistorted(self, uv: npt.ArrayLike) -> Floats:
-        """Where pixels ``(..., 2)`` lie on the image plane of the lens without distortion, in focal lengths."""
+        """Return undistorted image-plane coordinates ``(..., 2)`` of pixels ``(..., 2)``, in focal lengths."""
         wanted = (np.asarray(uv, dtype=np.float64) - np.array(self.centre_px)) / self.focal_px
         goal_x, goal_y = wanted[..., 0], wanted[..., 1]
         x, y = goal_x.copy(), goal_y.copy()
@@ -115,7 +115,7 @@ def pointed_camera_from_mcmf(
 
 @lru_cache(maxsize=16)
 def _largest_square(k1: float, k2: float, k3: float) -> float:
-    """Square of the radius at which the radial distortion stops growing; infinity where it never does."""
+    """Return the squared radius at which the distorted radius stops increasing; infinity if it never does."""
     roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0]) if (k1 or k2 or k3) else np.empty(0)
     real = roots[np.abs(roots.imag) < 1.0e-9 * np.abs(roots)].real
     real = real[real > 0.0]

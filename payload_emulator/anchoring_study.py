@@ -1,8 +1,8 @@
-"""How few landmarks keep the error bounded, and which: navigation with ever smaller parts of a catalogue.
+"""Study of the number and choice of landmarks: navigation with successively smaller parts of a catalogue.
 
-Every run is the same flight over the same craters with the same detector; only what is on board changes. Three ways
-to choose: at random, the largest first, and spread evenly over the ground (the largest of each cell of a grid that
-grows finer until there are enough). Simulated detections, level 2.
+Every run is the same flight over the same craters with the same detector; only the on-board catalogue changes.
+Landmarks are chosen at random, by size (largest first), or spread evenly over the ground (the largest of each cell of a
+grid that is refined until there are enough). Simulated detections, level 2.
 """
 
 from __future__ import annotations

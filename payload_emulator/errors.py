@@ -43,7 +43,7 @@ class DatasetError(PayloadError):
 
 
 class ParameterError(PayloadError):
-    """A parameter file is no TOML, or names a parameter that flight does not have, or gives it an impossible value.
+    """A parameter file that is not valid TOML, or has an unknown parameter or an invalid value.
 
     `file`, `key`, `expected` and `found` are the parts of the message.
     """

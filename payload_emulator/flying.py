@@ -117,12 +117,12 @@ class CatalogueDetector:
 def craters_in_view(
     world: World, exposure: Exposure, smallest_px: float, craters: CraterCatalogue | None = None
 ) -> tuple[IntArray, NDArray[np.float64], NDArray[np.float64]]:
-    """Return the craters in a picture: index, place (n, 2) and diameter (n,) in pixels.
+    """Return the craters in an image: index, place (n, 2) and diameter (n,) in pixels.
 
     Parameters
     ----------
     craters
-        Catalogue with the heights of the rims; that of the terrain, whose heights may be unknown, when None.
+        Catalogue with rim heights; None uses the catalogue of the terrain, whose heights may be unknown.
     """
     position = world.truth.positions_mcmf(exposure.utc_ns)[0]
     latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))

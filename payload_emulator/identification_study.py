@@ -1,8 +1,9 @@
-"""How often craters are taken for others: identification on simulated detections of a real catalogue.
+"""Study of wrong identifications on simulated detections of a real catalogue.
 
-Detections are drawn from the craters in view with a recall, a precision and errors that are stated; no images are
-made (evidence levels 1 and 2). Hostile frames come with the same numbers: nothing but false detections,
-mirror images, images turned by a right angle. A fix is wrong if half of its pairs or more are, and its place is.
+Detections are drawn from the craters in view with stated recall, precision and errors; no images are
+rendered (evidence levels 1 and 2). Hostile frames have the same number of detections: only false detections,
+mirror images, or images rotated by a right angle. A fix is wrong if at least half of its pairs are wrong and its
+position is wrong.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """TCP ports of the live payload: non-blocking, with bounded buffers, in one selector.
 
-A client can connect and leave at any moment, reset its connection, vanish without a word or never read. None of
-these may stop or delay the flight: nothing here blocks, and `Server.drop` is the only place where a client's socket
-is closed. It takes the socket out of the selector first, so that a new connection can have the same descriptor.
+A client can connect and disconnect at any time, reset its connection, disappear without closing it, or never read.
+This must not stop or delay the simulation: nothing here blocks, and `Server.drop` is the only place where a client's
+socket is closed. It takes the socket out of the selector first, so that a new connection can have the same descriptor.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from dataclasses import dataclass, field
 from payload_emulator.errors import LinkError
 
 CLIENT_LIMIT = 64
-"""Connections of one port at a time; more are closed at once, so that descriptors cannot run out."""
+"""Largest number of connections of one port; further ones are closed at once, to limit descriptors."""
 
 UNSENT_LIMIT_OCTETS = 8 << 20
-"""What waits for a client that reads slowly; a client that is further behind is disconnected."""
+"""Largest number of unsent octets for a client; a client that reads more slowly is disconnected."""
 
 _CHUNK_OCTETS = 65_536
 _CLOSE_S = 2.0
@@ -33,9 +33,9 @@ class Client:
     Attributes
     ----------
     number
-        Counts the connections of a port; it is never used again, unlike a descriptor.
+        Consecutive number of the connection; unlike a descriptor, it is never reused.
     unsent
-        Octets that the client has not taken yet.
+        Octets that were not sent yet.
     """
 
     number: int
@@ -51,9 +51,9 @@ class Server:
     Attributes
     ----------
     receive
-        Called with the number of the client and what it sent.
+        Called with the number of the client and the received octets.
     ended
-        Called with the number of a client that has gone.
+        Called with the number of a client that has disconnected.
     """
 
     name: str
@@ -77,19 +77,19 @@ class Server:
         self.port = int(self.listener.getsockname()[1])
 
     def attach(self, selector: selectors.BaseSelector) -> None:
-        """Serve this port from a selector; `serve` is to be called with the events of its keys."""
+        """Register the port with a selector, whose events are passed to `serve`."""
         self._selector = selector
         selector.register(self.listener, selectors.EVENT_READ, (self, None))
 
     def detach(self) -> None:
-        """Leave the selector; what is sent from here on goes out by `close`."""
+        """Unregister from the selector; data sent after this are delivered by `close`."""
         if self._selector is not None:
             for connection in (self.listener, *(client.connection for client in self.clients.values())):
                 self._selector.unregister(connection)
             self._selector = None
 
     def serve(self, client: Client | None, events: int) -> None:
-        """Handle an event of the listener (None) or of a client, which may have been dropped since."""
+        """Handle an event of the listener (None) or of a client, which may have been dropped meanwhile."""
         if client is None:
             self._accept()
             return
@@ -99,13 +99,13 @@ class Server:
             self._read(client)
 
     def send(self, octets: bytes) -> None:
-        """Give octets to every client without waiting; a client that is too far behind is disconnected."""
+        """Send octets to every client without blocking; disconnect clients with too many unsent octets."""
         for client in list(self.clients.values()):
             client.unsent += octets
             self._flush(client)
 
     def drop(self, client: Client) -> None:
-        """Close a connection; it is not served any more."""
+        """Close a connection and stop serving it."""
         if self.clients.pop(client.number, None) is None:
             return
         if self._selector is not None:
@@ -114,7 +114,7 @@ class Server:
         self.ended(client.number)
 
     def close(self) -> None:
-        """Close the port and all connections, after a last attempt to deliver what waits."""
+        """Close the port and all connections, after a last attempt to deliver unsent octets."""
         self.detach()
         due = time.monotonic() + _CLOSE_S
         for client in list(self.clients.values()):
@@ -129,7 +129,7 @@ class Server:
         try:
             connection, _ = self.listener.accept()
         except OSError:
-            return  # It has gone already, or descriptors are scarce: the next turn tries again.
+            return  # the client has disconnected, or descriptors are exhausted: the next event tries again
         assert self._selector is not None
         if len(self.clients) >= CLIENT_LIMIT:
             connection.close()

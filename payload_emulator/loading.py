@@ -268,7 +268,7 @@ def _burn_table(burns: Sequence[TrueBurn]) -> bytes:
 
 
 def filter_field(name: str, degree: int, data: DataFolder) -> GravityField:
-    """Return the gravity field that the filter flies: by default another one than the truth's."""
+    """Return the gravity field of the on-board filter; by default it differs from that of the truth."""
     if name == "auto":
         if data.gravity_alternative is None:
             return builtin_gravity().truncated(min(degree, _CUT_DEGREE))

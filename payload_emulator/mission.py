@@ -1,7 +1,7 @@
 """The mission description (`mission.toml`) of a scenario, and the attitude table of a pass.
 
-The description states what a ground segment is told about the spacecraft and the world that is flown. It is plain TOML;
-the reader is another program.
+The description states what a ground segment needs to know about the spacecraft and the simulated world. It is plain
+TOML, read by the ground service.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from tmtc.downlink import LinkSettings
 MISSION_FILE = "mission.toml"
 ATTITUDE_FILE = "attitude.csv"
 ATTITUDE_HEADER = "image_ticks,q_w,q_x,q_y,q_z"
-"""On-board time of the image, and the quaternion from ICRF axes to the camera as the attitude control reported it."""
+"""Columns: on-board time of the image, and the quaternion from ICRF axes to the camera reported by attitude control."""
 
 DETECTOR_RECIPE = SHIPPED / "detector-dataset.toml"
 """Data set that the shipped detector was trained on."""
 
 SEEN_SPLITS = ("train", "val")
-"""Terrain of the validation split decided thresholds, so it counts as seen."""
+"""Splits whose terrain counts as seen; the validation split was used to choose thresholds."""
 
 SPACECRAFT_NAME = "SelenITA"
 CLOCK_EPOCH = "2000-01-01T00:00:00 TAI"
@@ -48,12 +48,12 @@ Value = bool | int | float | str | Sequence[float] | Sequence[str] | None
 
 
 def scenario_mission_text(scenario: Scenario, data: DataFolder) -> str:
-    """Return the mission description of a scenario, which is flown as far as its windows for this."""
+    """Return the mission description of a scenario; the scenario is simulated as far as its windows require."""
     return mission_text(build_world(scenario, data), data)
 
 
 def mission_text(world: World, data: DataFolder) -> str:
-    """Return the mission description of a world as TOML; what it does not know it leaves out."""
+    """Return the mission description of a world as TOML; unknown values are left out."""
     scenario, camera, link = (
         world.scenario,
         world.scenario.camera,
@@ -135,7 +135,7 @@ def save_attitudes(folder: Path, inputs: Iterable[StepInput]) -> None:
 
 
 def unseen_share(world: World) -> float | None:
-    """Return the share of frames none of whose ground was used in training; None away from real terrain.
+    """Return the share of frames none of whose ground was used in training; None without real terrain.
 
     The ground of a frame is sampled at the centre, edges and corners of its footprint.
     """
@@ -155,7 +155,7 @@ def unseen_share(world: World) -> float | None:
 
 
 def seen_in_training(latitude_deg: FloatArray, longitude_deg: FloatArray) -> BoolArray:
-    """Return whether real ground (n,) lies where the shipped detector was trained or its thresholds were chosen."""
+    """Return whether real ground (n,) lies is in the training or validation data of the shipped detector."""
     seen = np.zeros(np.shape(latitude_deg), dtype=np.bool_)
     for source in _seen_sources():
         inside = _in_any(source.boxes, latitude_deg, longitude_deg, 0.0)

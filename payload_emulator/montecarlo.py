@@ -49,23 +49,23 @@ _ORIENTATION_MARGIN_NS = 5 * _ORIENTATION_STEP_NS
 
 @dataclass(frozen=True, slots=True)
 class SimulatedDetector:
-    """A detector as its confusion table describes it.
+    """Detector model given by its confusion table.
 
     Attributes
     ----------
     recall
         By size class 0, 1, 2 and 3 (3 to 5 km).
     precision
-        Share of detections that are craters; the others lie anywhere, with diameters of the true ones.
+        Share of detections that are craters; the others are distributed uniformly, with the diameters of true ones.
     sigma_px
-        Error of centres, per axis; `claimed_sigma_px` is what the detector says of it (None: the truth).
+        Error of centres, per axis; `claimed_sigma_px` is the value that the detector reports (None: the true one).
     persistence
-        Share of the variance that stays with its crater.
+        Share of the variance that is common to all frames of a crater.
     bias_px, bias_sigma_px, bias_correlation_s
-        Shift of all detections, right and down: given, and drawn on top, as a first-order Gauss-Markov process with
-        this memory (infinite: constant for a run).
+        Shift of all detections, right and down: a given value plus a first-order Gauss-Markov process with this
+        correlation time (infinite: constant for a run).
     scale, scale_sigma
-        Stretch of all detections about the image centre: given, and drawn once per run on top.
+        Scale error of all detections about the image centre: a given value plus a random value for each run.
     log_diameter_sigma
         Error of the logarithm of the diameter.
     """
@@ -110,7 +110,7 @@ class Kidnap:
 
 @dataclass(frozen=True, eq=False)
 class NavigationCase:
-    """Everything that one seed needs to make a run; all of it can cross to another process.
+    """Inputs of one run, given a seed; all of them can be pickled.
 
     Attributes
     ----------
@@ -127,13 +127,13 @@ class NavigationCase:
     start_position_m, start_velocity_m_s
         Size (3-D, one sigma) of the error of the state that starts the filter.
     attitude_noise_rad, attitude_bias_rad, attitude_correlation_s
-        Of the ADCS message, per axis, one sigma; the bias is a first-order Gauss-Markov process with this memory
-        (infinite: constant for a run).
+        Errors of the ADCS message, per axis, 1 sigma; the bias is a first-order Gauss-Markov process with this
+        correlation time (infinite: constant for a run).
     on_board
-        Craters that the uploaded catalogue holds, a mask; None for all.
+        Mask of the craters in the uploaded catalogue; None for all.
     any_node, node_longitudes_deg
-        Each run turns the orbit about the Moon's axis by an angle of its own, and so that the longitude of the
-        ascending node at the epoch lies between two values, if they are given.
+        Each run rotates the orbit about the Moon's axis by a random angle, such that the longitude of the ascending
+        node at the epoch lies between two values, if they are given.
     """
 
     epoch_utc_ns: int
@@ -395,7 +395,7 @@ def _with_drawn_node(case: NavigationCase, rng: np.random.Generator) -> Navigati
     if case.node_longitudes_deg is not None:
         normal = rotation @ np.cross(case.position_icrf_m, case.velocity_icrf_m_s)
         low, high = case.node_longitudes_deg
-        # The ascending node lies along axis x normal.
+        # The direction of the ascending node is axis x normal.
         now = float(np.arctan2(normal[0], -normal[1]))
         angle = float(np.radians(low + (high - low) * angle / (2.0 * np.pi))) - now
     turn = _rotation(angle * rotation[2])

@@ -1,6 +1,6 @@
-"""Worlds for Monte Carlo runs: gravity rough to any degree, craters of the paper's density, tracks.
+"""Worlds for Monte Carlo runs: gravity fields to any degree, craters of the paper's density, tracks.
 
-Noise of the filter is chosen on the track `tuning` alone. The others are held out: nothing is chosen on them.
+The process noise of the filter is tuned on the track `tuning` only. The other tracks are held out.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ _NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class TrackOrbit:
-    """An orbit that Monte Carlo runs fly, as elements at an epoch in the Moon's equator of date.
+    """Orbit of Monte Carlo runs, as elements at an epoch in the Moon's equator of date.
 
     Attributes
     ----------
     angles_deg
         Inclination, node, argument of perilune, true anomaly.
     node_longitudes_deg
-        Longitudes of the ascending node among which each run draws its own; None for any.
+        Range of longitudes of the ascending node from which each run draws one; None for any.
     """
 
     epoch: str
@@ -58,8 +58,8 @@ _TRACKS: dict[Track, TrackOrbit] = {
     "tuning": TrackOrbit("2029-09-16T06:00:00Z", 1_768_180.0, 0.006908, (86.5, 121.0, 210.0, 80.0)),
     # Inclined by 60 degrees, nearly circular: 25 to 34 km.
     "inclined": TrackOrbit("2029-11-02T12:00:00Z", 1_767_000.0, 0.0025, (60.0, 200.0, 20.0, 300.0)),
-    # Higher, and over the limbs as seen from the Earth, where a field without tracking of the far side is good: 34 to
-    # 62 km.
+    # Higher, and over the limbs as seen from the Earth, where a field without far-side tracking is accurate: 34 to 62
+    # km.
     "limb": TrackOrbit("2030-01-15T18:00:00Z", 1_785_400.0, 0.008, (80.0, 30.0, 150.0, 190.0), (75.0, 105.0)),
 }
 
@@ -89,18 +89,21 @@ def crater_world(seed: int = 11) -> CraterCatalogue:
 
 
 def standard_case(data: DataFolder, track: Track, hours: float, noise_factor: float = 1.0) -> NavigationCase:
-    """The orbit of a track from 5 km and 5 m/s off, a frame each 15 s, two imaging arcs of 37 minutes a revolution.
+    """Return the case of a track: start errors of 5 km and 5 m/s, a frame every 15 s.
 
-    Each run flies it with another node: over the same ground every run would meet the same errors of the gravity field,
-    and however many there were, their average would tell of one draw.
+    Each revolution has two imaging arcs of 37 minutes.
 
-    Truth flies GRAIL to degree 150, the filter Lunar Prospector's field to 100, where both are at hand; else a rough
-    field and the same cut. Every error that the filter allows for is drawn with the size and memory that it allows.
+    Each run has another ascending node: over the same ground, all runs would have the same gravity errors, and their
+    average would represent a single sample.
+
+    The truth uses GRAIL to degree 150 and the filter Lunar Prospector's field to degree 100, if both are available;
+    otherwise a synthetic field with the same truncation. Every error that the filter models is drawn with the size and
+    correlation time that the filter assumes.
 
     Parameters
     ----------
     noise_factor
-        Factor on all process noise of the filter: 1 is as shipped.
+        Factor on all process noise of the filter; 1 is the shipped value.
     """
     if data.gravity is not None and data.gravity_alternative is not None:
         gravity, other = load_gravity(data.gravity), load_gravity(data.gravity_alternative)

@@ -1,7 +1,7 @@
-"""The navigation of several sessions side by side: a row per archive, from what its summary says.
+"""Comparison of the navigation of several sessions: one row for each archive, from its summary.
 
 Errors are three-dimensional, in metres, after the frames counted (see `counted_from`); every row names its
-evidence level, which follows from the world that the mission description of the archive declares.
+evidence level, which follows from the world stated in the mission description of the archive.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from payload_emulator.mission import MISSION_FILE, level_of, level_text
 
 @dataclass(frozen=True, slots=True)
 class NavigationRow:
-    """A session; None where it has no such figure.
+    """Row of a session; values that are not available are None.
 
     Attributes
     ----------
     altitude_km
         Smallest, mean and largest over the frames.
     level
-        Evidence level: "2", "3s" or "3"; "" where the archive declares no world.
+        Evidence level: "2", "3s" or "3"; "" if the archive states no world.
     unseen_share
-        Share of frames over real terrain that was never used in training; None where it is not declared.
+        Share of frames over real terrain that was never used in training; None if it is not stated.
     median_m, p95_m, max_m
-        Of the position while images come.
+        Position error while images are available.
     coast_end_p95_m
-        Of the position right before the first image after a gap.
+        Position error immediately before the first image after a gap.
     recovery_frames
-        Frames with an image until the error is below 500 m after a kidnap or an outage.
+        Number of frames with an image until the error is below 500 m after a kidnap or an outage.
     propagate_only_m
-        Median error of the start state flown on without any image.
+        Median error of the start state propagated without images.
     """
 
     scenario: str
@@ -118,7 +118,7 @@ def _declared(path: Path) -> tuple[str, float | None]:
 
 
 def row_of(summary: Mapping[str, Any], level: str = "", unseen: float | None = None) -> NavigationRow:
-    """Return the row of a session's summary, flown at an evidence level."""
+    """Return the row of a session's summary at an evidence level."""
     navigation, altitude = summary["navigation"], summary["altitude_km"]
     imaging = navigation["imaging"]
     return NavigationRow(

@@ -22,7 +22,7 @@ from payload_emulator.flight.detector import DetectorParameters
 from payload_emulator.flight.payload import FlightParameters
 
 SHOWN = 80
-"""Characters of a wrong value that a message shows."""
+"""Largest number of characters of a wrong value in a message."""
 
 TYPE_WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
 
@@ -39,17 +39,17 @@ RANGES: dict[str, tuple[float, float]] = {
     "width_px": _COUNT,
     "height_px": _COUNT,
     "minimum_pairs": _COUNT,
-    "lost_search_every": _COUNT,  # divides the number of frames
+    "lost_search_every": _COUNT,  # the number of frames is divided by it
     "housekeeping_interval_s": (1e-3, math.inf),
     "reference_interval_s": (1e-3, math.inf),
     "fov_rad": (1e-3, math.pi),
-    "scale": (-0.5, 0.5),  # relative, of either sign
+    "scale": (-0.5, 0.5),  # relative, positive or negative
 }
 """Least and greatest value of a parameter by its last name. All others are limits, lengths, times, sigmas or counts,
 which are never negative."""
 
 BOUND_WORDS = (("minimum", "maximum"), ("lowest", "highest"))
-"""Words that make a lower limit and its upper limit of the names of two parameters of a section."""
+"""Words that distinguish the names of a lower limit and its upper limit in a section."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -71,18 +71,18 @@ def parse_parameters(
     source: str = "parameters",
     dropped: list[str] | None = None,
 ) -> BuildParameters:
-    """`flown` with what the TOML text changes.
+    """Return `flown` with the values of a TOML text.
 
     Parameters
     ----------
     dropped
-        Takes the names of parameters that this flight code does not have, as a record of older code may hold; None
-        refuses them.
+        List that receives the names of parameters unknown to this flight code, which a file of older code may have;
+        None refuses them.
 
     Raises
     ------
     ParameterError
-        No TOML, an unknown key, or a value of another type or out of its range; the message names the key.
+        Invalid TOML, an unknown key, or a value of a wrong type or out of range; the message names the key.
     """
     try:
         table = tomllib.loads(text)
@@ -207,7 +207,7 @@ def _in_range(given: float, source: str, place: str) -> None:
     Raises
     ------
     ParameterError
-        It is.
+        The number is not finite or out of range.
     """
     low, high = RANGES.get(place.rsplit(".", 1)[-1].partition("[")[0], (0.0, math.inf))
     if not math.isfinite(given) or not low <= given <= high:

@@ -102,7 +102,7 @@ def load_flight_build(path: Path) -> FlightBuild:
 
 
 def check_parameters(path: Path) -> None:
-    """Refuse a build file whose parameters this flight code does not have, or whose values it cannot have.
+    """Refuse a build file with parameters that are unknown to this flight code or have invalid values.
 
     Raises
     ------
@@ -180,7 +180,7 @@ def replay_archive(
         "downlink_octets": len(octets),
         "dropped": list(record.dropped),
         **flown.summary,
-        # A replay has the record alone: no truth is there to be read.
+        # a replay uses only the recording; it has no truth to read
         "truth_reads_after_start": 0,
         "cpu_ms_per_frame": cpu_ms / max(frames, 1),
         "wall_s": round(wall_s, 3),

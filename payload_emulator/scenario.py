@@ -235,12 +235,12 @@ class FaultsSection:
 
 @dataclass(frozen=True, slots=True)
 class ReferenceSection:
-    """How far the ground's reference ephemeris is from the truth, 1 sigma.
+    """Errors of the ground's reference ephemeris, 1 sigma.
 
     `radial_m`, `transverse_m` and `normal_m` are the errors of one orbit determination: an orbit of the same period
     that differs in eccentricity, phase and plane, so that errors are correlated over the whole arc and repeat with each
-    revolution. The transverse error is at least twice the radial one, as the dynamics demand. `position_error_m` adds a
-    constant offset in R/T/N.
+    revolution. The orbital dynamics require a transverse error of at least twice the radial error. `position_error_m`
+    adds a constant offset in R/T/N.
     """
 
     position_error_m: float = 0.0
@@ -263,10 +263,10 @@ class ReferenceSection:
 class RequirementsSection:
     """Limits that the mission description states for verdicts; a negative limit is not stated.
 
-    `estimator` is the one whose accuracy is judged, by default the filter where it is flown, else the first listed.
-    Errors are 3-D position errors. Consistency is the share of NEES and NIS values inside their 95 % bounds, which is
-    95 % for a filter that knows its errors; 90 % leaves room for the few samples of one pass. The temperature is the
-    warning limit of the packet dictionary, the other resources leave a fifth free.
+    `estimator` names the estimator whose accuracy is judged; the default is the filter if it is used, otherwise the
+    first listed. Errors are 3-D position errors. Consistency is the share of NEES and NIS values inside their 95 %
+    bounds, which is 95 % for a consistent filter; 90 % allows for the few samples of one pass. The temperature is the
+    warning limit of the packet dictionary, the limits of other resources leave a fifth free.
     """
 
     estimator: Literal["", "paper", "spherical", "anchored"] = ""

@@ -151,7 +151,7 @@ def score_navigation(
 
 
 def _first_of_each(image_ticks: Index, frame_ticks: Index) -> tuple[Index, Index]:
-    """Rows (n,) that speak of frames of the session, each frame once (what is played back comes twice)."""
+    """Return the rows (n,) of frames of the session, each frame once (frames that were played back occur twice)."""
     ticks = image_ticks.astype(np.int64)
     at = np.minimum(np.searchsorted(frame_ticks, ticks), frame_ticks.size - 1)
     rows = np.flatnonzero(frame_ticks[at] == ticks)

@@ -90,18 +90,18 @@ def new_board(
 
 @dataclass(slots=True, eq=False)
 class Spacecraft:
-    """The payload in its surroundings, one step after another.
+    """Payload and its environment, simulated step by step.
 
     Attributes
     ----------
     faults
-        What breaks; seconds count from `first_utc_ns`.
+        Faults; seconds count from `first_utc_ns`.
     resets
         Starts of the processor after the first, by cause.
     given
-        What the payload was given in the last step; None while the processor was down.
+        Inputs of the payload in the last step; None while the processor was down.
     truth_reads
-        Reads of the simulated truth while the payload took its steps: a payload has no way to it.
+        Number of reads of the simulated truth during payload steps; the payload must not have access to it.
     """
 
     loaded: LoadedPayload

@@ -420,7 +420,7 @@ def sample_truth(truth: Truth, frame_utc_ns: IntArray) -> Ephemeris:
 
 
 def with_reference_error(ephemeris: Ephemeris, section: ReferenceSection, seed: int) -> Ephemeris:
-    """Return the ephemeris with the errors that orbit determination leaves to the ground.
+    """Return the ephemeris with simulated orbit determination errors.
 
     The errors follow the Clohessy-Wiltshire solution of equal period about a circular orbit: with the angle u since the
     start, x = a cos u + b sin u, y = c - 2 a sin u + 2 b cos u, z = d cos u + e sin u (radial, transverse, normal), all
@@ -447,7 +447,8 @@ def with_reference_error(ephemeris: Ephemeris, section: ReferenceSection, seed: 
         x, y = a * cosine + b * sine, c - 2.0 * a * sine + 2.0 * b * cosine
         z = d * cosine + e * sine
         error = np.stack([x, y, z], axis=1) + offset
-        # The axes turn with the orbit: derivative in them, and the turn of the displacement about the normal.
+        # The axes rotate with the orbit: derivative in these axes plus the rotation of the displacement about the
+        # normal.
         slope = rate * np.stack(
             [-a * sine + b * cosine, -2.0 * a * cosine - 2.0 * b * sine, -d * sine + e * cosine], axis=1
         )

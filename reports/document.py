@@ -35,7 +35,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Headline:
-    """The numbers of the first page and the evidence level of them; None where they need no evidence."""
+    """Numbers of the first page and their evidence level; None if they need no evidence."""
 
     figures: tuple[HeadlineFigure, ...]
     evidence_level: str | None
@@ -150,13 +150,13 @@ EVIDENCE_LEVELS = (
 
 
 SEEN_MARK = "s"
-"""Follows the number of a level whose terrain was seen in training: 3s."""
+"""Suffix of an evidence level whose terrain was used in training: 3s."""
 
 SEEN_WORDS = "real terrain seen in training"
 
 
 def evidence_number(level: str) -> int | None:
-    """Return the number of an evidence level, from text that starts with it; None for any other text."""
+    """Return the number at the start of the text of an evidence level; None for other text."""
     text = level.strip().lower().removeprefix("level").strip(" (:")
     if not text[:1].isdigit() or text[1:2].isdigit():
         return None
@@ -165,7 +165,7 @@ def evidence_number(level: str) -> int | None:
 
 
 def evidence_label(level: str) -> str:
-    """Return the number of a level with its mark, such as "3" or "3s"; empty where none is stated."""
+    """Return the label of an evidence level, such as "3" or "3s"; empty if none is stated."""
     number = evidence_number(level)
     if number is None:
         return ""
@@ -174,7 +174,7 @@ def evidence_label(level: str) -> str:
 
 
 def evidence_text(level: str) -> str:
-    """Return words for a level: "level 2 of 5, procedural Moon", or those that the text itself gives in parentheses."""
+    """Return a level in words: "level 2 of 5, procedural Moon", or the words in parentheses in the text itself."""
     number = evidence_number(level)
     if number is None:
         return level.strip() or "evidence not stated"

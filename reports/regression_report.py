@@ -64,7 +64,7 @@ def _gates(report: RegressionReport) -> Table:
         for g in sorted(report.gates, key=lambda g: _ORDER.index(g.outcome))
     )
     return Table(
-        "Gates, those that failed first. A resolution above 1 means that these frames cannot show a degradation as "
+        "Gates, failed gates first. A resolution above 1 means that these frames cannot detect a degradation as "
         "large as the margin.",
         (
             Column("gate", numeric=False),
@@ -81,7 +81,7 @@ def _gates(report: RegressionReport) -> Table:
 
 
 def _outcome_text(gate: RegressionGate) -> str:
-    """Outcome, what would decide an open gate, and the reason of a waiver."""
+    """Return the outcome of a gate, the frames that an inconclusive gate needs, and the reason of a waiver."""
     text = {"pass": "passed", "fail": "failed"}.get(gate.outcome, gate.outcome)
     if gate.outcome == "inconclusive":
         if gate.reason.startswith("unknown"):
@@ -89,7 +89,7 @@ def _outcome_text(gate: RegressionGate) -> str:
         elif gate.frames_needed is not None:
             text += f": {count_text(gate.frames_needed)} frames needed, {count_text(gate.frames)} compared"
         else:
-            text += f": {count_text(gate.frames)} frames are too few to tell how many are needed"
+            text += f": {count_text(gate.frames)} frames are too few to estimate how many are needed"
     return f"{text}; waived: {gate.waived}" if gate.waived else text
 
 

@@ -53,7 +53,7 @@ def count_text(count: int | None) -> str:
 
 
 def computed_text(count: int | None, absent: str = "not computed") -> str:
-    """Return a count with thin spaces between thousands, or words where it was not computed."""
+    """Return a count with thin spaces between thousands, or a text if it was not computed."""
     return absent if count is None else count_text(count)
 
 

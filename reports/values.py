@@ -33,7 +33,7 @@ class HeadlineFigure:
     """One of the five numbers of the first page.
 
     ``value`` is a number (printed with three significant digits), text (printed as it is) or None ("not
-    available"). ``evidence_level`` overrides the report's own level where one figure rests on other evidence.
+    available"). ``evidence_level`` overrides the level of the report for a figure with other evidence.
     """
 
     label: str
@@ -48,10 +48,10 @@ REQUIREMENT_STATUSES = ("met", "not met", "unknown", "not judged")
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """One line of the verdict table.
+    """Row of the verdict table.
 
-    ``value`` has to be at most (``at_most``) or at least ``limit``. ``status`` is one of `REQUIREMENT_STATUSES`; a
-    value or limit that is not known is None and never "met", and one that is not judged is "not judged".
+    ``value`` must be at most (``at_most``) or at least ``limit``. ``status`` is one of `REQUIREMENT_STATUSES`. An
+    unknown value or limit is None and never "met"; a requirement without judgement is "not judged".
     """
 
     key: str
@@ -65,7 +65,7 @@ class Requirement:
 
     @property
     def margin(self) -> float | None:
-        """What is left up to the limit; negative past it, None where one of the two is not known."""
+        """Distance of the value from the limit; negative beyond it, None if either is unknown."""
         if self.value is None or self.limit is None:
             return None
         return self.limit - self.value if self.at_most else self.value - self.limit
@@ -103,8 +103,8 @@ class FrameAccounting:
 class ApidAccounting:
     """Packets of one application process; None where a count was not computed.
 
-    ``lost`` are missing between packets that came, by their sequence counts; ``lost_at_edges`` before the first and
-    after the last one, by the frames that were planned.
+    ``lost`` are packets missing between received packets, by sequence count. ``lost_at_edges`` are packets missing
+    before the first and after the last received packet, by the planned frames.
     """
 
     name: str
@@ -153,7 +153,7 @@ class PacketAccounting:
 
     @property
     def expected(self) -> int:
-        """Packets that came and packets known to be missing."""
+        """Received packets plus packets known to be missing."""
         return self.packets + self.missing
 
 
@@ -202,17 +202,17 @@ class DriftSample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NavigationSeries:
-    """One estimate, or one baseline, against the reference, sampled at ``utc_ns`` (n,).
+    """Errors of one estimate or baseline relative to the reference, sampled at ``utc_ns`` (n,).
 
-    ``kind`` is "estimate" (flown on board), "smoothed" (an estimate improved on the ground by what came later) or
+    ``kind`` is "estimate" (flown on board), "smoothed" (an estimate improved on the ground with later data) or
     "baseline" (computed on the ground for comparison).
     ``error_rtn_m`` and ``sigma_rtn_m`` are (n, 3), estimate minus reference. ``outcome`` and
-    ``reset_trigger`` name what the matcher did at each sample (see `ODOMETRY_OUTCOMES`, `FIX_OUTCOMES`,
-    `RESET_TRIGGERS`); empty tuples where the solution has no such thing. ``error_rtn_m`` at a reset is the
+    ``reset_trigger`` name the outcome of the matcher at each sample (see `ODOMETRY_OUTCOMES`, `FIX_OUTCOMES`,
+    `RESET_TRIGGERS`); empty tuples if the solution has none. ``error_rtn_m`` at a reset is the
     error after it; ``reset_error_m`` (n,) holds the horizontal error at the instant before, NaN elsewhere.
-    The optional arrays (n,) are what the error may depend on; ``nees`` (of the position under its full covariance) has
-    three degrees of freedom, ``nis`` ``nis_dof``. ``squared_normalised_errors`` stands in place of ``nees`` where only
-    standard deviations are known: squared errors over variances, summed over the axes.
+    The optional arrays (n,) are quantities on which the error may depend; ``nees`` (of the position under its full
+    covariance) has three degrees of freedom, ``nis`` ``nis_dof``. ``squared_normalised_errors`` replaces ``nees`` if
+    only standard deviations are known: squared errors over variances, summed over the axes.
     """
 
     name: str
@@ -431,12 +431,12 @@ class AnchorRead:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PassReport:
-    """Everything the report of one pass says.
+    """Content of the report of one pass.
 
     ``verdict`` is the sentence on the table of ``requirements``; ``verdict_level`` is "good", "caution", "bad" or ""
-    and colours the rule beside them. ``evidence_level`` is the evidence level of the
-    accuracy figures. ``not_available`` gives the reason why a section is missing; its keys are names of fields of this
-    value. ``configuration`` maps a group ("camera") to its settings.
+    and sets the colour of the rule next to them. ``evidence_level`` is the evidence level of the
+    accuracy figures. ``not_available`` gives the reason why a section is missing; its keys are field names of this
+    class. ``configuration`` maps a group ("camera") to its settings.
     """
 
     title: str
@@ -681,11 +681,12 @@ class RegressionGate:
     outcome
         "pass", "fail" or "inconclusive".
     margin, resolution
-        Degradation that is tolerated, and the smallest that the frames detect: in the unit, or a share of the baseline.
+        Tolerated degradation, and the smallest degradation that the frames can detect: in the unit, or as a share of
+        the baseline.
     frames, frames_needed
-        Frames that were compared, and with which the gate would be decided; None where that is unknown.
+        Number of compared frames, and number needed to decide the gate; None if unknown.
     reason, waived
-        Why it is inconclusive, and why its outcome does not count; empty where neither applies.
+        Why the gate is inconclusive, and why its outcome is waived; empty if neither applies.
     """
 
     name: str

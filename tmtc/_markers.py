@@ -20,7 +20,7 @@ _HIGH, _LOW = 0x1ACF, 0xFC1D
 
 @functools.cache
 def tables() -> Array:
-    """(2, 65536) uint8: bits in which each 16-bit word differs from the marker's first and second half."""
+    """Return (2, 65536) uint8: the number of bits in which each 16-bit word differs from each half of the marker."""
     words = np.arange(1 << 16, dtype=np.uint16)
     return np.stack([np.bitwise_count(words ^ np.uint16(half)) for half in (_HIGH, _LOW)])
 
@@ -29,9 +29,9 @@ def tables() -> Array:
 def find_markers(
     octets: Array, first: int, stop: int, tolerance: int, distance: Array, found: Array
 ) -> tuple[int, int]:
-    """(count, next bit): start bits in [first, stop) with at most `tolerance` wrong bits, upright or inverted.
+    """Find start bits in [first, stop) of markers with at most `tolerance` wrong bits; return (count, next bit).
 
-    They are written to `found`; the search ends early when it is full. 32 bits must stand behind every start bit.
+    The start bits are written to `found`; the search ends when it is full. 32 bits must follow every start bit.
     """
     count = 0
     bit = first

@@ -1,15 +1,15 @@
 """Attached sync markers: bit-level search for channel access data units (CADUs) in a stream of octets.
 
-The synchroniser has three states, as flight practice asks: *search* for a marker, *check* that another marker stands
-one period later, *lock* as long as markers keep standing there. In lock a single damaged marker is passed over
-(fly-wheel). At two in a row the search begins again, just behind the last frame's marker, so that bits lost or
-inserted by the link cost the frames they hit and no other. When the search finds the next marker a whole number of
-periods later, the frames between are kept as well: their own checks judge them.
+The synchroniser has the three usual states: *search* for a marker, *check* that another marker follows one period
+later, *lock* while markers follow at that distance. In lock a single damaged marker is accepted (fly-wheel). After two
+consecutive damaged markers the search restarts immediately after the marker of the last frame, so that bits lost or
+inserted by the link affect only the frames in which they occur. If the next marker is a whole number of periods later,
+the frames between are kept as well; their code or checksum decides whether they are valid.
 
-Markers are sought at every bit, upright and inverted (a receiver may lose bits and may lock with the wrong sign). A
-station may put octets between CADUs, a fixed header or a varying gap: the distance of the last two frames is tried as
-well as the period, and a frame without neighbours is accepted when its marker has at most one wrong bit or its own
-code or checksum proves it.
+Markers are searched at every bit, upright and inverted (a receiver may lose bits and may lock with the wrong
+polarity). A station may insert octets between CADUs, as a fixed header or a varying gap. Therefore, the distance of the
+last two frames is tried as well as the period, and an isolated frame is accepted when its marker has at most one wrong
+bit or when its code or checksum is valid.
 
 References
 ----------
@@ -31,31 +31,33 @@ BoolArray = npt.NDArray[np.bool_]
 ASM = bytes.fromhex("1ACFFC1D")
 ASM_LENGTH = 4
 DEFAULT_TOLERANCE = 3
-"""Wrong bits of a marker that are accepted: chance gives one false marker in 4e5 bits, which the check removes."""
+"""Accepted number of wrong bits in a marker. Random data give one false marker in 4e5 bits, which the check removes."""
 
 MARKER_BITS = 32
 LONE_TOLERANCE = 1
-"""Wrong bits of a marker that stands alone and proves itself by nothing else: one false marker in 6e7 bits."""
+"""Accepted number of wrong bits in the marker of an isolated frame without a valid code or checksum.
+
+Random data give one false marker in 6e7 bits."""
 
 MOST_BRIDGED = 64
-"""Frames that the fly-wheel fills in between two stretches in lock."""
+"""Largest number of frames that the fly-wheel fills in between two periods of lock."""
 
 _ASM_WORD = np.uint64(int.from_bytes(ASM, "big"))
 _SCAN_BITS = 1 << 19
 _CANDIDATES = 4096
 SETTLED = 4
-"""Frames in lock after which a damaged marker is passed over without a search."""
+"""Number of frames in lock after which a damaged marker is accepted without a search."""
 
 Verify = Callable[["CaduSync"], BoolArray]
-"""Whether each CADU holds a frame that its own code or checksum proves."""
+"""Returns whether each CADU holds a frame with a valid code or checksum."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CaduSync:
     """Whole CADUs of a stream in order: start bit (n,), polarity (n,) and wrong bits of the marker (n,).
 
-    `period` is the length of a CADU in octets. `truncated` holds the octets in which CADUs
-    begin that lost bits, so that the next marker came too early.
+    `period` is the length of a CADU in octets. `truncated` holds the start octets of CADUs that lost bits: the next
+    marker followed too early.
     """
 
     start_bits: IntArray
@@ -80,7 +82,7 @@ class CaduSync:
         )
 
     def take(self, rows: IntArray) -> CaduSync:
-        """The CADUs of these rows."""
+        """Return the CADUs of these rows."""
         return CaduSync(
             self.start_bits[rows],
             self.inverted[rows],
@@ -91,7 +93,7 @@ class CaduSync:
 
 
 def cadu_octets(octets: OctetArray, sync: CaduSync) -> OctetArray:
-    """CADUs (n, period), markers included, aligned to octets and upright."""
+    """Return the CADUs (n, period), markers included, aligned to octets and upright."""
     n = sync.start_bits.size
     result = np.empty((n, sync.period), dtype=np.uint8)
     if not n:
@@ -112,9 +114,9 @@ def cadu_octets(octets: OctetArray, sync: CaduSync) -> OctetArray:
 
 
 def find_period(octets: OctetArray) -> int:
-    """Octets from one marker to the next, by the commonest distance of undamaged markers; 0 where there is no stream.
+    """Return the most frequent distance of undamaged markers in octets; 0 if the stream has no markers.
 
-    Markers are sought at every bit of the whole stream. A single marker at the very start stands for a stream of one
+    Markers are searched at every bit of the whole stream. A single marker at the start is taken as a stream of one
     CADU.
     """
     starts, _ = undamaged_markers(octets)
@@ -125,7 +127,7 @@ def find_period(octets: OctetArray) -> int:
 
 
 def undamaged_markers(octets: OctetArray) -> tuple[IntArray, BoolArray]:
-    """Start bits (n,) of all markers without a wrong bit, and whether they are inverted (n,)."""
+    """Return the start bits (n,) of all markers without a wrong bit, and whether they are inverted (n,)."""
     none = np.empty(0, dtype=np.int64)
     starts = np.concatenate([none, *_candidates(octets, 0, 0, _SCAN_BITS)])
     if not starts.size:
@@ -134,9 +136,9 @@ def undamaged_markers(octets: OctetArray) -> tuple[IntArray, BoolArray]:
 
 
 def distances_of(start_bits: IntArray) -> dict[int, int]:
-    """How often each distance in octets occurs between two markers in a row, commonest first.
+    """Return how often each distance in octets occurs between consecutive markers, the most frequent first.
 
-    Distances that bits lost or inserted made no whole number of octets are left out.
+    Distances that are not a whole number of octets, because bits were lost or inserted, are left out.
     """
     distance = np.diff(start_bits)
     whole = distance[(distance % 8 == 0) & (distance >= 8 * ASM_LENGTH)] // 8
@@ -150,12 +152,12 @@ def synchronise(
     tolerance: int = DEFAULT_TOLERANCE,
     verify: Verify | None = None,
 ) -> CaduSync:
-    """CADUs of `period` octets in `octets`, markers with up to `tolerance` wrong bits accepted.
+    """Return the CADUs of `period` octets in `octets`; markers with up to `tolerance` wrong bits are accepted.
 
     Parameters
     ----------
     verify
-        Tells which CADUs prove themselves; frames without neighbours are accepted by it.
+        Returns which CADUs have a valid code or checksum; isolated frames are accepted by it.
     """
     return _Synchroniser(octets, period, tolerance, verify).run()
 
@@ -188,7 +190,8 @@ class _Synchroniser:
                 break
             found = self._search(final + 1, final + length, (spacing, length))
             if found is None or found > last:
-                # nothing better follows: the frame that should stand here is kept, its own checks will judge it
+                # no other marker follows: keep the frame expected here; its code or checksum decides whether it is
+                # valid
                 if expected <= last and count > 1:
                     self.starts.append(np.array([expected], dtype=np.int64))
                 break
@@ -211,7 +214,7 @@ class _Synchroniser:
         return CaduSync(starts[whole], inverted[whole], wrong[whole], starts[~whole] >> 3, self.period)
 
     def _in_lock(self, position: int, spacing: int) -> int:
-        """Frames from `position` on until two markers in a row are damaged; at least one."""
+        """Return the frames from `position` until two consecutive markers are damaged; at least one."""
         last = 8 * self.octets.size - 8 * self.period
         count, block = 0, 4
         while True:
@@ -222,7 +225,7 @@ class _Synchroniser:
             wrong, _ = _marker_errors(self.octets, starts)
             bad = wrong > self.tolerance
             follower = np.append(bad[1:], self._damaged_or_cut_off(int(starts[-1]) + spacing))
-            # a distance that came about by chance may fit the frame after next
+            # a distance that occurred by chance may fit the frame after next
             settled = count + np.arange(starts.size) >= SETTLED
             lost = bad & (follower | ~settled)
             if lost.any():
@@ -233,16 +236,16 @@ class _Synchroniser:
             block = min(4 * block, 4096)
 
     def _damaged_or_cut_off(self, bit: int) -> bool:
-        """Whether no marker stands at `bit`, or the stream ends before."""
+        """Return whether there is no marker at `bit`, or the stream ends before it."""
         if bit + MARKER_BITS > 8 * self.octets.size:
             return True
         wrong, _ = _marker_errors(self.octets, np.array([bit]))
         return bool(wrong[0] > self.tolerance)
 
     def _search(self, first: int, free: int, distances: tuple[int, ...]) -> int | None:
-        """First bit from `first` on at which a CADU is believed to begin; None where there is none.
+        """Return the first bit from `first` on at which a CADU probably begins; None if there is none.
 
-        `free`: end of the frame before; a marker that stands alone counts from there on.
+        `free`: end of the previous frame; isolated markers are accepted from this bit on.
         """
         total = 8 * self.octets.size
         length = 8 * self.period
@@ -275,7 +278,7 @@ class _Synchroniser:
         return lone
 
     def _follower_stands(self, candidates: IntArray, inverted: BoolArray, distance: int) -> BoolArray:
-        """Whether another marker of the same polarity stands at `distance`, or the stream ends before it."""
+        """Return whether another marker of the same polarity follows at `distance`, or the stream ends before it."""
         follower = candidates + distance
         inside = follower + MARKER_BITS <= 8 * self.octets.size
         result = ~inside & (candidates + 8 * self.period <= 8 * self.octets.size)
@@ -288,7 +291,7 @@ class _Synchroniser:
 def _candidates(octets: OctetArray, first: int, tolerance: int, stretch: int) -> Iterator[IntArray]:
     """Yield start bits of markers from bit `first` on, in order, in arrays of limited size.
 
-    `stretch` bits are searched before the first are yielded, more each time after that.
+    `stretch` bits are searched before the first array is yielded, and more before each later array.
     """
     from tmtc import _markers  # numba is imported only where it is used
 
@@ -305,12 +308,12 @@ def _candidates(octets: OctetArray, first: int, tolerance: int, stretch: int) ->
 
 
 def _marker_errors(octets: OctetArray, start_bits: IntArray) -> tuple[IntArray, BoolArray]:
-    """Bits in which the 32 bits at each start differ from the marker, and whether they fit it inverted."""
+    """Return the number of wrong bits of the marker at each start bit, and whether the marker is inverted."""
     first, shift = start_bits >> 3, (start_bits & 7).astype(np.uint64)
     word = octets[first].astype(np.uint64)
     for k in range(1, ASM_LENGTH):
         word = word << np.uint64(8) | octets[first + k]
-    # of the fifth octet only what a shifted marker reaches; there is none behind an aligned marker at the end
+    # a fifth octet is needed only by a shifted marker; none follows an aligned marker at the end of the stream
     fifth = octets[np.minimum(first + ASM_LENGTH, octets.size - 1)]
     word = (word << np.uint64(8) | fifth) >> (np.uint64(8) - shift) & np.uint64(0xFFFFFFFF)
     wrong: IntArray = np.bitwise_count(word ^ _ASM_WORD).astype(np.int64)

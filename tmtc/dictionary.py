@@ -1,7 +1,7 @@
 """The packet dictionary of the payload: version 3, and versions 1 and 2 before it.
 
 Everything that crosses the link is defined here and nowhere else; the ICD and the XTCE export are generated
-from it. A version only adds packets: each decodes everything that an older payload sends.
+from it. A version only adds packets, so that each version decodes the telemetry of older payloads.
 """
 
 from __future__ import annotations
@@ -478,7 +478,7 @@ def _second_telecommands() -> tuple[PacketDefinition, ...]:
 
 
 def _third_telemetry() -> tuple[PacketDefinition, ...]:
-    """What version 3 adds: the estimate of the filter in place of `filter_state`, which older payloads send."""
+    """Return the packets that version 3 adds: the filter estimate that replaces `filter_state` of older payloads."""
     return (
         PacketDefinition(
             "filter_estimate", APID_NAVIGATION_STATE, 129, 7,

@@ -43,7 +43,7 @@ IntArray = npt.NDArray[np.int64]
 
 FRAME_GOOD, FRAME_UNCORRECTABLE, FRAME_BAD_CHECKSUM, FRAME_FOREIGN, FRAME_UNCHECKED = 0, 1, 2, 3, 4
 FRAME_VERDICTS = ("good", "uncorrectable", "bad_checksum", "foreign", "unchecked")
-"""A frame that carries neither code nor checksum is `unchecked`: its packets are read, but it is never good."""
+"""A frame without code and checksum is `unchecked`: its packets are read, but the frame never counts as good."""
 
 _BATCH = 512
 
@@ -182,13 +182,13 @@ def encode_cadus(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameTable:
-    """One row for every CADU that was found, the discarded ones too.
+    """Table with one row for every CADU found, including discarded ones.
 
     `offset` of the marker in the stream, `marker_errors` wrong bits of it, `corrected` symbols repaired
     ((n, interleave), -1 where a codeword is lost), `verdict` an index of `FRAME_VERDICTS`; the header
-    fields of lost frames are not to be trusted. `buffer_offset` and `buffer_octets` are where the packet zone of the
-    frame lies in the buffer of packet octets, -1 and 0 for frames that gave none. Packets that were put together from
-    parts lie in the buffer behind the zones.
+    fields of lost frames are not reliable. `buffer_offset` and `buffer_octets` locate the packet zone of the frame in
+    the buffer of packet octets; they are -1 and 0 for frames without packet octets. Packets that were reassembled from
+    parts follow the packet zones in the buffer.
     """
 
     offset: IntArray
@@ -279,7 +279,7 @@ class DownlinkDecode:
 
     @property
     def frames_unchecked(self) -> int:
-        """Frames that carry neither code nor checksum, so that nobody knows whether they are good."""
+        """Number of frames without code and checksum, whose validity is unknown."""
         return 0 if self.frames is None else int(np.count_nonzero(self.frames.verdict == FRAME_UNCHECKED))
 
     @property
@@ -378,21 +378,21 @@ def settings_of(octets: Octets, dictionary: Dictionary = DICTIONARY) -> LinkSett
     Raises
     ------
     LinkFormatError
-        Markers stand in the stream, but no frame proves itself under any setting known here.
+        The stream contains markers, but no frame is valid under any known link setting.
     """
     proposal = propose_settings(octets, dictionary)
     if proposal.settings is None and proposal.has_regular_markers and not _holds_packets(octets):
         distance = next(iter(proposal.distances), 0)
         raise LinkFormatError(
-            f"downlink: {proposal.markers} markers stand in the stream, most of them every {distance} octets, but no "
-            "coding and randomiser known here fits; expected Reed-Solomon, frame error control or packets to prove a "
-            "frame, found none; state the settings of the link if they are known"
+            f"downlink: found {proposal.markers} markers in the stream, mostly {distance} octets apart, but no "
+            "known combination of coding and randomiser fits; expected valid Reed-Solomon codewords, frame error "
+            "control fields or packets, found none; state the link settings if they are known"
         )
     return proposal.settings
 
 
 def _holds_packets(octets: Octets) -> bool:
-    """Whether bare packets take up most of a stream."""
+    """Return whether bare packets fill most of a stream."""
     cut = cut_packets(octets)
     return 2 * int(cut.lengths[cut.crc_ok].sum()) > as_octets(octets).size
 
@@ -533,12 +533,12 @@ def _read_frames(
 
 
 def _blocks(stream: OctetArray, sync: cadu.CaduSync) -> OctetArray:
-    """The octets behind each marker (n, period - 4), aligned and upright."""
+    """Return the octets that follow each marker (n, period - 4), aligned and upright."""
     return cadu.cadu_octets(stream, sync)[:, cadu.ASM_LENGTH :]
 
 
 def proof_of(stream: OctetArray, settings: LinkSettings) -> cadu.Verify | None:
-    """Return a test whether CADUs hold frames that their code or checksum proves; None where a frame has neither."""
+    """Return a function that checks the code or checksum of CADUs; None if frames have neither."""
     if not settings.proves_frames:
         return None
 
@@ -553,7 +553,7 @@ def proof_of(stream: OctetArray, settings: LinkSettings) -> cadu.Verify | None:
 _LATE_FRAMES = 64
 COUNT_MODULUS = 256
 _MOST_TRIED = 4096
-"""Frames tried for the rest of one packet: a packet of 65,542 octets in the shortest frames in use takes 310."""
+"""Largest number of frames tried to complete a packet: the longest packet fills 310 of the shortest frames."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -567,11 +567,11 @@ class _Rebuilt:
 
 
 def _rebuild(zones: OctetArray, count: IntArray, pointer: IntArray) -> _Rebuilt:
-    """The packet octets of one virtual channel and the stretches of them that are unbroken.
+    """Return the packet octets of one virtual channel and their contiguous segments.
 
-    A stretch begins at the first packet that begins in it: octets before belong to a packet whose head was
-    lost. A packet whose end is missing behind its beginning is completed from frames that stand elsewhere in the
-    stream: sent again, received by another station, or recorded out of order.
+    A segment starts with the first packet that begins in it; earlier octets belong to a packet whose start was lost. A
+    packet whose end does not follow its start is completed from frames elsewhere in the stream: frames that were
+    sent again, received by another station, or recorded out of order.
     """
     zone = zones.shape[1]
     step = np.diff(count) % COUNT_MODULUS
@@ -588,7 +588,7 @@ def _rebuild(zones: OctetArray, count: IntArray, pointer: IntArray) -> _Rebuilt:
         segments = _segments(pointer, run, zone)
         completed, joined = _complete(zones, count, pointer, run, buffer, segments)
         if len(joined) > len(segments):
-            # frames that belong together do not follow one another: their order tells nothing about losses
+            # consecutive counts are not adjacent in the file: the order of the frames says nothing about losses
             lost = min(lost, _least_frames_lost(zones, count))
         buffer, segments = completed, joined
     return _Rebuilt(
@@ -602,7 +602,7 @@ def _rebuild(zones: OctetArray, count: IntArray, pointer: IntArray) -> _Rebuilt:
 
 
 def _segments(pointer: IntArray, run: IntArray, zone: int) -> IntArray:
-    """Octets [start, stop) (s, 2) of each run from the first packet that begins in it."""
+    """Return the octets [start, stop) (s, 2) of each run from the first packet that begins in it."""
     begins = np.flatnonzero(pointer < zone)
     runs, first = np.unique(run[begins], return_index=True)
     starts = begins[first] * zone + pointer[begins[first]]
@@ -611,7 +611,7 @@ def _segments(pointer: IntArray, run: IntArray, zone: int) -> IntArray:
 
 
 def _split_where_damaged(buffer: OctetArray, segments: IntArray, run: IntArray, zone: int) -> IntArray:
-    """Runs (n,) that end where a packet across the border of two frames does not hold.
+    """Return the runs (n,) split where a packet that spans two frames has a wrong checksum.
 
     Of frames in any order one in 256 follows another by chance.
     """
@@ -621,7 +621,7 @@ def _split_where_damaged(buffer: OctetArray, segments: IntArray, run: IntArray, 
         [cut.skipped, np.stack((cut.offsets[bad], cut.offsets[bad] + cut.lengths[bad]), axis=1)]
     )
     border = -(-(ranges[:, 0] + 1) // zone)
-    # not at the end of the run, where there is nothing to part
+    # not at the end of the run, where there is nothing to split
     parted = border[(border * zone < ranges[:, 1]) & (border < run.size)]
     begins_anew = np.zeros(run.size, dtype=np.int64)
     begins_anew[parted] = 1
@@ -637,10 +637,10 @@ def _complete(
     buffer: OctetArray,
     segments: IntArray,
 ) -> tuple[OctetArray, IntArray]:
-    """Buffer and segments with the packets that the ends of runs and the orphaned beginnings of others make up.
+    """Return buffer and segments with the packets reassembled from the end of one run and the start of another.
 
-    The end of a run that is the beginning of a packet is continued by frames with the counts that follow; the length
-    in the packet's header and its checksum decide whether they belong together. Octets are used once.
+    A packet that is incomplete at the end of a run is continued by frames with the subsequent counts. The length in the
+    packet header and the checksum decide whether they belong together. Each octet is used once.
     """
     zone = zones.shape[1]
     orphans: dict[int, list[int]] = {}
@@ -683,9 +683,9 @@ def _continuation(
     orphans: dict[int, list[int]],
     used: set[int],
 ) -> list[int]:
-    """Frames whose first octets complete a packet that has begun in a frame with that count; none where none do.
+    """Return the frames whose first octets complete a packet that began in a frame with that count; empty if none do.
 
-    Paths through copies of one frame are tried once, and `_MOST_TRIED` frames at most.
+    Copies of one frame are tried once, and at most `_MOST_TRIED` frames are tried.
     """
     zone = zones.shape[1]
     open_paths: list[tuple[bytes, int, list[int]]] = [(begun, count, [])]
@@ -733,7 +733,7 @@ def _frames_lost(zones: OctetArray, count: IntArray, idle: npt.NDArray[np.bool_]
 
 
 def _least_frames_lost(zones: OctetArray, count: IntArray) -> int:
-    """The least number of frames that must be missing between frames (n, zone) in an unknown order.
+    """Return the least number of frames that must be missing between frames (n, zone) in an unknown order.
 
     A sequence of T frames with counts from s on holds the count c at most (T - (c - s) mod 256 + 255) div 256 times.
     """
@@ -773,7 +773,8 @@ def _account(
     offsets, lengths = cut.offsets[good], cut.lengths[good]
     ticks = np.arange(good.size, dtype=np.int64)
     apid = headers.apid[good]
-    # only packets of the dictionary are known to carry their time there; an APID is ordered by it as a whole or not
+    # only packets of the dictionary are known to carry a time at this place; either all packets of an APID are
+    # ordered by time or none
     has_time = (dictionary.identify(buffer, cut)[good] >= 0) & headers.secondary_header[good]
     has_time &= lengths >= FRAME_HEADER_LENGTH + TM_HEADER_LENGTH
     timed = np.flatnonzero(has_time & ~np.isin(apid, apid[~has_time]))

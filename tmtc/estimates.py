@@ -1,4 +1,4 @@
-"""Estimates of the navigation filter out of the packets of any dictionary version, as states with full covariances."""
+"""Estimates of the navigation filter with full covariances, from the packets of any dictionary version."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ Float = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 ESTIMATE_PACKETS = ("filter_state", "filter_estimate")
-"""Packets that carry an estimate: that of version 2, and that of version 3 onwards."""
+"""Packets that carry an estimate: in version 2, and from version 3 on."""
 
 STATES = 9
 TRIANGLE = STATES * (STATES + 1) // 2
-"""Numbers of a covariance of position, velocity and empirical acceleration."""
+"""Number of elements in the upper triangle of the covariance of position, velocity and empirical acceleration."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilterEstimates:
-    """Estimates in the order of their packets.
+    """Filter estimates in the order of their packets.
 
     Attributes
     ----------
     packet_index
-        Place of each packet in the stream it was cut from, shape (n,).
+        Index of each packet in its stream, shape (n,).
     image_ticks, frame_number
         Of the image, shape (n,).
     packet_ticks
@@ -39,7 +39,7 @@ class FilterEstimates:
     covariance
         Of the state, in its units and axes, shape (n, 9, 9).
     innovation_degrees
-        Degrees of freedom of the normalised innovation squared, 0 without a fix, -1 where version 2 does not tell.
+        Degrees of freedom of the normalised innovation squared, 0 without a fix, -1 if unknown (version 2).
     """
 
     packet_index: Index
@@ -55,7 +55,7 @@ class FilterEstimates:
 
 
 def filter_estimates(tables: Mapping[str, Table]) -> FilterEstimates:
-    """Return the estimates in unpacked tables, those of version 2 first; none where no such packet came down."""
+    """Return the estimates in unpacked tables, those of version 2 first; empty if no such packet was received."""
     parts = [_of_table(tables[name]) for name in ESTIMATE_PACKETS if name in tables]
     if not parts:
         return _none()

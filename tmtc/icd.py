@@ -186,7 +186,7 @@ def _labels(f: Field) -> str:
 def _effects() -> list[str]:
     lines = ["## Effects of telecommands\n"]
     lines.append(
-        "Telecommands that are not routine are released by another person than who entered them, unless the mission "
+        "A telecommand that is not routine must be approved by a second person before release, unless the mission "
         "says otherwise. `insert_activity` has the effect of the telecommand that it carries.\n"
     )
     lines.append("| telecommand | effect | reason |\n|---|---|---|")

@@ -19,15 +19,15 @@ from tmtc.reed_solomon import ReedSolomon, code_for
 Coding = Literal["rs", "none"]
 
 FRAME_MIN_LENGTH = 16
-"""Octets of the shortest frame that is used: header, error control and some data."""
+"""Length of the shortest supported frame in octets: header, error control and some data."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkSettings:
-    """Parameters on which both ends of a link have to agree.
+    """Link parameters that must be the same at both ends.
 
-    `interleave` None takes the least that fits `frame_length` (octets). `rs_errors`: symbols that a codeword repairs.
-    `checksum`: frames end with frame error control.
+    If `interleave` is None, the least depth that fits `frame_length` (octets) is used. `rs_errors`: number of symbols
+    that can be corrected in a codeword. `checksum`: frames end with a frame error control field.
     """
 
     frame_length: int = 1115
@@ -45,7 +45,7 @@ class LinkSettings:
 
     @property
     def code(self) -> ReedSolomon | None:
-        """The Reed-Solomon code, or None."""
+        """Reed-Solomon code, or None."""
         if self.coding == "none":
             return None
         if self.coding != "rs":
@@ -54,22 +54,22 @@ class LinkSettings:
 
     @property
     def block_length(self) -> int:
-        """Octets between two markers."""
+        """Number of octets between two markers."""
         code = self.code
         return self.frame_length if code is None else code.block_length
 
     @property
     def cadu_length(self) -> int:
-        """Octets of a CADU, marker included."""
+        """Length of a CADU in octets, marker included."""
         return ASM_LENGTH + self.block_length
 
     @property
     def proves_frames(self) -> bool:
-        """Whether a damaged frame can be told from a good one: by its code or its checksum."""
+        """Whether damaged frames can be detected, by code or checksum."""
         return self.coding != "none" or self.checksum
 
     def describe(self) -> dict[str, object]:
-        """The settings by name, with the interleaving depth in force, for output."""
+        """Return the settings by name, with the actual interleaving depth, for output."""
         code = self.code
         return {
             "frame_length": self.frame_length,

@@ -1,11 +1,11 @@
 """Proposal of link settings from a recorded stream, with the evidence for each candidate.
 
-The whole stream is searched for undamaged markers. Their distances give the lengths of a CADU that are possible; a
-station may have put octets between CADUs, so that shorter lengths are tried when the distances alone give no frame
-that proves itself. For each length every code, basis, interleaving depth and randomiser is tried on a sample of CADUs
-spread over the stream: share of codewords that are right or can be repaired, share of frame checksums that hold,
-regularity of frame headers, and packets with a right checksum. A candidate without a code or checksum that could have
-failed is proposed only when packets prove it.
+The whole stream is searched for undamaged markers. Their distances give the possible lengths of a CADU. A station may
+have inserted octets between CADUs, so shorter lengths are tried if the distances alone give no valid frame. For each
+length, every code, basis, interleaving depth and randomiser is tried on a sample of CADUs spread over the stream. The
+evidence is the share of codewords that are correct or correctable, the share of valid frame checksums, the share of
+regular frame headers, and the number of packets with a valid checksum. A candidate with neither code nor checksum is
+proposed only if valid packets support it.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from tmtc.randomiser import Randomiser, randomise
 
 OctetArray = npt.NDArray[np.uint8]
 CountPackets = Callable[[cadu.CaduSync, LinkSettings], tuple[int, float]]
-"""Packets with a right checksum in these CADUs under these settings, and the share of the frames that they fill."""
+"""Returns the number of valid packets in CADUs under link settings, and the share of the frames that they fill."""
 
 RANDOMISERS: tuple[Randomiser, ...] = ("legacy", "long", "none")
 SAMPLE = 48
-"""CADUs on which candidates are tried, spread over the stream so that one weak stretch does not decide."""
+"""Number of CADUs on which candidates are tried, spread over the stream so that one weak part does not decide."""
 
 STRETCH = 64
-"""CADUs in a row from which packets are counted."""
+"""Number of consecutive CADUs in which packets are counted."""
 
 LONGEST_GAP = 64
-"""Octets that a station is assumed to add to each CADU at most when the mission description states nothing."""
+"""Largest number of octets that a station is assumed to insert between CADUs if the mission description states none."""
 
 LEAST_SHARE = 0.02
 LEAST_REGULAR = 0.9
-"""Share of frames without code and checksum that have regular headers; chance gives one in 128."""
+"""Smallest share of frames without code and checksum that have regular headers; random data give one in 128."""
 
 LEAST_FILLED = 0.5
-"""Share of frames without code and checksum that packets with a right checksum have to fill."""
+"""Smallest share of frames without code and checksum that valid packets fill."""
 
 LEAST_PROOFS = 2
-"""Frames that have to prove themselves: a 16-bit checksum holds by chance once in 65,536 trials."""
+"""Smallest number of valid frames: a 16-bit checksum is valid by chance once in 65,536 trials."""
 
 _STANDARD = tuple(cadu.ASM_LENGTH + depth * reed_solomon.CODEWORD for depth in reed_solomon.INTERLEAVES)
 _REPAIRED = 12
@@ -55,11 +55,11 @@ _SHORTEST_CADU = cadu.ASM_LENGTH + FRAME_HEADER_LENGTH + 2
 
 @dataclass(frozen=True, slots=True)
 class LinkEvidence:
-    """What speaks for one candidate: shares of a sample, and packets with a right checksum in a stretch of CADUs.
+    """Evidence for one candidate: shares of a sample, and valid packets in consecutive CADUs.
 
-    `clean` and `repaired`: codewords without error, and those that could be repaired (None: no code, or not tried).
-    `checksums`: frame checksums that hold. `regular`: frame headers of version 0 with the usual flags. `filled`: share
-    of the frames that right packets take up.
+    `clean` and `repaired`: codewords without error, and corrected codewords (None: no code, or not tried).
+    `checksums`: valid frame checksums. `regular`: frame headers of version 0 with the usual flags. `filled`: share of
+    the frames that valid packets fill.
     """
 
     settings: LinkSettings
@@ -72,7 +72,7 @@ class LinkEvidence:
     filled: float
 
     def describe(self) -> dict[str, object]:
-        """The evidence by name, for output."""
+        """Return the evidence by name, for output."""
         return {
             "settings": self.settings.describe(),
             "sampled": self.sampled,
@@ -87,10 +87,10 @@ class LinkEvidence:
 
 @dataclass(frozen=True, slots=True)
 class LinkProposal:
-    """Settings proposed for a stream (None: none can be), and what they rest on.
+    """Link settings proposed for a stream (None: none fit), with the evidence.
 
-    `markers`: undamaged markers in the stream. `distances`: octets between two of them and how often, commonest first.
-    `ambiguous`: another candidate is supported as well as the one proposed.
+    `markers`: undamaged markers in the stream. `distances`: octets between consecutive markers and their number, the
+    most frequent first. `ambiguous`: another candidate has equal support.
     """
 
     settings: LinkSettings | None
@@ -101,18 +101,18 @@ class LinkProposal:
 
     @property
     def has_regular_markers(self) -> bool:
-        """Whether markers stand in the stream more often, or more regularly, than chance puts them there."""
+        """Whether the stream has more, or more regular, markers than random data."""
         return self.markers >= 3 or max(self.distances.values(), default=0) >= 2
 
 
 def propose_link(stream: OctetArray, count_packets: CountPackets) -> LinkProposal:
-    """Return the settings under which a stream of CADUs makes sense, and the evidence.
+    """Return the link settings that fit a stream of CADUs, with the evidence.
 
     Parameters
     ----------
     stream : (n,) uint8
     count_packets
-        Counts the packets with a right checksum in some of the stream's CADUs.
+        Counts the valid packets in some CADUs of the stream.
     """
     starts, inverted = cadu.undamaged_markers(stream)
     distances = cadu.distances_of(starts)
@@ -143,7 +143,7 @@ def _rank(evidence: LinkEvidence) -> tuple[float, float]:
 
 
 def _lengths(octets: int, distances: dict[int, int]) -> Iterator[list[int]]:
-    """Yield lengths of a CADU in octets, the likeliest group first."""
+    """Yield groups of possible CADU lengths in octets, the most likely group first."""
     longest = cadu.ASM_LENGTH + max(FRAME_MAX_LENGTH, max(reed_solomon.INTERLEAVES) * reed_solomon.CODEWORD)
     if not distances:
         yield [octets] if _SHORTEST_CADU <= octets <= longest else []
@@ -153,7 +153,7 @@ def _lengths(octets: int, distances: dict[int, int]) -> Iterator[list[int]]:
         :4
     ]
     yield usual or [d for d in list(distances)[:1] if _SHORTEST_CADU <= d <= longest]
-    # a header or a gap between CADUs: lengths below the distance that few markers undercut
+    # a header or gap between CADUs: lengths up to the distance that only few pairs of markers are below
     ordered = sorted(distances)
     passed = np.cumsum([distances[d] for d in ordered])
     shortest = ordered[int(np.searchsorted(passed, 0.05 * total))]
@@ -172,8 +172,8 @@ def _examine(
 ) -> list[LinkEvidence]:
     """Return the evidence of the candidates for one length of a CADU.
 
-    `proved`: of those whose frames prove themselves by a code or a checksum; else of those without either. `usual`:
-    the length is a distance of markers; of other lengths only the standard ones are tried on codewords with errors.
+    `proved`: examine candidates with a code or checksum, otherwise those without. `usual`: the length is a distance of
+    markers; for other lengths, only the standard ones are tried on codewords with errors.
     """
     whole = np.flatnonzero(starts + 8 * length <= 8 * stream.size)
     if not whole.size:
@@ -193,7 +193,7 @@ def _examine(
         ]
         weighed = [_weigh(stream, sync, plain[c.randomiser], c, count_packets) for c in without]
         return [one for one in weighed if one.packets >= LEAST_PROOFS and one.filled >= LEAST_FILLED]
-    # a few blocks tell most candidates from the right one
+    # a few blocks exclude most candidates
     few = np.unique(np.linspace(0, rows.size - 1, min(rows.size, _FEW)).astype(np.int64))
     likely = [c for c in coded if reed_solomon.clean(plain[c.randomiser][few], _code(c)).any()]
     clean = [(c, reed_solomon.clean(plain[c.randomiser], _code(c))) for c in likely]
@@ -216,7 +216,7 @@ def _weigh(
     candidate: LinkSettings,
     count_packets: CountPackets,
 ) -> LinkEvidence:
-    """Return the evidence for one candidate, with frame error control when most frames have it."""
+    """Return the evidence for one candidate, with frame error control if most frames have it."""
     code = candidate.code
     settings, frames = candidate, blocks
     clean = repaired = None
@@ -235,7 +235,7 @@ def _weigh(
     share = float(regular[proved].mean()) if proved.any() else 0.0
     first = int(np.argmax(proved)) if proved.any() else 0
     begin = int(sync.start_bits[first] >> 3)
-    # enough for the stretch with the gaps that a station may have put between CADUs
+    # enough octets for these CADUs and the gaps that a station may have inserted
     stretch = stream[begin : begin + (STRETCH + 1) * (sync.period + LONGEST_GAP)]
     consecutive = cadu.synchronise(stretch, sync.period).head(STRETCH)
     shifted = cadu.CaduSync(
@@ -259,7 +259,7 @@ def _weigh(
 
 
 def _regular(frames: OctetArray) -> npt.NDArray[np.bool_]:
-    """Whether each frame (n, length) has version 0, no flags behind the counts and segment length id 11."""
+    """Return whether each frame (n, length) has version 0, no data field flags and segment length id 11."""
     regular: npt.NDArray[np.bool_] = (frames[:, 0] >> 6 == 0) & (frames[:, 4] >> 3 == 0b00011)
     return regular
 
@@ -267,7 +267,7 @@ def _regular(frames: OctetArray) -> npt.NDArray[np.bool_]:
 def _best(
     shares: list[tuple[float, LinkSettings, Any]],
 ) -> list[LinkSettings]:
-    """Candidates with at least half of the greatest share and enough frames that prove themselves."""
+    """Return the candidates with at least half of the greatest share and enough valid frames."""
     greatest = max((share for share, _, _ in shares), default=0.0)
     if greatest <= LEAST_SHARE:
         return []
@@ -279,7 +279,7 @@ def _best(
 
 
 def _repairable(blocks: OctetArray, settings: LinkSettings) -> int:
-    """Return of how many blocks the first codeword can be repaired."""
+    """Return the number of blocks whose first codeword can be corrected."""
     code = _code(settings)
     _, corrected = reed_solomon.repair(np.ascontiguousarray(blocks[:, :: code.interleave]), code)
     return int(np.count_nonzero(corrected >= 0))

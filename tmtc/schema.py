@@ -312,9 +312,9 @@ class Dictionary:
         acknowledgements: int = ACK_ALL,
         source: int = 0,
     ) -> bytes:
-        """The telecommand packet `name` holding `values`; same rules as `pack`, for finite numbers only.
+        """Return the telecommand packet `name` with `values`, by the rules of `pack`, for finite numbers only.
 
-        Nothing is taken for a number that is none: true and false are refused as values of any field.
+        Values that are not numbers are refused: true and false are not accepted for any field.
         """
         compiled = self._find(name)
         definition = compiled.definition

@@ -176,7 +176,7 @@ class Farm:
         """Whether the frame's data are to be used; control commands are executed here and give False."""
         if frame.control:
             sets_count = frame.data[:2] == CONTROL_SET_COUNT and len(frame.data) == 3
-            # a command that is neither of the two is an invalid frame, which is not counted (232.1-B, event E9)
+            # any other control command makes the frame invalid; it is not counted (232.1-B, event E9)
             if not frame.bypass or not (sets_count or frame.data == CONTROL_UNLOCK):
                 return False
             self.farm_b_counter = (self.farm_b_counter + 1) & 0b11

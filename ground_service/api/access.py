@@ -32,13 +32,13 @@ Words = Annotated[str | None, Query(min_length=1, max_length=200, pattern=r"^[^\
 Days = Annotated[
     float | None,
     Field(
-        default=None, gt=0.0, le=users.DAYS_LIMIT, allow_inf_nan=False, description="null: no end of validity"
+        default=None, gt=0.0, le=users.DAYS_LIMIT, allow_inf_nan=False, description="null: unlimited validity"
     ),
 ]
 
 
 class NewUser(Given):
-    """A user to be added."""
+    """User to add."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._@-]{0,63}$", examples=["ann"])
     role: Role
@@ -46,21 +46,21 @@ class NewUser(Given):
 
 
 class UserChange(Given):
-    """A change of one user: its state or its role, or both."""
+    """Change of the state or role of a user, or both."""
 
     state: Literal["active", "disabled"] | None = None
     role: Role | None = None
 
 
 class NewToken(Given):
-    """A token to be made."""
+    """Token to create."""
 
     days_valid: Days
     revoke_others: bool = Field(default=False, description="Revoke all earlier tokens of the user")
 
 
 class UserWithToken(schemas.Schema):
-    """A user and the new token, which is shown this once."""
+    """User and new token; the token cannot be read again."""
 
     user: users.User
     token: str
@@ -75,7 +75,7 @@ def list_users(ground: GroundOf, _: Admin) -> Any:
 
 @access.post("/users", status_code=201, response_model=UserWithToken)
 def add_user(ground: GroundOf, caller: Admin, given: NewUser) -> Any:
-    """Add a user; the answer holds the token, which cannot be read again."""
+    """Add a user; the response contains the token, which cannot be read again."""
     token = users.add_user(ground, given.name, given.role, days_valid=given.days_valid, actor=caller.name)
     return UserWithToken(user=users.get_user(ground, given.name), token=token)
 
@@ -88,13 +88,13 @@ def get_user(ground: GroundOf, _: Admin, name: UserName) -> Any:
 
 @access.patch("/users/{name}", response_model=users.User)
 def change_user(ground: GroundOf, caller: Admin, name: UserName, given: UserChange) -> Any:
-    """Disable or enable a user, or change the role; 409 names the state that was found instead."""
+    """Disable or enable a user, or change the role; 409 states the conflicting state."""
     return users.change_user(ground, name, state=given.state, role=given.role, actor=caller.name)
 
 
 @access.post("/users/{name}/tokens", status_code=201, response_model=UserWithToken)
 def add_token(ground: GroundOf, caller: Admin, name: UserName, given: NewToken) -> Any:
-    """Give a user a new token; the answer holds it, and it cannot be read again."""
+    """Create a token for a user; the response contains it, and it cannot be read again."""
     make = users.renew_token if given.revoke_others else users.add_token
     token = make(ground, name, days_valid=given.days_valid, actor=caller.name)
     return UserWithToken(user=users.get_user(ground, name), token=token)
@@ -102,14 +102,14 @@ def add_token(ground: GroundOf, caller: Admin, name: UserName, given: NewToken) 
 
 @access.get("/tokens", response_model=schemas.PageOf[users.Token])
 def list_tokens(ground: GroundOf, _: Admin, user: Words = None) -> Any:
-    """List tokens without their secrets, the newest first."""
+    """List tokens without their secrets, newest first."""
     found = users.list_tokens(ground, user)
     return page_of(found, len(found), max(len(found), 1), 0)
 
 
 @access.delete("/tokens/{token_id}", status_code=204, response_class=Response)
 def revoke_token(ground: GroundOf, caller: Admin, token_id: RowId) -> None:
-    """Revoke one token; it is refused from then on."""
+    """Revoke a token."""
     users.revoke_token(ground, token_id, actor=caller.name)
 
 
@@ -121,11 +121,11 @@ def list_audit(
     action: Words = None,
     target: Words = None,
     since: Annotated[str | None, Query(max_length=40, description="RFC 3339 UTC")] = None,
-    until: Annotated[str | None, Query(max_length=40, description="RFC 3339 UTC, not included")] = None,
+    until: Annotated[str | None, Query(max_length=40, description="RFC 3339 UTC, exclusive")] = None,
     limit: Limit = 100,
     offset: Offset = 0,
 ) -> Any:
-    """List what was done, the newest first: who, when, to what."""
+    """List the audit entries, newest first: actor, time, action and target."""
     times = [
         None if text is None else time_of(text, where) for text, where in ((since, "since"), (until, "until"))
     ]
@@ -140,5 +140,5 @@ def list_audit(
 
 @access.get("/audit/head", response_model=audit_log.AuditHead)
 def get_audit_head(ground: GroundOf, _: Operator) -> Any:
-    """Show number and hash of the newest entry, to be kept elsewhere."""
+    """Show number and hash of the newest entry, to be stored elsewhere."""
     return audit_log.audit_head(ground)

@@ -72,7 +72,7 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         ground = ground_from_settings(settings)
         app.state.ground = ground
         app.state.uploads = UploadPool(settings.uploads_at_once)
-        # With the threads of uploads, jobs and the feed no more than there are connections to the database.
+        # Together with the threads of uploads, jobs and the feed, not more than the connections to the database.
         threads = SQLITE_THREADS if ground.database.dialect == "sqlite" else SERVER_THREADS
         to_thread.current_default_thread_limiter().total_tokens = threads
         app.state.dispatcher = dispatcher_for(ground, settings, inline=inline_jobs)
@@ -136,7 +136,7 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
 
 
 def shared_budgets(settings: Settings) -> SharedBudgets | None:
-    """Return the budgets of the rate limit that API processes share, where there is a Redis broker to share them in."""
+    """Return the rate limit budgets that API processes share in a Redis broker; None without one."""
     broker = settings.resolved_broker_url()
     if settings.rate_limit_per_s <= 0.0 or broker is None or not broker.startswith(("redis://", "rediss://")):
         return None

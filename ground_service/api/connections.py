@@ -1,12 +1,12 @@
-"""Connections of the HTTP server: how many there may be, how long each may take, and in which order they are served.
+"""Connection limits, deadlines and scheduling of the HTTP server.
 
-uvicorn's protocols know one timeout (keep-alive) and one limit (concurrency, for all alike). The protocols here add:
+uvicorn's protocols have one timeout (keep-alive) and one limit (concurrency). The protocols here add:
 
-- a limit of connections in total and for each client address; a reserve above both that answers supervisors only, in
-  which a new connection takes the place of the oldest that has not asked for anything yet;
-- deadlines for the head of a request, for the progress of its body, and for a client that does not read the answer;
-- a queue of received octets that is worked off in slices of `SLICE_S`, so that a thousand requests at the same moment
-  cannot keep the event loop from accepting and answering others.
+- limits of connections in total and for each client address; a reserve above both answers health checks only, and a new
+  connection there replaces the oldest one without a request;
+- deadlines for the head of a request, for the progress of its body, and for a client that does not read the response;
+- a queue of received octets that is processed in slices of `SLICE_S`, so that a thousand simultaneous requests do not
+  block the event loop.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ WATCHED_PATHS = ("/healthz", "/readyz", "/metrics")
 
 @dataclass(frozen=True, slots=True)
 class ConnectionLimits:
-    """How many connections there may be, and how long each may take.
+    """Limits of the number and duration of connections.
 
-    The body of a request has to bring `body_octets` in every `body_s`; the time during which the service itself is
-    not reading does not count.
+    At least `body_octets` of a request body must arrive in every `body_s`; time during which the service does not read
+    is not counted.
     """
 
     total: int = 4096
@@ -54,7 +54,7 @@ class ConnectionLimits:
 
 
 def raise_file_limit() -> int:
-    """Raise the number of files this process may open to what the system allows it; the number."""
+    """Raise the limit of open files of this process to the maximum that the system allows; return it."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == resource.RLIM_INFINITY:
         return 1 << 20
@@ -64,12 +64,12 @@ def raise_file_limit() -> int:
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
             soft = wanted
         except (OSError, ValueError):
-            pass  # the limit stays as it is; connections are limited to what it allows
+            pass  # the limit is unchanged; it also limits the connections
     return soft
 
 
 class Door:
-    """The connections of one server."""
+    """Admission control for the connections of one server."""
 
     def __init__(self, limits: ConnectionLimits, proxies: TrustedProxies | None = None) -> None:
         self.limits = limits
@@ -83,15 +83,15 @@ class Door:
         self._sweeping = False
 
     def protocols(self) -> tuple[type[H11Protocol], type[WebSocketsSansIOProtocol]]:
-        """Return the protocol classes of HTTP and WebSocket that belong to this door."""
+        """Return the protocol classes for HTTP and WebSocket that use this admission control."""
         http = type("BoundProtocol", (GuardedProtocol,), {"door": self})
         socket = type("BoundSocket", (GuardedSocket,), {"door": self})
         return cast(type[H11Protocol], http), cast(type[WebSocketsSansIOProtocol], socket)
 
     def enter(self, protocol: GuardedProtocol, host: str) -> str | None:
-        """Count a new connection in; the key to count it out with, None in the reserve."""
+        """Register a new connection; return the key to unregister it, None if it is in the reserve."""
         key = address_key(host)
-        # All clients of a trusted proxy come from its address: only the total limits them here.
+        # All clients of a trusted proxy have its address: only the total limit applies here.
         crowded = host not in self._proxies and self._clients[key] >= self.limits.per_client
         if self._total < self.limits.total and not crowded:
             self._total += 1
@@ -104,7 +104,7 @@ class Door:
         return None
 
     def leave(self, key: str | None) -> None:
-        """Count a connection out."""
+        """Unregister a connection."""
         if key is None:
             return
         self._total -= 1
@@ -113,20 +113,20 @@ class Door:
             del self._clients[key]
 
     def watch(self, protocol: GuardedProtocol | GuardedSocket) -> None:
-        """Check the deadlines of a connection from now on."""
+        """Start to check the deadlines of a connection."""
         self._watched.add(protocol)
         if not self._sweeping:
             self._sweeping = True
             protocol.loop.call_later(SWEEP_S, self._sweep, protocol.loop)
 
     def forget(self, protocol: GuardedProtocol | GuardedSocket) -> None:
-        """Watch a connection no longer: it has ended, or became a WebSocket."""
+        """Stop checking a connection that has ended or became a WebSocket."""
         self._watched.discard(protocol)
         if isinstance(protocol, GuardedProtocol):
             self._reserve.pop(protocol, None)
 
     def queue(self, protocol: GuardedProtocol) -> None:
-        """Have the octets that a connection received worked off when its turn comes."""
+        """Queue a connection to process its received octets."""
         self._waiting.append(protocol)
         if not self._pumping:
             self._pumping = True
@@ -152,7 +152,7 @@ class Door:
 
 
 class Backlog:
-    """What a client has not read of what was sent to it."""
+    """Sent octets that a client has not read."""
 
     def __init__(self, transport: asyncio.Transport) -> None:
         self._transport = transport
@@ -160,7 +160,7 @@ class Backlog:
         self._since = 0.0
 
     def stuck_s(self, now: float) -> float:
-        """How long the client has read nothing although there is something to read, s."""
+        """Return the time for which the client has read nothing of the waiting octets, s."""
         octets = self._transport.get_write_buffer_size()
         if octets == 0 or octets < self._octets or self._octets == 0:
             self._since = now
@@ -169,7 +169,7 @@ class Backlog:
 
 
 class GuardedProtocol(H11Protocol):
-    """An HTTP connection with deadlines; see the module."""
+    """HTTP connection with deadlines; see the module."""
 
     door: ClassVar[Door]
 
@@ -210,7 +210,7 @@ class GuardedProtocol(H11Protocol):
             self.transport.pause_reading()
 
     def work_off(self) -> None:
-        """Handle what was received; reading goes on after that."""
+        """Process the received octets, then resume reading."""
         data = bytes(self._received)
         self._received.clear()
         if self.transport.is_closing():
@@ -229,7 +229,7 @@ class GuardedProtocol(H11Protocol):
         self._upgraded = True
         self.door.forget(self)
         super().handle_websocket_upgrade(event)
-        # From here on the WebSocket's protocol has the transport, and counts the connection out.
+        # The WebSocket protocol now owns the transport and unregisters the connection.
         cast(GuardedSocket, self.transport.get_protocol()).key = self._key
         self._key = None
         self.transport.resume_reading()
@@ -238,7 +238,7 @@ class GuardedProtocol(H11Protocol):
         return not self._in_reserve and super()._should_upgrade()
 
     def check(self, now: float) -> None:
-        """End the connection where the client takes longer than it may."""
+        """Close the connection if the client exceeds a deadline."""
         limits = self.door.limits
         if self._backlog.stuck_s(now) > limits.unread_s:
             self.transport.abort()
@@ -271,7 +271,7 @@ class GuardedProtocol(H11Protocol):
         self._stop_at = self.loop.time() + self.door.limits.stop_s
 
     def end(self, status: int, detail: str) -> None:
-        """Answer a request that did not come whole, if it still can be, and close the connection."""
+        """Respond to an incomplete request if possible, and close the connection."""
         if self.transport.is_closing():
             return
         cycle = self.cycle
@@ -287,7 +287,7 @@ class GuardedProtocol(H11Protocol):
 
 
 class GuardedSocket(WebSocketsSansIOProtocol):
-    """A WebSocket that is counted as the connection it came about from, and dropped where its client does not read."""
+    """WebSocket that counts as the connection it was upgraded from; it is closed if its client does not read."""
 
     door: ClassVar[Door]
     key: str | None = None
@@ -298,7 +298,7 @@ class GuardedSocket(WebSocketsSansIOProtocol):
         self.door.watch(self)
 
     def check(self, now: float) -> None:
-        """End the connection of a client that does not read."""
+        """Close the connection of a client that does not read."""
         if self._backlog.stuck_s(now) > self.door.limits.unread_s:
             self.transport.abort()
 
@@ -310,7 +310,7 @@ class GuardedSocket(WebSocketsSansIOProtocol):
 
 
 class _Reserve:
-    """The application as connections of the reserve get to see it: supervisors are answered, others come back later."""
+    """Application for connections of the reserve: it answers health checks and returns 503 to all other requests."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app

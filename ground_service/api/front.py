@@ -1,11 +1,11 @@
-"""The front process: accepts connections, answers `/healthz`, and hands all others to the server over a Unix socket.
+"""Front process: it accepts connections, answers `/healthz`, and passes all others to the server over a Unix socket.
 
-The server computes in threads of one Python process, and its event loop waits whenever one of them does. The front
-process shares nothing with it, so a supervisor is answered at once however much the server has to do. It asks the
-heartbeat of the server's event loop first: a server whose loop has stopped is not healthy.
+The server computes in threads of one Python process, which can delay its event loop. The front process is separate, so
+health checks are answered immediately at any load of the server. The response depends on the heartbeat of the server's
+event loop: a server whose loop has stopped is not healthy.
 
 Run as ``python -m ground_service.api.front LISTENER CHANNEL HEARTBEAT`` with the numbers of inherited descriptors. It
-imports the standard library only, ignores signals and ends with the server.
+imports only the standard library, ignores signals and exits with the server.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ HEALTH = b"GET /healthz"
 HEARTBEAT = struct.Struct("d")
 STALE_S = 30.0
 SILENT_S = 1.0
-"""A client that sends nothing for so long is the server's to wait for."""
+"""Time after which a connection without a request is passed to the server."""
 
 PEEKED_OCTETS = 16
 ACCEPTED_AT_ONCE = 64
@@ -36,7 +36,7 @@ BUSY = b'{"type":"about:blank","title":"busy","status":503,"detail":"the service
 
 
 class Front:
-    """The connections that are neither answered nor handed over yet."""
+    """Connections that are neither answered nor passed on yet."""
 
     def __init__(self, listener: socket.socket, channel: socket.socket, heartbeat: mmap.mmap) -> None:
         self._listener, self._channel, self._heartbeat = listener, channel, heartbeat
@@ -47,7 +47,7 @@ class Front:
         self._selector.register(channel, selectors.EVENT_READ)
 
     def run(self) -> None:
-        """Serve until the server is gone."""
+        """Serve until the server has ended."""
         while True:
             for key, events in self._selector.select(SILENT_S / 2 if self._waiting else None):
                 if key.fileobj is self._listener:
@@ -78,7 +78,7 @@ class Front:
             except BlockingIOError:
                 return
             except OSError:
-                time.sleep(0.05)  # no descriptors are left; those handed over go away soon
+                time.sleep(0.05)  # no descriptors are left; those already passed on are closed soon
                 return
             client.setblocking(False)
             self._waiting[client] = time.monotonic()
@@ -101,7 +101,7 @@ class Front:
             self._forget(client)
             self._answer(client)
         else:
-            # Also where the beginning of a request for health came alone: the server answers that one, too.
+            # This includes an incomplete health check: the server answers it as well.
             self._pass_on(client)
 
     def _answer(self, client: socket.socket) -> None:
@@ -128,14 +128,14 @@ class Front:
         self._hand_over()
 
     def _hand_over(self) -> None:
-        """Send as many connections as the server takes now; the others when it takes more."""
+        """Pass on as many connections as the channel accepts now; keep the others for later."""
         while self._handed:
             try:
                 socket.send_fds(self._channel, [b"c"], [self._handed[0].fileno()])
             except BlockingIOError:
                 break
             except OSError:
-                return  # the server is gone, which the channel tells next
+                return  # the server has ended; the channel reports it next
             self._handed.popleft().close()
         events = selectors.EVENT_READ | (selectors.EVENT_WRITE if self._handed else 0)
         self._selector.modify(self._channel, events)

@@ -44,10 +44,10 @@ SECURE_HEADERS = {
 
 
 class BodyLimit:
-    """Refuse bodies over a limit, announced or not; paths of uploads have their own, larger one.
+    """Limit of the size of request bodies, with or without Content-Length; upload paths have their own, larger limit.
 
-    Bodies that are not uploads are held in memory until they have come whole, before anybody knows whose they are.
-    All of them together may therefore hold `HELD_LIMIT_OCTETS`.
+    Bodies that are not uploads are kept in memory until they are complete, before the caller is authenticated.
+    Therefore all of them together may use at most `HELD_LIMIT_OCTETS`.
     """
 
     def __init__(self, app: ASGIApp, upload_paths: tuple[str, ...], upload_limit_octets: int) -> None:
@@ -106,10 +106,10 @@ class BodyLimit:
 
 
 class RateLimit:
-    """Refuse callers that ask more often than they may: a budget of two seconds' worth for each, refilled evenly.
+    """Rate limit: each caller has a budget of requests for two seconds, refilled continuously.
 
-    A caller is a user, once a token of that user was verified, and before that or without one the address of the
-    peer (see `proxies`). An invented token is therefore paid for by the address that it comes from.
+    A caller is a user if the token was verified before, otherwise the address of the peer (see `proxies`). Requests
+    with invalid tokens therefore use the budget of their address.
     """
 
     def __init__(self, app: ASGIApp, per_second: float, budgets: Budgets | None = None) -> None:
@@ -138,7 +138,7 @@ class RateLimit:
                 self._note(token, scope.get("state", {}).get(VERIFIED_CALLER))
 
     def _note(self, token: str, caller: str | None) -> None:
-        """Remember whose token it is; forget one that was not verified this time."""
+        """Remember the user of a verified token; forget a token that was not verified."""
         self._verified.pop(token, None)
         if caller is not None:
             self._verified[token] = caller
@@ -147,14 +147,14 @@ class RateLimit:
 
 
 class Budgets(Protocol):
-    """Requests that callers have left."""
+    """Remaining requests of callers."""
 
     async def take(self, caller: str) -> float:
-        """Take one from a caller's budget; the seconds to wait where none is left."""
+        """Take one request from a budget; return the seconds to wait if none is left."""
 
 
 class LocalBudgets:
-    """Budgets of the callers of this process, of the `CALLERS_KEPT` that asked last."""
+    """Budgets of the last `CALLERS_KEPT` callers of this process."""
 
     def __init__(self, per_second: float) -> None:
         self._rate = per_second
@@ -182,11 +182,11 @@ if wait_us > 0 then return math.ceil(wait_us) end
 redis.call('SET', KEYS[1], string.format('%.0f', paid_until + each_us), 'PX', math.ceil(depth_us / 1000) + 1000)
 return 0
 """
-"""The generic cell rate algorithm (ATM Forum TM 4.0, 4.4.2): one number for each caller, which expires by itself."""
+"""The generic cell rate algorithm (ATM Forum TM 4.0, 4.4.2): one value for each caller, which expires automatically."""
 
 
 class SharedBudgets:
-    """Budgets that all API processes of a deployment share, kept in Redis; while it is away, each has its own."""
+    """Budgets in Redis, shared by all API processes; each process has its own while Redis is unavailable."""
 
     def __init__(self, url: str, per_second: float) -> None:
         import redis.asyncio
@@ -208,16 +208,18 @@ class SharedBudgets:
                 return float(await self._script(keys=[key], args=[self._each_us, self._depth_us])) / 1e6
             except (redis.exceptions.RedisError, OSError) as error:
                 self._away_until = now_s + REDIS_RETRY_S
-                log.warning("rate limit: the broker is away (%s); each process counts for itself", error)
+                log.warning(
+                    "rate limit: the broker is unavailable (%s); each process limits on its own", error
+                )
         return await self._local.take(caller)
 
     async def close(self) -> None:
-        """Give the connections back."""
+        """Close the connections."""
         await self._client.aclose()
 
 
 def _token(scope: Scope) -> str:
-    """The hash of the token that a request carries, wherever it may; empty without one. Tokens are not kept."""
+    """Return the hash of the token in a request; empty without one. Tokens are not stored."""
     headers = Headers(scope=scope)
     token = headers.get("authorization", "")
     if not token and scope["type"] == "websocket":

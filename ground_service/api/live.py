@@ -20,7 +20,7 @@ live = APIRouter()
 async def watch(
     socket: WebSocket,
     after: Annotated[
-        int | None, Query(ge=0, le=2**63 - 1, description="Send what came after this number first")
+        int | None, Query(ge=0, le=2**63 - 1, description="First send the messages after this number")
     ] = None,
 ) -> None:
     """Messages ``{sequence, time, kind, ...}`` about jobs and passes.

@@ -13,7 +13,7 @@ operations = APIRouter(include_in_schema=False)
 
 @operations.get("/healthz")
 async def healthz() -> schemas.Health:
-    """The process lives; `front` answers this where it comes first on a connection."""
+    """Report that the process is alive; `front` answers this if it is the first request of a connection."""
     return schemas.Health(status="ok")
 
 

@@ -1,13 +1,13 @@
-"""Protection against requests that a web page of another origin makes in the browser of a user.
+"""Protection against requests that a web page of another origin sends from the browser of a user.
 
-Two attacks are refused in every mode, with users and without:
+Two attacks are prevented, with and without users:
 
-- *DNS rebinding*: a name of the attacker resolves to this machine, and its page reads the API as its own origin. The
-  browser names the attacker's host in the Host header, which is none of ours.
-- *Cross-site requests*: a page of another origin sends a request that changes something, or opens a WebSocket. The
-  browser names the page's origin (Origin) or says how the sites relate (Sec-Fetch-Site).
+- *DNS rebinding*: a host name of the attacker resolves to this machine, and its page reads the API as its own origin.
+  The browser sends the attacker's host name in the Host header, which is not a name of this service.
+- *Cross-site requests*: a page of another origin sends a request that changes data, or opens a WebSocket. The browser
+  sends the origin of the page (Origin) or the relation of the sites (Sec-Fetch-Site).
 
-Programs such as curl send neither header and are let through: no page can make a browser leave out both.
+Programs such as curl send neither header and are accepted: no page can make a browser omit both.
 
 References: Fetch Metadata Request Headers (W3C); RFC 6454, RFC 9110 section 15.5.20 (421), RFC 6455 section 10.2.
 """
@@ -27,15 +27,15 @@ from ground_service.api.problems import problem
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
 OPEN_PATHS = ("/healthz", "/readyz")
-"""Answered whatever the Host header says: supervisors ask by address, name or not at all, and learn one word."""
+"""Paths that are answered for any Host header: health checks use addresses, names or no host name."""
 
 DEFAULT_PORTS = {"http": 80, "https": 443}
 FORM_TYPES = ("application/x-www-form-urlencoded", "multipart/form-data", "text/plain")
-"""What a form of any page can send without asking first."""
+"""Media types that a form of any page can send without a preflight request."""
 
 
 class SameOrigin:
-    """Refuse requests to another host's name, and what pages of other origins ask for."""
+    """Refusal of requests to other host names and of requests from pages of other origins."""
 
     def __init__(self, app: ASGIApp, hosts: Iterable[str], api_prefix: str) -> None:
         self._app = app
@@ -69,13 +69,13 @@ class SameOrigin:
     def _is_ours(self, name: str, scope: Scope) -> bool:
         if name in self._hosts:
             return True
-        # An address, as opposed to a name, cannot be made to point elsewhere: the one that was connected to is ours.
+        # Unlike a name, an address cannot be rebound: the address of the connection belongs to this service.
         local = (scope.get("server") or ("",))[0]
         return _is_address(name) and name == _plain(str(local))
 
 
 def foreign(scope: Scope, headers: Headers, host: tuple[str, int | None], api_prefix: str) -> str | None:
-    """Return why a request must have come from a page of another origin; None where nothing says so."""
+    """Return why a request comes from a page of another origin; None if no header shows that."""
     changes = scope["type"] == "websocket" or scope["method"] not in SAFE_METHODS
     site = headers.get("sec-fetch-site", "").lower()
     origin = headers.get("origin")
@@ -93,12 +93,12 @@ def foreign(scope: Scope, headers: Headers, host: tuple[str, int | None], api_pr
         return "Origin: expected that of this service from a browser, found none"
     media = headers.get("content-type", "").partition(";")[0].strip().lower()
     if (origin is not None or site) and media in FORM_TYPES:
-        return f"Content-Type: expected one that no form of a page can send, found {media}"
+        return f"Content-Type: expected a type that an HTML form cannot send, found {media}"
     return None
 
 
 async def refuse(response: Response, scope: Scope, receive: Receive, send: Send) -> None:
-    """Answer a request, or the opening handshake of a WebSocket, with a refusal."""
+    """Refuse a request, or the opening handshake of a WebSocket."""
     if scope["type"] == "websocket" and "websocket.http.response" not in scope.get("extensions", {}):
         await receive()
         await send({"type": "websocket.close", "code": 1008, "reason": ""})
@@ -107,7 +107,7 @@ async def refuse(response: Response, scope: Scope, receive: Receive, send: Send)
 
 
 def _same(origin: str, host: tuple[str, int | None]) -> bool:
-    """Whether an origin has this host and port; a host without a port has the default one of the origin's scheme."""
+    """Return whether an origin has this host and port; the default port is that of the origin's scheme."""
     try:
         parts = urlsplit(origin)
         if parts.scheme not in DEFAULT_PORTS or parts.hostname is None or parts.path:
@@ -119,7 +119,7 @@ def _same(origin: str, host: tuple[str, int | None]) -> bool:
 
 
 def _host_and_port(text: str) -> tuple[str, int | None] | None:
-    """Name and port of a Host header; None where it is none."""
+    """Return name and port of a Host header; None if it is invalid."""
     try:
         parts = urlsplit(f"//{text}")
         if (
@@ -136,7 +136,7 @@ def _host_and_port(text: str) -> tuple[str, int | None] | None:
 
 
 def _plain(host: str) -> str:
-    """A host name as it is compared: small letters, no final dot, addresses in their one form."""
+    """Return the normalised host name: lower case, no final dot, canonical form of addresses."""
     name = host.strip().strip("[]").rstrip(".").lower()
     try:
         return str(ipaddress.ip_address(name))

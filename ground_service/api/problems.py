@@ -55,14 +55,14 @@ STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
 RETRY_AFTER_S = 1
 
 TOLD: tuple[tuple[type[Exception], str], ...] = (
-    (StorageFull, "no space left; nothing more was stored"),
+    (StorageFull, "no space left; the data were not stored"),
     (StorageReadOnly, "the archive or the database cannot be written"),
-    (FileDamaged, "a stored file no longer has the octets it was stored with"),
+    (FileDamaged, "the content of a stored file has changed"),
     (StoreError, "database unavailable"),
     (BuildNotChecked, "the parameters of the build cannot be checked here, so it was not registered"),
-    (Exception, "the service met an error that it has logged"),
+    (Exception, "internal error; see the log of the service"),
 )
-"""What callers are told of errors that are the service's own: neither places nor addresses."""
+"""Public text of internal errors, without paths and addresses."""
 
 
 class TooLarge(GroundError):
@@ -70,15 +70,15 @@ class TooLarge(GroundError):
 
 
 class Busy(GroundError):
-    """More at once than the service takes; the same request later may succeed."""
+    """Too many simultaneous requests; the same request may succeed later."""
 
 
 class BrokenOff(GroundError):
-    """A body that did not come to its end."""
+    """Incomplete request body."""
 
 
 class UnsupportedEncoding(GroundError):
-    """A body in a form that the service does not read."""
+    """Unsupported content encoding of a request body."""
 
 
 class PreconditionFailed(GroundError):
@@ -103,14 +103,14 @@ def problem(
 
 
 def busy(detail: str, request: Request | None = None) -> JSONResponse:
-    """A problem document that asks the caller to come again."""
+    """Return a problem document with Retry-After."""
     response = problem(503, "busy", detail, request)
     response.headers["Retry-After"] = str(RETRY_AFTER_S)
     return response
 
 
 def _allowed(app: FastAPI, request: Request) -> list[str]:
-    """The methods of all operations at the path of a request."""
+    """Return the methods of all operations at the path of a request."""
     methods: set[str] = set()
     for route in app.state.operations:
         if route.path_regex.match(request.scope["path"]):
@@ -134,7 +134,7 @@ def install(app: FastAPI) -> None:
             return problem(415, "unsupported encoding", str(error), request)
         if isinstance(error, PreconditionFailed):
             return problem(412, "precondition failed", str(error), request)
-        told = public_text(error)  # the log has the whole text
+        told = public_text(error)  # the log contains the complete text
         if isinstance(error, PlanConflicts):
             found = [
                 {"where": f"window {one.window_id}" if one.window_id else one.kind, "detail": one.detail}
@@ -146,7 +146,7 @@ def install(app: FastAPI) -> None:
         status, title = next((s, t) for kind, s, t in STATUSES if isinstance(error, kind))
         if status < 500:
             return problem(status, title, told, request)
-        # The message names the database or a folder of this machine: it goes to the log, which the id leads to.
+        # The message may contain paths or addresses: it is logged with the id of the request.
         request_id = getattr(request.state, "request_id", None)
         log.error("%s %s: %s", request.method, request.url.path, error, extra={"request_id": request_id})
         detail = next(text for kind, text in TOLD if isinstance(error, kind))
@@ -175,7 +175,7 @@ def install(app: FastAPI) -> None:
     async def unexpected(request: Request, error: Exception) -> JSONResponse:
         told = {"request_id": getattr(request.state, "request_id", None)}
         log.exception("%s %s", request.method, request.url.path, exc_info=error, extra=told)
-        return problem(500, "internal error", "the service met an error that it has logged", request)
+        return problem(500, "internal error", "internal error; see the log of the service", request)
 
     for kind in (GroundError, TmtcError, LunarError, ReportError):
         app.add_exception_handler(kind, known)

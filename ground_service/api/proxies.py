@@ -1,7 +1,7 @@
-"""Who is at the other end: the peer of the connection, or whom a trusted reverse proxy names.
+"""Client address of a request: the peer of the connection, or the address reported by a trusted reverse proxy.
 
-Headers of the family X-Forwarded-* are believed only where the connection comes from an address of
-`LINNA_TRUSTED_PROXIES`. From any other peer they are ignored, and the service works with the peer itself.
+X-Forwarded-* headers are accepted only on connections from an address of `LINNA_TRUSTED_PROXIES`. From any other peer
+they are ignored, and the peer is the client.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ SCHEMES = {"http": ("http", "ws"), "https": ("https", "wss"), "ws": ("http", "ws
 
 
 def parse_networks(texts: Sequence[str]) -> tuple[Network, ...]:
-    """Return the networks that texts such as ``10.0.0.7`` and ``10.0.0.0/8`` name.
+    """Return the networks given by texts such as ``10.0.0.7`` and ``10.0.0.0/8``.
 
     Raises
     ------
     ValueError
-        If one of them is no address and no network.
+        If a text is neither an address nor a network.
     """
     return tuple(ipaddress.ip_network(text) for text in texts)
 
 
 class TrustedProxies:
-    """The addresses whose X-Forwarded-* headers are believed."""
+    """Addresses whose X-Forwarded-* headers are accepted."""
 
     def __init__(self, texts: Sequence[str] = ()) -> None:
         self._networks = parse_networks(texts)
@@ -38,10 +38,9 @@ class TrustedProxies:
         return address is not None and any(address in network for network in self._networks)
 
     def client(self, peer: str, forwarded_for: str) -> str:
-        """Return the last address of the chain that no trusted proxy has; the peer where the chain says nothing.
+        """Return the last address of the chain that is not a trusted proxy; the peer without a chain.
 
-        Every proxy appends the address it was asked from, so entries to the left of an untrusted one are the
-        untrusted one's own words.
+        Every proxy appends the address of its peer, so entries to the left of an untrusted address may be forged.
         """
         found = peer
         for text in reversed([part.strip() for part in forwarded_for.split(",")]):
@@ -55,7 +54,7 @@ class TrustedProxies:
 
 
 class ForwardedHeaders:
-    """Put the client, scheme and host that a trusted proxy names in place of the proxy's own."""
+    """Replacement of client, scheme and host by those reported by a trusted proxy."""
 
     def __init__(self, app: ASGIApp, proxies: TrustedProxies) -> None:
         self._app = app
@@ -83,9 +82,9 @@ class ForwardedHeaders:
 
 
 def address_key(host: str) -> str:
-    """Return what callers without a name are told apart by: an IPv4 address, or the /64 of an IPv6 address.
+    """Return the key of an anonymous caller: its IPv4 address, or the /64 network of its IPv6 address.
 
-    One IPv6 subscriber holds a whole /64, so single addresses would earn as many budgets as anybody likes.
+    An IPv6 subscriber has a whole /64, so a budget for each address would not limit the caller.
     """
     address = _address(host)
     if isinstance(address, ipaddress.IPv6Address):
@@ -94,7 +93,7 @@ def address_key(host: str) -> str:
 
 
 def _address(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    """The address that a text such as 10.0.0.1, 10.0.0.1:80, ::1 or [::1]:80 holds."""
+    """Return the address in a text such as 10.0.0.1, 10.0.0.1:80, ::1 or [::1]:80."""
     if text.startswith("["):
         text = text[1:].partition("]")[0]
     elif text.count(":") == 1:
@@ -108,5 +107,5 @@ def _address(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 
 def _last(values: Sequence[str]) -> str:
-    """The last entry of a header that proxies append to: that of the proxy nearest to this service."""
+    """Return the last entry of a header to which proxies append: that of the nearest proxy."""
     return values[-1].rpartition(",")[2].strip() if values else ""

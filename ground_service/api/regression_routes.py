@@ -107,9 +107,9 @@ class RegressionItem(schemas.Schema):
     gates: int = Field(description="Gates that were judged")
     gates_failed: int
     gates_inconclusive: int
-    frames: int = Field(description="Frames that both builds flew")
+    frames: int = Field(description="Number of frames processed by both builds")
     frames_needed: int | None = Field(
-        description="Frames with which every gate over the suite would be decided; null where no gate states a number"
+        description="Number of frames needed to decide every gate over the suite; null if unknown"
     )
     created: str
 
@@ -229,7 +229,7 @@ def _register(ground: Ground, stored: StoredFile, caller: Caller) -> BuildOut:
 
 
 def _count(row: repository.Row, outcome: str) -> int:
-    """Gates of a verdict with this outcome that are not waived."""
+    """Return the number of gates with this outcome that are not waived."""
     return sum(gate["outcome"] == outcome and not gate["waived"] for gate in row["result"]["gates"])
 
 

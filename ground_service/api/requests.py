@@ -1,4 +1,4 @@
-"""Checks of requests before any operation sees them: characters, query keys, and JSON with one meaning only."""
+"""Request validation before the operations: characters, query keys, and unambiguous JSON."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ QUERY_KEYS_LIMIT = 100
 
 
 class PlainText:
-    """Refuse paths and queries with control characters, which no database, log or terminal should get to see."""
+    """Refusal of paths and queries with control characters, which are unsafe in databases, logs and terminals."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -46,7 +46,7 @@ class PlainText:
 
 
 class StrictRequest(Request):
-    """A request whose JSON has one meaning: no NaN, no infinite numbers, no NUL, no key twice in an object."""
+    """Request with unambiguous JSON: no NaN, infinite numbers, NUL characters or duplicate keys."""
 
     async def json(self) -> Any:
         if not hasattr(self, "_json"):
@@ -56,14 +56,14 @@ class StrictRequest(Request):
 
 @dataclass(frozen=True, slots=True)
 class QueryKeys:
-    """The query keys that an operation takes: all of them, and those that may be given several times."""
+    """Query keys of an operation: all keys, and the keys that may be repeated."""
 
     known: frozenset[str]
     lists: frozenset[str]
 
 
 class StrictRoute(APIRoute):
-    """An operation that refuses query keys it does not know or that come twice, and JSON as `StrictRequest` does."""
+    """Operation that refuses unknown or duplicate query keys, and JSON that `StrictRequest` refuses."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         handler = super().get_route_handler()
@@ -77,7 +77,7 @@ class StrictRoute(APIRoute):
 
 
 def query_keys(dependant: Any) -> QueryKeys:
-    """Return the query keys that an operation and what it depends on take."""
+    """Return the query keys of an operation and its dependencies."""
     known = {field.alias for field in dependant.query_params}
     lists = {field.alias for field in dependant.query_params if _is_list(field.field_info.annotation)}
     for inner in map(query_keys, dependant.dependencies):
@@ -91,7 +91,7 @@ def _is_list(annotation: Any) -> bool:
 
 
 async def query_is_known(socket: WebSocket, *known: str) -> bool:
-    """Whether the query of a WebSocket has only these keys, each at most once; if not, the handshake is refused."""
+    """Return whether a WebSocket query has only these keys, each at most once; refuse the handshake if not."""
     try:
         check_query(query_of(socket.scope), QueryKeys(frozenset(known), frozenset()))
     except HTTPException as error:
@@ -108,12 +108,12 @@ def query_of(scope: Scope) -> str:
 
 
 def check_query(query: str, keys: QueryKeys) -> None:
-    """Refuse a query with other keys than these, and with one of them twice that has one value.
+    """Refuse a query with unknown keys or with a repeated key that has a single value.
 
     Raises
     ------
     HTTPException
-        With status 422; it names the nearest known key.
+        Status 422; the detail names the nearest known key.
     """
     try:
         pairs = parse_qsl(query, keep_blank_values=True, max_num_fields=QUERY_KEYS_LIMIT)
@@ -134,9 +134,9 @@ def parse_json(octets: bytes) -> Any:
     Raises
     ------
     HTTPException
-        With status 422 where a number is not finite, a text holds NUL or half a character, or a key comes twice.
+        Status 422 if a number is not finite, a text has NUL or a lone surrogate, or a key is repeated.
     json.JSONDecodeError, UnicodeDecodeError, RecursionError
-        If it is no JSON, or nested too deeply.
+        If the text is not JSON, or nested too deeply.
     """
     value = json.loads(
         octets.decode("utf-8"), parse_constant=_constant, parse_float=_finite, object_pairs_hook=_once
@@ -160,14 +160,14 @@ def _finite(text: str) -> float:
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) != len(pairs):
-        raise HTTPException(422, "body: expected every key of an object once, found one twice")
+        raise HTTPException(422, "body: expected each key of an object once, found a duplicate")
     return found
 
 
 def _check_texts(value: Any) -> None:
     if isinstance(value, str):
         if "\0" in value or any("\ud800" <= character <= "\udfff" for character in value):
-            raise HTTPException(422, "body: expected texts of whole characters without NUL, found other")
+            raise HTTPException(422, "body: expected texts without NUL and lone surrogates, found one")
     elif isinstance(value, dict):
         for key, item in value.items():
             _check_texts(key)

@@ -126,18 +126,18 @@ async def upload_telemetry(
             min_length=1,
             max_length=200,
             pattern=r"^[^\x00-\x1f\x7f]*$",
-            description="Stream that the octets are a piece of; with `offset`",
+            description="Stream to which the octets belong; requires `offset`",
         ),
     ] = None,
     offset: Annotated[
-        int | None, Query(ge=0, lt=1 << 62, description="Where in `stream` the piece begins, in octets")
+        int | None, Query(ge=0, lt=1 << 62, description="Offset of the piece in `stream`, in octets")
     ] = None,
     idempotency_key: IdempotencyKey = None,
 ) -> schemas.IngestAccepted:
-    """Take a downlink, or a piece of one cut at any octet, and ingest it.
+    """Ingest a downlink, or a piece of one cut at any octet.
 
-    A downlink is a stream of CADUs or of space packets. Pieces are joined by `stream` and `offset` where they are
-    given, else in order of arrival and by content.
+    A downlink is a stream of CADUs or of space packets. Pieces are joined by `stream` and `offset` if given, otherwise
+    by order of arrival and by content.
     """
     if (stream is None) != (offset is None):
         raise InvalidInput("telemetry", "stream, offset", "both or neither", "one of them")

@@ -20,11 +20,9 @@ class Problem(BaseModel):
     status: int = Field(examples=[404])
     detail: str = Field(examples=["pass 7: not found"])
     instance: str | None = Field(default=None, examples=["/api/v1/passes/7"])
-    request_id: str | None = Field(default=None, description="Where the log says more")
+    request_id: str | None = Field(default=None, description="Id of the request in the log")
     errors: list[dict[str, str]] | None = Field(default=None, description="What is wrong, one by one")
-    state: str | None = Field(
-        default=None, description="Of a conflict: the state that another request brought about"
-    )
+    state: str | None = Field(default=None, description="For a conflict: the state found instead")
 
 
 class PageOf(Schema, Generic[Item]):
@@ -111,18 +109,20 @@ class ApidCompleteness(Schema):
     apid: int = Field(examples=[161])
     name: str = Field(examples=["detections"])
     packets: int
-    lost: int = Field(description="Missing between packets that came, by sequence count")
-    lost_at_edges: int | None = Field(description="Missing before the first and after the last, by the plan")
-    duplicates: int | None = Field(description="Came again with the same octets; null: not computed")
+    lost: int = Field(description="Missing between received packets, by sequence count")
+    lost_at_edges: int | None = Field(
+        description="Missing before the first and after the last packet, by the plan"
+    )
+    duplicates: int | None = Field(description="Received again with the same octets; null: not computed")
     conflicts: int
-    crc_errors: int | None = Field(description="Came with a wrong checksum; null: not computed")
+    crc_errors: int | None = Field(description="Received with a wrong checksum; null: not computed")
 
 
 class Completeness(Schema):
-    """Packets of a pass that came and that did not; null: not computed."""
+    """Received and missing packets of a pass; null: not computed."""
 
     packets: int
-    expected: int = Field(description="Packets that came and packets known to be missing")
+    expected: int = Field(description="Received packets plus packets known to be missing")
     lost: int
     lost_at_edges: int | None
     duplicates: int | None
@@ -394,13 +394,13 @@ class ReportErrors(Schema):
 
 
 class ReportRequirement(Schema):
-    """One line of the verdict table: the value has to be at most, or at least, the limit."""
+    """Row of the verdict table: the value must be at most, or at least, the limit."""
 
     key: str = Field(examples=["accuracy.median"])
     name: str = Field(examples=["median 3-D error"])
     unit: str = Field(examples=["m"])
     value: float | None = Field(description="null: unknown")
-    limit: float | None = Field(description="null: the mission description states none")
+    limit: float | None = Field(description="null: not stated in the mission description")
     at_most: bool
     status: str = Field(description="met, not met, unknown or not judged", examples=["met"])
     note: str

@@ -13,7 +13,7 @@ from ground_service.errors import NotAuthorised
 from ground_service.services.users import LOCAL_CALLER, Caller, authenticate, has_users
 
 VERIFIED_CALLER = "verified_caller"
-"""Name in the state of a request of the user whose token was verified; absent where no token was."""
+"""Key in the request state for the user whose token was verified; absent without a verified token."""
 
 _bearer = HTTPBearer(auto_error=False, description="Token given out by 'linna user add'")
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 FILES_KEPT = 320
-"""Files that are not connections or uploads: the reserve of connections, the database, the archive, the program."""
+"""Open files reserved for the connection reserve, the database, the archive and the program."""
 
 QUEUED = 4096
 TAKEN_AT_ONCE = 16
@@ -42,7 +42,7 @@ BEAT_S = 0.5
 SOCKET_MESSAGE_OCTETS = 4096
 
 SWITCH_S = 0.0005
-"""Python threads that compute give way to the event loop after so long (default: 5 ms)."""
+"""Interval after which computing Python threads yield to the event loop (default of Python: 5 ms)."""
 
 
 def serve(settings: Settings) -> None:
@@ -76,14 +76,15 @@ def serve(settings: Settings) -> None:
         http=http,
         ws=websocket,
         ws_max_size=SOCKET_MESSAGE_OCTETS,
-        # A compressor for every socket costs more memory than the messages are worth.
+        # Compression needs a compressor for each socket, too much memory for short messages.
         ws_per_message_deflate=False,
         log_config=logging_config(settings.log_format),
         timeout_graceful_shutdown=20,
         # Longer than clients and proxies keep idle connections, so that none is closed under a request of theirs.
         timeout_keep_alive=75,
         server_header=False,
-        # `proxies` does this, for proxies that the settings name; the server itself would believe any local process.
+        # `proxies` handles these headers for configured proxies; uvicorn itself would accept them from any local
+        # process.
         proxy_headers=False,
     )
     host, port = listener.getsockname()[:2]
@@ -95,7 +96,7 @@ def serve(settings: Settings) -> None:
 
 
 def _server(config: uvicorn.Config, listener: socket.socket) -> uvicorn.Server:
-    """A server that takes its connections from a front process."""
+    """Return a server that receives its connections from a front process."""
     import uvicorn
 
     class Server(uvicorn.Server):
@@ -127,7 +128,7 @@ def _server(config: uvicorn.Config, listener: socket.socket) -> uvicorn.Server:
 
 
 class FrontProcess:
-    """The front process as the server sees it: connections come out of a channel, a heartbeat goes in."""
+    """Server side of the front process: it receives connections from a channel and writes the heartbeat."""
 
     def __init__(
         self, listener: socket.socket, serve: Callable[[socket.socket], Coroutine[Any, Any, object]]
@@ -137,7 +138,7 @@ class FrontProcess:
         self._tasks: set[asyncio.Task[object]] = set()
 
     def start(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Start the process, and take connections from it; it is started again where it ends."""
+        """Start the process and receive connections from it; restart it if it ends."""
         self._loop = loop
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         self._channel.setblocking(False)
@@ -159,7 +160,7 @@ class FrontProcess:
         loop.add_reader(self._channel, self._take)
 
     def stop(self) -> None:
-        """Accept no more connections; the process ends with its channel."""
+        """Stop accepting connections; the process ends when its channel is closed."""
         self._beats.cancel()
         self._loop.remove_reader(self._channel)
         self._channel.close()
@@ -186,7 +187,7 @@ class FrontProcess:
                 task.add_done_callback(self._tasks.discard)
 
     def _again(self) -> None:
-        log.error("the front process has ended; it is started again")
+        log.error("the front process has ended; restarting it")
         self.stop()
         self.start(self._loop)
 

@@ -1,7 +1,7 @@
-"""Open WebSockets: who holds them, how many there may be, whether their callers may still hold them, and the feed.
+"""Open WebSockets: their callers and limits, periodic authorisation, and the feed.
 
-The feed is read once for all sockets of a process, however many there are. Callers are verified again every
-`VERIFY_S`: a socket whose token was revoked or has expired, or whose user was disabled, is closed.
+The feed is read once for all sockets of a process. Callers are verified again every `VERIFY_S`: a socket is closed if
+its token was revoked or has expired, or if its user was disabled.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ POLL_S = 0.5
 CLOSE_S = 2.0
 BATCH = 200
 QUEUED_LIMIT = 1000
-"""Messages kept for a client that reads slowly; one with more is closed and comes back for what it missed."""
+"""Largest number of queued messages of a socket; a socket with more is closed, and its client can reconnect."""
 
 REPLAYS_AT_ONCE = 2
 POLICY_VIOLATION = 1008
@@ -44,7 +44,7 @@ TRY_AGAIN_LATER = 1013
 
 @dataclass(eq=False, slots=True)
 class Session:
-    """A socket and its caller, as last verified; `ended` holds the code to close with."""
+    """Socket and its caller, as last verified; `ended` holds the close code."""
 
     socket: WebSocket
     caller: Caller
@@ -53,12 +53,12 @@ class Session:
     messages: asyncio.Queue[tuple[int, str]] = field(default_factory=lambda: asyncio.Queue(QUEUED_LIMIT))
 
     async def accept(self) -> None:
-        """Open the socket; whoever sent its token as a sub-protocol expects the name of that one back."""
+        """Accept the socket; a client that sent its token as a sub-protocol receives the sub-protocol name back."""
         protocol = "bearer" if "sec-websocket-protocol" in self.socket.headers else None
         await self.socket.accept(subprotocol=protocol)
 
     def end(self, code: int) -> None:
-        """Have the socket closed."""
+        """Request that the socket is closed."""
         if not self.ended.done():
             self.ended.set_result(code)
 
@@ -71,7 +71,7 @@ class Session:
 
 
 class Sockets:
-    """The WebSockets of one process."""
+    """WebSockets of one process."""
 
     def __init__(self, ground: Ground, *, open_without_users: bool, per_user: int, total: int) -> None:
         self._ground = ground
@@ -85,7 +85,7 @@ class Sockets:
 
     @asynccontextmanager
     async def admitted(self, socket: WebSocket) -> AsyncIterator[Session | None]:
-        """The session of a socket whose caller may look, to be accepted; None where it was refused."""
+        """Yield the session of a socket whose caller is authorised, to be accepted; None if it was refused."""
         token = token_of(socket)
         caller = await run_in_threadpool(self._verified, token)
         if caller is None or not caller.may("viewer"):
@@ -99,7 +99,7 @@ class Sockets:
         if self._holders[holder] >= self._per_user or len(self._sessions) >= self._total:
             limit = f"{self._per_user} of one user and {self._total} in all"
             refusal = problem(429, "too many sockets", f"WebSockets: expected at most {limit}")
-            with contextlib.suppress(RuntimeError):  # a server without denial responses has closed it
+            with contextlib.suppress(RuntimeError):  # a server without denial responses has closed the socket
                 await socket.send_denial_response(refusal)
             yield None
             return
@@ -117,9 +117,9 @@ class Sockets:
             session.end(POLICY_VIOLATION)
 
     async def follow(self, session: Session, after: int | None) -> None:
-        """Open a socket and send it the feed, until cancelled: first what came after a number, then what happens.
+        """Open a socket and send it the feed until cancelled: first messages after a number, then new messages.
 
-        Without a number that is all that happens after the socket was opened.
+        Without a number, only messages after the opening of the socket are sent.
         """
         newest = await run_in_threadpool(last_number, self._ground)
         if not self._readers:
@@ -127,7 +127,7 @@ class Sockets:
         self._readers.add(session)
         await session.accept()
         number = newest if after is None else after
-        known = self._number  # what comes after this is queued for the session
+        known = self._number  # later messages are queued for the session
         at = number
         while at < known:
             async with self._replays:
@@ -143,7 +143,7 @@ class Sockets:
                 await session.socket.send_text(text)
 
     async def run(self) -> None:
-        """Read the feed for all sockets, and verify their callers, until cancelled."""
+        """Read the feed for all sockets and verify their callers until cancelled."""
         await asyncio.gather(self._read(), self._verify())
 
     async def _read(self) -> None:
@@ -181,7 +181,7 @@ class Sockets:
                         session.caller = caller
 
     def _verified(self, token: str | None) -> Caller | None:
-        """Whose token it is now; the local user without one where there are no users."""
+        """Return the caller of a token; the local user if there are no users."""
         if token is None:
             return LOCAL_CALLER if self._open_without_users and not has_users(self._ground) else None
         try:
@@ -191,7 +191,7 @@ class Sockets:
 
 
 async def until_over(session: Session, *work: Any) -> None:
-    """Do several things at once until the first of them ends, the client goes, or the session is ended."""
+    """Run tasks concurrently until the first one ends, the client disconnects, or the session is ended."""
     tasks = [asyncio.ensure_future(one) for one in work]
     try:
         await asyncio.wait([*tasks, session.ended], return_when=asyncio.FIRST_COMPLETED)
@@ -210,14 +210,14 @@ async def until_over(session: Session, *work: Any) -> None:
 
 
 async def until_gone(socket: WebSocket) -> None:
-    """Read and drop what the client sends, until it goes."""
+    """Discard the messages of the client until it disconnects."""
     with contextlib.suppress(WebSocketDisconnect, RuntimeError):
         while (await socket.receive())["type"] != "websocket.disconnect":
             pass
 
 
 def token_of(socket: WebSocket) -> str | None:
-    """The token of the Authorization header, or the second value of the sub-protocol ``bearer``; None without one."""
+    """Return the token of the Authorization header or of the sub-protocol ``bearer``; None without one."""
     protocols = [value.strip() for value in socket.headers.get("sec-websocket-protocol", "").split(",")]
     scheme, _, token = socket.headers.get("authorization", "").partition(" ")
     if scheme.lower() == "bearer":
@@ -226,7 +226,7 @@ def token_of(socket: WebSocket) -> str | None:
 
 
 def text_of(item: dict[str, Any]) -> str:
-    """A message of the feed as it is sent."""
+    """Return a message of the feed as text."""
     message = {
         "sequence": item["id"],
         "time": time_text(item["utc_ns"]),

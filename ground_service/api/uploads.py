@@ -1,8 +1,8 @@
-"""Uploads: bodies that are streamed into the archive of files, a bounded number of them at once.
+"""Uploads: bodies that are streamed into the file archive, with a limit of simultaneous uploads.
 
-A body is received on the event loop and written by a few threads of its own, a block at a time. A client that sends
-slowly or not at all therefore holds a place and an open file, but no thread. Requests other than uploads do not
-depend on these threads.
+A body is received on the event loop and written block by block by a few dedicated threads. A client that sends slowly
+or not at all therefore uses an upload slot and an open file, but no thread. Other requests do not depend on these
+threads.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Result = TypeVar("Result")
 
 
 class UploadPool:
-    """The uploads of one process: how many there may be at once, and the threads that write them."""
+    """Upload slots of one process, and the threads that write uploads."""
 
     def __init__(self, at_once: int) -> None:
         self._places = asyncio.Semaphore(at_once)
@@ -40,12 +40,12 @@ class UploadPool:
 
     @asynccontextmanager
     async def place(self) -> AsyncIterator[None]:
-        """A place for one upload, waited for a little.
+        """Reserve an upload slot, after a short wait if needed.
 
         Raises
         ------
         Busy
-            If none is free.
+            If no slot is free.
         """
         if self._places.locked():
             if self._waiting >= WAITING_LIMIT:
@@ -65,36 +65,36 @@ class UploadPool:
             self._places.release()
 
     async def run(self, function: Callable[..., Result], *arguments: object) -> Result:
-        """The result of a function, called in a thread of the uploads."""
+        """Run a function in an upload thread and return its result."""
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
 
     def close(self) -> None:
-        """Wait for what is being written."""
+        """Wait for pending writes."""
         self._threads.shutdown(wait=True, cancel_futures=True)
 
 
 class Upload:
-    """One upload that has a place."""
+    """Upload with a reserved slot."""
 
     def __init__(self, request: Request, pool: UploadPool) -> None:
         self._request = request
         self._pool = pool
 
     async def run(self, function: Callable[..., Result], *arguments: object) -> Result:
-        """The result of a function, called in a thread of the uploads."""
+        """Run a function in an upload thread and return its result."""
         return await self._pool.run(function, *arguments)
 
     async def stored(self) -> StoredFile:
-        """The body, in the archive of files. Nothing of it stays if it does not come whole.
+        """Store the body in the file archive. Nothing is stored if the body is incomplete.
 
         Raises
         ------
         TooLarge
-            If there is more of it than the service takes.
+            If the body is larger than the limit.
         UnsupportedEncoding
-            If it is compressed for the transfer: what is archived has to be what was recorded.
+            If the transfer is compressed: the archive must hold the recorded octets.
         BrokenOff
-            If the client goes, or is too slow.
+            If the client disconnects or is too slow.
         """
         coding = self._request.headers.get("content-encoding", "identity").strip().lower()
         if coding != "identity":
@@ -120,7 +120,7 @@ class Upload:
 
             return await self._pool.run(finish)
         except ClientDisconnect:
-            raise BrokenOff(f"body: expected to its end, found {taken} octets") from None
+            raise BrokenOff(f"body: expected a complete body, found {taken} octets") from None
         finally:
             incoming.discard()
 
@@ -128,7 +128,7 @@ class Upload:
 async def upload_of(
     request: Request, _: Annotated[Caller, Depends(requires("operator"))]
 ) -> AsyncIterator[Upload]:
-    """A place for the body of a request whose caller may upload."""
+    """Yield an upload slot for a request whose caller may upload."""
     pool: UploadPool = request.app.state.uploads
     async with pool.place():
         yield Upload(request, pool)

@@ -1,7 +1,7 @@
-"""Transfer frames of a downlink, the packets of their virtual channels, and what is cut off at the edges of both.
+"""Transfer frames of a downlink, the packets of their virtual channels, and the fragments at the edges of both.
 
-Packets are taken from runs of frames whose channel counts follow each other. Octets of a packet that a run does not
-hold as a whole are returned as channel edges, so that they can be joined with those of other runs, in whatever file.
+Packets are extracted from runs of frames with consecutive channel counts. Octets of incomplete packets are returned as
+channel edges, so that they can be joined with those of other runs, also from other files.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ _BATCH = 512
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameBlock:
-    """Frames (n, frame_length) of CADUs at known offsets: repaired, `good` (n,) where codes and checksums hold.
+    """Corrected frames (n, frame_length) of CADUs at known offsets, `good` (n,) if codes and checksums are valid.
 
-    `corrected` (n,) counts repaired symbols.
+    `corrected` (n,) is the number of corrected symbols.
     """
 
     settings: LinkSettings
@@ -55,12 +55,12 @@ class FrameBlock:
     corrected: IntArray
 
     def of(self, spacecraft_id: int) -> NDArray[np.bool_]:
-        """Which frames (n,) are good ones of a spacecraft."""
+        """Return which frames (n,) are good frames of a spacecraft."""
         mine: NDArray[np.bool_] = self.good & (self.header.spacecraft_id == spacecraft_id)
         return mine
 
     def only(self, index: int) -> FrameBlock:
-        """One of the frames."""
+        """Return a block with one of the frames."""
         one = slice(index, index + 1)
         frames = self.frames[one]
         return FrameBlock(
@@ -73,13 +73,13 @@ class FrameBlock:
         )
 
     def spacecraft(self) -> list[int]:
-        """Ids that good frames carry, the commonest first."""
+        """Return the spacecraft ids of good frames, the most frequent first."""
         ids, counts = np.unique(self.header.spacecraft_id[self.good], return_counts=True)
         return [int(i) for i in ids[np.argsort(-counts, kind="stable")]]
 
 
 def marker_errors(octets: OctetArray, starts: IntArray) -> IntArray:
-    """Bits in which the four octets at each of `starts` (n,) differ from the marker."""
+    """Return the number of wrong marker bits in the four octets at each of `starts` (n,)."""
     word = octets[starts].astype(np.uint32)
     for k in range(1, ASM_LENGTH):
         word = word << np.uint32(8) | octets[starts + k]
@@ -88,12 +88,12 @@ def marker_errors(octets: OctetArray, starts: IntArray) -> IntArray:
 
 
 def is_checked(settings: LinkSettings) -> bool:
-    """Whether frames carry a code or a checksum that a wrong frame would fail."""
+    """Return whether frames have a code or a checksum."""
     return settings.proves_frames
 
 
 def read_frames(stream: OctetArray, offsets: IntArray, settings: LinkSettings) -> FrameBlock:
-    """The frames of whole CADUs that begin at octets `offsets` (n,) of `stream`."""
+    """Return the frames of complete CADUs that begin at octets `offsets` (n,) of `stream`."""
     length = settings.cadu_length
     if not offsets.size:
         return frames_of(np.empty((0, length), dtype=np.uint8), offsets, settings)
@@ -102,7 +102,7 @@ def read_frames(stream: OctetArray, offsets: IntArray, settings: LinkSettings) -
 
 
 def frames_of(cadus: OctetArray, offsets: IntArray, settings: LinkSettings) -> FrameBlock:
-    """The frames of CADUs (n, length), markers included, that were found at `offsets` (n,)."""
+    """Return the frames of CADUs (n, length), markers included, at `offsets` (n,)."""
     code = settings.code
     n = offsets.size
     frames = np.empty((n, settings.frame_length), dtype=np.uint8)
@@ -127,7 +127,7 @@ def frames_of(cadus: OctetArray, offsets: IntArray, settings: LinkSettings) -> F
 
 
 def control_words(block: FrameBlock, spacecraft_id: int) -> NDArray[np.uint32]:
-    """Operational control fields (n,) of the good frames of a spacecraft that have one, in order."""
+    """Return the operational control fields (n,) of the good frames of a spacecraft that have one, in order."""
     end = block.settings.frame_length - (CRC_LENGTH if block.settings.checksum else 0)
     mine = np.flatnonzero(block.of(spacecraft_id) & block.header.ocf)
     words = np.ascontiguousarray(block.frames[mine, end - OCF_LENGTH : end]).view(">u4")
@@ -135,12 +135,12 @@ def control_words(block: FrameBlock, spacecraft_id: int) -> NDArray[np.uint32]:
 
 
 Channel = tuple[int, int, int, int]
-"""Spacecraft, virtual channel, and where the packet zone of its frames begins and ends."""
+"""Spacecraft, virtual channel, and start and end of the packet zone in its frames."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelEdge:
-    """An edge of a run of frames of one channel."""
+    """Edge of a run of frames of one channel."""
 
     channel: Channel
     edge: Edge
@@ -148,9 +148,9 @@ class ChannelEdge:
 
 @dataclass(slots=True)
 class ChannelReader:
-    """Packets of the channels of one stream, read block by block of frames.
+    """Reader of the packets of all channels of one stream, one block of frames at a time.
 
-    What a block leaves unfinished at its end is kept for the next one; `edges` gathers what is cut off at gaps.
+    Incomplete packets at the end of a block are kept for the next one; `edges` collects the fragments at gaps.
     """
 
     dictionary: Dictionary
@@ -161,12 +161,12 @@ class ChannelReader:
     _open: dict[Channel, Edge] = field(default_factory=dict)
 
     def read(self, block: FrameBlock, spacecraft_id: int) -> PacketBatch:
-        """The packets of a spacecraft that are whole with this block, decoded."""
+        """Return the decoded packets of a spacecraft that are complete with this block."""
         buffer, cut = self.cut(block, spacecraft_id)
         return batch_of_cut(buffer, cut, self.dictionary, spacecraft_id)
 
     def cut(self, block: FrameBlock, spacecraft_id: int) -> tuple[bytes, PacketCut]:
-        """Octets, and where in them the packets of a spacecraft stand that are whole with this block."""
+        """Return octets, and the positions in them of the packets of a spacecraft that are complete with this block."""
         parts: list[bytes | OctetArray] = []
         segments: list[tuple[int, int]] = []
         filled = 0
@@ -185,7 +185,7 @@ class ChannelReader:
         return buffer, cut
 
     def close(self) -> None:
-        """Give what is still unfinished to the edges."""
+        """Add the incomplete packets to the edges."""
         for channel, edge in self._open.items():
             self._cut_off(channel, edge)
         self._open.clear()
@@ -199,7 +199,7 @@ class ChannelReader:
     def _channel(
         self, channel: Channel, zones: OctetArray, count: IntArray, pointer: IntArray, checked: bool
     ) -> Iterator[tuple[bytes | OctetArray, list[tuple[int, int]]]]:
-        """Octets and the stretches of them that hold whole packets."""
+        """Return octets and the segments of them that hold complete packets."""
         zone = zones.shape[1]
         idle = pointer == ONLY_IDLE_DATA
         buffer = np.ascontiguousarray(zones[~idle]).reshape(-1)
@@ -213,7 +213,7 @@ class ChannelReader:
                 self._cut_off(channel, kept)
                 kept = None
             low, high = int(row[first]), int(row[stop])
-            if low == high:  # nothing but idle frames: the run goes on, without octets
+            if low == high:  # only idle frames: the run continues without octets
                 if kept is not None:
                     self._open[channel] = kept.followed_by(b"", after)
                 continue
@@ -242,13 +242,13 @@ class ChannelReader:
             ranges.append((begin, end if checked else high * zone))
             if tail:
                 self._open[channel] = Edge(OPENER, UNKNOWN, after, tail)
-                if not checked:  # its octets are searched and counted as well
+                if not checked:  # its octets are also searched and counted
                     self.octets_unused -= len(tail)
         yield buffer, ranges
 
 
 def packets_end(buffer: OctetArray | bytes, start: int, stop: int) -> int:
-    """Where the packet begins that does not end within [start, stop), by the lengths of those before; else `stop`."""
+    """Return the start of the packet that does not end within [start, stop), by packet lengths; else `stop`."""
     while stop - start >= PRIMARY_HEADER_LENGTH:
         length = (int(buffer[start + 4]) << 8 | int(buffer[start + 5])) + PRIMARY_HEADER_LENGTH + 1
         if start + length > stop:
@@ -260,7 +260,7 @@ def packets_end(buffer: OctetArray | bytes, start: int, stop: int) -> int:
 def _channels(
     block: FrameBlock, spacecraft_id: int
 ) -> Iterator[tuple[Channel, OctetArray, IntArray, IntArray]]:
-    """Packet zones (m, zone), channel counts and first header pointers (m,) of each channel of a spacecraft."""
+    """Yield packet zones (m, zone), channel counts and first header pointers (m,) of each channel of a spacecraft."""
     header = block.header
     end = block.settings.frame_length - (CRC_LENGTH if block.settings.checksum else 0)
     secondary = block.frames[:, FRAME_HEADER_LENGTH] & 0x3F
@@ -273,7 +273,7 @@ def _channels(
         zones, count = block.frames[rows, low:high], header.channel_count[rows]
         pointer = header.first_header_pointer[rows]
         again = np.flatnonzero(np.diff(count) == 0) + 1
-        if again.size:  # the same frame twice in a row
+        if again.size:  # the same frame twice in succession
             again = again[(zones[again] == zones[again - 1]).all(axis=1)]
             keep = np.ones(rows.size, dtype=np.bool_)
             keep[again] = False

@@ -96,7 +96,7 @@ def _joined(pieces: list[Columns]) -> Columns:
 def packet_ticks(
     buffer: Octets, cut: PacketCut, good: IntArray, secondary_header: NDArray[np.bool_]
 ) -> IntArray:
-    """Return the on-board time (n,) of PUS-C packets with the agency's CUC 4+2; `NO_TICKS` for all others."""
+    """Return the on-board time (n,) of PUS-C packets with CUC 4+2 time (agency epoch); `NO_TICKS` for all others."""
     ticks = np.full(len(good), NO_TICKS, dtype=np.int64)
     long_enough = np.flatnonzero(secondary_header & (cut.lengths[good] >= _TIMED_HEADER.itemsize))
     header = gather(as_octets(buffer), cut.offsets[good[long_enough]], _TIMED_HEADER)

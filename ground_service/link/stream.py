@@ -1,7 +1,7 @@
-"""A downlink, read window by window: packets are handed on as soon as they are whole, every octet is accounted for.
+"""Reader of a downlink in windows: packets are returned when complete, every octet is accounted for.
 
-Windows of a CADU stream do not overlap: what one leaves unfinished (a CADU, a packet of a channel) is kept for the
-next. What is unfinished at the ends of the stream is given as edges, to be joined with those of other files.
+Windows of a CADU stream do not overlap: an incomplete CADU or packet at the end of a window is kept for the next.
+Incomplete units at the ends of the stream are returned as edges, to be joined with those of other files.
 """
 
 from __future__ import annotations
@@ -48,27 +48,27 @@ PROBE_OCTETS = 256 << 10
 """Octets from which the settings of a link are told; the whole window where the stream begins with noise."""
 
 CADU_MAX_OCTETS = 2048 + 2 * 16 * 8 + ASM_LENGTH
-"""No CADU of a known setting is longer."""
+"""Length of the longest CADU of the known link settings."""
 
 FOREIGN_FRAMES = 2
-"""A spacecraft is believed to be in a stream of frames without any check from this many frames on."""
+"""Number of frames from which a spacecraft is accepted in a stream of frames without code or checksum."""
 
 _CONTEXT_CADUS = 6
-"""CADUs of one window that the next is synchronised by: enough that the lock is settled."""
+"""Number of CADUs of one window used to synchronise the next: enough for a stable lock."""
 
 _LED_BACK = 64
-"""CADUs before the first marker that are tried."""
+"""Number of CADUs tried before the first marker."""
 
 _REGULAR_FRAMES = 3
-"""Frames without any check have to be this many, at equal distances, to show their link."""
+"""Number of equally spaced frames without code or checksum needed to determine their link."""
 
 _CERTAIN_PERIODS = 8
-"""Markers at this many distances are no chance: a coding that is not known is an error then."""
+"""Number of equal marker distances that exclude chance: an unknown coding is then an error."""
 
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """How a downlink comes: as CADUs with these settings, or as bare packets (None)."""
+    """Form of a downlink: CADUs with link settings, or bare packets (None)."""
 
     settings: LinkSettings | None
 
@@ -92,18 +92,18 @@ class LinkAccounting:
 
 
 class DownlinkReader:
-    """Reads one stream: CADUs or bare space packets, told apart by content.
+    """Reader of one stream of CADUs or bare space packets, distinguished by content.
 
-    After the last batch `link` says how it came (None: nothing in it could be read), `edges` what stands at its
-    ends, and `take_channel_edges` gives what was cut off in its channels.
+    After the last batch, `link` is the form of the stream (None: unreadable), `edges` holds the fragments at its ends,
+    and `take_channel_edges` returns the fragments in its channels.
 
     Parameters
     ----------
     spacecraft_id
-        Only frames of this spacecraft are used; None: those of every spacecraft in the stream. Bare packets do not
-        say whose they are.
+        Only frames of this spacecraft are used; None: those of every spacecraft in the stream. Bare packets carry no
+        spacecraft id.
     known
-        Links that are tried before the settings are found out from the stream.
+        Links that are tried before the settings are determined from the stream.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class DownlinkReader:
         self._located = False
 
     def take_channel_edges(self) -> list[ChannelEdge]:
-        """What was cut off in the channels since the last call."""
+        """Return the fragments in the channels since the last call."""
         edges, self._channels.edges = self._channels.edges, []
         return edges
 
@@ -164,7 +164,7 @@ class DownlinkReader:
             self.edges = fragment_edges(rest, None)
 
     def _link_of(self, window: bytes) -> Link | None:
-        """How the stream travels that begins like this; None while that cannot be told."""
+        """Return the link of a stream that begins with these octets; None if it cannot be determined yet."""
         for link in self._known:
             if link.settings is not None and _good_frames(window, link.settings):
                 return link
@@ -174,7 +174,7 @@ class DownlinkReader:
         return found
 
     def _packets(self, window: bytes, final: bool) -> tuple[bytes, PacketBatch]:
-        """Octets left over and the packets of a window of bare packets."""
+        """Return the remaining octets and the packets of a window of bare packets."""
         cut = cut_packets(window, final=final)
         if not self._located and (len(cut) or final):
             self._located = True
@@ -193,7 +193,7 @@ class DownlinkReader:
         return rest, batch_of_cut(window, cut, self._dictionary, self._spacecraft_id)
 
     def _frames(self, window: OctetArray, settings: LinkSettings, final: bool) -> Iterator[PacketBatch]:
-        """Batches of every spacecraft in a window."""
+        """Yield the batches of every spacecraft in a window."""
         length = settings.cadu_length
         stream = np.concatenate((self._held, window))
         base, context = self._position - self._held.size, self._context
@@ -224,7 +224,7 @@ class DownlinkReader:
             self._tail_edge(stream, block, end, base)
             accounting.octets_skipped += int(stream.size - context - offsets.size * length)
             return
-        # the last CADUs are kept as what the next window is synchronised by, and what is not whole yet
+        # keep the last CADUs, to synchronise the next window, and the incomplete one
         kept_from = max(end - _CONTEXT_CADUS * length, 0) if offsets.size or context else 0
         if stream.size - end > 2 * length:
             kept_from = end = stream.size - 2 * length
@@ -233,7 +233,7 @@ class DownlinkReader:
         self._position = base + stream.size
 
     def _wanted(self, block: FrameBlock) -> list[int]:
-        """Spacecraft whose frames are used."""
+        """Return the spacecraft whose frames are used."""
         found = block.spacecraft()
         if self._spacecraft_id is not None:
             return [one for one in found if one == self._spacecraft_id]
@@ -257,7 +257,7 @@ class DownlinkReader:
         self._last_words[spacecraft] = both[::-1][np.sort(newest)][::-1]
 
     def _head_edge(self, stream: OctetArray, block: FrameBlock, base: int) -> None:
-        """Note the octets before the first CADU, which end one that began before the stream."""
+        """Add the octets before the first CADU, the end of a CADU that began before the stream, to the edges."""
         loose = int(block.offsets[0]) % block.settings.cadu_length
         if base or self._context or not loose:
             return
@@ -269,7 +269,7 @@ class DownlinkReader:
         self.edges.append(Edge(CLOSER, count, UNKNOWN, stream[:loose].tobytes(), 0))
 
     def _tail_edge(self, stream: OctetArray, block: FrameBlock, end: int, base: int) -> None:
-        """Note the octets behind the last CADU, which begin one that goes on behind the stream."""
+        """Add the octets after the last CADU, the start of a CADU that continues after the stream, to the edges."""
         settings = block.settings
         if 0 < stream.size - end < settings.cadu_length and (self._located or block.offsets.size):
             count = UNKNOWN
@@ -286,12 +286,12 @@ class DownlinkReader:
 
 
 def proposed_link(window: bytes, dictionary: Dictionary = DICTIONARY) -> Link | None:
-    """How a stream travels that holds these octets, where they are evidence enough; else None.
+    """Return the link of a stream with these octets; None if they are not sufficient evidence.
 
     Raises
     ------
     LinkFormatError
-        If markers stand at a regular distance and no coding that is known fits.
+        If markers have a regular distance and no known coding fits.
     """
     try:
         probe = decode(window[:PROBE_OCTETS], dictionary=dictionary)
@@ -311,9 +311,9 @@ def proposed_link(window: bytes, dictionary: Dictionary = DICTIONARY) -> Link | 
 
 
 def fragment_edges(octets: bytes, settings: LinkSettings | None) -> list[Edge]:
-    """Edges of a piece in which no whole unit was found: around a marker, or a middle.
+    """Return the edges of a piece without a complete unit: around a marker, or a middle.
 
-    A piece that ends with the first octets of a marker may be either; both are given then.
+    For a piece that ends with the first octets of a marker, both are returned.
     """
     if settings is None:
         if len(octets) > PACKET_MAX_LENGTH:
@@ -334,7 +334,7 @@ def fragment_edges(octets: bytes, settings: LinkSettings | None) -> list[Edge]:
 
 
 def _begins_packet(octets: bytes) -> bool:
-    """Whether a PUS-C telemetry packet seems to begin here that does not end here."""
+    """Return whether an incomplete PUS-C telemetry packet seems to begin here."""
     return (
         len(octets) > PRIMARY_HEADER_LENGTH
         and octets[0] & 0xF8 == 0x08
@@ -344,7 +344,7 @@ def _begins_packet(octets: bytes) -> bool:
 
 
 def _around(octets: bytes, marker: int, settings: LinkSettings) -> list[Edge]:
-    """The end of a CADU before a marker, and the beginning of one at it."""
+    """Return the end of the CADU before a marker, and the start of the CADU at it."""
     opener = opener_of(octets[marker:], settings, marker, UNKNOWN)
     edges = []
     if 0 < marker < settings.cadu_length:
@@ -356,7 +356,7 @@ def _around(octets: bytes, marker: int, settings: LinkSettings) -> list[Edge]:
 
 
 def opener_of(octets: bytes, settings: LinkSettings, start: int, count: int) -> Edge:
-    """The beginning of a CADU; its own header says its count where it is there, else `count` does."""
+    """Return the start of a CADU as an opener; its count is that of its header if complete, else `count`."""
     header = randomise(as_octets(octets)[ASM_LENGTH:], settings.randomiser)[:FRAME_HEADER_LENGTH]
     if header.size == FRAME_HEADER_LENGTH:
         fields = frame_headers(header[None])
@@ -366,7 +366,7 @@ def opener_of(octets: bytes, settings: LinkSettings, start: int, count: int) -> 
 
 
 def _good_frames(window: bytes, settings: LinkSettings) -> bool:
-    """Whether a window holds a good frame of these settings."""
+    """Return whether a window holds a good frame with these settings."""
     for octets in (window[:PROBE_OCTETS], window if len(window) > PROBE_OCTETS and ASM in window else b""):
         stream = as_octets(octets)
         sync = cadu.synchronise(stream, settings.cadu_length, verify=proof_of(stream, settings))
@@ -382,7 +382,7 @@ def _good_frames(window: bytes, settings: LinkSettings) -> bool:
 
 
 def _led_back(stream: OctetArray, first: int, settings: LinkSettings) -> IntArray:
-    """Where CADUs stand before the first one found whose markers are damaged and whose frames are good."""
+    """Return the start of good CADUs with damaged markers before the first CADU found."""
     length = settings.cadu_length
     before = first - length * np.arange(min(first // length, _LED_BACK), 0, -1, dtype=np.int64)
     if not before.size or not is_checked(settings):

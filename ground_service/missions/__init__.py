@@ -1,1 +1,1 @@
-"""Mission descriptions: what the ground knows about a spacecraft, as immutable revisions of one document."""
+"""Mission descriptions: properties of a spacecraft known to the ground, as immutable revisions of one document."""

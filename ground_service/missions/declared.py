@@ -1,6 +1,6 @@
-"""What the manifest of an archive without `mission.toml` declares, as a mission description.
+"""Mission description from the manifest of an archive without `mission.toml`.
 
-Only keys and exact values that emulators have written are read; everything else is not stated.
+Only keys and exact values that emulators have written are read; all other values are not stated.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from ground_service.missions.model import (
 AnySection = TypeVar("AnySection", bound=Section)
 
 ORIENTATION_PREFIX = "orientation "
-"""The entry of `data_sources` that names the lunar orientation begins so."""
+"""Prefix of the entry of `data_sources` that names the lunar orientation."""
 
 REAL_TERRAINS = ("LROC WAC GLD100", "SLDEM2015")
-"""Names of real terrains that emulators wrote as `terrain`."""
+"""Names of real terrains in the manifest key `terrain`."""
 
 
 def mission_of_manifest(manifest: Mapping[str, Any]) -> Mission:
-    """Return what a manifest declares of the mission."""
+    """Return the mission description that a manifest declares."""
     sources = manifest.get("data_sources")
     named = [str(one) for one in sources] if isinstance(sources, list | tuple) else []
     orientations = [
@@ -71,7 +71,7 @@ def mission_of_manifest(manifest: Mapping[str, Any]) -> Mission:
 
 
 def _world(terrain: str, seed: object) -> World | None:
-    """The world of a terrain's name; whether training saw real terrain is not declared."""
+    """Return the world of a terrain name; a manifest does not state whether real terrain was used in training."""
     if terrain in REAL_TERRAINS:
         return "real-terrain"
     made = terrain == f"procedural Moon, seed {seed}" or terrain.endswith(
@@ -86,7 +86,7 @@ def _table(manifest: Mapping[str, Any], key: str) -> Mapping[str, Any]:
 
 
 def _section(kind: type[AnySection], **values: Any) -> AnySection:
-    """A section of the values that it accepts; what it refuses is not stated."""
+    """Return a section with the accepted values; refused values are not stated."""
     kept = {}
     for key, value in values.items():
         try:

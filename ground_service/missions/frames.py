@@ -1,6 +1,6 @@
-"""The lunar orientation and the gravity fields that a mission description declares.
+"""Lunar orientation and gravity fields declared by a mission description.
 
-The data folder of this machine decides only whether a declared model can be used, never which one is used.
+The local data folder decides only whether a declared model is available, never which model is used.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ REMEDY = "set LINNA_DATA to a folder that has it, or run linna data fetch"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DeclaredFrames:
-    """Models to evaluate with; None where one is not stated or not available, with the reason in `refused`.
+    """Models for the evaluation; None if not stated or not available, with the reason in `refused`.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class DeclaredFrames:
 
 
 def declared_frames(frames: Frames, data: DataFolder) -> DeclaredFrames:
-    """Return the models that a mission declares, as far as they are available."""
+    """Return the declared and available models of a mission."""
     refused: dict[str, str] = {}
     orientation = _orientation(frames.orientation, data)
     if orientation is None:

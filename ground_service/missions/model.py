@@ -1,7 +1,7 @@
-"""The mission description: `mission.toml` as a typed value, and its revisions.
+"""Mission description: `mission.toml` as a typed value, and its revisions.
 
-A value that the document does not state is None ("not stated"); nothing is filled in. Unknown keys are refused with the
-nearest known key. Angles are degrees, lengths metres or kilometres as the key says.
+A value that the document does not state is None ("not stated"); there are no defaults. Unknown keys are refused with
+the nearest known key. Angles are in degrees; lengths are in metres or kilometres, as given by the key.
 """
 
 from __future__ import annotations
@@ -41,30 +41,30 @@ CommandSubject = Annotated[str, AfterValidator(_known_subject)]
 
 
 class Section(BaseModel):
-    """Base of the sections: frozen, no keys but those declared, no numbers that are not finite.
+    """Base class of the sections: frozen, without undeclared keys or non-finite numbers.
 
-    No value is taken for one of another type, such as true for 1; TOML arrays are read as tuples.
+    Values are not converted between types, such as true to 1; TOML arrays are read as tuples.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
 
 class Spacecraft(Section):
-    """The spacecraft."""
+    """Spacecraft identification."""
 
     id: Annotated[int, Field(ge=0, le=1023)] | None = None
     name: str | None = None
 
 
 class DictionarySection(Section):
-    """The packet dictionary of the telemetry."""
+    """Packet dictionary of the telemetry."""
 
     version: int | None = None
     hash: str | None = None
 
 
 class Link(Section):
-    """How telemetry frames travel; `frame_checksum` is the frame error control field (FECF)."""
+    """Settings of the telemetry link; `frame_checksum` is the frame error control field (FECF)."""
 
     frame_length: int | None = None
     coding: Literal["rs", "none"] | None = None
@@ -90,7 +90,7 @@ class Time(Section):
 class Frames(Section):
     """Orientation of the Moon and gravity fields, by name.
 
-    The `onboard` values are those of the tables that the payload flies with; the smoother of the ground uses its field.
+    The `onboard` values are those of the on-board tables; the ground smoother uses the on-board gravity field.
     """
 
     orientation: str | None = None
@@ -104,8 +104,8 @@ class Frames(Section):
 class Camera(Section):
     """Intrinsics, lens, mounting and exposure.
 
-    `pointing` "nadir": the body points to the centre of the Moon with north up. The camera is turned from there by
-    `yaw_deg` clockwise and then by `tilt_deg` from the boresight toward image up. `k1` to `p2` are Brown's
+    `pointing` "nadir": the body points to the centre of the Moon with north up. The camera is rotated from this
+    attitude by `yaw_deg` clockwise and then by `tilt_deg` from the boresight toward image up. `k1` to `p2` are Brown's
     coefficients of the lens.
     """
 
@@ -125,7 +125,7 @@ class Camera(Section):
 
 
 class Catalogue(Section):
-    """The crater catalogue and its registration to the terrain."""
+    """Crater catalogue and its registration to the terrain."""
 
     source: str | None = None
     registration_north_m: float | None = None
@@ -133,7 +133,7 @@ class Catalogue(Section):
 
 
 class Reference(Section):
-    """Where the reference ephemeris comes from, and its 1-sigma error in radial, transverse and normal."""
+    """Source of the reference ephemeris, and its 1-sigma error in radial, transverse and normal."""
 
     source: str | None = None
     sigma_rtn_m: Annotated[tuple[NotNegative, NotNegative, NotNegative], Array] | None = None
@@ -154,7 +154,7 @@ LEVEL_WORDS: dict[Level, str] = {
 
 
 class Evidence(Section):
-    """The world that was flown.
+    """Simulated or real world of the flight, from which the evidence level follows.
 
     `unseen_share` is the share of frames over real terrain that was not used in training.
     """
@@ -165,7 +165,7 @@ class Evidence(Section):
 
     @property
     def level(self) -> Level | None:
-        """Evidence level; None where it does not follow from what is stated."""
+        """Evidence level; None if the stated values do not determine it."""
         if self.world == "real-terrain":
             if self.unseen_share is None:
                 return None
@@ -188,7 +188,7 @@ class Evidence(Section):
 
 
 def weakest_evidence(worlds: Sequence[Evidence]) -> str:
-    """Return the text of the lowest level among several; "" if one of them does not state its level, or without any."""
+    """Return the text of the lowest of several levels; "" if there are none or one is unknown."""
     order = list(LEVEL_WORDS)
     levels = [one.level for one in worlds]
     if not levels or None in levels:
@@ -202,11 +202,11 @@ class Requirements(Section):
     Attributes
     ----------
     estimator
-        The estimator whose accuracy is judged.
+        Name of the estimator whose accuracy is judged.
     better_than
-        Baselines whose median error the estimator has to beat, by name.
+        Names of baselines whose median error must be larger than that of the estimator.
     consistency_inside_percent
-        Least share of NEES and of NIS values inside their two-sided 95 % bounds.
+        Smallest share of NEES and of NIS values inside their two-sided 95 % bounds.
     """
 
     estimator: Estimator | None = None
@@ -237,10 +237,10 @@ class Automation(Section):
 
 
 class Approval(Section):
-    """What people have to approve.
+    """Rules for the approval of telecommands.
 
     `second_person_for` and `one_person_for` change the rule of the packet dictionary. They list telecommands, or
-    functions such as ``perform_function/set_mode``, that two persons or one person release.
+    functions such as ``perform_function/set_mode``, that need two persons or one person for release.
     """
 
     windows: Literal["manual", "automatic"] | None = None
@@ -256,7 +256,7 @@ class Approval(Section):
 
 
 class Mission(Section):
-    """The mission description of one spacecraft."""
+    """Mission description of one spacecraft."""
 
     schema_version: Literal[1] = SCHEMA_VERSION  # type: ignore[assignment]
     name: Annotated[str, Field(min_length=1, max_length=200)]
@@ -275,7 +275,7 @@ class Mission(Section):
 
     @property
     def revision(self) -> str:
-        """SHA-256 of the stated values: the same content has the same revision, whatever its layout."""
+        """SHA-256 of the stated values: the revision depends on the content and not on the layout of the document."""
         stated = self.model_dump(mode="json", exclude_none=True)
         text = json.dumps({k: v for k, v in stated.items() if v != {}}, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
@@ -287,7 +287,7 @@ class Mission(Section):
 
 
 class MissionRevision(BaseModel):
-    """An entered revision of a mission description."""
+    """Stored revision of a mission description."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -301,19 +301,19 @@ class MissionRevision(BaseModel):
 
 
 class MissionDetail(MissionRevision):
-    """An entered revision with its document."""
+    """Stored revision with its document."""
 
     document: Mission
-    text: str = Field(description="mission.toml as it was entered")
+    text: str = Field(description="mission.toml as it was added")
 
 
 def parse_mission(text: str, source: str = "mission.toml") -> Mission:
-    """Return the mission description written in `text`.
+    """Return the mission description in `text`.
 
     Raises
     ------
     InvalidInput
-        The text is not TOML, has an unknown key or a value that is not allowed; the first fault is named.
+        The text is not TOML, or has an unknown key or an invalid value; the message states the first fault.
     """
     result = _read(text, source)
     if isinstance(result, Mission):
@@ -322,7 +322,7 @@ def parse_mission(text: str, source: str = "mission.toml") -> Mission:
 
 
 def mission_faults(text: str, source: str = "mission.toml") -> list[str]:
-    """Return one line for each fault of a mission description; none for a good one."""
+    """Return one line for each fault of a mission description; empty if it is valid."""
     result = _read(text, source)
     return [] if isinstance(result, Mission) else [str(fault) for fault in result]
 

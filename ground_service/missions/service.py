@@ -1,4 +1,4 @@
-"""Use cases of mission descriptions: enter, list, show, and the description that a pass refers to."""
+"""Use cases of mission descriptions: add, list, show, and find the description of a pass."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from ground_service.services.users import audit
 
 
 def read_mission(octets: bytes, source: str = "mission.toml") -> tuple[Mission, str]:
-    """Return a mission description and its text from the octets of a file.
+    """Return the mission description and its text from the octets of a file.
 
     Raises
     ------
     InvalidInput
-        The octets are no mission description.
+        The octets are not a mission description.
     """
     if len(octets) > MISSION_LIMIT_OCTETS:
         raise InvalidInput(source, "", f"at most {MISSION_LIMIT_OCTETS} octets", str(len(octets)))
@@ -50,12 +50,12 @@ def add_mission(
     actor: str = "local",
     may_change_approval: bool = True,
 ) -> MissionDetail:
-    """Enter a mission description as a revision; the same content again gives the same revision.
+    """Add a mission description as a revision; the same content gives the same revision.
 
     Raises
     ------
     Forbidden
-        It changes for which telecommands a second person is needed, and the caller may not do that.
+        It changes which telecommands need a second person, and the caller is not permitted to change that.
     """
     mission, text = read_mission(octets, source)
     with ground.database.writing() as connection:
@@ -73,7 +73,7 @@ def _persons(approval: Approval) -> tuple[frozenset[str], frozenset[str]]:
 
 
 def enter(connection: Connection, mission: Mission, text: str | None = None, *, actor: str) -> int:
-    """Enter a revision in the caller's transaction; its id."""
+    """Add a revision in the caller's transaction; return its id."""
     key, new = store.add_revision(
         connection, mission, text or format_mission(mission), actor=actor, now_utc_ns=utc_now_ns()
     )
@@ -83,7 +83,7 @@ def enter(connection: Connection, mission: Mission, text: str | None = None, *, 
 
 
 def list_missions(ground: Ground, *, limit: int = 100, offset: int = 0) -> tuple[list[MissionRevision], int]:
-    """Return a page of the revisions, the newest first, and the number of all."""
+    """Return a page of the revisions, newest first, and the total number."""
     with ground.database.reading() as connection:
         return store.list_revisions(connection, limit=limit, offset=offset)
 
@@ -95,7 +95,7 @@ def get_mission(ground: Ground, revision: str) -> MissionDetail:
 
 
 def mission_of_pass(connection: Connection, record: Mapping[str, Any]) -> Mission:
-    """Return the description that a pass refers to, else what its manifest declares."""
+    """Return the description that a pass refers to, otherwise that of its manifest."""
     if record["mission_id"] is not None:
         return store.get_mission(connection, record["mission_id"])
     return mission_of_manifest(record["manifest"])

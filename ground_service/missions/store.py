@@ -1,4 +1,4 @@
-"""All SQL of mission descriptions."""
+"""Database access for mission descriptions."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from lunar.timescales import format_utc
 
 MISSIONS = repository.MISSIONS
 ARCHIVE_ACTOR = "archive"
-"""Who enters the mission descriptions that come with pass archives."""
+"""Actor of mission descriptions that are imported with pass archives."""
 
 REVISION_PREFIX = 8
-"""A revision may be named by so many digits or more of its hash."""
+"""Smallest number of hash digits that identify a revision."""
 
 
 def add_revision(
     connection: Connection, mission: Mission, text: str, *, actor: str, now_utc_ns: int
 ) -> tuple[int, bool]:
-    """Enter a revision; its id, and whether it is new. The same content again gives the same entry."""
+    """Add a revision; return its id, and whether it is new. The same content gives the same entry."""
     known = repository.find(connection, MISSIONS, revision=mission.revision)
     if known is not None:
         return int(known["id"]), False
@@ -41,7 +41,7 @@ def add_revision(
                     created_utc_ns=now_utc_ns,
                 )
             ), True
-    except IntegrityError:  # another process entered the same content at the same time
+    except IntegrityError:  # another process added the same content at the same time
         known = repository.find(connection, MISSIONS, revision=mission.revision)
         if known is None:
             raise
@@ -49,7 +49,7 @@ def add_revision(
 
 
 def get_mission(connection: Connection, mission_id: int) -> Mission:
-    """Return the document of an entered revision."""
+    """Return the document of a stored revision."""
     return _document(repository.get(connection, MISSIONS, mission_id, "mission revision"))
 
 
@@ -59,7 +59,7 @@ def find_revision(connection: Connection, revision: str) -> MissionDetail:
     Raises
     ------
     NotFound
-        None begins so, or several do.
+        No hash, or several, begin with these digits.
     """
     wanted = revision.strip().lower()
     rows: list[Any] = []
@@ -72,18 +72,18 @@ def find_revision(connection: Connection, revision: str) -> MissionDetail:
 
 
 def detail(connection: Connection, mission_id: int) -> MissionDetail:
-    """Return an entered revision with its document."""
+    """Return a stored revision with its document."""
     return _detail(repository.get(connection, MISSIONS, mission_id, "mission revision"))
 
 
 def list_revisions(connection: Connection, *, limit: int, offset: int) -> tuple[list[MissionRevision], int]:
-    """Return a page of the revisions, the newest first, and the number of all."""
+    """Return a page of the revisions, newest first, and the total number."""
     page = repository.page(connection, MISSIONS, limit=limit, offset=offset)
     return [_revision(row, _document(row)) for row in page.rows], page.total
 
 
 def newest_of_spacecraft(connection: Connection, ccsds_id: int) -> int | None:
-    """Return the id of the revision of a spacecraft that was entered last; None without any."""
+    """Return the id of the newest revision of a spacecraft; None without any."""
     found = connection.execute(
         select(MISSIONS.c.id).where(MISSIONS.c.ccsds_id == ccsds_id).order_by(MISSIONS.c.id.desc()).limit(1)
     ).scalar()
@@ -91,9 +91,9 @@ def newest_of_spacecraft(connection: Connection, ccsds_id: int) -> int | None:
 
 
 def approval_in_force(connection: Connection, ccsds_id: int) -> Approval:
-    """Return the approval rules of the newest revision of a spacecraft that a person entered.
+    """Return the approval rules of the newest revision of a spacecraft that was added by a person.
 
-    Descriptions that come with archives change nothing of what people have to approve.
+    Descriptions imported with archives do not change the approval rules.
     """
     found = connection.execute(
         select(MISSIONS.c.id)

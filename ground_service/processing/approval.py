@@ -1,4 +1,4 @@
-"""Which telecommands two people have to agree on: by their effect, unless the mission says otherwise."""
+"""Approval policy: telecommands that need a second person, by effect or by mission description."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tmtc.effects import EFFECTS, CommandEffect, Effect
 
 @dataclass(frozen=True, slots=True)
 class ApprovalPolicy:
-    """Telecommands that one person enters and another releases.
+    """Policy for telecommands that one person enters and a second person releases.
 
     Attributes
     ----------
@@ -21,24 +21,24 @@ class ApprovalPolicy:
     second_person_for: frozenset[str]
 
     def needs_second_person(self, effect: CommandEffect) -> bool:
-        """Whether a telecommand with this effect is released by somebody else than entered it."""
-        if effect.subject not in EFFECTS:  # nobody knows what it does
+        """Return whether a telecommand with this effect needs a second person for release."""
+        if effect.subject not in EFFECTS:  # the effect is unknown
             return True
         return effect.subject in self.second_person_for
 
     def raised(self, *subjects: str) -> ApprovalPolicy:
-        """Return the policy with a second person for these, too."""
+        """Return the policy extended by telecommands that need a second person."""
         return ApprovalPolicy(self.second_person_for | _known(subjects))
 
     def relaxed(self, *subjects: str) -> ApprovalPolicy:
-        """Return the policy with one person for these."""
+        """Return the policy with telecommands that need only one person."""
         return ApprovalPolicy(self.second_person_for - _known(subjects))
 
 
 DEFAULT_POLICY = ApprovalPolicy(
     frozenset(subject for subject, one in EFFECTS.items() if one.effect is not Effect.ROUTINE)
 )
-"""Whatever changes the state of the payload or destroys data needs a second person."""
+"""Default policy: a second person for all telecommands that change on-board state or destroy data."""
 
 
 def _known(subjects: tuple[str, ...]) -> frozenset[str]:

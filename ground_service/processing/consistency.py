@@ -1,14 +1,13 @@
-"""Consistency of an estimator by the textbook definitions: NEES, NIS, their bounds, and what the bounds contain.
+"""Consistency of an estimator by the standard definitions: NEES, NIS, their bounds, and the share inside the bounds.
 
 The normalised estimation error squared of an error e (d,) with covariance P (d, d) is e' P^-1 e, the normalised
 innovation squared that of an innovation with its covariance. For a consistent Gaussian estimator each is chi-square
 with d degrees of freedom, and the sum over n independent ones with n d.
 
-How to use it on a pass: `nees` with full covariances gives one number per sample, `summary` the line of a table, and
-`met` whether a mean lies in its bounds (None: unknown). Where only standard deviations came down, use
-`squared_normalised_errors` and print `DIAGONAL_NAME`: a sum over the diagonal is no NEES, and has the mean of one but
-not its distribution. Samples of one pass are not independent; `summary` takes how many independent ones they are worth
-from their autocorrelation, unless told.
+`nees` with full covariances gives one number per sample, `summary` the row of a table, and `met` whether a mean is
+inside its bounds (None: unknown). If only standard deviations are available, use `squared_normalised_errors` and print
+`DIAGONAL_NAME`: a sum over the diagonal has the mean of a NEES but not its distribution. Samples of one pass are not
+independent; `summary` estimates the number of independent samples from their autocorrelation, unless it is given.
 
 References
 ----------
@@ -25,13 +24,13 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray = NDArray[np.float64]
 
 DIAGONAL_NAME = "sum of squared normalised errors (diagonal)"
-"""What to call the sum of squared errors over variances: it ignores correlations and is no NEES."""
+"""Name of the sum of squared errors over variances, which ignores correlations and is not a NEES."""
 
 PROBABILITY = 0.95
-"""Probability of the two-sided bounds unless another is asked for."""
+"""Default probability of the two-sided bounds."""
 
 _LARGEST_CONDITION = 1e14
-"""Condition number of a correlation matrix beyond which double precision leaves no digit of its inverse."""
+"""Condition number of a correlation matrix above which its inverse has no correct digit in double precision."""
 
 
 def nees(error: ArrayLike, covariance: ArrayLike) -> FloatArray:
@@ -42,12 +41,12 @@ def nees(error: ArrayLike, covariance: ArrayLike) -> FloatArray:
     error
         Estimate minus truth (or reference), shape (..., d).
     covariance
-        Covariance of the estimate in the same units and axes, shape (..., d, d). To judge against a reference with
-        errors of its own add their covariance.
+        Covariance of the estimate in the same units and axes, shape (..., d, d). For a reference with its
+        own errors, add their covariance.
 
     Returns
     -------
-    Shape (...); NaN where a number is missing or the covariance is not symmetric and positive definite: unknown.
+    Shape (...); NaN (unknown) where a number is missing or the covariance is not symmetric and positive definite.
     """
     e, p = np.asarray(error, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
     size = e.shape[-1] if e.ndim else 0
@@ -62,7 +61,7 @@ def nees(error: ArrayLike, covariance: ArrayLike) -> FloatArray:
     variance = np.einsum("nii->ni", matrices)
     known = np.all(np.isfinite(errors), axis=1) & np.all(np.isfinite(matrices), axis=(1, 2))
     known &= np.all(variance > 0.0, axis=1)
-    # Metres and centimetres per second in one matrix: the correlation is solved, not the covariance.
+    # Position and velocity have different scales: solve with the correlation matrix, not the covariance.
     scale = np.sqrt(np.where(known[:, None], variance, 1.0))
     correlation = np.where(known[:, None, None], matrices, np.eye(size)) / (
         scale[:, :, None] * scale[:, None, :]
@@ -78,7 +77,7 @@ def nees(error: ArrayLike, covariance: ArrayLike) -> FloatArray:
 
 
 def nis(innovation: ArrayLike, covariance: ArrayLike) -> FloatArray:
-    """Return the normalised innovations squared, v' S^-1 v; shapes and unknowns as for `nees`."""
+    """Return the normalised innovations squared, v' S^-1 v; shapes and NaN as in `nees`."""
     return nees(innovation, covariance)
 
 
@@ -94,8 +93,8 @@ def squared_normalised_errors(error: ArrayLike, sigma: ArrayLike) -> FloatArray:
 
 
 def bounds(degrees: ArrayLike, probability: float = PROBABILITY) -> tuple[FloatArray, FloatArray]:
-    """Return the two-sided bounds of one chi-square value of so many degrees of freedom; NaN for none."""
-    # Imported here: it takes a second, and commands that judge nothing import this module as well.
+    """Return the two-sided bounds of one chi-square value; NaN for zero degrees of freedom."""
+    # Imported here because the import takes a second, and most commands that import this module do not need it.
     from scipy.stats import chi2
 
     freedom = np.asarray(degrees, dtype=np.float64)
@@ -105,9 +104,9 @@ def bounds(degrees: ArrayLike, probability: float = PROBABILITY) -> tuple[FloatA
 
 
 def average_bounds(degrees: float, samples: float, probability: float = PROBABILITY) -> tuple[float, float]:
-    """Return the two-sided bounds of the mean of independent values (ANEES, average NIS), each of so many degrees.
+    """Return the two-sided bounds of the mean of independent values (ANEES, average NIS) with equal degrees of freedom.
 
-    `samples` need not be whole: correlated samples are worth fewer. NaN for less than one.
+    `samples` may be fractional, because correlated samples count as fewer independent ones. NaN for less than one.
     """
     if not samples >= 1.0 or not degrees > 0.0:
         return float("nan"), float("nan")
@@ -124,10 +123,10 @@ def share_inside(values: ArrayLike, degrees: ArrayLike, probability: float = PRO
 
 
 def independent_samples(values: ArrayLike) -> float:
-    """Return how many independent samples a series (n,) in time order is worth, from 1 to its known values.
+    """Return the effective number of independent samples of a series (n,) in time order, at least 1.
 
-    The number of known samples over the integrated autocorrelation time, summed to the first lag at which the
-    correlation is not positive (the rule of Geyer's initial positive sequence for single lags).
+    This is the number of known samples over the integrated autocorrelation time, summed to the first lag with a
+    correlation that is not positive (the rule of Geyer's initial positive sequence for single lags).
     """
     value = np.asarray(values, dtype=np.float64)
     value = value[np.isfinite(value)]
@@ -149,22 +148,22 @@ def independent_samples(values: ArrayLike) -> float:
 
 @dataclass(frozen=True, slots=True)
 class ConsistencySummary:
-    """NEES or NIS of a series against its distribution.
+    """NEES or NIS of a series compared with its distribution.
 
     Attributes
     ----------
     samples, unknown
-        Values that are known, and those that are not.
+        Number of known and unknown values.
     mean_per_degree
         Sum of values over sum of degrees of freedom: 1 for a consistent estimator.
     low_per_degree, high_per_degree
         Bounds of that mean for the number of independent samples.
     independent
-        How many independent samples the known ones are worth.
+        Effective number of independent samples.
     inside
         Share of values inside the bounds of a single value.
     probability
-        Of all bounds.
+        Probability of all bounds.
     """
 
     samples: int
@@ -178,7 +177,7 @@ class ConsistencySummary:
 
     @property
     def met(self) -> bool | None:
-        """Whether the mean lies in its bounds; None where that is not known."""
+        """Whether the mean is inside its bounds; None if unknown."""
         if not np.isfinite(self.mean_per_degree) or not np.isfinite(self.low_per_degree):
             return None
         return self.low_per_degree <= self.mean_per_degree <= self.high_per_degree
@@ -190,16 +189,16 @@ def summary(
     independent: float | None = None,
     probability: float = PROBABILITY,
 ) -> ConsistencySummary:
-    """Return the consistency of a series (n,) in time order, of values with so many degrees of freedom each.
+    """Return the consistency of a series (n,) of values in time order with given degrees of freedom.
 
     Parameters
     ----------
     values
         NEES or NIS, NaN where unknown.
     degrees
-        Degrees of freedom, a number or (n,); a value with none counts as unknown.
+        Degrees of freedom, a number or (n,); a value with zero degrees counts as unknown.
     independent
-        Number of independent samples, where it is known (runs of a Monte Carlo); None takes it from the series.
+        Number of independent samples, if known (runs of a Monte Carlo); None: estimated from the series.
     """
     value = np.asarray(values, dtype=np.float64).reshape(-1)
     freedom = np.broadcast_to(np.asarray(degrees, dtype=np.float64), value.shape)

@@ -1,9 +1,9 @@
-"""Octets, frames and packets of raw downlink files, accounted for by on-board time.
+"""Accounting of octets, frames and packets of raw downlink files by on-board time.
 
-Frames carry no time of their own. A frame has the time of the last packet that begins in it, and one in which none
-begins (damaged, idle, the middle of a long packet) that of the frame before it, at the start of a file that of the
-first frame after it. So every frame of a file lies in the pass in which its neighbours lie. Files in which no packet
-can be read belong to no pass.
+Frames carry no time. A frame is assigned the time of the last packet that begins in it. A frame in which no packet
+begins (damaged, idle, or the middle of a long packet) is assigned the time of the previous frame, or of the next one at
+the start of a file. Therefore, every frame is assigned to the same pass as its neighbours. Files without a readable
+packet belong to no pass.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ DIGEST_OCTETS = 16
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawFile:
-    """What one raw file holds, by on-board time; `NO_TICKS` where no time can be told.
+    """Content of one raw file by on-board time; `NO_TICKS` if the time is unknown.
 
     Attributes
     ----------
     frame_ticks, frame_bad, frame_corrected, frame_octets
-        Of every frame (f,): time, whether it could not be used, corrected symbols, octets from its marker to the next.
+        For every frame (f,): time, whether it was unusable, corrected symbols, octets from its marker to the next.
     packet_ticks, packet_apid, packet_good
-        Of every packet (p,), damaged ones included; the APID of a damaged one may be wrong.
+        For every packet (p,), including damaged ones; the APID of a damaged packet may be wrong.
     packet_digest
         Hash of every packet, empty for damaged ones.
     skipped_ticks, skipped_octets
-        Of every stretch (s,) that belongs to no frame or no packet.
+        For every interval (s,) of octets that belongs to no frame or no packet.
     has_frames
         False for a file of bare packets.
     """
@@ -57,16 +57,16 @@ class RawFile:
 
     @property
     def span(self) -> tuple[int, int] | None:
-        """First and last on-board time in the file; None where no time can be told."""
+        """First and last on-board time in the file; None if unknown."""
         times = self.packet_ticks[self.packet_ticks != NO_TICKS]
         return (int(times.min()), int(times.max())) if times.size else None
 
 
 @dataclass(frozen=True, slots=True)
 class RawAccount:
-    """Sums over raw files within a stretch of on-board time; by APID where `duplicates` and `crc_errors` are maps.
+    """Sums over raw files within an interval of on-board time; `duplicates` and `crc_errors` are by APID.
 
-    `frames` and `octets` are None where only bare packets came.
+    `frames` and `octets` are None if only bare packets were received.
     """
 
     frames: int | None
@@ -79,12 +79,12 @@ class RawAccount:
 
 
 def read_raw(octets: Octets, spacecraft_id: int | None) -> RawFile:
-    """Return what a raw file holds of one spacecraft.
+    """Return the content of a raw file for one spacecraft.
 
     Raises
     ------
     LinkFormatError
-        If frames stand in the file whose coding is not known.
+        If the file has frames with an unknown coding.
     """
     found = decode(octets, spacecraft_id=spacecraft_id)
     starts, good = found.cut.offsets, found.cut.crc_ok
@@ -98,7 +98,7 @@ def read_raw(octets: Octets, spacecraft_id: int | None) -> RawFile:
     frames = _frames(found, starts[order], ticks[order], good[order])
     octets_skipped = skipped[:, 1] - skipped[:, 0]
     if found.frames is not None:
-        # The parts of a packet that was put together are left over in the zones, but not unused.
+        # The parts of a reassembled packet are outside packets in the zones, but are used.
         joined = order[_frame_of(found, starts[order]) < 0]
         skipped_ticks = np.concatenate([skipped_ticks, ticks[joined]])
         octets_skipped = np.concatenate([octets_skipped, -found.cut.lengths[joined]])
@@ -155,7 +155,7 @@ def account_raw(files: Sequence[RawFile], start_ticks: int, stop_ticks: int) -> 
 def _frames(
     found: DownlinkDecode, starts: IntArray, ticks: IntArray, good: BoolArray
 ) -> tuple[IntArray, BoolArray, IntArray, IntArray]:
-    """Time, badness, corrected symbols and octets of every frame but those of other spacecraft."""
+    """Return time, unusable flag, corrected symbols and octets of every frame, except those of other spacecraft."""
     table = found.frames
     if table is None:
         none = np.zeros(0, dtype=np.int64)
@@ -164,9 +164,10 @@ def _frames(
     frame_ticks = np.full(len(table), NO_TICKS, dtype=np.int64)
     frame = _frame_of(found, starts)
     known = np.flatnonzero(good & (ticks != NO_TICKS) & (frame >= 0))
-    # The last packet that begins in each frame is written last.
+    # The assignment keeps the last packet that begins in each frame.
     frame_ticks[frame[known]] = ticks[known]
-    # Octets between two markers belong to the first of them, those before the first marker to the first frame.
+    # Octets between two markers belong to the frame of the first one, octets before the first marker to the first
+    # frame.
     edges = np.concatenate([table.offset, [_stream_octets(found)]])
     edges[0] = 0
     corrected = np.where(table.corrected > 0, table.corrected, 0).sum(axis=1).astype(np.int64)
@@ -179,7 +180,7 @@ def _frames(
 
 
 def _frame_of(found: DownlinkDecode, places: IntArray) -> IntArray:
-    """Row of the frame in whose packet zone each place of the buffer lies; -1 for places in none."""
+    """Return the row of the frame whose packet zone contains each position of the buffer; -1 if none does."""
     table = found.frames
     assert table is not None
     used = np.flatnonzero(table.buffer_offset >= 0)
@@ -194,7 +195,7 @@ def _frame_of(found: DownlinkDecode, places: IntArray) -> IntArray:
 
 
 def _unused(found: DownlinkDecode) -> IntArray:
-    """Ranges (s, 2) of the buffer that belong to no packet: skipped ones, and those of packets whose head was lost."""
+    """Return the ranges (s, 2) of the buffer outside packets: skipped octets, and packets whose start was lost."""
     cut = found.cut
     taken = np.concatenate(
         [np.stack([cut.offsets, cut.offsets + cut.lengths], axis=1), cut.idle.reshape(-1, 2)]
@@ -206,12 +207,12 @@ def _unused(found: DownlinkDecode) -> IntArray:
 
 
 def _before(edges: IntArray, places: IntArray) -> IntArray:
-    """Row of the last edge (ascending) at or before each place; the first row where there is none."""
+    """Return the row of the last edge (ascending) at or before each position; the first row if there is none."""
     return np.maximum(np.searchsorted(edges, places, side="right") - 1, 0)
 
 
 def _filled(ticks: IntArray) -> IntArray:
-    """Times (n,) with unknown ones taken from the one before, at the start from the first known one."""
+    """Return times (n,) with unknown times replaced by the previous one, at the start by the first known one."""
     known = np.flatnonzero(ticks != NO_TICKS)
     if not known.size:
         return ticks

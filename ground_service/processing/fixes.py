@@ -1,8 +1,8 @@
-"""Fixes judged and repeated on the ground from the identifications that came down: which crater was taken for which.
+"""Ground evaluation of fixes from telemetered identifications: wrong fixes, and the snapshot baseline.
 
 A fix is wrong when at least half of its identifications name a crater that, seen from the reference position, lies
 further from the detection than the detector's own tolerance. The snapshot baseline solves each frame for its position
-alone, from the same identifications and the attitude, without dynamics and without memory.
+alone, from the same identifications and the attitude, without dynamics and without earlier frames.
 """
 
 from __future__ import annotations
@@ -88,10 +88,10 @@ def wrong_fixes(
     position_mcmf_m: FloatArray,
     camera_from_mcmf: FloatArray | None = None,
 ) -> int:
-    """Return how many frames were identified wrongly.
+    """Return the number of frames with wrong identifications.
 
-    The reference (m, 3), MCMF, and the attitude (m, 3, 3) are given at the ascending times `utc_ns` (m,); the camera
-    looks to nadir where no attitude is given.
+    The reference (m, 3), MCMF, and the attitude (m, 3, 3) are given at the ascending times `utc_ns` (m,); without
+    an attitude the camera points to nadir.
     """
     at = np.minimum(np.searchsorted(utc_ns, pairs.utc_ns), max(len(utc_ns) - 1, 0))
     if len(utc_ns) == 0 or len(pairs.frame) == 0:
@@ -114,16 +114,16 @@ def snapshot_positions(
     pointing: Pointing = nadir_camera_from_mcmf,
     camera_from_mcmf: FloatArray | None = None,
 ) -> FloatArray:
-    """Position (m, 3), MCMF, of each epoch from its own identifications; NaN where they do not give one.
+    """Return the position (m, 3), MCMF, at each epoch from its own identifications; NaN without a solution.
 
     Parameters
     ----------
     utc_ns, start_mcmf_m
-        Ascending epochs (m,) and where to begin (m, 3): what the payload itself believed.
+        Ascending epochs (m,) and start positions of the iteration (m, 3): the estimates of the payload.
     pointing
-        Attitude (..., 3, 3) of a camera at positions (..., 3), for epochs without an attitude of their own.
+        Attitude (..., 3, 3) of a camera at positions (..., 3), for epochs without a known attitude.
     camera_from_mcmf
-        Attitude (m, 3, 3) at each epoch; NaN where it is not known.
+        Attitude (m, 3, 3) at each epoch; NaN if unknown.
     """
     if camera_from_mcmf is None:
         camera_from_mcmf = np.full((len(utc_ns), 3, 3), np.nan)
@@ -162,7 +162,7 @@ def _solved(
     pointing: Pointing,
     fixed: FloatArray,
 ) -> FloatArray:
-    """Gauss-Newton on the positions (f, 3) of cameras that see n craters each; NaN where it does not settle."""
+    """Return the positions (f, 3) of cameras that see n craters each by Gauss-Newton; NaN without convergence."""
     result = np.full(start_m.shape, np.nan)
     position = start_m.astype(np.float64)
     going = np.flatnonzero(np.isfinite(position).all(axis=1))
@@ -195,6 +195,6 @@ def _projected(
     pointing: Pointing,
     fixed: FloatArray,
 ) -> FloatArray:
-    """Pixels (..., n, 2) of craters (..., n, 3) from cameras at positions (..., 3), in a fixed attitude where known."""
+    """Return the pixels (..., n, 2) of craters (..., n, 3) for cameras at (..., 3), in fixed attitudes if known."""
     rotations = np.where(np.isfinite(fixed), fixed, pointing(positions_m))
     return np.asarray(camera.project((crater_m - positions_m[..., None, :]) @ rotations.swapaxes(-1, -2)))

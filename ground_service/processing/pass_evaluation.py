@@ -90,7 +90,7 @@ WORST_MINIMUM_EXPECTED = 3
 """A frame with fewer expected craters says nothing about the detector and is no candidate for the worst ones."""
 
 _NO_IMAGE_GRAY = 72
-"""Gray level of the ground on which a frame is drawn whose image did not come down."""
+"""Gray level of the background of a frame whose image was not received."""
 
 RESETS = ("initialization", "time_gap", "manual_step", "safety_timeout")
 
@@ -102,14 +102,14 @@ PERFECT_START_M = 1.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PassInputs:
-    """Everything that the evaluation of a pass needs; None or empty where it is not known.
+    """Inputs of the evaluation of a pass; None or empty if unknown.
 
     Attributes
     ----------
     orientation, gravity, onboard_gravity
         Lunar orientation of the pass, gravity field of its reference and that of the on-board filter, as declared.
     refused
-        Why one of these is None, by its name.
+        Reasons for models that are None, by name.
     reference_sigma_rtn_m
         Declared 1-sigma error of the reference in radial, transverse and normal.
     limits
@@ -420,7 +420,7 @@ def _consistency(
 
     The covariance of the reference (3, 3), R/T/N, is added to that of the estimate.
 
-    A NIS has two degrees for every crater that a fix used: as downlinked, or of the count of craters.
+    A NIS has two degrees for every crater that a fix used: as downlinked, or derived from the number of craters.
     """
     known = np.isfinite(samples.nis)
     degrees = np.where(known, 2 * samples.matched, 0).astype(np.int64) if known.any() else None
@@ -444,9 +444,9 @@ def _smoothed(
     provenance: dict[str, str],
     remarks: list[str],
 ) -> list[NavigationSeries]:
-    """The filter's orbit smoothed on the ground, where its states came down in full and the reference covers them.
+    """Return the filter's orbit smoothed on the ground, if complete states and a reference are available.
 
-    The gravity field is that of the filter: another one than that of the truth, so that a common error shows.
+    The gravity field is that of the filter and not that of the truth, so that a common error remains visible.
     """
     filtered = inputs.filter_states
     reported = next((s for s in inputs.navigation if s.estimator == "anchored"), None)
@@ -601,7 +601,7 @@ def _detector(
 
 
 def _refusal(inputs: PassInputs) -> str:
-    """Why nothing can be compared with a reference; empty where it can."""
+    """Return why no comparison with a reference is possible; empty if it is."""
     if inputs.reference is None:
         return "no reference ephemeris covers this pass"
     if inputs.orientation is None:
@@ -610,7 +610,7 @@ def _refusal(inputs: PassInputs) -> str:
 
 
 def _pointing_text(inputs: PassInputs, remarks: list[str]) -> str:
-    """Words for how the camera looked; what is not known of it becomes a remark."""
+    """Return a text on the camera pointing; add a remark for unknown attitudes."""
     known = int(np.count_nonzero(inputs.viewing.known(inputs.detections.utc_ns)))
     total = len(inputs.detections)
     if known == total:
@@ -618,9 +618,11 @@ def _pointing_text(inputs: PassInputs, remarks: list[str]) -> str:
     if "camera" in inputs.refused:
         remarks.append(inputs.refused["camera"])
     if known:
-        remarks.append(f"the attitude of {total - known} of {total} frames is not known: taken as declared")
-        return "the camera in its telemetered attitude, where there is one"
-    return "the camera as declared" if "camera" not in inputs.refused else "a nadir camera"
+        remarks.append(
+            f"the attitude of {total - known} of {total} frames is unknown; the declared attitude is used"
+        )
+        return "the camera in its telemetered attitude, if available"
+    return "the camera in its declared attitude" if "camera" not in inputs.refused else "a nadir camera"
 
 
 def _choose_frames(
@@ -639,7 +641,7 @@ def _choose_frames(
     scored = np.isin(expected.size_class, (0, 1, 2)) & expected.complete
     total = np.bincount(owner[scored], minlength=len(detections))
     hit = np.bincount(owner[scored & (matches.detection_of_crater >= 0)], minlength=len(detections))
-    # Every frame is a candidate: the few whose images came down are not the worst ones of the pass.
+    # Every frame is a candidate, not only the few frames with a received image.
     every = np.flatnonzero(detections.usable)
     candidates = every[(total[every] >= WORST_MINIMUM_EXPECTED) & (hit[every] < total[every])]
     recall = hit[candidates] / np.maximum(total[candidates], 1)
@@ -761,7 +763,7 @@ def _outcomes_of(inputs: PassInputs, estimator: str) -> OutcomeSamples | None:
 def _headline(
     inputs: PassInputs, navigation: tuple[NavigationSeries, ...], detector: DetectorScore | None
 ) -> tuple[HeadlineFigure, ...]:
-    """The five figures: those of the declared estimator, never of the one that did best."""
+    """Return the five headline figures; accuracy is that of the declared estimator, not of the best one."""
     name = inputs.limits.estimator
     own = next((s for s in navigation if s.kind == "estimate" and s.name == name and len(s.utc_ns) > 1), None)
     only = next((s for s in navigation if s.name == "propagate-only"), None)

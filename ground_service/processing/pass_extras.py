@@ -136,5 +136,5 @@ def snapshot_series(
         error_rtn_m=error,
         # Frames know nothing of one another: each is a fix of its own, and there is no drift to speak of.
         statistics=navigation_statistics(error, path_m[rows], np.ones(len(solved), dtype=np.bool_)),
-        description="each frame by itself: the filter's identifications and the attitude, no dynamics",
+        description="each frame separately, from the filter's identifications and the attitude, without dynamics",
     )

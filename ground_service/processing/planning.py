@@ -334,7 +334,7 @@ class Planner:
 
 
 def frames_between(start_utc_ns: int, stop_utc_ns: int, cadence_s: float) -> int:
-    """Return the number of frames of an observation: one at its start, then one a cadence, none at its stop."""
+    """Return the number of frames of an observation: one at its start, then one per cadence, none at its stop."""
     return max(-((start_utc_ns - stop_utc_ns) // round(cadence_s * NS)), 1)
 
 

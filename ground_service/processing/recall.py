@@ -1,9 +1,9 @@
-"""The detector judged on the ground: which catalogued craters should be in each image, and which were detected.
+"""Ground evaluation of the detector: catalogued craters expected in each image, and detected craters.
 
-A crater is expected where its centre, at rim height, projects into the image of the camera at the reference position
-and in the attitude of the frame. A detection is true when it lies within half a radius of the crater, and within the
-paper's pixel limit, one detection to one crater. Detections of craters outside the scored size classes count neither
-for nor against.
+A crater is expected if its centre, at rim height, projects into the image of the camera at the reference position and
+in the attitude of the frame. A detection is true if it lies within half a radius of the crater and within the paper's
+pixel limit, with at most one detection per crater. Detections of craters outside the scored size classes are not
+counted.
 """
 
 from __future__ import annotations
@@ -346,7 +346,7 @@ def _residuals(
 
 
 def _off_nadir_rad(rotations: FloatArray, position_mcmf_m: FloatArray) -> FloatArray:
-    """Angle (f,) of the boresight from nadir."""
+    """Return the angle (f,) between boresight and nadir."""
     with np.errstate(invalid="ignore"):
         down = -position_mcmf_m / np.linalg.norm(position_mcmf_m, axis=-1, keepdims=True)
     return np.asarray(np.arccos(np.clip(np.einsum("ni,ni->n", rotations[:, 2], down), -1.0, 1.0)))
@@ -358,7 +358,7 @@ def _view_radius_m(camera: PinholeCamera, altitude_m: FloatArray, off_nadir_rad:
     A twentieth is added for relief: rims stand up to some km above and below the sphere.
     """
     corner = off_nadir_rad + float(np.arccos(camera.rays(camera.corners_px())[:, 2].min()))
-    # Past a right angle the sine falls again: such a corner sees the sky.
+    # Beyond a right angle the sine decreases again: such a corner does not see the ground.
     arc = np.where(corner < np.pi / 2.0, ground_arc_m(corner, altitude_m), np.nan)
     with np.errstate(invalid="ignore"):
         horizon = horizon_arc_m(altitude_m)

@@ -1,7 +1,7 @@
-"""What the reference contributes to an observed error: its covariance in NEES, and the error budget.
+"""Contribution of the reference to observed errors: its covariance in the NEES, and the error budget.
 
-The reference is taken to be independent of the estimate: observed covariance = estimate + reference. That holds for a
-filter that has forgotten its start state, not for odometry that is reset to the anchor ephemeris.
+The reference is assumed independent of the estimate: observed covariance = estimate + reference. This holds for a
+filter whose initial state has no more influence, not for odometry that is reset to the anchor ephemeris.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ Sigma = tuple[float, float, float]
 
 
 def reference_covariance_m2(sigma_rtn_m: Sigma | None) -> FloatArray:
-    """Return the covariance (3, 3) of the reference in R/T/N; zero where its error is not declared."""
+    """Return the covariance (3, 3) of the reference in R/T/N; zero if its error is not declared."""
     return np.diag(np.square(sigma_rtn_m or (0.0, 0.0, 0.0)))
 
 
 def error_budget(error_rtn_m: FloatArray, reference_sigma_rtn_m: Sigma | None) -> ErrorBudget | None:
-    """Return how the observed error (n, 3) splits; None without errors or without a declared reference error."""
+    """Return the error budget of an observed error (n, 3); None without errors or a declared reference error."""
     known = np.isfinite(error_rtn_m).all(axis=1)
     if reference_sigma_rtn_m is None or not known.any():
         return None

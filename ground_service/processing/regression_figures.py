@@ -19,12 +19,12 @@ LATENCY_LEVEL = 0.25
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ratio:
-    """A sum over frames over another sum, (n,) each; NaN in the numerator leaves a frame out.
+    """Ratio of two sums over frames, (n,) each; NaN in the numerator leaves a frame out.
 
     Attributes
     ----------
     counts
-        Whether it is a share of counted things (craters, frames), which is never known better than to a few of them.
+        Whether it is a share of counted items (craters, frames), whose resolution is limited to a few items.
     """
 
     numerator: FloatArray
@@ -43,7 +43,7 @@ class Ratio:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Percentile:
-    """A percentile of the finite values (n,); `level` between 0 and 1."""
+    """Percentile of the finite values (n,); `level` between 0 and 1."""
 
     values: FloatArray
     level: float
@@ -63,14 +63,14 @@ Sample = Ratio | Percentile
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A metric that can be gated.
+    """Metric to which a gate can be applied.
 
     Attributes
     ----------
     name, unit
         As in policies and verdicts.
     higher_is_better
-        Which direction is worse.
+        Direction of improvement.
     relative
         Whether a change counts as a ratio (lengths, times) or as a difference (shares, pixels).
     sample
@@ -89,7 +89,7 @@ class Figure:
 
 
 def figures_of(passes: Sequence[PassFrames]) -> tuple[Figure, ...]:
-    """Return every metric that these passes allow, whichever build flew them."""
+    """Return every metric that these passes provide, for either build."""
     estimators = sorted({name for one in passes for name in one.estimators})
     stages = sorted({name for one in passes for name in one.latency})
     found = [
@@ -164,7 +164,7 @@ def shift_samples(frames: PassFrames) -> tuple[Ratio, Ratio]:
 
 
 def same_telemetry(first: PassFrames, second: PassFrames) -> bool:
-    """Whether two builds sent the same values in every frame; CPU times and memory are no telemetry."""
+    """Return whether two builds sent the same values in every frame; CPU times and memory are not compared."""
     names = (
         "answered",
         "expected",

@@ -2,7 +2,7 @@
 
 A gate compares paired samples of both builds and has three outcomes:
 
-- **fail**: the degradation exceeds the margin by more than chance explains (one-sided Student's t). Gates over the
+- **fail**: the degradation exceeds the margin significantly (one-sided Student's t). Gates over the
   suite and gates of single passes are two families, each with half of 1 - confidence under Holm's procedure, so that
   a build as good as the baseline fails any gate with a probability of at most 1 - confidence.
 - **pass**: the frames resolve the margin (a change as large as the margin would be detected at the policy's confidence
@@ -10,8 +10,8 @@ A gate compares paired samples of both builds and has three outcomes:
   passes, so this needs no correction for the number of gates (intersection-union test).
 - **inconclusive**: everything else, such as too few frames or a value that is unknown.
 
-Telemetry that is identical in every frame is compared exactly, as are metrics without chance in them (packets that
-cannot be decoded, memory).
+Telemetry that is identical in every frame is compared exactly, as are deterministic metrics (packets that cannot be
+decoded, memory).
 
 References
 ----------
@@ -65,7 +65,7 @@ LATENCY = "latency."
 UNDECODABLE = "telemetry.undecodable"
 MEMORY = "memory"
 EXACT_METRICS = (UNDECODABLE, MEMORY)
-"""Metrics without chance in them: their margin may be 0."""
+"""Deterministic metrics, whose margin may be 0."""
 
 _LARGEST_LOG = 50.0
 _IDENTICAL = "identical telemetry in every frame"
@@ -74,21 +74,21 @@ _SAME = "identical values in every frame"
 
 @dataclass(frozen=True, slots=True)
 class GateRule:
-    """What a policy states about some metrics.
+    """Gate rule of a policy for some metrics.
 
     Attributes
     ----------
     figure
-        Name of the metric; may hold wildcards.
+        Name of the metric; may contain wildcards.
     margin
-        Degradation that is tolerated over the suite: in the metric's unit, or as a share of the baseline.
+        Tolerated degradation over the suite: in the metric's unit, or as a share of the baseline.
     pass_margin
-        The same for every pass alone; None where the gate is not applied to single passes.
+        The same for every single pass; None if the gate is not applied to single passes.
     reason
-        Why the margin is as it is.
+        Rationale of the margin.
     required
-        Whether a metric without a value leaves the verdict open. A rule with wildcards that is not required applies to
-        the metrics that exist.
+        Whether a metric without a value makes the verdict inconclusive. A rule with wildcards that is not required
+        applies to the metrics that exist.
     """
 
     figure: str
@@ -100,7 +100,7 @@ class GateRule:
 
 @dataclass(frozen=True, slots=True)
 class Waiver:
-    """A gate that need not pass until a day (ISO, inclusive): `gate` and `pass_name` may hold wildcards."""
+    """Waiver of a gate until a day (ISO, inclusive); `gate` and `pass_name` may contain wildcards."""
 
     gate: str
     reason: str
@@ -110,12 +110,13 @@ class Waiver:
 
 @dataclass(frozen=True, slots=True)
 class GatePolicy:
-    """How builds are judged.
+    """Policy for the comparison of builds.
 
     Attributes
     ----------
     confidence
-        Of every pass; 1 - confidence is the chance that a build as good as the baseline fails any gate.
+        Confidence of every pass decision; 1 - confidence is the probability that a build as good as the baseline fails
+        any gate.
     power
         Probability with which a degradation as large as the resolution is detected.
     """
@@ -130,7 +131,7 @@ class GatePolicy:
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """The decision of one gate.
+    """Decision of one gate.
 
     Attributes
     ----------
@@ -141,22 +142,22 @@ class Gate:
     baseline, candidate
         Values of the metric; NaN where unknown.
     margin
-        Degradation that is tolerated: a difference, or a share of the baseline.
+        Tolerated degradation: a difference, or a share of the baseline.
     limit
         The baseline degraded by the margin.
     change_low, change_high
         One-sided confidence bounds of the degradation: a difference, or a share of the baseline. Positive is worse.
     p_value, level
-        Of the test for failure; NaN for gates without chance in them.
+        Of the test for failure; NaN for gates of deterministic metrics.
     resolution
         Smallest degradation that these frames detect at the policy's confidence and power, in the unit of the margin;
-        infinite where they detect none.
+        infinite if they detect none.
     frames, frames_needed
-        Frames that were compared, and with which the gate would be decided; None where that is unknown.
+        Number of compared frames, and number needed to decide the gate; None if unknown.
     reason
-        Why the gate is inconclusive; for other gates what the decision rests on, where it is not the test.
+        Why the gate is inconclusive; for other gates the basis of the decision if it is not the test.
     waived
-        Why the outcome does not count; empty where it does.
+        Reason of the waiver; empty if the gate is not waived.
     """
 
     name: str
@@ -195,14 +196,14 @@ def judge(
     *,
     today: str = "",
 ) -> list[Gate]:
-    """Return the gates of a policy over the passes that both builds flew, those of the suite first.
+    """Return the gates of a policy over the passes processed by both builds, those of the suite first.
 
     Parameters
     ----------
     baseline, candidate
-        Frames of each pass by its name, the same frames in both.
+        Frames of each pass by its name; both have the same frames.
     today
-        Day (ISO) by which waivers are in force; none is when empty.
+        Day (ISO) that selects the valid waivers; empty: none are valid.
     """
     names = [name for name in baseline if name in candidate]
     if not names:
@@ -225,7 +226,7 @@ def judge(
 
 
 def verdict_of(gates: Sequence[Gate]) -> str:
-    """Return "fail" if a gate failed, "pass" if all passed and there are any, else "inconclusive"; waivers count."""
+    """Return the verdict over the gates that are not waived: "fail", "pass" or (also without gates) "inconclusive"."""
     if any(gate.outcome == FAIL and not gate.waived for gate in gates):
         return FAIL
     return PASS if gates and all(gate.counts_as_passed for gate in gates) else INCONCLUSIVE
@@ -246,14 +247,14 @@ def metric_interval(sample: Sample, sizes: Sequence[int], resamples: int) -> tup
 
 
 def rule_of(policy: GatePolicy, figure: str) -> GateRule | None:
-    """Return the last rule that applies to a metric; None where none does."""
+    """Return the last rule that applies to a metric; None if none does."""
     found = [rule for rule in policy.rules if fnmatch.fnmatchcase(figure, rule.figure)]
     return found[-1] if found else None
 
 
 @dataclass(frozen=True, slots=True)
 class _Test:
-    """A gate before the level of its test is known; `change` (positive is worse) and `margin` in the tested scale."""
+    """Gate before the level of its test is known; `change` (positive is worse) and `margin` are in the tested scale."""
 
     name: str
     unit: str
@@ -273,9 +274,9 @@ class _Test:
 
     @property
     def p_value(self) -> float:
-        """Probability of so large a degradation by chance if the true one equals the margin."""
+        """Probability of at least this degradation if the true degradation equals the margin."""
         if math.isnan(self.change):
-            # Telemetry that only the baseline sends is a fault of the candidate; a cost that nobody measured is not.
+            # Telemetry that only the baseline sends is a fault of the candidate; a cost that was not measured is not.
             lost = math.isfinite(self.baseline) and not self.name.startswith(LATENCY)
             return 0.0 if lost else 1.0
         if self.change <= self.margin:
@@ -305,7 +306,7 @@ def _tests(
         then, now = (float(sample.value(whole)[0]) for sample in samples)
         if not (math.isfinite(then) or math.isfinite(now) or rule.required):
             continue  # neither build has this metric
-        # Latencies are equal in every frame only where both builds are the same replay.
+        # Latencies are equal in every frame only if both builds are the same replay.
         exact = _same_values(*samples) if figure.name.startswith(LATENCY) else identical
         spread = Spread(0.0, math.inf, 1.0) if exact else _spread(figure, *samples, sizes, policy)
         tests.append(
@@ -343,7 +344,7 @@ def _margin(rule: GateRule | None, pass_name: str) -> float | None:
 
 
 def _missing(figure: Figure, old: Sample, new: Sample) -> int:
-    """Frames on which the baseline has a value of a telemetered metric and the candidate none."""
+    """Return the number of frames in which only the baseline has a value of a telemetered metric."""
     if figure.name.startswith(LATENCY):
         return 0  # a stage that did not run has no latency
     return int(np.count_nonzero(old.known & ~new.known))
@@ -358,7 +359,7 @@ def _same_values(old: Sample, new: Sample) -> bool:
 
 
 def _change(figure: Figure, then: float, now: float) -> float:
-    """Degradation: a difference, or the logarithm of a ratio; infinite against nothing."""
+    """Return the degradation: a difference, or the logarithm of a ratio; infinite relative to zero."""
     sign = -1.0 if figure.higher_is_better else 1.0
     if not figure.relative:
         return sign * (now - then)
@@ -377,7 +378,7 @@ def _spread(figure: Figure, old: Sample, new: Sample, sizes: Sequence[int], poli
 
 
 def _ratio_spread(old: Ratio, new: Ratio, relative: bool, sizes: Sequence[int], policy: GatePolicy) -> Spread:
-    """Spread of the change of a ratio of sums, from the influence of each frame."""
+    """Return the spread of the change of a ratio of sums, from the influence of each frame."""
     influences = []
     for sample in (old, new):
         influence = ratio_influence(sample.numerator, sample.denominator)
@@ -401,7 +402,7 @@ def _ratio_spread(old: Ratio, new: Ratio, relative: bool, sizes: Sequence[int], 
 def _percentile_spread(
     old: Percentile, new: Percentile, relative: bool, sizes: Sequence[int], policy: GatePolicy
 ) -> Spread:
-    """Spread of the change of a percentile, from a block bootstrap of both builds with the same weights."""
+    """Return the spread of the change of a percentile, from a block bootstrap of both builds with equal weights."""
     whole = np.ones((1, len(old.values)))
     then, now = float(old.value(whole)[0]), float(new.value(whole)[0])
     with np.errstate(invalid="ignore"):
@@ -416,7 +417,7 @@ def _percentile_spread(
     spread = resampled_spread(change, sizes, block, time)
     if spread.freedom < 1.0:
         return spread
-    # As many values as this share of the frames may lie on either side of the percentile in an equal sample.
+    # In an equivalent sample, this share of the values may lie on the other side of the percentile.
     independent = float(np.count_nonzero(old.known)) / time
     unseen = unseen_changes(policy.confidence) / independent if independent > 0.0 else math.inf
     reach = student_quantile(policy.confidence, spread.freedom)
@@ -446,7 +447,7 @@ def _bias_test(
     pass_name: str,
     identical: bool,
 ) -> _Test | None:
-    """Test whether the candidate's centres lie elsewhere than the baseline's, and not because an old bias went away.
+    """Test whether the candidate's centres are shifted relative to the baseline's, other than by a reduced bias.
 
     The metric is the length of the mean difference of detected and catalogued centre. What is tested is the length of
     its change, along the direction of the change; a change that at least halves the bias is no degradation.
@@ -527,7 +528,7 @@ def _gate(test: _Test, level: float, policy: GatePolicy) -> Gate:
 def _outcome(
     test: _Test, level: float, detectable: float, high: float, policy: GatePolicy
 ) -> tuple[str, str, int | None]:
-    """Outcome, reason, and frames with which the gate would be decided."""
+    """Return outcome, reason, and the number of frames needed to decide the gate."""
     if test.p_value <= level:
         return FAIL, "the candidate has no value" if math.isnan(test.change) else "", None
     if not math.isfinite(test.baseline):
@@ -561,12 +562,12 @@ def _limit(test: _Test) -> float:
 
 
 def _stated(test: _Test, change: float) -> float:
-    """A change of the tested scale in the unit of the margin."""
+    """Return a change of the tested scale in the unit of the margin."""
     return _ratio(change) - 1.0 if test.relative else change
 
 
 def _ratio(logarithm: float) -> float:
-    """Ratio of a logarithm; infinite where too few frames leave everything open."""
+    """Return the ratio of a logarithm; infinite for too few frames."""
     return math.inf if logarithm > _LARGEST_LOG else math.exp(logarithm)
 
 
@@ -604,7 +605,7 @@ def _exact(before: Sequence[PassFrames], after: Sequence[PassFrames], policy: Ga
 
 
 def _unknown(policy: GatePolicy, judged: set[str], frames: int) -> list[Gate]:
-    """Inconclusive gates of the rules that require a metric and found none."""
+    """Return inconclusive gates for the rules whose required metric does not exist."""
     return [
         Gate(
             rule.figure,

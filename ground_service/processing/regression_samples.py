@@ -33,19 +33,19 @@ BAD_OUTCOMES = ("missed", "rejected", "refused")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EstimatorFrames:
-    """One estimator, a row per frame (n,); NaN where it said nothing.
+    """Samples of one estimator, a row per frame (n,); NaN without a report.
 
     Attributes
     ----------
     error_m, sigma_m
-        Length of the position error, and of the standard deviations claimed with it.
+        Length of the position error, and of the reported standard deviations.
     squared_normalised_error
-        Sum of squared errors over variances of the three axes: 3 on average for an estimator that knows its errors.
-        Packets of most dictionaries hold sigmas and no covariance, so this ignores correlations and is no NEES.
+        Sum of squared errors over variances of the three axes: 3 on average for a consistent estimator.
+        Packets of most dictionaries hold sigmas and no covariance, so this ignores correlations and is not a NEES.
     drift_percent
-        Horizontal error gained since the frame before over the ground path in between.
+        Growth of the horizontal error since the previous frame over the ground path between them.
     outcome
-        Outcome by name, empty where none came down.
+        Outcome by name; empty without a report.
     wrong
         1 for a wrong fix, 0 for another outcome.
     """
@@ -117,12 +117,12 @@ def pass_frames(
     orientation: Orientation,
     viewing: Viewing | None = None,
 ) -> PassFrames:
-    """The frames of a pass by what came down of them.
+    """Return the frames of a pass with their received samples.
 
     Parameters
     ----------
     frame_ticks, frame_utc_ns
-        On-board time of each frame as the payload was given it, and the UTC that it stands for, (n,).
+        On-board time of each frame in the payload input, and the corresponding UTC, (n,).
     detections, navigation
         Samples whose `frame_number` is the row of the frame.
     outcomes
@@ -130,7 +130,7 @@ def pass_frames(
     packet_ticks, packet_octets
         On-board time and length of every packet.
     viewing
-        Mounting and attitudes of the camera; a nadir camera when None.
+        Mounting and attitudes of the camera; None: a nadir camera.
     """
     n = len(frame_ticks)
     track = reference_states(reference, orientation, frame_utc_ns)

@@ -1,12 +1,12 @@
 """Paired statistics of two builds over the same frames.
 
-Both builds see the same frames, so the change of a figure is computed frame by frame and what the builds have in common
-cancels. A figure that is a ratio of sums has a linear influence for each frame; its standard error follows from the sum
-of the influences. A percentile has none that can be estimated from few frames; its standard error comes from a block
-bootstrap with equal weights for both builds. Frames that follow one another see the same craters and share the state of
-the filter: the integrated autocorrelation time, estimated from the paired series, enlarges the standard error and
-reduces the degrees of freedom. Passes are strata: only the variation within passes counts as chance. Everything random
-is seeded: the same samples give the same results.
+Both builds process the same frames, so the change of a metric is computed for each frame and common variation cancels.
+For a metric that is a ratio of sums, each frame has a linear influence; the standard error follows from the sum of the
+influences. The influence on a percentile cannot be estimated from few frames; its standard error comes from a block
+bootstrap with equal weights for both builds. Successive frames show the same craters and share the state of the filter:
+the integrated autocorrelation time, estimated from the paired series, increases the standard error and reduces the
+degrees of freedom. Passes are strata: only variation within passes counts as random. Random numbers are seeded: the
+same samples give the same results.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ BLOCKS_PER_CORRELATION_TIME = 2.0
 """Length of a bootstrap block in autocorrelation times: shorter blocks lose correlation, longer ones lose blocks."""
 
 LARGEST_FRAMES_NEEDED = 100_000_000
-"""Numbers of frames above this are not reported: no archive holds so many."""
+"""Largest reported number of needed frames; no archive has more."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """How far chance alone moves the change of a metric.
+    """Random variation of the change of a metric.
 
     Attributes
     ----------
     error
-        Standard error as the sample shows it; NaN where the frames do not give one.
+        Standard error of the sample; NaN if the frames do not determine it.
     freedom
         Degrees of freedom of Student's t.
     correlation_frames
         Integrated autocorrelation time of the paired series, in frames.
     floor
-        Smallest credible standard error: what a sample without a single changed frame leaves open. Infinite where
-        the frames cannot bound it.
+        Smallest credible standard error, given by a sample without a changed frame. Infinite if the frames do not
+        bound it.
     fewest_frames
-        Frames from which the floor is finite.
+        Number of frames from which the floor is finite.
     failure_floor
-        Smallest credible standard error for claims of a degradation: what the position of a percentile between few
-        values leaves open.
+        Smallest credible standard error for claims of a degradation, given by the position of a percentile between
+        few values.
     """
 
     error: float
@@ -70,12 +70,12 @@ class Spread:
 
 
 def series_spread(influence: FloatArray, sizes: Sequence[int]) -> Spread:
-    """Spread of the sum of a series (n,) of influences, stratified by pass.
+    """Return the spread of the sum of a series (n,) of influences, stratified by pass.
 
     Parameters
     ----------
     sizes
-        Frames of each pass, in the order in which the passes follow one another.
+        Number of frames of each pass, in order.
     """
     centred = _centred(influence, sizes)
     time = autocorrelation_time(influence, sizes)
@@ -88,7 +88,7 @@ def series_spread(influence: FloatArray, sizes: Sequence[int]) -> Spread:
 
 
 def autocorrelation_time(series: FloatArray, sizes: Sequence[int]) -> float:
-    """Integrated autocorrelation time of a series (n,) in frames, at least 1, pooled over passes.
+    """Return the integrated autocorrelation time of a series (n,) in frames, at least 1, pooled over passes.
 
     The time is 1 + 2 (r_1 + r_2 + ...). Sums of neighbouring terms are added as long as they are positive (initial
     positive sequence). Subtracting the mean of a short pass lowers every autocovariance by about the time over the
@@ -127,7 +127,7 @@ def autocorrelation_time(series: FloatArray, sizes: Sequence[int]) -> float:
 def resampled_spread(
     resampled: FloatArray, sizes: Sequence[int], block: int, correlation_frames: float
 ) -> Spread:
-    """Spread from resampled values (resamples,) of a change; corrected for the number of blocks."""
+    """Return the spread from resampled values (resamples,) of a change, corrected for the number of blocks."""
     frames, passes = sum(sizes), sum(1 for size in sizes if size)
     freedom = frames / correlation_frames - passes
     blocks = sum(int(block_of_frame(size, block)[-1]) + 1 for size in sizes if size)
@@ -139,7 +139,7 @@ def resampled_spread(
 
 
 def block_length(correlation_frames: float) -> int:
-    """Frames of a bootstrap block for a series with this autocorrelation time."""
+    """Return the length of a bootstrap block in frames for a series with this autocorrelation time."""
     if correlation_frames <= 1.0:
         return 1
     return math.ceil(BLOCKS_PER_CORRELATION_TIME * correlation_frames)
@@ -169,13 +169,13 @@ def block_weights(frames_of_pass: tuple[int, ...], block: int, resamples: int, s
 
 
 def block_of_frame(frames: int, block: int) -> IntArray:
-    """Index (frames,) of the block of each frame; blocks of nearly equal length, at least two where possible."""
+    """Return the index (frames,) of the block of each frame; of nearly equal length, at least two if possible."""
     blocks = min(max(2, round(frames / block)), frames)
     return np.arange(frames, dtype=np.int64) * blocks // max(frames, 1)
 
 
 def interval(resampled: FloatArray, confidence: float = 0.95) -> tuple[float, float]:
-    """Percentile interval of resampled values; NaN where there is none."""
+    """Return the percentile interval of resampled values; NaN if there is none."""
     finite = resampled[np.isfinite(resampled)]
     if len(finite) == 0:
         return float("nan"), float("nan")
@@ -191,7 +191,7 @@ def weighted_ratio(numerator: FloatArray, denominator: FloatArray, weights: Floa
 
 
 def ratio_influence(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
-    """Influence (n,) of each frame on the ratio of sums: its residual over the sum of the denominators.
+    """Return the influence (n,) of each frame on the ratio of sums: its residual over the sum of the denominators.
 
     References
     ----------
@@ -223,7 +223,7 @@ def weighted_quantile(values: FloatArray, level: float, weights: FloatArray) -> 
 
 
 def unseen_changes(confidence: float) -> float:
-    """Number of changed items that a sample without one may miss at this confidence: 4.6 at 99 %, 3.0 at 95 %.
+    """Return the upper bound of the number of changed items if none was observed: 4.6 at 99 %, 3.0 at 95 % confidence.
 
     References
     ----------
@@ -233,7 +233,7 @@ def unseen_changes(confidence: float) -> float:
 
 
 def student_quantile(probability: float, freedom: float) -> float:
-    """Value that Student's t stays below with this probability."""
+    """Return the quantile of Student's t at this probability."""
     from scipy import special  # imported here: the service starts without it
 
     if math.isinf(freedom):
@@ -242,14 +242,14 @@ def student_quantile(probability: float, freedom: float) -> float:
 
 
 def student_upper_tail(t: float, freedom: float) -> float:
-    """Probability that Student's t exceeds `t`."""
+    """Return the probability that Student's t exceeds `t`."""
     from scipy import special
 
     return float(special.ndtr(-t) if math.isinf(freedom) else special.stdtr(freedom, -t))
 
 
 def resolution(spread: Spread, confidence: float, power: float) -> float:
-    """Smallest change that a one-sided test at this confidence detects with this power; infinite where none is.
+    """Return the smallest change that a one-sided test at this confidence detects with this power; infinite if none.
 
     References
     ----------
@@ -264,14 +264,15 @@ def resolution(spread: Spread, confidence: float, power: float) -> float:
 def frames_needed(
     frames: int, passes: int, spread: Spread, detectable: float, confidence: float, power: float
 ) -> int | None:
-    """Frames of the same kind with which a change of `detectable` would be resolved; None where that is unknown.
+    """Return the number of similar frames needed to resolve a change of `detectable`; None if unknown.
 
     The standard error falls with the root of the number of frames, its floor with the number, and the quantiles of t
     with the degrees of freedom: about frames * (resolution / detectable)^2 where these are many.
     """
     if not (math.isfinite(spread.error) and detectable > 0.0 and frames > 0):
         return None
-    # An infinite floor falls to a finite value that these frames do not tell; the number is then a lower bound.
+    # An infinite floor decreases to a finite value that these frames do not determine; the number is a lower bound
+    # then.
     floor = spread.floor if math.isfinite(spread.floor) else 0.0
 
     def coarse(count: int) -> bool:
@@ -295,7 +296,7 @@ def frames_needed(
 
 
 def holm_levels(p_values: Sequence[float], alpha: float) -> list[float]:
-    """Level at which each test is judged by Holm's step-down procedure: alpha over the tests not yet rejected.
+    """Return the level of each test in Holm's step-down procedure: alpha over the number of tests not yet rejected.
 
     A test is rejected when its p-value and those of all smaller ones are below their levels; the chance that any true
     hypothesis of the family is rejected is at most alpha, whatever the dependence. After the first test that is kept
@@ -321,6 +322,6 @@ def _passes(series: FloatArray, sizes: Sequence[int]) -> list[FloatArray]:
 
 
 def _centred(series: FloatArray, sizes: Sequence[int]) -> FloatArray:
-    """The series less the mean of its pass."""
+    """Return the series minus the mean of its pass."""
     parts = [part - part.mean() if len(part) else part for part in _passes(series, sizes)]
     return np.concatenate(parts) if parts else series

@@ -44,15 +44,15 @@ def smoothed_series(
     model: SmootherModel,
     reference_covariance_m2: FloatArray,
 ) -> NavigationSeries | None:
-    """The smoothed orbit against the reference; None where no state came down in full.
+    """Return the errors of the smoothed orbit relative to the reference; None without complete states.
 
-    The payload flies its own rotation of the Moon: what it reports as a place on the Moon is taken from it, and the
-    smoother's correction, a difference of two inertial states, is added.
+    The payload uses its own rotation model of the Moon. Therefore, its reported selenographic positions are used, and
+    the smoother's correction, a difference of two inertial states, is added.
 
     Parameters
     ----------
     reported
-        Places that the same filter reported.
+        Positions reported by the same filter.
     track
         Reference at the times of `filtered`; `path_m` (n,) is the ground path to each.
     reference_covariance_m2

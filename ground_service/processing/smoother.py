@@ -43,8 +43,8 @@ class FilterStates:
     covariance
         Shape (n, 9, 9).
     innovation_degrees
-        Degrees of freedom of the normalised innovation squared of each frame, 0 without a fix, -1 where it is not
-        known, shape (n,); None for states that no frame belongs to.
+        Degrees of freedom of the normalised innovation squared of each frame, 0 without a fix, -1 if unknown, shape
+        (n,); None for states that do not belong to frames.
     """
 
     utc_ns: IntArray
@@ -62,7 +62,7 @@ class FilterStates:
 
     @property
     def position_covariance_rtn_m2(self) -> FloatArray:
-        """Covariance of the position (n, 3, 3) along radial, transverse and normal of each state."""
+        """Return the position covariance (n, 3, 3) in radial, transverse and normal axes of each state."""
         rtn = rtn_from_inertial(self.state[:, _POSITION], self.state[:, _VELOCITY])
         block = rtn @ self.covariance[:, _POSITION, _POSITION] @ np.swapaxes(rtn, 1, 2)
         return np.asarray(block, dtype=np.float64)

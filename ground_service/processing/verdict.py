@@ -1,7 +1,7 @@
-"""The verdict of a pass: its requirements, each with limit, value and whether it is met, and the sentence on them.
+"""Verdict of a pass: the requirements with limit, value and status, and a summary sentence.
 
 Limits are those of the mission description. A requirement without a limit is shown without judgement. A value that is
-not known never counts as met. The accuracy is that of the declared estimator, whichever did better.
+not known never counts as met. The accuracy is that of the declared estimator, also if another one is better.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from reports.values import (
 
 NEES_DEGREES = 3
 LARGEST_SENTENCE = 5
-"""Failed requirements that the sentence names; the table has all."""
+"""Largest number of failed requirements named in the sentence; the table has all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluated:
-    """What a pass was found to be, as far as requirements ask for it."""
+    """Results of a pass that requirements refer to."""
 
     navigation: tuple[NavigationSeries, ...] = ()
     detector: DetectorScore | None = None
@@ -120,7 +120,7 @@ def _row(
     judged: bool,
     note: str = "",
 ) -> Requirement:
-    """A requirement judged: `strict` excludes equality, `known` False keeps a value from counting as met."""
+    """Return a judged requirement: `strict` excludes equality; with `known` False the value never counts as met."""
     if value is not None and not math.isfinite(value):
         value = None
     if limit is not None and not math.isfinite(limit):
@@ -147,7 +147,7 @@ def _limited(
     known: bool = True,
     note: str = "",
 ) -> Requirement:
-    """A requirement that is judged where the mission states its limit."""
+    """Return a requirement that is judged if the mission states its limit."""
     judged = limit is not None
     return _row(key, name, unit, value, limit, at_most=at_most, known=known, judged=judged, note=note)
 
@@ -159,7 +159,7 @@ def _declared(limits: Limits, found: Evaluated) -> NavigationSeries | None:
 
 
 def _median(series: NavigationSeries | None) -> float | None:
-    """Median error; at its first frame odometry is where it was put, so that one frame is no navigation."""
+    """Return the median error; None for a single frame, where the error is that of the start position."""
     if series is None or len(series.utc_ns) < 2:
         return None
     return series.statistics.median_3d_m
@@ -172,7 +172,7 @@ def _accuracy(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
     elif series is None:
         note = f"{limits.estimator} reported nothing"
     elif len(series.utc_ns) < 2:
-        note = "one frame was navigated: too little to judge by"
+        note = "only one frame was navigated, too few for a judgement"
     else:
         note = f"{limits.estimator}, {count_text(len(series.utc_ns))} samples"
     median = _median(series)
@@ -192,7 +192,7 @@ def _accuracy(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
 
 
 def _comparisons(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
-    """The declared estimator against every baseline that was computed or has to be beaten."""
+    """Return the comparisons of the declared estimator with every computed or required baseline."""
     wanted = limits.better_than or ()
     others = {one.name: one for one in found.navigation if one.kind in ("baseline", "smoothed")}
     own = _median(_declared(limits, found))
@@ -242,7 +242,7 @@ def _completeness(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
         share = 100.0 * packets.packets / packets.expected if packets.expected else None
         note = f"{count_text(packets.packets)} of {count_text(packets.expected)} packets"
         if edges is None:
-            note += "; what is missing at the edges is not known without a plan"
+            note += "; without a plan, packets missing at the edges are unknown"
     yield _limited(
         "completeness.packets",
         "packets received of those expected",
@@ -315,7 +315,7 @@ def _independence(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
 
 
 def _resets(series: NavigationSeries | None) -> float | None:
-    """Resets of an estimator after its first sample; None where it reported no outcomes."""
+    """Return the number of resets of an estimator after its first sample; None if it reported no outcomes."""
     if series is None or not series.reset_trigger:
         return None
     return float(sum(trigger != "none" for trigger in series.reset_trigger[1:]))

@@ -1,4 +1,4 @@
-"""How the camera looked at each frame: attitude as telemetered or as declared, mounting and lens.
+"""Camera pointing in each frame: telemetered or declared attitude, mounting and lens.
 
 Frames: ICRF, mean-Earth (MCMF) and camera axes (x right, y down, z along the boresight).
 """
@@ -29,17 +29,17 @@ def _no_quaternions() -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Viewing:
-    """The camera and where it looked.
+    """Camera and its pointing.
 
     Attributes
     ----------
     camera
-        With the distortion of its lens, where that is declared.
+        Camera with the declared lens distortion, if any.
     tilt_rad, yaw_rad
         Mounting from nadir with image up to the north: yaw clockwise, then tilt from the boresight toward image up.
     attitude_utc_ns, q_wxyz
         Times (n,), ascending, and quaternions (n, 4) from ICRF to camera axes of the frames whose attitude is known.
-        Other frames are taken to point as declared.
+        Other frames use the declared pointing.
     """
 
     camera: PinholeCamera = field(default_factory=PinholeCamera)
@@ -49,7 +49,7 @@ class Viewing:
     q_wxyz: FloatArray = field(default_factory=_no_quaternions)
 
     def pointed(self, position_mcmf_m: FloatArray) -> FloatArray:
-        """Return the rotations (..., 3, 3) from MCMF to the camera as declared, at positions (..., 3)."""
+        """Return the rotations (..., 3, 3) from MCMF to the camera in the declared pointing, at positions (..., 3)."""
         return pointed_camera_from_mcmf(position_mcmf_m, self.tilt_rad, self.yaw_rad)
 
     def known(self, utc_ns: IntArray) -> BoolArray:
@@ -64,7 +64,7 @@ class Viewing:
         Parameters
         ----------
         utc_ns, position_mcmf_m, mcmf_from_icrf
-            Times (n,), positions (n, 3) and rotations (n, 3, 3) of the frames; NaN where not known gives NaN.
+            Times (n,), positions (n, 3) and rotations (n, 3, 3) of the frames; NaN (unknown) gives NaN.
         """
         rotations = self.pointed(position_mcmf_m)
         rows, known = self._rows(utc_ns)

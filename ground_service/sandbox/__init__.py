@@ -1,5 +1,5 @@
-"""Confinement of payload builds: programs of others, run without secrets, files or network of the service.
+"""Sandbox for payload builds: third-party programs without access to secrets, files or the network of the service.
 
-`kernel` holds the system calls, `launcher` is the process that sets a confined run up and watches it, `host` is the
-side of the service: it describes a run, starts the launcher and checks what comes back.
+`kernel` contains the system calls. `launcher` is the process that sets up and supervises a run. `host` is the interface
+of the service: it describes a run, starts the launcher and validates the result.
 """

@@ -1,4 +1,4 @@
-"""The service's side of a confined run: what a build may see, the launcher, and a check that the sandbox holds."""
+"""Interface of the service to the sandbox: file system view of a build, launcher, and a self-test of the sandbox."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from pathlib import Path
 from typing import Any, Literal
 
 GRACE_S = 180.0
-"""Time beyond the time limit of a run in which its launcher must have ended."""
+"""Time after the time limit of a run within which its launcher must end."""
 
 PACKAGES = ("lunar", "tmtc", "reports", "payload_emulator", "ground_service", "linna")
-"""Packages that the flight code of this project needs; scenarios, migrations and tests stay outside."""
+"""Packages that the flight code of this project needs; scenarios, migrations and tests are not visible."""
 
 _SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib64", "/lib32")
 _SYSTEM_FILES = ("/etc/ld.so.cache", "/etc/alternatives", "/sys/devices/system/cpu")
 _LAUNCH = "import sys; sys.path.insert(0, sys.argv.pop(1)); from ground_service.sandbox.launcher import main; main()"
 REMEDY = (
-    "let the kernel grant user namespaces to this process, or run builds in the runner: "
+    "permit user namespaces for this process, or run builds in the runner: "
     "set LINNA_RUNNER_EXCHANGE and start `linna runner` (docs/build-contract.md)"
 )
 
 
 class SandboxRefused(Exception):
-    """A run that did not happen, because it could not be confined."""
+    """A run that was not started because it could not be isolated."""
 
     def __init__(self, reason: str, remedy: str = REMEDY) -> None:
         super().__init__(f"{reason}; remedy: {remedy}" if remedy else reason)
@@ -40,7 +40,7 @@ class SandboxRefused(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A part of the file system of a run: `bind` a path read-only, a `link`, or a file of some `text`."""
+    """Part of the file system of a run: a read-only `bind` of a path, a `link`, or a file with a `text`."""
 
     kind: Literal["bind", "link", "text"]
     source: str
@@ -49,18 +49,18 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A confined run, as the launcher reads it.
+    """Description of a run, as read by the launcher.
 
     Attributes
     ----------
     mode
-        `namespaces`, or `user` in a machine that is nothing but a runner.
+        `namespaces`, or `user` in a container that is used only as a runner.
     limits
         As in the build file; see `ground_service.services.builds.Limits`.
     outputs
-        Names in the output folder that are taken out.
+        Names of the files that are copied from the output folder.
     deliver, printed
-        Folder for the outputs, and file for the end of what the program prints, both of the caller.
+        Folder of the caller for the outputs, and file for the end of the program's printed text.
     """
 
     mode: Literal["namespaces", "user"]
@@ -76,16 +76,16 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Protection:
-    """What confines builds here.
+    """Isolation of builds on this machine.
 
     Attributes
     ----------
     isolation
         The parts of the sandbox in force; "" if it is refused.
     refusal
-        Why a run would be refused; "" if it would not. The remedy is `REMEDY`.
+        Why runs are refused; "" if they are not. The remedy is `REMEDY`.
     checks
-        Result of each check that a probe made inside the sandbox, by name.
+        Result of each check of the probe inside the sandbox, by name.
     """
 
     isolation: str
@@ -94,12 +94,12 @@ class Protection:
 
 
 def execute(run: Run) -> dict[str, Any]:
-    """Run a program confined; what became of it.
+    """Run a program in the sandbox; return the report of the launcher.
 
     Raises
     ------
     SandboxRefused
-        It was not run, because a protection could not be put in force.
+        The program was not run because a protection could not be enabled.
     """
     reading, writing = os.pipe()
     try:
@@ -139,7 +139,7 @@ def execute(run: Run) -> dict[str, Any]:
 
 
 def program_view() -> tuple[Part, ...]:
-    """Everything a program needs of this machine: system libraries, Python, the packages of this project."""
+    """Return the parts of this machine that a program needs: system libraries, Python, the packages of this project."""
     parts: list[Part] = []
     for name in _SYSTEM:
         path = Path(name)
@@ -158,28 +158,28 @@ def program_view() -> tuple[Part, ...]:
 
 
 def check_private(folders: Sequence[Path]) -> None:
-    """Refuse a layout in which a folder of the service lies inside of what a build can read.
+    """Refuse a layout in which a folder of the service is inside a folder that a build can read.
 
     Raises
     ------
     SandboxRefused
-        If one does.
+        If there is such a folder.
     """
     parts = [*program_view()]
     for folder in folders:
         if _covered(os.path.realpath(folder), parts):
             raise SandboxRefused(
-                f"{folder}: expected outside of the folders of Python and of the system, which builds can read"
+                f"{folder}: expected a folder outside those of Python and of the system, which builds can read"
             )
 
 
 def package_root() -> Path:
-    """Folder that holds the packages of this checkout or installation."""
+    """Return the folder of the packages of this checkout or installation."""
     return Path(__file__).resolve().parents[2]
 
 
 def tail(path: Path, octets: int = 2000) -> str:
-    """The end of a text file; "" if there is none."""
+    """Return the end of a text file; "" if there is none."""
     try:
         return path.read_text(errors="replace")[-octets:]
     except OSError:
@@ -187,7 +187,7 @@ def tail(path: Path, octets: int = 2000) -> str:
 
 
 def make_readable(folder: Path) -> None:
-    """Let every user read a folder of copies; only who can reach the folder itself gets there."""
+    """Let every user read a folder of copies; the parent folder restricts who can reach it."""
     for where, _, names in os.walk(folder):
         Path(where).chmod(0o755)
         for name in names:
@@ -197,7 +197,7 @@ def make_readable(folder: Path) -> None:
 
 @functools.cache
 def protection() -> Protection:
-    """What confines builds here, by a probe that tries from inside."""
+    """Return how builds are isolated here, verified by a probe inside the sandbox."""
     from ground_service.sandbox import probe
 
     with tempfile.TemporaryDirectory(prefix="sandbox-") as folder:

@@ -1,7 +1,7 @@
-"""System calls of Linux that confine a process, with the standard library only.
+"""Linux system calls that isolate a process, with the standard library only.
 
-Namespaces, mounts, capabilities and a seccomp filter. Every function raises `OSError` if the kernel refuses: nothing
-here fails silently, because a protection that is not in force is not to be relied upon.
+Namespaces, mounts, capabilities and a seccomp filter. Every function raises `OSError` if the kernel
+refuses. No function fails silently, because a missing protection must not go unnoticed.
 """
 
 import ctypes
@@ -31,7 +31,7 @@ _AT_FDCWD, _AT_RECURSIVE = -100, 0x8000
 _PR_SET_PDEATHSIG, _PR_SET_DUMPABLE, _PR_SET_SECCOMP, _PR_CAPBSET_DROP = 1, 4, 22, 24
 _PR_SET_SECUREBITS, _PR_SET_CHILD_SUBREAPER, _PR_SET_NO_NEW_PRIVS, _PR_CAP_AMBIENT = 28, 36, 38, 47
 _PR_CAP_AMBIENT_CLEAR_ALL = 4
-# SECBIT_NOROOT, NO_SETUID_FIXUP and NO_CAP_AMBIENT_RAISE, each with its lock.
+# SECBIT_NOROOT, NO_SETUID_FIXUP and NO_CAP_AMBIENT_RAISE, each with its lock bit.
 _SECUREBITS = 0b1100_1111
 _CAPABILITY_VERSION_3 = 0x2008_0522
 _SECCOMP_MODE_FILTER = 2
@@ -40,7 +40,7 @@ _SECCOMP_MODE_FILTER = 2
 _ARCHITECTURES = {"x86_64": (0xC000_003E, 0), "aarch64": (0xC000_00B7, 1)}
 _X32_BIT = 0x4000_0000
 
-# Numbers on x86-64 and AArch64; None: not there.
+# Numbers on x86-64 and AArch64; None: not available.
 _NUMBERS: dict[str, tuple[int | None, int | None]] = {
     "_sysctl": (156, None), "acct": (163, 89), "add_key": (248, 217), "adjtimex": (159, 171), "bpf": (321, 280),
     "chroot": (161, 51), "clock_adjtime": (305, 266), "clock_settime": (227, 112), "clone": (56, 220),
@@ -63,11 +63,11 @@ _NUMBERS: dict[str, tuple[int | None, int | None]] = {
     "vhangup": (153, 58),
 }  # fmt: skip
 
-# Refused whatever the arguments are. Sockets reach what no namespace separates (AF_VSOCK: the host of a virtual
-# machine); memfd_create and System V shared memory are memory that no file limit counts; io_uring does the work of
-# other calls behind the filter; keys belong to the user, not to a namespace.
+# Refused with any arguments. Sockets can reach resources outside all namespaces (AF_VSOCK: the host of a virtual
+# machine). memfd_create and System V shared memory allocate memory that no file limit counts. io_uring performs other
+# system calls without the filter. Keys belong to the user, not to a namespace.
 DENIED = tuple(sorted(set(_NUMBERS) - {"clone", "clone3", "ioctl", "socketpair"}))
-# What the default profile of container engines refuses to a process without CAP_SYS_ADMIN.
+# System calls that the default profile of container engines refuses to a process without CAP_SYS_ADMIN.
 ENGINE_DENIED = ("unshare", "setns", "mount", "umount2", "pivot_root", "mount_setattr", "open_tree", "move_mount",
                  "fsopen", "fsmount", "fsconfig", "fspick", "keyctl", "add_key", "request_key", "bpf",
                  "perf_event_open", "userfaultfd", "open_by_handle_at", "name_to_handle_at")  # fmt: skip
@@ -112,18 +112,18 @@ def mount(source: str, target: str, kind: str = "", flags: int = 0, options: str
 
 
 def unmount(target: str) -> None:
-    """Take a mount out of the tree, also if it is in use."""
+    """Detach a mount from the tree, also if it is in use."""
     _checked(_libc.umount2(target.encode(), ctypes.c_int(MNT_DETACH)), f"umount {target}")
 
 
 def pivot_root(new: str, old: str) -> None:
-    """Make `new` the root, and put the former root to `old`."""
+    """Make `new` the root and move the former root to `old`."""
     call = number("pivot_root")
     _checked(_libc.syscall(ctypes.c_long(call), new.encode(), old.encode()), "pivot_root")
 
 
 def restrict_mount(target: str, attributes: int, *, cleared: int = 0, below: bool = True) -> None:
-    """Set and clear attributes of a mount, and of all below it unless `below` is False (Linux 5.12)."""
+    """Set and clear attributes of a mount, and of all mounts below it unless `below` is False (Linux 5.12)."""
     values = struct.pack("QQQQ", attributes, cleared, 0, 0)
     _checked(
         _libc.syscall(
@@ -139,45 +139,45 @@ def restrict_mount(target: str, attributes: int, *, cleared: int = 0, below: boo
 
 
 def die_with_parent() -> None:
-    """Have this process killed when the thread that started it ends."""
+    """Request that this process is killed when the thread that started it ends."""
     _prctl(_PR_SET_PDEATHSIG, 9, "PR_SET_PDEATHSIG")
 
 
 def adopt_orphans() -> None:
-    """Become the parent of descendants whose own parents have died."""
+    """Become the parent of descendants whose own parents have ended."""
     _prctl(_PR_SET_CHILD_SUBREAPER, 1, "PR_SET_CHILD_SUBREAPER")
 
 
 def hide_memory(hidden: bool = True) -> None:
-    """Keep other processes of this user from this one's memory, environment, descriptors and user maps."""
+    """Deny other processes of this user access to memory, environment, descriptors and user maps of this process."""
     _prctl(_PR_SET_DUMPABLE, int(not hidden), "PR_SET_DUMPABLE")
 
 
 def forbid_new_privileges() -> None:
-    """Make set-user-id programs and file capabilities without effect, for good."""
+    """Disable set-user-id programs and file capabilities permanently."""
     _prctl(_PR_SET_NO_NEW_PRIVS, 1, "PR_SET_NO_NEW_PRIVS")
 
 
 def drop_bounding_set(kept: tuple[int, ...] = ()) -> None:
-    """Give up capabilities, except those kept, for all programs executed from here on; needs CAP_SETPCAP."""
+    """Drop capabilities, except those in `kept`, for all programs executed later; needs CAP_SETPCAP."""
     for capability in range(64):
         if capability in kept:
             continue
         try:
             _prctl(_PR_CAPBSET_DROP, capability, "PR_CAPBSET_DROP")
         except OSError as error:
-            if error.errno == errno.EINVAL:  # the kernel knows no more of them
+            if error.errno == errno.EINVAL:  # the kernel has no further capabilities
                 return
             raise
 
 
 def lock_securebits() -> None:
-    """Take away that user 0 has capabilities, and that changes of the user keep any; needs CAP_SETPCAP."""
+    """Lock the securebits so that user 0 has no capabilities and user changes keep none; needs CAP_SETPCAP."""
     _prctl(_PR_SET_SECUREBITS, _SECUREBITS, "PR_SET_SECUREBITS")
 
 
 def drop_capabilities(kept: tuple[int, ...] = ()) -> None:
-    """Give up all effective, permitted, inheritable and ambient capabilities, except those kept (below 32)."""
+    """Drop all effective, permitted, inheritable and ambient capabilities, except those in `kept` (below 32)."""
     _prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL, "PR_CAP_AMBIENT")
     header = struct.pack("Ii", _CAPABILITY_VERSION_3, 0)
     mask = sum(1 << capability for capability in kept)
@@ -185,12 +185,12 @@ def drop_capabilities(kept: tuple[int, ...] = ()) -> None:
 
 
 def number(call: str) -> int:
-    """Number of a system call on this machine.
+    """Return the number of a system call on this machine.
 
     Raises
     ------
     OSError
-        If the processor architecture is not known here.
+        If the processor architecture is not supported.
     """
     found = _NUMBERS[call][_architecture()[1]]
     if found is None:
@@ -201,8 +201,8 @@ def number(call: str) -> int:
 def seccomp_filter(denied: tuple[str, ...] = DENIED, *, sockets: bool = False) -> bytes:
     """Return the filter program that refuses system calls with EPERM and permits all others.
 
-    `clone` with any flag of a namespace is refused, and `clone3`, whose flags a filter cannot see, does not exist.
-    Unless `sockets` is set, the only sockets are pairs (`socketpair`) inside the program.
+    `clone` with any namespace flag is refused; `clone3`, whose flags a filter cannot read, returns ENOSYS.
+    Unless `sockets` is set, only socket pairs (`socketpair`) are permitted.
     """
     audit, column = _architecture()
     steps = [_step(_LOAD, _ARCHITECTURE_AT), _step(_EQUAL, audit, 1, 0), _step(_RETURN, _KILL)]
@@ -224,7 +224,7 @@ def seccomp_filter(denied: tuple[str, ...] = DENIED, *, sockets: bool = False) -
 
 
 def install_filter(program: bytes) -> None:
-    """Put a filter in force for this process and all that it starts; needs `forbid_new_privileges` before."""
+    """Install a filter for this process and all its descendants; requires `forbid_new_privileges` before."""
     buffer = ctypes.create_string_buffer(program, len(program))
     holder = _Program(len(program) // 8, ctypes.cast(buffer, ctypes.c_void_p))
     pointer = ctypes.cast(ctypes.pointer(holder), ctypes.c_void_p).value
@@ -245,7 +245,7 @@ def _step(code: int, value: int, if_true: int = 0, if_false: int = 0) -> bytes:
 
 
 def _on_argument(call: str, position: int, test: list[bytes], code: int) -> list[bytes]:
-    """Refuse `call` if the test of the low half of an argument does not skip the step after it."""
+    """Return filter steps that refuse `call`, unless the test of the low half of an argument skips the refusal."""
     load = _step(_LOAD, _ARGUMENTS_AT + 8 * position)
     body = [load, *test, _step(_RETURN, _ERRNO | code), _step(_LOAD, _NUMBER_AT)]
     return [_step(_EQUAL, number(call), 0, len(body)), *body]

@@ -1,17 +1,17 @@
-"""The process that sets a confined run up, watches it, and takes its outputs out.
+"""Launcher process: it sets up a sandboxed run, supervises it, and extracts its outputs.
 
 It is started by `ground_service.sandbox.host` with an empty environment and the standard library only, reads one JSON
-object from standard input (`host.Run`) and writes one to the descriptor named by its first argument. Two ways:
+object from standard input (`host.Run`) and writes one to the descriptor named by its first argument. Two modes:
 
-`namespaces`: processes A, B, C and D. A (this one, outside) watches time, memory and processor time. B enters new
+`namespaces`: processes A, B, C and D. A (this one, outside) supervises time, memory and processor time. B enters new
 namespaces, whose users A maps. C, forked by B, is process 1 of the new process namespace: it builds a file system
 of read-only parts of this machine and one limited tmpfs, and starts D, the program. When D has ended, C kills
 everything else inside and sends the output files through a pipe. When C ends, the kernel removes the rest.
 
-`user`: for a machine that is nothing but a runner (a container without network, secrets and other programs). A gives D
-a user of its own for this run. What that user left running is killed, and what it left in files is removed.
+`user`: for a container that is used only as a runner, without network, secrets and other programs. A runs D as a
+separate user for this run. Remaining processes of that user are killed and its files are removed.
 
-In both, D has no capability, cannot gain one, and runs under a system call filter and resource limits.
+In both modes, D has no capabilities, cannot gain any, and runs with a system call filter and resource limits.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ SAMPLE_S = 0.1
 SETUP_S = 30.0
 COLLECT_S = 60.0
 PRINTED_OCTETS = 65_536
-"""What is kept of the end of what a program prints."""
+"""Number of octets kept from the end of the program's printed text."""
 
 INODES = 65_536
 BASE = "/tmp"
@@ -42,7 +42,7 @@ _CHUNK = 1 << 16
 
 
 class Refused(Exception):
-    """A protection that cannot be put in force."""
+    """A protection that cannot be enabled."""
 
 
 def main() -> None:
@@ -92,7 +92,7 @@ def run_in_namespaces(run):
         wait_for(b, SETUP_S)
         return report
     finally:
-        # Where B is gone, so are C, and with it everything in the process namespace.
+        # If B has ended, C has ended as well, and with it all processes in the process namespace.
         with contextlib.suppress(ProcessLookupError, ChildProcessError):
             os.kill(b, signal.SIGKILL)
         reap()
@@ -100,11 +100,11 @@ def run_in_namespaces(run):
 
 
 def user_map():
-    """What to write into the maps of the user namespace, and the user of the build inside.
+    """Return the maps of the user namespace, and the user of the build inside it.
 
-    A service that runs as root gives the build a user that exists nowhere else, chosen by process number: limits by
-    user bind it, and files of others are closed to it. Any other service can map its own user only; limits by user
-    are then counted in the new namespace.
+    A service that runs as root assigns the build a unique user, derived from the process id: limits per user apply to
+    it, and it cannot access files of other users. Any other service can map only its own user; limits per user are then
+    counted in the new namespace.
     """
     me, group = os.geteuid(), os.getegid()
     with open("/proc/self/uid_map") as stream:
@@ -124,18 +124,18 @@ def user_map():
 
 
 def build_uid():
-    """A user for this run: above the ranges of systemd and of user namespaces."""
+    """Return a user id for this run, above the ranges of systemd and of user namespaces."""
     return 1_900_000_000 + os.getpid()
 
 
 def enter_namespaces(run, uid, entered, mapped, control, reports, printed):
-    """Process B."""
+    """Run process B."""
     kernel.die_with_parent()
     try:
-        # A writes the maps, which belong to root while the memory is hidden.
+        # A writes the maps; they belong to root while the process is not dumpable.
         kernel.hide_memory(False)
         kernel.unshare(kernel.NAMESPACES)
-        kernel.die_with_parent()  # again: a change of credentials can cancel it
+        kernel.die_with_parent()  # again, because a change of credentials can cancel it
     except OSError as error:
         os.write(entered, f"namespaces: {error.strerror}".encode())
         return
@@ -155,7 +155,7 @@ def enter_namespaces(run, uid, entered, mapped, control, reports, printed):
 
 
 def be_init(run, uid, control, reports, printed):
-    """Process C: process 1 of the namespace."""
+    """Run process C, process 1 of the namespace."""
     try:
         kernel.die_with_parent()
         if os.getpid() != 1:
@@ -194,7 +194,7 @@ def be_init(run, uid, control, reports, printed):
 
 
 def build_root(run, uid):
-    """Make a root of nothing but what the run needs; the kernel forgets every other path."""
+    """Create a root with only the parts that the run needs; all other paths become unreachable."""
     limits = run["limits"]
     kernel.mount("", "/", "", kernel.MS_REC | kernel.MS_PRIVATE)
     kernel.mount("tmpfs", BASE, "tmpfs", kernel.MS_NOSUID | kernel.MS_NODEV, "mode=755,size=1m")
@@ -220,7 +220,7 @@ def build_root(run, uid):
             )
     for path in WRITABLE:
         os.makedirs("/new" + path, exist_ok=True)
-        # A mount of its own, so that it stays writable when the root is not; the limit is one for all of them.
+        # A separate mount, so that it stays writable when the root is not; all of them share one limit.
         kernel.mount("/new" + path, "/new" + path, "", kernel.MS_BIND)
         if os.getuid() == 0:
             os.chown("/new" + path, uid, uid)
@@ -233,7 +233,7 @@ def build_root(run, uid):
         kernel.mount("proc", "/new/proc", "proc", kernel.MS_NOSUID | kernel.MS_NODEV | kernel.MS_NOEXEC)
         kernel.restrict_mount("/new/proc", kernel.MOUNT_ATTR_RDONLY)
     except OSError:
-        has_proc = False  # An engine hides parts of its own: the folder stays empty.
+        has_proc = False  # A container engine hides parts of /proc: the folder stays empty.
     kernel.unmount("/old")
     os.chdir("/new")
     kernel.pivot_root(".", ".")
@@ -256,7 +256,7 @@ def bind(source, target):
 
 
 def check_network():
-    """Refuse to go on with any network interface besides an own loopback that is down."""
+    """Refuse to continue with any network interface other than a loopback that is down."""
     try:
         with open("/proc/net/route") as stream:
             routes = stream.read().splitlines()[1:]
@@ -270,7 +270,7 @@ def check_network():
 
 
 def run_as_user(run):
-    """Run in a machine that is nothing but a runner, as a user that exists for this run only."""
+    """Run in a dedicated runner container, as a user that is used for this run only."""
     if os.geteuid() != 0:
         raise Refused("separate user: expected a runner with CAP_SETUID, CAP_SETGID and CAP_KILL")
     uid = build_uid()
@@ -324,7 +324,7 @@ def kill_user(uid):
 
 
 def as_user(uid, action):
-    """Do something in a process that has become this user, and wait for it."""
+    """Call a function in a child process with this user id, and wait for it."""
     child = os.fork()
     if child == 0:
         try:
@@ -333,7 +333,7 @@ def as_user(uid, action):
                 action()
         finally:
             os._exit(0)
-    # The action may be to kill all processes of the user, itself included on some systems.
+    # The function may kill all processes of the user, on some systems including itself.
     os.waitpid(child, 0)
 
 
@@ -344,7 +344,7 @@ def put_on_user(uid):
 
 
 def remove_owned(uid):
-    """Remove what this user owns in the places where anybody may write."""
+    """Remove the files of this user in the world-writable folders."""
     for place in ("/tmp", "/dev/shm", "/var/tmp", "/run"):
         for folder, names, files in os.walk(place, topdown=False):
             for name in files + names:
@@ -359,7 +359,7 @@ def remove_owned(uid):
 
 
 def become_build(run, uid, gid, printed, change_user):
-    """Turn this forked process into the program (process D)."""
+    """Replace this forked process by the program (process D)."""
     limits = run["limits"]
     try:
         os.setsid()
@@ -370,7 +370,7 @@ def become_build(run, uid, gid, printed, change_user):
         if change_user:
             os.setgroups([])
         with contextlib.suppress(PermissionError):
-            # Without CAP_SETPCAP there is nothing in the sets that no_new_privs would let a program gain.
+            # Without CAP_SETPCAP, no_new_privs prevents a program from gaining capabilities of the bounding set.
             kernel.drop_bounding_set()
             kernel.lock_securebits()
         if change_user:
@@ -390,7 +390,7 @@ def become_build(run, uid, gid, printed, change_user):
             (resource.RLIMIT_MSGQUEUE, 0),
             (resource.RLIMIT_CORE, 0),
         ):
-            # The processor time has a second of warning, by a signal that tells it from other kills.
+            # The soft limit sends SIGXCPU a second before the hard limit, to distinguish it from other kills.
             hard = value + (kind == resource.RLIMIT_CPU)
             resource.setrlimit(kind, (value, hard))
         kernel.install_filter(kernel.seccomp_filter())
@@ -405,10 +405,10 @@ def become_build(run, uid, gid, printed, change_user):
 
 
 class Watch:
-    """Process A while a program runs: its limits, what it prints, and the report of process C."""
+    """Supervision by process A: limits, printed text, and the report of process C."""
 
     def __init__(self, run, root, reports, printed, stop, *, own=0, shared_disk=False):
-        # `own`: how many of the first descendants belong to the sandbox, whose memory does not count.
+        # `own`: number of first descendants that belong to the sandbox; their memory is not counted.
         self.run, self.root, self.stop, self.own, self.shared_disk = run, root, stop, own, shared_disk
         self.occupied_before = occupied()
         self.reports, self.printed = reports, printed
@@ -465,7 +465,7 @@ class Watch:
         self.tail = (self.tail + octets)[-PRINTED_OCTETS:]
 
     def drain(self):
-        """Take what is left in the pipe: nobody writes to it any more."""
+        """Read the rest of the pipe after all writers have ended."""
         while self.printed in self.open and select.select([self.printed], [], [], 0)[0]:
             octets = os.read(self.printed, _CHUNK)
             if not octets:
@@ -490,7 +490,7 @@ class Watch:
                     counted.append(process)
         limit = limits["memory_mib"] << 20
         if rss > limit:
-            # Pages that processes share count for each of them above; ask the kernel, which takes longer.
+            # Shared pages were counted for each process above; the proportional size is exact but slower.
             rss = sum(map(proportional_memory, counted))
         self.cpu_s = max(self.cpu_s, cpu)
         self.most_mib = max(self.most_mib, rss / (1 << 20))
@@ -502,12 +502,12 @@ class Watch:
             self.end("disk")
 
     def folder_full(self):
-        """Whether a run without a file system of its own has written more than it may, deleted files included."""
+        """Return whether a run without its own file system has exceeded its file space, including deleted files."""
         written = occupied() - self.occupied_before
         return self.shared_disk and written > self.run["limits"]["folder_mib"] << 20
 
     def take(self, octets):
-        """Octets of the report: messages, and files behind the messages that announce them."""
+        """Process octets of the report: messages, each followed by the file that it announces."""
         self.buffer += octets
         while self.buffer:
             if self.file is not None:
@@ -548,7 +548,7 @@ class Watch:
         elif "file" in message:
             wanted = message["file"] in self.run["outputs"]
             if not wanted or message["octets"] > self.run["limits"]["file_mib"] << 20:
-                raise Refused("an output that was not asked for")
+                raise Refused("an output that was not requested")
             self.left = message["octets"]
             path = os.path.join(self.run["deliver"], message["file"])
             self.file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb")
@@ -563,7 +563,7 @@ class Watch:
 
 
 def send_outputs(reports, run):
-    """Send the output files: regular files of a permitted size under the names asked for, nothing else."""
+    """Send the output files: only regular files of a permitted size with requested names."""
     folder = os.open(run.get("collect", "/out"), os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     for name in run["outputs"]:
         try:
@@ -595,12 +595,12 @@ def write_all(descriptor, octets):
 
 
 def read_some(descriptor, timeout_s):
-    """What can be read within a time; nothing when the other end is closed or silent."""
+    """Return the octets that can be read within a time; empty if the other end is closed or sends nothing."""
     return os.read(descriptor, _CHUNK) if select.select([descriptor], [], [], timeout_s)[0] else b""
 
 
 def reaped(wanted):
-    """Status of a child that has ended, reaping all others that have; None while it runs."""
+    """Return the status of a child that has ended, reaping all other ended children; None while it runs."""
     status = None
     while True:
         try:
@@ -639,7 +639,7 @@ def usage():
 
 
 def occupied():
-    """Octets in the places where anybody may write."""
+    """Return the number of octets used in the world-writable folders."""
     total = 0
     for place in ("/tmp", "/dev/shm"):
         with contextlib.suppress(OSError):
@@ -649,7 +649,7 @@ def occupied():
 
 
 def proportional_memory(process):
-    """Resident octets of a process, shared pages divided by those who share them where that can be read."""
+    """Return the proportional set size of a process in octets; the resident set size if that is not readable."""
     with (
         contextlib.suppress(OSError, IndexError, ValueError),
         open(f"/proc/{process}/smaps_rollup") as stream,
@@ -663,7 +663,7 @@ def proportional_memory(process):
 
 
 def descendants(root):
-    """Processes below another one, parents first."""
+    """Return the descendants of a process, parents first."""
     children = {}
     for name in os.listdir("/proc"):
         if name.isdigit():

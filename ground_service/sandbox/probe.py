@@ -1,6 +1,6 @@
-"""Run inside the sandbox before the first build: whether each protection is in force; all must be.
+"""Self-test inside the sandbox before the first build: every protection must be in force.
 
-It tries what a hostile program would, and writes the results to `/out/result.json`: name → true where it held.
+It attempts the actions of a hostile program and writes `/out/result.json`: name → true if the protection held.
 """
 
 import ctypes
@@ -55,7 +55,7 @@ def own_processes_only() -> bool:
 
 
 def forks_end() -> bool:
-    """Whether a limit on processes binds: forks fail long before 100 of them."""
+    """Return whether the process limit is effective: forks must fail before 100 processes."""
     reading, writing = os.pipe()
     children = []
     try:
@@ -75,7 +75,7 @@ def forks_end() -> bool:
 
 
 def disk_ends() -> bool:
-    """Whether a limit on all files together binds."""
+    """Return whether the limit on the total size of all files is effective."""
     made = []
     try:
         for number in range(64):

@@ -1,4 +1,4 @@
-"""What must hold in a runner that cannot make namespaces: it has to be a container with nothing in it."""
+"""Requirements for a runner without namespaces: a dedicated container without other content."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ _PERMITTED = {5: "CAP_KILL", 6: "CAP_SETGID", 7: "CAP_SETUID", 8: "CAP_SETPCAP"}
 _NEEDED = (5, 6, 7)
 _SECRET_WORDS = ("PASSWORD", "SECRET", "TOKEN", "URL", "CREDENTIAL")
 _MEMORY_KINDS = ("tmpfs", "proc", "sysfs", "devpts", "mqueue", "cgroup", "cgroup2", "devtmpfs", "ramfs")
-# Files of an engine, owned by root, which a build cannot change.
+# Files of the container engine, owned by root, which a build cannot change.
 _ENGINE_FILES = ("/etc/hosts", "/etc/hostname", "/etc/resolv.conf", "/sbin/docker-init")
 _LISTENING = "0A"
 
 
 def runner_faults(exchange: Path) -> list[str]:
-    """Return what is missing for builds to be confined by a user of their own; nothing if all holds."""
+    """Return the unmet requirements for isolation of builds by separate users; empty if all are met."""
     status = dict(
         line.split(":\t", 1) for line in Path("/proc/self/status").read_text().splitlines() if ":\t" in line
     )
     held = int(status["CapEff"], 16)
     names = sorted(name for name in os.environ if set(name.upper().split("_")) & set(_SECRET_WORDS))
     faults = {
-        "user 0 of a container (a build gets a user of its own)": os.geteuid() == 0,
+        "user 0 of a container (a build gets a separate user)": os.geteuid() == 0,
         "the capabilities SETUID, SETGID and KILL": all(held >> bit & 1 for bit in _NEEDED),
         "no other capability": held & ~sum(1 << bit for bit in _PERMITTED) == 0,
         "no-new-privileges": status["NoNewPrivs"].strip() == "1",
@@ -39,7 +39,7 @@ def runner_faults(exchange: Path) -> list[str]:
 
 
 def _mounts() -> list[tuple[str, str, set[str]]]:
-    """Mount point, kind and options of every mount."""
+    """Return mount point, type and options of every mount."""
     rows = [line.split() for line in Path("/proc/self/mounts").read_text().splitlines()]
     return [(row[1].replace("\\040", " "), row[2], set(row[3].split(","))) for row in rows]
 
@@ -61,7 +61,7 @@ def _writable_disks(exchange: Path) -> list[str]:
 
 
 def _routes() -> list[str]:
-    """Interfaces besides the loopback that have a route."""
+    """Return the interfaces with a route, except the loopback."""
     found = [line.split()[0] for line in Path("/proc/net/route").read_text().splitlines()[1:]]
     six = Path("/proc/net/ipv6_route")
     if six.exists():
@@ -76,13 +76,13 @@ def _listeners() -> list[str]:
         if path.exists():
             rows = [line.split() for line in path.read_text().splitlines()[1:]]
             found += [row[1] for row in rows if row[3] == _LISTENING]
-    # __SO_ACCEPTCON: a socket that others can connect to.
+    # __SO_ACCEPTCON: a listening socket.
     rows = [line.split() for line in Path("/proc/net/unix").read_text().splitlines()[1:]]
     return found + [row[-1] for row in rows if int(row[3], 16) & 0x1_0000]
 
 
 def _foreign_processes() -> list[int]:
-    """Processes that are neither above nor below this one."""
+    """Return the processes that are neither ancestors nor descendants of this one."""
     parents: dict[int, int] = {}
     for entry in Path("/proc").glob("[0-9]*/stat"):
         try:

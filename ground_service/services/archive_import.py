@@ -188,7 +188,7 @@ def _interval(folder: Path, manifest: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def archived_mission(folder: Path, manifest: Mapping[str, Any]) -> Mission:
-    """Return the mission description of an archive, else what its manifest declares."""
+    """Return the mission description of an archive, otherwise that of its manifest."""
     return _mission(folder, manifest)[0]
 
 

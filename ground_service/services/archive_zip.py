@@ -21,7 +21,7 @@ from ground_service.store.files import UNPACKING, unfinished_prefix
 
 ENTRIES_LIMIT = 20_000
 DIRECTORY_LIMIT_OCTETS = 8 << 20
-"""Octets of the central directory: 400 for each entry; the directory is read as a whole."""
+"""Largest size of the central directory in octets, 400 for each entry; the directory is read at once."""
 
 OCTETS_LIMIT = 16 << 30
 RATIO_LIMIT = 200
@@ -76,12 +76,12 @@ _ENTRY_OCTETS = 46
 
 
 def _check_directory(path: Path, name: str) -> None:
-    """Refuse a zip by its central directory before any of it is kept in memory.
+    """Refuse a zip with a too large central directory before reading it into memory.
 
     Raises
     ------
     InvalidInput
-        If the directory has too many octets or entries, whatever the end record says of them.
+        If the directory has too many octets or entries, also if the end record states fewer.
     """
     with path.open("rb") as stream:
         size = stream.seek(0, os.SEEK_END)

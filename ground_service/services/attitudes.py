@@ -1,4 +1,4 @@
-"""The table of the attitude of each frame, as pass archives hold it (`attitude.csv`)."""
+"""Attitude table of a pass archive (`attitude.csv`), one row per frame."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ground_service.errors import InvalidInput
 
 HEADER = "image_ticks,q_w,q_x,q_y,q_z"
 UNIT_TOLERANCE = 1e-3
-"""A quaternion may be so far from unit length: reports of attitude control have few digits."""
+"""Accepted deviation of a quaternion from unit length: attitude control reports have few digits."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +34,7 @@ def load_attitudes(path: Path, source: str = "attitude.csv") -> AttitudeTable:
     Raises
     ------
     InvalidInput
-        The file is no such table; the first bad line is named.
+        The file is not an attitude table; the message states the first invalid line.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()

@@ -1,4 +1,4 @@
-"""Reading of the audit log: who did what, when, to what."""
+"""Queries of the audit log."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ground_service.store import repository
 
 
 class AuditEntry(BaseModel):
-    """An entry of the audit log with its place in the hash chain."""
+    """Entry of the audit log with its hash chain values."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -25,12 +25,12 @@ class AuditEntry(BaseModel):
     action: str = Field(examples=["release telecommand"])
     target: str = Field(examples=["7"])
     detail: dict[str, Any]
-    previous_sha256: str = Field(description="Hash of the entry before it")
+    previous_sha256: str = Field(description="Hash of the previous entry")
     sha256: str = Field(description="Hash of this entry")
 
 
 class AuditHead(BaseModel):
-    """The newest entry of the chain; kept elsewhere, it shows whether the log was cut off later."""
+    """Newest entry of the chain; a copy stored elsewhere shows whether the log was truncated later."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -49,10 +49,10 @@ def list_entries(
     limit: int = 100,
     offset: int = 0,
 ) -> tuple[list[AuditEntry], int]:
-    """Return a page of entries, the newest first, and how many there are.
+    """Return a page of entries, newest first, and the total number.
 
-    `actor` and `target` are compared whole; `action` also names a group: "telecommand" finds "release telecommand".
-    Times are limits of an interval, `until_utc_ns` not included.
+    `actor` and `target` must be equal; `action` may be a part of the name: "telecommand" finds "release telecommand".
+    The interval does not include `until_utc_ns`.
     """
     table = repository.AUDIT
     conditions: list[Any] = []

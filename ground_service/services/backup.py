@@ -1,8 +1,8 @@
-"""Backup and restore: the whole service as a folder, while it runs, from and into either database.
+"""Backup and restore of the service as a folder, during operation, with SQLite and PostgreSQL.
 
-The folder holds a SQLite database of the same schema, the archive's files, and a list of what must be in it: the
-SHA-256 of every table and of the list of files, and the head of the audit chain. A restore checks all of it before it
-writes anything, and fills an empty service only.
+The folder contains a SQLite database of the same schema, the files of the archive, and a manifest with the SHA-256 of
+every table and of the list of files and the head of the audit chain. A restore verifies everything before it writes,
+and requires an empty service.
 """
 
 from __future__ import annotations
@@ -40,14 +40,15 @@ DAMAGE_LISTED = 20
 
 
 def backup(ground: Ground, out: Path, *, now_utc_ns: int) -> dict[str, Any]:
-    """Write everything into a new folder; what was written.
+    """Write a backup into a new folder; return its manifest.
 
-    `damaged` of the list names rows of the service that do not fit their digests: they are in the backup as they are.
+    `damaged` in the manifest lists rows of the service that do not match their digests; the backup contains them
+    unchanged.
 
     Raises
     ------
     Conflict
-        If something is there already.
+        If the folder exists already.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise Conflict(f"{out}: expected a folder that is new or empty, found something in it")
@@ -97,22 +98,22 @@ def backup(ground: Ground, out: Path, *, now_utc_ns: int) -> dict[str, Any]:
 
 
 def restore(folder: Path, ground: Ground) -> dict[str, Any]:
-    """Fill an empty service from a backup that is found to be whole; its list.
+    """Restore a verified backup into an empty service; return its manifest.
 
     Raises
     ------
     InvalidInput
-        If the folder is no backup, or a row of it was changed.
+        If the folder is not a backup, or a row in it was changed.
     FileDamaged, NotFound
-        If a file of it was changed or is missing.
+        If a file in it was changed or is missing.
     Conflict
-        If the service holds anything.
+        If the service is not empty.
     """
     manifest = _manifest(folder)
     with ground.database.reading() as connection:
         filled = rows.first_filled_table(connection)
     if filled is not None:
-        raise Conflict(f"{ground.database.label}: expected an empty service, found {filled} in it")
+        raise Conflict(f"{ground.database.label}: expected an empty service, found rows in {filled}")
     source = prepare_database(f"sqlite:///{folder / DATABASE}", upgrade=False)
     try:
         with source.snapshot() as connection:
@@ -147,7 +148,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
 
 
 def _check_rows(folder: Path, connection: Connection, manifest: dict[str, Any]) -> None:
-    """Compare every table, the list of files and the audit chain of a backup with its list."""
+    """Compare every table, the list of files and the audit chain of a backup with its manifest."""
     for name, table in rows.table_digests(connection).items():
         if manifest["rows"].get(name) != table.rows:
             raise InvalidInput(
@@ -162,7 +163,9 @@ def _check_rows(folder: Path, connection: Connection, manifest: dict[str, Any]) 
         raise InvalidInput(str(folder / MANIFEST), "audit_head", "the head of the audit chain", "another")
     broken = next(audit.broken_entries(connection), None)
     if broken is not None:
-        raise InvalidInput(str(folder / DATABASE), f"audit {broken.number}", "a whole chain", broken.reason)
+        raise InvalidInput(
+            str(folder / DATABASE), f"audit {broken.number}", "a complete chain", broken.reason
+        )
 
 
 def _strays(connection: Connection) -> Iterator[row_digests.StrayRow]:
@@ -180,7 +183,7 @@ def _list_sha256(names: list[str]) -> str:
 
 
 def _copy_rows(connection: Connection, target: Database) -> None:
-    """Every row that a connection sees into another, empty database, in one transaction."""
+    """Copy every row that a connection sees into another, empty database, in one transaction."""
     with target.writing() as writing:
         for table in rows.copied_tables():
             rows.insert_rows(writing, table, rows.row_blocks(connection, table))
@@ -199,7 +202,7 @@ def _check_file(files: FileArchive, sha256: str) -> None:
 
 
 def _copy_file(source: Path, files: FileArchive, sha256: str) -> int:
-    """Copy a file into an archive, checked while it is read; its octets."""
+    """Copy a file into an archive and verify its hash; return its number of octets."""
     if not source.is_file():
         raise NotFound("file", f"{sha256} in {source.parent.parent}")
     stored: StoredFile = files.put_file(source)

@@ -43,16 +43,16 @@ _OUT_OF_DISK = ("File too large", "No space left on device", "file size limit")
 
 @dataclass(frozen=True, slots=True)
 class BuildRun:
-    """What became of a run.
+    """Outcome of a run.
 
     Attributes
     ----------
     outcome
         A key of `OUTCOMES`.
     detail
-        What to tell a person who asks why.
+        Explanation of the outcome for users.
     isolation
-        What the program was confined by; "" if it was not run.
+        Sandbox in which the program ran; "" if it was not run.
     """
 
     build: str
@@ -81,15 +81,15 @@ class BuildRun:
 def run_build(
     build: Build, archive: Path, out: Path, *, runner: Path | None = None, private: Sequence[Path] = ()
 ) -> BuildRun:
-    """Run a build over an archived pass, its downlink written into `out`.
+    """Run a build over an archived pass and write its downlink into `out`.
 
-    The program sees a copy of what the payload was given and of its own files: no reference, no truth, no catalogue
-    of the ground, no network, nothing else of this machine. Where it cannot be confined it is not run.
+    The program has access only to copies of the payload inputs and of its own files: no reference, truth, ground
+    catalogue, network or other part of this machine. It is not run if it cannot be isolated.
 
     Parameters
     ----------
     runner
-        Exchange folder of a runner that takes the run over; None runs it in a sandbox here.
+        Exchange folder of the runner that executes the run; None runs it in a local sandbox.
     private
         Folders that a build must not be able to read, such as the archive of the service.
     """

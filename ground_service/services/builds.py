@@ -55,7 +55,7 @@ _SHIPPED_MODEL = "payload_emulator/flight/models/craters.onnx"
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a run of a build may use: seconds, MiB, open files, processes and threads.
+    """Resource limits of a run of a build: seconds, MiB, open files, processes and threads.
 
     `cpu_s` and `memory_mib` count all processes of the run together, and `folder_mib` everything that it writes.
     """
@@ -70,17 +70,17 @@ class Limits:
 
 
 CHECK_LIMITS = Limits(wall_s=120, cpu_s=60, memory_mib=2048, file_mib=1, folder_mib=16, processes=32)
-"""The check imports the flight code and reads a text file."""
+"""Limits of the parameter check, which imports the flight code and reads a text file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Build:
-    """A build under test.
+    """Payload build under test.
 
     Attributes
     ----------
     file
-        The build file; other names in it are of files beside it.
+        The build file; other file names in it are relative to its folder.
     command
         Program and arguments with the places {archive}, {out} and {build}; empty for a build on the flight code.
     files
@@ -88,7 +88,7 @@ class Build:
     parameters
         Name of the parameter file of a build on the flight code; "" without one.
     camera
-        What the build is made for, where it is made for one camera only.
+        Camera for which the build is made; None if it is not specific to a camera.
     digest
         Identity of the build.
     """
@@ -117,7 +117,7 @@ class Build:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """The command line, with the places {python}, {archive}, {out} and {folder} (of the staged build)."""
+        """Return the command line, with the placeholders {python}, {archive}, {out} and {folder}."""
         place = "{folder}" if self.command else ("{folder}/" + BUILD_FILE if self.folder_needed else CURRENT)
         words = [word.replace("{build}", place) for word in self.command or FLIGHT_COMMAND]
         if words[0] in dict(self.files):
@@ -126,11 +126,11 @@ class Build:
 
     @property
     def folder_needed(self) -> bool:
-        """Whether there are files of the build, as there are not for the flight code at hand."""
+        """Whether the build has its own files; the flight code of this installation has none."""
         return str(self.file) != CURRENT
 
     def stage(self, folder: Path) -> None:
-        """Copy the build file and the files it names into a new folder: all that a run sees of a build."""
+        """Copy the build file and the files it names into a new folder, the only one that a run can access."""
         folder.mkdir(parents=True)
         if not self.folder_needed:
             return
@@ -198,12 +198,12 @@ def load_build(given: str | Path) -> Build:
 
 
 def register_build(ground: Ground, build: Build, *, actor: str = "local") -> Build:
-    """Keep a build with the service: its files by content, its identity and origin; the kept build comes back.
+    """Store a build: its files by content, its identity and origin; return the stored build.
 
     Raises
     ------
     InvalidInput
-        Its parameters are not those of the flight code.
+        Its parameters are not valid for the flight code.
     BuildNotChecked
         Its parameters cannot be checked here.
     """
@@ -213,7 +213,7 @@ def register_build(ground: Ground, build: Build, *, actor: str = "local") -> Bui
     try:
         if not folder.exists():
             make_durable_folder(folder.parent)
-            # A name of its own: another process may register the same build at the same time.
+            # a unique name: another process may register the same build at the same time
             partial = Path(tempfile.mkdtemp(prefix=f".{build.digest[:16]}.", dir=folder.parent))
             text = build.file.read_bytes() if build.file.is_file() else _current_text().encode()
             (partial / BUILD_FILE).write_bytes(text)
@@ -225,7 +225,7 @@ def register_build(ground: Ground, build: Build, *, actor: str = "local") -> Bui
                 replace_durably(partial, folder)
             except OSError:
                 shutil.rmtree(partial, ignore_errors=True)
-                if not folder.exists():  # else the other process was first, with the same files
+                if not folder.exists():  # otherwise the other process was first, with the same files
                     raise
     except OSError as error:
         raise storage_error(error, folder) from None
@@ -248,16 +248,16 @@ def register_build(ground: Ground, build: Build, *, actor: str = "local") -> Bui
 
 
 def check_parameters(build: Build, *, runner: Path | None = None, private: Sequence[Path] = ()) -> None:
-    """Have the flight code check the parameter file of a build; other builds have nothing to check.
+    """Check the parameter file of a build with the flight code; other builds are not checked.
 
-    The flight code is a program to the ground: it runs confined like a build, on a copy of the build's files.
+    The flight code runs in the sandbox like a build, with a copy of the files of the build.
 
     Raises
     ------
     InvalidInput
-        A parameter is unknown or has an impossible value.
+        A parameter is unknown or has an invalid value.
     BuildNotChecked
-        The check cannot be confined here, or did not finish.
+        The check cannot be isolated here, or did not finish.
     """
     if not build.parameters:
         return
@@ -288,7 +288,7 @@ def check_parameters(build: Build, *, runner: Path | None = None, private: Seque
 
 
 def _fault_of(told: str) -> InvalidInput | None:
-    """Return the fault that the check printed as JSON; None where it printed no such thing."""
+    """Return the fault that the check printed as JSON; None if it printed none."""
     try:
         fault = json.loads(told[told.index('{"fault"') :])["fault"]
         return InvalidInput(*(str(fault[name]) for name in ("file", "key", "expected", "found")))

@@ -1,8 +1,8 @@
-"""Telecommands: entered, released or rejected, sent, and followed to their end.
+"""Telecommands: entry, release or rejection, transmission, and verification.
 
 queued → released → sent → (accepted → started → completed | failed), or queued → rejected. A command that
-changes the state of the payload or destroys data (`tmtc.effects`) is critical: it is released by somebody other than
-who entered it. Every step is a compare-and-set in the database (`store.states`) and
+changes the state of the payload or destroys data (`tmtc.effects`) is critical: a second person must release
+it. Every step is a compare-and-set in the database (`store.states`) and
 goes into the audit log in the transaction that makes it.
 """
 
@@ -38,7 +38,7 @@ from tmtc.uplink import UplinkEncoder
 
 DEFAULT_TIMEOUT_S = 600
 TIMEOUT_LIMIT_S = 2**31 - 1
-"""Commands of a planned window are followed to the end of the window, which may be years away."""
+"""Largest timeout: commands of a planned window are verified until its end, which may be years ahead."""
 
 _SERVICE, _TIME_OUT = "service", "time out"
 
@@ -47,7 +47,7 @@ COMMANDS = tuple(definition.name for definition in DICTIONARY.telecommands)
 
 @dataclass(frozen=True, slots=True)
 class Approval:
-    """Who entered what a telecommand is made from, and who approved it."""
+    """Persons who entered and approved the source of a telecommand, such as a window."""
 
     entered_by: str
     approved_by: str | None
@@ -86,7 +86,7 @@ def add_released(
     window_id: int | None = None,
     approval: Approval | None = None,
 ) -> int:
-    """Add a telecommand that is released already, within the caller's transaction; its id.
+    """Add a telecommand in state released, within the caller's transaction; return its id.
 
     Raises
     ------
@@ -134,12 +134,12 @@ def add_scheduled(
 
 
 def release_command(ground: Ground, command_id: int, *, actor: str) -> None:
-    """Release a queued command for uplink: its octets are made and never change again.
+    """Release a queued command for uplink: its octets are generated and never change again.
 
     Raises
     ------
     StateConflict
-        If it is not queued, or somebody else decided on it at the same time.
+        If it is not queued, or another request decided on it at the same time.
     Conflict
         If it is critical and was entered by the same person.
     """
@@ -150,19 +150,19 @@ def release_command(ground: Ground, command_id: int, *, actor: str) -> None:
                 DICTIONARY, row["name"], row["arguments"], _packed(row["name"], row["arguments"], 0)
             )
             raise Conflict(
-                f"telecommand {command_id} ({row['name']}): is critical; expected another person than {actor} "
+                f"telecommand {command_id} ({row['name']}): critical; expected a person other than {actor} "
                 f"to release it ({effect.effect}: {effect.reason})"
             )
         _release(connection, row, actor)
 
 
 def reject_command(ground: Ground, command_id: int, *, actor: str, reason: str) -> None:
-    """Take a queued command out of the queue.
+    """Reject a queued command.
 
     Raises
     ------
     StateConflict
-        If it is not queued, or somebody else decided on it at the same time.
+        If it is not queued, or another request decided on it at the same time.
     """
     require_line(reason, "telecommand", "reason", REASON_LIMIT)
     with ground.database.writing() as connection:
@@ -173,9 +173,9 @@ def reject_command(ground: Ground, command_id: int, *, actor: str, reason: str) 
 def take_uplink(
     ground: Ground, *, spacecraft_id: int, instance: str = FLOWN, framed: bool = True, actor: str
 ) -> tuple[bytes, list[int]]:
-    """What is to be sent now: all released commands in order, as CLTUs or bare packets, and their ids.
+    """Return the released commands in order as CLTUs or bare packets, and their ids, and mark them as sent.
 
-    They count as sent from then on: each is handed out once, whoever asks, and however many do.
+    Each command is returned exactly once, also to concurrent callers.
     """
     table = TELECOMMAND.table
     with ground.database.writing() as connection:
@@ -196,10 +196,9 @@ def take_uplink(
 
 
 def note_timeouts(ground: Ground, since_utc_ns: int, until_utc_ns: int) -> list[int]:
-    """Put on record, and tell those who watch, which telecommands should have ended in between and did not; their ids.
+    """Record and publish the telecommands whose timeout has passed; return their ids.
 
-    Each is noted once, however often and by however many processes it is asked for. What is reported late counts all
-    the same.
+    Each timeout is recorded once, also with concurrent processes. Later verification reports are still accepted.
     """
     table = TELECOMMAND.table
     due = table.c.sent_utc_ns + cast(table.c.timeout_s, BigInteger) * 1_000_000_000
@@ -259,7 +258,7 @@ def _add(
     window_id: int | None = None,
     **issued: Any,
 ) -> int:
-    """Enter a telecommand that the dictionary accepts; its id. `issued` holds its octets where it has them already."""
+    """Add a valid telecommand; return its id. `issued` holds its octets if it has them already."""
     _packed(name, arguments, 0)
     if isinstance(timeout_s, bool) or not 1 <= timeout_s <= TIMEOUT_LIMIT_S:
         raise InvalidInput("telecommand", "timeout_s", f"1 to {TIMEOUT_LIMIT_S}", str(timeout_s)[:40])
@@ -284,7 +283,7 @@ def _add(
 
 
 def _release(connection: Connection, row: repository.Row, actor: str) -> None:
-    """Give a queued telecommand its sequence count and its octets, which never change again."""
+    """Assign sequence count and octets to a queued telecommand; they never change again."""
     issued = _issued(connection, row["vehicle_id"], row["name"], row["arguments"], actor)
     _decide(connection, row["id"], "released", **issued)
     _note(
@@ -305,7 +304,7 @@ def _decide(connection: Connection, command_id: int, state: str, decided_by: str
 def _issued(
     connection: Connection, vehicle: int, name: str, arguments: Mapping[str, Any], actor: str
 ) -> dict[str, Any]:
-    """Columns of a telecommand that is given the next sequence count of its spacecraft."""
+    """Return the columns of a telecommand with the next sequence count of its spacecraft."""
     count = next_telecommand(connection, vehicle) % SEQUENCE_COUNT_LIMIT
     octets = _packed(name, arguments, count)
     return {
@@ -331,7 +330,7 @@ def _packed(name: str, arguments: Mapping[str, Any], count: int) -> bytes:
 
 
 def policy_of(connection: Connection, vehicle: int) -> ApprovalPolicy:
-    """Return the rule of a spacecraft about second persons: that of the dictionary, changed by its mission."""
+    """Return the approval policy of a spacecraft: that of the dictionary, modified by its mission description."""
     row = repository.get(connection, repository.VEHICLES, vehicle, "spacecraft")
     approval = approval_in_force(connection, int(row["ccsds_id"]))
     return DEFAULT_POLICY.raised(*(approval.second_person_for or ())).relaxed(
@@ -342,7 +341,7 @@ def policy_of(connection: Connection, vehicle: int) -> ApprovalPolicy:
 def _second_person(
     connection: Connection, vehicle: int, name: str, arguments: Mapping[str, Any]
 ) -> CommandEffect | None:
-    """The effect for which a telecommand needs a second person; None where it needs none."""
+    """Return the effect for which a telecommand needs a second person; None if it needs none."""
     effect = effect_of(DICTIONARY, name, arguments, _packed(name, arguments, 0))
     return effect if policy_of(connection, vehicle).needs_second_person(effect) else None
 
@@ -350,18 +349,18 @@ def _second_person(
 def _require_approval(
     connection: Connection, vehicle: int, name: str, arguments: Mapping[str, Any], approval: Approval | None
 ) -> None:
-    """Refuse to release a telecommand at once that needs a second person, where no such person approved its window.
+    """Refuse the immediate release of a telecommand that needs a second person if no second person approved its window.
 
     Raises
     ------
     Conflict
-        If nobody did, or the one who entered the window.
+        If the window was not approved, or approved by the person who entered it.
     """
     effect = _second_person(connection, vehicle, name, arguments)
     if effect is None or (approval is not None and approval.entered_by != approval.approved_by):
         return
     raise Conflict(
-        f"telecommand {name}: is critical; expected a window that another person than who entered it has approved "
+        f"telecommand {name}: critical; expected a window that a second person has approved "
         f"({effect.effect}: {effect.reason})"
     )
 

@@ -1,12 +1,12 @@
-"""Export and import of all rows and files as one portable file, from and into either database.
+"""Export and import of all rows and files as one portable file, with SQLite and PostgreSQL.
 
 The file is a zip archive: `manifest.json` with its SHA-256 in `manifest.sha256`, one file of JSON lines for each table
-(see `store.rows`), and the files of the archive under their SHA-256. The manifest holds number and SHA-256 of the lines
-of each table, so an import checks everything before it writes anything. Everything is streamed: memory does not grow
-with the archive.
+(see `store.rows`), and the files of the archive under their SHA-256. The manifest has the number and SHA-256 of the
+lines of each table, so an import verifies everything before it writes. All data are streamed: memory use does not
+depend on the size of the archive.
 
-An export can also be made from a database of the last revision before version 1.0. Its import leaves out what is
-derived, decodes the packets again, and binds the old audit entries in a chain.
+A database of the last revision before version 1.0 can also be exported. Its import leaves out derived rows, decodes the
+packets again, and adds the old audit entries to a hash chain.
 """
 
 from __future__ import annotations
@@ -43,19 +43,19 @@ MANIFEST_DIGEST = "manifest.sha256"
 MANIFEST_LIMIT_OCTETS = 16 << 20
 BLOCK_OCTETS = 1 << 20
 EARLIER_REVISION = "0011"
-"""The last revision before version 1.0: its tables can be read."""
+"""Last schema revision before version 1.0; its tables can be exported."""
 
 DERIVED = frozenset({"rollups", "stream_edges", *(one.__tablename__ for one in SAMPLE_TABLES)})
-"""Tables of an earlier revision that are not taken over: they are made again from the packets."""
+"""Tables of an earlier revision that are not imported, because they are derived from the packets."""
 
 EARLIER_VALUES: dict[tuple[str, str], Any] = {
     ("users", "state"): "active",
     ("tokens", "hint"): "",
 }
-"""Values of columns that an earlier revision does not have, where NULL or the default of the column is not right."""
+"""Values of columns missing in an earlier revision, if neither NULL nor the default of the column is correct."""
 
 EARLIER_COPIES = {("windows", "edited_by"): "created_by"}
-"""Columns that an earlier revision does not have, and the column of the same row that holds their value."""
+"""Columns missing in an earlier revision, and the column of the same row with their value."""
 
 Say = Callable[[str], None]
 
@@ -65,7 +65,7 @@ class _Strict(BaseModel):
 
 
 class ExportedTable(_Strict):
-    """One table of an export."""
+    """Table of an export."""
 
     columns: tuple[str, ...]
     rows: int = Field(ge=0)
@@ -73,7 +73,7 @@ class ExportedTable(_Strict):
 
 
 class ExportedFiles(_Strict):
-    """The files of an export."""
+    """Files of an export."""
 
     count: int = Field(ge=0)
     octets: int = Field(ge=0)
@@ -81,11 +81,11 @@ class ExportedFiles(_Strict):
 
 
 class ExportManifest(_Strict):
-    """What is in an export."""
+    """Manifest of an export."""
 
     format: str
     version: int
-    revision: str = Field(description="Schema revision of the database that was exported")
+    revision: str = Field(description="Schema revision of the exported database")
     made_utc: str
     tables: dict[str, ExportedTable]
     files: ExportedFiles
@@ -93,14 +93,12 @@ class ExportManifest(_Strict):
 
 
 class ImportResult(_Strict):
-    """What an import stored."""
+    """Result of an import."""
 
     revision: str
     rows: dict[str, int]
     files: int
-    left_out: dict[str, int] = Field(
-        description="Rows of an earlier revision that are made again or have no place"
-    )
+    left_out: dict[str, int] = Field(description="Rows of an earlier revision that were derived or not used")
     decoded: int = Field(description="Rows decoded again from packets of an earlier revision")
 
 
@@ -116,14 +114,14 @@ def export_database(
     with_files: bool = True,
     say: Say | None = None,
 ) -> ExportManifest:
-    """Write all rows (and files) of a database into a new zip file, in one state of the database.
+    """Write a consistent snapshot of all rows (and files) of a database into a new zip file.
 
     Raises
     ------
     Conflict
         If the file exists already.
     DatabaseTooOld, DatabaseTooNew
-        If the schema is one that this program cannot read.
+        If this program cannot read the schema.
     """
     if out.exists():
         raise Conflict(f"{out}: expected a file that does not exist yet, found one")
@@ -210,7 +208,7 @@ def _write_files(
 
 
 def _entry(name: str) -> zipfile.ZipInfo:
-    """An entry whose time does not depend on the clock."""
+    """Return a zip entry with a fixed time."""
     entry = zipfile.ZipInfo(name)
     entry.compress_type = zipfile.ZIP_DEFLATED
     return entry
@@ -220,16 +218,16 @@ def _entry(name: str) -> zipfile.ZipInfo:
 
 
 def import_database(ground: Ground, path: Path, *, say: Say | None = None) -> ImportResult:
-    """Fill an empty service from an export that is found to be whole.
+    """Import a verified export into an empty service.
 
     Raises
     ------
     InvalidInput
-        If the file is no export, or was changed.
+        If the file is not an export, or was changed.
     FileDamaged
-        If a file of the archive in it was changed.
+        If a file of the archive in the export was changed.
     Conflict
-        If the service holds anything.
+        If the service is not empty.
     """
     tell = say or (lambda _text: None)
     try:
@@ -243,7 +241,7 @@ def import_database(ground: Ground, path: Path, *, say: Say | None = None) -> Im
         with ground.database.reading() as connection:
             filled = rows.first_filled_table(connection)
         if filled is not None:
-            raise Conflict(f"{ground.database.label}: expected an empty service, found {filled} in it")
+            raise Conflict(f"{ground.database.label}: expected an empty service, found rows in {filled}")
         tell("checking the export")
         _check_tables(path, archive, manifest)
         names = _file_names(path, archive, manifest)
@@ -252,7 +250,10 @@ def import_database(ground: Ground, path: Path, *, say: Say | None = None) -> Im
                 _check_file(path, archive, name)
             elif not ground.files.path(name).is_file():
                 raise InvalidInput(
-                    str(path), f"file {name[:16]}…", f"the file in {ground.files.root}", "none there or here"
+                    str(path),
+                    f"file {name[:16]}…",
+                    f"the file in {ground.files.root}",
+                    "none there or in the export",
                 )
         if manifest.files.included:
             tell("files")
@@ -282,10 +283,12 @@ def _read_manifest(path: Path, archive: zipfile.ZipFile) -> ExportManifest:
                 str(path), MANIFEST, f"{FORMAT} version {VERSION}", f"version {str(document['version'])[:20]}"
             )
         if archive.read(MANIFEST_DIGEST) != hashlib.sha256(listed).hexdigest().encode():
-            raise InvalidInput(str(path), MANIFEST, f"the list whose hash is in {MANIFEST_DIGEST}", "another")
+            raise InvalidInput(
+                str(path), MANIFEST, f"the manifest whose hash is in {MANIFEST_DIGEST}", "another"
+            )
         return ExportManifest.model_validate(document)
     except (KeyError, TypeError, ValueError, ValidationError, zipfile.BadZipFile):
-        raise InvalidInput(str(path), MANIFEST, "the list of an export", "none or another") from None
+        raise InvalidInput(str(path), MANIFEST, "the manifest of an export", "none or another") from None
 
 
 def _check_tables(path: Path, archive: zipfile.ZipFile, manifest: ExportManifest) -> None:
@@ -345,7 +348,7 @@ def _blocks(archive: zipfile.ZipFile, name: str) -> Iterator[bytes]:
 def _store_rows(
     ground: Ground, path: Path, archive: zipfile.ZipFile, manifest: ExportManifest, *, earlier: bool
 ) -> tuple[dict[str, int], dict[str, int]]:
-    """Insert the rows of every table in one transaction; how many, and how many were left out."""
+    """Insert the rows of every table in one transaction; return the numbers of inserted and omitted rows."""
     stored: dict[str, int] = {}
     taken = {table.name for table in rows.copied_tables()} - (DERIVED if earlier else frozenset())
     with ground.database.writing() as connection:
@@ -385,7 +388,7 @@ def _parsed(
 
 
 class _Unknown:
-    """A column that this version does not have."""
+    """Column that this version does not have."""
 
     def __init__(self, name: str) -> None:
         from sqlalchemy import JSON
@@ -396,7 +399,7 @@ class _Unknown:
 def _upgraded(
     path: Path, table: Table, exported: ExportedTable, parsed: Iterable[dict[str, Any]]
 ) -> Iterator[dict[str, Any]]:
-    """Rows of an earlier revision with the columns of this one."""
+    """Yield the rows of an earlier revision with the columns of this one."""
     added: dict[str, Any] = {}
     copies = {new: old for (name, new), old in EARLIER_COPIES.items() if name == table.name}
     for column in table.columns:
@@ -423,7 +426,7 @@ def _upgraded(
 
 
 def _store_chain(connection: Connection, parsed: Iterable[Mapping[str, Any]]) -> int:
-    """Bind audit entries of an earlier revision in a chain, in their order; their numbers become those of the chain."""
+    """Add the audit entries of an earlier revision to a hash chain, in order and with new numbers."""
     count = 0
     for row in parsed:
         audit.add_note(
@@ -444,7 +447,7 @@ def _store_chain(connection: Connection, parsed: Iterable[Mapping[str, Any]]) ->
 
 
 def _count_telecommands(connection: Connection) -> None:
-    """Let sequence counts of telecommands go on behind those that an earlier revision gave, which counted rows."""
+    """Continue the telecommand sequence counts of an earlier revision, which were row counts."""
     table, counters = repository.TELECOMMANDS, repository.COMMAND_COUNTERS
     given = connection.execute(
         select(table.c.vehicle_id, func.count())

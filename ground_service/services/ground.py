@@ -72,18 +72,18 @@ def open_ground(
     database_url: str | None = None,
     runner: Path | None = None,
 ) -> Ground:
-    """The ground service under `home`, its SQLite database created or brought up to date there.
+    """Return the ground service under `home`; its SQLite database is created or upgraded.
 
     Parameters
     ----------
     home
-        Folder of the database, the raw files and the reports; made when it does not exist.
+        Folder of the database, the raw files and the reports; created if missing.
     data
-        Public data products; none means the built-in models.
+        Public data products; None: the built-in models.
     database_url
-        Another database than ``home/linna.db``.
+        Database URL; None: ``home/linna.db``.
     runner
-        Exchange folder of the runner that runs payload builds; None: a sandbox of this machine.
+        Exchange folder of the runner that executes payload builds; None: a local sandbox.
     """
     home = home.expanduser().absolute()
     try:
@@ -100,7 +100,7 @@ def open_ground(
 
 
 def keep_private(path: Path, mode: int) -> None:
-    """Take from everybody but the owner what `mode` does not give them; a warning where that is not ours to do."""
+    """Remove permissions of group and others that are not in `mode`; log a warning if that is not permitted."""
     try:
         found = stat.S_IMODE(path.stat().st_mode)
         if found & ~mode & 0o077:
@@ -112,12 +112,12 @@ def keep_private(path: Path, mode: int) -> None:
 
 
 def ground_from_settings(settings: Settings) -> Ground:
-    """The ground service that the deployment's settings describe.
+    """Return the ground service for the settings of the deployment.
 
     Raises
     ------
     PowerfulRole
-        Its database role could change the schema or the audit log, and the settings do not allow it.
+        Its database role can change the schema or the audit log, and the settings do not permit that.
     """
     data = find_data(settings.data) if settings.data is not None else DataFolder()
     url = settings.resolved_database_url()

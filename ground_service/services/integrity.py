@@ -1,9 +1,9 @@
-"""An archive checked against itself: files, rows, packets, what is decoded from them, and the audit chain.
+"""Integrity check of an archive: files, rows, packets, decoded values, and the audit chain.
 
-Everything derived is made again in a scratch archive and compared by content: from the stored packets, or (`deep`)
-from the raw files, as if they had been ingested for the first time. All else has digests of its own. What this cannot
-find is a change by somebody who can write to the database and knows how digests and chain are made; a head of the
-audit chain that is kept elsewhere shows that for the log.
+Derived data are generated again in a scratch archive and compared by content: from the stored packets, or (`deep`) from
+the raw files, as in their first ingest. All other data have digests. The check does not detect changes by a person who
+can write to the database and computes matching digests and a matching chain; for the audit log, a head of the chain
+that was stored elsewhere detects them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tmtc.stream import cut_packets
 
 BLOCK_PACKETS = 20_000
 LIMIT_OF_A_KIND = 200
-"""Damage told one by one of each kind; the rest is counted."""
+"""Largest number of listed damages of each kind; the rest is only counted."""
 
 INGESTED = ("done", "failed")
 
@@ -40,24 +40,24 @@ Say = Callable[[str], None]
 
 
 class Damage(BaseModel):
-    """Something that is not as it was written."""
+    """Damaged or missing item of the archive."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     kind: str = Field(description="Table, or files, audit, schema")
-    key: str = Field(description="Which row, file or entry")
+    key: str = Field(description="Row, file or entry")
     reason: str
 
 
 class Verification(BaseModel):
-    """What was checked, and what of it is damaged."""
+    """Result of an integrity check."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     checked: dict[str, int] = Field(description="Rows, files and entries checked, by kind")
-    unchecked: dict[str, int] = Field(description="What could not be checked, by reason")
+    unchecked: dict[str, int] = Field(description="Number of unchecked items, by reason")
     damaged: list[Damage]
-    damaged_total: int = Field(description="All damage, also what is not listed")
+    damaged_total: int = Field(description="Number of all damages, including unlisted ones")
     verdict: Literal["intact", "damaged"]
     audit_head: str | None = Field(description="NUMBER:SHA256 of the newest audit entry")
 
@@ -84,14 +84,14 @@ class _Findings:
 def verify(
     ground: Ground, *, deep: bool = False, expected_head: audit.Head | None = None, say: Say | None = None
 ) -> Verification:
-    """Check an archive against itself, in one state of the database; nothing is changed.
+    """Check the integrity of an archive, in one snapshot of the database, without changes.
 
     Parameters
     ----------
     deep
-        Ingest all raw files again into a scratch archive and compare; else the stored packets are decoded again.
+        Ingest all raw files again into a scratch archive and compare; otherwise decode the stored packets again.
     expected_head
-        A head of the audit chain that was kept elsewhere: its entry has to be in the chain.
+        Head of the audit chain that was stored elsewhere: its entry must be in the chain.
     """
     found = _Findings()
     tell = say or (lambda _text: None)
@@ -157,14 +157,12 @@ def _check_audit(connection: Connection, expected: audit.Head | None, found: _Fi
         stored = audit.read_entry_sha256(connection, expected.number)
         if stored != expected.sha256:
             what = "another" if stored is not None else "none"
-            found.damage(
-                "audit", expected.number, f"expected the entry of the head that was kept, found {what}"
-            )
+            found.damage("audit", expected.number, f"expected the entry of the stored head, found {what}")
     return audit.read_head(connection)
 
 
 def _check_files(connection: Connection, files: FileArchive, found: _Findings) -> set[str]:
-    """Check every file against its row; names of those that are whole."""
+    """Check every file against its row; return the hashes of undamaged files."""
     good, known = set(), set()
     table = repository.FILES
     for sha256, octets in connection.execute(select(table.c.sha256, table.c.octets).order_by(table.c.sha256)):
@@ -183,7 +181,7 @@ def _check_files(connection: Connection, files: FileArchive, found: _Findings) -
         if not path.is_file() or path.name.startswith(".") or path.name in known:
             continue
         if path == files.path(path.name) and _sha256(path) == path.name:
-            found.skip("files without a row, as an upload leaves that was broken off")
+            found.skip("files without a row, left by interrupted uploads")
         else:
             found.damage("files", path.name[:80], "expected no such file in the archive, found one")
     return good
@@ -211,7 +209,7 @@ def _scratch(ground: Ground) -> Iterator[Ground]:
 def _ingest_again(
     connection: Connection, ground: Ground, scratch: Ground, good: set[str], found: _Findings
 ) -> None:
-    """Ingest every raw file into the scratch archive, as each was the first time."""
+    """Ingest every raw file into the scratch archive, as in its first ingest."""
     ingests, vehicles, files, pieces = (
         repository.INGESTS, repository.VEHICLES, repository.FILES, repository.PIECES,
     )  # fmt: skip
@@ -232,7 +230,7 @@ def _ingest_again(
         place = Place(row["stream"], row["position"]) if row["stream"] else None
         key = (row["file_sha256"], row["ccsds_id"], row["instance"], row["spacecraft_id"], place)
         if row["state"] not in INGESTED:
-            found.skip("ingests that have not come to their end")
+            found.skip("unfinished ingests")
             continue
         if key in seen or row["file_sha256"] not in good:
             continue
@@ -255,19 +253,19 @@ def _ingest_one(scratch: Ground, stored: StoredFile, row: Any, place: Place | No
     instance = row["scope"] or row["instance"] or FLOWN
     spacecraft = row["spacecraft_id"]
     if row["scope"] is None and row["ccsds_id"] is not None:
-        # An ingest from before pieces were recorded: what was stated about it is not known any more.
+        # an ingest older than the record of pieces: the statements of its sender are not known
         try:
             ingest_stored(scratch, stored, name=str(row["name"]), instance=instance)
             return
         except GroundError:
-            spacecraft = int(row["ccsds_id"])  # bare packets do not say whose they are
+            spacecraft = int(row["ccsds_id"])  # bare packets carry no spacecraft id
     ingest_stored(
         scratch, stored, name=str(row["name"]), spacecraft_id=spacecraft, instance=instance, place=place
     )
 
 
 def _decode_again(connection: Connection, scratch: Ground, found: _Findings) -> None:
-    """Store the packets of this archive in the scratch archive, as if they came for the first time."""
+    """Store the packets of this archive in the scratch archive, as in their first ingest."""
     table = repository.PACKETS
     for row in connection.execute(select(repository.VEHICLES)).mappings().all():
         vehicle, last = int(row["id"]), 0
@@ -295,10 +293,10 @@ def _decode_again(connection: Connection, scratch: Ground, found: _Findings) -> 
 
 
 def _whole(key: int, digest: bytes, octets: bytes, found: _Findings) -> bool:
-    """Whether a stored packet has its digest and the length that its header says."""
+    """Return whether a stored packet matches its digest and the length in its header."""
     octets = bytes(octets)
     if hashlib.blake2b(octets, digest_size=DIGEST_OCTETS).digest() != bytes(digest):
-        found.damage("packets", key, "expected octets that give its digest, found other octets")
+        found.damage("packets", key, "expected octets that match its digest, found other octets")
         return False
     if len(octets) <= PRIMARY_HEADER_LENGTH or len(octets) != PRIMARY_HEADER_LENGTH + 1 + int.from_bytes(
         octets[4:6], "big"
@@ -319,7 +317,7 @@ def _compare(connection: Connection, made: Connection, found: _Findings) -> None
             "packets", _packets(connection, int(row["id"])), _packets(made, known[int(row["id"])]), found
         )
         if row["decoded_version"] not in (None, DICTIONARY.version):
-            found.skip("vehicles that are not decoded with this dictionary yet")
+            found.skip("vehicles not yet decoded with this dictionary")
             continue
         for name, table in repository.SAMPLES.items():
             _check_packets_of(connection, name, table, int(row["id"]), found)
@@ -335,9 +333,7 @@ def _compare(connection: Connection, made: Connection, found: _Findings) -> None
             .where(table.c.vehicle_id.not_in(list(known)))
             .group_by(table.c.vehicle_id)
         ):
-            found.damage(
-                name, f"vehicle {vehicle}", f"expected no rows of a vehicle that is not, found {count}"
-            )
+            found.damage(name, f"vehicle {vehicle}", f"expected no rows of an unknown vehicle, found {count}")
         if name == "packets":
             continue
         other = connection.execute(
@@ -348,7 +344,7 @@ def _compare(connection: Connection, made: Connection, found: _Findings) -> None
         for version, count in other:
             if version > DICTIONARY.version:
                 found.damage(
-                    name, f"dictionary version {version}", f"expected none so new, found {count} rows"
+                    name, f"dictionary version {version}", f"expected no newer version, found {count} rows"
                 )
             else:
                 found.skip(f"values decoded with dictionary version {version}", int(count))
@@ -357,7 +353,7 @@ def _compare(connection: Connection, made: Connection, found: _Findings) -> None
 def _check_packets_of(
     connection: Connection, name: str, table: Table, vehicle: int, found: _Findings
 ) -> None:
-    """Report packets that values name and that are not there, or not under this number."""
+    """Report packets referenced by values that are missing or have another number."""
     packets = repository.PACKETS
     missing = connection.execute(
         select(table.c.packet_id, func.count())
@@ -407,7 +403,7 @@ def _keyed(connection: Connection, query: Any, key_columns: int) -> Keyed:
 
 
 def _compare_rows(kind: str, stored: Keyed, expected: Keyed, found: _Findings) -> None:
-    """Merge two lists in the order of their keys and tell where they differ."""
+    """Merge two lists in the order of their keys and report their differences."""
     mine, other = next(stored, None), next(expected, None)
     while mine is not None or other is not None:
         if mine is None or (other is not None and other[0] < mine[0]):
@@ -417,7 +413,9 @@ def _compare_rows(kind: str, stored: Keyed, expected: Keyed, found: _Findings) -
             continue
         found.count(kind)
         if other is None or mine[0] < other[0]:
-            found.damage(kind, _words(mine[0]), "expected no such row, found one that no raw octets give")
+            found.damage(
+                kind, _words(mine[0]), "expected no such row, found one that the raw data do not give"
+            )
             mine = next(stored, None)
             continue
         if mine[1] != other[1]:

@@ -102,7 +102,7 @@ IDENTITY = {
     "regression": ("candidate", "baseline"),
     "redecode": ("vehicle_id",),
 }
-"""Arguments by which a request for a job under an id that is known is the same request."""
+"""Arguments that must be equal for two requests with the same job id to be the same request."""
 
 _OTHER_REQUEST = "Idempotency-Key: expected the request that it was first sent with, found another"
 
@@ -116,7 +116,7 @@ def enter_job(ground: Ground, kind: str, arguments: Mapping[str, Any], *, job_id
 def add_job(
     connection: Connection, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None
 ) -> str:
-    """As `enter_job`, within the caller's transaction.
+    """Add a job as `enter_job` does, within the caller's transaction.
 
     Raises
     ------
@@ -155,14 +155,14 @@ def enter_jobs(
     arguments: Mapping[str, Any],
     job_id: str,
 ) -> list[str]:
-    """Enter a job and the replays that it needs first, all or none; the ids of what is to be started, in this order.
+    """Add a job and the replays that it needs first in one transaction; return the ids to start, in order.
 
-    Where the job was entered before, nothing is added and nothing is to be started but the job.
+    If the job exists already, nothing is added and only the job is started.
 
     Parameters
     ----------
     first
-        Arguments of the replays by a name of each within the job.
+        Arguments of the replays by their names within the job.
 
     Raises
     ------
@@ -195,12 +195,12 @@ def enter_ingest(
     place: Place | None = None,
     job_id: str | None = None,
 ) -> tuple[int, str]:
-    """Enter an archived file and the job that ingests it, both or neither; their ids. The same job again: the same.
+    """Add an archived file and the job that ingests it in one transaction; return their ids, also if the job exists.
 
     Raises
     ------
     Conflict
-        If the id stands for the ingest of something else.
+        If the id belongs to another ingest.
     """
     with ground.database.writing() as connection:
         if job_id is not None:
@@ -222,7 +222,7 @@ def _known_ingest(
     spacecraft_id: int | None,
     instance: str,
 ) -> int:
-    """The ingest of a job that was entered before with the same file and for the same spacecraft."""
+    """Return the ingest of an existing job with the same file and the same spacecraft."""
     asked = {"spacecraft_id": spacecraft_id, "instance": instance}
     if job["kind"] == "ingest" and asked.items() <= job["arguments"].items():
         ingest_id = int(job["arguments"]["ingest_id"])
@@ -241,14 +241,14 @@ def enter_redecoding(ground: Ground) -> list[str]:
 
 
 def run_job(ground: Ground, job_id: str) -> dict[str, Any]:
-    """Do a job that was entered; its row afterwards. A job that fails says why and is not repeated, whatever the error.
+    """Run a job and return its row afterwards. A failed job records the reason and is not repeated.
 
-    A job that somebody else is doing now, here or in another process, is left to that one.
+    A job that is already running, here or in another process, is not started.
 
     Raises
     ------
     DatabaseUnavailable, StorageFull, StorageReadOnly
-        If the database went away, or nothing can be written: the job is not at its end, and is to be done again.
+        If the database is unavailable, or nothing can be written: the job has not finished and will run again.
     """
     with _alone_here(job_id) as here, ground.database.alone(_lock_key(job_id)) as alone:
         if not (here and alone):
@@ -273,7 +273,7 @@ def _run_alone(ground: Ground, job_id: str) -> dict[str, Any]:
                 attempts=attempt,
                 started_utc_ns=utc_now_ns(),
             )
-        except StateConflict:  # somebody else has begun it since it was read
+        except StateConflict:  # another process has started the job since it was read
             return repository.get(connection, repository.JOBS, job_id, JOB.kind)
         publish(connection, "job", {"id": job_id, "kind": job["kind"], "state": "running"})
     if attempt > ATTEMPTS_LIMIT:
@@ -284,19 +284,19 @@ def _run_alone(ground: Ground, job_id: str) -> dict[str, Any]:
         result = WORK[job["kind"]](ground, job["arguments"], job_id)
         return _finish(ground, job_id, attempt, state="done", result=result, progress=1.0, error=None)
     except PASSING as error:
-        log.info("job %s (%s) is to be done again: %s", job_id, job["kind"], error)
+        log.info("job %s (%s) will run again: %s", job_id, job["kind"], error)
         _put_back(ground, job_id, attempt)
         raise
     except (GroundError, TmtcError, LunarError, ReportError) as error:
         log.warning("job %s (%s) failed: %s", job_id, job["kind"], error)
         return _finish(ground, job_id, attempt, state="failed", error=public_text(error))
-    except Exception as error:  # whatever it is: the job is at its end, and says so
+    except Exception as error:  # any error ends the job, which records it
         translated = storage_error(error, "archive") if isinstance(error, OSError) else None
         if isinstance(translated, PASSING):
-            log.info("job %s (%s) is to be done again: %s", job_id, job["kind"], error)
+            log.info("job %s (%s) will run again: %s", job_id, job["kind"], error)
             _put_back(ground, job_id, attempt)
             raise translated from error
-        log.exception("job %s (%s) met an unexpected error", job_id, job["kind"], extra={"job": job_id})
+        log.exception("job %s (%s): unexpected error", job_id, job["kind"], extra={"job": job_id})
         return _finish(ground, job_id, attempt, state="failed", error=public_text(error))
 
 
@@ -351,7 +351,7 @@ def _lock_key(job_id: str) -> int:
 
 
 def _finish(ground: Ground, job_id: str, attempt: int, *, state: str, **values: Any) -> dict[str, Any]:
-    """End the attempt of a job; a job that was taken up again by somebody else meanwhile is left to that one."""
+    """End the attempt of a job, unless another process has started a new attempt meanwhile."""
     with ground.database.writing() as connection:
         try:
             move(
@@ -364,7 +364,7 @@ def _finish(ground: Ground, job_id: str, attempt: int, *, state: str, **values: 
                 **values,
             )
         except StateConflict as error:
-            log.warning("job %s: attempt %d ends after another was begun: %s", job_id, attempt, error)
+            log.warning("job %s: attempt %d ended after another one had started: %s", job_id, attempt, error)
             return repository.get(connection, repository.JOBS, job_id, JOB.kind)
         job = repository.get(connection, repository.JOBS, job_id, JOB.kind)
         publish(

@@ -232,7 +232,7 @@ def navigation_samples(connection: Connection, span: PassSpan) -> tuple[Navigati
 
 
 def filter_states(connection: Connection, span: PassSpan) -> FilterStates | None:
-    """Return the estimates of the navigation filter with their covariances, in time order; None where none came."""
+    """Return the estimates of the navigation filter with their covariances, in time order; None without any."""
     rows = repository.samples(
         connection,
         "filter_states",
@@ -377,7 +377,7 @@ def detection_frames(connection: Connection, span: PassSpan) -> tuple[IntArray, 
 
 
 def camera_of(camera: Camera) -> PinholeCamera:
-    """Return the camera that a mission declares, with its lens; sizes that it does not state are the paper's."""
+    """Return the declared camera of a mission, with its lens; the paper's values replace sizes that are not stated."""
     default = PinholeCamera()
     sizes = (
         default.width_px if camera.width_px is None else camera.width_px,
@@ -389,7 +389,7 @@ def camera_of(camera: Camera) -> PinholeCamera:
 
 
 def viewing_of(camera: Camera, attitudes: AttitudeTable, span: PassSpan) -> Viewing:
-    """Return how the camera looked during a pass."""
+    """Return the pointing of the camera during a pass."""
     utc_ns = span.utc_ns(attitudes.image_ticks.tolist())
     order = np.argsort(utc_ns, kind="stable")
     return Viewing(
@@ -402,13 +402,13 @@ def viewing_of(camera: Camera, attitudes: AttitudeTable, span: PassSpan) -> View
 
 
 def attitude_table(files: FileArchive, record: Mapping[str, Any]) -> AttitudeTable:
-    """Return the attitude of each frame of a pass, as its archive has it."""
+    """Return the attitude of each frame of a pass from its archive."""
     sha256 = record["attitude_sha256"]
     return no_attitudes() if sha256 is None else load_attitudes(files.path(sha256))
 
 
 def orientation_of(mission: Mission, data: DataFolder) -> Orientation:
-    """Return the lunar orientation to evaluate a pass of a mission in.
+    """Return the lunar orientation for the evaluation of a pass.
 
     Raises
     ------
@@ -428,7 +428,7 @@ def _refused(declared: DeclaredFrames, camera: Camera) -> dict[str, str]:
         words = {"pointing": "pointing", "k1": "lens"}
         refused["camera"] = (
             f"the mission description does not state the {' and '.join(words[name] for name in missing)} of the "
-            "camera: a nadir camera without distortion is assumed where no attitude is known"
+            "camera: a nadir camera without distortion is assumed for frames without attitude"
         )
     return refused
 
@@ -499,7 +499,7 @@ def _housekeeping(connection: Connection, span: PassSpan) -> tuple[HousekeepingP
 
 
 def _cpu_percent(connection: Connection, span: PassSpan, cadence_s: float | None) -> float | None:
-    """Largest processor time of a step over the cadence, in percent of one core; None where it is not known."""
+    """Return the largest processor time of a step over the cadence, in percent of one core; None if unknown."""
     octets = repository.packet_octets(
         connection, span.vehicle, APID_PERFORMANCE, span.start_ticks, span.stop_ticks
     )

@@ -1,4 +1,4 @@
-"""The stretch of on-board time of a pass."""
+"""On-board time interval of a pass."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class PassSpan:
-    """The stretch of on-board time that belongs to a pass, how it maps to UTC, the dictionary version to read it in."""
+    """On-board time interval of a pass, its correlation with UTC, and its dictionary version."""
 
     vehicle: int
     start_ticks: int
@@ -24,5 +24,5 @@ class PassSpan:
     dictionary_version: int
 
     def utc_ns(self, ticks: Sequence[int]) -> IntArray:
-        """Correlated UTC (n,) of on-board ticks."""
+        """Return the correlated UTC (n,) of on-board ticks."""
         return utc_ns_of_ticks(np.array(ticks, dtype=np.int64), self.correlations)[0]

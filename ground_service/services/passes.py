@@ -84,9 +84,9 @@ def define_pass(
     instance: str = FLOWN,
     manifest: Mapping[str, Any] | None = None,
 ) -> int:
-    """Enter an interval of a spacecraft's time as a pass; its id.
+    """Add an interval of a spacecraft's time as a pass; return its id.
 
-    The pass refers to the mission description of the spacecraft that was entered last, where there is one.
+    The pass refers to the newest mission description of the spacecraft, if there is one.
     """
     require_line(name, "pass", "name")
     if stop_utc_ns <= start_utc_ns:

@@ -75,7 +75,7 @@ def import_plan(ground: Ground, entries: Sequence[PlanEntry], *, actor: str) -> 
     ids: dict[str, int] = {}
     ordered = _in_order(entries)
     with ground.database.writing() as connection:
-        # All spacecraft of the plan, always in the same order: two imports at once do not wait for each other.
+        # Lock all spacecraft of the plan in a fixed order, so that simultaneous imports do not deadlock.
         for spacecraft_id, instance in sorted(
             {(one.window.spacecraft_id, one.window.instance) for one in entries}
         ):

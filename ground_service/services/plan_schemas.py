@@ -30,7 +30,7 @@ class Schema(BaseModel):
 
 
 class Given(Schema):
-    """Base of requests: no value is taken for one of another type, such as true for 1."""
+    """Base class of requests; values are not converted between types, such as true to 1."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 

@@ -65,7 +65,7 @@ _DECIDABLE = {
     "approved": ("draft",),
     "failed": ("draft", "approved", "uplinked", "executing", "executed", "downlinked", "processed"),
 }
-"""States in which a window can be decided on, by the decision."""
+"""States in which a window can be decided, by decision."""
 
 
 class PlanConflicts(Conflict):
@@ -170,7 +170,7 @@ def add_window(ground: Ground, entry: WindowEntry, *, actor: str) -> repository.
 def insert_window(
     ground: Ground, connection: Connection, entry: WindowEntry, *, actor: str
 ) -> repository.Row:
-    """As `add_window`, within the caller's transaction."""
+    """Add a window as `add_window` does, within the caller's transaction."""
     _check_entry(entry)
     vehicle = repository.vehicle_id(connection, entry.spacecraft_id, entry.instance)
     lock_spacecraft(connection, vehicle)
@@ -268,14 +268,14 @@ def delete_window(
     actor: str,
     expected: Callable[[repository.Row], None] | None = None,
 ) -> None:
-    """Take a window off the plan; one whose telecommands were sent stays on record.
+    """Delete a window from the plan, unless its telecommands were sent.
 
     `expected` is as in `change_window`.
 
     Raises
     ------
     Conflict
-        If telecommands of it were sent, or another window names it as its predecessor.
+        If its telecommands were sent, or it is the predecessor of another window.
     """
     with ground.database.writing() as connection:
         row = _locked_window(connection, window_id)
@@ -638,7 +638,7 @@ def _withdraw(connection: Connection, window_id: int, actor: str) -> None:
 
 
 def _locked_window(connection: Connection, window_id: int) -> repository.Row:
-    """A window as it stands once nobody else can change the plan of its spacecraft until the transaction ends."""
+    """Lock the plan of the spacecraft of a window until the transaction ends, and return the window."""
     row = repository.get(connection, repository.WINDOWS, window_id, "window")
     lock_spacecraft(connection, row["vehicle_id"])
     return window_row(connection, window_id)

@@ -57,10 +57,11 @@ def catch_up(ground: Ground, vehicle: int) -> int:
 
 
 def note_dictionary(connection: Connection, vehicle: int) -> None:
-    """Before packets are stored, inside the same transaction: note which dictionary decodes them.
+    """Record the dictionary version that decodes packets, before they are stored in the same transaction.
 
-    A vehicle that an older version decoded is to be decoded again up to here; what comes now is decoded already.
-    Its row is locked only where something has to be noted: several transactions may store packets at once.
+    Packets of the vehicle that an older version decoded must be decoded again up to this point; later packets are
+    already decoded. The row is locked only if something must be recorded, so that several transactions can store
+    packets.
     """
     row = repository.get(connection, repository.VEHICLES, vehicle, "vehicle")
     if row["decoded_version"] is not None and not _behind(row):

@@ -32,7 +32,7 @@ from ground_service.store.states import change_if
 
 MANIFEST = "manifest.json"
 _FILES_LOCK = "files of regression archives"
-"""Held while the files of archives are counted on, so that none is removed that another process has just kept."""
+"""Lock held while files of archives are in use, so that no file is removed that another process has just stored."""
 
 INPUTS = "payload/inputs.jsonl"
 _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -189,7 +189,7 @@ def keep_archive(ground: Ground, path: Path, *, pinned: bool = False) -> PassArc
         with ground.database.writing() as connection:
             hold(connection, _FILES_LOCK)
             for name, file in stored.items():
-                if not file.path.exists():  # it was removed with another archive meanwhile
+                if not file.path.exists():  # the file was removed with another archive meanwhile
                     files.put_file(folder / name)
             added = repository.add_new(
                 connection,
@@ -262,7 +262,7 @@ def let_go(ground: Ground, *, unused_for_ns: int) -> list[str]:
     files = store_of(ground)
     with ground.database.writing() as connection:
         hold(connection, _FILES_LOCK)
-        # One statement: an archive that somebody uses or pins at this moment stays.
+        # One statement, so that an archive that is used or pinned concurrently is kept.
         old = connection.execute(
             delete(table)
             .where(table.c.pinned == 0, table.c.used_utc_ns <= utc_now_ns() - unused_for_ns)

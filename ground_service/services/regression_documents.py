@@ -60,7 +60,7 @@ def regression_json(outcome: RegressionOutcome) -> dict[str, Any]:
 
 
 def regression_text(outcome: RegressionOutcome) -> str:
-    """A few lines for a terminal: the verdict, what failed, what is open and how many frames would decide it."""
+    """Return a summary for a terminal: verdict, failed and inconclusive gates, and the number of frames needed."""
     lines = [f"{outcome.candidate.title} against {outcome.baseline.title}: {outcome.verdict}"]
     for one in outcome.passes:
         if one.state != "judged":
@@ -81,7 +81,7 @@ def regression_text(outcome: RegressionOutcome) -> str:
         f"({outcome.frames_judged} frames)"
     )
     if not outcome.gates:
-        lines.append("  No gate was judged: the passes above give no metric to compare")
+        lines.append("  No gate was judged: the passes above give no comparable metric")
     if needed_text(outcome):
         lines.append(f"  {needed_text(outcome)}")
     lines += [f"  {remark}" for remark in outcome.remarks]
@@ -89,7 +89,7 @@ def regression_text(outcome: RegressionOutcome) -> str:
 
 
 def gate_text(gate: Gate) -> str:
-    """Return the values of a gate, why it is open, and the frames that would decide it."""
+    """Return the values of a gate, why it is inconclusive, and the number of frames needed."""
     parts = [
         f"{_number(gate.baseline)} -> {_number(gate.candidate)} {gate.unit}".rstrip(),
         f"limit {_number(gate.limit)}",
@@ -105,7 +105,7 @@ def gate_text(gate: Gate) -> str:
 
 
 def needed_text(outcome: RegressionOutcome) -> str:
-    """Return how many frames and passes would decide every gate over the suite; empty where none is open."""
+    """Return the number of frames and passes needed to decide every gate over the suite; empty if all are decided."""
     needed, frames = outcome.frames_needed, outcome.frames_judged
     judged = sum(one.state == "judged" for one in outcome.passes)
     if needed is None or needed <= frames or not judged:
@@ -123,7 +123,7 @@ def _number(value: float) -> str:
 
 
 def regression_junit(outcome: RegressionOutcome, finished_utc_ns: int) -> str:
-    """JUnit XML: a case for every gate and for every pass.
+    """Return JUnit XML with a test case for every gate and every pass.
 
     Elements, their order and their attributes are valid in the schema of the Jenkins xUnit plugin (junit-10.xsd) and in
     the stricter one of Apache Ant (JUnit.xsd). An inconclusive case is an error, which is neither a pass nor a failure;
@@ -177,7 +177,7 @@ def regression_junit(outcome: RegressionOutcome, finished_utc_ns: int) -> str:
 
 
 def _xml(text: str) -> str:
-    """Text without the control characters that XML cannot hold."""
+    """Return a text without the control characters that XML forbids."""
     return "".join(c if c in "\t\n" or ord(c) >= 32 else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 

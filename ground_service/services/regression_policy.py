@@ -41,7 +41,7 @@ class PowerTable(_Table):
 
 
 class GateTable(_Table):
-    """One rule: the metrics it applies to, and the degradation that is tolerated."""
+    """Gate rule: the metrics it applies to, and the tolerated degradation."""
 
     figure: Text
     margin: float = Field(ge=0.0, le=1e9)
@@ -51,7 +51,7 @@ class GateTable(_Table):
 
 
 class WaiverTable(_Table):
-    """A gate that need not pass until a day."""
+    """Waiver of a gate until a day."""
 
     gate: Text
     pass_name: Text = Field(default="*", alias="pass")
@@ -60,7 +60,7 @@ class WaiverTable(_Table):
 
 
 class PolicyTable(_Table):
-    """The whole file."""
+    """Content of a policy file."""
 
     schema_version: int = Field(ge=SCHEMA_VERSION, le=SCHEMA_VERSION)
     version: Text
@@ -86,7 +86,7 @@ def load_policy(path: Path | None = None) -> PolicyFile:
     Raises
     ------
     InvalidInput
-        The file is missing or is no policy; the message names the key.
+        The file is missing or not a valid policy; the message names the key.
     """
     where = path or SHIPPED
     source = str(where)
@@ -114,7 +114,7 @@ def load_policy(path: Path | None = None) -> PolicyFile:
             raise InvalidInput(
                 source,
                 f"gate[{i}].margin",
-                "a number above 0: no number of frames shows that nothing at all has changed",
+                "a number above 0: no number of frames can show a change of exactly zero",
                 "0",
             )
     policy = GatePolicy(
@@ -145,7 +145,7 @@ def _day(text: str) -> datetime.date | str:
 
 def _invalid(error: ValidationError, source: str) -> InvalidInput:
     """Return the first fault as one line: an unknown key with the nearest known one."""
-    # A misspelt key is also a missing one: the unknown key names the cause.
+    # A misspelt key also causes a missing key: report the unknown key, which is the cause.
     first = min(error.errors(include_url=False), key=lambda item: item["type"] != "extra_forbidden")
     place = _place(first["loc"])
     if first["type"] == "extra_forbidden":
@@ -166,7 +166,7 @@ def _place(location: Sequence[int | str]) -> str:
 
 
 def _keys_at(location: Sequence[int | str]) -> list[str]:
-    """Keys of the table at a place."""
+    """Return the keys of the table at a location."""
     tables: dict[str, type[BaseModel]] = {
         "confidence": ConfidenceTable,
         "power": PowerTable,

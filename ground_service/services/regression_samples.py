@@ -64,7 +64,7 @@ class ReadDownlink:
 
 
 def pass_context(archive: PassArchive, data: DataFolder) -> PassContext:
-    """Return what is known of a pass that was archived, in the lunar orientation that it declares.
+    """Return the context of an archived pass, in its declared lunar orientation.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def pass_context(archive: PassArchive, data: DataFolder) -> PassContext:
 def _viewing(
     folder: Path, declared: Camera, camera: PinholeCamera, ticks: IntArray, utc_ns: IntArray
 ) -> Viewing:
-    """How the camera looked at the frames of an archive."""
+    """Return the pointing of the camera for the frames of an archive."""
     path = folder / ATTITUDE_FILE
     table = load_attitudes(path, str(path)) if path.is_file() else no_attitudes()
     order = np.argsort(ticks, kind="stable")

@@ -96,7 +96,7 @@ class RegressionOutcome:
         """Pass, fail or inconclusive.
 
         "fail": a gate failed, or the candidate failed on a pass. "inconclusive": there is no gate, a gate is
-        inconclusive, or a pass could not be judged for its archive or its baseline.
+        inconclusive, or a pass could not be judged because of its archive or its baseline.
         """
         of_gates = verdict_of(self.gates)
         if of_gates == FAIL or any(one.state == "candidate failed" for one in self.passes):
@@ -110,7 +110,7 @@ class RegressionOutcome:
 
     @property
     def frames_judged(self) -> int:
-        """Frames that both builds flew."""
+        """Number of frames processed by both builds."""
         return sum(
             len(one.baseline_read.frames)
             for one in self.passes
@@ -119,7 +119,7 @@ class RegressionOutcome:
 
     @property
     def frames_needed(self) -> int | None:
-        """Frames with which every gate over the suite would be decided; None where no gate states a number."""
+        """Number of frames needed to decide every gate over the suite; None if no gate states a number."""
         return max(
             (
                 gate.frames_needed
@@ -205,7 +205,7 @@ def do_replay(ground: Ground, digest: str, build: Build) -> KeptReplay:
             try:
                 context = pass_context(archive, ground.data)
             except (GroundError, LunarError):
-                pass  # a fault of the archive or of the ground's data, not of the build: the verdict reports it
+                pass  # a fault of the archive or of ground data, not of the build; the verdict reports it
             else:
                 try:
                     read_downlink(context, octets, None, 0.0)
@@ -297,7 +297,7 @@ def judge_regression(
             if replay and replay.isolation
         }
     )
-    remarks += [f"builds were confined by: {name}" for name in isolations]
+    remarks += [f"builds were isolated by: {name}" for name in isolations]
     return RegressionOutcome(baseline, candidate, policy, tuple(gates), passes, tuple(remarks))
 
 
@@ -310,7 +310,7 @@ def keep_regression(ground: Ground, outcome: RegressionOutcome, *, regression_id
     now = utc_now_ns()
     with ground.database.writing() as connection:
         repository.register_file(connection, html, "report", f"regression {identity}", now)
-        repository.add_new(  # a verdict that was kept stays
+        repository.add_new(  # a stored verdict is not replaced
             connection,
             repository.REGRESSIONS,
             id=identity,
@@ -385,7 +385,7 @@ def _read(ground: Ground, context: PassContext, replay: KeptReplay) -> ReadDownl
 
 
 def _keep(ground: Ground, digest: str, build: Build, replay: KeptReplay) -> KeptReplay:
-    """Keep a replay; one that succeeded is never replaced by one that another worker did at the same time."""
+    """Store a replay; a successful replay is never replaced by a concurrent one of another worker."""
     values = {item.name: getattr(replay, item.name) for item in dataclasses.fields(replay)}
     identity = replay_id(digest, build)
     table = repository.REPLAYS

@@ -42,7 +42,7 @@ def _overview(files: FileArchive, sha256: str, max_points: int) -> dict[str, Any
     document = json.loads(files.get(sha256))
     return {
         **{name: document.get(name) for name in _TEXTS},
-        # Reports made before there was a table have none.
+        # Reports of earlier versions have no table.
         "requirements": document.get("requirements") or [],
         "navigation": [_series(one, max_points) for one in document["navigation"]],
     }

@@ -25,7 +25,7 @@ from reports.document import evidence_number
 from reports.values import PassReport
 
 REAL_TERRAIN_LEVEL = 3
-"""From this evidence level on, what was flown over is the real Moon."""
+"""Lowest evidence level with real terrain."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,12 +1,12 @@
-"""Runs of builds in a sandbox of this machine, or in a runner that shares nothing but an exchange folder.
+"""Execution of builds in a local sandbox, or in a runner that shares only an exchange folder with the service.
 
 The exchange folder holds `jobs`, `running` and `results`. A job is a folder with `request.json`, `archive` and `build`,
 and appears under its final name only when it is complete. The runner moves it to `running`, copies it, runs it, and
 publishes a folder of the same name in `results` with `report.json`, `printed.txt` and the outputs. `runner.json` is
 touched every few seconds while the runner lives. docs/build-contract.md describes the files.
 
-The service treats everything that comes back as hostile: names it asked for, regular files with one name, within the
-limits, opened without following links, and a report that is checked field by field.
+The service does not trust the results: it accepts only requested names, regular files with a single link, within the
+limits, opened without following symbolic links, and it validates every field of the report.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ PRINTED_LIMIT_OCTETS = 1 << 17
 POLL_S = 0.1
 HEARTBEAT_S = 2.0
 SILENT_S = 30.0
-"""A runner that has not been heard of for this long is not there."""
+"""Age of `runner.json` from which the runner counts as stopped."""
 
 _log = logging.getLogger(__name__)
 Seconds = Annotated[float, Field(ge=0.0, le=1e7, allow_inf_nan=False)]
@@ -54,7 +54,7 @@ Seconds = Annotated[float, Field(ge=0.0, le=1e7, allow_inf_nan=False)]
 
 @dataclass(frozen=True, slots=True)
 class RunRequest:
-    """What to run: words with the places {python}, {archive}, {out} and {folder}, and limits."""
+    """Request of a run: words with the placeholders {python}, {archive}, {out} and {folder}, and limits."""
 
     words: tuple[str, ...]
     limits: Mapping[str, int]
@@ -62,7 +62,7 @@ class RunRequest:
 
 
 class RunReport(BaseModel):
-    """What became of a run."""
+    """Result of a run."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -85,19 +85,19 @@ def run_in_sandbox(
     *,
     mode: Literal["namespaces", "user"] = "namespaces",
 ) -> dict[str, Any]:
-    """Run in a sandbox of this machine.
+    """Run a build in a local sandbox.
 
     Parameters
     ----------
     staged
         Folder with `archive` and `build`, copies that belong to this run.
     written, printed
-        Where the outputs go, and the end of what the program prints.
+        Destinations of the outputs and of the end of the program's printed text.
 
     Raises
     ------
     SandboxRefused
-        It cannot be confined.
+        The build cannot be isolated.
     """
     host.make_readable(staged / "archive")
     host.make_readable(staged / "build")
@@ -137,12 +137,12 @@ def run_in_sandbox(
 def run_by_runner(
     exchange: Path, request: RunRequest, staged: Path, written: Path, printed: Path
 ) -> dict[str, Any]:
-    """Have a runner run it; parameters as in `run_in_sandbox`.
+    """Run a build in a runner; parameters as in `run_in_sandbox`.
 
     Raises
     ------
     SandboxRefused
-        There is no runner, or it refuses, or what it gave back cannot be trusted.
+        There is no runner, the runner refuses, or its result is invalid.
     """
     identity = uuid.uuid4().hex
     try:
@@ -167,7 +167,7 @@ def run_by_runner(
 
 
 def environment(home: str, temporary: str) -> dict[str, str]:
-    """Everything that a program is told of the world: no data folder, no proxies, one thread."""
+    """Return the environment variables of a build: no data folder, no proxies, one thread."""
     path = [os.path.dirname(sys.executable), "/usr/local/bin", "/usr/bin", "/bin"]
     return {
         "PATH": ":".join(path),
@@ -192,17 +192,17 @@ def environment(home: str, temporary: str) -> dict[str, str]:
 def serve_exchange(
     exchange: Path, *, jobs: int | None = None, stopping: threading.Event | None = None
 ) -> int:
-    """Run jobs of an exchange folder one after another, until `jobs` of them are done or `stopping` is set.
+    """Run the jobs of an exchange folder one by one, until `jobs` of them are done or `stopping` is set.
 
     Returns
     -------
     int
-        Jobs done.
+        Number of completed jobs.
 
     Raises
     ------
     SandboxRefused
-        Nothing confines builds here, another runner serves the folder, or a build left something behind.
+        Builds cannot be isolated here, another runner serves the folder, or a build left processes or files.
     """
     mode = runner_mode(exchange)
     stopping = stopping or threading.Event()
@@ -211,7 +211,7 @@ def serve_exchange(
     done = 0
     with _alone(exchange), _heartbeat(exchange, mode, stopping):
         for left in sorted((exchange / "running").iterdir()):
-            # The runner ended in the middle of it.
+            # The runner ended during this job.
             _publish(exchange, left.name, {"cause": "crashed"}, None)
         while not stopping.is_set() and (jobs is None or done < jobs):
             job = _next_job(exchange)
@@ -224,12 +224,12 @@ def serve_exchange(
 
 
 def runner_mode(exchange: Path) -> Literal["namespaces", "user"]:
-    """How builds are confined in this runner: namespaces where the kernel grants them, else a user for each run.
+    """Return how this runner isolates builds: with namespaces if possible, otherwise with a user per run.
 
     Raises
     ------
     SandboxRefused
-        Neither is possible; the message says what is missing.
+        Neither is possible; the message states what is missing.
     """
     confined = host.protection()
     if not confined.refusal:
@@ -241,7 +241,7 @@ def runner_mode(exchange: Path) -> Literal["namespaces", "user"]:
 
 
 def _next_job(exchange: Path) -> Path | None:
-    """The oldest job, taken over."""
+    """Take over the oldest job and return its folder; None without one."""
     waiting = [path for path in (exchange / "jobs").iterdir() if not path.name.startswith(".")]
     for path in sorted(waiting, key=lambda path: path.stat().st_mtime_ns):
         with contextlib.suppress(OSError):
@@ -252,7 +252,7 @@ def _next_job(exchange: Path) -> Path | None:
 def _run_job(exchange: Path, job: Path, mode: Literal["namespaces", "user"]) -> None:
     with tempfile.TemporaryDirectory(prefix="runner-") as name:
         folder = Path(name)
-        # Whoever gets here can read; the build's own copies are all that is inside.
+        # All users that can reach this folder may read it; it contains only the copies of the build.
         folder.chmod(0o711)
         out = folder / "out"
         out.mkdir(mode=0o700)
@@ -319,7 +319,7 @@ def _heartbeat(exchange: Path, mode: str, stopping: threading.Event) -> Iterator
 
 
 def _awaited(exchange: Path, identity: str, run_s: float) -> Path:
-    """The folder of a result, waited for while the runner lives."""
+    """Wait for a result while the runner is alive, and return its folder."""
     result, running = exchange / "results" / identity, exchange / "running" / identity
     started: float | None = None
     quiet_since = time.monotonic()
@@ -328,17 +328,17 @@ def _awaited(exchange: Path, identity: str, run_s: float) -> Path:
         if alive(exchange):
             quiet_since = now
         elif now - quiet_since > SILENT_S or not (started or _ever_heard_of(exchange)):
-            raise SandboxRefused(f"runner exchange {exchange}: expected a runner, found none that answers")
+            raise SandboxRefused(f"runner exchange {exchange}: expected a runner, found none that responds")
         if started is None and running.exists():
             started = now
         if started is not None and now - started > run_s:
-            raise SandboxRefused(f"runner exchange {exchange}: the runner did not answer in time")
+            raise SandboxRefused(f"runner exchange {exchange}: the runner did not respond in time")
         time.sleep(POLL_S)
     return result
 
 
 def alive(exchange: Path) -> bool:
-    """Whether a runner serves the folder now."""
+    """Return whether a runner serves the folder now."""
     try:
         return time.time() - os.lstat(exchange / ALIVE).st_mtime < SILENT_S
     except OSError:
@@ -350,7 +350,7 @@ def _ever_heard_of(exchange: Path) -> bool:
 
 
 def _taken(result: Path, request: RunRequest, written: Path, printed: Path) -> dict[str, Any]:
-    """Copy what a runner gave back out of the exchange folder, checked."""
+    """Copy the result of a runner out of the exchange folder and validate it."""
     folder = os.open(result, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
         octets = _octets(folder, REPORT, REPORT_LIMIT_OCTETS)
@@ -376,12 +376,12 @@ def _taken(result: Path, request: RunRequest, written: Path, printed: Path) -> d
 
 
 def _octets(folder: int, name: str, limit: int) -> bytes | None:
-    """Contents of a regular file with one name and a permitted size; None where there is no file.
+    """Return the content of a regular file with a single link and a permitted size; None if there is no file.
 
     Raises
     ------
     SandboxRefused
-        There is something else under this name.
+        The name is not such a file.
     """
     try:
         descriptor = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=folder)
@@ -392,7 +392,7 @@ def _octets(folder: int, name: str, limit: int) -> bytes | None:
     with os.fdopen(descriptor, "rb") as stream:
         state = os.fstat(descriptor)
         if not stat.S_ISREG(state.st_mode) or state.st_nlink != 1:
-            raise SandboxRefused(f"runner: {name}: expected a regular file with one name, found another")
+            raise SandboxRefused(f"runner: {name}: expected a regular file with a single link, found another")
         octets = stream.read(limit + 1)
     if len(octets) > limit:
         raise SandboxRefused(f"runner: {name}: expected at most {limit} octets, found more")
@@ -400,9 +400,9 @@ def _octets(folder: int, name: str, limit: int) -> bytes | None:
 
 
 def _make_shared(folder: Path) -> None:
-    """A folder that service and runner, which share a group, may both change, and nobody else may read."""
+    """Create a folder that service and runner, which share a group, may change, and that others cannot read."""
     folder.mkdir(parents=True, exist_ok=True)
-    with contextlib.suppress(PermissionError):  # made by the other side
+    with contextlib.suppress(PermissionError):  # created by the other side
         folder.chmod(0o2770)
 
 

@@ -1,7 +1,7 @@
-"""Users, roles and bearer tokens. A token is shown once, when it is made; only its hash is kept.
+"""Users, roles and bearer tokens. A token is shown once, when it is created; only its hash is stored.
 
-Every change compares the state it starts from with the stored one and fails with a conflict where another change came
-first. Nothing is cached: a disabled user or a revoked token is refused by every process from the commit on.
+Every change compares the expected state with the stored state and fails with a conflict if another change came first.
+Nothing is cached: every process refuses a disabled user or a revoked token as soon as the change is committed.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ STATES = ("active", "disabled")
 TOKEN_OCTETS = 32
 TOKEN_MINIMUM = 24
 HINT_LENGTH = 12
-"""Characters of a generated token that are kept to tell tokens apart; 37 random characters stay secret."""
+"""Number of characters of a token that are stored to identify it; 37 random characters remain secret."""
 
 USED_STEP_NS = 3_600_000_000_000
-"""The time of last use is kept to the hour, so that reading does not become writing."""
+"""Resolution of the stored time of last use, to limit the number of writes."""
 
 DAYS_LIMIT = 36_500.0
 RESERVED_NAMES = ("local", "service", "archive")
-"""Actors of the program itself in the audit log."""
+"""Names of the program itself as an actor in the audit log."""
 
 _ANYBODY = select(repository.USERS.c.id).limit(1)
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
@@ -47,7 +47,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who asks for something, in which role, and with which token."""
+    """Authenticated caller with role and token."""
 
     name: str
     role: str
@@ -63,7 +63,7 @@ LOCAL_CALLER = Caller("local", "admin")
 
 
 class User(BaseModel):
-    """A user of the service."""
+    """User of the service."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -74,7 +74,7 @@ class User(BaseModel):
 
 
 class Token(BaseModel):
-    """A bearer token without its secret."""
+    """Bearer token without its secret."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -96,9 +96,9 @@ def add_user(
     Raises
     ------
     InvalidInput
-        If the name, the role or the validity cannot be used.
+        If the name, the role or the validity is invalid.
     Conflict
-        If there is such a user already.
+        If the user exists already.
     """
     _check(name, role)
     lifetime_ns = _lifetime_ns(days_valid)
@@ -112,7 +112,7 @@ def add_user(
 
 
 def renew_token(ground: Ground, name: str, *, days_valid: float | None = None, actor: str = "local") -> str:
-    """Give a user a new token and revoke all earlier ones."""
+    """Create a token for a user, revoke all earlier ones, and return it."""
     lifetime_ns = _lifetime_ns(days_valid)
     now = utc_now_ns()
     with ground.database.writing() as connection:
@@ -124,7 +124,7 @@ def renew_token(ground: Ground, name: str, *, days_valid: float | None = None, a
 
 
 def add_token(ground: Ground, name: str, *, days_valid: float | None = None, actor: str = "local") -> str:
-    """Give a user one more token; earlier ones stay valid."""
+    """Create a further token for a user and return it; earlier ones remain valid."""
     lifetime_ns = _lifetime_ns(days_valid)
     now = utc_now_ns()
     with ground.database.writing() as connection:
@@ -135,12 +135,12 @@ def add_token(ground: Ground, name: str, *, days_valid: float | None = None, act
 
 
 def ensure_user(ground: Ground, name: str, role: str, token: str, *, actor: str = "local") -> bool:
-    """Make sure that a user exists with this role and token, as a deployment is set up; whether anything changed.
+    """Create a user with this role and token if needed, for deployments; return whether anything changed.
 
     Raises
     ------
     InvalidInput
-        If the token is too short to be safe.
+        If the token is too short to be secure.
     Conflict
         If the user is disabled: a restart of the deployment must not enable it again.
     """
@@ -181,7 +181,7 @@ def get_user(ground: Ground, name: str) -> User:
     Raises
     ------
     NotFound
-        If there is none of this name.
+        If there is no such user.
     """
     with ground.database.reading() as connection:
         return _user(_user_row(connection, name))
@@ -222,7 +222,7 @@ def change_user(
 
 
 def list_tokens(ground: Ground, name: str | None = None) -> list[Token]:
-    """Return the tokens of one user or of all, the newest first, without their secrets."""
+    """Return the tokens of one user or of all users, newest first, without their secrets."""
     users, tokens = repository.USERS, repository.TOKENS
     query = (
         select(tokens, users.c.name).join(users, users.c.id == tokens.c.user_id).order_by(tokens.c.id.desc())
@@ -265,18 +265,18 @@ def has_users(ground: Ground) -> bool:
 
 
 def authenticate(ground: Ground, token: str) -> Caller:
-    """Return whose token this is.
+    """Return the caller that a token belongs to.
 
     Raises
     ------
     NotAuthorised
-        If it is nobody's, has expired or was revoked, or if its user is disabled.
+        If the token is unknown, expired or revoked, or if its user is disabled.
     """
     row = _token_row(ground, token)
     if row is None or row["revoked_utc_ns"] is not None:
         raise NotAuthorised("token: expected one that 'linna user add' gave out, found another")
     if row["state"] != "active":
-        raise NotAuthorised(f"token: its user {row['name']} is disabled")
+        raise NotAuthorised(f"token: user {row['name']} is disabled")
     now = utc_now_ns()
     if row["expires_utc_ns"] is not None and row["expires_utc_ns"] <= now:
         raise NotAuthorised("token: has expired; 'linna user token NAME' gives a new one")
@@ -286,7 +286,7 @@ def authenticate(ground: Ground, token: str) -> Caller:
 
 
 def token_valid(ground: Ground, token: str) -> bool:
-    """Whether a token is accepted now: one indexed read, for connections that outlive the request that opened them."""
+    """Return whether a token is valid now; one indexed query, for connections that outlive their opening request."""
     row = _token_row(ground, token)
     if row is None or row["revoked_utc_ns"] is not None or row["state"] != "active":
         return False
@@ -294,12 +294,12 @@ def token_valid(ground: Ground, token: str) -> bool:
 
 
 def token_sha256(token: str) -> str:
-    """Return what is kept of a token (hex)."""
+    """Return the stored hash of a token (hex)."""
     return hashlib.sha256(token.encode()).hexdigest()
 
 
 def audit(connection: Connection, actor: str, action: str, target: str, detail: dict[str, Any]) -> None:
-    """Add an entry to the audit log, in the transaction that does what it says."""
+    """Add an entry to the audit log, in the transaction of the recorded change."""
     audit_log.add_note(connection, audit_log.Note(utc_now_ns(), actor, action, target, detail))
 
 
@@ -307,7 +307,7 @@ def _check(name: str, role: str) -> None:
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise InvalidInput("user", "name", "1 to 64 letters, digits and . _ @ -", repr(name)[:80])
     if name in RESERVED_NAMES:
-        raise InvalidInput("user", "name", "a name that the program does not use itself", name)
+        raise InvalidInput("user", "name", "a name that is not reserved for the program", name)
     if role not in ROLES:
         raise InvalidInput("user", "role", ", ".join(ROLES), repr(role)[:80])
 
@@ -328,14 +328,14 @@ def _user_row(connection: Connection, name: str) -> repository.Row:
 
 
 def _add_row(connection: Connection, name: str, role: str, now: int) -> int | None:
-    """Add a user; None where another transaction was first."""
+    """Add a user; None if another transaction added it first."""
     return repository.add_new(
         connection, repository.USERS, name=name, role=role, state="active", created_utc_ns=now
     )
 
 
 def _locked_admins(connection: Connection) -> list[int]:
-    """Ids of active administrators, locked so that two of them cannot be disabled at once."""
+    """Lock the active administrators, so that not all can be disabled at once, and return their ids."""
     users = repository.USERS
     query = select(users.c.id).where(users.c.role == "admin", users.c.state == "active").order_by(users.c.id)
     return [int(key) for key in connection.execute(query.with_for_update()).scalars()]
@@ -374,7 +374,7 @@ def _token_row(ground: Ground, token: str) -> repository.Row | None:
 
 
 def _note_use(ground: Ground, token_id: int, now: int) -> None:
-    """Keep the hour of the last use, where the store can be written."""
+    """Store the hour of the last use, if the store can be written."""
     tokens = repository.TOKENS
     earlier = or_(tokens.c.used_utc_ns.is_(None), tokens.c.used_utc_ns <= now - USED_STEP_NS)
     with suppress(StoreError), ground.database.writing() as connection:

@@ -56,7 +56,7 @@ def advance_windows(ground: Ground, vehicle: int) -> int:
             state = _advance(connection, row, correlations)
             if state is not None:
                 changed.append((row["id"], state))
-        for window_id, state in changed:  # last: others wait for the end of a transaction that has published
+        for window_id, state in changed:  # last: a transaction that has published blocks others until it ends
             publish(connection, "window", {"id": window_id, "state": state})
     return len(changed)
 
@@ -64,7 +64,7 @@ def advance_windows(ground: Ground, vehicle: int) -> int:
 def _advance(
     connection: Connection, row: Mapping[str, Any], correlations: tuple[TimeCorrelation, ...]
 ) -> str | None:
-    """The new state of a window; None where it has not changed, or somebody decided on the window meanwhile."""
+    """Return the new state of a window; None if it has not changed, or the window was decided meanwhile."""
     facts = _facts(connection, row, correlations)
     state, reason = state_of(facts)
     values: dict[str, Any] = {}

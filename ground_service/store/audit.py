@@ -1,11 +1,11 @@
-"""The audit log: entries that are only ever added, each bound to the one before it by a hash.
+"""Append-only audit log in which each entry contains the hash of the previous one.
 
-Entry n holds the SHA-256 of entry n - 1 and the SHA-256 of its own content with that. Changing, inserting or removing
-an entry breaks the chain. One row, the head, holds number and hash of the newest entry; a copy of the head that is
-kept elsewhere shows whether the end of the log was cut off.
+Entry n contains the SHA-256 of entry n - 1, and the SHA-256 of its own content including that hash. Changing, inserting
+or removing an entry breaks the chain. One row, the head, contains number and hash of the newest entry; a copy of the
+head that is stored elsewhere shows whether the log was truncated.
 
-Entries are collected during a transaction and appended as its last statements, so the row of the head is locked only
-while they are written and committed. That lock makes the order of the chain the order of commits.
+Entries are collected during a transaction and appended by its last statements, so the row of the head is locked only
+during their insertion and the commit. Because of this lock, the order of the chain is the order of commits.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ground_service.errors import AuditBroken
 from ground_service.store.models import AuditEntry, AuditHead
 
 GENESIS = "0" * 64
-"""Hash that the first entry takes for that of the entry before it."""
+"""Previous hash of the first entry."""
 
 PENDING = "linna_audit"
 """Execution option of a write transaction: the list of entries to append at its end."""
@@ -37,7 +37,7 @@ _HEAD: Table = AuditHead.__table__  # type: ignore[assignment]
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """Number and hash of the newest entry; number 0 where there is none."""
+    """Number and hash of the newest entry; number 0 without entries."""
 
     number: int
     sha256: str
@@ -45,7 +45,7 @@ class Head:
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """What somebody did: an entry before it has a place in the chain."""
+    """Audit entry before it is appended to the chain."""
 
     utc_ns: int
     actor: str
@@ -56,14 +56,14 @@ class Note:
 
 @dataclass(frozen=True, slots=True)
 class BrokenEntry:
-    """An entry that does not follow from the one before it."""
+    """Entry that is inconsistent with the previous one or with its hash."""
 
     number: int
     reason: str
 
 
 def entry_sha256(previous_sha256: str, number: int, note: Note) -> str:
-    """Return the hash (hex) of an entry: SHA-256 of its canonical JSON with the hash of the entry before it."""
+    """Return the hash (hex) of an entry: SHA-256 of its canonical JSON with the hash of the previous entry."""
     content = [
         previous_sha256, number, note.utc_ns, note.actor, note.action, note.target, plain_detail(note.detail),
     ]  # fmt: skip
@@ -71,7 +71,7 @@ def entry_sha256(previous_sha256: str, number: int, note: Note) -> str:
 
 
 def plain_detail(detail: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a detail as JSON gives it back: keys as text, numbers that are not finite as text."""
+    """Return a detail with JSON types: keys as text, non-finite numbers as text."""
     plain: dict[str, Any] = json.loads(json.dumps(_finite(detail)))
     return plain
 
@@ -82,7 +82,7 @@ def add_note(connection: Connection, note: Note) -> None:
     Raises
     ------
     RuntimeError
-        If the connection is in no such transaction: the entry would be lost.
+        If the connection is not in such a transaction, because the entry would be lost.
     """
     pending = connection.get_execution_options().get(PENDING)
     if pending is None:
@@ -91,12 +91,12 @@ def add_note(connection: Connection, note: Note) -> None:
 
 
 def append_pending(connection: Connection) -> None:
-    """Append the entries of a transaction to the chain, as its last statements.
+    """Append the entries of a transaction to the chain, by its last statements.
 
     Raises
     ------
     AuditBroken
-        If the row of the head is missing: an entry without a predecessor would hide that.
+        If the row of the head is missing; an entry without a predecessor would hide that.
     """
     pending: list[Note] = connection.get_execution_options().get(PENDING, [])
     if not pending:
@@ -125,13 +125,13 @@ def append_pending(connection: Connection) -> None:
 
 
 def read_head(connection: Connection) -> Head | None:
-    """Return the head of the chain; None where its row is missing."""
+    """Return the head of the chain; None if its row is missing."""
     row = connection.execute(select(_HEAD.c.number, _HEAD.c.sha256).where(_HEAD.c.id == HEAD_ID)).first()
     return Head(int(row[0]), str(row[1])) if row is not None else None
 
 
 def read_entry_sha256(connection: Connection, number: int) -> str | None:
-    """Return the stored hash of one entry; None where there is no such entry."""
+    """Return the stored hash of one entry; None if it does not exist."""
     found = connection.execute(select(_ENTRIES.c.sha256).where(_ENTRIES.c.id == number)).scalar()
     return str(found) if found is not None else None
 
@@ -142,7 +142,7 @@ def count_entries(connection: Connection) -> int:
 
 
 def broken_entries(connection: Connection) -> Iterator[BrokenEntry]:
-    """Yield what is wrong with the chain, from its first entry to its head."""
+    """Yield the faults of the chain, from its first entry to its head."""
     number, previous = 0, GENESIS
     rows = connection.execution_options(yield_per=BLOCK_ROWS).execute(
         select(_ENTRIES).order_by(_ENTRIES.c.id)
@@ -153,10 +153,10 @@ def broken_entries(connection: Connection) -> Iterator[BrokenEntry]:
             missing = f"entry {number + 1}" if found == number + 2 else f"entries {number + 1} to {found - 1}"
             yield BrokenEntry(found, f"expected entry {number + 1}, found {found}: {missing} missing")
         elif row["previous_sha256"] != previous:
-            yield BrokenEntry(found, "expected the hash of the entry before it, found another")
+            yield BrokenEntry(found, "expected the hash of the previous entry, found another")
         note = Note(row["utc_ns"], row["actor"], row["action"], row["target"], row["detail"] or {})
         if entry_sha256(str(row["previous_sha256"]), found, note) != row["sha256"]:
-            yield BrokenEntry(found, "expected content that gives its hash, found changed content")
+            yield BrokenEntry(found, "expected content that matches its hash, found changed content")
         number, previous = found, str(row["sha256"])
     head = read_head(connection)
     others = connection.execute(
@@ -178,7 +178,7 @@ GUARD_NAMES = ("audit_no_update", "audit_no_delete")
 
 
 def install_guards(connection: Connection) -> None:
-    """Let the database refuse to change or remove entries; installing again changes nothing."""
+    """Install triggers that refuse to change or remove entries; a repeated call changes nothing."""
     if connection.dialect.name == "sqlite":
         for name, change in zip(GUARD_NAMES, ("UPDATE", "DELETE"), strict=True):
             connection.execute(
@@ -205,7 +205,7 @@ def install_guards(connection: Connection) -> None:
 
 
 def missing_guards(connection: Connection) -> list[str]:
-    """Return the names of triggers of the audit table that are not there."""
+    """Return the names of missing triggers of the audit table."""
     query = (
         "SELECT name FROM sqlite_master WHERE type = 'trigger'"
         if connection.dialect.name == "sqlite"

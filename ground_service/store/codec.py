@@ -1,4 +1,4 @@
-"""How the detections, pairs and filter states of one image lie in one column: little-endian engineering values."""
+"""Binary encoding of detections, pairs and filter states of one image in a column: little-endian values."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def unpack_identifications(columns: Sequence[bytes]) -> tuple[NDArray[np.void], 
 
 
 def pack_filter_states(state: NDArray[np.float64], covariance: NDArray[np.float64]) -> list[bytes]:
-    """One octet string per state (n, k): the state and the lower triangle of its covariance (n, k, k), float64."""
+    """Pack each state (n, k) and the lower triangle of its covariance (n, k, k) into an octet string of float64."""
     rows, columns = np.tril_indices(state.shape[1])
     packed = np.concatenate([state, covariance[:, rows, columns]], axis=1).astype("<f8")
     return [row.tobytes() for row in packed]
@@ -65,7 +65,7 @@ def pack_filter_states(state: NDArray[np.float64], covariance: NDArray[np.float6
 def unpack_filter_states(
     columns: Sequence[bytes], size: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """States (n, size) and covariances (n, size, size) of packed octet strings."""
+    """Return states (n, size) and covariances (n, size, size) from packed octet strings."""
     rows, places = np.tril_indices(size)
     values = np.frombuffer(b"".join(columns), dtype="<f8").reshape(len(columns), size + len(rows))
     covariance = np.zeros((len(columns), size, size))

@@ -1,7 +1,7 @@
-"""Counters and locks of a spacecraft's operations: one row for each spacecraft, locked while it is counted on.
+"""Counters and locks of spacecraft operations: one row for each spacecraft, locked during changes.
 
-Whoever changes the telecommands or the plan of a spacecraft locks its row first, and rows of telecommands and windows
-only afterwards. All processes lock in this order, so none waits for another in a circle.
+A transaction that changes the telecommands or the plan of a spacecraft locks its row first, and rows of telecommands
+and windows afterwards. All processes use this lock order, which prevents deadlocks.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from ground_service.store.repository import COMMAND_COUNTERS, add_new
 
 
 def lock_spacecraft(connection: Connection, vehicle: int) -> int:
-    """Lock the operations of a vehicle until the transaction ends; how many sequence counts were given so far."""
+    """Lock the operations of a vehicle until the transaction ends; return the number of assigned sequence counts."""
     query = (
         select(COMMAND_COUNTERS.c.telecommands)
         .where(COMMAND_COUNTERS.c.vehicle_id == vehicle)
@@ -28,7 +28,7 @@ def lock_spacecraft(connection: Connection, vehicle: int) -> int:
 
 
 def next_telecommand(connection: Connection, vehicle: int) -> int:
-    """Return the number of the next telecommand of a vehicle, from 0, unwrapped; no two transactions get the same."""
+    """Return the number of the next telecommand of a vehicle, from 0, unwrapped; the number is unique."""
     lock_spacecraft(connection, vehicle)
     taken = connection.execute(
         update(COMMAND_COUNTERS)
@@ -40,7 +40,7 @@ def next_telecommand(connection: Connection, vehicle: int) -> int:
 
 
 def hold(connection: Connection, name: str) -> None:
-    """Let one transaction at a time hold `name`, until it ends; SQLite has one writer anyway."""
+    """Lock `name` until the transaction ends; SQLite needs no lock because it has one writer."""
     if connection.dialect.name == "postgresql":
         digest = hashlib.blake2b(name.encode(), digest_size=8).digest()
         key = int.from_bytes(digest, "big", signed=True)

@@ -47,7 +47,7 @@ log = logging.getLogger(__name__)
 BUSY_TIMEOUT_MS = 30_000
 
 REVISIONS_BEFORE_1_0 = tuple(f"{number:04d}" for number in range(1, 12))
-"""Schema revisions of the development versions; their chain of migrations is not kept."""
+"""Schema revisions before version 1.0, which have no migrations."""
 
 PAGE_CACHE_KIB = 16_384
 """SQLite's own cache of each connection; what falls out of it is still in the system's, which all of them share."""
@@ -77,7 +77,7 @@ class Database:
 
     @contextmanager
     def snapshot(self) -> Iterator[Connection]:
-        """A connection to read with that sees one state of the database, whatever is written meanwhile."""
+        """Yield a read connection with a consistent snapshot of the database."""
         with self._translated(), self.engine.connect() as connection:
             if self.dialect == "postgresql":
                 connection = connection.execution_options(isolation_level="REPEATABLE READ")
@@ -86,7 +86,7 @@ class Database:
 
     @contextmanager
     def writing(self) -> Iterator[Connection]:
-        """A connection inside one write transaction, committed at the end, undone on an error.
+        """Yield a connection in a write transaction, committed at the end and rolled back on an error.
 
         Audit entries of the transaction are appended to their chain just before the commit.
         """
@@ -172,21 +172,21 @@ def open_database(url: str) -> Database:
 
 
 def prepare_database(url: str, *, upgrade: bool | None = None) -> Database:
-    """The database at `url` with the schema of this version.
+    """Return the database at `url` with the schema of this version.
 
-    A SQLite database is created and upgraded by itself; a server's schema is changed only by
-    `linna db upgrade` (`upgrade` True) so that one person decides when.
+    A SQLite database is created and upgraded automatically. The schema of a server is changed only by
+    `linna db upgrade` (`upgrade` True), so that an administrator decides when.
 
     Raises
     ------
     DatabaseTooNew
         If a newer version of the program wrote it.
     DatabaseTooOld
-        If a version before 1.0 wrote it: only an export can be read.
+        If a version before 1.0 wrote it: it can only be exported.
     DatabaseNotMigrated
-        If it is older and may not be upgraded here.
+        If it is older and must not be upgraded here.
     DatabaseUnavailable, StorageReadOnly, StorageFull
-        If it cannot be used.
+        If it is not usable.
     """
     database = open_database(url)
     try:
@@ -221,12 +221,12 @@ def schema_revisions(database: Database) -> tuple[str | None, str, tuple[str, ..
 
 
 def upgrade_database(database: Database) -> None:
-    """Bring the schema to the newest revision in one transaction; wait for another process that does the same."""
+    """Upgrade the schema to the newest revision in one transaction; wait for a concurrent upgrade."""
     _migrate(database, "upgrade", "head")
 
 
 def empty_database(database: Database) -> None:
-    """Drop every table and with it every row; the files of the archive stay."""
+    """Drop every table; the files of the archive are kept."""
     _migrate(database, "downgrade", "base")
 
 
@@ -272,13 +272,13 @@ def database_error(error: DBAPIError, label: str) -> GroundError:
 
 
 _json_text = functools.partial(json.dumps, allow_nan=False)
-"""JSON has no NaN and no infinities, and PostgreSQL takes none: SQLite is kept to the same rule."""
+"""JSON encoder without NaN and infinities, which PostgreSQL refuses; SQLite uses the same rule."""
 
 
 def _refuse_values(context: ExceptionContext) -> None:
-    """Raise the error of this package where a value cannot be handed to the database at all."""
+    """Raise an error of this package if a value cannot be passed to the database."""
     error = context.original_exception
-    if isinstance(error, (ValueError, OverflowError)):  # NaN in JSON, integers over 64 bits, half surrogates
+    if isinstance(error, (ValueError, OverflowError)):  # NaN in JSON, integers over 64 bits, lone surrogates
         raise _refused(str(error)) from error
 
 
@@ -308,11 +308,11 @@ def _make_folder(path: Path) -> None:
 
 
 def _prepare_sqlite(connection: sqlite3.Connection, _record: object) -> None:
-    """Select WAL and durable commits, and no transaction handling by the driver: `_begin_sqlite` says BEGIN."""
+    """Select WAL and durable commits, without transactions of the driver; `_begin_sqlite` starts them."""
     connection.isolation_level = None
     cursor = connection.cursor()
     cursor.execute("PRAGMA journal_mode=WAL")
-    cursor.execute("PRAGMA synchronous=FULL")  # a commit is on the disk before it is acknowledged
+    cursor.execute("PRAGMA synchronous=FULL")  # a commit is written to the disk before it is acknowledged
     cursor.execute("PRAGMA foreign_keys=ON")
     cursor.execute("PRAGMA temp_store=MEMORY")
     cursor.execute(f"PRAGMA cache_size=-{PAGE_CACHE_KIB}")
@@ -320,7 +320,7 @@ def _prepare_sqlite(connection: sqlite3.Connection, _record: object) -> None:
 
 
 def _prepare_postgresql(connection: Any, _record: object) -> None:
-    """Mark the session as one of this program; ask for durable commits where the server's default is otherwise."""
+    """Mark the session as one of this program, and request durable commits."""
     with connection.cursor() as cursor:
         cursor.execute(f"SET {row_digests.WRITER_SETTING} = 'on'")
         cursor.execute("SHOW synchronous_commit")
@@ -330,14 +330,14 @@ def _prepare_postgresql(connection: Any, _record: object) -> None:
 
 
 def _warn_of_unsafe_server(database: Database) -> None:
-    """Log a warning where the server itself does not synchronise its files, which no session can change."""
+    """Log a warning if the server does not synchronise its files, which a session cannot change."""
     if database.dialect != "postgresql":
         return
     with database.reading() as connection:
         for setting in ("fsync", "full_page_writes"):
             if connection.execute(text(f"SHOW {setting}")).scalar() == "off":
                 log.warning(
-                    "database %s: %s is off; acknowledged data can be lost in a power failure; set it on",
+                    "database %s: %s is off; acknowledged data can be lost in a power failure; turn it on",
                     database.label,
                     setting,
                 )

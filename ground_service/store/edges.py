@@ -1,7 +1,6 @@
-"""Pieces of downlinks, the links they came by, and the octets that wait for their neighbours.
+"""Pieces of downlinks, their links, and octets that wait for adjacent pieces.
 
-Every question is answered from an index and returns a bounded number of rows, so its cost does not depend on how many
-pieces there are.
+Every query uses an index and returns a bounded number of rows, so its cost does not depend on the number of pieces.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from tmtc.link import LinkSettings
 DIGEST_OCTETS = 16
 
 REUSABLE_OCTETS = 8
-"""A piece of fewer octets may stand at several places of a stream: it is kept when it has been used."""
+"""Length below which a piece may occur at several positions of a stream; it is kept after use."""
 
 _BLOCK = 64
 
@@ -39,7 +38,7 @@ _WITHIN = select(STREAM_EDGES.c.id).where(
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A file of a downlink and its place in a stream; see `models.Piece`."""
+    """File of a downlink and its position in a stream; see `models.Piece`."""
 
     ingest_id: int
     scope: str
@@ -53,7 +52,7 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class StoredEdge:
-    """An edge that waits, or has been used."""
+    """Stored edge, waiting or used."""
 
     id: int
     domain: str
@@ -71,23 +70,23 @@ class Part:
 
 
 def add_piece(connection: Connection, piece: Piece) -> None:
-    """Enter a piece."""
+    """Add a piece."""
     connection.execute(insert(PIECES).values(**asdict(piece)))
 
 
 def piece_of(connection: Connection, ingest_id: int) -> Piece:
-    """The piece of an ingest."""
+    """Return the piece of an ingest."""
     row = connection.execute(select(PIECES).where(PIECES.c.ingest_id == ingest_id)).mappings().one()
     return Piece(**row)
 
 
 def note_read(connection: Connection, ingest_id: int, links_tried: int | None) -> None:
-    """Note that a piece has been read (None), or how many links could not read it."""
+    """Record that a piece has been read (None), or the number of links that could not read it."""
     connection.execute(update(PIECES).where(PIECES.c.ingest_id == ingest_id).values(links_tried=links_tried))
 
 
 def pieces_to_read_again(connection: Connection, scope: str, links: int) -> list[int]:
-    """Ingests whose pieces could not be read when fewer links were known than now."""
+    """Return the ingests whose pieces could not be read when fewer links were known."""
     rows = connection.execute(
         select(PIECES.c.ingest_id)
         .where(PIECES.c.scope == scope, PIECES.c.links_tried < links)
@@ -97,7 +96,7 @@ def pieces_to_read_again(connection: Connection, scope: str, links: int) -> list
 
 
 def octets_before(connection: Connection, piece: Piece, octets: int) -> list[Part]:
-    """Parts of files that hold the octets before a piece, in order, as far as they are there."""
+    """Return the parts of files with the octets before a piece, in order, as far as available."""
     parts: list[Part] = []
     end = piece.position
     while octets > 0:
@@ -107,7 +106,7 @@ def octets_before(connection: Connection, piece: Piece, octets: int) -> list[Par
                 continue
             covered = row["octets"] if not piece.stream else end - row["position"]
             if covered > row["octets"]:
-                return parts  # octets between the two are not there
+                return parts  # octets between the two are missing
             taken = min(covered, octets)
             parts.insert(0, Part(row["file_sha256"], covered - taken, covered))
             octets -= taken
@@ -120,7 +119,7 @@ def octets_before(connection: Connection, piece: Piece, octets: int) -> list[Par
 
 
 def octets_behind(connection: Connection, piece: Piece, octets: int) -> list[Part]:
-    """Parts of files that hold the octets behind a piece, in order, as far as they are there."""
+    """Return the parts of files with the octets after a piece, in order, as far as available."""
     parts: list[Part] = []
     after = piece.position
     end = piece.position + piece.octets
@@ -149,7 +148,7 @@ def octets_behind(connection: Connection, piece: Piece, octets: int) -> list[Par
 
 
 def _may_follow(piece: Piece, row: Any) -> bool:
-    """Whether a piece may hold octets next to those of another: not where other spacecraft were asked for."""
+    """Return whether a piece may be adjacent to another; pieces of different requested spacecraft are not."""
     asked = {piece.spacecraft_id, row["spacecraft_id"]} - {None}
     return bool(piece.stream) or len(asked) < 2
 
@@ -167,7 +166,7 @@ def _pieces(connection: Connection, piece: Piece, condition: Any, *, newest_firs
 
 
 def known_links(connection: Connection, scope: str) -> list[Link]:
-    """Links by which downlinks of a scope have come, the oldest first."""
+    """Return the known links of the downlinks of a scope, oldest first."""
     rows = connection.execute(
         select(KNOWN_LINKS.c.settings).where(KNOWN_LINKS.c.scope == scope).order_by(KNOWN_LINKS.c.id)
     )
@@ -175,7 +174,7 @@ def known_links(connection: Connection, scope: str) -> list[Link]:
 
 
 def learn_link(connection: Connection, scope: str, link: Link) -> None:
-    """Note that downlinks of a scope come like this."""
+    """Record a link of the downlinks of a scope."""
     _insert_new(
         connection,
         KNOWN_LINKS,
@@ -184,7 +183,7 @@ def learn_link(connection: Connection, scope: str, link: Link) -> None:
 
 
 def link_digest(link: Link) -> str:
-    """A short name of a link by its settings."""
+    """Return a short identifier of a link, derived from its settings."""
     text = json.dumps(_settings(link), sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
@@ -200,7 +199,7 @@ def _link(settings: dict[str, Any] | None) -> Link:
 def add_edges(
     connection: Connection, domain: str, edges: Iterable[Edge], file_sha256: str | None = None
 ) -> list[bytes]:
-    """Keep edges of a domain, those that are there already left as they are; their identities."""
+    """Store the new edges of a domain; return the identities of all."""
     rows = [
         {
             "domain": domain,
@@ -222,7 +221,7 @@ def add_edges(
 
 
 def identity_of(edge: Edge, file_sha256: str | None) -> bytes:
-    """The identity of an edge within its domain: the octets of a file by their place, others by content."""
+    """Return the identity of an edge in its domain: by position for octets of a file, otherwise by content."""
     digest = hashlib.blake2b(digest_size=DIGEST_OCTETS)
     place = (edge.role, edge.count, edge.next_count, file_sha256, edge.start, len(edge.octets))
     digest.update(repr(place).encode())
@@ -232,7 +231,7 @@ def identity_of(edge: Edge, file_sha256: str | None) -> bytes:
 
 
 def open_edges(connection: Connection, domain: str, identities: Sequence[bytes]) -> list[StoredEdge]:
-    """Those of these edges that still wait."""
+    """Return the edges that still wait."""
     found: list[StoredEdge] = []
     for first in range(0, len(identities), 500):
         rows = connection.execute(
@@ -256,7 +255,7 @@ def candidates(
     next_count: int | None = None,
     limit: int = _BLOCK,
 ) -> list[StoredEdge]:
-    """Edges that wait and have one of these values, at most `limit`, the newest first."""
+    """Return at most `limit` waiting edges with one of these values, newest first."""
     conditions = [STREAM_EDGES.c.domain == domain, STREAM_EDGES.c.role == role, STREAM_EDGES.c.open == 1]
     if fit is not None:
         conditions.append(STREAM_EDGES.c.fit.in_(fit))
@@ -271,7 +270,7 @@ def candidates(
 
 
 def open_starts(connection: Connection, domain: str, part: Part) -> list[int]:
-    """Where openers that wait begin within a part of a file."""
+    """Return the start positions of waiting openers within a part of a file."""
     rows = connection.execute(
         select(STREAM_EDGES.c.start)
         .where(
@@ -288,17 +287,16 @@ def open_starts(connection: Connection, domain: str, part: Part) -> list[int]:
 
 
 def is_reusable(edge: Edge) -> bool:
-    """Whether octets may stand at several places of a stream, so that they are kept when they have been used."""
+    """Return whether octets may occur at several positions of a stream, so that they are kept after use."""
     return edge.role == MIDDLE and len(edge.octets) < REUSABLE_OCTETS
 
 
 def use_edges(
     connection: Connection, edges: Iterable[StoredEdge], parts: Iterable[tuple[str, Part]] = ()
 ) -> None:
-    """Note that edges have been joined with their neighbours, and those of a domain that lie within parts of files.
+    """Mark edges as used, and edges of a domain that lie within parts of files.
 
-    Rows are locked in the order of their ids, so that two transactions that use the same edges do not wait for each
-    other in a circle.
+    Rows are locked in the order of their ids, so that two transactions that use the same edges do not deadlock.
     """
     keys = {one.id for one in edges if not is_reusable(one.edge)}
     for domain, part in parts:
@@ -322,7 +320,7 @@ def use_edges(
 
 
 def octets_pending(connection: Connection, file_sha256: str) -> int:
-    """Octets of a file that wait for their neighbours, by the link that explains most of it."""
+    """Return the number of octets of a file that wait for adjacent pieces, for the link that explains most of it."""
     rows = connection.execute(
         select(STREAM_EDGES.c.domain, STREAM_EDGES.c.open, STREAM_EDGES.c.start, STREAM_EDGES.c.length).where(
             STREAM_EDGES.c.file_sha256 == file_sha256
@@ -351,7 +349,7 @@ def _stored(row: Any) -> StoredEdge:
 
 
 def _insert_new(connection: Connection, table: Any, rows: Sequence[dict[str, Any]]) -> None:
-    """Insert rows, leaving out those whose key is there already."""
+    """Insert rows whose key does not exist yet."""
     if not rows:
         return
     dialect = postgresql if connection.dialect.name == "postgresql" else sqlite

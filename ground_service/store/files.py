@@ -1,7 +1,7 @@
-"""The archive of files: each stored once, immutable, under the SHA-256 of its octets.
+"""File archive: each file is stored once, immutable, under the SHA-256 of its content.
 
-A stored file survives a power failure: its octets, its name and every folder made for it are synchronised to the disk
-before `FileArchive.put` returns.
+A stored file survives a power failure: its content, its name and every new folder are synchronised to the disk before
+`FileArchive.put` returns.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from ground_service.errors import FileDamaged, NotFound, StoreError, storage_err
 BLOCK_OCTETS = 1 << 20
 
 INCOMING = ".incoming-"
-"""Prefix of files that are still being written; host and process follow, so that leftovers can be told."""
+"""Prefix of files that are still being written; host and process follow, to identify leftovers."""
 
 UNPACKING = ".unpacking-"
 """Prefix of folders that an archive is being unpacked into."""
 
 UNFINISHED_AGE_S = 86_400.0
-"""What a process of another host has not finished after a day is a leftover."""
+"""Age from which an unfinished file of another host is a leftover."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class FileArchive:
         return self.root / sha256[:2] / sha256
 
     def incoming(self) -> IncomingFile:
-        """A new file, to be appended to and then kept."""
+        """Return a new file, which can be appended to and then kept."""
         return IncomingFile(self)
 
     def put(self, blocks: Iterable[bytes]) -> StoredFile:
@@ -63,7 +63,7 @@ class FileArchive:
             for block in blocks:
                 incoming.append(block)
             return incoming.keep()
-        except OSError as error:  # of whoever makes the blocks
+        except OSError as error:  # an error of the producer of the blocks
             raise storage_error(error, self.root) from None
         finally:
             incoming.discard()
@@ -84,7 +84,7 @@ class FileArchive:
             raise storage_error(error, self.root) from None
 
     def remove_leftovers(self, now_s: float | None = None) -> int:
-        """Remove files that a process left half-written when it ended; how many those were."""
+        """Remove unfinished files of ended processes; return their number."""
         return remove_leftovers(self.root, INCOMING, now_s)
 
     def put_file(self, path: Path) -> StoredFile:
@@ -101,7 +101,7 @@ class FileArchive:
         Raises
         ------
         NotFound
-            If nothing of this content is stored.
+            If no file with this hash is stored.
         FileDamaged
             If the octets on disk are no longer those that were stored.
         """
@@ -118,12 +118,12 @@ class FileArchive:
         return octets
 
     def read(self, sha256: str, start: int, stop: int) -> bytes:
-        """Octets [start, stop) of a stored file, fewer where it ends before.
+        """Return octets [start, stop) of a stored file, fewer if it ends before.
 
         Raises
         ------
         NotFound
-            If nothing of this content is stored.
+            If no file with this hash is stored.
         """
         path = self.path(sha256)
         try:
@@ -137,10 +137,10 @@ class FileArchive:
 
 
 class IncomingFile:
-    """A file on its way into the archive: it is appended to, then kept whole, or discarded.
+    """File that is being added to the archive: it is appended to, then kept or discarded.
 
-    The functions may be called from different threads. After `discard` nothing can be appended any more, so that a
-    write which was under way when its upload was given up leaves nothing.
+    The methods may be called from different threads. After `discard` nothing can be appended, so that a pending write
+    of a cancelled upload leaves no file.
     """
 
     def __init__(self, archive: FileArchive) -> None:
@@ -153,7 +153,7 @@ class IncomingFile:
         self._over = False
 
     def append(self, block: bytes) -> None:
-        """Write the next octets; the first call makes the file."""
+        """Write the next octets; the first call creates the file."""
         with self._lock:
             try:
                 stream = self._stream or self._open()
@@ -179,7 +179,7 @@ class IncomingFile:
                     self._temporary.chmod(0o400)
                     os.replace(self._temporary, target)
                     self._temporary = None
-                # also where another process stored it: its own synchronisation may still be under way
+                # also if another process stored it, because its synchronisation may still be pending
                 sync_folder(target.parent)
                 sync_folder(self._archive.root)
                 return StoredFile(sha256, self._octets, target)
@@ -187,7 +187,7 @@ class IncomingFile:
                 raise storage_error(error, self._archive.root) from None
 
     def discard(self) -> None:
-        """Remove what was not kept."""
+        """Remove the file if it was not kept."""
         with self._lock:
             self._over = True
             with contextlib.suppress(OSError):
@@ -219,7 +219,7 @@ def read_blocks(path: Path) -> Iterator[bytes]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Synchronise the names in a folder to the disk."""
+    """Synchronise the directory entries of a folder to the disk."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -228,7 +228,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def make_durable_folder(folder: Path) -> None:
-    """Make a folder and those above it that are missing; what was made survives a power failure."""
+    """Create a folder and its missing parents durably."""
     missing = []
     for one in (folder, *folder.parents):
         if one.exists():
@@ -240,7 +240,7 @@ def make_durable_folder(folder: Path) -> None:
 
 
 def replace_durably(written: Path, target: Path) -> None:
-    """Give a written file or folder its name: after a power failure it is there whole, or what was there before."""
+    """Rename a written file or folder atomically and durably: after a power failure the new or the old one exists."""
     for folder, _, names in os.walk(written):
         for path in (Path(folder, name) for name in names):
             if path.is_file() and not path.is_symlink():
@@ -253,9 +253,9 @@ def replace_durably(written: Path, target: Path) -> None:
 
 
 def remove_leftovers(folder: Path, prefix: str, now_s: float | None = None) -> int:
-    """Remove files and folders that a process left unfinished in `folder` when it ended; how many those were.
+    """Remove unfinished files and folders of ended processes in `folder`; return their number.
 
-    Those of this host whose process still runs are kept, and those of other hosts for `UNFINISHED_AGE_S`.
+    Those of running processes of this host are kept, those of other hosts for `UNFINISHED_AGE_S`.
     """
     removed = 0
     now_s = time.time() if now_s is None else now_s
@@ -273,7 +273,7 @@ def remove_leftovers(folder: Path, prefix: str, now_s: float | None = None) -> i
 
 
 def unfinished_prefix(prefix: str) -> str:
-    """A prefix for the name of what this process is writing, by which `remove_leftovers` knows whose it is."""
+    """Return a prefix for unfinished names of this process, by which `remove_leftovers` identifies the process."""
     return f"{prefix}{_host()}.{os.getpid()}.{_start_of(os.getpid())}-"
 
 
@@ -293,14 +293,14 @@ def _is_leftover(path: Path, prefix: str, now_s: float) -> bool:
     host, _, process = path.name.removeprefix(prefix).split("-")[0].partition(".")
     number, _, start = process.partition(".")
     if host == _host() and number.isdigit():
-        # a container that is started again gives its processes the numbers that they had before
+        # a restarted container assigns the same process ids again
         found = _start_of(int(number))
         return not _runs(int(number)) or (start != found and not {"", "0"} & {start, found})
     return now_s - path.stat().st_mtime > UNFINISHED_AGE_S
 
 
 def _start_of(process: int) -> str:
-    """When a process was started, in the kernel's ticks since boot; 0 where the kernel does not tell."""
+    """Return the start time of a process in kernel ticks since boot; 0 if unknown."""
     try:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[19]
     except (OSError, IndexError):

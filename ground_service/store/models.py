@@ -111,12 +111,12 @@ class Packet(Base):
 
 
 class Piece(Base):
-    """A file of a downlink as it was ingested, and where in its stream it stands.
+    """Ingested file of a downlink, and its position in its stream.
 
-    Pieces of one `scope` (instance of the spacecraft) can be joined. `spacecraft_id` is whose frames are asked for;
-    NULL: those of every spacecraft. `stream` and `position` (octets from its beginning) are what the sender said;
-    without, `stream` is empty and `position` the number of the ingest, so that neighbours are those that came one
-    after another. `links_tried` counts the known links of the scope that could not read it; NULL where one could.
+    Pieces of one `scope` (instance of the spacecraft) can be joined. `spacecraft_id` selects the frames of
+    one spacecraft; NULL: those of every spacecraft. `stream` and `position` (octets from its start) are stated by the
+    sender. Otherwise, `stream` is empty and `position` is the number of the ingest, so that successive ingests are
+    adjacent. `links_tried` is the number of known links of the scope that could not read it; NULL if one could.
     """
 
     __tablename__ = "pieces"
@@ -135,7 +135,7 @@ class Piece(Base):
 
 
 class KnownLink(Base):
-    """How downlinks of a scope were found to travel; `settings` NULL: bare packets."""
+    """Link found for the downlinks of a scope; `settings` NULL: bare packets."""
 
     __tablename__ = "known_links"
     __table_args__ = (UniqueConstraint("scope", "digest"),)
@@ -146,12 +146,12 @@ class KnownLink(Base):
 
 
 class StreamEdge(Base):
-    """Octets of a CADU or packet that was cut apart, kept until those next to them are there.
+    """Octets of a CADU or packet that was cut, stored until the adjacent octets are received.
 
-    `domain` says what may be joined: the raw octets of one link, or one virtual channel. `role`, `count`, `next_count`
-    and `fit` are those of `link.edges.Edge`, -1 where not known; the `count` of an opener is its `next_count`. `open`
-    is 0 when the octets have been used; they are not kept then. `start` is where they stand in `file_sha256`, NULL for
-    those of a channel.
+    `domain` names the edges that may be joined: those of the raw octets of one link, or of one virtual channel. `role`,
+    `count`, `next_count` and `fit` are those of `link.edges.Edge`, -1 if unknown; the `count` of an opener is its
+    `next_count`. `open` is 0 when the octets have been used; they are then deleted. `start` is their position in
+    `file_sha256`, NULL for octets of a channel.
     """
 
     __tablename__ = "stream_edges"
@@ -313,7 +313,7 @@ class FilterState(Sample, Base):
     """Estimate of the navigation filter with its covariance; `ticks` is the image's time.
 
     `values` holds the state and its covariance as `store.codec.pack_filter_states` packs them; `innovation_degrees`
-    are those of the NIS of the frame, None where the packet does not tell (dictionary version 2).
+    are those of the NIS of the frame, None if the packet does not contain it (dictionary version 2).
     """
 
     __tablename__ = "filter_states"
@@ -424,7 +424,7 @@ class EphemerisRecord(Base):
 
 
 class MissionRecord(Base):
-    """A revision of a mission description, entered once by the hash of what it states and never changed."""
+    """Revision of a mission description, identified by the hash of its stated values and never changed."""
 
     __tablename__ = "missions"
     id: Mapped[int] = mapped_column(Integer, primary_key=True)
@@ -439,8 +439,8 @@ class MissionRecord(Base):
 class Pass(Base):
     """An observation window of one vehicle: an interval of time that samples belong to by on-board time.
 
-    `mission_id` is the revision of the mission description that was in force, `attitude_sha256` the table of the
-    attitude of each frame; NULL where none is known.
+    `mission_id` is the revision of the mission description that was in force, `attitude_sha256` the attitude
+    table; NULL if unknown.
     """
 
     __tablename__ = "passes"
@@ -499,7 +499,7 @@ class Report(Base):
 
 
 class User(Base):
-    """Somebody who may use the service, with one role; `state` is active or disabled."""
+    """User of the service with one role; `state` is active or disabled."""
 
     __tablename__ = "users"
     id: Mapped[int] = mapped_column(Integer, primary_key=True)
@@ -510,9 +510,9 @@ class User(Base):
 
 
 class Token(Base):
-    """A bearer token of a user; only its hash is kept.
+    """Bearer token of a user; only its hash is stored.
 
-    `hint` is the beginning of the token, to tell tokens apart; `used_utc_ns` is kept to the hour.
+    `hint` is the start of the token, to identify it; `used_utc_ns` has a resolution of an hour.
     """
 
     __tablename__ = "tokens"
@@ -527,7 +527,7 @@ class Token(Base):
 
 
 class AuditEntry(Base):
-    """Something that somebody did; entries are only ever added, numbered from 1 without gaps (see `store.audit`)."""
+    """Action of a user; entries are only appended, numbered from 1 without gaps (see `store.audit`)."""
 
     __tablename__ = "audit"
     id: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
@@ -610,7 +610,7 @@ class Telecommand(Base):
 
 
 class CommandCounter(Base):
-    """How many sequence counts the telecommands of a vehicle were given; locked by whoever commands it."""
+    """Number of telecommand sequence counts assigned for a vehicle; locked during commanding."""
 
     __tablename__ = "command_counters"
     vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"), primary_key=True)
@@ -618,11 +618,11 @@ class CommandCounter(Base):
 
 
 class Window(Base):
-    """A planned observation.
+    """Planned observation window.
 
-    `decision` is what people decided (draft, approved, failed), `state` where the window has come with what telemetry
-    says, kept up to date by `services.window_progress`; `version` counts changes by people. `edited_by` entered it or
-    changed it last, `decided_by` took the decision.
+    `decision` is the decision of a person (draft, approved, failed). `state` is the progress of the window including
+    telemetry, updated by `services.window_progress`. `version` counts changes by persons. `edited_by` added the window
+    or changed it last, `decided_by` made the decision.
     """
 
     __tablename__ = "windows"

@@ -64,7 +64,7 @@ SELECT %(vehicle_id)s, * FROM unnest(
 ON CONFLICT (vehicle_id, apid, ticks, sequence_count, digest) DO NOTHING
 RETURNING id, digest
 """
-"""Inserts in the order given; a row that another transaction inserts now is waited for."""
+"""Insert in the given order; the statement waits for a concurrent insert of the same row."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,12 +77,12 @@ class Stored:
 
 
 def store_batch(connection: Connection, vehicle_id: int, batch: Batch) -> Stored:
-    """Store what of the batch is not stored yet, inside the caller's write transaction.
+    """Store the packets of a batch that are not stored yet, inside the caller's write transaction.
 
-    Storing the same packets again, in other batches or in another order, changes nothing: a packet is known by its
-    vehicle and its octets. Several transactions may store at once. Packets are inserted in the order of their key, so
-    that of two transactions with the same packets one waits for the other and none in a circle. The row of the vehicle
-    is only kept from being locked: whoever locks it waits for the packets that are being stored.
+    Storing the same packets again, in other batches or in another order, changes nothing: a packet is identified by its
+    vehicle and its octets. Several transactions may store at the same time. Packets are inserted in the order of their
+    key, so that two transactions with the same packets do not deadlock. A shared lock on the row of the vehicle makes
+    transactions that lock the vehicle wait until the packets are stored.
     """
     count = len(batch.octets)
     if count == 0:
@@ -172,7 +172,7 @@ def _time_ranges(apid: IntArray, ticks: IntArray) -> list[tuple[int, int, int]]:
 
 
 def _insert_packets(connection: Connection, vehicle_id: int, batch: Batch, new: IntArray) -> IntArray:
-    """Insert the packets at `new` (n,); their ids (n,), 0 for one that another transaction has stored meanwhile."""
+    """Insert the packets at `new` (n,); return their ids (n,), 0 for packets that another transaction has stored."""
     if not len(new):
         return np.zeros(0, dtype=np.int64)
     chosen = new.tolist()

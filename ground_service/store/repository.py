@@ -26,7 +26,7 @@ Row = dict[str, Any]
 IntArray = NDArray[np.int64]
 
 SPACECRAFT_ID_MAX = 1023
-"""A transfer frame has ten bits for it (CCSDS 132.0-B)."""
+"""Largest spacecraft id: a transfer frame has ten bits for it (CCSDS 132.0-B)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,9 +83,9 @@ def add(connection: Connection, table: Table, **values: Any) -> Any:
 
 
 def add_new(connection: Connection, table: Table, **values: Any) -> Any | None:
-    """Insert one row and return its primary key; None where a row with a unique value of it exists already.
+    """Insert one row and return its primary key; None if a row with the same unique value exists already.
 
-    A row that another process is adding at this moment counts, too: its end is waited for.
+    The function waits for a concurrent insert of the same row by another process.
     """
     make = postgresql_insert if connection.dialect.name == "postgresql" else sqlite_insert
     key = next(iter(table.primary_key.columns))
@@ -146,12 +146,12 @@ def page(
 
 
 def vehicle_id(connection: Connection, ccsds_id: int, instance: str) -> int:
-    """The id of a spacecraft in one instance, made when it is new.
+    """Return the vehicle id of a spacecraft in one instance; create it if it is new.
 
     Raises
     ------
     InvalidInput
-        If the id is none that a transfer frame can carry, or the instance no printable line.
+        If the id does not fit a transfer frame, or the instance is not a printable line.
     """
     if isinstance(ccsds_id, bool) or not 0 <= ccsds_id <= SPACECRAFT_ID_MAX:
         raise InvalidInput("spacecraft", "id", f"0 to {SPACECRAFT_ID_MAX}", str(ccsds_id)[:40])

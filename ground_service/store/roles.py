@@ -1,7 +1,8 @@
-"""Two roles of a PostgreSQL database: the owner of the schema, and the service, which can only work in it.
+"""Roles of a PostgreSQL database: the owner of the schema, and the service with limited privileges.
 
-The service reads and writes rows. It is no superuser, owns nothing, cannot change the schema, and can add entries to
-the audit log but neither change nor remove them. Migrations run as the owner, who then grants the service its rights.
+The service reads and writes rows. It is not a superuser, owns nothing, cannot change the schema, and can add entries to
+the audit log but neither change nor remove them. Migrations run as the owner, who then grants the service its
+privileges.
 """
 
 from __future__ import annotations
@@ -19,24 +20,24 @@ APPEND_ONLY = ("audit",)
 
 
 class PowerfulRole(StoreError):
-    """The service runs as a database role that can do more than the service needs."""
+    """The database role of the service has more privileges than the service needs."""
 
     def __init__(self, label: str, powers: list[str]) -> None:
         super().__init__(
             f"database {label}: expected a role that can only read and write rows, found one that "
             f"{', '.join(powers)}; remedy: run `linna db upgrade` with LINNA_MIGRATION_DATABASE_URL of the owner, "
-            "which grants the role of LINNA_DATABASE_URL its rights, or set LINNA_ALLOW_DATABASE_OWNER=true"
+            "which grants the role of LINNA_DATABASE_URL its privileges, or set LINNA_ALLOW_DATABASE_OWNER=true"
         )
         self.powers = tuple(powers)
 
 
 def grant_statements(role: str, tables: list[str]) -> Iterator[str]:
-    """Yield the SQL that gives a role what the service needs, and takes everything else from it.
+    """Yield SQL that grants a role the privileges that the service needs and revokes all others.
 
     Parameters
     ----------
     role
-        Name of the role, which exists already.
+        Name of an existing role.
     tables
         Names of all tables of the schema.
     """
@@ -56,7 +57,7 @@ def grant_statements(role: str, tables: list[str]) -> Iterator[str]:
 
 
 def grant_service(database: Database, role: str) -> None:
-    """Give a role what the service needs, as the owner of the schema; doing it again changes nothing.
+    """Grant a role the privileges of the service, as the owner of the schema; a repeated call changes nothing.
 
     Raises
     ------
@@ -83,12 +84,12 @@ def grant_service(database: Database, role: str) -> None:
 
 
 def powers_of(connection: Connection) -> list[str]:
-    """Return what the role of this connection can do that the service has no need of."""
+    """Return the privileges of the role of this connection that the service does not need."""
     questions = {
         "is a superuser": "SELECT rolsuper FROM pg_roles WHERE rolname = current_user",
-        "can make roles": "SELECT rolcreaterole FROM pg_roles WHERE rolname = current_user",
+        "can create roles": "SELECT rolcreaterole FROM pg_roles WHERE rolname = current_user",
         "can replicate": "SELECT rolreplication FROM pg_roles WHERE rolname = current_user",
-        "can run programs or read files of the server": (
+        "can run programs or access files of the server": (
             "SELECT bool_or(pg_has_role(current_user, oid, 'USAGE')) FROM pg_roles WHERE rolname IN "
             "('pg_execute_server_program', 'pg_read_server_files', 'pg_write_server_files')"
         ),
@@ -106,12 +107,12 @@ def powers_of(connection: Connection) -> list[str]:
 
 
 def check_role(database: Database) -> None:
-    """Refuse a role that can do more than the service needs; SQLite has no roles.
+    """Refuse a role with more privileges than the service needs; SQLite has no roles.
 
     Raises
     ------
     PowerfulRole
-        It can.
+        The role has such privileges.
     """
     if database.dialect != "postgresql":
         return
@@ -125,5 +126,5 @@ def check_role(database: Database) -> None:
 
 
 def quoted(name: str) -> str:
-    """A name as SQL."""
+    """Return a quoted SQL identifier."""
     return '"' + name.replace('"', '""') + '"'

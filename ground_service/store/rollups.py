@@ -73,9 +73,9 @@ def width_ticks(level: int) -> int:
 def add_to_rollups(
     connection: Connection, vehicle_id: int, dictionary_version: int, kind: str, columns: Mapping[str, Any]
 ) -> None:
-    """Count new samples, within the transaction that stores them; columns (n,) as they are stored.
+    """Add new samples to the roll-ups, in the transaction that stores them; columns (n,) as stored.
 
-    The roll-ups of a vehicle are locked until the transaction ends: they are the last that it writes.
+    The roll-ups of a vehicle are locked until the transaction ends; therefore they are written last.
     """
     if kind not in KINDS or len(columns["ticks"]) == 0:
         return
@@ -283,7 +283,7 @@ def _buckets_query(count: int) -> Any:
 
 
 def _store(connection: Connection, found: Sequence[tuple[Mapping[str, int], _Level]]) -> None:
-    """Add buckets, by the rest of their key (of one vehicle, version and kind), to those that are stored."""
+    """Add buckets, by the rest of their key (of one vehicle, version and kind), to the stored ones."""
     merged: list[tuple[Mapping[str, int], _Level]] = []
     replaced: list[dict[str, int]] = []
     few = _few_stored(connection, found)

@@ -1,9 +1,9 @@
-"""A SHA-256 of every row whose content cannot be derived again, kept by triggers beside the row.
+"""SHA-256 digests of all rows that cannot be derived from other data, maintained by triggers.
 
-The triggers act only for connections of this program: SQLite's are temporary ones of each connection, PostgreSQL's
-look at a setting of the session. A row that anything else changes, adds or removes no longer fits its digest. A row
-that does not fit is not made to fit by a later change of the program. Somebody who knows this can write digests, too:
-they find accidental damage and plain edits; against forgery there is the head of the audit chain kept elsewhere.
+The triggers act only for connections of this program: those of SQLite are temporary triggers of each connection, those
+of PostgreSQL check a session setting. A row that is changed, added or removed otherwise does not match its digest, and
+a later change by the program does not hide this. The digests detect accidental damage and simple edits. They do not
+detect forgery by a person who also writes digests; use a head of the audit chain that is stored elsewhere for that.
 
 Packets and what is decoded from them have no digests: they are compared with the raw files.
 """
@@ -25,7 +25,7 @@ from ground_service.store import models
 BARE = frozenset(
     {"packets", "audit", "audit_head", "row_digests", *(one.__tablename__ for one in models.SAMPLE_TABLES)}
 )
-"""Tables without digests: derived from raw files, or bound in the audit chain."""
+"""Tables without digests: derived from raw files, or part of the audit chain."""
 
 WRITER_SETTING = "linna.writer"
 FUNCTION = "linna_row_digest"
@@ -36,7 +36,7 @@ _TRIGGERS_OF_A_TABLE = 3
 
 @dataclass(frozen=True, slots=True)
 class StrayRow:
-    """A row that does not fit its digest."""
+    """Row that does not match its digest."""
 
     table: str
     key: str
@@ -50,7 +50,7 @@ def guarded_tables() -> tuple[Table, ...]:
 
 
 def row_sha256(*values: Any) -> str:
-    """Return the digest (hex) of the values of a row as SQLite holds them."""
+    """Return the digest (hex) of the values of a row as stored by SQLite."""
     digest = hashlib.sha256()
     for value in values:
         if value is None:
@@ -66,7 +66,7 @@ def row_sha256(*values: Any) -> str:
 
 
 def prepare_sqlite(driver: sqlite3.Connection) -> None:
-    """Make the triggers of a SQLite connection outside of a transaction; do nothing where they are made already."""
+    """Create the triggers of a SQLite connection outside a transaction, if they do not exist."""
     made = driver.execute("SELECT count(*) FROM temp.sqlite_master WHERE type = 'trigger'").fetchone()[0]
     tables = guarded_tables()
     if made == _TRIGGERS_OF_A_TABLE * len(tables):
@@ -80,7 +80,7 @@ def prepare_sqlite(driver: sqlite3.Connection) -> None:
 
 
 def install(connection: Connection) -> None:
-    """Make the triggers of a PostgreSQL schema, anew where there are any; SQLite's belong to connections."""
+    """Create or replace the triggers of a PostgreSQL schema; triggers of SQLite belong to connections."""
     if connection.dialect.name != "postgresql":
         return
     for table in guarded_tables():
@@ -89,7 +89,7 @@ def install(connection: Connection) -> None:
 
 
 def missing_triggers(connection: Connection) -> list[str]:
-    """Return tables whose triggers are not there or switched off; none on SQLite, where no schema holds them."""
+    """Return the tables with missing or disabled triggers; empty for SQLite, whose schema has none."""
     if connection.dialect.name != "postgresql":
         return []
     found = set(
@@ -103,7 +103,7 @@ def missing_triggers(connection: Connection) -> list[str]:
 
 
 def stray_rows(connection: Connection, table: Table) -> Iterator[StrayRow]:
-    """Yield rows of a table that do not fit their digests, and digests without a row."""
+    """Yield rows of a table that do not match their digests, and digests without a row."""
     key, digest = _expressions(connection, table)
     kept = "d.table_name = :name AND d.row_key = " + key
     rows = connection.execute(
@@ -116,7 +116,7 @@ def stray_rows(connection: Connection, table: Table) -> Iterator[StrayRow]:
     for row_key, sha256 in rows:
         reason = "expected the digest of this row, found none: not written by this program"
         if sha256 is not None:
-            reason = "expected content that gives its digest, found changed content"
+            reason = "expected content that matches its digest, found changed content"
         yield StrayRow(table.name, str(row_key), reason)
     gone = connection.execute(
         text(
@@ -130,7 +130,7 @@ def stray_rows(connection: Connection, table: Table) -> Iterator[StrayRow]:
 
 
 def unknown_digests(connection: Connection) -> Iterator[StrayRow]:
-    """Yield digests of tables that have none."""
+    """Yield digests of tables without digests."""
     names = {table.name for table in guarded_tables()}
     for name, key in connection.execute(text("SELECT table_name, row_key FROM row_digests")):
         if name not in names:
@@ -138,7 +138,7 @@ def unknown_digests(connection: Connection) -> Iterator[StrayRow]:
 
 
 def _expressions(connection: Connection, table: Table) -> tuple[str, str]:
-    """SQL of key and digest of a row r."""
+    """Return SQL expressions for the key and the digest of a row r."""
     if connection.dialect.name == "sqlite":
         driver: Any = connection.connection.driver_connection
         driver.create_function(FUNCTION, -1, row_sha256, deterministic=True)

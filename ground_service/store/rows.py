@@ -1,6 +1,6 @@
-"""Rows as lines of JSON: one form for both databases, for digests of tables, backups and exports.
+"""Rows as JSON lines: one form for both databases, for digests of tables, backups and exports.
 
-A row is a JSON array in the order of the columns; octets are base64, numbers that are not finite are text.
+A row is a JSON array in the order of the columns; octets are base64, non-finite numbers are text.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from ground_service.store import models
 BLOCK_ROWS = 5000
 
 KEPT_BY_THE_PROGRAM = frozenset({"row_digests"})
-"""Tables that triggers fill: they are not copied."""
+"""Tables filled by triggers, which are not copied."""
 
 MADE_WITH_THE_SCHEMA = frozenset({"audit_head"})
-"""Tables that hold rows in an empty database; a copy replaces them."""
+"""Tables with rows in an empty database; a copy replaces these rows."""
 
 Row = dict[str, Any]
 
@@ -37,12 +37,12 @@ class TableDigest:
 
 
 def copied_tables() -> list[Table]:
-    """Return the tables that hold content, those that others point to first."""
+    """Return the tables to copy, referenced tables first."""
     return [table for table in models.Base.metadata.sorted_tables if table.name not in KEPT_BY_THE_PROGRAM]
 
 
 def row_blocks(connection: Connection, table: Table) -> Iterator[list[Row]]:
-    """Yield all rows of a table in the order of its key, which is the same on both databases."""
+    """Yield all rows of a table in the order of its key, which is the same in both databases."""
     key = [
         collate(column, "C") if connection.dialect.name == "postgresql" and isinstance(column.type, String) else column
         for column in table.primary_key.columns
@@ -64,7 +64,7 @@ def parse_line(columns: Sequence[Any], line: bytes) -> Row:
     Raises
     ------
     ValueError
-        If it is none of a table with these columns.
+        If the line is not a row of a table with these columns.
     """
     values = json.loads(line)
     if not isinstance(values, list) or len(values) != len(columns):
@@ -90,7 +90,7 @@ def table_lines(connection: Connection, table: Table) -> Iterator[bytes]:
 
 
 def table_digests(connection: Connection) -> dict[str, TableDigest]:
-    """Return the digest of every table that holds content."""
+    """Return the digest of every copied table."""
     return {table.name: lines_digest(table_lines(connection, table)) for table in copied_tables()}
 
 
@@ -105,7 +105,7 @@ def first_filled_table(connection: Connection) -> str | None:
 
 
 def insert_rows(connection: Connection, table: Table, blocks: Iterable[list[Row]]) -> int:
-    """Insert rows into an empty table, in place of those that the schema came with; how many."""
+    """Insert rows into an empty table, replacing rows created with the schema; return their number."""
     count = 0
     later: list[Row] = []
     if table.name in MADE_WITH_THE_SCHEMA:
@@ -114,7 +114,7 @@ def insert_rows(connection: Connection, table: Table, blocks: Iterable[list[Row]
         if not block:
             continue
         if table.name == "windows":
-            # A window may name one with a greater key: they are linked when all are there.
+            # A window may reference one with a greater key: link them after all are inserted.
             later += [row for row in block if row["predecessor_id"] is not None]
             block = [{**row, "predecessor_id": None} for row in block]
         connection.execute(insert(table), block)
@@ -127,7 +127,7 @@ def insert_rows(connection: Connection, table: Table, blocks: Iterable[list[Row]
 
 
 def advance_sequences(connection: Connection) -> None:
-    """Let new keys of PostgreSQL begin behind those that were inserted."""
+    """Set the key sequences of PostgreSQL to continue after the inserted keys."""
     if connection.dialect.name != "postgresql":
         return
     for table in copied_tables():

@@ -1,8 +1,8 @@
-"""State machines of stored entities. Every change of a state is one compare-and-set statement in the database.
+"""State machines of stored entities. Every state change is one compare-and-set statement in the database.
 
 A transition is `UPDATE ... SET state = new WHERE id = ... AND state IN (states from which new can be entered)`. The
-number of changed rows decides: of several requests that arrive together, on any number of processes, one changes the
-row and all others are told the state that they found. No state is read first and written afterwards.
+number of changed rows decides: of several concurrent requests, in any number of processes, one changes the row and all
+others receive a conflict with the state found. No state is read first and written afterwards.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ground_service.store.repository import Row
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateMachine:
-    """The states of one kind of row, in its column ``state``.
+    """States of one kind of row, in its column ``state``.
 
     Attributes
     ----------
@@ -45,14 +45,14 @@ TELECOMMAND = StateMachine(
     {
         "queued": ("released", "rejected"),
         "released": ("sent", "rejected"),
-        # inside another telecommand, whose fate it shares
+        # part of another telecommand, with the same outcome
         "carried": ("sent", "rejected"),
     },
 )
 JOB = StateMachine(
     "job",
     repository.JOBS,
-    # A job whose process ended in the middle is still "running" and is taken up again.
+    # A job whose process ended prematurely is still "running" and is started again.
     {"queued": ("running",), "running": ("running", "queued", "done", "failed")},
 )
 
@@ -67,21 +67,21 @@ def move(
     where: Mapping[str, Any] | None = None,
     **values: Any,
 ) -> None:
-    """Change the state of one row, and other columns with it.
+    """Change the state of one row, and other columns in the same statement.
 
     Parameters
     ----------
     expected
         States in which the row may be found; by default all from which `state` can be entered.
     where
-        Values that columns must have besides, such as the number of the attempt that ends.
+        Further required column values, such as the number of the attempt that ends.
 
     Raises
     ------
     NotFound
         If there is no such row.
     StateConflict
-        If its state does not allow the transition, or `where` does not hold; nothing is changed then.
+        If its state does not permit the transition, or `where` does not match; nothing is changed then.
     """
     table, column = machine.table, next(iter(machine.table.primary_key.columns))
     expected = expected or machine.before(state)
@@ -97,10 +97,10 @@ def move(
 def move_all(
     connection: Connection, machine: StateMachine, conditions: Sequence[Any], state: str, **values: Any
 ) -> list[Row]:
-    """Change the state of all rows that fulfil the conditions and may enter it; these rows as they are now.
+    """Change the state of all rows that match the conditions and may enter it; return the changed rows.
 
-    Two processes that call this at the same time never get the same row. The caller holds a lock that both need
-    (`counters.lock_spacecraft`), so that they do not wait for rows of each other.
+    Two concurrent processes never get the same row. The caller holds a lock (`counters.lock_spacecraft`), which
+    prevents deadlocks between processes.
     """
     table = machine.table
     rows = connection.execute(
@@ -115,7 +115,7 @@ def move_all(
 def change_if(
     connection: Connection, table: Table, key: Any, found: Mapping[str, Any], **values: Any
 ) -> bool:
-    """Change columns of a row that still has the values in which it was found; whether it was so."""
+    """Change columns of a row if it still has the expected values; return whether it was changed."""
     column = next(iter(table.primary_key.columns))
     unchanged = (
         table.c[name].is_(None) if value is None else table.c[name] == value for name, value in found.items()

@@ -96,7 +96,7 @@ class ThreadDispatcher:
             log.warning("job %s did not finish: %s", job_id, error)
         except (
             Exception
-        ):  # the thread's outermost loop: the job could not even be ended and is taken up again
+        ):  # outermost loop of the thread: the job could not be ended and is started again later
             log.exception("job %s did not finish", job_id)
         finally:
             with self._lock:

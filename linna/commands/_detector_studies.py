@@ -50,7 +50,7 @@ def configure(verbs: Any) -> None:
     landmarks.set_defaults(handler=_landmarks)
 
     trials = verbs.add_parser(
-        "trials", help="ways of showing frames to the network, compared on the validation split"
+        "trials", help="compare input and output processing of the trained network on the validation split"
     )
     add_model(trials)
     trials.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
@@ -92,11 +92,11 @@ def configure(verbs: Any) -> None:
         help="training frames of every variant (default: 480 240)",
     )
     ablate.add_argument(
-        "--validation-frames", type=int, default=150, help="at most, of each kind of terrain (default: 150)"
+        "--validation-frames", type=int, default=150, help="maximum for each kind of terrain (default: 150)"
     )
     _add_test(ablate, "variant")
     ablate.add_argument(
-        "--test-frames", type=int, default=160, help="with --test: at most, of each kind of terrain"
+        "--test-frames", type=int, default=160, help="with --test: maximum for each kind of terrain"
     )
     ablate.add_argument(
         "--seeds", type=int, nargs="+", default=[1, 2], help="of the baseline; the others take the first"
@@ -116,7 +116,7 @@ def _add_test(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument(
         "--test",
         action="store_true",
-        help=f"afterwards score the test split once, for the {what} chosen on the validation split",
+        help=f"also score the test split once, for the {what} chosen on the validation split",
     )
 
 

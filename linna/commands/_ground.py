@@ -52,7 +52,7 @@ def operations(arguments: argparse.Namespace) -> Any:
 
 
 def local_actor() -> str:
-    """Name of the user of this machine for the audit log; its number where it has no name."""
+    """Return the name of the operating-system user for the audit log; the user id if there is no name."""
     try:
         return getpass.getuser()
     except (KeyError, OSError):

@@ -12,15 +12,17 @@ LIMIT = 1000
 
 def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(metavar="ACTION", required=True)
-    listing = actions.add_parser("list", help="who did what, the newest entry first")
-    listing.add_argument("--actor", metavar="NAME", help="only what this user did")
+    listing = actions.add_parser("list", help="list the entries, newest first")
+    listing.add_argument("--actor", metavar="NAME", help="only entries of this user")
     listing.add_argument("--action", metavar="TEXT", help="only actions that contain this text")
-    listing.add_argument("--target", metavar="TEXT", help="only what was done to this")
+    listing.add_argument("--target", metavar="TEXT", help="only entries with this target")
     listing.add_argument("--since", metavar="UTC", help="from this time on (RFC 3339)")
     listing.add_argument("--until", metavar="UTC", help="before this time (RFC 3339)")
-    listing.add_argument("--limit", type=int, default=50, metavar="N", help="entries (default: 50)")
+    listing.add_argument(
+        "--limit", type=int, default=50, metavar="N", help="largest number of entries (default: 50)"
+    )
     listing.set_defaults(handler=list_entries)
-    head = actions.add_parser("head", help="number and hash of the newest entry, to be kept elsewhere")
+    head = actions.add_parser("head", help="show number and hash of the newest entry, to be stored elsewhere")
     head.set_defaults(handler=show_head)
     for action in (listing, head):
         add_operator_options(action)

@@ -1,4 +1,4 @@
-"""`linna db`: the database; its schema, roles, backup, export and import, retention."""
+"""`linna db`: schema, roles, backup, export, import and retention of the database."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(metavar="ACTION", required=True)
     upgrade = actions.add_parser("upgrade", help="bring the schema to this version")
     upgrade.set_defaults(handler=run_upgrade)
-    granting = actions.add_parser("grant", help="give a database role what the service needs, and no more")
+    granting = actions.add_parser(
+        "grant", help="grant a database role the least privileges that the service needs"
+    )
     granting.add_argument("--role", metavar="NAME", help="default: the user of $LINNA_DATABASE_URL")
-    granting.add_argument("--print", action="store_true", help="print the SQL instead")
+    granting.add_argument("--print", action="store_true", help="print the SQL statements and do not run them")
     granting.set_defaults(handler=run_grant)
     downgrade = actions.add_parser("downgrade", help="delete every table and row of the database")
-    downgrade.add_argument("revision", help="base: there is no revision before the first")
-    downgrade.add_argument("--yes", action="store_true", help="delete everything")
+    downgrade.add_argument("revision", help="base, the only revision to downgrade to")
+    downgrade.add_argument("--yes", action="store_true", help="confirm that everything is deleted")
     downgrade.set_defaults(handler=run_downgrade)
     status = actions.add_parser("status", help="which revision the database has")
     status.set_defaults(handler=run_status)
@@ -34,13 +36,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
     restoring.add_argument("folder", type=Path)
     restoring.set_defaults(handler=run_restore)
     exporting = actions.add_parser("export", help="write all rows and files into one portable file")
-    exporting.add_argument("--no-files", action="store_true", help="rows only; the files are named by hash")
+    exporting.add_argument(
+        "--no-files", action="store_true", help="export rows only; files are referenced by hash"
+    )
     exporting.set_defaults(handler=run_export)
-    importing = actions.add_parser("import", help="fill an empty service from an export, on either database")
+    importing = actions.add_parser(
+        "import", help="import an export into an empty service, with SQLite or PostgreSQL"
+    )
     importing.set_defaults(handler=run_import)
     for action in (exporting, importing):
         action.add_argument("file", type=Path)
-    tidying = actions.add_parser("tidy", help="take away the feed and finished jobs that are old")
+    tidying = actions.add_parser("tidy", help="delete old feed messages and old finished jobs")
     tidying.add_argument("--days", type=int, help="older than this (default: $LINNA_RETENTION_DAYS)")
     tidying.set_defaults(handler=run_tidy)
     decoding = actions.add_parser("redecode", help="decode the archive again with this version's dictionary")
@@ -100,7 +106,7 @@ def run_grant(arguments: argparse.Namespace) -> int:
 
 
 def _service_role(settings: Settings) -> str | None:
-    """Role of the service where it is another than that of migrations."""
+    """Return the database role of the service; None if it is also the role of migrations."""
     from sqlalchemy import make_url
 
     service, owner = (
@@ -117,11 +123,13 @@ def run_downgrade(arguments: argparse.Namespace) -> int:
 
     if arguments.revision != "base":
         raise UsageError(
-            f"revision: expected base, as a downgrade to another revision would lose rows, found {arguments.revision}"
+            f"revision: expected base, because a downgrade to another revision loses rows, found {arguments.revision}"
         )
     database = open_database(settings_of(arguments).resolved_migration_url())
     if not arguments.yes:
-        raise UsageError(f"--yes: expected it, as base deletes every row of {database.label}, found nothing")
+        raise UsageError(
+            f"expected --yes, because base deletes every row of {database.label}, found no --yes"
+        )
     try:
         found = schema_revisions(database)[0]
         if found is not None:

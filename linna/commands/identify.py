@@ -8,7 +8,7 @@ from pathlib import Path
 
 from linna.output import add_json_flag, emit, log
 
-LEVEL = "level 1-2: simulated detections of the craters of a catalogue (recall, precision, errors as stated), no images"
+LEVEL = "level 1-2: simulated detections of the craters of a catalogue (stated recall, precision and errors), no images"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

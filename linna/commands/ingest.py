@@ -31,10 +31,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stream",
         metavar="NAME",
-        help="the files are pieces of this stream, one behind another (default: joined in order and by content)",
+        help="stream of which the files are consecutive pieces (default: joined by order and content)",
     )
     parser.add_argument(
-        "--offset", type=int, metavar="N", help="where in --stream the first file begins, octets (default: 0)"
+        "--offset", type=int, metavar="N", help="offset of the first file in --stream, octets (default: 0)"
     )
     add_operator_options(parser)
     add_json_flag(parser)
@@ -152,5 +152,5 @@ def _line(one: dict[str, Any]) -> str:
     return (
         f"{one['file']}: {one['packets']} packets, {one['packets_new']} new, {one['crc_errors']} damaged, "
         f"{one['frames_bad']} bad frames, {one['octets_skipped']} octets skipped"
-        + (f", {one['octets_pending']} of them wait for neighbours" if one["octets_pending"] else "")
+        + (f", {one['octets_pending']} of them wait for adjacent pieces" if one["octets_pending"] else "")
     )

@@ -32,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "check",
         help="propose the link settings of a recording from the whole file",
         description="Propose the link settings of a recording from the whole file. Exit status 0: one candidate; "
-        "1: it contradicts the mission description; 3: none, or several that the recording supports as well.",
+        "1: it contradicts the mission description; 3: none, or several with equal support.",
     )
     checking.add_argument("file", type=Path, metavar="FILE")
     checking.add_argument(
@@ -73,7 +73,7 @@ def check(arguments: argparse.Namespace) -> int:
 
 
 def _declared(path: Path | None) -> dict[str, Any]:
-    """Return the link settings that a mission description states; none without one."""
+    """Return the link settings that a mission description states; empty without a description."""
     from ground_service.missions.model import parse_mission
 
     if path is None:
@@ -104,16 +104,16 @@ def _lines(proposal: LinkProposal, packets: int, differences: list[str]) -> list
         lines.append(
             f"{_named(one.settings.describe())}: of {one.sampled} frames: codewords clean {_share(one.clean)}, "
             f"repairable {_share(one.repaired)}, checksums {_share(one.checksums)}, headers {_share(one.regular)}; "
-            f"{one.packets} packets in a stretch"
+            f"{one.packets} packets in consecutive CADUs"
         )
     if proposal.settings is not None:
         lines.append(f"settings: {_named(proposal.settings.describe())}")
     elif packets:
         lines.append(f"no frames: {packets} space packets without frames")
     else:
-        lines.append("settings: none; no frame proves itself under any setting known here")
+        lines.append("settings: none; no frame is valid under any known setting")
     if proposal.ambiguous:
-        lines.append("ambiguous: other candidates are supported as well; state the settings of the link")
+        lines.append("ambiguous: other candidates have equal support; state the link settings")
     return lines + differences
 
 

@@ -16,8 +16,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--track",
         choices=("test", "tuning", "inclined", "limb"),
         default="test",
-        help="orbit flown: that of the paper (test), the one noise is tuned on, or one of two that nothing was "
-        "chosen on (default: test)",
+        help="orbit: the paper's (test), the one on which process noise is tuned, or one of two held-out orbits "
+        "(default: test)",
     )
     parser.add_argument(
         "--noise-factor", type=float, default=1.0, metavar="F", help="factor on the filter's process noise"

@@ -76,7 +76,7 @@ def describe(figures: dict[str, Any]) -> str:
 
 
 def requirement_lines(requirements: list[dict[str, Any]]) -> list[str]:
-    """The judged requirements as lines of text, failures first."""
+    """Return the judged requirements as lines of text, failures first."""
     order = ("not met", "unknown", "met")
     judged = [one for one in requirements if one["status"] in order]
     return [

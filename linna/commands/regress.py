@@ -69,7 +69,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     build.add_argument("action", choices=("register", "list"))
     build.add_argument("file", nargs="?", help="build file")
     _finish(build, _build)
-    sandbox = commands.add_parser("sandbox", help="what confines builds here, or why they are not run")
+    sandbox = commands.add_parser(
+        "sandbox", help="show which sandbox isolates builds here, or why builds are refused"
+    )
     add_json_flag(sandbox)
     sandbox.set_defaults(handler=_sandbox)
 
@@ -134,10 +136,12 @@ def _sandbox(arguments: argparse.Namespace) -> int:
     here = protection()
     answers = exchange is not None and alive(exchange)
     if exchange is not None:
-        told = f"builds run in the runner of {exchange}"
-        refusal = "" if answers else f"runner exchange {exchange}: expected a runner, found none that answers"
+        told = f"builds run in the runner at {exchange}"
+        refusal = (
+            "" if answers else f"runner exchange {exchange}: expected a runner, found none that responds"
+        )
     else:
-        told, refusal = f"builds are confined by: {here.isolation}", here.refusal
+        told, refusal = f"builds are isolated by: {here.isolation}", here.refusal
     lines = [f"builds are refused: {refusal}; remedy: {REMEDY}" if refusal else told]
     lines += [f"  {'in force' if held else 'NOT in force'}: {name}" for name, held in here.checks.items()]
     figures = {

@@ -9,16 +9,16 @@ from linna.output import add_json_flag, emit, progress
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("archive", type=Path, nargs="?", help="pass archive: a folder, or a zip of one")
+    parser.add_argument("archive", type=Path, nargs="?", help="pass archive: a folder or a zip file")
     parser.add_argument(
         "--build", default="current", help="build file (TOML), or 'current': this flight code and its network"
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for downlink and summary")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="output folder for downlink and summary")
     parser.add_argument(
         "--check-build",
         type=Path,
         metavar="BUILD",
-        help="fly nothing; check the parameters of a build file against this flight code",
+        help="only check the parameters of a build file against this flight code",
     )
     parser.add_argument(
         "--complete",
@@ -79,7 +79,7 @@ def _check(arguments: argparse.Namespace) -> int:
         fault = {name: getattr(error, name) for name in ("file", "key", "expected", "found")}
         emit(arguments, {"fault": fault}, text=str(error))
         return 2
-    emit(arguments, {"fault": None}, text=f"{arguments.check_build}: parameters are in order")
+    emit(arguments, {"fault": None}, text=f"{arguments.check_build}: parameters are valid")
     return 0
 
 

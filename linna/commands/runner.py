@@ -1,4 +1,4 @@
-"""`linna runner`: runs payload builds for a service, in a container that has nothing else."""
+"""`linna runner`: execution of payload builds for a ground service, in a separate container."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder shared with the service (default: $LINNA_RUNNER_EXCHANGE)",
     )
-    parser.add_argument("--jobs", type=int, metavar="N", help="end after N builds (default: never)")
-    parser.add_argument("--check", action="store_true", help="only say whether builds can be confined here")
+    parser.add_argument("--jobs", type=int, metavar="N", help="exit after N builds (default: never)")
+    parser.add_argument("--check", action="store_true", help="only check whether builds can be isolated here")
     parser.set_defaults(handler=run)
 
 
@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
         stopping = threading.Event()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: stopping.set())
-        print(f"builds are confined by: {runner_mode(exchange)}", flush=True)
+        print(f"builds are isolated by: {runner_mode(exchange)}", flush=True)
         serve_exchange(exchange, jobs=arguments.jobs, stopping=stopping)
     except SandboxRefused as error:
         raise UsageError(str(error)) from None

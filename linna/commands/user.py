@@ -17,14 +17,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
     renewing = actions.add_parser("token", help="give a user a new token and revoke all earlier ones")
     renewing.add_argument("--keep", action="store_true", help="keep earlier tokens valid")
     renewing.set_defaults(handler=renew)
-    ensuring = actions.add_parser("ensure", help="make sure that a user exists with the token of a variable")
+    ensuring = actions.add_parser(
+        "ensure", help="create the user if needed, with the token of an environment variable"
+    )
     ensuring.add_argument(
         "--token-variable", default="LINNA_ADMIN_TOKEN", metavar="NAME", help="default: LINNA_ADMIN_TOKEN"
     )
     ensuring.set_defaults(handler=ensure)
-    disabling = actions.add_parser("disable", help="refuse a user from now on, with all tokens")
+    disabling = actions.add_parser("disable", help="disable a user and all tokens of the user")
     disabling.set_defaults(handler=change, state="disabled", role=None)
-    enabling = actions.add_parser("enable", help="accept a disabled user again")
+    enabling = actions.add_parser("enable", help="enable a disabled user")
     enabling.set_defaults(handler=change, state="active", role=None)
     ranking = actions.add_parser("role", help="change the role of a user")
     ranking.set_defaults(handler=change, state=None)
@@ -35,15 +37,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
         action.add_argument("--role", choices=ROLES, required=True)
     for action in (adding, renewing):
         action.add_argument(
-            "--days", type=float, metavar="D", help="days that the token is valid (default: no end)"
+            "--days", type=float, metavar="D", help="validity of the token in days (default: unlimited)"
         )
     listing = actions.add_parser("list", help="all users")
     listing.set_defaults(handler=list_all)
-    showing = actions.add_parser("tokens", help="tokens without their secrets, the newest first")
-    showing.add_argument("name", nargs="?", help="only those of this user")
+    showing = actions.add_parser("tokens", help="list the tokens without their secrets, newest first")
+    showing.add_argument("name", nargs="?", help="only tokens of this user")
     showing.set_defaults(handler=list_tokens)
     revoking = actions.add_parser("revoke", help="revoke one token")
-    revoking.add_argument("token_id", type=int, metavar="ID", help="as 'linna user tokens' shows it")
+    revoking.add_argument("token_id", type=int, metavar="ID", help="number shown by 'linna user tokens'")
     revoking.set_defaults(handler=revoke)
     for action in (
         adding, renewing, ensuring, disabling, enabling, ranking, listing, showing, revoking,

@@ -1,4 +1,4 @@
-"""`linna verify`: the archive of the ground service checked against itself."""
+"""`linna verify`: integrity check of the archive of the ground service."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--head",
         metavar="NUMBER:SHA256",
-        help="a head of the audit chain that was kept elsewhere ('linna audit head')",
+        help="head of the audit chain that was stored elsewhere ('linna audit head')",
     )
     add_service_options(parser)
     add_json_flag(parser)

@@ -64,52 +64,53 @@ Index = NDArray[np.int64]
 
 _NAN = float("nan")
 _NO_CRATERS = np.empty(0, dtype=np.int64)
-# Motion of a low orbit about the Moon's centre (2 pi in 111 minutes): a place that is off by a distance along the orbit
-# comes with a velocity that is off by this times the distance.
+# Angular rate of a low orbit (2 pi in 111 minutes): an along-track position error implies a velocity error of this rate
+# times the position error.
 _ORBITAL_RATE_RAD_S = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class AnchoredLimits:
-    """Limits of plausibility, of gaps and of gates in the anchored mode, each with its reason.
+    """Plausibility limits, gap limits and gates of the anchored mode, each with its reason.
 
     Attributes
     ----------
     lowest_radius_m, highest_radius_m
-        Distances from the Moon's centre outside which no estimate is one: 10 km below the sphere of the maps, deeper
-        than any ground, and 1,000 km above it, far beyond the altitudes at which craters are resolved.
+        Distances from the Moon's centre outside which an estimate is invalid: 10 km below the reference sphere, below
+        all terrain, and 1,000 km above it, far above the altitudes at which craters are resolved.
     correction_sigmas
-        A correction of the position larger than so many predicted standard deviations is refused: chance exceeds 7 once
-        in 1e10 fixes (chi-square of 3 degrees above 49), so it comes of a wrong identification.
+        A position correction larger than this number of predicted standard deviations is rejected: a correct fix
+        exceeds 7 once in 1e10 fixes (chi-square of 3 degrees above 49), so the cause is a wrong identification.
     crater_memory_s
-        Longest gap over which craters stay among the states. At 50 km altitude a crater crosses the image in 105 s, at
-        100 km in 215 s; afterwards it is not in view any more.
+        Longest gap over which craters remain in the state vector. At 50 km altitude a crater crosses the image in 105
+        s, at 100 km in 215 s; after that it is out of view.
     search_sigmas, search_margin_px
-        Craters outside the predicted image are searched up to so many standard deviations of the position (3.5 misses
-        1 in 2,000 per axis), and at most so far outside: with 200 px around 512 the area searched, and with it the
-        number of chance pairs, is three times that of the image.
+        Craters outside the predicted image are searched up to this number of standard deviations of the position (3.5
+        misses 1 in 2,000 per axis), and at most this distance outside: with 200 px around a 512 px image the search
+        area, and therefore the number of chance matches, is three times that of the image.
     map_margin_px
-        Craters up to so far outside the predicted image claim detections at its edge before the map takes them.
+        Craters up to this distance outside the predicted image are matched to detections at its edge before these are
+        mapped as new landmarks.
     lowest_altitude_m
-        Altitude that scales pixels to metres is never taken as less, so that a poor prediction divides by no zero.
+        Lower bound of the altitude that scales pixels to metres, so that a poor prediction does not divide by zero.
     smallest_variance_px2
-        No detector repeats itself better than 0.2 px: without a floor two sightings of a crater would be one equation
-        twice.
+        The repeatability of a detector is not better than 0.2 px: without a floor, two sightings of a crater would give
+        the same equation twice.
     frame_gate_sigmas
-        Normal quantile of the probability with which the NIS of a right fix passes: 4.265 is 1 - 1e-5, one right fix
-        refused in 35 days with a frame each 15 s half of the time.
+        Normal quantile of the probability that the NIS of a correct fix passes: 4.265 is 1 - 1e-5, one correct fix
+        rejected in 35 days with a frame every 15 s for half of the time.
     agreement_share
-        A fix must explain this share of the detections or craters that it could, whichever are fewer, else image and
-        map disagree. A right fix explains the recall of the detector, 0.6, a chance one a few craters.
+        A fix must explain this share of the possible detections or craters, whichever are fewer; otherwise image and
+        map disagree. A correct fix explains a share equal to the detector's recall, 0.6, a chance match a few craters.
     judged_craters
-        Frames with fewer craters or detections say nothing about whether image and map agree.
+        With fewer craters or detections a frame does not show whether image and map agree.
     lost_search_every
-        Of frames in which the place is searched without a prior, one in so many is: a search takes up to a second.
+        Search without a prior only in every n-th frame: a search takes up to a second.
     search_radius_sigmas
-        The half width of the widened search counts as so many standard deviations.
+        Number of standard deviations that the half width of the widened search represents.
     found_sigmas, found_position_m, found_velocity_m_s
-        Start of the filter at a place found without a prior: so many times the standard deviation of the place plus a
-        floor, which covers what the shift of the catalogue adds, and a floor of the velocity.
+        Initial uncertainty of the filter after a search without a prior: this multiple of the standard deviation of the
+        position plus a floor, which covers the offset of the catalogue, and a floor of the velocity.
     """
 
     lowest_radius_m: float = MOON_RADIUS_M - 10e3
@@ -133,37 +134,39 @@ class AnchoredLimits:
 
 @dataclass(frozen=True, slots=True)
 class AnchoredParameters:
-    """Everything of the anchored mode that may be tuned.
+    """Tunable parameters of the anchored mode.
 
     Attributes
     ----------
     gravity_degree
         Degree to which the gravity table is used.
     noise
-        Process noise; None takes the one that goes with the gravity table and the degree.
+        Process noise; None uses the noise that belongs to the gravity table and the degree.
     detection_sigma_px, detection_sigma_floor_px, detection_sigma_scale
-        Sigma per axis of a detection where the detector gives none; smallest believed; factor on what it gives.
+        Sigma per axis of a detection if the detector gives none; smallest accepted sigma; factor on the detector's
+        sigma.
     detection_persistence
-        Share of a detection's variance that stays with its crater from frame to frame.
+        Share of a detection's variance that is common to all frames of a crater.
     tracking_limit_m
-        Largest position sigma around which a linear prediction is searched; beyond, the search is by votes.
+        Largest position sigma with which the search uses a linear prediction; above it, the search uses votes.
     search_radius_m
-        Half width of the widened search after the map has disagreed with the images.
+        Half width of the widened search after a disagreement between map and images.
     divergence_limit_m
         Position sigma beyond which the estimate counts as lost.
     suspicion_frames
-        Frames in a row that must disagree before the search is widened.
+        Number of consecutive disagreeing frames before the search is widened.
     lost_frames, lost
-        Frames in a row that must disagree before the place is searched without any prior, and how.
+        Number of consecutive disagreeing frames before the position is searched without a prior, and the parameters of
+        that search.
     map_landmarks, mapping
-        Whether craters that the catalogue lacks are mapped and used on later passes, and how.
+        Whether craters that are not in the catalogue are mapped and used on later passes, and the parameters of this.
     relative
-        Whether the move between two frames is measured on detections that no catalogue names, and how.
+        Whether the motion between two frames is measured with uncatalogued detections, and the parameters of this.
     limits
-        Of plausibility, gaps and gates.
+        Plausibility limits, gap limits and gates.
     crater_limit
-        Craters used of one frame: more than these, the surest, say little more, since attitude and catalogue err alike
-        for all of them.
+        Largest number of craters used in one frame, the most certain first. More craters add little, because the errors
+        of attitude and catalogue are common to all.
     """
 
     gravity_degree: int = 100
@@ -663,7 +666,7 @@ def _plausible(prior: FilterState, posterior: FilterState, limits: AnchoredLimit
 def frame_limit(degrees: int, sigmas: float) -> float:
     """Return the chi-square quantile at the probability of a normal quantile.
 
-    By Wilson and Hilferty's cube root: too wide by 7 % at two degrees of freedom and by 2 % at ten.
+    Wilson and Hilferty's cube-root approximation: too large by 7 % at two degrees of freedom and by 2 % at ten.
     """
     share = 2.0 / (9.0 * degrees)
     return float(degrees * (1.0 - share + sigmas * np.sqrt(share)) ** 3)

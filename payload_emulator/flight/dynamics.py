@@ -25,7 +25,7 @@ Float = NDArray[np.float64]
 _ARC_S = 60.0
 # RK4 at 5 s differs from 1 s by less than a millimetre over an orbit.
 _STEP_S = 5.0
-# Altitudes beyond which the law by which noise falls with altitude was not measured.
+# Altitude range in which the decrease of the noise with altitude was measured.
 _LOWEST_M, _HIGHEST_M = 10_000.0, 100_000.0
 # The gradient of a field of degree 12 is right to a few parts in a thousand at 15 km.
 _GRADIENT_DEGREE = 12
@@ -33,21 +33,21 @@ _GRADIENT_DEGREE = 12
 
 @dataclass(frozen=True, slots=True)
 class ProcessNoise:
-    """What the model leaves out, radial, transverse, normal.
+    """Unmodelled accelerations: radial, transverse, normal.
 
     Attributes
     ----------
     white_psd_m2_s3
-        Spectral density of white acceleration: gravity that the table lacks or has wrong.
+        Spectral density of white acceleration: omission and commission errors of the gravity table.
     markov_sigma_m_s2, correlation_s
-        First-order Gauss-Markov acceleration: what lasts, like the pressure of light.
+        First-order Gauss-Markov acceleration: slowly varying errors such as solar radiation pressure.
     far_side_psd_m2_s3
-        White acceleration over the far side in place of the other, for a field that was made without tracking there;
-        None where the field knows both sides alike.
+        White acceleration over the far side, for a field that was determined without tracking there; None if the field
+        has the same accuracy on both sides.
     scale_height_m, far_side_scale_height_m
-        Height over which the density of either side falls to 1/e: what a field lacks are its finest waves, and between
-        15 and 45 km their power falls by a factor of 50 (degree 100). Densities are those at 30 km; None: the same at
-        any altitude.
+        Height difference over which the density of each side decreases to 1/e: a field omits the highest degrees, whose
+        power decreases by a factor of 50 between 15 and 45 km (degree 100). Densities are those at 30 km; None:
+        independent of altitude.
     """
 
     white_psd_m2_s3: tuple[float, float, float] = (6e-8, 3e-8, 3e-8)

@@ -1,11 +1,12 @@
 """Extended Kalman filter of orbit, common errors and the craters in view, iterated, covariance in Joseph form.
 
 The first 18 states are position and velocity (ICRF), empirical acceleration (radial, transverse, normal), attitude
-bias (camera axes), pixel bias, catalogue offset (east, north, up) and image scale. Behind them stand three for each
-crater that was used and is still in view: how far it lies from its catalogued place, east, north, up. A crater is
-seen several times on a pass and errs the same way each time; its error is a state, not fresh noise, and goes when it
-does. The noise of the attitude, one rotation for all detections of a frame, is a state for the time of an update: a
-wide field of view sees it, and projection bends too much over a degree for it to be noise about the measured attitude.
+bias (camera axes), pixel bias, catalogue offset (east, north, up) and image scale. They are followed by three states
+for each crater that was used and is still in view: its offset from its catalogued position, east, north, up. A crater
+is observed several times on a pass with the same error, so its error is a state and not independent noise; the state is
+removed when the crater leaves the view. The attitude noise, one rotation for all detections of a frame, is a state
+during an update: it is observable in a wide field of view, and the projection is too nonlinear over a degree to treat
+it as noise about the measured attitude.
 """
 
 from __future__ import annotations
@@ -336,7 +337,7 @@ def update(
 def corrected_covariance(covariance: Float, design: Float, gain: Float, noise: Float) -> Float:
     """Return the covariance after a measurement in Joseph form, (1 - K H) P (1 - K H)' + K R K', symmetric.
 
-    It holds for any gain, not only the optimal one, so that rounding of the gain does no harm.
+    The form is valid for any gain, not only the optimal one, so rounding of the gain does not invalidate it.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Shifts of the pixels of a picture by the lens of the simulated camera."""
+"""Pixel shifts caused by the lens distortion of the simulated camera."""
 
 from __future__ import annotations
 

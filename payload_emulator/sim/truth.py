@@ -33,7 +33,7 @@ _POLAR_NORTH_LIMIT_RAD = np.radians(89.9)
 
 @dataclass(slots=True)
 class ReadCount:
-    """Number of reads of the truth while `counted_reads` was in force."""
+    """Number of reads of the truth inside `counted_reads`."""
 
     count: int = 0
 
@@ -43,7 +43,7 @@ _COUNTED: ContextVar[ReadCount | None] = ContextVar("counted_reads_of_truth", de
 
 @contextmanager
 def counted_reads(counter: ReadCount) -> Iterator[None]:
-    """Count every read of any truth by this thread; threads that render ahead meanwhile are not counted."""
+    """Count every read of any truth by this thread; reads by other threads are not counted."""
     token = _COUNTED.set(counter)
     try:
         yield

@@ -1,12 +1,12 @@
-"""Ways to close the gap to real terrain that need training, each against the same small recipe with one thing changed.
+"""Training changes to improve detection on real terrain, each compared with the same baseline recipe.
 
-Every variant is trained from scratch on the same number of crops and, but for the one that is about them, on the same
-frames. The budgets are small: the figures compare variants with each other and say nothing of what a full training
-reaches. The recipe as it stands is trained with every seed; how far its own figures lie apart is the noise below which
-no effect counts. Thresholds, figures and the choice of a variant are those of the validation split. The test split is
-scored in a separate step, for the chosen variant only.
+Every variant is trained from scratch on the same number of crops and, except for the variant that changes the frames,
+on the same frames. The budgets are small: the figures compare variants with each other and do not show the result of a
+full training. The baseline recipe is trained with every seed; the spread of its figures is the noise level, and smaller
+effects are not significant. Thresholds, figures and the choice of a variant are those of the validation split. The test
+split is scored in a separate step, for the chosen variant only.
 
-Each variant is a run folder of its own, so what was killed goes on from its last checkpoint.
+Each variant has its own run folder, so an interrupted training resumes from its last checkpoint.
 """
 
 from __future__ import annotations
@@ -100,13 +100,13 @@ def ablate(
 ) -> list[dict[str, Any]]:
     """Train each variant in a folder of its own under `folder` and score it on the validation split; return the rows.
 
-    The baseline runs with every seed, the others with the first unless `every_seed`. Variants whose material is
-    not given are left out and said to be. What is finished is not done again.
+    The baseline runs with every seed, the others with the first unless `every_seed`. Variants without
+    material are left out and logged. Finished variants are not trained again.
 
     Raises
     ------
     DatasetError
-        The folder holds runs of another budget or other data, or there are no frames to learn from or to validate on.
+        The folder holds runs with another budget or other data, or there are no training or validation frames.
     """
     rows = []
     for variant in variants:
@@ -303,7 +303,7 @@ def _of_kind(material: Material, split: str, complete: bool) -> list[tuple[Datas
 
 
 def _score(network: Any, material: Material, parameters: AblationParameters) -> dict[str, Any]:
-    """Return the validation figures by kind of terrain, at the threshold of real frames where there are any."""
+    """Return the validation figures by kind of terrain, at the threshold of real frames if there are any."""
     scored = {}
     for name, complete in _KINDS.items():
         frames = _thin(_of_kind(material, "val", complete), parameters.validation_frames)

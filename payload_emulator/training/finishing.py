@@ -33,7 +33,7 @@ FIRST_ID = 1
 """COCO readers take 0 for "no annotation" and for the background, so images, categories and annotations begin at 1."""
 
 RIM_VERTICES = 32
-"""Vertices of a rim's polygon, its extreme points besides: the area is 0.6 % too small at most."""
+"""Number of vertices of a rim polygon, plus its extreme points: the area is at most 0.6 % too small."""
 
 
 def write_index(

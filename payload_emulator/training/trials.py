@@ -1,6 +1,6 @@
-"""Ways to close the gap to real terrain that need no new training, compared on the validation split.
+"""Changes of input and output processing to improve detection on real terrain without training.
 
-A trial changes how a frame is shown to the network or how its answer is read. Thresholds and the choice of a trial
+A trial changes how a frame is passed to the network or how the output is decoded. Thresholds and the choice of a trial
 follow from the validation split alone. The test split is scored in a separate step, for the chosen trial only.
 """
 
@@ -51,13 +51,13 @@ def run_trials(
 ) -> dict[str, Any]:
     """Return the figures of each trial on the validation split, and the trial with the greatest strict F1.
 
-    Real frames are scored where there are any, all frames otherwise. Each trial has the threshold of its own greatest
+    Real frames are scored if there are any, otherwise all frames. Each trial has the threshold of its own greatest
     F1. Of equal trials the first is chosen. The test split is not read.
 
     Raises
     ------
     DatasetError
-        The validation split is empty, or the frames are of another camera than the detector's.
+        The validation split is empty, or the camera of the frames is not that of the detector.
     """
     for dataset in datasets:
         refuse_other_camera(detector, dataset)

@@ -1,10 +1,11 @@
-"""Two looks at the same ground under different Suns: what the second adds to the first.
+"""Study of a second observation of the same ground under a different Sun direction.
 
-Frames of a data set that look at the same ground are paired; detections of the second are put on the mean ground and
-from there into the first. A crater found in both keeps the mean of its scores, one found in only one of two frames that
-both show its place half of its score; where only the first frame looks, scores stay. Places are those of the first.
-Judged on the frames that have a partner, against the first frame alone. Thresholds and the choice between the two ways
-follow from the validation split alone; the test split is scored in a separate step, for the chosen way only.
+Frames of a data set that show the same ground are paired. Detections of the second frame are projected onto the mean
+ground surface and from there into the first frame. A crater detected in both frames has the mean of both scores. A
+crater detected in only one of two frames that both show its position has half of its score. Elsewhere scores are
+unchanged. Positions are those of the first frame. The result is compared with the first frame alone, over the frames
+with a partner. Thresholds and the choice between the two ways follow from the validation split alone; the test split is
+scored in a separate step, for the chosen way only.
 """
 
 from __future__ import annotations
@@ -185,7 +186,7 @@ def format_two_suns(study: Mapping[str, Any], test: Mapping[str, Any] | None = N
     """Return both ways on the validation split, the chosen one, and its test figures where given."""
     lines = [
         f"two Suns: {study['validation_frames']} of {study['of_validation_frames']} validation frames share most of "
-        "their ground with another under a Sun elsewhere",
+        "their ground with another frame under a different Sun direction",
         *(_line(title, study[name]) for name, title in WAYS.items()),
         f"chosen on the validation split: {WAYS[study['chosen']]}",
     ]

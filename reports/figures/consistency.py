@@ -30,11 +30,11 @@ _LEFT, _RIGHT, _BOTTOM = 0.72, 1.85, 0.50
 
 
 DIAGONAL = "sum of squared normalised errors (diagonal)"
-"""What stands in place of the NEES where only standard deviations came down."""
+"""Name of the quantity used instead of the NEES if only standard deviations are available."""
 
 
 def squared_errors(one: NavigationSeries) -> tuple[str, FloatArray] | None:
-    """Return the name and values (n,) of the squared errors that are known: NEES, or a sum over the diagonal."""
+    """Return the name and values (n,) of the available squared errors: NEES, or the sum over the diagonal."""
     for name, values in (("NEES", one.nees), (DIAGONAL, one.squared_normalised_errors)):
         if values is not None and np.isfinite(values).any():
             return name, values
@@ -92,9 +92,9 @@ def draw_consistency(
 
 
 def dependences(one: NavigationSeries, track: TrackSeries | None) -> list[tuple[str, str, Binned]]:
-    """Error of one solution by what it may depend on: name, axis label and bins of each quantity known.
+    """Return the error of one solution by each known quantity: name, axis label and bins.
 
-    The altitude is that of the reference: an estimated altitude would sort the errors by themselves.
+    The altitude is that of the reference: bins of an estimated altitude would correlate with the error.
     """
     error = error_3d_m(one.error_rtn_m)
     altitude_m = None if track is None else reference_at(track, one.utc_ns)[2]

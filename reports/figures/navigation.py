@@ -209,7 +209,7 @@ def _usual_limit(error: FloatArray, bound: FloatArray) -> tuple[float, float, st
     if len(bound):
         usual = max(usual, 1.15 * float(np.quantile(bound, 0.9)))
     largest = float(error.max())
-    # The usual bounds are always inside the axis, however small the errors are.
+    # The axis always includes the usual bounds, also for small errors.
     shown = max(1.08 * largest, usual) if 1.08 * largest < 2.0 * usual else usual
     return _symmetric_limit(np.array([shown / 1.08]))
 
@@ -403,14 +403,14 @@ def _log_percent_axis(axes: Axes, values: FloatArray) -> None:
 def zoom_span(
     time: TimeScale, arcs: Sequence[TimeSpan], hours: float = 1.0, resets: Sequence[int] = ()
 ) -> TimeScale | None:
-    """Return the hour that shows a reset, or else an imaging arc; None for spans under two hours.
+    """Return the hour to enlarge, with a reset or else an imaging arc; None for spans under two hours.
 
     Parameters
     ----------
     resets
-        Times (UTC ns) of the resets. The one nearest the middle, except one at the start, lies at two thirds of the
-        hour, so that the growth of the error before it shows. Without one, the hour begins a little before the
-        imaging arc nearest the middle.
+        Times (UTC ns) of the resets. The reset nearest the middle of the span, except one at the start, is placed at
+        two thirds of the hour, so that the growth of the error before it is visible. Without resets, the hour begins
+        shortly before the imaging arc nearest the middle.
     """
     length_ns = int(hours * 3.6e12)
     if time.stop_utc_ns - time.start_utc_ns < 2 * length_ns:

@@ -71,7 +71,7 @@ TRIGGERS = {
 }
 
 REFERENCE = "ink"
-"""Role of the colour of the reference, which no estimate or baseline has."""
+"""Role of the colour of the reference; no estimate or baseline uses this colour."""
 
 _KNOWN_SERIES = {"paper": "vermillion", "spherical": "purple", "anchored": "blue"}
 _OTHER_SERIES = ("green", "orange", "sky", "gray1")

@@ -132,9 +132,9 @@ def frames_and_packets(view: PassView) -> list[Block]:
                     Column("CRC errors"),
                 ),
                 rows,
-                note="Lost in gaps: missing sequence counts between packets that came. Lost at edges: packets of "
-                "planned frames before the first and after the last that came. Duplicates and CRC errors are counted "
-                "in the raw files over the on-board time of the pass.",
+                note="Lost in gaps: missing sequence counts between received packets. Lost at edges: packets of "
+                "planned frames before the first and after the last received packet. Duplicates and CRC errors "
+                "are counted in the raw files over the on-board time of the pass.",
             )
         )
     if report.gaps:

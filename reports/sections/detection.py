@@ -89,7 +89,7 @@ def detector_blocks(score: DetectorScore) -> list[Block]:
         )
         if bins
     ]
-    # One bin shows no dependence: a sentence replaces the plot.
+    # A plot with one bin shows no dependence; a sentence replaces it.
     single = [(label, bins) for label, bins in parts if sum(b.expected > 0 for b in bins) == 1]
     parts = [(label, bins) for label, bins in parts if sum(b.expected > 0 for b in bins) > 1]
     for label, bins in single:
@@ -97,8 +97,8 @@ def detector_blocks(score: DetectorScore) -> list[Block]:
         name, _, unit = label.partition(", ")
         blocks.append(
             Paragraph(
-                f"All craters were expected at one {name}, {only.low:g} to {only.high:g} {unit}: nothing can be "
-                "said about how the detector depends on it.",
+                f"All craters were expected at one {name}, {only.low:g} to {only.high:g} {unit}. "
+                "The dependence of the detector on it cannot be determined.",
                 small=True,
             )
         )
@@ -108,7 +108,7 @@ def detector_blocks(score: DetectorScore) -> list[Block]:
             Picture(
                 "detector-bins",
                 f"Precision and recall by {' and by '.join(by[label] for label, _ in parts)}, over the craters "
-                "expected in each bin (gray, to its own scale).",
+                "expected in each bin (gray, separate scale).",
                 f"Precision and recall in bins of {' and '.join(by[label] for label, _ in parts)}.",
                 2.3,
                 lambda c: detector.draw_bins(c, parts),
@@ -158,9 +158,9 @@ def detector_blocks(score: DetectorScore) -> list[Block]:
 
 
 def _curves_caption(curves: bool, calibration: bool) -> str:
-    """Caption of the panels that there are."""
-    left = "precision against recall as the threshold moves"
-    right = "how often a detection of a given score is true; on the dashed line a score could be read as a probability"
+    """Return the caption of the panels that are shown."""
+    left = "precision against recall for varying threshold"
+    right = "share of true detections by score; on the dashed line the score equals the probability"
     if curves and calibration:
         return f"Left: {left}. Right: {right}."
     only = left if curves else right
@@ -215,8 +215,8 @@ def galleries(view: PassView) -> list[Block]:
                 "worst",
                 worst,
                 3,
-                f"The {len(worst)} frames with the lowest recall, of all frames of the pass. A plain ground stands for "
-                "an image that did not come down.",
+                f"The {len(worst)} frames with the lowest recall, of all frames of the pass. A uniform background "
+                "replaces an image that was not received.",
             )
         )
     return blocks

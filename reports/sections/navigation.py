@@ -60,7 +60,7 @@ def errors(view: PassView) -> list[Block]:
 
 
 def _budget_table(view: PassView) -> list[Block]:
-    """What the reference contributes to the observed errors."""
+    """Return the table of the contribution of the reference to the observed errors."""
     rows = []
     for one in view.with_error:
         budget = one.error_budget
@@ -82,7 +82,7 @@ def _budget_table(view: PassView) -> list[Block]:
             (Column("solution", numeric=False), Column("observed"), Column("reference"), Column("estimate")),
             tuple(rows),
             note="Observed² = estimate² + reference², with the 1-sigma error of the reference that the mission "
-            "declares. It holds where the two are independent: not for odometry that is reset to the anchor ephemeris.",
+            "declares. The errors of odometry that is reset to the anchor ephemeris are not independent.",
         )
     ]
 

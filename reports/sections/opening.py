@@ -54,7 +54,7 @@ def about(report: Judged, *facts: tuple[str, str]) -> tuple[tuple[str, str], ...
 
 
 def judgement(report: Judged, *, counts_only: bool = False) -> list[Block]:
-    """Verdict and figures; figures that only count things have no evidence level unless one is given."""
+    """Return verdict and figures; figures that are only counts have no evidence level unless one is given."""
     blocks: list[Block] = []
     if report.verdict:
         blocks.append(Verdict(report.verdict[0].upper() + report.verdict[1:], report.verdict_level))
@@ -96,7 +96,7 @@ def provenance_and_data(report: Judged) -> list[Block]:
         blocks.append(
             Paragraph(
                 f"The accuracy figures are at {evidence_text(report.evidence_level)}. A figure at a lower level "
-                "says less about flight than one at a higher level, and is not to be quoted without its level."
+                "says less about performance in flight than one at a higher level. Quote figures only with their level."
             )
         )
     if report.provenance:

@@ -27,7 +27,7 @@ def summary(view: PassView) -> list[Block]:
 
 
 def requirements_table(view: PassView) -> list[Block]:
-    """Requirement, limit, value, margin and status of everything that the verdict rests on."""
+    """Return the table of requirements: limit, value, margin and status."""
     rows: list[tuple[Cell | str, ...]] = []
     for one in view.report.requirements:
         judged = one.status != "not judged"
@@ -49,7 +49,7 @@ def requirements_table(view: PassView) -> list[Block]:
     return [
         Heading("Requirements"),
         Table(
-            "Requirements of the mission description, and what this pass gave.",
+            "Requirements of the mission description, and the results of this pass.",
             (
                 Column("requirement", numeric=False),
                 Column("status", numeric=False),
@@ -67,7 +67,7 @@ def requirements_table(view: PassView) -> list[Block]:
 
 
 def _with_unit(value: float, unit: str) -> str:
-    """Return a number with three significant digits and its unit; whole numbers below a thousand as they are."""
+    """Return a number with three significant digits and its unit; whole numbers below a thousand are unchanged."""
     whole = float(value).is_integer() and abs(value) < 1000.0
     text = number_text(value, 0) if whole else significant_text(value)
     return f"{text}{NO_BREAK_SPACE}{unit}" if unit else text

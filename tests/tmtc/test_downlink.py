@@ -358,7 +358,7 @@ def test_packets_outside_the_dictionary_are_counted_as_unknown():
 def test_markers_without_frames_between_them_are_an_error_that_says_so():
     noise = np.random.default_rng(3).integers(0, 256, (30, 700), dtype=np.uint8)
     noise[:, :4] = np.frombuffer(ASM, dtype=np.uint8)
-    with pytest.raises(LinkFormatError, match="most of them every 700 octets"):
+    with pytest.raises(LinkFormatError, match="mostly 700 octets apart"):
         decode(noise.tobytes())
 
 

@@ -199,7 +199,7 @@ def test_a_broker_that_is_away_leaves_each_process_its_own_budget(caplog: pytest
 
     with ThreadPoolExecutor(1) as pool:
         assert pool.submit(anyio.run, ask).result() == [True, True, False]
-    assert sum("each process counts for itself" in record.message for record in caplog.records) == 1
+    assert sum("each process limits on its own" in record.message for record in caplog.records) == 1
 
 
 def test_a_log_entry_is_one_json_object_with_what_was_passed() -> None:

@@ -109,8 +109,8 @@ def test_known_query_keys_are_taken(client: TestClient) -> None:
         (b'{"name": "x", "cadence_s": 1e400}', "found 1e400"),
         (b'{"name": "a\\u0000b"}', "without NUL"),
         (b'{"a\\u0000b": 1}', "without NUL"),
-        (b'{"name": ["\\ud800"]}', "whole characters"),
-        (b'{"name": "x", "name": "y"}', "found one twice"),
+        (b'{"name": ["\\ud800"]}', "lone surrogates"),
+        (b'{"name": "x", "name": "y"}', "found a duplicate"),
     ],
 )
 def test_json_with_no_or_two_meanings_is_refused(client: TestClient, body: bytes, words: str) -> None:

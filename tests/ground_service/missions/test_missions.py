@@ -241,7 +241,7 @@ def released_by_one(ground, name: str, arguments: dict) -> bool:
     try:
         release_command(ground, command, actor="ann")
     except Conflict as error:
-        assert "expected another person than ann" in str(error)
+        assert "expected a person other than ann" in str(error)
         return False
     return True
 

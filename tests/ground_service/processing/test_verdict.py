@@ -160,7 +160,10 @@ def test_two_frames_are_judged_and_one_is_not() -> None:
     )
     one = replace(series("anchored", median=0.0), utc_ns=np.zeros(1, dtype=np.int64))
     judged = row("accuracy.median", Limits(estimator="anchored", median_error_m=10.0), found(one))
-    assert (judged.status, judged.note) == ("unknown", "one frame was navigated: too little to judge by")
+    assert (judged.status, judged.note) == (
+        "unknown",
+        "only one frame was navigated, too few for a judgement",
+    )
 
 
 def test_resets_of_other_estimators_are_shown_without_judgement() -> None:

@@ -142,7 +142,7 @@ def test_a_backup_names_rows_that_were_damaged_before(filled: tuple[Ground, str]
         connection.execute("UPDATE users SET role = 'admin'")
     connection.close()
     manifest = backup(filled[0], tmp_path / "saved", now_utc_ns=START)
-    assert manifest["damaged"] == ["users 1: expected content that gives its digest, found changed content"]
+    assert manifest["damaged"] == ["users 1: expected content that matches its digest, found changed content"]
 
 
 def test_a_backup_goes_from_either_database_into_either(

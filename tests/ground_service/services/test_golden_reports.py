@@ -313,7 +313,7 @@ def test_a_tilted_camera_with_a_lens(make_pass: Callable[..., Any], ground: Grou
     assert report.detector.micro.expected == made.expected
     assert report.detector.micro.detected_true == made.expected - made.missed
     assert report.detector.micro.localisation_px == pytest.approx(np.hypot(0.5, 1.25), abs=1 / 64)
-    assert "the camera as declared" in report.detector.method
+    assert "the camera in its declared attitude" in report.detector.method
     nadir = evaluated(ground, pass_of(50, MISSION).folder)
     assert nadir.detector is not None and nadir.detector.micro is not None
     assert nadir.detector.micro.recall < 0.2

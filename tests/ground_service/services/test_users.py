@@ -52,7 +52,7 @@ def test_a_disabled_user_is_refused_at_once_in_every_process(either: Ground, tmp
         assert authenticate(other, token).name == "bob"
         assert token_valid(other, token)
         assert change_user(either, "bob", state="disabled", actor="ann").state == "disabled"
-        with pytest.raises(NotAuthorised, match="its user bob is disabled"):
+        with pytest.raises(NotAuthorised, match="user bob is disabled"):
             authenticate(other, token)
         assert not token_valid(other, token)
         with pytest.raises(Conflict, match="user bob: expected state active, found disabled"):

@@ -120,7 +120,7 @@ def test_a_role_with_more_power_than_the_service_needs_is_refused(
 ) -> None:
     monkeypatch.setenv("LINNA_ALLOW_DATABASE_OWNER", "false")
     for url, powers in (
-        (roles.superuser, {"is a superuser", "can make roles", "owns tables", "can change the audit log"}),
+        (roles.superuser, {"is a superuser", "can create roles", "owns tables", "can change the audit log"}),
         (roles.owner, {"owns tables", "can add to the schema", "can change the audit log"}),
     ):
         with pytest.raises(PowerfulRole, match="LINNA_MIGRATION_DATABASE_URL") as error:

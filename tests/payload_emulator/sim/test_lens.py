@@ -50,7 +50,7 @@ def test_what_lies_beyond_the_fold_of_the_lens_is_not_folded_back_into_the_pictu
 
 
 def test_a_lens_that_folds_the_picture_is_refused():
-    with pytest.raises(LensError, match="folds it"):
+    with pytest.raises(LensError, match="folds the image"):
         BrownCamera(k1=-0.2)
 
 
