@@ -12,6 +12,10 @@ CCSDS 301.0-B-4 sections 3.2 (CUC) and 3.3 (CDS).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from tmtc.errors import MalformedPacket, TruncatedPacket, ValueRefused
 
@@ -19,6 +23,9 @@ P_FIELD = 0x2E
 TICKS_PER_SECOND = 1 << 16
 TICKS_LIMIT = 1 << 48
 CUC_LENGTH = 7
+
+NO_TICKS = -1
+"""On-board time of a packet that carries none, or none that is possible."""
 
 EPOCH_1958_TAI = 0b001
 EPOCH_AGENCY = 0b010
@@ -58,6 +65,13 @@ def unpack_cuc(octets: bytes | memoryview) -> int:
     if octets[0] != P_FIELD:
         raise MalformedPacket(f"CUC time code: expected P-field 0x{P_FIELD:02X}, found 0x{octets[0]:02X}")
     return int.from_bytes(octets[1:CUC_LENGTH], "big")
+
+
+def onboard_ticks(values: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+    """Return on-board times (n,) given as u64 in signed integers; `NO_TICKS` for those beyond 48 bits."""
+    ticks = values.astype(np.int64)
+    ticks[values >= TICKS_LIMIT] = NO_TICKS
+    return ticks
 
 
 def pack_cuc_time(time: CucTime) -> bytes:

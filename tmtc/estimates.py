@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from tmtc.cuc import onboard_ticks
 from tmtc.schema import Table
 
 Float = npt.NDArray[np.float64]
@@ -79,7 +80,7 @@ def _of_table(table: Table) -> FilterEstimates:
     names = ("position_icrf_m", "velocity_icrf_m_s", "acceleration_rtn_m_s2")
     return FilterEstimates(
         table.packet_index,
-        columns["image_ticks"],
+        onboard_ticks(columns["image_ticks"]),
         columns["frame_number"],
         table.ticks,
         np.concatenate([columns[name] for name in names], axis=1),

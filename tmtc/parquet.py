@@ -15,7 +15,7 @@ import numpy as np
 _MAGIC = b"PAR1"
 _INT64, _DOUBLE, _BYTE_ARRAY = 2, 5, 6
 _OPTIONAL = 1
-_UTF8 = 0
+_UTF8, _UINT_64 = 0, 14
 _PLAIN, _RLE = 0, 3
 _DATA_PAGE = 0
 
@@ -30,7 +30,7 @@ def parquet_octets(columns: Mapping[str, Sequence[object]]) -> bytes:
     chunks, schema = [], [_struct((4, _BINARY, _binary("schema")), (5, _I32, _zigzag(len(columns))))]
     total = 0
     for name, values in columns.items():
-        kind, data = _plain(values)
+        kind, converted, data = _plain(values)
         levels = _levels(values)
         page = struct.pack("<I", len(levels)) + levels + data
         page_header = _struct(
@@ -63,8 +63,8 @@ def parquet_octets(columns: Mapping[str, Sequence[object]]) -> bytes:
         )
         chunks.append(_struct((2, _I64, _zigzag(at)), (3, _STRUCT, meta)))
         element = [(1, _I32, _zigzag(kind)), (3, _I32, _zigzag(_OPTIONAL)), (4, _BINARY, _binary(name))]
-        if kind == _BYTE_ARRAY:
-            element.append((6, _I32, _zigzag(_UTF8)))
+        if converted is not None:
+            element.append((6, _I32, _zigzag(converted)))
         schema.append(_struct(*element))
     group = _struct((1, _LIST, _list(_STRUCT, chunks)), (2, _I64, _zigzag(total)), (3, _I64, _zigzag(rows)))
     footer = _struct(
@@ -77,15 +77,23 @@ def parquet_octets(columns: Mapping[str, Sequence[object]]) -> bytes:
     return bytes(body) + footer + struct.pack("<I", len(footer)) + _MAGIC
 
 
-def _plain(values: Sequence[object]) -> tuple[int, bytes]:
-    """(physical type, plain encoding) of the values that are there."""
+def _plain(values: Sequence[object]) -> tuple[int, int | None, bytes]:
+    """(physical type, converted type, plain encoding) of the values that are there.
+
+    Whole numbers are signed, or unsigned where one does not fit; a column that fits neither is written as text.
+    """
     present = [value for value in values if value is not None]
     if present and all(isinstance(value, (int, np.integer)) for value in present):
-        return _INT64, np.array(present, dtype="<i8").tobytes()
-    if all(isinstance(value, (int, float, np.integer, np.floating)) for value in present):
-        return _DOUBLE, np.array(present, dtype="<f8").tobytes()
+        numbers = [int(value) for value in present]  # type: ignore[call-overload]
+        least, greatest = min(numbers), max(numbers)
+        if least >= -(1 << 63) and greatest < 1 << 63:
+            return _INT64, None, np.array(numbers, dtype="<i8").tobytes()
+        if least >= 0 and greatest < 1 << 64:
+            return _INT64, _UINT_64, np.array(numbers, dtype="<u8").tobytes()
+    elif all(isinstance(value, (int, float, np.integer, np.floating)) for value in present):
+        return _DOUBLE, None, np.array(present, dtype="<f8").tobytes()
     texts = [str(value).encode() for value in present]
-    return _BYTE_ARRAY, b"".join(struct.pack("<I", len(text)) + text for text in texts)
+    return _BYTE_ARRAY, _UTF8, b"".join(struct.pack("<I", len(text)) + text for text in texts)
 
 
 def _levels(values: Sequence[object]) -> bytes:

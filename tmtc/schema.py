@@ -219,8 +219,8 @@ class DecodedCommand:
 class Table:
     """All packets of one kind as columns.
 
-    `packet_index` (n,) points into the `PacketCut`; `columns` hold engineering values (integers as int64,
-    all else float64), `raw` the transmitted ones; a field of size k gives (n, k). `items` holds the
+    `packet_index` (n,) points into the `PacketCut`; `columns` hold engineering values (integers as int64, u64 as
+    uint64, all else float64), `raw` the transmitted ones; a field of size k gives (n, k). `items` holds the
     repeated fields of all packets one after another and `item_owner` the row of this table that each
     belongs to.
     """
@@ -660,7 +660,7 @@ def _decode_column(f: Field, raw: Array) -> Array:
     if f.is_float:
         return raw.astype(np.float64) if not f.is_calibrated else raw.astype(np.float64) * f.scale + f.offset
     if not f.is_calibrated:
-        return raw.astype(np.int64)
+        return raw.astype(np.uint64 if f.type == "u64" else np.int64)
     values = raw * f.scale + f.offset
     if f.missing is not None:
         values[raw == f.missing] = np.nan
@@ -710,7 +710,7 @@ def _encode(packet: str, f: Field, value: object) -> int | float:
 
 def _encode_column(packet: str, f: Field, value: object) -> Array:
     """Raw numbers (n,) of engineering values."""
-    given = np.asarray(value)
+    given = _as_array(f, value)
     if given.size == 0:
         return np.empty((0,) if f.size == 1 else (0, f.size), dtype=f.dtype)
     if given.shape[1:] != (() if f.size == 1 else (f.size,)):
@@ -753,6 +753,17 @@ def _encode_column(packet: str, f: Field, value: object) -> Array:
     _refuse(packet, f, given, (codes < least) | (codes > greatest))
     codes[absent] = 0 if f.missing is None else f.missing
     return codes.astype(f.dtype)
+
+
+def _as_array(f: Field, value: object) -> Array:
+    given = np.asarray(value)
+    if f.type == "u64" and given.dtype.kind == "f" and not isinstance(value, np.ndarray):
+        # numpy makes floats of a list that holds integers below and above 2^63
+        exact = np.asarray(value, dtype=object)
+        least, greatest = f.raw_limits
+        if all(isinstance(v, (int, np.integer)) and least <= v <= greatest for v in exact.flat):
+            return exact.astype(np.uint64)
+    return given
 
 
 def _refuse_no_number(packet: str, name: str, value: object) -> None:

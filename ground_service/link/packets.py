@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmtc.cuc import NO_TICKS, onboard_ticks
 from tmtc.dictionary import DICTIONARY
 from tmtc.estimates import ESTIMATE_PACKETS, filter_estimates
 from tmtc.schema import Dictionary, Table, as_octets, gather
@@ -18,7 +19,6 @@ from tmtc.stream import Octets, PacketCut, primary_headers
 IntArray = NDArray[np.int64]
 Columns = dict[str, Any]
 
-NO_TICKS = -1
 DIGEST_OCTETS = 16
 
 _TIMED_HEADER = np.dtype(
@@ -114,7 +114,7 @@ def _frame_columns(table: Table, place: IntArray) -> Columns:
     """Columns that every sample of an image has; its time is that of the image, not of the packet."""
     return {
         "packet": place[table.packet_index],
-        "ticks": table.columns["image_ticks"],
+        "ticks": onboard_ticks(table.columns["image_ticks"]),
         "packet_ticks": table.ticks,
         "frame_number": table.columns["frame_number"],
     }
@@ -199,7 +199,7 @@ def _time_reports(table: Table, place: IntArray) -> Columns:
     return {
         "packet": place[table.packet_index],
         "ticks": table.ticks,
-        "reported_ticks": table.columns["reported_ticks"],
+        "reported_ticks": onboard_ticks(table.columns["reported_ticks"]),
         "rate_exponent": table.columns["rate_exponent"],
     }
 

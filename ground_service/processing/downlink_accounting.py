@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ground_service.link.packets import NO_TICKS, packet_ticks
+from ground_service.link.packets import packet_ticks
+from tmtc.cuc import NO_TICKS
 from tmtc.downlink import FRAME_FOREIGN, FRAME_GOOD, DownlinkDecode, decode
 from tmtc.stream import Octets
 

@@ -16,7 +16,7 @@ from sqlalchemy import Connection
 from ground_service.clock import utc_now_ns
 from ground_service.errors import PASSING, GroundError, InvalidInput
 from ground_service.link.frames import ChannelEdge, is_checked
-from ground_service.link.packets import NO_TICKS, PacketBatch
+from ground_service.link.packets import PacketBatch
 from ground_service.link.stream import (
     BARE,
     CADU_MAX_OCTETS,
@@ -33,6 +33,7 @@ from ground_service.services.window_progress import advance_windows
 from ground_service.store import edges, repository
 from ground_service.store.files import StoredFile, read_blocks
 from ground_service.store.packets import store_batch
+from tmtc.cuc import NO_TICKS
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import TmtcError
 from tmtc.link import LinkSettings

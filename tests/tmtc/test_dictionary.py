@@ -363,6 +363,22 @@ def test_integer_columns_do_not_wrap_in_arithmetic():
     assert table.columns["image_ticks" if "image_ticks" in table.columns else "mode"].dtype == np.int64
 
 
+@pytest.mark.parametrize("value", [0, 2**63 - 1, 2**63, 2**64 - 1])
+def test_unsigned_integers_of_64_bits_stay_what_was_sent(value):
+    definition = PacketDefinition(
+        "wide", 1, 3, 25, "",
+        (Field("number", "u64", ""), Field("vector", "u64", "", size=2), Field("count", "u8", "")),
+        Group("count", (Field("item", "u64", ""),)),
+    )  # fmt: skip
+    dictionary = Dictionary(1, (definition,))
+    values = {"number": value, "vector": [1, value], "items": [{"item": value}, {"item": 7}]}
+    octets = dictionary.pack("wide", values, ticks=0, sequence_count=0)
+    table = dictionary.unpack_many(octets, cut_packets(octets))["wide"]
+    assert table.columns["number"].tolist() == [value] and table.columns["vector"].tolist() == [[1, value]]
+    assert table.items["item"].tolist() == [value, 7]
+    assert dictionary.unpack(octets)[1]["items"]["item"].tolist() == [value, 7]
+
+
 def test_limits_tell_warning_from_alarm():
     temperature = DICTIONARY.packet("housekeeping").field("temperature_c")
     values = [-41.0, -30.0, -20.0, 20.0, 60.0, 61.0, 86.0, math.nan]

@@ -95,6 +95,31 @@ def test_parquet_is_the_octets_that_pyarrow_reads():
     )
 
 
+def test_unsigned_integers_of_64_bits_are_written_whole():
+    event = {"frame_number": 1, "image_ticks": 2**64 - 1, "estimator": "anchored", "outcome": "fixed"}
+    rest = dict.fromkeys(("latitude_deg", "longitude_deg", "altitude_m", "nis"), 0.0)
+    vectors = {"velocity_icrf_m_s": [0.0] * 3, "sigma_rtn_m": [0.0] * 3, "matched": 0}
+    octets = DICTIONARY.pack("navigation_state", {**event, **rest, **vectors}, ticks=0, sequence_count=0)
+    records = packet_records(DICTIONARY.unpack_many(octets, cut_packets(octets)))
+    assert json.loads(format_records(records, "json"))[0]["image_ticks"] == 18446744073709551615
+    rows = list(csv.DictReader(io.StringIO(format_records(records, "csv").decode())))
+    assert rows[0]["image_ticks"] == "18446744073709551615"
+    assert b"\xff" * 8 in format_records(records, "parquet")
+
+
+def test_parquet_columns_beyond_signed_integers_are_the_octets_that_pyarrow_reads():
+    octets = parquet_octets({"u": [0, None, 2**64 - 1], "both": [-1, 2**63, 5]})
+    # read with pyarrow 26.0.1: {'u': [0, None, 18446744073709551615], 'both': ['-1', '9223372036854775808', '5']},
+    # u of type uint64, both of type string
+    assert octets.hex() == (
+        "504152311500152c152c2c150615001506150600000200000003050000000000000000ffffffffffffffff1500155015"
+        "502c15061500150615060000020000000307020000002d31130000003932323333373230333638353437373538303801"
+        "000000351502193c4806736368656d6115040015042502180175251c00150c25021804626f74682500001606191c192c"
+        "26081c1504192500061918017515001606164e164e2608000026561c150c19250006191804626f746815001606167216"
+        "722656000016c001160600280a6c696e6e6120746d7463007400000050415231"
+    )
+
+
 def test_parquet_begins_and_ends_as_its_format_says():
     octets = format_records(packet_records(tables()), "parquet")
     assert octets[:4] == octets[-4:] == b"PAR1"
