@@ -298,7 +298,7 @@ def test_the_table_of_a_pass_of_which_nothing_is_known() -> None:
 
 def test_packets_without_a_plan_say_what_is_not_known() -> None:
     said = row("completeness.packets", EVERY_LIMIT, found(packets=PacketAccounting(60, lost=40))).note
-    assert said == "60 of 100 packets; what is missing at the edges is not known without a plan"
+    assert said == "60 of 100 packets; without a plan, packets missing at the edges are unknown"
 
 
 def test_housekeeping_without_a_finite_value_is_unknown() -> None:
