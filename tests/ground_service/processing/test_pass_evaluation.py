@@ -531,7 +531,7 @@ def test_detections_are_scored_on_the_frames_with_a_fit_image(report: PassReport
     assert [one.detected_true for one in report.detector.per_class] == [10, 10, 9]
     assert [(one.low, one.high) for one in report.detector.by_altitude_km] == [(30.0, 40.0)]
     assert report.detector.by_sun_elevation_deg == ()
-    assert "into the camera as declared;" in report.detector.method
+    assert "into the camera in its declared attitude;" in report.detector.method
 
 
 def test_the_map_counts_each_crater_as_often_as_it_was_in_view(report: PassReport) -> None:
@@ -601,8 +601,8 @@ def test_the_pointing_is_told_from_what_is_known_of_it() -> None:
     ).as_quat()[:, [3, 0, 1, 2]]
     some = evaluate_pass(inputs(viewing=Viewing(CAMERA, attitude_utc_ns=TIMES[:5], q_wxyz=turned[:5])))
     assert [one.detected_true for one in some.detector.per_class] == [10, 6, 5]  # type: ignore[union-attr]
-    assert "into the camera in its telemetered attitude, where there is one;" in scored(some)[1]
-    assert some.remarks[-1] == "the attitude of 7 of 12 frames is not known: taken as declared"
+    assert "into the camera in its telemetered attitude, if available;" in scored(some)[1]
+    assert some.remarks[-1] == "the attitude of 7 of 12 frames is unknown; the declared attitude is used"
     refused = evaluate_pass(inputs(refused={"camera": "the camera is not declared"}))
     assert "into a nadir camera;" in scored(refused)[1]
     assert refused.remarks[-1] == "the camera is not declared"
