@@ -86,7 +86,7 @@ def account_sequence(ticks: IntArray, sequence_count: IntArray) -> SequenceAccou
     steps = near + wraps * COUNT_MODULUS
     restart = (steps < 0) & (step_ticks > REORDER_TICKS)
     run = np.concatenate(([0], np.cumsum(restart))).astype(np.int64)
-    total = np.concatenate(([0], np.cumsum(np.where(restart, 0, steps))))
+    total = np.concatenate(([0], np.cumsum(steps)))
     first = np.flatnonzero(np.concatenate(([True], restart)))
     count = total - total[first][run] + counts[first][run]
 

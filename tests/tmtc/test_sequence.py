@@ -137,6 +137,19 @@ def test_a_counter_that_begins_anew_is_a_restart_and_no_gap():
     assert (result.accounts[0].restarts, result.gaps, result.conflicts, result.duplicates) == (1, 0, 0, 0)
 
 
+def test_losses_before_and_after_a_restart_are_still_losses():
+    counts = np.concatenate((np.arange(3000, 3100), np.arange(0, 50)))
+    result = report(np.delete(counts, [50, 120]))
+    # The second run counts on from 16,384.
+    assert result.accounts[0].missing_ranges.tolist() == [[3050, 3050], [16_404, 16_404]]
+
+
+def test_a_count_that_falls_to_less_than_64_by_more_than_64_is_a_restart():
+    for before, after, restarts in ((3000, 63, 1), (3000, 64, 0), (115, 50, 1), (114, 50, 0)):
+        result = report([before, after])
+        assert result.accounts[0].restarts == restarts, (before, after)
+
+
 def test_a_loss_of_more_than_half_a_wrap_is_found_by_the_expected_rate():
     counts = np.concatenate((np.arange(100), np.arange(12_100, 12_200)))
     ticks = counts << 16  # one packet a second

@@ -54,6 +54,7 @@ def test_octets_between_frames_are_skipped_octets_of_the_frame_before() -> None:
     one, two = account_raw([file], 0, 11 * HOUR), account_raw([file], 19 * HOUR, 30 * HOUR)
     assert one.octets_skipped == 777 and one.octets == len(FIRST) + 777
     assert two.octets_skipped == 0
+    assert account_raw([file], 10 * HOUR, 11 * HOUR).octets_skipped == 777
 
 
 def test_a_packet_that_came_twice_is_a_duplicate_of_its_process_in_its_pass() -> None:
@@ -70,6 +71,9 @@ def test_a_packet_put_together_from_parts_leaves_no_octets_unused() -> None:
     found = account_raw([read_raw(octets, SPACECRAFT)], 0, 11 * HOUR)
     assert (found.frames, found.frames_bad, found.octets) == (len(FIRST) // CADU, 0, len(FIRST))
     assert (found.octets_skipped, found.duplicates) == (0, {EVENTS: 0})
+    # The packets put together stand in no frame: they give none of another pass their time.
+    file = read_raw(octets + SECOND, SPACECRAFT)
+    assert account_raw([file], 19 * HOUR, 30 * HOUR).frames == len(SECOND) // CADU
 
 
 def test_packets_with_a_wrong_checksum_are_counted_by_process() -> None:

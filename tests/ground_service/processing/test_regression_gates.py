@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from benchmarks.gate_error_rates import degraded, outcomes, simulated, suite
+from ground_service.processing.regression_figures import Percentile, Ratio
 from ground_service.processing.regression_gates import (
     Gate,
     GatePolicy,
     GateRule,
     Waiver,
     judge,
+    metric_interval,
     rule_of,
     verdict_of,
 )
-from ground_service.processing.regression_samples import PassFrames
+from ground_service.processing.regression_samples import EstimatorFrames, PassFrames
 
 POLICY = GatePolicy(
     version="test",
@@ -355,3 +358,213 @@ def test_twice_the_margin_is_not_passed_where_the_frames_resolve_it() -> None:
     assert all(twice[name]["pass"] == 0 for name in resolved)
     assert all(twice[name]["fail"] > 0 for name in resolved)
     assert degraded(2.0)["recall"] == pytest.approx(0.66)
+
+
+N = 100
+SIGN = np.where(np.arange(N) % 2, -1.0, 1.0)
+
+
+def alternating(hits: float = 14.0, swing: float = 1.0, octets: float = 1000.0, **more: Any) -> PassFrames:
+    """One pass of 20 craters a frame whose hits and octets alternate: neighbours correlate negatively, time 1."""
+    nothing = np.zeros(N)
+    return PassFrames(
+        answered=np.ones(N, dtype=np.bool_),
+        expected=np.full(N, 20.0),
+        hits=hits + swing * SIGN,
+        alarms=nothing,
+        error_px=nothing,
+        shift_u_px=nothing,
+        shift_v_px=nothing,
+        packets=np.full(N, 8.0),
+        octets=octets * (1.0 + 0.1 * swing * SIGN),
+        estimators={},
+        **more,
+    )
+
+
+def gate_of(before: PassFrames, after: PassFrames, name: str, margin: float, **more: Any) -> Gate:
+    policy = replace(POLICY, rules=(GateRule(name, margin, **more),))
+    (found,) = judge({"only": before}, {"only": after}, policy)
+    return found
+
+
+def test_a_gate_of_a_share_is_student_s_t_with_the_rule_of_three_as_its_floor() -> None:
+    """The share of a frame swings by 1/20 of a hit; the change by a tenth of that: its error is 0.005 over root 99."""
+    found = gate_of(alternating(), alternating(swing=1.1), "detector.recall", 0.02)
+    error, t = 0.1 / 20.0 / np.sqrt(99.0), stats.t(99)
+    # A single frame of the baseline may differ by root two of its swing, ln 100 of them unseen among a hundred.
+    floor = -np.log(0.01) * np.sqrt(2.0) / 20.0 / N
+    assert floor > t.ppf(0.99) * error
+    assert (found.outcome, found.name, found.unit, found.pass_name) == ("pass", "detector.recall", "", "")
+    assert (found.baseline, found.candidate) == pytest.approx((0.7, 0.7))
+    assert (found.margin, found.limit) == pytest.approx((0.02, 0.68))
+    assert found.change_low == pytest.approx(-t.ppf(0.99) * error)
+    assert found.change_high == pytest.approx(floor)
+    assert found.resolution == pytest.approx((t.ppf(0.99) + t.ppf(0.9)) * floor / t.ppf(0.99))
+    # One test of one family has all of 1 - confidence.
+    assert (found.p_value, found.level) == (1.0, pytest.approx(0.01))
+    assert (found.frames, found.frames_needed, found.reason, found.waived) == (100, None, "", "")
+
+
+def test_a_degradation_past_the_margin_has_the_p_value_of_student_s_t() -> None:
+    found = gate_of(alternating(), alternating(hits=13.5, swing=1.1), "detector.recall", 0.0235)
+    error = 0.1 / 20.0 / np.sqrt(99.0)
+    assert found.p_value == pytest.approx(stats.t.sf(0.0015 / error, 99), rel=1e-6)
+    assert (found.outcome, found.change_low) == ("fail", pytest.approx(0.025 - stats.t.ppf(0.99, 99) * error))
+    close = gate_of(alternating(), alternating(hits=13.5, swing=1.1), "detector.recall", 0.0245)
+    assert close.p_value == pytest.approx(stats.t.sf(0.0005 / error, 99), rel=1e-6)
+    assert (close.outcome, close.reason) == ("inconclusive", "the change is too close to the margin")
+    # The distance to the margin, 0.0005, would have to be resolved.
+    assert close.frames_needed is not None and close.frames_needed > N
+    better = gate_of(alternating(), alternating(hits=14.5, swing=1.1), "detector.recall", 0.02)
+    assert (better.outcome, better.p_value) == ("pass", 1.0)
+    assert better.change_high < 0.0
+
+
+def test_a_share_of_counts_is_not_known_better_than_to_one_of_them() -> None:
+    """Hits that never change: the floor is one crater of 2000, ln 100 of them."""
+    other = replace(alternating(swing=0.0), packets=np.full(N, 9.0))
+    found = gate_of(alternating(swing=0.0), other, "detector.recall", 0.02)
+    assert found.change_high == pytest.approx(-np.log(0.01) / 2000.0)
+    assert (found.outcome, found.change_low) == ("pass", 0.0)
+
+
+def test_a_gate_of_a_mean_is_judged_by_the_ratio_of_the_means() -> None:
+    """The octets of a frame swing by a tenth, the candidate's by 11 % of 1010: the change is ln 1.01."""
+    found = gate_of(alternating(), alternating(swing=1.1, octets=1010.0), "telemetry.octets_per_frame", 0.05)
+    error, t = 0.01 / np.sqrt(99.0), stats.t(99)
+    floor = -np.log(0.01) * np.sqrt(2.0) * 0.1 / N
+    assert (found.baseline, found.candidate) == pytest.approx((1000.0, 1010.0))
+    assert (found.unit, found.margin, found.limit) == ("octets", 0.05, pytest.approx(1050.0))
+    assert found.change_low == pytest.approx(1.01 * np.exp(-t.ppf(0.99) * error) - 1.0)
+    assert found.change_high == pytest.approx(1.01 * np.exp(floor) - 1.0)
+    assert found.resolution == pytest.approx(np.expm1((t.ppf(0.99) + t.ppf(0.9)) * floor / t.ppf(0.99)))
+    assert found.outcome == "pass"
+    worse = gate_of(alternating(), alternating(swing=1.1, octets=1055.0), "telemetry.octets_per_frame", 0.05)
+    assert worse.p_value == pytest.approx(stats.t.sf(np.log(1.055 / 1.05) / error, 99), rel=1e-6)
+
+
+def test_a_percentile_that_is_nought_in_both_builds_has_not_changed() -> None:
+    nothing = np.zeros(N)
+    still = {"anchored": EstimatorFrames(nothing, nothing, nothing, nothing, ("fixed",) * N, nothing)}
+    before, after = alternating(), alternating(swing=1.1)
+    found = gate_of(
+        replace(before, estimators=still), replace(after, estimators=still), "navigation.anchored.p50", 0.1
+    )
+    assert (found.outcome, found.baseline, found.candidate, found.unit) == ("pass", 0.0, 0.0, "m")
+    assert (found.change_low, found.change_high, found.resolution) == (0.0, 0.0, 0.0)
+
+
+def test_the_gates_without_chance_state_their_limits_in_full() -> None:
+    before, after = alternating(undecodable=2, memory_mib=200.0), alternating(undecodable=3, memory_mib=221.0)
+    bad = gate_of(before, after, "telemetry.undecodable", 1.0)
+    assert (bad.outcome, bad.baseline, bad.candidate, bad.margin, bad.limit) == ("pass", 2.0, 3.0, 1.0, 3.0)
+    assert (bad.unit, bad.frames, bad.resolution, bad.reason) == ("packets", 100, 0.0, "")
+    memory = gate_of(before, after, "memory", 0.1)
+    assert (memory.outcome, memory.baseline, memory.candidate, memory.margin) == ("fail", 200.0, 221.0, 0.1)
+    assert (memory.unit, memory.frames, memory.resolution, memory.reason) == ("MiB", 100, 0.0, "")
+    assert memory.limit == pytest.approx(220.0)
+    assert gate_of(before, replace(after, memory_mib=220.0), "memory", 0.1).outcome == "pass"
+    unknown = gate_of(before, replace(after, memory_mib=np.nan), "memory", 0.1)
+    assert (unknown.outcome, unknown.resolution) == ("inconclusive", np.inf)
+
+
+def test_the_memory_of_a_build_is_that_of_its_worst_pass() -> None:
+    before = {"a": alternating(memory_mib=100.0), "b": alternating(memory_mib=200.0)}
+    after = {"a": alternating(memory_mib=230.0), "b": alternating(memory_mib=100.0)}
+    (memory,) = judge(before, after, replace(POLICY, rules=(GateRule("memory", 0.1),)))
+    assert (memory.baseline, memory.candidate, memory.frames) == (200.0, 230.0, 200)
+
+
+def test_a_metric_that_nobody_has_states_nothing() -> None:
+    found = gate_of(alternating(), alternating(), "latency.network", 0.1, required=True)
+    assert (found.name, found.outcome, found.margin, found.frames) == (
+        "latency.network", "inconclusive", 0.1, 100,
+    )  # fmt: skip
+    assert np.isnan([found.baseline, found.candidate, found.limit, found.change_low, found.p_value]).all()
+    assert (found.resolution, found.unit, found.pass_name) == (np.inf, "", "")
+
+
+def test_a_bias_is_tested_along_its_change() -> None:
+    """Centres move by 0.3 px in columns and 0.4 in rows; every frame has ten hits and swings by 0.01 px along that."""
+
+    def moved(along_px: float, swing_px: float) -> PassFrames:
+        length = 10.0 * (along_px + swing_px * SIGN)
+        return replace(alternating(), hits=np.full(N, 10.0), shift_u_px=0.6 * length, shift_v_px=0.8 * length)
+
+    found = gate_of(moved(0.1, 0.01), moved(0.6, 0.06), "detector.bias", 0.12)
+    error = 0.05 / np.sqrt(99.0)
+    assert (found.outcome, found.unit, found.margin) == ("fail", "px", 0.12)
+    assert (found.baseline, found.candidate, found.limit) == pytest.approx((0.1, 0.6, 0.22))
+    assert found.change_low == pytest.approx(0.5 - stats.t.ppf(0.99, 99) * error)
+    assert found.p_value == pytest.approx(stats.t.sf(0.38 / error, 99), rel=1e-6)
+    # A bias that at least halves is no degradation, however far the centres moved.
+    assert gate_of(moved(0.6, 0.01), moved(-0.3, 0.06), "detector.bias", 0.12).p_value == 1.0
+    assert gate_of(moved(0.6, 0.01), moved(-0.31, 0.06), "detector.bias", 0.12).outcome == "fail"
+
+
+def test_single_passes_and_the_suite_are_two_families() -> None:
+    """Half of 1 - confidence for each; Holm divides it among the tests of a family that are not yet rejected."""
+    rules = (GateRule("detector.recall", 0.02, pass_margin=0.03), GateRule("detector.precision", 0.02))
+    before = {"a": alternating(), "b": alternating()}
+    after = {"a": alternating(swing=1.1), "b": alternating(swing=1.1)}
+    gates = judge(before, after, replace(POLICY, rules=rules))
+    assert [(one.name, one.pass_name, one.margin) for one in gates] == [
+        ("detector.recall", "", 0.02), ("detector.precision", "", 0.02),
+        ("detector.recall", "a", 0.03), ("detector.recall", "b", 0.03),
+    ]  # fmt: skip
+    assert [one.level for one in gates] == pytest.approx([0.0025] * 4)
+    assert [one.frames for one in gates] == [200, 200, 100, 100]
+
+
+def test_a_waiver_may_name_a_pass() -> None:
+    before = {"a": alternating(), "b": alternating()}
+    after = {"a": alternating(hits=10.0), "b": alternating(hits=10.0)}
+    rule = GateRule("detector.recall", 0.02, pass_margin=0.02)
+    waiver = Waiver("detector.*", "dust", "2029-08-07", pass_name="a")
+    gates = judge(before, after, replace(POLICY, rules=(rule,), waivers=(waiver,)), today="2029-08-01")
+    assert [(one.pass_name, one.waived) for one in gates] == [
+        ("", ""), ("a", "dust (until 2029-08-07)"), ("b", ""),
+    ]  # fmt: skip
+
+
+def test_only_passes_that_both_builds_flew_are_compared() -> None:
+    gates = judge(
+        {"a": alternating(), "b": alternating()},
+        {"b": alternating(), "c": alternating()},
+        replace(POLICY, rules=(GateRule("detector.recall", 0.02),)),
+    )
+    assert [(one.pass_name, one.frames) for one in gates] == [("", 100)]
+
+
+def test_the_interval_of_a_share_is_that_of_independent_trials() -> None:
+    """Two passes of 500 frames of 20 craters, a recall of 0.7: sigma is root (0.21 / 20,000)."""
+    rng = np.random.default_rng(11)
+    hits = rng.binomial(20, 0.7, 1000).astype(np.float64)
+    sample = Ratio(hits, np.full(1000, 20.0), counts=True)
+    low, high = metric_interval(sample, [500, 500], 2000)
+    sigma = np.sqrt(0.21 / 20_000.0)
+    # Frames that seem to correlate by chance widen it by a few percent; 2000 resamples know it to 3 %.
+    assert high - low == pytest.approx(2.0 * 1.96 * sigma, rel=0.2)
+    assert 0.5 * (low + high) == pytest.approx(hits.sum() / 20_000.0, abs=0.2 * sigma)
+
+
+def test_the_interval_of_a_median_is_that_of_order_statistics() -> None:
+    """Of 900 uniform numbers the median has a sigma of 1 / (2 root 900)."""
+    values = np.random.default_rng(12).random(900)
+    low, high = metric_interval(Percentile(values, 0.5), [900], 2000)
+    assert high - low == pytest.approx(2.0 * 1.96 / 60.0, rel=0.25)
+    assert low < np.median(values) < high
+
+
+def test_values_that_last_widen_the_interval() -> None:
+    """Each number stands for five frames: root five more uncertain."""
+    values = np.repeat(np.random.default_rng(13).random(400), 5)
+    low, high = metric_interval(Percentile(values, 0.5), [2000], 2000)
+    assert high - low == pytest.approx(2.0 * 1.96 / 40.0, rel=0.3)
+
+
+def test_no_frames_have_no_interval() -> None:
+    nothing = np.zeros(0)
+    assert np.isnan(metric_interval(Ratio(nothing, nothing, counts=True), [], 10)).all()
+    assert np.isnan(metric_interval(Ratio(np.zeros(3), np.zeros(3), counts=True), [3], 10)).all()

@@ -102,6 +102,12 @@ def test_a_pass_of_n_frames_shows_no_longer_time_than_a_third_of_n() -> None:
     assert autocorrelation_time(np.zeros(0), []) == 1.0
 
 
+def test_four_frames_are_the_fewest_that_show_a_correlation() -> None:
+    """1, 1, -1, -1 has r1 = 1/3; less a third of the pass at most: 4/3 of a frame."""
+    assert autocorrelation_time(np.array([1.0, 1.0, -1.0, -1.0]), [4]) == pytest.approx(4.0 / 3.0)
+    assert autocorrelation_time(np.array([1.0, 0.0, -1.0]), [3]) == 1.0
+
+
 def test_the_standard_error_of_a_mean_of_independent_frames_is_sigma_over_root_n() -> None:
     values = np.random.default_rng(1).standard_normal(4000)
     spread = series_spread(values / 4000, [2000, 2000])

@@ -82,3 +82,44 @@ def test_a_packet_from_another_age_does_not_disturb_the_rest(years: int) -> None
     account = account_sequence(np.r_[ticks, stray], np.r_[counts, 77])
     inside = account.run == account.run[np.searchsorted(np.sort(np.r_[ticks, stray]), ticks[10])]
     assert inside.sum() >= 1000
+
+
+def test_few_packets_have_no_rate_and_a_silence_hides_no_wraps() -> None:
+    """Sixty packets, an hour of silence, and the count goes on at the one after the next."""
+    ticks, counts = stream(60)
+    later = np.array([ticks[-1] + 3600 * SECOND])
+    account = account_sequence(np.r_[ticks, later], np.r_[counts, 61])
+    assert (account.lost, account.restarts) == (1, 0)
+    (gap,) = account.gaps
+    assert (gap.run, gap.first_count, gap.last_count) == (0, 60, 60)
+    assert (gap.before_ticks, gap.after_ticks) == (int(ticks[-1]), int(later[0]))
+
+
+@pytest.mark.parametrize(("silence_s", "restarts", "lost"), [(600, 1, 0), (1000, 0, 8383)])
+def test_wraps_are_looked_for_where_half_of_one_could_have_been_made(
+    silence_s: int, restarts: int, lost: int
+) -> None:
+    """At ten packets a second 600 s hold 6000 of them and 1000 s hold 10,000; half a wrap is 8192.
+
+    A fall of 8000 is then a restart, or 8384 packets further on, of which the last came.
+    """
+    ticks, counts = stream(9000)
+    after, counts_after = stream(100)
+    account = account_sequence(
+        np.r_[ticks, after + ticks[-1] + silence_s * SECOND], np.r_[counts, counts_after + 999]
+    )
+    assert (account.restarts, account.lost) == (restarts, lost)
+
+
+def test_a_fall_within_a_second_is_no_restart_and_one_after_it_is() -> None:
+    for ticks, restarts in ((SECOND, 0), (SECOND + 1, 1)):
+        account = account_sequence(np.array([0, ticks]), np.array([10, 9]))
+        assert account.restarts == restarts
+
+
+def test_counts_go_on_from_the_first_of_each_run() -> None:
+    before, counts_before = stream(5, first=16_382)
+    after = before[-1] + 60 * SECOND + np.arange(3) * SECOND
+    account = account_sequence(np.r_[before, after], np.r_[counts_before, 0, 1, 2])
+    assert account.run.tolist() == [0] * 5 + [1] * 3
+    assert account.count.tolist() == [16_382, 16_383, 16_384, 16_385, 16_386, 0, 1, 2]
