@@ -104,11 +104,25 @@ GROUPS = {
         tuple(
             f"{_FLIGHT}/{name}.py" for name in ("navigation_filter", "anchored", "observer", "acquisition")
         ),
-        (_FLIGHT_TESTS,),
+        tuple(
+            f"{_FLIGHT_TESTS}/test_{name}.py"
+            for name in (
+                "navigation_filter",
+                "anchored",
+                "anchored_navigator",
+                "observer",
+                "acquisition",
+                "burns",
+            )
+        ),
     ),
     "authorisation": Group(
         ("ground_service/services/users.py", "ground_service/api/security.py"),
-        (f"{_GROUND_TESTS}/services", f"{_GROUND_TESTS}/api/test_limits.py"),
+        (
+            f"{_GROUND_TESTS}/services/test_users.py",
+            f"{_GROUND_TESTS}/api/test_access.py",
+            f"{_GROUND_TESTS}/api/test_security.py",
+        ),
     ),
     "commanding": Group(
         (
@@ -116,7 +130,11 @@ GROUPS = {
             f"{_PROCESSING}/verification.py",
             f"{_FLIGHT}/commanding.py",
         ),
-        (f"{_GROUND_TESTS}/services/test_commanding.py", _FLIGHT_TESTS),
+        (
+            f"{_GROUND_TESTS}/services/test_commanding.py",
+            f"{_GROUND_TESTS}/processing/test_verification.py",
+            f"{_FLIGHT_TESTS}/test_commanding.py",
+        ),
     ),
 }
 

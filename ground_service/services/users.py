@@ -142,7 +142,8 @@ def ensure_user(ground: Ground, name: str, role: str, token: str, *, actor: str 
     InvalidInput
         If the token is too short to be secure.
     Conflict
-        If the user is disabled: a restart of the deployment must not enable it again.
+        If the user is disabled or the token was revoked: a restart of the deployment must not enable either again. If
+        another user has this token.
     """
     if len(token) < TOKEN_MINIMUM:
         raise InvalidInput("token", "", f"{TOKEN_MINIMUM} characters or more", f"{len(token)}")
@@ -151,19 +152,25 @@ def ensure_user(ground: Ground, name: str, role: str, token: str, *, actor: str 
     hashed = token_sha256(token)
     with ground.database.writing() as connection:
         user = repository.find(connection, repository.USERS, name=name)
+        if user is not None and user["state"] != "active":
+            raise Conflict(f"user {name}: expected state active, found {user['state']}")
+        known = repository.find(connection, repository.TOKENS, token_sha256=hashed)
+        if known is not None and (user is None or known["user_id"] != user["id"]):
+            raise Conflict(f"user {name}: expected a token of its own, found that of another user")
+        if known is not None and known["revoked_utc_ns"] is not None:
+            raise Conflict(f"user {name}: expected a token in force, found one that was revoked")
         if user is not None:
-            if user["state"] != "active":
-                raise Conflict(f"user {name}: expected state active, found {user['state']}")
-            valid = repository.find(
-                connection, repository.TOKENS, user_id=user["id"], token_sha256=hashed, revoked_utc_ns=None
-            )
-            if valid is not None and user["role"] == role:
+            if known is not None and user["role"] == role:
                 return False
             _set_role(connection, user, role)
-            _revoke_all(connection, user["id"], now)
+            _revoke_all(connection, user["id"], now, kept=None if known is None else known["id"])
         elif _add_row(connection, name, role, now) is None:
             raise Conflict(f"user {name}: exists already")
-        token_id = _keep_token(connection, _user_row(connection, name)["id"], token, token[:4], now, None)
+        token_id = (
+            known["id"]
+            if known is not None
+            else _keep_token(connection, _user_row(connection, name)["id"], token, token[:4], now, None)
+        )
         audit(connection, actor, "ensure user", name, {"role": role, "token_id": token_id})
     return True
 
@@ -439,12 +446,14 @@ def _keep_token(
     )
 
 
-def _revoke_all(connection: Connection, user_id: int, now: int) -> int:
+def _revoke_all(connection: Connection, user_id: int, now: int, kept: int | None = None) -> int:
+    """Revoke the tokens of a user, all but one where that is kept; how many."""
     tokens = repository.TOKENS
+    others = [] if kept is None else [tokens.c.id != kept]
     return int(
         connection.execute(
             update(tokens)
-            .where(tokens.c.user_id == user_id, tokens.c.revoked_utc_ns.is_(None))
+            .where(tokens.c.user_id == user_id, tokens.c.revoked_utc_ns.is_(None), *others)
             .values(revoked_utc_ns=now)
         ).rowcount
     )

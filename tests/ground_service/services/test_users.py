@@ -17,10 +17,12 @@ from ground_service.services.users import (
     change_user,
     ensure_user,
     get_user,
+    has_users,
     list_tokens,
     list_users,
     renew_token,
     revoke_token,
+    token_sha256,
     token_valid,
 )
 from ground_service.store import repository
@@ -192,3 +194,244 @@ def test_a_deployment_does_not_enable_a_disabled_user_again(ground: Ground) -> N
     with pytest.raises(Conflict, match="expected state active, found disabled"):
         ensure_user(ground, "ann", "admin", SECRET)
     assert not token_valid(ground, SECRET)
+
+
+HOUR_NS = 3_600_000_000_000
+NOW = 500_000 * HOUR_NS + 1_234_567_890
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """A clock that stands at `NOW` until it is set."""
+
+    def put(now: int) -> None:
+        monkeypatch.setattr("ground_service.services.users.utc_now_ns", lambda: now)
+
+    put(NOW)
+    return put
+
+
+def details(ground: Ground) -> list[tuple[str, str, str, object]]:
+    return [(one.actor, one.action, one.target, one.detail) for one in list_entries(ground)[0]][::-1]
+
+
+def test_every_change_is_in_the_audit_log_with_what_it_changed(ground: Ground) -> None:
+    add_user(ground, "ann", "admin", actor="eve")
+    add_user(ground, "bob", "viewer", actor="ann")
+    add_token(ground, "bob", actor="ann")
+    renew_token(ground, "bob", actor="ann")
+    change_user(ground, "bob", role="operator", actor="ann")
+    change_user(ground, "bob", state="disabled", role="viewer", actor="ann")
+    change_user(ground, "bob", state="active", actor="ann")
+    revoke_token(ground, 4, actor="ann")
+    ensure_user(ground, "cleo", "operator", SECRET, actor="deployment")
+    assert details(ground) == [
+        ("eve", "add user", "ann", {"role": "admin", "token_id": 1}),
+        ("ann", "add user", "bob", {"role": "viewer", "token_id": 2}),
+        ("ann", "add token", "bob", {"token_id": 3}),
+        ("ann", "renew token", "bob", {"token_id": 4, "revoked": 2}),
+        ("ann", "change role", "bob", {"from": "viewer", "to": "operator"}),
+        ("ann", "disable user", "bob", {}),
+        ("ann", "change role", "bob", {"from": "operator", "to": "viewer"}),
+        ("ann", "enable user", "bob", {}),
+        ("ann", "revoke token", "bob", {"token_id": 4}),
+        ("deployment", "ensure user", "cleo", {"role": "operator", "token_id": 5}),
+    ]
+
+
+def test_who_is_not_named_is_local(ground: Ground) -> None:
+    add_user(ground, "ann", "admin")
+    add_token(ground, "ann")
+    renew_token(ground, "ann")
+    add_user(ground, "bob", "viewer")
+    change_user(ground, "bob", role="operator")
+    revoke_token(ground, 3)
+    ensure_user(ground, "cleo", "viewer", SECRET)
+    assert {actor for actor, *_ in details(ground)} == {"local"}
+
+
+def test_a_token_is_shown_with_its_times_and_valid_up_to_its_last_instant(
+    ground: Ground, clock: Callable[[int], None]
+) -> None:
+    """NOW is 500,000 hours after 1970: 2027-01-15T08:00:00Z; two days later it expires."""
+    token = add_user(ground, "ann", "operator", days_valid=2.0)
+    (shown,) = list_tokens(ground)
+    assert token.startswith("linna_") and len(token) == 6 + 43 and shown.hint == token[:12]
+    assert (shown.id, shown.user, shown.state) == (1, "ann", "active")
+    assert shown.created == "2027-01-15T08:00:01.234567890Z"
+    assert (shown.expires, shown.revoked, shown.used) == ("2027-01-17T08:00:01.234567890Z", None, None)
+    assert get_user(ground, "ann").created == shown.created
+    caller = authenticate(ground, token)
+    assert (caller.name, caller.role, caller.token_id) == ("ann", "operator", 1)
+    assert list_tokens(ground)[0].used == "2027-01-15T08:00:00.000000000Z"
+    end = NOW + 48 * HOUR_NS
+    clock(end - 1)
+    assert token_valid(ground, token) and authenticate(ground, token).name == "ann"
+    assert list_tokens(ground)[0].state == "active"
+    clock(end)
+    assert not token_valid(ground, token) and list_tokens(ground)[0].state == "expired"
+    with pytest.raises(NotAuthorised, match="has expired"):
+        authenticate(ground, token)
+    clock(end + HOUR_NS)
+    assert revoke_token(ground, 1).revoked == "2027-01-17T09:00:01.234567890Z"
+    # Revoked says more than expired.
+    assert list_tokens(ground)[0].state == "revoked"
+
+
+@pytest.mark.parametrize("make", [add_token, renew_token])
+def test_further_tokens_expire_too(
+    ground: Ground, clock: Callable[[int], None], make: Callable[..., str]
+) -> None:
+    add_user(ground, "ann", "viewer")
+    token = make(ground, "ann", days_valid=0.5)
+    assert list_tokens(ground)[0].expires == "2027-01-15T20:00:01.234567890Z"
+    clock(NOW + 12 * HOUR_NS)
+    assert not token_valid(ground, token)
+    with pytest.raises(InvalidInput, match="days valid: expected more than 0, at most 36500, found -1"):
+        make(ground, "ann", days_valid=-1)
+    with pytest.raises(NotFound):
+        make(ground, "bob")
+
+
+def test_a_century_is_the_longest_validity(ground: Ground) -> None:
+    add_user(ground, "ann", "viewer", days_valid=36_500.0)
+    with pytest.raises(InvalidInput, match="days valid"):
+        add_user(ground, "bob", "viewer", days_valid=36_500.001)
+
+
+def test_the_use_of_a_token_is_noted_after_an_hour_and_not_before(
+    ground: Ground, clock: Callable[[int], None]
+) -> None:
+    """The stored time is the full hour; an hour after that, not after the use, it is written again."""
+    token = add_user(ground, "ann", "viewer")
+    authenticate(ground, token)
+    clock(501_000 * HOUR_NS - 1)
+    authenticate(ground, token)
+    assert list_tokens(ground)[0].used == "2027-02-25T23:00:00.000000000Z"
+    clock(501_000 * HOUR_NS - 1 + HOUR_NS)
+    authenticate(ground, token)
+    assert list_tokens(ground)[0].used == "2027-02-26T00:00:00.000000000Z"
+
+
+def test_only_the_token_itself_is_accepted(ground: Ground) -> None:
+    token = add_user(ground, "ann", "viewer")
+    for other in ("", token[:-1], token + " ", token.upper(), token_sha256(token)):
+        assert not token_valid(ground, other)
+        with pytest.raises(NotAuthorised, match="expected one that 'linna user add' gave out, found another"):
+            authenticate(ground, other)
+    # SHA-256 of "abc", FIPS 180-4.
+    assert token_sha256("abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def test_a_deployment_sets_role_and_token_anew_and_revokes_the_old_one(ground: Ground) -> None:
+    old = add_user(ground, "ann", "viewer")
+    assert ensure_user(ground, "ann", "operator", SECRET)
+    assert (get_user(ground, "ann").role, token_valid(ground, old)) == ("operator", False)
+    caller = authenticate(ground, SECRET)
+    assert (caller.name, caller.role) == ("ann", "operator")
+    assert list_tokens(ground)[0].expires is None
+    assert not ensure_user(ground, "ann", "operator", SECRET)
+    # Another token in the same role is a change, too.
+    assert ensure_user(ground, "ann", "operator", SECRET[::-1]) and not token_valid(ground, SECRET)
+
+
+def test_a_deployment_may_change_the_role_and_keep_the_token(ground: Ground) -> None:
+    ensure_user(ground, "ann", "viewer", SECRET)
+    further = add_token(ground, "ann")
+    assert ensure_user(ground, "ann", "operator", SECRET, actor="deployment")
+    caller = authenticate(ground, SECRET)
+    assert (caller.role, caller.token_id) == ("operator", 1)
+    assert not token_valid(ground, further)
+    assert details(ground)[-1] == ("deployment", "ensure user", "ann", {"role": "operator", "token_id": 1})
+
+
+def test_a_deployment_does_not_bring_a_revoked_token_back(ground: Ground) -> None:
+    ensure_user(ground, "ann", "viewer", SECRET)
+    revoke_token(ground, 1)
+    with pytest.raises(Conflict, match="user ann: expected a token in force, found one that was revoked"):
+        ensure_user(ground, "ann", "viewer", SECRET)
+    assert not token_valid(ground, SECRET)
+
+
+@pytest.mark.parametrize("exists", [True, False])
+def test_two_users_of_a_deployment_have_tokens_of_their_own(ground: Ground, exists: bool) -> None:
+    ensure_user(ground, "ann", "viewer", SECRET)
+    if exists:
+        add_user(ground, "bob", "viewer")
+    with pytest.raises(Conflict, match="user bob: expected a token of its own, found that of another user"):
+        ensure_user(ground, "bob", "admin", SECRET)
+    assert authenticate(ground, SECRET).name == "ann"
+    assert [one.name for one in list_users(ground)] == (["ann", "bob"] if exists else ["ann"])
+    assert all(one.role == "viewer" for one in list_users(ground))
+
+
+@pytest.mark.parametrize(("length", "accepted"), [(23, False), (24, True)])
+def test_a_token_of_a_deployment_has_24_characters_or_more(
+    ground: Ground, length: int, accepted: bool
+) -> None:
+    if accepted:
+        assert ensure_user(ground, "ann", "viewer", "t" * length)
+    else:
+        with pytest.raises(InvalidInput, match="token: expected 24 characters or more, found 23"):
+            ensure_user(ground, "ann", "viewer", "t" * length)
+    assert bool(list_users(ground)) is accepted
+
+
+def test_changes_that_cannot_be_made_are_refused_with_what_was_expected(ground: Ground) -> None:
+    add_user(ground, "ann", "admin")
+    with pytest.raises(Conflict, match="user ann: exists already"):
+        add_user(ground, "ann", "viewer")
+    for change, message in (
+        ({}, "user ann: expected a new state or role, found neither"),
+        ({"state": "asleep"}, "user state: expected active or disabled, found 'asleep'"),
+        ({"role": "root"}, "user role: expected viewer, operator, admin, found 'root'"),
+    ):
+        with pytest.raises(InvalidInput) as caught:
+            change_user(ground, "ann", **change)  # type: ignore[arg-type]
+        assert str(caught.value).replace(",", "") == message.replace(",", "")
+    with pytest.raises(NotFound, match="bob"):
+        change_user(ground, "bob", state="disabled")
+    with pytest.raises(NotFound, match="bob"):
+        get_user(ground, "bob")
+    with pytest.raises(InvalidInput, match="program does not use itself"):
+        change_user(ground, "service", role="viewer")
+
+
+def test_users_are_listed_by_name_and_tokens_newest_first(ground: Ground) -> None:
+    assert not has_users(ground) and list_users(ground) == [] and list_tokens(ground) == []
+    for name in ("cleo", "ann", "bob"):
+        add_user(ground, name, "viewer")
+    add_token(ground, "ann")
+    assert has_users(ground)
+    assert [one.name for one in list_users(ground)] == ["ann", "bob", "cleo"]
+    assert [(one.id, one.user) for one in list_tokens(ground)] == [
+        (4, "ann"),
+        (3, "bob"),
+        (2, "ann"),
+        (1, "cleo"),
+    ]
+    assert [one.id for one in list_tokens(ground, "ann")] == [4, 2]
+    with pytest.raises(NotFound):
+        list_tokens(ground, "eve")
+
+
+def test_an_administrator_may_be_demoted_while_another_is_active(ground: Ground) -> None:
+    add_user(ground, "ann", "admin")
+    add_user(ground, "bob", "admin")
+    assert change_user(ground, "ann", role="operator").role == "operator"
+    # Nobody else is left, but an administrator may stay one, and others may be disabled.
+    with pytest.raises(Conflict, match="another active administrator"):
+        change_user(ground, "bob", role="viewer")
+    assert change_user(ground, "bob", role="admin").role == "admin"
+    assert change_user(ground, "ann", state="disabled").state == "disabled"
+
+
+def test_renewing_revokes_only_the_tokens_of_that_user(ground: Ground) -> None:
+    other = add_user(ground, "bob", "viewer")
+    add_user(ground, "ann", "viewer")
+    revoke_token(ground, 2)
+    add_token(ground, "ann")
+    renew_token(ground, "ann")
+    # The one that was revoked before is not revoked again.
+    assert details(ground)[-1][3] == {"token_id": 4, "revoked": 1}
+    assert token_valid(ground, other)

@@ -1,0 +1,83 @@
+"""Who a request comes from, and which role it needs."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from fastapi.security import HTTPAuthorizationCredentials
+
+from ground_service.api.problems import Forbidden
+from ground_service.api.security import caller_of, requires
+from ground_service.errors import NotAuthorised
+from ground_service.services.ground import Ground
+from ground_service.services.users import LOCAL_CALLER, Caller, add_user, change_user
+
+ROLES = ("viewer", "operator", "admin")
+
+
+def request(ground: Ground, open_without_users: bool) -> Any:
+    app = SimpleNamespace(state=SimpleNamespace(ground=ground, open_without_users=open_without_users))
+    return SimpleNamespace(app=app, state=SimpleNamespace())
+
+
+def bearer(token: str) -> HTTPAuthorizationCredentials:
+    return HTTPAuthorizationCredentials(scheme="Bearer", credentials=token)
+
+
+def test_without_users_an_open_service_has_a_local_caller_who_may_do_everything(ground: Ground) -> None:
+    asked = request(ground, True)
+    assert caller_of(asked, None) == LOCAL_CALLER == Caller("local", "admin", None)
+    assert vars(asked.state) == {"caller": "local"}
+
+
+def test_a_service_that_others_reach_is_closed_even_without_users(ground: Ground) -> None:
+    with pytest.raises(
+        NotAuthorised, match="expected a bearer token in the Authorization header, found none"
+    ):
+        caller_of(request(ground, False), None)
+
+
+def test_the_first_user_closes_an_open_service_even_once_disabled(ground: Ground) -> None:
+    add_user(ground, "ann", "viewer")
+    change_user(ground, "ann", state="disabled")
+    asked = request(ground, True)
+    with pytest.raises(NotAuthorised, match="found none"):
+        caller_of(asked, None)
+    assert vars(asked.state) == {}
+
+
+@pytest.mark.parametrize("open_without_users", [True, False])
+def test_a_token_names_its_caller_whatever_the_service_is_open_to(
+    ground: Ground, open_without_users: bool
+) -> None:
+    token = add_user(ground, "ann", "operator")
+    asked = request(ground, open_without_users)
+    caller = caller_of(asked, bearer(token))
+    assert (caller.name, caller.role, caller.token_id) == ("ann", "operator", 1)
+    assert vars(asked.state) == {"caller": "ann", "verified_caller": "ann"}
+    invented = request(ground, open_without_users)
+    with pytest.raises(NotAuthorised):
+        caller_of(invented, bearer(token + "x"))
+    assert vars(invented.state) == {}
+
+
+@pytest.mark.parametrize("role", ROLES)
+@pytest.mark.parametrize("needed", ROLES)
+def test_a_role_may_do_what_those_below_it_may(role: str, needed: str) -> None:
+    caller = Caller("ann", role)
+    allowed = ROLES.index(role) >= ROLES.index(needed)
+    assert caller.may(needed) is allowed
+    check = requires(needed)
+    if allowed:
+        assert asyncio.run(check(caller)) is caller
+    else:
+        with pytest.raises(Forbidden, match=f"^ann: expected the role {needed} or higher, found {role}$"):
+            asyncio.run(check(caller))
+
+
+def test_a_role_that_does_not_exist_allows_nothing() -> None:
+    with pytest.raises(ValueError, match="not in tuple"):
+        Caller("ann", "admin").may("root")
