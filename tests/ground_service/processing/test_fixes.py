@@ -72,6 +72,38 @@ def test_a_fix_is_wrong_when_half_of_its_identifications_are(swapped: int, expec
     assert wrong_fixes(found, CAMERA, UTC_NS, POSITION) == expected
 
 
+@pytest.mark.parametrize("frame", [0, 1])
+def test_a_wrong_fix_counts_in_whichever_frame_it_is(frame: int) -> None:
+    found = pairs()
+    moved = found.uv_px + np.where(found.frame == frame, 30.0, 0.0)[:, None]
+    found = Pairs(found.frame, found.utc_ns, moved, found.diameter_px, found.crater_mcmf_m)
+    assert wrong_fixes(found, CAMERA, UTC_NS, POSITION) == 1
+    # A frame at whose time there is no reference is neither right nor wrong.
+    other = 1 - frame
+    assert wrong_fixes(found, CAMERA, UTC_NS[[other]], POSITION[[other]]) == 0
+    lost = POSITION.copy()
+    lost[frame] = np.nan
+    assert wrong_fixes(found, CAMERA, UTC_NS, lost) == 0
+
+
+@pytest.mark.parametrize(
+    ("offset_px", "diameter_px", "wrong"), [(4.9, 20.0, 0), (5.1, 20.0, 1), (9.9, 100.0, 0), (10.1, 100.0, 1)]
+)
+def test_an_identification_is_right_within_half_a_radius_and_ten_pixels(
+    offset_px: float, diameter_px: float, wrong: int
+) -> None:
+    found = pairs()
+    moved = found.uv_px + np.array([offset_px, 0.0]) * (found.frame == 0)[:, None]
+    found = Pairs(found.frame, found.utc_ns, moved, np.full(16, diameter_px), found.crater_mcmf_m)
+    assert wrong_fixes(found, CAMERA, UTC_NS, POSITION) == wrong
+
+
+def test_without_times_or_pairs_no_fix_is_wrong() -> None:
+    assert wrong_fixes(pairs(), CAMERA, UTC_NS[:0], POSITION[:0]) == 0
+    none = Pairs(*(getattr(pairs(), name)[:0] for name in Pairs.__slots__))
+    assert wrong_fixes(none, CAMERA, UTC_NS, POSITION) == 0
+
+
 def test_identifications_are_joined_by_time_place_and_number() -> None:
     catalogue = make_catalogue(np.radians([10.0, 11.0, 12.0]), np.zeros(3), np.full(3, 5e3), source="test")
     detections = DetectionSamples(

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from ground_service.processing.baseline import StartState
 from ground_service.processing.fixes import IdentificationSamples
+from ground_service.processing.landmarks import MappedCraters
 from ground_service.processing.pass_evaluation import (
     PassInputs,
     _imaging_arcs,
@@ -634,6 +635,26 @@ def test_fixes_are_repeated_from_single_frames_and_told_right_from_wrong() -> No
     ]
     bare = evaluate_pass(inputs(identifications=identified(), catalogue=None))
     assert series(bare, "anchored").wrong_fixes is None
+
+
+def test_the_map_of_the_payload_is_compared_with_the_catalogue(report: PassReport) -> None:
+    """One landmark 100 m north of the first crater, reported twice, and used in one pair of thirteen."""
+    landmark = MappedCraters(
+        np.full(2, 3_000_000_000), np.full(2, math.degrees(100.0 / MOON_M)), np.zeros(2), np.zeros(2), np.full(2, 6e3),
+        np.full((2, 3), 50.0), np.array([1, 2]),
+    )  # fmt: skip
+    some = identified()
+    own = IdentificationSamples(
+        np.append(some.utc_ns, TIMES[5]),
+        np.append(some.detection, 0),
+        np.append(some.crater_id, 3_000_000_000),
+    )
+    found = evaluate_pass(inputs(landmarks=landmark, identifications=own)).payload_map
+    assert found is not None
+    assert (found.mapped, found.mapped_again, found.used, found.pairs, found.pairs_of_all) == (1, 1, 1, 1, 13)
+    assert found.catalogued == 1 and found.source == "made"
+    np.testing.assert_allclose(found.offset_m, [[0.0, 100.0]], atol=1e-6)
+    assert report.payload_map is None
 
 
 def test_the_sun_and_the_ground_stand_beside_every_estimate() -> None:

@@ -1,9 +1,17 @@
 """The detector's score, on a crater field whose detections are made by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from ground_service.processing.recall import expected_craters, match_detections, score_detections
+from ground_service.processing.recall import (
+    ExpectedCraters,
+    Matches,
+    expected_craters,
+    match_detections,
+    score_detections,
+)
 from ground_service.processing.samples import DetectionSamples
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, make_catalogue
@@ -135,3 +143,164 @@ def test_no_craters_and_no_frames_are_no_error() -> None:
     assert score.micro.false_alarms == 1
     nothing = expected_craters(field(), CAMERA, np.zeros((0, 3)))
     assert len(nothing.index) == 0
+
+
+def three_frames() -> tuple[DetectionSamples, ExpectedCraters, Matches]:
+    """Three frames of craters of 40 px each, classes 0, 1, 2 and 0; the detections are 1 px off, one is an alarm.
+
+    Frame 0 has the craters 0 to 3, of which the last lies where the catalogue is not complete; 1 and 2 find theirs,
+    the first of frame 0 is missed, and its second detection is of nothing.
+    """
+    u = np.array([50.0, 150.0, 250.0, 350.0, 50.0, 150.0, 250.0])
+    expected = ExpectedCraters(
+        offsets=np.array([0, 4, 6, 7]),
+        index=np.arange(7),
+        u_px=u,
+        v_px=np.full(7, 100.0),
+        diameter_px=np.full(7, 40.0),
+        size_class=np.array([0, 1, 2, 0, 0, 1, 2]),
+        complete=np.array([True, True, True, False, True, True, True]),
+    )
+    found = DetectionSamples(
+        frame_number=np.arange(3),
+        utc_ns=np.arange(3),
+        usable=np.ones(3, dtype=np.bool_),
+        quality=("ok",) * 3,
+        offsets=np.array([0, 3, 5, 7]),
+        u_px=np.array([151.0, 250.0, 450.0, 50.0, 150.0, 250.0, 450.0]),
+        v_px=np.array([100.0, 102.0, 100.0, 103.0, 100.0, 104.0, 100.0]),
+        diameter_px=np.full(7, 40.0),
+        score=np.array([0.9, 0.8, 0.35, 0.7, 0.6, 0.95, 0.31]),
+        size_class=np.array([1, 2, 1, 0, 1, 2, 3]),
+    )
+    return found, expected, match_detections(found, expected)
+
+
+def test_scores_are_given_by_class_and_by_bins_of_altitude_and_of_the_sun() -> None:
+    found, expected, matches = three_frames()
+    assert matches.crater_of_detection.tolist() == [1, 2, -1, 4, 5, 6, -1]
+    assert matches.detection_of_crater.tolist() == [-1, 0, 1, -1, 3, 4, 5]
+    score = score_detections(
+        found,
+        expected,
+        matches,
+        np.array([25e3, 25.5e3, 31e3]),
+        np.array([4.0, 7.0, 8.0]),
+        np.array([10.0, 20.0, 30.0]),
+    )
+    assert score.micro is not None and score.residuals is not None
+    # Errors of 1, 2, 3, 0 and 4 px; the crater of the incomplete region is not expected.
+    assert (score.micro.expected, score.micro.detected_true, score.micro.false_alarms) == (6, 5, 1)
+    assert score.micro.localisation_px == pytest.approx(2.0)
+    assert (score.micro.size_class, score.micro.label) == (-1, "5–30 km")
+    assert [
+        (one.size_class, one.label, one.expected, one.detected_true, one.false_alarms)
+        for one in score.per_class
+    ] == [
+        (0, "5–10 km", 2, 1, 0),
+        (1, "10–15 km", 2, 2, 1),
+        (2, "15–30 km", 2, 2, 0),
+    ]
+    assert [
+        (one.low, one.high, one.expected, one.precision, one.recall, one.localisation_px)
+        for one in score.by_altitude_km
+    ] == [
+        (20.0, 30.0, 5, pytest.approx(0.8), pytest.approx(0.8), pytest.approx(1.5)),
+        (30.0, 40.0, 1, 1.0, 1.0, 4.0),
+    ]
+    assert [
+        (one.low, one.high, one.expected, one.precision, one.recall) for one in score.by_sun_elevation_deg
+    ] == [
+        (0.0, 5.0, 3, pytest.approx(2 / 3), pytest.approx(2 / 3)),
+        (5.0, 10.0, 3, 1.0, 1.0),
+    ]
+    residuals = score.residuals
+    assert (
+        residuals.u_px.tolist() == [150.0, 250.0, 50.0, 150.0, 250.0]
+        and residuals.v_px.tolist() == [100.0] * 5
+    )
+    assert residuals.du_px.tolist() == [1.0, 0.0, 0.0, 0.0, 0.0]
+    assert residuals.dv_px.tolist() == [0.0, 2.0, 3.0, 0.0, 4.0]
+    assert residuals.sun_azimuth_deg is not None and residuals.sun_azimuth_deg.tolist() == [
+        10.0,
+        10.0,
+        20.0,
+        20.0,
+        30.0,
+    ]
+    assert residuals.diameter_px is not None and residuals.diameter_px.tolist() == [40.0] * 5
+    assert "into a nadir camera; a detection is true within 0.5 radii and 10 px of the centre" in score.method
+
+
+def test_curves_and_calibration_follow_the_scores() -> None:
+    """True at 0.9, 0.8, 0.7, 0.6 and 0.95, an alarm at 0.35; the detection of class 3 counts nowhere."""
+    found, expected, matches = three_frames()
+    score = score_detections(found, expected, matches, np.full(3, 25e3))
+    assert [one.label for one in score.curves] == ["5–10 km", "10–15 km", "15–30 km", "5–30 km"]
+    every = score.curves[3]
+    assert every.threshold.tolist() == [0.35, 0.6, 0.7, 0.8, 0.9, 0.95]
+    np.testing.assert_allclose(every.precision, [5 / 6, 1.0, 1.0, 1.0, 1.0, 1.0])
+    np.testing.assert_allclose(every.recall, np.array([5, 5, 4, 3, 2, 1]) / 6)
+    assert score.curves[1].threshold.tolist() == [0.35, 0.6, 0.9]
+    np.testing.assert_allclose(score.curves[1].precision, [2 / 3, 1.0, 1.0])
+    np.testing.assert_allclose(score.curves[1].recall, [1.0, 1.0, 0.5])
+    assert [(one.mean_score, one.fraction_true, one.count) for one in score.calibration] == [
+        (0.35, 0.0, 1),
+        (0.6, 1.0, 1),
+        (0.7, 1.0, 1),
+        (0.8, 1.0, 1),
+        (pytest.approx(0.925), 1.0, 2),
+    ]
+    assert score.by_sun_elevation_deg == () and score.residuals is not None
+    assert score.residuals.sun_azimuth_deg is None
+
+
+def test_alarms_count_where_most_of_the_view_is_complete() -> None:
+    """Two craters of a frame, one of them in an incomplete region: half is not most."""
+    found, expected, _ = three_frames()
+    for complete, alarms in (([True, True, False, False], 0), ([True, True, True, False], 1)):
+        part = replace(expected, complete=np.array([*complete, True, True, True]))
+        score = score_detections(found, part, match_detections(found, part), np.full(3, 25e3))
+        assert score.micro is not None and score.micro.false_alarms == alarms
+
+
+def test_the_closest_pair_in_radii_is_matched_first() -> None:
+    """A detection 4 px from a crater of 40 px (0.2 radii) and 3 px from one of 20 px (0.3) belongs to the former."""
+    _, expected, _ = three_frames()
+    two = replace(
+        expected,
+        offsets=np.array([0, 2]),
+        u_px=np.array([50.0, 57.0]),
+        v_px=np.zeros(2),
+        diameter_px=np.array([40.0, 20.0]),
+        size_class=np.zeros(2, dtype=np.int64),
+        index=np.arange(2),
+        complete=np.ones(2, dtype=np.bool_),
+    )
+    found = detections([54.0], [0.0], [28.0], [0])
+    assert match_detections(found, two).detection_of_crater.tolist() == [0, -1]
+    # With a second detection on the latter both have their own.
+    both = detections([54.0, 57.0], [0.0, 0.0], [28.0, 20.0], [0, 0])
+    assert match_detections(both, two).crater_of_detection.tolist() == [0, 1]
+
+
+def test_craters_of_many_frames_are_those_of_each_frame_alone() -> None:
+    """More frames than are projected together: every one sees what it sees alone, and lost ones see nothing."""
+    longitude = np.radians(np.linspace(-0.5, 0.5, 501))
+    position = mcmf_from_spherical(np.zeros(501), longitude, np.full(501, ALTITUDE_M))
+    position[7] = np.nan
+    every = expected_craters(field(), CAMERA, position)
+    for frame in (0, 250, 500):
+        alone = expected_craters(field(), CAMERA, position[[frame]])
+        rows = slice(every.offsets[frame], every.offsets[frame + 1])
+        for name in ("index", "u_px", "v_px", "diameter_px", "size_class", "complete"):
+            np.testing.assert_array_equal(getattr(every, name)[rows], getattr(alone, name))
+    assert every.offsets[7] == every.offsets[8] and len(every.offsets) == 502
+    assert every.offsets[-1] == len(every.index)
+
+
+def test_classes_and_completeness_are_those_of_the_catalogue() -> None:
+    mixed = replace(field(), complete=np.array([True, False, True, True, True]))
+    expected = expected_craters(mixed, CAMERA, POSITION)
+    assert expected.size_class.tolist()[:3] == [0, 1, 2] and expected.size_class[3] not in (0, 1, 2)
+    assert expected.complete.tolist() == [True, False, True, True]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ground_service.processing.smoother import CommandedBurn, FilterStates, SmootherModel, smooth
+from ground_service.processing.smoother import CommandedBurn, FilterStates, SmootherModel, _legs, smooth
 from lunar.elements import Elements, icrf_state_from_elements
 from lunar.frames import IauOrientation
 from lunar.gravity import GravityField, builtin_gravity
@@ -278,3 +278,29 @@ def test_sigmas_lie_along_the_axes_of_the_orbit() -> None:
     one = FilterStates(TIMES[:1], state, covariance)
     np.testing.assert_allclose(one.sigma_rtn_m, [[3.0, 2.0, 4.0]])
     np.testing.assert_allclose(one.position_covariance_rtn_m2[0], np.diag([9.0, 4.0, 16.0]), atol=1e-12)
+
+
+def test_two_burns_of_one_instant_both_count() -> None:
+    filtered = straight([0.0, 50.0])
+    burns = tuple(CommandedBurn(EPOCH + 20 * 10**9, np.array([0.0, push, 0.0]), 0.3) for push in (0.05, 0.03))
+    found = smooth(filtered, replace(PUSHED, burns=burns))
+    assert_same(found, rauch_tung_striebel(filtered, [[20.0, 0.0, 30.0]], [[0.05, 0.03, 0.0]], 0.3), filtered)
+
+
+def test_long_steps_are_cut_into_equal_ones_of_a_minute_at_most() -> None:
+    """TDB runs with UTC but for a second or two at the epoch; a burn ends a step."""
+    start_s = float(tdb_s_from_utc_ns(EPOCH))
+    second = 10**9
+    assert _legs(EPOCH, EPOCH + 150 * second, start_s, ()) == [
+        (start_s, 50.0, None), (start_s + 50.0, 50.0, None), (start_s + 100.0, 50.0, None),
+    ]  # fmt: skip
+    assert _legs(EPOCH, EPOCH + 60 * second, start_s, ()) == [(start_s, 60.0, None)]
+    assert _legs(EPOCH, EPOCH, start_s, ()) == []
+    burn = CommandedBurn(EPOCH + 90 * second, np.zeros(3), 0.1)
+    first, last, after = _legs(EPOCH, EPOCH + 100 * second, start_s, (burn,))
+    assert (first, last[1:]) == ((start_s, 45.0, None), (45.0, burn)) and after[1:] == (10.0, None)
+    # Microseconds are what a float64 of seconds past J2000 tells.
+    assert (last[0] - start_s, after[0] - start_s) == (
+        pytest.approx(45.0, abs=1e-5),
+        pytest.approx(90.0, abs=1e-5),
+    )
