@@ -36,6 +36,10 @@ PRINTED_OCTETS = 65_536
 
 INODES = 65_536
 BASE = "/tmp"
+FIRST_BUILD_UID = 1_900_000_000
+"""Lowest user id of builds, above the ranges of systemd and of user namespaces."""
+
+WORLD_WRITABLE = ("/tmp", "/dev/shm", "/var/tmp", "/run")
 DEVICES = ("null", "zero", "full", "random", "urandom")
 WRITABLE = ("/out", "/tmp", "/home/build", "/dev/shm")
 _CHUNK = 1 << 16
@@ -124,8 +128,8 @@ def user_map():
 
 
 def build_uid():
-    """Return a user id for this run, above the ranges of systemd and of user namespaces."""
-    return 1_900_000_000 + os.getpid()
+    """Return a user id for this run."""
+    return FIRST_BUILD_UID + os.getpid()
 
 
 def enter_namespaces(run, uid, entered, mapped, control, reports, printed):
@@ -345,14 +349,25 @@ def put_on_user(uid):
 
 def remove_owned(uid):
     """Remove the files of this user in the world-writable folders."""
-    for place in ("/tmp", "/dev/shm", "/var/tmp", "/run"):
+    for place in WORLD_WRITABLE:
+        # A folder without permissions hides its content: make all folders accessible before os.walk reads them.
+        for folder, names, _ in os.walk(place):
+            for path in owned(folder, names, uid):
+                if not os.path.islink(path):
+                    os.chmod(path, 0o700)
         for folder, names, files in os.walk(place, topdown=False):
-            for name in files + names:
-                path = os.path.join(folder, name)
+            for path in owned(folder, files + names, uid):
                 with contextlib.suppress(OSError):
-                    state = os.lstat(path)
-                    if state.st_uid == uid:
-                        (os.rmdir if stat.S_ISDIR(state.st_mode) else os.unlink)(path)
+                    (os.rmdir if stat.S_ISDIR(os.lstat(path).st_mode) else os.unlink)(path)
+
+
+def owned(folder, names, uid):
+    """Yield the paths of these names in a folder that belong to a user."""
+    for name in names:
+        path = os.path.join(folder, name)
+        with contextlib.suppress(OSError):
+            if os.lstat(path).st_uid == uid:
+                yield path
 
 
 # Both

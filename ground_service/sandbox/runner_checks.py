@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
+
+from ground_service.sandbox import launcher
 
 _PERMITTED = {5: "CAP_KILL", 6: "CAP_SETGID", 7: "CAP_SETUID", 8: "CAP_SETPCAP"}
 _NEEDED = (5, 6, 7)
@@ -36,6 +39,25 @@ def runner_faults(exchange: Path) -> list[str]:
         f"an exchange folder closed to others ({exchange})": _closed(exchange),
     }
     return [name for name, holds in faults.items() if not holds]
+
+
+def build_remains() -> Iterator[str]:
+    """Yield the processes of build users, and their files in the world-writable folders."""
+    for status in Path("/proc").glob("[0-9]*/status"):
+        try:
+            user = next(line for line in status.read_text().splitlines() if line.startswith("Uid:"))
+        except (OSError, StopIteration):
+            continue
+        if int(user.split()[1]) >= launcher.FIRST_BUILD_UID:
+            yield f"process {status.parent.name}"
+    for place in launcher.WORLD_WRITABLE:
+        for folder, names, files in os.walk(place):
+            for path in (Path(folder, name) for name in (*names, *files)):
+                try:
+                    if path.lstat().st_uid >= launcher.FIRST_BUILD_UID:
+                        yield str(path)
+                except FileNotFoundError:
+                    continue
 
 
 def _mounts() -> list[tuple[str, str, set[str]]]:

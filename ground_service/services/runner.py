@@ -33,7 +33,7 @@ from pydantic.dataclasses import dataclass
 
 from ground_service.sandbox import host
 from ground_service.sandbox.host import Run, SandboxRefused
-from ground_service.sandbox.runner_checks import runner_faults
+from ground_service.sandbox.runner_checks import build_remains, runner_faults
 
 DOWNLINKS = ("downlink.cadu", "downlink.packets")
 PERFORMANCE = "performance.json"
@@ -220,6 +220,9 @@ def serve_exchange(
                 continue
             _run_job(exchange, job, mode)
             done += 1
+            remains = next(build_remains(), None) if mode == "user" else None
+            if remains is not None:
+                raise SandboxRefused(f"runner: expected no processes and files of the build, found {remains}")
     return done
 
 
