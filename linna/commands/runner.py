@@ -14,7 +14,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="folder shared with the service (default: $LINNA_RUNNER_EXCHANGE)",
     )
     parser.add_argument("--jobs", type=int, metavar="N", help="exit after N builds (default: never)")
-    parser.add_argument("--check", action="store_true", help="only check whether a runner serves the exchange folder")
+    parser.add_argument(
+        "--check", action="store_true", help="only check whether a runner serves the exchange folder"
+    )
     parser.set_defaults(handler=run)
 
 
