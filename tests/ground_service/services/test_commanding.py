@@ -1,12 +1,13 @@
 """Telecommands: validation, release by two persons, uplink, and what the reports say became of them."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sqlalchemy import select
+from sqlalchemy import select, update
 
 from ground_service.errors import Conflict, InvalidInput, NotFound
 from ground_service.processing.verification import SentCommand, VerificationReport, fate_of
@@ -361,3 +362,295 @@ def test_who_changes_a_window_has_entered_it(ground: Ground, monkeypatch: pytest
     change_window(ground, window, actor="bob", changes={"cadence_s": 20.0}, decision="approved")
     with pytest.raises(Conflict, match="a second person"):
         uplink_window(ground, window, actor="ann")
+
+
+NOW = parse_utc("2029-08-07T06:00:00Z")
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """A clock that stands at `NOW` until it is set."""
+
+    def put(now: int) -> None:
+        for module in ("commanding", "command_state"):
+            monkeypatch.setattr(f"ground_service.services.{module}.utc_now_ns", lambda: now)
+
+    put(NOW)
+    return put
+
+
+def notes(ground: Ground, command: int) -> list[tuple[str, str, Any]]:
+    """Who did what to a command, and the details, in order."""
+    with ground.database.reading() as connection:
+        rows = repository.page(connection, repository.AUDIT, target=str(command)).rows
+    return [(row["actor"], row["action"], row["detail"]) for row in sorted(rows, key=lambda row: row["id"])]
+
+
+def told(ground: Ground) -> list[Any]:
+    return [item["payload"] for item in read_feed(ground, 0) if item["kind"] == "telecommand"]
+
+
+def test_each_step_keeps_what_was_done_when_by_whom_and_tells_those_who_watch(
+    ground: Ground, clock: Callable[[int], None]
+) -> None:
+    command = enter_command(
+        ground, "perform_function", START, spacecraft_id=SPACECRAFT, timeout_s=90, actor="ann"
+    )
+    view = get_command(ground, command)
+    assert (view.spacecraft_id, view.instance, view.fate) == (SPACECRAFT, "flight", None)
+    expected = {
+        "name": "perform_function", "arguments": START, "state": "queued", "critical": 0, "timeout_s": 90,
+        "requested_by": "ann", "created_utc_ns": NOW, "window_id": None, "carrier_id": None, "decided_by": None,
+        "sequence_count": None, "octets": None, "sent_utc_ns": None,
+    }  # fmt: skip
+    assert {name: view.row[name] for name in expected} == expected
+    clock(NOW + 1)
+    release_command(ground, command, actor="bob")
+    octets = DICTIONARY.pack_command("perform_function", START, sequence_count=0)
+    expected |= {
+        "state": "released", "decided_by": "bob", "decided_utc_ns": NOW + 1, "sequence_count": 0, "octets": octets,
+        "request_id": int.from_bytes(octets[:4], "big"),
+    }  # fmt: skip
+    row = get_command(ground, command).row
+    assert {name: row[name] for name in expected} == expected
+    clock(NOW + 2)
+    take_uplink(ground, spacecraft_id=SPACECRAFT, actor="cleo")
+    row = get_command(ground, command).row
+    assert (row["state"], row["sent_utc_ns"], row["sent_after_ticks"]) == ("sent", NOW + 2, -1)
+    assert notes(ground, command) == [
+        ("ann", "enter telecommand", {"name": "perform_function", "arguments": START}),
+        ("bob", "release telecommand", {"sequence_count": 0}),
+        ("cleo", "send telecommand", {}),
+    ]
+    assert told(ground) == [{"id": command, "state": state} for state in ("queued", "released", "sent")]
+
+
+def test_a_rejection_keeps_its_reason(ground: Ground, clock: Callable[[int], None]) -> None:
+    command = entered(ground)
+    clock(NOW + 5)
+    reject_command(ground, command, actor="bob", reason="wrong cadence")
+    row = get_command(ground, command).row
+    assert (row["state"], row["decided_by"], row["decided_utc_ns"], row["reason"]) == (
+        "rejected", "bob", NOW + 5, "wrong cadence",
+    )  # fmt: skip
+    assert notes(ground, command)[1] == ("bob", "reject telecommand", {"reason": "wrong cadence"})
+    assert told(ground)[-1] == {"id": command, "state": "rejected"}
+
+
+@pytest.mark.parametrize(
+    ("timeout_s", "accepted"), [(0, False), (1, True), (2**31 - 1, True), (2**31, False), (True, False)]
+)
+def test_a_time_out_lasts_a_second_to_68_years(ground: Ground, timeout_s: int, accepted: bool) -> None:
+    def enter() -> int:
+        return enter_command(
+            ground, "test_connection", {}, spacecraft_id=SPACECRAFT, timeout_s=timeout_s, actor="ann"
+        )
+
+    if accepted:
+        assert get_command(ground, enter()).row["timeout_s"] == timeout_s
+    else:
+        with pytest.raises(
+            InvalidInput, match=f"telecommand, timeout_s: expected 1 to 2147483647, found {timeout_s}"
+        ):
+            enter()
+
+
+def test_a_command_is_followed_for_ten_minutes_unless_told_otherwise(ground: Ground) -> None:
+    assert get_command(ground, entered(ground)).row["timeout_s"] == 600
+
+
+def test_an_unknown_name_is_answered_with_the_nearest_one(ground: Ground) -> None:
+    for name, near in (("test_conection", "test_connection"), ("zzz", DICTIONARY.telecommands[0].name)):
+        with pytest.raises(InvalidInput, match=f"of the dictionary, such as {near}, found '{name}'"):
+            entered(ground, name)
+
+
+def test_commands_are_sent_in_the_order_of_their_release(
+    ground: Ground, clock: Callable[[int], None]
+) -> None:
+    first, second, third = (entered(ground, "test_connection") for _ in range(3))
+    for offset, command in ((1, second), (2, third), (2, first)):
+        clock(NOW + offset)
+        release_command(ground, command, actor="ann")
+    stream, ids = take_uplink(ground, spacecraft_id=SPACECRAFT, framed=False, actor="ann")
+    # Of two released in one instant the one entered first; the counts are those of the release.
+    assert ids == [second, first, third]
+    octets = [DICTIONARY.pack_command("test_connection", {}, sequence_count=count) for count in (0, 2, 1)]
+    assert stream == b"".join(octets)
+
+
+def test_an_uplink_holds_only_what_is_meant_for_its_spacecraft(ground: Ground) -> None:
+    mine = entered(ground, "test_connection")
+    twin = enter_command(
+        ground, "test_connection", {}, spacecraft_id=SPACECRAFT, instance="twin", actor="ann"
+    )
+    other = enter_command(ground, "test_connection", {}, spacecraft_id=77, actor="ann")
+    waiting = entered(ground, "test_connection")
+    for command in (mine, twin, other):
+        release_command(ground, command, actor="ann")
+    assert take_uplink(ground, spacecraft_id=SPACECRAFT, actor="ann")[1] == [mine]
+    assert take_uplink(ground, spacecraft_id=SPACECRAFT, instance="twin", actor="ann")[1] == [twin]
+    assert [get_command(ground, one).state for one in (other, waiting)] == ["released", "queued"]
+    # Each spacecraft counts by itself.
+    assert [get_command(ground, one).row["sequence_count"] for one in (mine, twin, other)] == [0, 0, 0]
+
+
+def test_a_command_is_judged_by_reports_newer_than_those_known_when_it_was_sent(
+    ground: Ground, tmp_path: Path
+) -> None:
+    first = sent(ground)
+    request = get_command(ground, first).row["request_id"]
+    downlink(
+        ground, tmp_path, ("verification_accepted", 900, {"request_id": request}),
+        ("verification_completed", 1200, {"request_id": request}),
+    )  # fmt: skip
+    assert get_command(ground, sent(ground)).row["sent_after_ticks"] == 1200
+    other = enter_command(ground, "test_connection", {}, spacecraft_id=77, actor="ann")
+    release_command(ground, other, actor="ann")
+    take_uplink(ground, spacecraft_id=77, actor="ann")
+    assert get_command(ground, other).row["sent_after_ticks"] == -1
+
+
+def test_commands_are_listed_newest_first_by_pages_and_by_state(ground: Ground) -> None:
+    ids = [entered(ground, "test_connection") for _ in range(4)]
+    release_command(ground, ids[1], actor="ann")
+
+    def listed(**which: Any) -> tuple[list[int], int]:
+        views, total = list_commands(ground, **which)
+        return [int(view.row["id"]) for view in views], total
+
+    assert listed() == (ids[::-1], 4)
+    assert listed(limit=2, offset=1) == ([ids[2], ids[1]], 4)
+    assert listed(state="queued") == ([ids[3], ids[2], ids[0]], 3)
+    assert listed(state="released") == ([ids[1]], 1)
+
+
+def test_time_outs_are_noted_from_the_first_instant_asked_for_to_before_the_last(
+    ground: Ground, clock: Callable[[int], None]
+) -> None:
+    command = sent(ground)
+    due = NOW + 600 * 10**9
+    clock(due + 1)
+    assert note_timeouts(ground, due + 1, due + 100) == []
+    assert note_timeouts(ground, 0, due) == []
+    assert note_timeouts(ground, due, due + 1) == [command]
+    assert get_command(ground, command).row["timeout_noted_utc_ns"] == due + 1
+    assert notes(ground, command)[-1] == (
+        "service",
+        "time out telecommand",
+        {"state": "sent", "timeout_s": 600},
+    )
+    assert note_timeouts(ground, 0, due + 100) == []
+
+
+def test_several_commands_time_out_at_once_and_those_that_ended_do_not(
+    ground: Ground, tmp_path: Path, clock: Callable[[int], None]
+) -> None:
+    commands = [sent(ground) for _ in range(3)]
+    ended = {"request_id": get_command(ground, commands[0]).row["request_id"]}
+    downlink(ground, tmp_path, ("verification_completed", 3000, ended))
+    entered(ground)
+    clock(NOW + 700 * 10**9)
+    assert note_timeouts(ground, 0, NOW + 700 * 10**9) == commands[1:]
+
+
+def vehicle_of(ground: Ground) -> int:
+    command = entered(ground, "test_connection")
+    return int(get_command(ground, command).row["vehicle_id"])
+
+
+def test_an_activity_carries_the_octets_of_its_telecommand(
+    ground: Ground, clock: Callable[[int], None]
+) -> None:
+    vehicle = vehicle_of(ground)
+    with ground.database.writing() as connection:
+        outer = commanding.add_scheduled(
+            connection, vehicle, "perform_function", START, release_ticks=65_536, actor="ann", timeout_s=77,
+            window_id=5,
+        )  # fmt: skip
+    carrier, inner = get_command(ground, outer).row, get_command(ground, outer - 1).row
+    octets = DICTIONARY.pack_command("perform_function", START, sequence_count=0)
+    expected = {
+        "name": "perform_function", "arguments": START, "state": "carried", "requested_by": "ann", "timeout_s": 77,
+        "window_id": 5, "carrier_id": outer, "sequence_count": 0, "octets": octets, "decided_by": "ann",
+        "decided_utc_ns": NOW, "request_id": int.from_bytes(octets[:4], "big"),
+    }  # fmt: skip
+    assert {name: inner[name] for name in expected} == expected
+    arguments = {"release_ticks": 65_536, "items": [{"octet": octet} for octet in octets]}
+    expected = {
+        "name": "insert_activity", "arguments": arguments, "state": "released", "requested_by": "ann",
+        "timeout_s": 77, "window_id": 5, "carrier_id": None, "sequence_count": 1, "decided_by": "ann",
+        "octets": DICTIONARY.pack_command("insert_activity", arguments, sequence_count=1),
+    }  # fmt: skip
+    assert {name: carrier[name] for name in expected} == expected
+    clock(NOW + 9)
+    assert take_uplink(ground, spacecraft_id=SPACECRAFT, actor="bob")[1] == [outer]
+    # What is inside is sent with its carrier.
+    inner = get_command(ground, outer - 1).row
+    assert (inner["state"], inner["sent_utc_ns"], inner["sent_after_ticks"]) == ("sent", NOW + 9, -1)
+
+
+REBOOT = {"function_id": "reboot", "argument_1": 0.0, "argument_2": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("approval", "released"),
+    [
+        (None, False),
+        (commanding.Approval("ann", "ann"), False),
+        (commanding.Approval("ann", "bob"), True),
+    ],
+)
+def test_a_telecommand_released_at_once_needs_an_approval_by_two_persons(
+    ground: Ground, approval: commanding.Approval | None, released: bool
+) -> None:
+    vehicle = vehicle_of(ground)
+
+    def add(name: str, arguments: dict[str, Any]) -> int:
+        with ground.database.writing() as connection:
+            return commanding.add_released(
+                connection,
+                vehicle,
+                name,
+                arguments,
+                actor="ann",
+                timeout_s=50,
+                window_id=3,
+                approval=approval,
+            )
+
+    def schedule() -> int:
+        with ground.database.writing() as connection:
+            return commanding.add_scheduled(
+                connection, vehicle, "perform_function", REBOOT, release_ticks=1, actor="ann", timeout_s=50,
+                approval=approval,
+            )  # fmt: skip
+
+    if released:
+        row = get_command(ground, add("perform_function", REBOOT)).row
+        assert (row["state"], row["critical"], row["timeout_s"], row["window_id"]) == ("released", 1, 50, 3)
+        assert get_command(ground, schedule()).row["critical"] == 1
+    else:
+        for work in (lambda: add("perform_function", REBOOT), schedule):
+            with pytest.raises(Conflict, match=r"telecommand perform_function: .*critical"):
+                work()
+        assert list_commands(ground)[1] == 1
+    # A routine command needs nobody.
+    row = get_command(ground, add("test_connection", {})).row
+    assert (row["state"], row["critical"]) == ("released", 0)
+
+
+def test_the_count_of_telecommands_wraps(ground: Ground) -> None:
+    vehicle = vehicle_of(ground)
+    release_command(ground, 1, actor="ann")
+    with ground.database.writing() as connection:
+        connection.execute(
+            update(repository.COMMAND_COUNTERS)
+            .where(repository.COMMAND_COUNTERS.c.vehicle_id == vehicle)
+            .values(telecommands=16_384)
+        )
+    command = entered(ground, "test_connection")
+    release_command(ground, command, actor="ann")
+    row = get_command(ground, command).row
+    assert row["sequence_count"] == 0
+    assert row["octets"] == DICTIONARY.pack_command("test_connection", {}, sequence_count=0)
