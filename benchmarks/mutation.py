@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,6 +39,11 @@ SOURCES = (
     "benchmarks",
 )
 UNTESTED = "not checked"
+_SHOW = """
+import json, sys
+from mutmut.mutation.diff_apply import get_diff_for_mutant
+print(json.dumps({name: get_diff_for_mutant(name) for name in sys.argv[1:]}))
+"""
 _PLUGIN = "benchmarks.mutation_plugin"
 KILLED = frozenset({"killed", "timeout", "suspicious", "segfault"})
 
@@ -138,18 +143,19 @@ GROUPS = {
     ),
 }
 
-_LEFT_OUT = (
-    (
-        re.compile(r"dtype=|astype\("),
-        re.compile(r",? ?dtype=[\w.]+|\.astype\([\w.]+\)"),
-        "element type that NumPy chooses anyway",
-    ),
-    (
-        re.compile(r"[\"'][^\"']* [^\"']*[\"']"),
-        re.compile(r"f?\"[^\"]* [^\"]*\"|f?'[^']* [^']*'"),
-        "wording of a message (a text with blanks)",
-    ),
+_ELEMENT_TYPE = re.compile(r",? ?dtype=[\w.]+|\.astype\([\w.]+\)")
+_TEXT = re.compile(r"f?\"[^\"]*\"|f?'[^']*'")
+
+
+def _without_messages(code: str) -> str:
+    return _TEXT.sub(lambda text: "" if " " in text.group() else text.group(), code)
+
+
+_LEFT_OUT: tuple[tuple[Callable[[str], str], str], ...] = (
+    (lambda code: _ELEMENT_TYPE.sub("", code), "element type that NumPy chooses anyway"),
+    (_without_messages, "wording of a message (a text with blanks)"),
 )
+"""What is taken out of the code before and after a change; a change is not tested where nothing else differs."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -188,19 +194,22 @@ def run_group(name: str, sample: int, seed: int, children: int) -> dict[str, obj
         if not known:
             raise SystemExit(f"mutation: group {name}: no mutants were made:\n{generated[-2000:]}")
         random.Random(seed).shuffle(known)
+        wanted = sample or len(known)
+        differences: dict[str, str] = {}
         chosen: list[str] = []
-        for mutant in known:
-            if len(chosen) == (sample or len(known)):
+        for first in range(0, len(known), wanted):
+            differences |= _differences(tree, known[first : first + wanted])
+            chosen = [mutant for mutant in differences if reason_left_out(differences[mutant]) is None]
+            if len(chosen) >= wanted:
                 break
-            if reason_left_out(_difference(tree, mutant)) is None:
-                chosen.append(mutant)
+        chosen = chosen[:wanted]
         said = _mutmut(tree, "run", "--max-children", str(children), *chosen)
         found = _states(tree)
         states = {mutant: found.get(mutant, UNTESTED) for mutant in chosen}
         if UNTESTED in states.values():
             raise SystemExit(f"mutation: group {name}: mutants were not tested:\n{said[-2000:]}")
         survivors = [
-            {"name": mutant, "state": state, "difference": _difference(tree, mutant)}
+            {"name": mutant, "state": state, "difference": differences[mutant]}
             for mutant, state in sorted(states.items())
             if state not in KILLED
         ]
@@ -248,24 +257,28 @@ def _copy_tree(tree: Path, group: Group) -> None:
         project.write("\n".join(lines) + "\n")
 
 
-def _difference(tree: Path, mutant: str) -> str:
-    """Return the changed lines of a mutant, without the headers of the difference."""
-    shown = _mutmut(tree, "show", mutant)
-    return "\n".join(line for line in shown.splitlines() if re.match(r"[-+](?![-+]{2})", line))
+def _differences(tree: Path, mutants: Sequence[str]) -> dict[str, str]:
+    """Return the changed lines of mutants by their names, without the headers of the differences."""
+    shown = _python(tree, "-c", _SHOW, *mutants)
+    try:
+        found: dict[str, str] = json.loads(shown)
+    except ValueError:
+        raise SystemExit(f"mutation: mutants cannot be shown:\n{shown[-2000:]}") from None
+    return {
+        mutant: "\n".join(line for line in lines.splitlines() if re.match(r"[-+](?![-+]{2})", line))
+        for mutant, lines in found.items()
+    }
 
 
 def reason_left_out(difference: str) -> str | None:
     """Return why a mutant is not tested; None if it is."""
     before = [line[1:] for line in difference.splitlines() if line.startswith("-")]
     after = [line[1:] for line in difference.splitlines() if line.startswith("+")]
-    for present, part, reason in _LEFT_OUT:
-        if present.search("".join(before)) and _without(before, part) == _without(after, part):
+    for without, reason in _LEFT_OUT:
+        reduced = [re.sub(r"[\s,]", "", without(" ".join(lines))) for lines in (before, after)]
+        if reduced[0] == reduced[1]:
             return reason
     return None
-
-
-def _without(lines: Iterable[str], part: re.Pattern[str]) -> str:
-    return re.sub(r"[\s,]", "", part.sub("", " ".join(lines)))
 
 
 def _states(tree: Path) -> dict[str, str]:
@@ -276,8 +289,12 @@ def _states(tree: Path) -> dict[str, str]:
 
 def _mutmut(tree: Path, *arguments: str) -> str:
     """Return what mutmut prints, run in a copy of the tree."""
+    return _python(tree, "-m", "mutmut", *arguments)
+
+
+def _python(tree: Path, *arguments: str) -> str:
     done = subprocess.run(
-        [sys.executable, "-m", "mutmut", *arguments],
+        [sys.executable, *arguments],
         cwd=tree,
         capture_output=True,
         text=True,

@@ -24,6 +24,7 @@ def test_a_group_names_modules_and_tests_that_exist(name: str) -> None:
         "-    a = np.zeros(n, dtype=np.int64)\n+    a = np.zeros(n, )",
         "-    a = b.astype(np.int64)\n+    a = b.astype(None)",
         '-    raise Conflict("not queued")\n+    raise Conflict("XXnot queuedXX")',
+        '-    raise Refused("a", b, "not so", "c")\n+    raise Refused("a", b, "NOT SO", "c")',
     ],
 )
 def test_element_types_and_wording_are_left_out(difference: str) -> None:
@@ -38,6 +39,8 @@ def test_element_types_and_wording_are_left_out(difference: str) -> None:
         '-    return table["a"] + 1\n+    return table["a"] + 2',
         '-    if state == "queued":\n+    if state == "XXqueuedXX":',
         "-    raise Conflict(name)\n+    raise Conflict(None)",
+        '-    raise Refused("a", b, "c")\n+    raise Refused("a", c, "c")',
+        "-    order = np.argsort(a, kind=b)\n+    order = np.argsort(a)",
     ],
 )
 def test_what_decides_is_tested(difference: str) -> None:

@@ -270,7 +270,7 @@ def test_an_id_that_no_transfer_frame_can_carry_is_refused(ground: Ground, space
 @pytest.mark.parametrize("reason", ["", "two\nlines", "\x1b[2Jgone", "nul\x00", "x" * 501])
 def test_a_reason_is_one_printable_line(ground: Ground, reason: str) -> None:
     command = entered(ground)
-    with pytest.raises(InvalidInput, match="reason: expected a line of 1 to 500 characters"):
+    with pytest.raises(InvalidInput, match="telecommand, reason: expected a line of 1 to 500 characters"):
         reject_command(ground, command, actor="bob", reason=reason)
     assert get_command(ground, command).state == "queued"
 
