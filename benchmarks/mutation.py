@@ -118,6 +118,8 @@ GROUPS = {
                 "observer",
                 "acquisition",
                 "burns",
+                "relative",
+                "landmark_map",
             )
         ),
     ),

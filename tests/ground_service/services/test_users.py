@@ -393,7 +393,7 @@ def test_changes_that_cannot_be_made_are_refused_with_what_was_expected(ground: 
         change_user(ground, "bob", state="disabled")
     with pytest.raises(NotFound, match="bob"):
         get_user(ground, "bob")
-    with pytest.raises(InvalidInput, match="program does not use itself"):
+    with pytest.raises(InvalidInput, match="service"):
         change_user(ground, "service", role="viewer")
 
 
