@@ -10,12 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lunar._compile import njit
 from lunar._gravity_kernel import acceleration, acceleration_gradient
-
-FloatArray = NDArray[np.float64]
+from lunar.arrays import FloatArray
 
 COLUMNS = 16
 FORCES = 8

@@ -26,11 +26,9 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from llvmlite.binding import get_host_cpu_features
-from numpy.typing import NDArray
 
 from lunar._compile import cgutils, intrinsic, njit, types
-
-FloatArray = NDArray[np.float64]
+from lunar.arrays import FloatArray
 
 LANES = 8 if get_host_cpu_features().get("avx512f") else 4
 """Orders side by side: as many doubles as a vector register of this machine holds (or twice that, on small ones)."""

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lunar.arrays import FloatArray
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import enu_from_mcmf, spherical_from_mcmf
-
-FloatArray = NDArray[np.float64]
 
 CAMERA_FROM_ENU: FloatArray = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 """Nadir camera, image up to the north: x = east, y = south, z = down."""

@@ -21,12 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.constants import MOON_RADIUS_M
 from lunar.errors import DataFileError, LunarError
 from lunar.frames import mcmf_from_spherical
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 TWO_PI = 2.0 * math.pi
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.ephemeris import Ephemeris
 from lunar.errors import EphemerisCoverageError
 from lunar.frames import rtn_from_inertial
 from lunar.timescales import format_utc
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

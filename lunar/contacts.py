@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, IntArray
 from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
@@ -21,8 +21,6 @@ from lunar.visibility import (
     sunlit_fraction,
 )
 
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 Span = tuple[int, int]
 
 _LIGHT_TIME_NS = 2 * NS

@@ -25,11 +25,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.errors import DataFileError, EphemerisCoverageError, EphemerisError
 from lunar.timescales import NS, format_utc, tai_ns_from_utc_ns
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 GAP_FACTOR = 10
 """A step longer than this many median steps of its segment is a gap, in which nothing is interpolated."""

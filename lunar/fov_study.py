@@ -23,13 +23,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lunar.arrays import FloatArray
 from lunar.camera import ground_arc_m
 from lunar.catalogue import BAND_RAD, CLASS_LIMITS_M, CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.errors import LunarError
 from lunar.frames import spherical_from_mcmf
-
-FloatArray = NDArray[np.float64]
 
 PAPER_FOV_DEG = tuple(float(v) for v in range(10, 161, 10))
 PAPER_COUNTS = (1, 3, 5)

@@ -29,12 +29,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from lunar.arrays import FloatArray
 from lunar.constants import MOON_RADIUS_M
 from lunar.errors import DataFileError, EphemerisCoverageError
-
-FloatArray = NDArray[np.float64]
 
 ARCSECOND_RAD = np.pi / 648_000.0
 DAY_S = 86_400.0

@@ -23,11 +23,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from lunar.arrays import FloatArray
 from lunar.errors import DataFileError, OrbitError
-
-FloatArray = NDArray[np.float64]
 
 Record = tuple[int, int, int, float, float]
 """Line number, degree, order, C, S."""

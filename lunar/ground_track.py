@@ -6,16 +6,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.constants import MOON_RADIUS_M
 from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation
 from lunar.timescales import NS, tdb_s_from_utc_ns
 from lunar.visibility import subsatellite
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 PASS_LATITUDE_RAD = math.radians(60.0)
 

@@ -12,9 +12,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lunar import constants
+from lunar.arrays import FloatArray
 from lunar.elements import Elements, elements_from_icrf_state
 from lunar.errors import OrbitError
 from lunar.propagation import (
@@ -27,8 +28,6 @@ from lunar.propagation import (
     state_vector,
 )
 from lunar.timescales import utc_ns_from_tdb_s
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.ephemeris import (
     INTERPOLATIONS,
     Covariance,
@@ -30,9 +31,6 @@ from lunar.ephemeris import (
 from lunar.errors import DataFileError, TimeFormatError, UnknownFrameError, UnknownTimeSystemError
 from lunar.frames import ICRF_NAMES, J2000_NAMES, icrf_from_j2000
 from lunar.timescales import NS, TIME_SYSTEMS, format_utc, from_utc_ns, parse_utc, to_utc_ns
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 VERSIONS = ("1.0", "2.0", "3.0")
 CENTRES = ("MOON",)

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lunar import constants
+from lunar.arrays import FloatArray
 from lunar.errors import EphemerisCoverageError, ImpactError, OrbitError
 from lunar.gravity import GravityField, packed, packed_gradient
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
@@ -33,7 +34,6 @@ from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 if TYPE_CHECKING:
     from lunar.frames import Orientation
 
-FloatArray = NDArray[np.float64]
 
 DEFAULT_INTEGRATOR = "rkn86"
 

@@ -17,8 +17,8 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.ephemeris import Ephemeris, EphemerisSegment, parse_numbers, read_text
 from lunar.errors import (
     DataFileError,
@@ -29,9 +29,6 @@ from lunar.errors import (
 )
 from lunar.frames import ICRF_NAMES, J2000_NAMES, icrf_from_j2000
 from lunar.timescales import NS, parse_utc, tai_ns_from_utc_ns, utc_ns_from_tai_ns
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _STATE_WIDTH = {"EPHEMERISTIMEPOSVEL": 7, "EPHEMERISTIMEPOSVELACC": 10}
 _UNITS_M = {"METERS": 1.0, "KILOMETERS": 1000.0, "METER": 1.0, "KILOMETER": 1000.0}

@@ -17,9 +17,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lunar.arrays import FloatArray
 from lunar.constants import ASTRONOMICAL_UNIT_M, SECONDS_PER_DAY
-
-FloatArray = NDArray[np.float64]
 
 _J2000_JD = 2_451_545.0
 _CENTURY_S = 36_525.0 * SECONDS_PER_DAY

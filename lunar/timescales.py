@@ -22,12 +22,9 @@ from datetime import UTC, datetime, timedelta
 from typing import Any, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.errors import TimeFormatError
-
-IntArray = NDArray[np.int64]
-FloatArray = NDArray[np.float64]
 
 NS = 1_000_000_000
 TT_MINUS_TAI_NS = 32_184_000_000

@@ -22,10 +22,10 @@ from payload_emulator.loading import LoadedPayload
 from payload_emulator.scenario import SHIPPED, FaultsSection, Scenario
 from payload_emulator.sim.faults import Fault, parse_fault
 from payload_emulator.world import World, build_world, clock_ticks
+from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 
 CAMPAIGNS = SHIPPED / "campaigns"
-_TICKS_PER_SECOND = 65_536
 _SETTLING_S = 240.0
 _KEYS = {"name": str, "faults": list, "events": list, "safe": bool}
 
@@ -145,7 +145,7 @@ def fly_case(world: World, loaded: LoadedPayload, case: Case, seed: int) -> Resu
         for packet in flown.packets:
             name, values = DICTIONARY.unpack(packet)
             if name.startswith("event_"):
-                made_s = (int.from_bytes(packet[14:20], "big") - first_ticks) / _TICKS_PER_SECOND
+                made_s = (int.from_bytes(packet[14:20], "big") - first_ticks) / TICKS_PER_SECOND
                 events.append((made_s, labels[values["event_id"]]))
             elif name == "detections" and values["image_quality"] == 0:
                 processed.append(second)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import IntArray
 from lunar.camera import project_mcmf
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
@@ -25,6 +26,7 @@ from payload_emulator.link import LIGHT_S, Receiver, Transmitter, contacts
 from payload_emulator.scenario import ClockSection
 from payload_emulator.spacecraft import Spacecraft
 from payload_emulator.world import Exposure, World, clock_ticks, exposures, orders_before, sample_truth
+from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import APID_TIME_REPORT, DICTIONARY
 from tmtc.downlink import LinkSettings
 
@@ -35,19 +37,16 @@ PLAYBACK_CHANNEL = 1
 # Source of the planned telecommands; whoever commands by hand has another one, with counts of its own.
 _PLANNING_SOURCE = 1
 _TIME_RATE_EXPONENT = 1  # a clock known to be off is watched: a time report every second frame of telemetry
-_LATE_TICKS = 120 * 65_536
+_LATE_TICKS = 120 * TICKS_PER_SECOND
 _DUMP_OCTETS = 64_000
 _BEFORE_ARC_NS = 60 * _NS
 _IDLE_STEP_NS = 60 * _NS
-_STANDBY_BEFORE_TICKS = 20 * 65_536
+_STANDBY_BEFORE_TICKS = 20 * TICKS_PER_SECOND
 _PATIENCE_NS = 600 * _NS
 _AHEAD_NS = 12 * 3_600 * _NS
 _NO_ATTITUDE = np.full(7, np.nan)
 # A detector as the one that flies, roughly: what is drawn where no image is rendered.
 _REDUCED_RECALL, _REDUCED_SIGMA_PX, _SMALLEST_PX = 0.7, 0.6, 5.0
-
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray
 from lunar.camera import ground_point_sphere
 from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
@@ -30,8 +31,6 @@ from payload_emulator.sim.renderer import Rendering
 from payload_emulator.sim.sensor import Picture, take_picture
 from payload_emulator.sim.truth import require_above_ground
 from payload_emulator.world import World, build_world, true_sun_direction
-
-FloatArray = NDArray[np.float64]
 
 RENDERERS = ("fast", "raymarch", "cycles")
 LABEL_RULES = ("exact", "paper")

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, IntArray
 from lunar.constants import SPEED_OF_LIGHT_M_S
 from lunar.ephemeris import Ephemeris
 from lunar.third_bodies import earth_position_icrf_m
@@ -26,9 +27,6 @@ from tmtc.crc import CRC_LENGTH
 from tmtc.downlink import DownlinkEncoder, LinkSettings
 from tmtc.frames import FRAME_HEADER_LENGTH, OCF_LENGTH, pack_clcw
 from tmtc.uplink import Farm, UplinkDecoder, UplinkEncoder, cut_telecommands
-
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 LIGHT_S = 1.28
 _LIGHT_NS = 1_500_000_000

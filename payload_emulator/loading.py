@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
@@ -65,8 +65,6 @@ _CENTRE_SIGMA_OF_DIAMETER = 0.03
 _HEIGHT_SIGMA_M = 50.0
 # No place of a crater is better known than this.
 _SMALLEST_SIGMA_M = 10.0
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,8 +13,8 @@ from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, FloatArray
 from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder
 from lunar.frames import IauOrientation, spherical_from_mcmf
@@ -24,6 +24,7 @@ from payload_emulator.recording import StepInput
 from payload_emulator.scenario import SHIPPED, RequirementsSection, Scenario
 from payload_emulator.training.recipe import Box, Source, load_recipe
 from payload_emulator.world import World, build_world
+from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import LinkSettings
 
@@ -40,10 +41,7 @@ SEEN_SPLITS = ("train", "val")
 
 SPACECRAFT_NAME = "SelenITA"
 CLOCK_EPOCH = "2000-01-01T00:00:00 TAI"
-TICKS_PER_SECOND = 65_536
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Value = bool | int | float | str | Sequence[float] | Sequence[str] | None
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.datafolder import DataFolder, default_gravity, default_orientation
 from lunar.elements import Elements, icrf_state_from_elements, state_from_elements
 from lunar.ephemeris import Ephemeris, EphemerisSegment
@@ -19,9 +19,6 @@ from lunar.propagation import ForceModel, SolarPressure, Trajectory, propagate
 from lunar.timescales import tai_ns_from_utc_ns, tdb_minus_tt_s, tdb_s_from_utc_ns
 from payload_emulator.errors import ScenarioError
 from payload_emulator.scenario import Scenario
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _NS = 1_000_000_000
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray
 from payload_emulator.errors import RecordError
 from payload_emulator.flight.payload import FlightTables
 from payload_emulator.parameter_file import BuildParameters, format_parameters, parse_parameters
@@ -36,7 +37,6 @@ TABLES = f"{FOLDER}/tables"
 FRAME_TIMES = "frame_times.csv"
 DICTIONARY_FILE = f"{FOLDER}/dictionary.json"
 
-FloatArray = NDArray[np.float64]
 Image = NDArray[Any]
 
 

@@ -21,6 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import ModelError, ParameterError, RecordError
 from payload_emulator.flight.detections import Detections
@@ -42,7 +43,6 @@ from payload_emulator.recording import (
 )
 from tmtc.downlink import encode_cadus
 
-FloatArray = NDArray[np.float64]
 Image = NDArray[Any]
 Progress = Callable[[Iterable[Any], int], Iterator[Any]]
 CpuClock = Callable[[], float]

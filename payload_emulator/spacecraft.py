@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray
 from payload_emulator.flight.detections import Detections, Detector
 from payload_emulator.flight.loads import MODEL_NUMBER, TABLE_NUMBERS
 from payload_emulator.flight.machine import PARAMETERS_NUMBER
@@ -19,9 +20,9 @@ from payload_emulator.loading import LoadedPayload
 from payload_emulator.sim.faults import Fault
 from payload_emulator.sim.platform import PlatformModel, SimulatedBoard
 from payload_emulator.sim.truth import ReadCount, counted_reads
+from tmtc.cuc import TICKS_PER_SECOND
 
 _NS = 1_000_000_000
-_TICKS_PER_SECOND = 65_536
 _NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)
 _PLATFORM = PlatformModel()
 _REGIONS = {
@@ -30,8 +31,6 @@ _REGIONS = {
     "table_flip": TABLE_NUMBERS["catalogue"],
     "parameters_flip": PARAMETERS_NUMBER,
 }
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,7 +226,7 @@ class Spacecraft:
             board.settings[:] = self._rng.integers(0, 256, board.settings.size, dtype=np.uint8)
             self._reset(ResetCause.brown_out)
         elif fault.kind == "clock_jump":
-            self._clock_error_ticks += round(fault.size * _TICKS_PER_SECOND)
+            self._clock_error_ticks += round(fault.size * TICKS_PER_SECOND)
         elif fault.kind == "power_cut":
             self._reset(ResetCause.brown_out)
         elif fault.kind == "processor_hang":

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
@@ -41,6 +42,7 @@ from payload_emulator.sim.truth import (
     perturbed,
     require_above_ground,
 )
+from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 
 _NS = 1_000_000_000
@@ -55,9 +57,6 @@ _REDUCED_PX = 8
 _HIGHEST_GROUND_M = 12_000.0
 # With the Sun this far below the horizon of the sub-satellite point no ground in view is lit, mountains included.
 _NIGHT_RAD = np.radians(12.0)
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -309,7 +308,7 @@ def clock_ticks(world: World, utc_ns: int) -> int:
     clock = world.scenario.clock
     elapsed_s = (utc_ns - int(world.frame_utc_ns[0])) / _NS
     error_s = clock.offset_s + clock.drift_ppm * 1e-6 * elapsed_s
-    return int(ticks_from_utc_ns(utc_ns)) + round(error_s * 65_536)
+    return int(ticks_from_utc_ns(utc_ns)) + round(error_s * TICKS_PER_SECOND)
 
 
 def _fly_to_windows(

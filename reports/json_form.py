@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from reports.values import FloatArray
+from reports.arrays import FloatArray
 
 SCHEMA_VERSION = 1
 DIGITS = 9

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from reports.arrays import FloatArray
 from reports.campaign_report import solution_table, solutions
 from reports.document import Block, Cell, Column, Document, Heading, Picture, Table
 from reports.figures import campaign
@@ -11,7 +12,7 @@ from reports.sections.detection import gallery_picture
 from reports.sections.opening import about, absent, judgement, missing_and_remarks, provenance_and_data
 from reports.statistics import quantiles
 from reports.text import count_text, significant_text
-from reports.values import CampaignPass, FloatArray, RegressionGate, RegressionReport
+from reports.values import CampaignPass, RegressionGate, RegressionReport
 
 _ORDER = ("fail", "inconclusive", "pass")
 _SWATCHES = {"pass": "green", "inconclusive": "orange", "fail": "vermillion"}

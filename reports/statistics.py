@@ -10,15 +10,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from reports.values import (
-    BoolArray,
-    FloatArray,
-    IntArray,
-    NavigationSeries,
-    NavigationStatistics,
-    TimeSpan,
-    TrackSeries,
-)
+from reports.arrays import BoolArray, FloatArray, IntArray
+from reports.values import NavigationSeries, NavigationStatistics, TimeSpan, TrackSeries
 
 MOON_RADIUS_M = 1_737_400.0
 QUANTILES = (0.5, 0.68, 0.95, 0.99)

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reports.arrays import FloatArray, IntArray
 from reports.errors import ReportError
 from reports.figures.canvas import TimeScale, thinned, time_axis
 from reports.figures.theme import color, drawing
@@ -17,8 +17,6 @@ from reports.figures.theme import color, drawing
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 FORMATS = (".png", ".svg", ".pdf")
 CLASS_NAMES = ("Class 0 (5-10 km)", "Class 1 (10-15 km)", "Class 2 (15-30 km)")

@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+from reports.arrays import BoolArray, FloatArray, IntArray
+
 ByteArray = NDArray[np.uint8]
 
 ODOMETRY_OUTCOMES = ("anchored", "multi", "single", "predicted", "missed", "rejected")

@@ -22,11 +22,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
-OctetArray = npt.NDArray[np.uint8]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
+from tmtc.arrays import BoolArray, IntArray, OctetArray
 
 ASM = bytes.fromhex("1ACFFC1D")
 ASM_LENGTH = 4

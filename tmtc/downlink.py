@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tmtc import cadu, reed_solomon
+from tmtc.arrays import IntArray, OctetArray
 from tmtc.clcw import UplinkSeen, uplink_seen
 from tmtc.crc import CRC_LENGTH, crc16
 from tmtc.dictionary import DICTIONARY
@@ -37,9 +38,6 @@ from tmtc.randomiser import Randomiser, randomise
 from tmtc.schema import Dictionary, Table, as_octets
 from tmtc.sequence import SequenceReport, account
 from tmtc.stream import Octets, PacketCut, PrimaryHeaders, cut_packets, primary_headers
-
-OctetArray = npt.NDArray[np.uint8]
-IntArray = npt.NDArray[np.int64]
 
 FRAME_GOOD, FRAME_UNCORRECTABLE, FRAME_BAD_CHECKSUM, FRAME_FOREIGN, FRAME_UNCHECKED = 0, 1, 2, 3, 4
 FRAME_VERDICTS = ("good", "uncorrectable", "bad_checksum", "foreign", "unchecked")

@@ -16,11 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from tmtc.arrays import IntArray, OctetArray
 from tmtc.crc import CRC_LENGTH, crc16
 from tmtc.errors import FrameError, TruncatedPacket, ValueRefused
-
-OctetArray = npt.NDArray[np.uint8]
-IntArray = npt.NDArray[np.int64]
 
 FRAME_HEADER_LENGTH = 6
 FRAME_MAX_LENGTH = 2048

@@ -18,12 +18,12 @@ import numpy as np
 import numpy.typing as npt
 
 from tmtc import cadu, reed_solomon
+from tmtc.arrays import OctetArray
 from tmtc.errors import LinkFormatError
 from tmtc.frames import FRAME_HEADER_LENGTH, FRAME_MAX_LENGTH, frame_checksums_hold
 from tmtc.link import FRAME_MIN_LENGTH, LinkSettings
 from tmtc.randomiser import Randomiser, randomise
 
-OctetArray = npt.NDArray[np.uint8]
 CountPackets = Callable[[cadu.CaduSync, LinkSettings], tuple[int, float]]
 """Returns the number of valid packets in CADUs under link settings, and the share of the frames that they fill."""
 

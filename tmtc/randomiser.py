@@ -13,12 +13,11 @@ import functools
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from tmtc.arrays import OctetArray
 from tmtc.errors import LinkFormatError
 
 Randomiser = Literal["none", "legacy", "long", "telecommand"]
-OctetArray = npt.NDArray[np.uint8]
 
 # s[n + degree] is the sum of s[n + tap] over the taps; first bits of the sequence
 _REGISTERS: dict[str, tuple[int, tuple[int, ...], str]] = {

@@ -19,9 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from tmtc.arrays import OctetArray
 from tmtc.errors import LinkFormatError
-
-OctetArray = npt.NDArray[np.uint8]
 
 CODEWORD = 255
 INTERLEAVES = (1, 2, 3, 4, 5, 8)

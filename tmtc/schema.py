@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from tmtc.arrays import IntArray
 from tmtc.crc import CRC_LENGTH, append_crc, check_crc
 from tmtc.errors import MalformedPacket, TruncatedPacket, UnknownPacket, ValueRefused
 from tmtc.packets import (
@@ -46,7 +47,6 @@ if TYPE_CHECKING:
     from tmtc.stream import Octets, PacketCut
 
 Array = npt.NDArray[Any]
-IntArray = npt.NDArray[np.int64]
 
 _STRUCT_CODES = {
     "u8": "B", "i8": "b", "u16": "H", "i16": "h", "u32": "I", "i32": "i", "u64": "Q", "i64": "q",

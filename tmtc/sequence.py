@@ -17,10 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from tmtc.arrays import IntArray
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.packets import SEQUENCE_COUNT_LIMIT
-
-IntArray = npt.NDArray[np.int64]
 
 FIRST, DUPLICATE, CONFLICT = 0, 1, 2
 

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tmtc.arrays import IntArray
 from tmtc.crc import crc16
 from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, TYPE_TELEMETRY
 from tmtc.schema import as_octets
 
 Octets = bytes | bytearray | memoryview | npt.NDArray[np.uint8]
-IntArray = npt.NDArray[np.int64]
 
 _GOOD, _BAD, _SKIPPED, _IDLE = 0, 1, 2, 3
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ground_service.link.edges import CLOSER, MIDDLE, OPENER, UNKNOWN, Edge
 from ground_service.link.packets import PacketBatch, batch_of_cut
+from lunar.arrays import IntArray, OctetArray
 from tmtc import reed_solomon
 from tmtc.cadu import ASM, ASM_LENGTH
 from tmtc.crc import CRC_LENGTH
@@ -32,9 +33,6 @@ from tmtc.packets import IDLE_APID, PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH
 from tmtc.randomiser import randomise
 from tmtc.schema import Dictionary
 from tmtc.stream import PacketCut, cut_packets
-
-OctetArray = NDArray[np.uint8]
-IntArray = NDArray[np.int64]
 
 COUNTS = 256
 _BATCH = 512

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import IntArray
 from tmtc.cuc import NO_TICKS, onboard_ticks
 from tmtc.dictionary import DICTIONARY
 from tmtc.estimates import ESTIMATE_PACKETS, filter_estimates
 from tmtc.schema import Dictionary, Table, as_octets, gather
 from tmtc.stream import Octets, PacketCut, primary_headers
 
-IntArray = NDArray[np.int64]
 Columns = dict[str, Any]
 
 DIGEST_OCTETS = 16

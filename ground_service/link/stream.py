@@ -24,6 +24,7 @@ from ground_service.link.frames import (
     read_frames,
 )
 from ground_service.link.packets import PacketBatch, batch_of_cut
+from lunar.arrays import IntArray, OctetArray
 from tmtc import cadu
 from tmtc.cadu import ASM, ASM_LENGTH
 from tmtc.clcw import UplinkSeen, uplink_seen
@@ -36,9 +37,6 @@ from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH
 from tmtc.randomiser import randomise
 from tmtc.schema import Dictionary, as_octets
 from tmtc.stream import cut_packets
-
-OctetArray = NDArray[np.uint8]
-IntArray = NDArray[np.int64]
 
 WINDOW_OCTETS = 2 << 20
 """Octets decoded and stored at a time: large enough to spread the cost of a transaction, small against memory:

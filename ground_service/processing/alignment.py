@@ -9,15 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation, mcmf_from_spherical, rtn_from_inertial, spherical_from_mcmf
 from lunar.timescales import tdb_s_from_utc_ns
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,15 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.frames import Orientation
 from lunar.gravity import GravityField
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import tdb_s_from_utc_ns
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 BASELINE_DEGREE = 50
 """Degree of the propagate-only baseline: what a flight computer can afford."""

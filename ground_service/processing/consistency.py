@@ -19,9 +19,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from lunar.arrays import FloatArray
 
 DIAGONAL_NAME = "sum of squared normalised errors (diagonal)"
 """Name of the sum of squared errors over variances, which ignores correlations and is not a NEES."""

@@ -13,14 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_service.errors import EvaluationError
+from lunar.arrays import IntArray
 from lunar.timescales import (
     tai_ns_from_utc_ns,
     ticks_from_utc_ns,
     utc_ns_from_tai_ns,
     utc_ns_from_ticks,
 )
-
-IntArray = NDArray[np.int64]
 
 IDEAL_CLOCK = 0
 """Id of the correlation of a clock that shows TAI without error."""

@@ -13,15 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ground_service.link.packets import packet_ticks
+from lunar.arrays import BoolArray, IntArray
 from tmtc.cuc import NO_TICKS
 from tmtc.downlink import FRAME_FOREIGN, FRAME_GOOD, DownlinkDecode, decode
 from tmtc.stream import Octets
-
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 DIGEST_OCTETS = 16
 

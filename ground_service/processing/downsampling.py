@@ -6,11 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+from lunar.arrays import BoolArray, FloatArray, IntArray
 
 GAP_STEPS = 5.0
 """A silence of this many usual steps is a gap, over which no line should be drawn."""

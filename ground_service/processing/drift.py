@@ -7,12 +7,9 @@ over it, in percent. A reset ends a stretch: what counts is the error at the ins
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, FloatArray
 from reports.values import DriftSample, NavigationStatistics
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 PATH_LENGTHS_M = (100e3, 200e3, 500e3, 1000e3, 2000e3)
 """Sub-track lengths of the relative error, as trajectory benchmarks use them; a frame is about 24.5 km."""

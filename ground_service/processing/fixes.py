@@ -11,15 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ground_service.processing.recall import CENTRE_TOLERANCE_PX, CENTRE_TOLERANCE_RADII
 from ground_service.processing.samples import DetectionSamples
+from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Pointing = Callable[[FloatArray], FloatArray]
 
 ROUNDS = 8

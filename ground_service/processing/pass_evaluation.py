@@ -46,6 +46,7 @@ from ground_service.processing.smoothed_series import SMOOTHED, smoothed_series,
 from ground_service.processing.smoother import CommandedBurn, FilterStates
 from ground_service.processing.verdict import Evaluated, Limits, requirements, verdict_of
 from ground_service.processing.viewing import Viewing
+from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M, NANOSECONDS_PER_SECOND
 from lunar.ephemeris import Ephemeris
@@ -70,10 +71,6 @@ from reports.values import (
     TimeSpan,
     TrackSeries,
 )
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 ESTIMATOR_NAMES = ("paper", "spherical", "anchored")
 """On-board estimators by their number in telemetry."""

@@ -5,20 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ground_service.processing.alignment import ReferenceStates, error_of_places_rtn_m
 from ground_service.processing.drift import navigation_statistics
 from ground_service.processing.fixes import Pairs, snapshot_positions, wrong_fixes
 from ground_service.processing.samples import NavigationSamples
 from ground_service.processing.viewing import Viewing
+from lunar.arrays import FloatArray
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns
 from lunar.visibility import sun_elevation_azimuth
 from reports.values import NavigationSeries, TerrainMap
-
-FloatArray = NDArray[np.float64]
 
 SNAPSHOT = "snapshot"
 FILTER = "anchored"

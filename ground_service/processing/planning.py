@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ground_service.processing.recall import expected_craters
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import NANOSECONDS_PER_SECOND
@@ -26,9 +26,6 @@ from lunar.timescales import tdb_s_from_utc_ns
 from lunar.visibility import GroundStation, find_windows, link, sun_elevation_azimuth, sunlit_fraction
 from tmtc.dictionary import DICTIONARY
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 Range = tuple[float, float]
 TerrainAt = Callable[[FloatArray, FloatArray], BoolArray]
 """Latitudes and longitudes (n,) in rad to whether the ground there is mare (n,)."""

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ground_service.processing.samples import DetectionSamples
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera, above_horizon, ground_arc_m, horizon_arc_m, nadir_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue, size_class
 from reports.values import (
@@ -26,10 +26,6 @@ from reports.values import (
     PrecisionRecallCurve,
     ResidualSeries,
 )
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 CLASS_LABELS = ("5–10 km", "10–15 km", "15–30 km")
 SCORED_CLASSES = (0, 1, 2)

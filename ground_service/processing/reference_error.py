@@ -7,11 +7,9 @@ filter whose initial state has no more influence, not for odometry that is reset
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray
 from reports.values import ErrorBudget
-
-FloatArray = NDArray[np.float64]
 
 Sigma = tuple[float, float, float]
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from ground_service.processing.regression_samples import BAD_OUTCOMES, EstimatorFrames, PassFrames
 from ground_service.processing.regression_statistics import weighted_quantile, weighted_ratio
-
-FloatArray = NDArray[np.float64]
+from lunar.arrays import FloatArray
 
 LATENCY_LEVEL = 0.25
 """Of CPU times the lower quartile over the frames is taken: whatever else the machine does only ever adds."""

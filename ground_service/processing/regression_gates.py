@@ -26,7 +26,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ground_service.processing.regression_figures import (
     Figure,
@@ -55,8 +54,6 @@ from ground_service.processing.regression_statistics import (
     student_upper_tail,
     unseen_changes,
 )
-
-FloatArray = NDArray[np.float64]
 
 PASS, FAIL, INCONCLUSIVE = "pass", "fail", "inconclusive"
 

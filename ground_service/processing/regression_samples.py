@@ -6,22 +6,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ground_service.processing.alignment import error_of_places_rtn_m, reference_states
 from ground_service.processing.consistency import squared_normalised_errors
 from ground_service.processing.recall import SCORED_CLASSES, expected_craters, match_detections
 from ground_service.processing.samples import DetectionSamples, NavigationSamples
 from ground_service.processing.viewing import Viewing
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 WRONG_FIX_SIGMAS = 6.0
 WRONG_FIX_M = 500.0

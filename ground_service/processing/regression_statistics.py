@@ -17,10 +17,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from lunar.arrays import FloatArray, IntArray
 
 BLOCKS_PER_CORRELATION_TIME = 2.0
 """Length of a bootstrap block in autocorrelation times: shorter blocks lose correlation, longer ones lose blocks."""

@@ -11,12 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-IntArray = NDArray[np.int64]
+from lunar.arrays import IntArray
+from tmtc.cuc import TICKS_PER_SECOND
 
 COUNT_MODULUS = 1 << 14
-TICKS_PER_SECOND = 1 << 16
 
 REORDER_TICKS = TICKS_PER_SECOND
 """Counts may fall back within this time without meaning a restart: packets made in the same instant are stored in

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ground_service.processing.alignment import (
     ReferenceStates,
@@ -14,13 +13,12 @@ from ground_service.processing.consistency import nees
 from ground_service.processing.drift import drift_by_length, navigation_statistics
 from ground_service.processing.samples import NavigationSamples
 from ground_service.processing.smoother import CommandedBurn, FilterStates, SmootherModel, smooth
+from lunar.arrays import FloatArray
 from lunar.frames import Orientation, mcmf_from_spherical
 from lunar.gravity import GravityField
 from lunar.gravity_omission import omission_psd_m2_s3
 from lunar.propagation import ForceModel
 from reports.values import NavigationSeries
-
-FloatArray = NDArray[np.float64]
 
 SMOOTHED = "smoothed"
 SMOOTHER_DEGREE = 100

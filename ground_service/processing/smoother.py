@@ -13,13 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.frames import rtn_from_inertial
 from lunar.propagation import ForceModel, propagate_with_stm
 from lunar.timescales import tdb_s_from_utc_ns
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 SIZE = 9
 _POSITION, _VELOCITY, _ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)

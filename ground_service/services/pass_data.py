@@ -37,6 +37,7 @@ from ground_service.services.pass_span import PassSpan
 from ground_service.store import repository
 from ground_service.store.codec import unpack_detections, unpack_filter_states, unpack_identifications
 from ground_service.store.files import FileArchive
+from lunar.arrays import IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.datafolder import DataFolder
@@ -50,8 +51,6 @@ from reports.values import (
 )
 from tmtc.dictionary import APID_DETECTIONS, APID_PERFORMANCE, DICTIONARY
 from tmtc.stream import cut_packets
-
-IntArray = NDArray[np.int64]
 
 PASS_MARGIN_NS = 60_000_000_000
 """Samples this far outside a window still belong to it: housekeeping before the first and after the last image."""

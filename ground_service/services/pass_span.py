@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ground_service.processing.correlation import TimeCorrelation, utc_ns_of_ticks
-
-IntArray = NDArray[np.int64]
+from lunar.arrays import IntArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sqlalchemy import Connection, func, select, update
 
 from ground_service.clock import utc_now_ns
@@ -28,6 +27,7 @@ from ground_service.services.plan_schemas import time_of
 from ground_service.services.users import audit
 from ground_service.services.window_progress import advance_windows
 from ground_service.store import repository
+from lunar.arrays import IntArray
 from lunar.constants import SPEED_OF_LIGHT_M_S
 from lunar.ephemeris import Ephemeris, load_ephemeris
 from lunar.errors import LunarError
@@ -35,8 +35,6 @@ from lunar.third_bodies import earth_position_icrf_m
 from lunar.timescales import tai_ns_from_utc_ns, tdb_s_from_utc_ns
 from lunar.visibility import link
 from tmtc.dictionary import APID_TIME_REPORT
-
-IntArray = NDArray[np.int64]
 
 AUTOMATIC = "time reports, light time"
 """Method of correlations that are fitted again by themselves."""

@@ -20,6 +20,7 @@ from ground_service.services.archive_import import ATTITUDE_FILE, archived_missi
 from ground_service.services.attitudes import load_attitudes, no_attitudes
 from ground_service.services.pass_data import camera_of, orientation_of
 from ground_service.services.regression_archives import PassArchive, frame_inputs
+from lunar.arrays import IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.datafolder import DataFolder
@@ -30,8 +31,6 @@ from tmtc.definitions import parse_dictionary
 from tmtc.downlink import DownlinkDecode, decode
 from tmtc.errors import TmtcError
 from tmtc.schema import Dictionary, Table
-
-IntArray = NDArray[np.int64]
 
 FRAME_TIMES = "frame_times.csv"
 LATENCY_LEVEL = 0.25

@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from sqlalchemy import Connection, bindparam, func, select
 
 from ground_service.store.bulk import insert_columns
 from ground_service.store.codec import pack_detections, pack_filter_states, pack_identifications
 from ground_service.store.models import SAMPLE_TABLES, Packet, Vehicle
 from ground_service.store.rollups import add_to_rollups
-
-IntArray = NDArray[np.int64]
+from lunar.arrays import IntArray
 
 RANGE_GAP_TICKS = 600 << 16
 """Stored packets are looked up by ranges of on-board time; a silence of ten minutes splits a range, so that a batch

@@ -21,9 +21,9 @@ from ground_service.errors import InvalidInput, NotFound
 from ground_service.store import models
 from ground_service.store.files import StoredFile
 from ground_service.text import require_line
+from lunar.arrays import IntArray
 
 Row = dict[str, Any]
-IntArray = NDArray[np.int64]
 
 SPACECRAFT_ID_MAX = 1023
 """Largest spacecraft id: a transfer frame has ten bits for it (CCSDS 132.0-B)."""

@@ -13,15 +13,12 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sqlalchemy import Connection, LargeBinary, and_, bindparam, delete, func, or_, select
 
 from ground_service.store.bulk import insert_columns
 from ground_service.store.counters import hold
 from ground_service.store.models import SAMPLE_TABLES, Rollup
-
-IntArray = NDArray[np.int64]
-FloatArray = NDArray[np.float64]
+from lunar.arrays import FloatArray, IntArray
 
 STATE_VALUES = (
     "latitude_deg", "longitude_deg", "altitude_m", "velocity_x_m_s", "velocity_y_m_s", "velocity_z_m_s",

@@ -50,7 +50,6 @@ from payload_emulator.flight.sighting import (
     turned_by,
 )
 from payload_emulator.flight.tables import (
-    TICKS_PER_SECOND,
     BurnTable,
     CatalogueTable,
     GravityTable,
@@ -58,6 +57,7 @@ from payload_emulator.flight.tables import (
     OrientationTable,
     no_burns,
 )
+from tmtc.cuc import TICKS_PER_SECOND
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -16,7 +16,8 @@ from lunar.gravity import GravityField, packed, packed_gradient
 from lunar.gravity_omission import FAR_SIDE_COSINE, REFERENCE_ALTITUDE_M, field_noise
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns, utc_ns_from_ticks
-from payload_emulator.flight.tables import TICKS_PER_SECOND, BurnTable, GravityTable, OrientationTable
+from payload_emulator.flight.tables import BurnTable, GravityTable, OrientationTable
+from tmtc.cuc import TICKS_PER_SECOND
 
 Float = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from payload_emulator.flight.parameters import ParameterStore
 from payload_emulator.flight.ports import SENSORS
 from payload_emulator.flight.preprocess import ImageQuality
-from payload_emulator.flight.tables import TICKS_PER_SECOND
 from payload_emulator.flight.telemetry import Telemetry
+from tmtc.cuc import TICKS_PER_SECOND
 
 Float = NDArray[np.float64]
 

@@ -26,7 +26,8 @@ from lunar.constants import MOON_RADIUS_M
 from lunar.frames import enu_from_mcmf
 from payload_emulator.flight.detections import Detections
 from payload_emulator.flight.sighting import LandmarkMap, Sighting, landmark_map
-from payload_emulator.flight.tables import TICKS_PER_SECOND, CatalogueTable
+from payload_emulator.flight.tables import CatalogueTable
+from tmtc.cuc import TICKS_PER_SECOND
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lunar.camera import PinholeCamera
 from payload_emulator.flight.dynamics import OrbitModel
 from payload_emulator.flight.sighting import LandmarkMap, Pose, Sighting, look
-from payload_emulator.flight.tables import TICKS_PER_SECOND
+from tmtc.cuc import TICKS_PER_SECOND
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -35,7 +35,8 @@ from lunar.constants import MOON_RADIUS_M
 from payload_emulator.flight.detections import Detections
 from payload_emulator.flight.matcher import GroundFeatures, Match, MatcherParameters, match_frames
 from payload_emulator.flight.outcomes import Mode, Outcome, ResetTrigger
-from payload_emulator.flight.tables import TICKS_PER_SECOND, AnchorTable
+from payload_emulator.flight.tables import AnchorTable
+from tmtc.cuc import TICKS_PER_SECOND
 
 Float = NDArray[np.float64]
 

@@ -30,9 +30,8 @@ from payload_emulator.flight.reports import send_large_data, send_structure
 from payload_emulator.flight.services import check, execute, name_of
 from payload_emulator.flight.settings import Recovery, Settings
 from payload_emulator.flight.store import PacketStore, StoreClass
-from payload_emulator.flight.tables import TICKS_PER_SECOND
 from payload_emulator.flight.telemetry import Telemetry
-from tmtc.cuc import TICKS_LIMIT
+from tmtc.cuc import TICKS_LIMIT, TICKS_PER_SECOND
 from tmtc.pus import ACK_ACCEPTANCE, ACK_COMPLETION, ACK_START
 
 __all__ = ["FlightParameters", "FlightTables", "Payload", "PayloadMode"]

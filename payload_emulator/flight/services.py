@@ -18,7 +18,7 @@ from payload_emulator.flight.ports import ResetCause
 from payload_emulator.flight.products import map_octets
 from payload_emulator.flight.reports import send_large_data, send_structure
 from payload_emulator.flight.schedule import Activity
-from payload_emulator.flight.tables import TICKS_PER_SECOND
+from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 
 Values = Mapping[str, Any]

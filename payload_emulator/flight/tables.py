@@ -22,13 +22,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import TableError
+from tmtc.cuc import TICKS_PER_SECOND
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 MAGIC = b"LINNATBL"
 VERSION = 1
-TICKS_PER_SECOND = 65_536
 _HEADER = struct.Struct(">8s2sHII")
 
 # Nodes of the Lagrange interpolation of smooth tables: with 60 s between nodes of a 111 min orbit the

@@ -6,14 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray
 from lunar.frames import matrix_from_quaternion, rtn_from_inertial
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import tdb_s_from_utc_ns
 from payload_emulator.sim.truth import Truth
-
-FloatArray = NDArray[np.float64]
 
 _NS = 1_000_000_000
 # The flown orbit is known this long beyond what anyone asks for.

@@ -15,11 +15,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from tmtc.cuc import TICKS_PER_SECOND
+
 Float = NDArray[np.float64]
 Memory = NDArray[np.uint8]
 
 UNLIMITED = 1 << 62
-TICKS_PER_SECOND = 65_536
 _CAMERA, _ACCELERATOR = 1, 2
 
 

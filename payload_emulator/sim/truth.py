@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import (
     Orientation,
@@ -23,9 +24,6 @@ from lunar.frames import (
 )
 from lunar.timescales import format_utc, tdb_s_from_utc_ns
 from payload_emulator.errors import ScenarioError
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _SEARCH_STEP_NS = 20_000_000_000
 _POLAR_NORTH_LIMIT_RAD = np.radians(89.9)

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray
 from lunar.catalogue import size_class
 from payload_emulator.training.dataset import (
     CATEGORIES,
@@ -26,8 +26,6 @@ from payload_emulator.training.dataset import (
 )
 from payload_emulator.training.recipe import SPLITS, Recipe
 from payload_emulator.training.targets import Tier
-
-FloatArray = NDArray[np.float64]
 
 FIRST_ID = 1
 """COCO readers take 0 for "no annotation" and for the background, so images, categories and annotations begin at 1."""

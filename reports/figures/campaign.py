@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from reports.arrays import FloatArray
 from reports.figures.canvas import Canvas, TimeScale, log_length_axis, spread, time_axis
 from reports.figures.theme import color
 from reports.published import TABLE_II
-from reports.values import CampaignPass, FloatArray
+from reports.values import CampaignPass
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reports.arrays import FloatArray
 from reports.figures.theme import color
 from reports.text import month_name, utc_fields
-from reports.values import ByteArray, FloatArray, TimeSpan
+from reports.values import ByteArray, TimeSpan
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from reports.arrays import FloatArray
 from reports.figures.canvas import Canvas, TimeScale, log_length_axis, shade_arcs, thinned, time_axis
 from reports.figures.theme import color
 from reports.statistics import (
@@ -19,7 +20,7 @@ from reports.statistics import (
     round_edges,
     running_mean,
 )
-from reports.values import FloatArray, NavigationSeries, TimeSpan, TrackSeries
+from reports.values import NavigationSeries, TimeSpan, TrackSeries
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

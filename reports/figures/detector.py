@@ -7,17 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from reports.arrays import FloatArray
 from reports.figures.canvas import Canvas, spread
 from reports.figures.theme import color
 from reports.published import TABLE_II
-from reports.values import (
-    BinScore,
-    CalibrationBin,
-    ClassScore,
-    FloatArray,
-    PrecisionRecallCurve,
-    ResidualSeries,
-)
+from reports.values import BinScore, CalibrationBin, ClassScore, PrecisionRecallCurve, ResidualSeries
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

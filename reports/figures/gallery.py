@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from reports.arrays import BoolArray, FloatArray
 from reports.figures.canvas import Canvas
 from reports.figures.theme import color
 from reports.text import utc_text
-from reports.values import BoolArray, FloatArray, GalleryFrame
+from reports.values import GalleryFrame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from reports.arrays import FloatArray
 from reports.figures.canvas import (
     Canvas,
     TimeScale,
@@ -27,7 +28,7 @@ from reports.statistics import (
     reference_at,
 )
 from reports.text import length_text
-from reports.values import FloatArray, NavigationSeries, TimeSpan, TrackSeries
+from reports.values import NavigationSeries, TimeSpan, TrackSeries
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from reports.arrays import FloatArray
 from reports.figures.canvas import Canvas, TimeScale, shade_arcs, time_axis
 from reports.figures.theme import OUTCOMES, color
 from reports.statistics import runs
 from reports.text import percent_text
-from reports.values import FloatArray, NavigationSeries, TimeSpan
+from reports.values import NavigationSeries, TimeSpan
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,18 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from reports.arrays import BoolArray, FloatArray
 from reports.figures.canvas import Canvas
 from reports.figures.theme import color
 from reports.statistics import inside
-from reports.values import (
-    BoolArray,
-    CraterMap,
-    FloatArray,
-    NavigationSeries,
-    TerrainMap,
-    TimeSpan,
-    TrackSeries,
-)
+from reports.values import CraterMap, NavigationSeries, TerrainMap, TimeSpan, TrackSeries
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,13 +6,14 @@ import math
 
 import numpy as np
 
+from reports.arrays import FloatArray, IntArray
 from reports.document import Block, Cell, Column, Heading, Picture, Table
 from reports.figures import consistency, navigation
 from reports.sections.common import PassView, role_of, slug
 from reports.sections.summary import error_picture
 from reports.statistics import chi2_quantile, containment, error_3d_m, inside, quantiles
 from reports.text import NOT_A_VALUE, count_text, number_text
-from reports.values import FloatArray, IntArray, NavigationSeries
+from reports.values import NavigationSeries
 
 
 def errors(view: PassView) -> list[Block]:

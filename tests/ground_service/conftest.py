@@ -26,6 +26,7 @@ import pytest
 from sqlalchemy import create_engine, text
 
 from ground_service.services.ground import Ground, open_ground
+from ground_service.store.database import prepare_database
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue, make_catalogue, save_catalogue, size_class
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
@@ -295,6 +296,17 @@ def _housekeeping(k: int) -> dict[str, Any]:
 def synthetic_pass(make_pass: Callable[..., SyntheticPass]) -> SyntheticPass:
     """The pass that most tests look at; not to be altered."""
     return make_pass()
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Ground]:
+    """An empty service on each database."""
+    url = None
+    if request.param == "postgresql":
+        url = request.getfixturevalue("new_postgres_database")()
+        prepare_database(url, upgrade=True).engine.dispose()
+    with open_ground(tmp_path / "home", database_url=url) as ground:
+        yield ground
 
 
 @pytest.fixture

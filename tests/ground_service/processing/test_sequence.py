@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ground_service.processing.sequence import COUNT_MODULUS, TICKS_PER_SECOND, account_sequence
+from ground_service.processing.sequence import COUNT_MODULUS, account_sequence
+from tmtc.cuc import TICKS_PER_SECOND
 
 SECOND = TICKS_PER_SECOND
 

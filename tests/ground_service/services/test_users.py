@@ -1,7 +1,7 @@
 """Users and tokens: states that are compared and set, and refusals that hold at once."""
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -26,20 +26,8 @@ from ground_service.services.users import (
     token_valid,
 )
 from ground_service.store import repository
-from ground_service.store.database import prepare_database
 
 SECRET = "a-token-of-a-deployment-0123456789"
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Ground]:
-    """An empty service on each database."""
-    url = None
-    if request.param == "postgresql":
-        url = request.getfixturevalue("new_postgres_database")()
-        prepare_database(url, upgrade=True).engine.dispose()
-    with open_ground(tmp_path / "home", database_url=url) as ground:
-        yield ground
 
 
 def actions(ground: Ground) -> list[tuple[str, str, str]]:

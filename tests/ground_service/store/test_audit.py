@@ -5,7 +5,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +19,6 @@ from ground_service.store.database import Database, prepare_database
 from ground_service.store.models import AuditEntry, AuditHead
 
 PROCESSES, EACH = 4, 25
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
-    if request.param == "sqlite":
-        url = f"sqlite:///{tmp_path / 'linna.db'}"
-    else:
-        url = request.getfixturevalue("new_postgres_database")()
-    opened = prepare_database(url, upgrade=True)
-    yield opened
-    opened.engine.dispose()
 
 
 def add(database: Database, *actions: str, detail: dict[str, Any] | None = None) -> None:

@@ -1,7 +1,6 @@
 """Edges that wait: every look-up is answered from an index, however many edges there are."""
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,24 +8,19 @@ from sqlalchemy import event, text
 
 from ground_service.link.edges import CLOSER, MIDDLE, OPENER, UNKNOWN, Edge
 from ground_service.store import edges
-from ground_service.store.database import Database, prepare_database
+from ground_service.store.database import Database
 
 COUNT = 4_000
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
-    if request.param == "sqlite":
-        url = f"sqlite:///{tmp_path / 'linna.db'}"
-    else:
-        url = request.getfixturevalue("new_postgres_database")()
-    opened = prepare_database(url, upgrade=True)
-    with opened.writing() as connection:
+@pytest.fixture
+def database(database: Database) -> Database:
+    """A database with waiting edges."""
+    with database.writing() as connection:
         edges.add_edges(connection, "d", list(many()), "0" * 64)
-    with opened.writing() as connection:
+    with database.writing() as connection:
         connection.execute(text("ANALYZE"))
-    yield opened
-    opened.engine.dispose()
+    return database
 
 
 def many() -> Iterator[Edge]:

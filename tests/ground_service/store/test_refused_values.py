@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +11,6 @@ from ground_service.errors import DatabaseBusy, InvalidInput, public_text
 from ground_service.services.ground import Ground, open_ground
 from ground_service.store import repository
 from ground_service.store.database import database_error, prepare_database
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Ground]:
-    """The service on either database."""
-    url = None
-    if request.param == "postgresql":
-        url = request.getfixturevalue("new_postgres_database")()
-        prepare_database(url, upgrade=True).engine.dispose()
-    with open_ground(tmp_path / "home", database_url=url) as ground:
-        yield ground
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import sqlite3
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,17 +28,6 @@ REPORT = {
     "json_sha256": "j",
     "summary": {"b": [0.1, None], "ü": "x"},
 }
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
-    if request.param == "sqlite":
-        url = f"sqlite:///{tmp_path / 'linna.db'}"
-    else:
-        url = request.getfixturevalue("new_postgres_database")()
-    opened = prepare_database(url, upgrade=True)
-    yield opened
-    opened.engine.dispose()
 
 
 def strays(database: Database) -> list[StrayRow]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import threading
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -12,22 +11,10 @@ import pytest
 
 import ground_service
 from ground_service.errors import NotFound, StateConflict
-from ground_service.services.ground import Ground, open_ground
+from ground_service.services.ground import Ground
 from ground_service.store import repository
 from ground_service.store.counters import hold, next_telecommand
-from ground_service.store.database import prepare_database
 from ground_service.store.states import JOB, TELECOMMAND, change_if, move, move_all
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Ground]:
-    """The service on either database."""
-    url = None
-    if request.param == "postgresql":
-        url = request.getfixturevalue("new_postgres_database")()
-        prepare_database(url, upgrade=True).engine.dispose()
-    with open_ground(tmp_path / "home", database_url=url) as ground:
-        yield ground
 
 
 def add_command(ground: Ground, state: str = "queued") -> int:

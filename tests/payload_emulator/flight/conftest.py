@@ -14,6 +14,7 @@ from payload_emulator.flight.detections import Detections
 from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload, PayloadMode
 from payload_emulator.flight.preprocess import ImageQuality
 from payload_emulator.spacecraft import new_board
+from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 
 Float = NDArray[np.float64]
@@ -21,7 +22,6 @@ RADIUS_M = 1_737_400.0
 GM_M3_S2 = 4.902800066e12
 MOON_RATE_RAD_S = 2.661699e-6
 EPOCH_TICKS = 61_000_000_000_000
-TICKS_PER_SECOND = 65_536
 # 120 degrees over 512 pixels, written out here on purpose.
 FOCAL_PX = 256.0 / np.tan(np.radians(60.0))
 CENTRE_PX = 255.5

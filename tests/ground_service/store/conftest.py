@@ -1,0 +1,17 @@
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from ground_service.store.database import Database, prepare_database
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
+    if request.param == "sqlite":
+        url = f"sqlite:///{tmp_path / 'linna.db'}"
+    else:
+        url = request.getfixturevalue("new_postgres_database")()
+    opened = prepare_database(url, upgrade=True)
+    yield opened
+    opened.engine.dispose()

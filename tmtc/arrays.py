@@ -1,0 +1,8 @@
+"""Type aliases of NumPy arrays."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+OctetArray = NDArray[np.uint8]
