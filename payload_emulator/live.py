@@ -116,13 +116,13 @@ _TELECOMMAND_START = 0b00011
 
 @dataclass(slots=True, eq=False)
 class Flight(Generic[Signal]):
-    """Signals on their way, given to `arrive` when it is over; what started later arrives later."""
+    """Delayed signals, passed to `arrive` after the propagation time in the order of transmission."""
 
     arrive: Callable[[Signal], None]
     _on_the_way: deque[tuple[float, Signal]] = field(default_factory=deque)
 
     def start(self, signal: Signal, seconds: float) -> None:
-        """Send a signal; without a way it is there at once."""
+        """Send a signal; without a propagation time it arrives immediately."""
         due = time.monotonic() + seconds
         if self._on_the_way:
             due = max(due, self._on_the_way[-1][0])
@@ -143,19 +143,19 @@ class Flight(Generic[Signal]):
 
 @dataclass(slots=True, eq=False)
 class LivePayload:
-    """A scenario flown live.
+    """Scenario in live operation.
 
     Attributes
     ----------
     rate
-        Simulated seconds in a second of the wall clock; 0: as quick as it goes.
+        Simulated seconds per second of the wall clock; 0: as fast as possible.
     paused
-        Whether time stands still until `run` or `step`.
+        Whether simulated time is stopped until `run` or `step`.
     catalogue
-        Craters with the heights of their rims, for the rings of the console; without it the terrain's catalogue.
+        Craters with rim heights, for the rings of the console; None: the catalogue of the terrain.
     has_operator
-        Whether the scenario's own operator commands, too; without it, telecommands come over TCP only, whose counts its
-        own would collide with.
+        Whether the operator of the scenario also sends telecommands. Otherwise, telecommands come only over TCP; both
+        together would use conflicting sequence counts.
     """
 
     world: World
@@ -193,7 +193,7 @@ class LivePayload:
         self._servers = {}
         try:
             self._open("telemetry", self.telemetry_port, lambda number, octets: None)
-            # The end of a connection takes as long as what was sent on it.
+            # The end of a connection is delayed like the data sent on it.
             self._open(
                 "telecommand",
                 self.telecommand_port,
@@ -312,11 +312,11 @@ class LivePayload:
             server.serve(client, events)
 
     def _take_telecommands(self, octets: bytes, connection: int = 0) -> None:
-        """Send the octets of a connection up; none mean that it has ended."""
+        """Send the octets of a connection to the spacecraft; no octets mean that the connection has ended."""
         self._upwards.start((connection, octets), self._way_s)
 
     def _arrive(self, signal: tuple[int, bytes]) -> None:
-        """Octets reach the spacecraft's antenna; a packet that a lost connection broke off ends with it."""
+        """Receive octets at the spacecraft; an incomplete packet is discarded at the end of its connection."""
         connection, octets = signal
         if not octets:
             self._uplinks.pop(connection, None)
@@ -468,7 +468,7 @@ def snapshot(
 
 
 def _catalogue(world: World, flown: Flown, craters: CraterCatalogue | None) -> list[dict[str, float]]:
-    """Return the largest craters in the picture: of the given catalogue, else of that of the terrain."""
+    """Return the largest craters in the image, from the given catalogue or that of the terrain."""
     assert flown.exposure is not None
     craters = world.terrain.catalogue if craters is None else craters
     index, uv, diameter_px = craters_in_view(world, flown.exposure, _SMALLEST_SHOWN_PX, craters)

@@ -46,12 +46,12 @@ Progress = Callable[[float], None]
 
 
 DEFAULT_LINKS = (Link(LinkSettings()), Link(LinkSettings(checksum=False)))
-"""Links that are tried where nothing is known of a spacecraft and a piece is too small to tell."""
+"""Links that are tried for an unknown spacecraft if a piece is too small to determine its link."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a file stands in a stream of octets, by what its sender says."""
+    """Position of a file in a stream of octets, as stated by its sender."""
 
     stream: str
     offset: int
@@ -59,13 +59,13 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class IngestResult:
-    """What one ingest found in its file, and what of it was new.
+    """Content of an ingested file, and the new part of it.
 
-    `packets_joined` came about only together with files that were ingested before, of `frames_joined` frames among
-    others. `octets_pending` cannot be used yet: they wait for the octets before or behind them. `first_ticks` and
-    `last_ticks` are the earliest and the latest on-board time of the whole packets in the file, None without any.
-    `vehicle_ids` are the vehicles whose packets it holds. `uplink` holds, for each spacecraft and telecommand channel
-    that the frames tell of, what `tmtc.clcw.UplinkSeen` says.
+    `packets_joined` is the number of packets completed with earlier files, `frames_joined` that of frames.
+    `octets_pending` cannot be used yet: they wait for the octets before or after them. `first_ticks` and
+    `last_ticks` are the earliest and the latest on-board time of the complete packets in the file, None without any.
+    `vehicle_ids` are the vehicles whose packets it contains. `uplink` contains a `tmtc.clcw.UplinkSeen` for each
+    spacecraft and telecommand channel reported in the frames.
     """
 
     ingest_id: int
@@ -99,22 +99,22 @@ def ingest_file(
     name: str | None = None,
     place: Place | None = None,
 ) -> IngestResult:
-    """Archive a downlink file and store what is in it.
+    """Archive a downlink file and store its content.
 
     Parameters
     ----------
     spacecraft_id
-        Whose the file is: frames of other spacecraft are left out. None takes the ids from the frames; bare packets
-        carry none, so they need it.
+        Spacecraft of the file; frames of other spacecraft are ignored. None: the ids are those of the frames. Required
+        for bare packets, which have no id.
     instance
-        Which instance of the spacecraft the telemetry belongs to.
+        Instance of the spacecraft to which the telemetry belongs.
     place
-        Where the file stands in its stream; without, by the order of arrival and by content.
+        Position of the file in its stream; None: joined by order of arrival and by content.
 
     Raises
     ------
     InvalidInput
-        If the file cannot be read or holds nothing of a downlink.
+        If the file is unreadable or contains no part of a downlink.
     """
     if not path.is_file():
         raise InvalidInput(str(path), "", "a downlink file", "a folder" if path.is_dir() else "nothing there")
@@ -157,7 +157,7 @@ def add_ingest(
     place: Place | None = None,
     state: str = "queued",
 ) -> int:
-    """Enter an archived file to be ingested, within the caller's transaction; the id of the ingest."""
+    """Add an ingest of an archived file, within the caller's transaction; return its id."""
     now = utc_now_ns()
     repository.register_file(connection, stored, "downlink", name, now)
     ingest_id = int(
@@ -194,9 +194,9 @@ def run_ingest(
     *,
     progress: Progress | None = None,
 ) -> IngestResult:
-    """Do what was entered with `add_ingest`; running it again is harmless.
+    """Run an ingest that was added with `add_ingest`; a repetition changes nothing.
 
-    `progress` is told the share of the file that is stored, several times where it is long.
+    `progress` is called with the stored share of the file, several times for a long file.
     """
     with ground.database.writing() as connection:
         record = repository.get(connection, repository.INGESTS, ingest_id, "ingest")
@@ -247,7 +247,7 @@ def _read_piece(
     again: bool,
     progress: Progress | None,
 ) -> IngestResult:
-    """Store what is in a piece and what comes about together with others, and read those that wait for its link."""
+    """Store the content of a piece and the units joined with others, and read pieces that wait for its link."""
     with ground.database.reading() as connection:
         piece = edges.piece_of(connection, ingest_id)
     reading = _Reading(ground, piece, progress)
@@ -269,14 +269,14 @@ def _read_piece(
 
 @dataclass(frozen=True, slots=True)
 class _Batch:
-    """Packets of a downlink, and what was cut off in its channels with them."""
+    """Packets of a downlink, and the fragments in its channels."""
 
     packets: PacketBatch
     channel_edges: list[ChannelEdge]
 
 
 class _Reading:
-    """The reading of one piece."""
+    """Reading of one piece."""
 
     def __init__(
         self,
@@ -296,7 +296,7 @@ class _Reading:
         self.reader = DownlinkReader(piece.spacecraft_id)
 
     def read(self) -> list[edges.Piece]:
-        """Read and join the piece; the pieces that can be read now that its link is known."""
+        """Read and join the piece; return the pieces that can be read now because its link is known."""
         while True:
             with self.ground.database.reading() as connection:
                 known = edges.known_links(connection, self.piece.scope)
@@ -342,7 +342,7 @@ class _Reading:
             ]
 
     def _store_batches(self) -> _Batch | None:
-        """Store all batches of the file but the last one, which is returned."""
+        """Store all batches of the file except the last one, which is returned."""
         ground, total = self.ground, max(self.piece.octets, 1)
         path = ground.files.path(self.piece.file_sha256)
         last: _Batch | None = None
@@ -373,7 +373,7 @@ class _Reading:
             self.ticks = [min([*self.ticks, int(timed.min())]), max([*self.ticks, int(timed.max())])]
 
     def _link_by_place(self, known: list[Link]) -> Link | None:
-        """The link that a piece too small to show it came by, told from the octets around it."""
+        """Return the link of a piece that is too small to determine it, from the adjacent octets."""
         if known:
             return None
         with self.ground.database.reading() as connection:
@@ -389,12 +389,12 @@ class _Reading:
                 pass
         except TmtcError:
             return None
-        link = probe.link  # octets that only happened to come one after another must not make a link
+        link = probe.link  # octets that are adjacent only by order of arrival must not determine a link
         certain = link is None or link.settings is None or is_checked(link.settings)
         return link if certain else None
 
     def _keep_fragment(self, connection: Connection, link: Link | None, known: list[Link]) -> None:
-        """Keep a piece in which nothing whole was found, by each link that it may have come by."""
+        """Store a piece without a complete unit as fragments, for each possible link."""
         links = [link] if link is not None else known or list(DEFAULT_LINKS[:1])
         if not known and self.spacecraft_id is not None and BARE not in links:
             links = [*links, BARE]
@@ -405,12 +405,12 @@ class _Reading:
             self.joiner.keep_edges(connection, one, fragment_edges(octets, one.settings) if octets else [])
 
     def _refuse_noise(self) -> None:
-        """Refuse what cannot be a fragment of anything.
+        """Refuse a piece that cannot be a fragment of a unit.
 
         Raises
         ------
         InvalidInput
-            If the piece is longer than any CADU or packet without holding one.
+            If the piece is longer than any CADU or packet but contains none.
         """
         limit = 2 * CADU_MAX_OCTETS if self.spacecraft_id is None else PACKET_MAX_LENGTH
         if self.piece.octets > limit:
@@ -418,11 +418,11 @@ class _Reading:
                 _name(self.ground, self.piece.file_sha256),
                 "",
                 "a stream of CADUs or of space packets",
-                f"{self.piece.octets} octets without a single good packet",
+                f"{self.piece.octets} octets without a valid packet",
             )
 
     def result(self) -> IngestResult:
-        """What the reading found."""
+        """Return the result of the reading."""
         found, joined = self.reader.accounting, self.joiner.joined
         with self.ground.database.reading() as connection:
             pending = edges.octets_pending(connection, self.piece.file_sha256)

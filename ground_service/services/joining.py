@@ -1,14 +1,15 @@
-"""Joining of what was cut apart between pieces of a downlink, at any octet, in whatever order the pieces come.
+"""Joining of units that were cut between pieces of a downlink, at any octet and in any order of the pieces.
 
-A CADU that stands in several pieces is put together from its neighbours by place (what the sender said of the position,
-or the order of arrival), else by content: a beginning and an end whose lengths make up one CADU and whose frame counts
-follow. A packet that stands in several runs of frames is put together by the counts of its channel. The codes and
-checksums of the CADU or packet decide in every case; octets that fit nowhere yet wait.
+A CADU in several pieces is joined by position (stated by the sender, or the order of arrival), otherwise by content: a
+start and an end whose lengths add up to one CADU and whose frame counts are consecutive. A packet in several runs of
+frames is joined by the counts of its channel. The codes and checksums of the CADU or packet decide in every case;
+octets that do not match yet wait.
 
-Edges are committed before their neighbours are looked for. Of two pieces that are ingested at once, at least the later
-therefore sees the edges of both, and no lock is held while anything is decoded. What joining gives is stored in at most
-two transactions: one for CADUs or bare packets, one for the packets of channels. The octets of a CADU count as used
-from the second one on, so that an ingest that is cut off in between joins the CADU again and finds the same packets.
+Edges are committed before adjacent edges are searched. Therefore, of two pieces that are ingested at the same time, at
+least the later one sees the edges of both, and no lock is held during decoding. The result of joining is stored in at
+most two transactions: one for CADUs or bare packets, one for the packets of channels. The octets of a CADU count as
+used from the second one on, so that an ingest that is cut off in between joins the CADU again and finds the same
+packets.
 """
 
 from __future__ import annotations
@@ -52,26 +53,27 @@ from tmtc.stream import cut_packets
 OctetArray = NDArray[np.uint8]
 
 MIDDLES_LIMIT = 512
-"""Pieces without any place that are tried, the newest first."""
+"""Largest number of pieces without a position that are tried, newest first."""
 
 MIDDLES_IN_A_CADU = 7
 ARRANGEMENTS_LIMIT = 5_040
-"""How many pieces without a place one CADU may have, and how many arrangements of the right length are tried."""
+"""Limits of the pieces without a position in one CADU, and of the arrangements of the right length that are tried."""
 
 ANY_COUNT_LIMIT = 16
-"""Edges of the right length and another frame count that are tried, the newest first: counts are told from the frames
-around a CADU, and are wrong where these are of another spacecraft."""
+"""Largest number of edges of the right length and another frame count that are tried, newest first.
+
+Counts are derived from the frames around a CADU, and are wrong if these are of another spacecraft."""
 
 REPAIRS_LIMIT = 4
-"""Arrangements that are repaired when none is free of errors."""
+"""Largest number of arrangements that are corrected if none is free of errors."""
 
 PATHS_LIMIT = 256
-"""Ways through middles that are followed for one packet."""
+"""Largest number of sequences of middles that are tried for one packet."""
 
 
 @dataclass(slots=True)
 class Joined:
-    """What joining gave."""
+    """Result of joining."""
 
     packets: int = 0
     samples: int = 0
@@ -80,7 +82,7 @@ class Joined:
 
 @dataclass(slots=True)
 class _Found:
-    """What joining has found and not stored yet: packets by spacecraft, edges, and the octets that are used by it."""
+    """Results that are not stored yet: packets by spacecraft, edges, and the octets used."""
 
     packets: dict[int, list[bytes]] = field(default_factory=dict)
     channel_edges: list[ChannelEdge] = field(default_factory=list)
@@ -92,7 +94,7 @@ class _Found:
         return bool(self.packets or self.channel_edges or self.openers or self.used or self.parts)
 
     def uses(self, edge: StoredEdge) -> bool:
-        """Whether an edge is used up."""
+        """Return whether an edge is used."""
         if edge.id in self.used:
             return not store.is_reusable(edge.edge)
         return not store.is_reusable(edge.edge) and any(
@@ -107,9 +109,9 @@ class _Found:
 
 @dataclass(slots=True)
 class Joiner:
-    """Joins one piece with all others of its scope.
+    """Joiner of one piece with all others of its scope.
 
-    `vehicles` are the ids of vehicles by spacecraft, added to as spacecraft are met.
+    `vehicles` maps spacecraft to vehicle ids; new spacecraft are added.
     """
 
     ground: Ground
@@ -122,7 +124,7 @@ class Joiner:
     _joined_cadus: _Found = field(default_factory=_Found)
 
     def vehicle(self, connection: repository.Connection, spacecraft: int) -> int:
-        """Return the id of the vehicle of a spacecraft, made when it is new."""
+        """Return the vehicle id of a spacecraft; create it if it is new."""
         if spacecraft not in self.vehicles:
             vehicle = repository.vehicle_id(connection, spacecraft, self.piece.scope)
             note_dictionary(connection, vehicle)
@@ -130,7 +132,7 @@ class Joiner:
         return self.vehicles[spacecraft]
 
     def keep_channel_edges(self, connection: repository.Connection, edges: Sequence[ChannelEdge]) -> None:
-        """Keep what was cut off in channels, within the caller's transaction, to be joined by `join`."""
+        """Store the fragments in channels for `join`, within the caller's transaction."""
         by_domain: dict[str, list[Edge]] = {}
         for one in edges:
             spacecraft, channel, start, stop = one.channel
@@ -140,7 +142,7 @@ class Joiner:
             self._channels += [(domain, identity) for identity in store.add_edges(connection, domain, mine)]
 
     def keep_edges(self, connection: repository.Connection, link: Link, edges: Sequence[Edge]) -> None:
-        """Keep the edges of the piece, which came by `link`, within the caller's transaction."""
+        """Store the edges of the piece, whose link is `link`, within the caller's transaction."""
         domain = raw_domain(self.piece, link)
         if self.piece.stream:
             edges = [replace(one, role=PLACED) if one.role == MIDDLE else one for one in edges]
@@ -148,7 +150,7 @@ class Joiner:
         self._raw.append((link, mine))
 
     def join(self) -> None:
-        """Join the edges that were kept and committed, and all that comes about by it."""
+        """Join the stored and committed edges, and the edges that result from joining."""
         for link, identities in self._raw:
             domain = raw_domain(self.piece, link)
             if link.settings is not None:
@@ -174,9 +176,9 @@ class Joiner:
         self._store()
 
     def _store(self) -> list[bytes]:
-        """Store what was found, in one transaction; the identities of beginnings of packets that wait since then.
+        """Store the results in one transaction; return the identities of new waiting starts of packets.
 
-        All transactions write in this order, so that none waits for another in a circle.
+        All transactions write in this order, which prevents deadlocks.
         """
         found, self._found = self._found, _Found()
         if not found:
@@ -205,7 +207,7 @@ class Joiner:
     def _open(
         self, connection: repository.Connection, domain: str, identities: Sequence[bytes]
     ) -> Iterator[StoredEdge]:
-        """Those of these edges that wait, each as long as what was found since does not use it."""
+        """Yield the edges that wait and are not used by results found meanwhile."""
         for edge in store.open_edges(connection, domain, identities):
             if edge.edge.role != PLACED and not self._found.uses(edge):
                 yield edge
@@ -260,7 +262,7 @@ class Joiner:
                 if pairs and self._try_cadus(settings, pairs):
                     return
         if self.piece.stream:
-            return  # what lacks octets without a place waits for those with one
+            return  # an incomplete CADU without a position waits for octets with one
         for arrangement in self._with_middles(connection, domain, edge, counts, length):
             if self._try_cadus(settings, arrangement):
                 return
@@ -268,7 +270,7 @@ class Joiner:
     def _with_count_first(
         self, connection: repository.Connection, domain: str, role: int, fit: int, counts: list[int]
     ) -> Iterator[list[StoredEdge]]:
-        """Edges of the right length: those of the right count, and then those of any."""
+        """Yield the edges of the right length: those with the right count first, then those with any count."""
         if counts[0] == UNKNOWN:
             yield self._candidates(connection, domain, role, fit=(fit,))
             return
@@ -281,7 +283,7 @@ class Joiner:
     def _with_middles(
         self, connection: repository.Connection, domain: str, edge: StoredEdge, counts: list[int], length: int
     ) -> Iterator[list[list[StoredEdge]]]:
-        """Arrangements of a CADU with pieces that have no place of their own, those of fewer pieces first."""
+        """Yield arrangements of a CADU with pieces without a position, those with fewer pieces first."""
         middles = self._candidates(connection, domain, MIDDLE, limit=MIDDLES_LIMIT)
         if not middles:
             return
@@ -314,7 +316,7 @@ class Joiner:
             yield some
 
     def _try_cadus(self, settings: LinkSettings, arrangements: list[list[StoredEdge]]) -> bool:
-        """Whether one of these arrangements of edges is a CADU; its packets are taken then."""
+        """Return whether one of these arrangements of edges is a CADU, and take its packets."""
         length = settings.cadu_length
         code = settings.code
         for first in range(0, len(arrangements), 256):
@@ -335,7 +337,7 @@ class Joiner:
         return False
 
     def _take_frames(self, block: FrameBlock) -> list[int]:
-        """Take the packets of good frames, each for itself; the offsets of those frames."""
+        """Take the packets of good frames separately; return the offsets of those frames."""
         used = []
         for index in np.flatnonzero(block.good).tolist():
             spacecraft = int(block.header.spacecraft_id[index])
@@ -385,7 +387,7 @@ class Joiner:
     def _channel_paths(
         self, connection: repository.Connection, domain: str, edge: StoredEdge
     ) -> Iterator[list[StoredEdge]]:
-        """Sequences of edges, from an opener to a closer, that an edge may belong to."""
+        """Yield sequences of edges, from an opener to a closer, that an edge may belong to."""
         budget = PATHS_LIMIT
         heads = self._backwards(connection, domain, [edge]) if edge.edge.role != OPENER else [[edge]]
         for head in heads:
@@ -433,7 +435,7 @@ class Joiner:
     # bare packets
 
     def _join_packets_by_place(self, connection: repository.Connection, domain: str) -> None:
-        """Walk along packets from the last beginning that is known before the piece, as far as octets are there."""
+        """Cut packets from the last known packet start before the piece, as far as octets are available."""
         before = store.octets_before(connection, self.piece, PACKET_MAX_LENGTH)
         behind = store.octets_behind(connection, self.piece, PACKET_MAX_LENGTH)
         sha256, octets = self.piece.file_sha256, self.piece.octets
@@ -523,9 +525,9 @@ class Joiner:
         edge: StoredEdge,
         ends: dict[int, list[StoredEdge]],
     ) -> tuple[list[StoredEdge], bytes] | None:
-        """Edges that make up a packet that begins with `opener` and holds `edge`, and its octets; else None.
+        """Return the edges and octets of a packet that begins with `opener` and contains `edge`; None if there is none.
 
-        `ends` holds the closers by length that were looked up, and is added to.
+        `ends` caches the closers by length.
         """
 
         def closers(missing: int) -> list[StoredEdge]:
@@ -564,9 +566,9 @@ class Joiner:
 
 
 def raw_domain(piece: Piece, link: Link) -> str:
-    """Name of what may be joined with the raw octets of a piece that came by a link.
+    """Return the name of the domain in which the raw octets of a piece with this link can be joined.
 
-    CADUs name their spacecraft, bare packets do not.
+    CADUs contain the spacecraft id, bare packets do not.
     """
     if link == BARE:
         return f"packets {piece.spacecraft_id} {piece.scope}"
@@ -574,7 +576,7 @@ def raw_domain(piece: Piece, link: Link) -> str:
 
 
 def _known_beginnings(connection: repository.Connection, domain: str, parts: Sequence[Part]) -> list[int]:
-    """Where in a chain of parts packets are known to begin that were cut off: at waiting openers."""
+    """Return the known starts of incomplete packets in a chain of parts, which are waiting openers."""
     places = []
     position = 0
     for part in parts:
@@ -591,9 +593,9 @@ def _counts_fit(one: int, other: int) -> bool:
 def _subsets(
     must: tuple[StoredEdge, ...], others: Sequence[StoredEdge], totals: Collection[int]
 ) -> Iterator[tuple[StoredEdge, ...]]:
-    """Sets of edges with those of `must` whose octets together are one of `totals`, those of fewer edges first.
+    """Yield sets of edges, including `must`, whose total octets are one of `totals`, those with fewer edges first.
 
-    Bit n of `reach[k][i]` says whether k of `others[i:]` have n octets together, so that no set is begun in vain.
+    Bit n of `reach[k][i]` is set if k of `others[i:]` have n octets in total, which excludes impossible sets early.
     """
     held = sum(len(one.edge.octets) for one in must)
     wanted = sum(1 << total - held for total in totals if total >= held)
@@ -625,7 +627,7 @@ def _subsets(
 
 
 def _slots_across(stream: OctetArray, start: int, stop: int, settings: LinkSettings) -> NDArray[np.int64]:
-    """Where CADUs stand that lie partly in [start, stop) of a stream and partly outside."""
+    """Return the positions of CADUs that lie partly in [start, stop) of a stream and partly outside."""
     length = settings.cadu_length
     last = stream.size - length
     if last < 0:
@@ -642,7 +644,7 @@ def _slots_across(stream: OctetArray, start: int, stop: int, settings: LinkSetti
 
 
 def _within(parts: Sequence[Part], start: int, stop: int) -> Iterator[Part]:
-    """The portions of a chain of parts that lie in [start, stop) of it."""
+    """Return the portions of a chain of parts within [start, stop) of it."""
     position = 0
     for part in parts:
         size = part.stop - part.start
@@ -653,7 +655,7 @@ def _within(parts: Sequence[Part], start: int, stop: int) -> Iterator[Part]:
 
 
 def _orders(middles: Sequence[StoredEdge], edge: StoredEdge) -> Iterator[tuple[StoredEdge, ...]]:
-    """Sequences of up to two middles, with `edge` where it is one."""
+    """Yield sequences of up to two middles, including `edge` if it is one."""
     others = [one for one in middles if one.id != edge.id]
     if edge.edge.role != MIDDLE:
         yield from ((one,) for one in middles)
@@ -666,14 +668,14 @@ def _orders(middles: Sequence[StoredEdge], edge: StoredEdge) -> Iterator[tuple[S
 
 
 def _goes_on(packet: bytes, rest: bytes) -> bool:
-    """Whether octets behind a packet look like the next one: one checksum is not enough among many arrangements."""
+    """Return whether a packet seems to follow: with many arrangements, one valid checksum is not sufficient."""
     if len(rest) < PRIMARY_HEADER_LENGTH:
         return rest[:1] in (b"", packet[:1])
     return rest[0] & 0xF8 == packet[0] & 0xF8 and rest[2] >> 6 == packet[2] >> 6
 
 
 def _packet_length(octets: bytes, start: int) -> int:
-    """Octets of the packet at `start`, 0 where it is not whole or none can stand there."""
+    """Return the length of the packet at `start` in octets, 0 if it is incomplete or invalid."""
     if len(octets) - start <= PRIMARY_HEADER_LENGTH or octets[start] >> 4:
         return 0
     length = int.from_bytes(octets[start + 4 : start + 6], "big") + PRIMARY_HEADER_LENGTH + 1
@@ -681,7 +683,7 @@ def _packet_length(octets: bytes, start: int) -> int:
 
 
 def _is_packet(octets: bytes) -> bool:
-    """Whether these octets are one telemetry packet whose checksum holds."""
+    """Return whether these octets are one telemetry packet with a valid checksum."""
     return (
         len(octets) > PRIMARY_HEADER_LENGTH + 2
         and _packet_length(octets, 0) == len(octets)
@@ -695,7 +697,7 @@ def _is_idle(octets: bytes) -> bool:
 
 
 def _is_even_idle(octets: bytes) -> bool:
-    """Whether these octets are one idle packet with the same octet throughout."""
+    """Return whether these octets are one idle packet filled with one octet value."""
     fill = octets[PRIMARY_HEADER_LENGTH:]
     return _packet_length(octets, 0) == len(octets) and _is_idle(octets) and fill == fill[:1] * len(fill)
 

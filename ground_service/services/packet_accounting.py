@@ -1,8 +1,7 @@
-"""Packets, frames and octets of one pass: what came, what is missing, what was damaged or came twice.
+"""Accounting of the packets, frames and octets of one pass: received, missing, damaged and duplicate.
 
-Packets are counted by their sequence counts and by the frames that were planned; frames and octets are those of the
-raw files whose on-board time lies in the pass (`processing.downlink_accounting`), so other passes of the spacecraft
-change nothing.
+Missing packets follow from sequence counts and from the planned frames. Frames and octets are those of the raw files
+with on-board times in the pass (`processing.downlink_accounting`); other passes of the spacecraft have no influence.
 """
 
 from __future__ import annotations
@@ -34,13 +33,13 @@ COMPLETENESS_BINS = 60
 GAP_POINTS = 256
 
 RAW_LIMIT_OCTETS = 128 << 20
-"""Raw files larger than this are not read again for a report; what needs them is then not computed."""
+"""Largest size of raw files that are read again for a report; above it, the dependent values are not computed."""
 
 
 def packet_accounting(
     files: FileArchive, connection: Connection, record: Mapping[str, Any], span: PassSpan
 ) -> PacketAccounting:
-    """Return the packets of a pass, what is missing of them, and what became of its octets."""
+    """Return the packet and octet accounting of a pass."""
     headers = repository.packet_headers(connection, span.vehicle, span.start_ticks, span.stop_ticks)
     raw = _raw_account(files, connection, span)
     names = _apid_names()
@@ -86,7 +85,7 @@ def packet_accounting(
 
 
 def _raw_account(files: FileArchive, connection: Connection, span: PassSpan) -> RawAccount | None:
-    """Sums over the raw files of the vehicle; None without any, or where one is too large to be read again."""
+    """Return sums over the raw files of the vehicle; None without files, or if one is too large."""
     vehicle = repository.get(connection, repository.VEHICLES, span.vehicle, "vehicle")
     found = []
     for sha256, octets in _raw_files(connection, span):
@@ -97,7 +96,7 @@ def _raw_account(files: FileArchive, connection: Connection, span: PassSpan) -> 
 
 
 def _raw_files(connection: Connection, span: PassSpan) -> list[tuple[str, int]]:
-    """Hashes and sizes of the ingested files of the vehicle that may hold something of the pass, in order of hash."""
+    """Return hashes and sizes of the ingested files that may contain data of the pass, ordered by hash."""
     ingests, stored = repository.INGESTS, repository.FILES
     query = (
         select(ingests.c.file_sha256, stored.c.octets, ingests.c.accounting)
@@ -121,16 +120,16 @@ def _raw_files(connection: Connection, span: PassSpan) -> list[tuple[str, int]]:
 
 @lru_cache(maxsize=32)
 def _raw_file(files: FileArchive, sha256: str, spacecraft_id: int) -> RawFile:
-    """The file of a hash never changes, so neither does what it holds."""
+    """Return the content of a raw file; cached, because the file of a hash never changes."""
     return read_raw(files.get(sha256), spacecraft_id)
 
 
 @dataclass(frozen=True, slots=True)
 class _Images:
-    """Images that a report came down of: how many, first and last frame number; and what the payload counted.
+    """Reported images: number, first and last frame number; and the frame counter of the payload.
 
-    `first_made` and `after_last_made` are the frame counter at the start and at the end of the observation, None where
-    the event that tells it did not come.
+    `first_made` and `after_last_made` are the frame counter at the start and at the end of the observation, None if
+    the event with the counter was not received.
     """
 
     count: int
@@ -148,7 +147,7 @@ def _images(connection: Connection, record: Mapping[str, Any], span: PassSpan) -
         )
 
     images = columns("detections", "ticks", "frame_number")
-    # An observation ends at the first frame time at or after its planned end, so up to one cadence after the span.
+    # An observation ends at the first frame time at or after its planned end: up to one cadence after the span.
     events = columns("events", "event_id", "frame_number", after_ticks=_cadence_ticks(record))
     counters: dict[int, list[int]] = {STARTED: [], STOPPED: []}
     for event, number in zip(events["event_id"], events["frame_number"], strict=True):
@@ -169,9 +168,9 @@ def _cadence_ticks(record: Mapping[str, Any]) -> int:
 
 
 def _frames_at_edges(planned: object, images: _Images, in_gaps: int) -> int | None:
-    """Frames that are missing before the first or after the last that came; None where that is not known.
+    """Return the number of frames missing before the first or after the last received frame; None if unknown.
 
-    What the payload counted from start to stop of the observation says it; without both counters, the plan.
+    It follows from the frame counter at start and end of the observation; without both, from the plan.
     """
     start, stop = images.first_made, images.after_last_made
     if (
@@ -188,7 +187,7 @@ def _frames_at_edges(planned: object, images: _Images, in_gaps: int) -> int | No
 
 
 def _packets_at_edges(apid: int, frames: int | None, packets: int, of_frames: int) -> int | None:
-    """Packets of an application process that frames at the edges would have given; None where that is not known."""
+    """Return the expected packets of an application process for the frames at the edges; None if unknown."""
     if frames is None or apid not in _IMAGE_APIDS:
         return None
     if frames == 0:
@@ -201,7 +200,7 @@ _IMAGE_APIDS = frozenset(
     for definition in DICTIONARY.telemetry
     if any(field.name == "image_ticks" for field in definition.fields)
 )
-"""Application processes whose packets are made for images."""
+"""Application processes whose packets are generated for images."""
 
 
 def _apid_names() -> dict[int, str]:
@@ -224,7 +223,7 @@ def _completeness(
 
 
 def _spread(gap: Gap) -> NDArray[np.float64]:
-    """On-board times (k, 2) over which the packets of a gap are taken to be spread, and how many at each."""
+    """Return the on-board times (k, 2) over which the packets of a gap are distributed, and their numbers."""
     points = min(gap.missing, GAP_POINTS)
     ticks = np.linspace(gap.before_ticks, gap.after_ticks, points + 2)[1:-1]
     return np.column_stack([ticks, np.full(points, gap.missing / points)])
