@@ -19,7 +19,7 @@ from ground_service.processing.regression_samples import EstimatorFrames, PassFr
 
 RECALL, PRECISION = 0.70, 0.87
 SUITES = ((2, 12), (5, 40), (5, 200))
-"""Passes, and frames of each."""
+"""Numbers of passes and of frames in each pass."""
 
 POLICY = GatePolicy(
     version="simulated",
@@ -48,9 +48,9 @@ def simulated(
     slow: float = 1.0,
     error: float = 1.0,
 ) -> PassFrames:
-    """Return a pass over a scene (its craters, how hard they are) with the noise of one camera and filter run.
+    """Return a pass over a scene (craters and their difficulty) with the noise of one camera and filter run.
 
-    A crater is as hard to find as its scene makes it; noise changes one in twenty. The error of the filter has an
+    The scene determines which craters are detected; noise changes one in twenty. The error of the filter has an
     autocorrelation of 0.8 from frame to frame (autocorrelation time 9 frames).
     """
     world, rng = np.random.default_rng((1, scene)), np.random.default_rng((2, scene, noise))
@@ -105,7 +105,7 @@ def suite(
 
 
 def degraded(margins: float) -> dict[str, float]:
-    """Return the faults that degrade every gated metric by so many margins of `POLICY`."""
+    """Return the faults that degrade every gated metric by a number of margins of `POLICY`."""
     by_name = {rule.figure: rule.margin for rule in POLICY.rules}
     return {
         "recall": RECALL - margins * by_name["detector.recall"],
@@ -118,7 +118,7 @@ def degraded(margins: float) -> dict[str, float]:
 
 
 def outcomes(passes: int, frames: int, margins: float, pairs: int) -> dict[str, Counter[str]]:
-    """Return how often each gate, and the verdict, had each outcome; every pair of builds has scenes of its own."""
+    """Return the number of each outcome of each gate and of the verdict; every pair of builds has different scenes."""
     found: dict[str, Counter[str]] = {}
     for pair in range(pairs):
         scene = 100 * pair

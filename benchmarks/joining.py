@@ -1,4 +1,4 @@
-"""Cost of joining one piece when very many edges wait, and the rate of two workers.
+"""Benchmark of joining one piece while many edges wait, and of the rate of two workers.
 
     python -m benchmarks.joining [--edges 100000] [--pieces 40] [--postgresql] [--workers]
 
@@ -41,7 +41,7 @@ BLOCK = 5_000
 
 
 def fill(ground: Ground, link: Link, count: int, channel: str) -> None:
-    """Put `count` edges of CADUs and of a channel each into the table."""
+    """Insert `count` edges of CADUs and of a channel each into the table."""
     assert link.settings is not None
     rng = np.random.default_rng(1)
     length = link.settings.cadu_length
@@ -60,7 +60,7 @@ def fill(ground: Ground, link: Link, count: int, channel: str) -> None:
         with ground.database.writing() as connection:
             edges.add_edges(connection, domain, raw, "0" * 64)
             edges.add_edges(connection, channel, packets)
-    # As autovacuum does while a table grows, which would otherwise run during the measurement.
+    # Run ANALYZE now, because autovacuum would otherwise run it during the measurement.
     with ground.database.engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
         connection.execute(
             text("VACUUM ANALYZE stream_edges" if ground.database.dialect == "postgresql" else "ANALYZE")
@@ -68,7 +68,7 @@ def fill(ground: Ground, link: Link, count: int, channel: str) -> None:
 
 
 def measure(database_url: str | None, count: int, pieces: int) -> dict[str, Any]:
-    """Milliseconds of joining a piece, with an empty and with a full table."""
+    """Return the milliseconds of joining a piece, with an empty and with a full table."""
     stream = mixed_downlink(40 * pieces)
     taken: dict[str, list[float]] = {}
     commits: list[float] = []

@@ -1,4 +1,4 @@
-"""Mutation testing of the code that decides: `python -m benchmarks.mutation [--group NAME] [--sample N] [--seed S]`.
+"""Mutation testing of decision code: `python -m benchmarks.mutation [--group NAME] [--sample N] [--seed S]`.
 
 mutmut changes one expression at a time in a copy of the tree and runs the tests that reach it. Each group names its
 modules and the tests that must protect them. A seeded sample of the mutants of every group estimates its score; the
@@ -157,11 +157,11 @@ _LEFT_OUT: tuple[tuple[Callable[[str], str], str], ...] = (
     (lambda code: _ELEMENT_TYPE.sub("", code), "element type that NumPy chooses anyway"),
     (_without_messages, "wording of a message (a text with blanks)"),
 )
-"""What is taken out of the code before and after a change; a change is not tested where nothing else differs."""
+"""Pattern removed from the code before and after a mutation; equal results are not tested."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the groups asked for and print one line for each; status 1 if a score is below the limit."""
+    """Run the requested groups and print one line for each; return 1 if a score is below the limit."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.mutation", description=__doc__.splitlines()[0]
     )
@@ -229,7 +229,7 @@ def run_group(name: str, sample: int, seed: int, children: int) -> dict[str, obj
 
 
 def line_of(name: str, result: dict[str, object]) -> str:
-    """Return the figures of a group on one line."""
+    """Return the figures of a group as one line."""
     low, high = result["interval"]  # type: ignore[misc]
     return (
         f"{name}: {result['killed']} of {result['tested']} mutants killed "

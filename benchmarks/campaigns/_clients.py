@@ -1,4 +1,4 @@
-"""Clients of the service that upload pieces and enter, decide and fetch telecommands while its parts are killed."""
+"""Clients that upload pieces and add, decide and fetch telecommands while parts of the service are killed."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ from benchmarks.campaigns._ledger import Entered, HandOut, Ledger, Told, mark_of
 
 PATIENCE_S = 900.0
 LOOK_AFTER_S = 1.0
-"""What a killed process had asked the database for is done by then."""
+"""Time after which the database has completed the statements of a killed process."""
 
 FUNCTIONS = ("start_observation", "reboot")
-"""One that a single person may release, and one that needs a second person."""
+"""Telecommands for one person, and for two persons."""
 
 TIMEOUT_S = 86_400
 
 RECENT = 12
-"""Clients decide on so many of the newest telecommands, and so on the same ones."""
+"""Number of newest telecommands on which clients decide, so that they compete for the same ones."""
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What the service answered; no answer of its was about something being away."""
+    """Response of the service, other than those for unavailable parts."""
 
     status: int
     body: bytes
     headers: Mapping[str, str]
 
     def json(self) -> Any:
-        """The body as JSON."""
+        """Return the body as JSON."""
         return json.loads(self.body)
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """Octets of a downlink, and where they begin if the client tells that."""
+    """Octets of a downlink, and their position if the client states it."""
 
     name: str
     octets: bytes
@@ -54,18 +54,18 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """One user at the processes of a service."""
+    """Session of one user with the processes of a service."""
 
     apis: tuple[str, ...]
     token: str
 
     def ask(self, method: str, path: str, body: bytes | None = None, key: str = "") -> Answer:
-        """Ask until there is an answer that is not about something being away, one process after another.
+        """Repeat a request, with one process after another, until a response is not for an unavailable part.
 
         Raises
         ------
         SystemExit
-            If there is none within `PATIENCE_S`.
+            If there is no such response within `PATIENCE_S`.
         """
         headers = {"Authorization": f"Bearer {self.token}"}
         if body is not None:
@@ -83,7 +83,7 @@ class Session:
             except urllib.error.HTTPError as error:
                 if error.code < 500:
                     return Answer(error.code, error.read(), dict(error.headers))
-            except (OSError, ValueError, http.client.HTTPException):  # cut off in the middle of an answer
+            except (OSError, ValueError, http.client.HTTPException):  # the response was incomplete
                 pass
             if time.monotonic() > until:
                 raise SystemExit(f"{method} {path}: no answer within {PATIENCE_S:.0f} s")
@@ -91,7 +91,7 @@ class Session:
         raise AssertionError
 
     def get(self, path: str) -> Any:
-        """What a path holds."""
+        """Return the JSON of a path."""
         answer = self.ask("GET", path)
         if answer.status != 200:
             raise SystemExit(f"GET {path}: {answer.status} {answer.body[:300]!r}")
@@ -99,7 +99,7 @@ class Session:
 
 
 class Client(threading.Thread):
-    """A user who uploads pieces and commands the spacecraft until there are no more pieces."""
+    """User who uploads pieces and commands the spacecraft until there are no more pieces."""
 
     def __init__(
         self,
@@ -132,7 +132,7 @@ class Client(threading.Thread):
             self._over.set()
 
     def _actions(self) -> Iterator[Callable[[], None]]:
-        """What a client does between pieces: each once, then at random."""
+        """Yield the actions between pieces: each once, then in random order."""
         every = (self._enter, self._decide, self._fetch, self._note_head)
         yield from every
         while True:
@@ -148,7 +148,7 @@ class Client(threading.Thread):
         self._ledger.jobs.append(answer.json()["job_id"])
 
     def _enter(self) -> None:
-        """Enter a telecommand; where it is open whether it was, look, and enter it again under another key."""
+        """Add a telecommand; after an unknown result check the list, and add it again under another key."""
         mark = self._ledger.new_mark()
         function = self._rng.choice(FUNCTIONS)
         given = {
@@ -174,7 +174,7 @@ class Client(threading.Thread):
         raise SystemExit("POST /telecommands: its end was left open 20 times")
 
     def _decide(self) -> None:
-        """Release or reject one of the newest telecommands, as other clients do at the same time."""
+        """Release or reject one of the newest telecommands, concurrently with other clients."""
         recent = self._ledger.entered[-RECENT:]
         if not recent:
             return
@@ -190,11 +190,11 @@ class Client(threading.Thread):
             self._ledger.told.append(Told(command, found))
 
     def _fetch(self) -> None:
-        """Take what is to be sent now, at times twice under one key."""
+        """Fetch the telecommands to be sent, sometimes twice under one key."""
         key = f"uplink {self._rng.getrandbits(64):x}"
         path = f"/uplink?spacecraft_id={self._spacecraft}&format=packets"
         answer = self._session.ask("POST", path, key=key)
-        if answer.status == 409:  # taken by a process that was killed before it answered
+        if answer.status == 409:  # fetched by a process that was killed before its response
             self._ledger.count_unanswered()
             return
         if answer.status != 200:
@@ -211,7 +211,7 @@ class Client(threading.Thread):
 
 
 def cut_pieces(stream: bytes, pieces: int, rng: random.Random, name: str) -> list[Piece]:
-    """A stream cut at random octets, in random order; every other piece tells where it begins."""
+    """Return a stream cut at random octets, in random order; every other piece states its position."""
     places = sorted(rng.sample(range(1, len(stream)), pieces - 1))
     made = [
         Piece(f"{name} {start}", stream[start:stop], start if rng.random() < 0.5 else None)
@@ -222,5 +222,5 @@ def cut_pieces(stream: bytes, pieces: int, rng: random.Random, name: str) -> lis
 
 
 def broken_of(clients: Sequence[Client]) -> BaseException | None:
-    """What ended a client before its time."""
+    """Return the error that ended a client prematurely."""
     return next((one.broken for one in clients if one.broken is not None), None)

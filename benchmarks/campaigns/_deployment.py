@@ -84,7 +84,7 @@ class Part:
         return self._process.pid
 
     def kill_child(self, module: str) -> bool:
-        """Kill the child process that runs this module, which its parent has to start again; whether there was one."""
+        """Kill the child process that runs this module, which its parent restarts; return whether there was one."""
         for pid in descendants(self.pid):
             with contextlib.suppress(OSError):
                 if module.encode() in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"):
@@ -119,12 +119,12 @@ def bare_environment(**settings: str) -> dict[str, str]:
 
 
 def service_environment(**settings: str) -> dict[str, str]:
-    """The environment of a service whose database belongs to the role that it uses."""
+    """Return the environment of a service whose role owns the database."""
     return bare_environment(LINNA_ALLOW_DATABASE_OWNER="true", **settings)
 
 
 def runs(pid: int) -> bool:
-    """Whether a process is there and has not ended; one that has may wait long for its parent to notice."""
+    """Return whether a process exists and is not a zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
     except OSError:
@@ -218,7 +218,7 @@ SERVICE_ROLE = "service"
 
 
 class Deployment:
-    """PostgreSQL, Redis, API processes and two workers, as a database role that owns nothing."""
+    """Deployment of PostgreSQL, Redis, API processes and two workers, with a database role that owns nothing."""
 
     def __init__(self, folder: Path, apis: int = 1, **settings: str) -> None:
         if shutil.which("redis-server") is None:
@@ -261,7 +261,7 @@ class Deployment:
 
     @staticmethod
     def _prepare(owner_url: str) -> None:
-        """Make the schema as its owner, and the role of the service."""
+        """Create the schema as its owner, and the role of the service."""
         database = prepare_database(owner_url, upgrade=True)
         with database.writing() as connection:
             connection.execute(text(f"CREATE ROLE {SERVICE_ROLE} LOGIN"))
@@ -278,7 +278,7 @@ class Deployment:
 
 
 class ManyApis:
-    """Several API processes over one database and one broker, without workers: jobs are entered and left."""
+    """Several API processes with one database and one broker, without workers: jobs are added but not run."""
 
     def __init__(self, folder: Path, url: str, count: int = 2) -> None:
         if shutil.which("redis-server") is None:

@@ -1,4 +1,4 @@
-"""What clients were told of telecommands, and the comparison of it with what the archive holds in the end."""
+"""Acknowledgements of telecommands received by clients, and their comparison with the final archive."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ AFTER = {
     "sent": ("sent",),
     "queued": ("queued", "released", "rejected", "sent"),
 }
-"""States that a telecommand may have in the end, by the state that a client was told."""
+"""Permitted final states of a telecommand, by the acknowledged state."""
 
 DECISIONS = {"released": "release", "sent": "release", "rejected": "reject"}
 
 
 @dataclass(frozen=True, slots=True)
 class Entered:
-    """A telecommand whose entry was acknowledged."""
+    """Telecommand whose addition was acknowledged."""
 
     mark: int
     command: int
@@ -42,7 +42,7 @@ class Entered:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """A state that a client was told; `decided_by` where the client's own decision was acknowledged."""
+    """Acknowledged state; `decided_by` is set if it is the decision of that client."""
 
     command: int
     state: str
@@ -51,7 +51,7 @@ class Told:
 
 @dataclass(frozen=True, slots=True)
 class HandOut:
-    """Telecommands that were handed out to a client, as bare packets."""
+    """Telecommands fetched by a client, as bare packets."""
 
     actor: str
     commands: tuple[int, ...]
@@ -60,7 +60,7 @@ class HandOut:
 
 @dataclass(frozen=True, slots=True)
 class AuditLine:
-    """Who did what to which telecommand, by the audit log."""
+    """Audit entry about a telecommand: actor, action and target."""
 
     action: str
     command: int
@@ -69,7 +69,7 @@ class AuditLine:
 
 @dataclass
 class Ledger:
-    """What all clients of a run were told; filled by several threads."""
+    """Acknowledgements of all clients of a run; filled by several threads."""
 
     entered: list[Entered] = field(default_factory=list)
     told: list[Told] = field(default_factory=list)
@@ -82,29 +82,29 @@ class Ledger:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def new_mark(self) -> int:
-        """A number that no other telecommand has among its arguments."""
+        """Return a unique number for the arguments of a telecommand."""
         with self._lock:
             self._marks += 1
             return self._marks
 
     def count_unanswered(self) -> None:
-        """Note a hand-out whose answer no client has."""
+        """Count a hand-out without a received response."""
         with self._lock:
             self.unanswered_hand_outs += 1
 
     def count_changed(self) -> None:
-        """Note a key that was answered in two ways."""
+        """Count a key with two different responses."""
         with self._lock:
             self.changed_answers += 1
 
 
 def mark_of(row: Mapping[str, Any]) -> int:
-    """The number by which clients tell telecommands apart: their first argument."""
+    """Return the number that identifies a telecommand: its first argument."""
     return int(row["arguments"]["argument_1"])
 
 
 def judge(ledger: Ledger, rows: Sequence[Mapping[str, Any]], lines: Iterable[AuditLine]) -> Counter[str]:
-    """Return how often the archive differs from what was acknowledged, by kind of fault.
+    """Return the number of differences between the archive and the acknowledgements, by kind of fault.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def _judge_hand_outs(ledger: Ledger, by_id: Mapping[int, Mapping[str, Any]]) -> 
 
 
 def _wrong_lines(ledger: Ledger, by_id: Mapping[int, Mapping[str, Any]], lines: Iterable[AuditLine]) -> int:
-    """How many audit entries about telecommands are missing, too many, or name somebody else."""
+    """Return the number of audit entries about telecommands that are missing, superfluous, or have a wrong actor."""
     found: Counter[tuple[str, int]] = Counter()
     actors: dict[tuple[str, int], str] = {}
     for line in lines:

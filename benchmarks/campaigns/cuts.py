@@ -1,4 +1,4 @@
-"""Random cuts of one downlink at any octet, in any order, with repetitions: every archive has to be the same.
+"""Campaign of random cuts of one downlink at any octet, in any order, with repetitions: all archives must be equal.
 
     python -m benchmarks.campaigns.cuts [--splits 1000] [--kind cadus|packets|both] [--seed S] [--json]
 
@@ -37,14 +37,14 @@ ORDERS = ("in order", "shuffled", "reversed", "interleaved", "repeated")
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """Pieces of a downlink: where each begins and ends, in the order in which they are ingested."""
+    """Pieces of a downlink: start and end of each, in the order of ingest."""
 
     order: str
     pieces: tuple[tuple[int, int], ...]
 
 
 def random_split(octets: int, rng: np.random.Generator, order: str, pieces: int, smallest: int) -> Split:
-    """A split of so many octets into at most so many pieces, no piece shorter than `smallest`."""
+    """Return a random split into a limited number of pieces, none shorter than `smallest`."""
     count = int(rng.integers(1, pieces))
     cuts = np.unique(rng.integers(1, octets, count))
     kept = [0]
@@ -55,7 +55,7 @@ def random_split(octets: int, rng: np.random.Generator, order: str, pieces: int,
 
 
 def ordered(pieces: list[tuple[int, int]], rng: np.random.Generator, order: str) -> Split:
-    """The pieces in one of the `ORDERS`."""
+    """Return the pieces in one of the `ORDERS`."""
     if order == "reversed":
         pieces = pieces[::-1]
     elif order == "interleaved":
@@ -78,7 +78,7 @@ def hash_of(
     placed: bool,
     bare: bool,
 ) -> tuple[str, int]:
-    """The hash of the archive of these pieces, in an instance of its own, and how many packets it holds."""
+    """Return the hash of the archive of these pieces, in a separate instance, and its number of packets."""
     path = ground.home / "piece.bin"
     for start, stop in pieces:
         path.write_bytes(stream[start:stop])
@@ -96,7 +96,7 @@ def hash_of(
 
 
 def streams(packets: int, kinds: Sequence[str]) -> dict[str, bytes]:
-    """A downlink as CADUs and as bare packets."""
+    """Return a downlink as CADUs and as bare packets."""
     cadus = mixed_downlink(packets)
     found = decode(cadus)
     octets = b"".join(found.cut.packets(found.buffer))
@@ -124,7 +124,7 @@ def main() -> int:
 
 
 def campaign(ground: Ground, given: argparse.Namespace, sources: dict[str, bytes]) -> int:
-    """All splits; the exit status."""
+    """Ingest all splits; return the exit status."""
     kinds = list(sources)
     whole = {
         kind: hash_of(

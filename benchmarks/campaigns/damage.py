@@ -1,4 +1,4 @@
-"""Deliberate damage to every kind of row and file: does `linna verify --all` find it?
+"""Campaign of deliberate damage to every kind of row and file, to test its detection by `linna verify --all`.
 
     python -m benchmarks.campaigns.damage [--postgresql] [--quick] [--single] [--packets N] [--only TABLE...] [--json]
 
@@ -63,7 +63,7 @@ CHANGES = ("changed", "removed", "put in")
 
 @dataclass(frozen=True, slots=True)
 class Harm:
-    """One piece of damage: what it is done to, how, and the function that does it."""
+    """One damage: its target, its kind, and the function that causes it."""
 
     kind: str
     change: str
@@ -72,7 +72,7 @@ class Harm:
 
 
 def fill(ground: Ground, folder: Path, packets: int) -> None:
-    """Fill an archive with telemetry, and with rows of every table, as the program writes them."""
+    """Fill an archive with telemetry, and with rows of every table as the program writes them."""
     (folder / "mixed.cadu").write_bytes(mixed_downlink(packets))
     (folder / "rest.cadu").write_bytes(_rest_of_the_dictionary())
     for name in ("mixed.cadu", "rest.cadu"):
@@ -94,7 +94,7 @@ def fill(ground: Ground, folder: Path, packets: int) -> None:
 
 
 def _rest_of_the_dictionary() -> bytes:
-    """One packet of every kind that `mixed_downlink` does not hold."""
+    """Return one packet of every kind that `mixed_downlink` does not contain."""
     sequencer, packets = PacketSequencer(), []
     for definition in DICTIONARY.telemetry:
         if definition.name in ("housekeeping", "detections", "navigation_state", "event_info"):
@@ -118,7 +118,7 @@ def _value(field: Any) -> Any:
 
 
 def _invented(connection: Connection, table: Table) -> dict[str, Any]:
-    """A row of a table with a value of its type in every column, naming rows that are there."""
+    """Return a row of a table with a valid value in every column and references to existing rows."""
     row: dict[str, Any] = {}
     for column in table.columns:
         if column.foreign_keys:
@@ -150,7 +150,7 @@ def _plain_value(column: Any) -> Any:
 
 
 def harms(engine: Engine, home: Path, only: Sequence[str] = ()) -> Iterator[Harm]:
-    """All damage to be done: to each column and row of each table, and to files."""
+    """Yield all damages: to each column and row of each table, and to files."""
     for table in Base.metadata.sorted_tables:
         if only and table.name not in only:
             continue
@@ -185,7 +185,7 @@ def _where(table: Table, row: dict[str, Any]) -> Any:
 
 
 def _another(column: Any, value: Any, *, far: bool = False) -> Any:
-    """A value of the same type that differs as little as it can."""
+    """Return a value of the same type with the smallest possible difference."""
     if value is None:
         return _plain_value(column)
     if isinstance(column.type, JSON):
@@ -203,7 +203,7 @@ def _another(column: Any, value: Any, *, far: bool = False) -> Any:
 
 def _statement(statement: Any) -> Callable[[Connection, Path], None]:
     def do(connection: Connection, _home: Path) -> None:
-        if connection.execute(statement).rowcount not in (1, -1):  # -1: the database does not say
+        if connection.execute(statement).rowcount not in (1, -1):  # -1: unknown to the database
             raise RuntimeError(f"expected one row to be damaged by {statement}")
 
     return do
@@ -270,7 +270,7 @@ def _foreign_file(_connection: Connection, home: Path) -> None:
 
 @contextmanager
 def outside(url: Any, *, guards: bool = False) -> Iterator[Connection]:
-    """A connection of another program, whose changes no trigger and no foreign key stops unless `guards`."""
+    """Yield a connection of another program, without triggers and foreign keys unless `guards`."""
     engine = create_engine(url)
     try:
         with engine.begin() as connection:
@@ -287,7 +287,7 @@ def outside(url: Any, *, guards: bool = False) -> Iterator[Connection]:
 
 
 def _guards_again(connection: Connection) -> None:
-    """Put the triggers of the audit table back, so that their absence does not give the damage away."""
+    """Restore the triggers of the audit table, because missing triggers would be detected as damage."""
     from ground_service.store.audit import install_guards
 
     install_guards(connection)
@@ -297,7 +297,7 @@ def _guards_again(connection: Connection) -> None:
 
 
 class SqliteCopies:
-    """Fresh copies of a filled archive on SQLite."""
+    """Fresh copies of a filled archive with SQLite."""
 
     def __init__(self, folder: Path, packets: int) -> None:
         self._folder = folder
@@ -321,7 +321,7 @@ class SqliteCopies:
 
 
 class PostgresCopies:
-    """Fresh copies of a filled archive on PostgreSQL: databases made from a template."""
+    """Fresh copies of a filled archive with PostgreSQL: databases created from a template."""
 
     def __init__(self, folder: Path, packets: int, server_url: str) -> None:
         self._folder, self._server = folder, server_url
@@ -354,14 +354,14 @@ class PostgresCopies:
 
 
 SOURCES = frozenset({"files", "ingests", "vehicles"})
-"""Rows that say what is to be ingested again: damaged together with values they would hide those."""
+"""Tables that select what is ingested again; combined with damaged values, their damage would hide that damage."""
 
 ALONE = frozenset({"row_digests", "audit_head", "files on disk"})
-"""Kinds whose damage shows in other kinds."""
+"""Kinds whose damage is also reported for other kinds."""
 
 
 def rounds(wanted: Sequence[Harm], *, single: bool) -> list[list[Harm]]:
-    """Damage to be done to one copy together: at most one of each kind, each told apart by its kind."""
+    """Return groups of damages for one copy: at most one of each kind, so that reports can be assigned."""
     if single:
         return [[harm] for harm in wanted]
     made: dict[tuple[Any, ...], list[Harm]] = {}
@@ -376,7 +376,7 @@ def rounds(wanted: Sequence[Harm], *, single: bool) -> list[list[Harm]]:
 def campaign(
     copies: SqliteCopies | PostgresCopies, *, deep: bool, single: bool = False, only: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Do every damage to a copy and verify it; what was found and what was not."""
+    """Apply every damage to a copy and verify it; return detected and undetected damages."""
     with copies.pristine as ground:
         clean = verify(ground, deep=deep)
         if clean.damaged:
@@ -415,7 +415,7 @@ def campaign(
 
 
 def _names(result: Verification, harm: Harm) -> bool:
-    """Whether the damage is found, and told where it is; a digest stands for the table of its row."""
+    """Return whether a damage is detected with its location; a digest counts for the table of its row."""
     kinds = {one.kind for one in result.damaged}
     if harm.kind == "files on disk":
         return "files" in kinds

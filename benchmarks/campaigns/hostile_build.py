@@ -1,4 +1,4 @@
-"""A hostile payload build against the service, under every profile that the service runs in.
+"""Campaign of a hostile payload build against the service, with every process profile of the service.
 
     python -m benchmarks.campaigns.hostile_build [--profile NAME ...] [--json]
 
@@ -46,14 +46,14 @@ SCENARIOS = ("root", "uid 10001", "image", "no unshare", "no unshare, runner")
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One attempt of the build.
+    """Attempt of the build.
 
     Attributes
     ----------
     kind
-        The run it was made in.
+        The kind of run.
     succeeded
-        Whether the build achieved something.
+        Whether the attempt was successful.
     """
 
     profile: str
@@ -65,14 +65,14 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class ProfileResult:
-    """What a profile showed.
+    """Result of a profile.
 
     Attributes
     ----------
     refusals
-        Runs that were refused, of `runs`.
+        Number of refused runs, of `runs`.
     isolation
-        What confined the others.
+        Isolation of the other runs.
     """
 
     profile: str
@@ -89,7 +89,7 @@ class ProfileResult:
 
 
 class Decoys:
-    """What a service has on its loopback: ports and sockets, of which nobody may be reached."""
+    """Ports and sockets on the loopback of the service, which a build must not reach."""
 
     def __init__(self, folder: Path) -> None:
         self.connections = 0
@@ -129,9 +129,9 @@ class Decoys:
 
 
 class Service:
-    """The files, secrets and processes of a service that a build is to attack, open to every user of the machine.
+    """Files, secrets and processes of a service as targets of a build, accessible to every user of the machine.
 
-    Permissions of files would stop some attempts of some users; here nothing but the sandbox does.
+    File permissions would prevent some attempts; here only the sandbox prevents them.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -162,7 +162,7 @@ class Service:
         self._before = self.state()
 
     def open_to_all(self) -> None:
-        """Let every user read and change everything here."""
+        """Let every user read and change all files."""
         for where, _, names in os.walk(self.folder):
             os.chmod(where, 0o777)
             for name in names:
@@ -170,14 +170,14 @@ class Service:
                     os.chmod(os.path.join(where, name), 0o666)
 
     def state(self) -> dict[str, str | None]:
-        """Contents of the files of the service."""
+        """Return the contents of the files of the service."""
         return {
             path: Path(path).read_text(errors="replace") if Path(path).exists() else None
             for path in self.secrets
         }
 
     def damage(self) -> list[str]:
-        """What a build did to the service, by name."""
+        """Return the effects of a build on the service, by name."""
         now = self.state()
         found = [f"{path} changed" for path, text in self._before.items() if now[path] != text]
         if self.process.poll() is not None:
@@ -188,14 +188,14 @@ class Service:
         return found
 
     def close(self) -> None:
-        """End what was started."""
+        """End the started processes."""
         self.process.kill()
         self.process.wait()
         self.decoys.close()
 
 
 def write_build(folder: Path, kind: str, service: Service, leftover: str, writable: Sequence[Path]) -> Path:
-    """Write the build that attacks in one way."""
+    """Write a build with one kind of attack."""
     folder.mkdir()
     shutil.copy(ATTACK, folder / "attack.py")
     targets = {
@@ -220,7 +220,7 @@ def write_build(folder: Path, kind: str, service: Service, leftover: str, writab
 
 
 def write_archive(folder: Path) -> None:
-    """Write the smallest pass archive that can be flown."""
+    """Write the smallest pass archive that can be replayed."""
     import hashlib
 
     files = {
@@ -262,7 +262,7 @@ for build in builds:
 
 
 def campaign(profile: str, kinds: Sequence[str] = KINDS) -> ProfileResult:
-    """Have the service run every kind of attack under a profile."""
+    """Run every kind of attack with a profile of the service."""
     name, _, with_runner = profile.partition(", ")
     with tempfile.TemporaryDirectory(prefix="hostile-") as temporary:
         folder = Path(temporary)
@@ -338,7 +338,7 @@ def _campaign(
 
 
 def _judged(profile: str, kind: str, run: Mapping[str, Any], place: Path) -> list[Finding]:
-    """What a run achieved, by what it reports and by what it delivered."""
+    """Return the findings of a run, from its report and its outputs."""
     found: list[Finding] = []
     delivered = {path.name: path for path in place.iterdir()}
     if kind == "explore":
@@ -367,7 +367,7 @@ def _judged(profile: str, kind: str, run: Mapping[str, Any], place: Path) -> lis
 
 
 def _left(leftover: str, folder: Path, out: Path) -> list[str]:
-    """Processes and files of a build that are still there after its run."""
+    """Return processes and files of a build that remain after its run."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
@@ -388,7 +388,7 @@ def _left(leftover: str, folder: Path, out: Path) -> list[str]:
     ):
         if (place / leftover).exists():
             found.append(f"{place / leftover} was left")
-    for where, folders, names in os.walk(folder):  # bears folders that go while it looks
+    for where, folders, names in os.walk(folder):  # tolerates folders that are removed meanwhile
         if leftover in (*folders, *names):
             found.append(f"{where}/{leftover} was left")
     return found
@@ -435,13 +435,13 @@ def _tell(profile: str, kind: str, run: Mapping[str, Any], findings: Sequence[Fi
 
 
 def went_well(result: ProfileResult) -> bool:
-    """Whether nothing succeeded, and the build was refused exactly where it cannot be confined."""
+    """Return whether no attempt succeeded, and builds were refused exactly if they cannot be isolated."""
     expected = result.runs if result.profile == "no unshare" else 0
     return not result.successes and result.refusals == expected
 
 
 def table(results: Sequence[ProfileResult]) -> str:
-    """One line for each profile."""
+    """Return a table with one line for each profile."""
     lines = [f"{'profile':20} {'runs':>5} {'refused':>8} {'attempts':>9} {'successes':>10}  confined by"]
     for one in results:
         by = one.isolation or f"not run: {one.refusal.split(';')[0]}"

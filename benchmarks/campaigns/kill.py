@@ -1,4 +1,4 @@
-"""Random kills of every part of the service during ingest, commanding and reports.
+"""Campaign of random kills of every part of the service during ingest, commanding and reports.
 
     python -m benchmarks.campaigns.kill [--kills 300] [--state FILE [--seconds S]] [--laptop] [--json]
 
@@ -104,7 +104,7 @@ def contents(ground: Ground) -> tuple[str, list[bytes]]:
 
 
 def commands_of(ground: Ground, ledger: Ledger) -> tuple[int, Counter[str]]:
-    """How many telecommands there are, and how often the archive differs from what clients were told."""
+    """Return the number of telecommands, and the differences between the archive and the acknowledgements."""
     lines = []
     with ground.database.reading() as connection:
         rows = [dict(row) for row in connection.execute(select(repository.TELECOMMANDS)).mappings()]
@@ -218,9 +218,9 @@ def work_meanwhile(
     reports: int,
     ledger: Ledger,
 ) -> None:
-    """Have the clients upload the downlink, anew while there are kills, with commands and reports in between.
+    """Upload the downlink with clients, repeatedly during the kills, with commands and reports in between.
 
-    A round waits a little for the first job of the round before: a great heap of jobs tells no more than a small one.
+    A round waits for the first job of the previous round, to limit the number of waiting jobs.
     """
     waiting: deque[Piece] = deque()
     over = threading.Event()
@@ -257,13 +257,13 @@ def work_meanwhile(
 
 
 def wait_for_room(waiting: deque[Piece], over: threading.Event) -> None:
-    """Wait until all pieces are taken."""
+    """Wait until all pieces are accepted."""
     while waiting and not over.wait(0.2):
         pass
 
 
 def ask_for_reports(session: Session, packets: int, reports: int, ledger: Ledger) -> None:
-    """Define a pass over everything and ask for reports of it."""
+    """Define a pass over the whole time and request reports of it."""
     definition = {
         "name": "all",
         "start": format_utc(START),

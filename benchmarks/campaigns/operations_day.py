@@ -1,4 +1,4 @@
-"""A day's operations against a payload that flies live: plan, uplink, execution, downlink, ingest, report.
+"""Campaign of a day of operations with a live payload: plan, uplink, execution, downlink, ingest, report.
 
     python -m benchmarks.campaigns.operations_day [SCENARIO] [--minutes M] [--distributed] [--json]
 
@@ -79,7 +79,7 @@ class Transcript:
             print(text, flush=True)
 
     def linna(self, *words: object, by: str = "ann", refused: bool = False) -> None:
-        """One command of an operator, at the server; `refused` where it has to be refused."""
+        """Run one operator command with the server; `refused` if it must be refused."""
         typed = [str(word) for word in words]
         self.say(f"{by} $ linna " + " ".join(typed))
         os.environ["LINNA_TOKEN"] = self.tokens[by]
@@ -216,7 +216,7 @@ def rehearse(
 
 
 def refuse_strangers(desk: Transcript, api: str) -> list[int]:
-    """Ask as somebody without a token, under another name of the service, and as a page of another origin."""
+    """Send requests without a token, with another host name, and from a page of another origin."""
     own = {"Authorization": f"Bearer {desk.tokens['bob']}"}
     asked: tuple[tuple[str, str, dict[str, str]], ...] = (
         ("GET", "/api/v1/windows", {}),
@@ -238,7 +238,7 @@ def refuse_strangers(desk: Transcript, api: str) -> list[int]:
 
 
 def look_at_audit(desk: Transcript, ground: Ground) -> dict[str, Any]:
-    """What the audit log says of the day, and whether its chain and the rows are whole."""
+    """Return the audit summary of the day, and whether its chain and the rows are undamaged."""
     entries, total = list_entries(ground, limit=1000)
     for (action, actor), count in sorted(Counter((one.action, one.actor) for one in entries).items()):
         desk.say(f"# audit: {actor} {action} {count}")
@@ -248,7 +248,7 @@ def look_at_audit(desk: Transcript, ground: Ground) -> dict[str, Any]:
 
 
 def plan(desk: Transcript, api: Client, scenario: str, folder: Path, now_utc_ns: int, minutes: float) -> int:
-    """Mission description, reference ephemeris, search, window, approval, telecommands; the window."""
+    """Add mission description, reference ephemeris, window, approval and telecommands; return the window."""
     given = load_scenario(scenario)
     start = now_utc_ns + LEAD_S * NS
     stop = start + round(minutes * 60) * NS

@@ -1,4 +1,4 @@
-"""Power failures during ingest: every disk state that a cut may leave has to hold what was acknowledged.
+"""Campaign of power failures during ingest: every possible disk state must contain all acknowledged data.
 
     python -m benchmarks.campaigns.power [--cuts 1000] [--pieces 40] [--seed S] [--json]
 
@@ -187,7 +187,7 @@ with open_ground(home) as ground:
 
 @dataclass(frozen=True, slots=True)
 class Operation:
-    """One change of the disk."""
+    """Change of the disk."""
 
     kind: int
     path: str
@@ -197,14 +197,14 @@ class Operation:
 
 @dataclass(slots=True)
 class Node:
-    """A file: what is synchronised, and changes that are not."""
+    """File with its synchronised content, and changes that are not synchronised."""
 
     octets: bytearray = field(default_factory=bytearray)
     pending: list[Operation] = field(default_factory=list)
 
 
 def record(folder: Path, pieces: list[bytes]) -> list[Operation]:
-    """Ingest the pieces in a process of its own under the recorder; what it did to the disk."""
+    """Ingest the pieces in a separate process with the recorder; return the disk operations."""
     source, library, journal = folder / "shim.c", folder / "shim.so", folder / "journal"
     source.write_text(SHIM)
     subprocess.run(
@@ -224,7 +224,7 @@ def record(folder: Path, pieces: list[bytes]) -> list[Operation]:
 
 
 def read_journal(octets: bytes, root: str) -> list[Operation]:
-    """The operations of a journal, paths from `root`; acknowledgements become notes."""
+    """Return the operations of a journal, with paths relative to `root`; acknowledgements become notes."""
     operations = []
     at = 0
     while at < len(octets):
@@ -240,22 +240,22 @@ def read_journal(octets: bytes, root: str) -> list[Operation]:
             if kind == OPEN:
                 operations.append(Operation(NOTE, path.removeprefix("acknowledged/"), 0, b""))
             continue
-        if not path.endswith("-shm"):  # rebuilt by SQLite, never synchronised
+        if not path.endswith("-shm"):  # recreated by SQLite, never synchronised
             operations.append(Operation(kind, path, offset, data))
     return operations
 
 
 class Disk:
-    """The disk as the kernel may have left it: names and octets, synchronised or not."""
+    """Model of the disk: names and octets, synchronised or not."""
 
     def __init__(self) -> None:
-        self.nodes: dict[str, Node] = {}  # as running programs see it
+        self.nodes: dict[str, Node] = {}  # as visible to running programs
         self.folders = {""}
         self.durable: dict[str, Node | None] = {"": None}  # names on the disk; None: a folder
-        self.changes: dict[str, list[tuple[str, str, Node | None]]] = {}  # of each folder's names, in order
+        self.changes: dict[str, list[tuple[str, str, Node | None]]] = {}  # name changes by folder
 
     def apply(self, operation: Operation) -> None:
-        """One operation."""
+        """Apply an operation."""
         path = operation.path
         if operation.kind == MKDIR:
             self.folders.add(path)
@@ -298,7 +298,7 @@ class Disk:
             names.pop(path, None)
 
     def write(self, folder: Path, rng: random.Random) -> None:
-        """A state that a cut may leave now, under `folder`."""
+        """Write a disk state that is possible after a power failure now, under `folder`."""
         names = dict(self.durable)
         for changes in self.changes.values():
             for one in changes[: rng.randint(0, len(changes))]:
@@ -307,7 +307,7 @@ class Disk:
         for path, node in sorted(names.items(), key=lambda item: item[0]):
             target = folder / path
             if not (folder / path).parent.is_dir():
-                continue  # its folder did not reach the disk
+                continue  # its folder was not written to the disk
             if node is None:
                 target.mkdir(exist_ok=True)
                 continue
@@ -323,7 +323,7 @@ class Disk:
 
 
 def change(octets: bytearray, operation: Operation, rng: random.Random | None) -> None:
-    """Write or truncate; with `rng` only some sectors of a write reach the disk."""
+    """Write or truncate a file; with `rng` only some sectors of a write are on the disk."""
     if operation.kind == TRUNCATE:
         del octets[operation.offset :]
         octets.extend(bytes(max(operation.offset - len(octets), 0)))
@@ -342,7 +342,7 @@ def change(octets: bytearray, operation: Operation, rng: random.Random | None) -
 
 
 def check(folder: Path, pieces: list[bytes], acknowledged: list[str], expected: str | None) -> str:
-    """What is wrong with the archive that a cut left; nothing: an empty text."""
+    """Return the fault of the archive after a power failure; empty if there is none."""
     try:
         with open_ground(folder) as ground:
             with ground.database.reading() as connection:
@@ -362,13 +362,13 @@ def check(folder: Path, pieces: list[bytes], acknowledged: list[str], expected: 
                     vehicle = repository.vehicle_id(connection, SPACECRAFT, "flight")
                     if archive_hash(connection, vehicle) != expected:
                         return "the archive differs after the rest was ingested"
-    except Exception as error:  # whatever it is: the archive cannot be used
+    except Exception as error:  # any error means that the archive is not usable
         return f"{type(error).__name__}: {error}"
     return ""
 
 
 def campaign(cuts: int, pieces: int, packets: int, seed: int, resumed: int = 10) -> dict[str, Any]:
-    """Power cuts at random operations of one run; every `resumed`-th state takes the rest of the pieces."""
+    """Cut the power at random operations of one run; ingest the remaining pieces in every `resumed`-th state."""
     rng = random.Random(seed)
     stream = mixed_downlink(packets)
     places = sorted(rng.sample(range(1, len(stream)), pieces - 1))

@@ -1,4 +1,4 @@
-"""Races for the state of telecommands, windows and jobs over HTTP.
+"""Campaign of races for the state of telecommands, windows and jobs over HTTP.
 
     python -m benchmarks.campaigns.race [--races 10000] [--seconds S] [--apis 2] [--seed 1] [--json]
 
@@ -49,7 +49,7 @@ from ground_service.store import repository
 from ground_service.store.database import prepare_database
 
 SHARES = {"release": 60, "uplink": 15, "approve": 10, "window": 9, "ingest": 3, "regress": 3}
-"""Races of each kind, per cent."""
+"""Share of each kind of race in percent."""
 
 FIRST_SPACECRAFT, SPACECRAFT = 100, 8
 CRITICAL = ("perform_function", {"function_id": "reboot", "argument_1": 0.0, "argument_2": 0.0})
@@ -73,7 +73,7 @@ Figures = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One request of a race; `label` names it when the answers are judged."""
+    """Request of a race; `label` identifies it in the evaluation."""
 
     label: str
     method: str
@@ -85,7 +85,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a request was answered."""
+    """Response to a request."""
 
     label: str
     status: int
@@ -94,11 +94,11 @@ class Answer:
 
     @property
     def won(self) -> bool:
-        """Whether the request was carried out."""
+        """Whether the request took effect."""
         return 200 <= self.status < 300
 
     def json(self) -> Any:
-        """The body as JSON; None where it is none."""
+        """Return the body as JSON; None if it is not JSON."""
         try:
             return json.loads(self.body)
         except ValueError:
@@ -106,7 +106,7 @@ class Answer:
 
 
 class Racers:
-    """Threads that send the requests of a race at the same moment, over connections that are kept."""
+    """Threads that send the requests of a race simultaneously, over persistent connections."""
 
     def __init__(self, ports: Sequence[int], tokens: Mapping[str, str], most: int = 8) -> None:
         self._ports, self._tokens = tuple(ports), dict(tokens)
@@ -115,7 +115,7 @@ class Racers:
         self._opened: list[http.client.HTTPConnection] = []
 
     def race(self, requests: Sequence[Request], rng: random.Random) -> list[Answer]:
-        """Answers to requests that are sent together, to the processes in turn."""
+        """Send requests simultaneously, to the processes in turn, and return the responses."""
         start = threading.Barrier(len(requests))
         first = rng.randrange(len(self._ports))
         order = list(requests)
@@ -160,7 +160,7 @@ class Racers:
 
 @dataclass
 class Tally:
-    """What was counted so far."""
+    """Counters of a campaign."""
 
     races: Counter[str] = field(default_factory=Counter)
     requests: Counter[str] = field(default_factory=Counter)
@@ -203,7 +203,7 @@ class Campaign:
     def run(
         self, races: int, progress: Callable[[int], None] = lambda _: None, seconds: float = float("inf")
     ) -> Figures:
-        """Races of all kinds in a seeded order, as many as begin within `seconds`; the figures."""
+        """Run races of all kinds in a seeded order for `seconds`; return the figures."""
         kinds = [kind for kind, share in SHARES.items() for _ in range(max(1, round(races * share / 100)))]
         self.rng.shuffle(kinds)
         races_of: dict[str, Callable[[int], None]] = {
@@ -275,7 +275,7 @@ class Campaign:
         return Request("hand out", "POST", f"/uplink?spacecraft_id={spacecraft}&format={form}", f"bob{k % 2}")
 
     def _new_window(self, spacecraft: int) -> int:
-        """A draft over a span that no other race uses."""
+        """Add a draft window over a time span that no other race uses."""
         start = WINDOWS_FROM_NS + self.windows * 7200 * NS
         self.windows += 1
         entry = WindowEntry(f"race {self.windows}", start, start + 600 * NS, 30.0, spacecraft)
@@ -311,7 +311,7 @@ class Campaign:
         change_window(self.ground, window, actor="bob0", changes={}, decision="approved")
         if (
             self.rng.random() < 0.5
-        ):  # half of the windows are uplinked before, so that the hand-outs have something
+        ):  # half of the windows are uplinked before, so that there are telecommands to fetch
             uplink_window(self.ground, window, actor="bob0")
         path = f"/windows/{window}"
         requests = [Request("uplink", "POST", f"{path}/uplink", f"bob{k}") for k in range(2)]
@@ -321,7 +321,7 @@ class Campaign:
         self._judge_window(window)
 
     def _judge_window(self, window: int) -> None:
-        """Whether the telecommands of a window fit what was decided on it."""
+        """Check that the telecommands of a window match its decision."""
         table = repository.TELECOMMANDS
         with self.ground.database.reading() as connection:
             state = str(repository.get(connection, repository.WINDOWS, window, "window")["decision"])
@@ -358,7 +358,7 @@ class Campaign:
         self.tally.fault("no_winner", kind, str([one.status for one in answers]), not jobs)
 
     def _count_rows(self) -> None:
-        """What the database tells after all races."""
+        """Count the rows of the database after all races."""
         table, audit, ingests, jobs = (
             repository.TELECOMMANDS,
             repository.AUDIT,
@@ -399,7 +399,7 @@ class Campaign:
 
 
 def prepare(ground: Ground, folder: Path) -> tuple[dict[str, str], tuple[str, str]]:
-    """Users, two builds and an archive: the tokens by user, the identities of the builds. No job is ever run."""
+    """Add users, two builds and an archive; return the tokens by user and the identities of the builds."""
     tokens = {name: add_user(ground, name, "operator") for name in ("ann", "bob", "bob0", "bob1")}
     builds = []
     for name in ("baseline", "candidate"):
@@ -427,12 +427,12 @@ def prepare(ground: Ground, folder: Path) -> tuple[dict[str, str], tuple[str, st
 
 
 def holds(figures: Mapping[str, Any]) -> bool:
-    """Whether nothing happened that must never happen."""
+    """Return whether no forbidden event occurred."""
     return all(figures[name] == 0 for name in FAULTS)
 
 
 def table(figures: Mapping[str, Any]) -> str:
-    """The figures as text."""
+    """Return the figures as text."""
     lines = [f"{'race':<10}{'races':>8}{'requests':>10}{'carried out':>13}{'refused':>9}"]
     totals: defaultdict[str, int] = defaultdict(int)
     for kind, row in figures["kinds"].items():
@@ -460,7 +460,7 @@ def run(
     seconds: float = float("inf"),
     quiet: bool = False,
 ) -> Figures:
-    """The campaign over an empty database at `url`; the figures."""
+    """Run the campaign with an empty database at `url`; return the figures."""
     prepare_database(url, upgrade=True).engine.dispose()
 
     def progress(number: int) -> None:
@@ -487,7 +487,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was started is ended
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that started processes are ended
     with tempfile.TemporaryDirectory() as name, PostgresServer(Path(name)) as database:
         figures = run(Path(name), database.url, given.races, given.apis, given.seed, seconds=given.seconds)
     print(json.dumps(figures, indent=2) if given.json else table(figures))

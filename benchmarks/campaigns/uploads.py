@@ -1,4 +1,4 @@
-"""Many clients at once: simultaneous uploads, requests that never end, and a flood of WebSockets.
+"""Campaign of many clients: simultaneous uploads, incomplete requests, and a flood of WebSockets.
 
     python -m benchmarks.campaigns.uploads [--uploads N] [--half-sent N] [--sockets N] [--postgres] [--json]
 
@@ -54,37 +54,37 @@ ANSWER_S = 180.0
 PROBE_S = 60.0
 WATCHED_S = 5.0
 FORK = multiprocessing.get_context("fork")
-"""Clients are copies of this process, so that they need no time to import what it has."""
+"""Context for clients as forks of this process, which need no time for imports."""
 
 SPACECRAFT = 76
 
 
 @dataclass(frozen=True, slots=True)
 class Server:
-    """Where the service is, and the token of somebody who may upload."""
+    """Address of the service, and a token with the right to upload."""
 
     port: int
     token: str
 
     @property
     def head(self) -> str:
-        """Headers of every request."""
+        """Return the headers of every request."""
         return f"Host: 127.0.0.1:{self.port}\r\nAuthorization: Bearer {self.token}\r\n"
 
     def upload(self, octets: int) -> bytes:
-        """The head of an upload of a length."""
+        """Return the head of an upload of a length."""
         return (
             f"POST /api/v1/telemetry?spacecraft_id={SPACECRAFT} HTTP/1.1\r\n{self.head}"
             f"Content-Length: {octets}\r\n\r\n"
         ).encode()
 
     def read(self, path: str) -> bytes:
-        """A request for something, on a connection of its own."""
+        """Return a request on a separate connection."""
         return f"GET {path} HTTP/1.1\r\n{self.head}Connection: close\r\n\r\n".encode()
 
 
 def downlink(number: int, packets: int) -> bytes:
-    """Space packets that no other client sends."""
+    """Return space packets that are unique to a client."""
     values: dict[str, Any] = {"event_id": "observation_stopped", "value_1": 0.0, "value_2": 0.0}
     return b"".join(
         DICTIONARY.pack(
@@ -98,7 +98,7 @@ def downlink(number: int, packets: int) -> bytes:
 
 
 async def answer_of(reader: asyncio.StreamReader) -> tuple[int, dict[str, str]]:
-    """Status and headers of an answer, its body read."""
+    """Read a response; return its status and headers."""
     status = int((await reader.readline()).split()[1])
     headers: dict[str, str] = {}
     while line := (await reader.readline()).decode("latin-1").strip():
@@ -109,7 +109,7 @@ async def answer_of(reader: asyncio.StreamReader) -> tuple[int, dict[str, str]]:
 
 
 async def upload(server: Server, body: bytes, start: asyncio.Event, counts: Counter[str]) -> None:
-    """Send a body until it is accepted; what came of it goes to `counts`."""
+    """Send a body until it is accepted; count the responses in `counts`."""
     chance = random.Random(len(body))
     begin = time.monotonic()
     first = True
@@ -139,7 +139,7 @@ async def upload(server: Server, body: bytes, start: asyncio.Event, counts: Coun
 
 
 def send_uploads(server: Server, first: int, count: int, packets: int, results: Any, go: Event) -> None:
-    """The process of the clients: connect, wait for the signal, send, tell."""
+    """Run the process of the clients: connect, wait for the signal, send, report."""
     allow_files()
     counts: Counter[str] = Counter()
     bodies = [downlink(number, packets) for number in range(first, first + count)]
@@ -160,7 +160,7 @@ def send_uploads(server: Server, first: int, count: int, packets: int, results: 
 
 
 def probe(server: Server, path: str, every_s: float, stop: Event, results: Any) -> None:
-    """The process that asks for something on a new connection again and again: its times in ms, and errors."""
+    """Run a process that repeats a request on new connections; report its times in ms, and errors."""
 
     results.put("ready")
 
@@ -187,7 +187,7 @@ def probe(server: Server, path: str, every_s: float, stop: Event, results: Any) 
 
 
 class Probes:
-    """Health, or something else, asked for while a part of the campaign runs."""
+    """Repeated health checks or other requests while a part of the campaign runs."""
 
     def __init__(self, server: Server, path: str = "/healthz", every_s: float = 0.02) -> None:
         self._stop, self._results = FORK.Event(), FORK.SimpleQueue()
@@ -196,7 +196,7 @@ class Probes:
         assert self._results.get() == "ready"
 
     def figures(self, name: str) -> dict[str, Any]:
-        """Percentiles of the time until the answer, ms."""
+        """Return percentiles of the response time, ms."""
         self._stop.set()
         times, errors = self._results.get()
         self._process.join()
@@ -210,7 +210,7 @@ class Probes:
 
 
 def simultaneous_uploads(server: Server, count: int, packets: int) -> dict[str, Any]:
-    """All clients connect, then send at the same moment."""
+    """Connect all clients, then send simultaneously."""
     results, go = FORK.SimpleQueue(), FORK.Event()
     clients = FORK.Process(target=send_uploads, args=(server, 0, count, packets, results, go))
     clients.start()
@@ -231,7 +231,7 @@ def simultaneous_uploads(server: Server, count: int, packets: int) -> dict[str, 
 
 
 def half_sent(server: Server, count: int, honest: int) -> dict[str, Any]:
-    """Connections that never end their request are held, while honest clients upload."""
+    """Keep connections with incomplete requests open while other clients upload."""
     allow_files()
 
     async def run() -> dict[str, Any]:
@@ -274,7 +274,7 @@ def half_sent(server: Server, count: int, honest: int) -> dict[str, Any]:
 
 
 def socket_flood(server: Server, count: int, seconds: float) -> dict[str, Any]:
-    """WebSockets of one caller: how many are let in, and what reads take meanwhile."""
+    """Open WebSockets of one caller; return the number accepted, and the response times meanwhile."""
     allow_files()
 
     async def run() -> Counter[str]:
@@ -301,7 +301,7 @@ def socket_flood(server: Server, count: int, seconds: float) -> dict[str, Any]:
 
 
 async def dropped(writers: Iterable[asyncio.StreamWriter]) -> None:
-    """End connections without waiting for the other side."""
+    """Close connections without waiting for the other side."""
     ended = list(writers)
     for writer in ended:
         writer.transport.abort()
@@ -309,19 +309,19 @@ async def dropped(writers: Iterable[asyncio.StreamWriter]) -> None:
 
 
 def allow_files() -> None:
-    """Let this process open as many files as the system allows it to."""
+    """Raise the limit of open files of this process to the maximum of the system."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 def peak_rss_mib(pid: int) -> int:
-    """The most memory that a process ever had, MiB."""
+    """Return the peak resident memory of a process, MiB."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) >> 10
 
 
 def stopped(server: Server, service: Laptop, hanging: int) -> dict[str, Any]:
-    """SIGTERM while uploads hang; how long it takes, and which temporary files remain."""
+    """Send SIGTERM during incomplete uploads; return the time to stop, and the remaining temporary files."""
 
     async def hang() -> list[asyncio.StreamWriter]:
         writers = []
@@ -347,7 +347,7 @@ def stopped(server: Server, service: Laptop, hanging: int) -> dict[str, Any]:
 
 
 def alive(pid: int) -> bool:
-    """Whether a process of ours runs, and is not only waiting for its status to be read."""
+    """Return whether a child process runs and is not a zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
@@ -365,12 +365,12 @@ def campaign(
     watched_s: float = WATCHED_S,
     **settings: str,
 ) -> dict[str, Any]:
-    """All parts one after another, with these settings of the service; see the module.
+    """Run all parts in sequence with these settings of the service; see the module.
 
     Parameters
     ----------
     watched_s
-        How long the idle service, and the one with many WebSockets, is watched, s.
+        Observation time of the idle service, and of the service with many WebSockets, s.
     """
     database = PostgresServer(folder) if postgres else None
     if database is not None:
@@ -405,7 +405,7 @@ def campaign(
 
 
 def verdict(figures: dict[str, Any]) -> list[str]:
-    """What went wrong, one line each."""
+    """Return the faults, one line each."""
     answers = figures.get("answers", {})
     faults = []
     if answers.get("accepted", 0) != figures.get("uploads", 0):

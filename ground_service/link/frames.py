@@ -197,7 +197,7 @@ class ChannelReader:
     def _channel(
         self, channel: Channel, zones: OctetArray, count: IntArray, pointer: IntArray, checked: bool
     ) -> Iterator[tuple[bytes | OctetArray, list[tuple[int, int]]]]:
-        """Return octets and the segments of them that hold complete packets."""
+        """Yield octets and the segments of them that hold complete packets."""
         zone = zones.shape[1]
         idle = pointer == ONLY_IDLE_DATA
         buffer = np.ascontiguousarray(zones[~idle]).reshape(-1)

@@ -192,7 +192,7 @@ def _accuracy(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
 
 
 def _comparisons(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
-    """Return the comparisons of the declared estimator with every computed or required baseline."""
+    """Yield the comparisons of the declared estimator with every computed or required baseline."""
     wanted = limits.better_than or ()
     others = {one.name: one for one in found.navigation if one.kind in ("baseline", "smoothed")}
     own = _median(_declared(limits, found))

@@ -644,7 +644,7 @@ def _slots_across(stream: OctetArray, start: int, stop: int, settings: LinkSetti
 
 
 def _within(parts: Sequence[Part], start: int, stop: int) -> Iterator[Part]:
-    """Return the portions of a chain of parts within [start, stop) of it."""
+    """Yield the portions of a chain of parts within [start, stop) of it."""
     position = 0
     for part in parts:
         size = part.stop - part.start

@@ -1,1 +1,1 @@
-"""A hostile payload build, and the profiles under which the service meets it."""
+"""Hostile payload build, and the process profiles of the service for tests with it."""

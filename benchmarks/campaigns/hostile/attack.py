@@ -52,7 +52,7 @@ def attempt(name, action):
 
 
 def call(name, *arguments):
-    """A raw system call; a negative result raises."""
+    """Make a raw system call; raise an error for a negative result."""
     result = LIBC.syscall(ctypes.c_long(SYSTEM_CALLS[name]), *arguments)
     if result < 0:
         code = ctypes.get_errno()
@@ -249,7 +249,7 @@ def set_namespace(process, kind):
 
 
 def foreign_signal(process):
-    """A signal to process 1 is permitted in a process namespace and has no effect; the campaign looks for effects."""
+    """Send a signal to process 1; permitted in a process namespace without effect, the campaign checks for effects."""
     if process == 1:
         os.kill(1, 9)
         time.sleep(0.05)
@@ -364,7 +364,7 @@ def finish():
 
 
 def disk_fill():
-    """Fill every place that can be written, in files of permitted size, until all are full, and wait a second."""
+    """Fill every writable folder with files of permitted size, and wait for a second."""
     wanted, written, made = TARGETS["folder_mib"] * 2, 0, []
     for place in (OUT, "/tmp", os.environ["HOME"], "/dev/shm", "/var/tmp", "/run", "/var/lib"):
         number = 0
@@ -387,7 +387,7 @@ def disk_fill():
 
 
 def memory_bomb():
-    """Several processes, each inside its own limit, together far beyond it."""
+    """Start several processes that exceed the memory limit only together."""
     for _ in range(8):
         if os.fork() == 0:
             held = bytearray(TARGETS["memory_mib"] * 6 << 17)
@@ -400,7 +400,7 @@ def memory_bomb():
 
 
 def outlive():
-    """Daemons that ignore signals and fork on and on, while the program runs past its time limit."""
+    """Start daemons that ignore signals and fork continuously, and exceed the time limit."""
     for _ in range(3):
         if os.fork() == 0:
             os.setsid()
@@ -425,7 +425,7 @@ def outlive():
 
 
 def daemon():
-    """The same, but the program itself ends at once and well."""
+    """Start such daemons, and end immediately with status 0."""
     finish()
     if os.fork() == 0:
         outlive()
@@ -454,7 +454,7 @@ def sparse_out():
 
 
 def swap_out():
-    """Keep exchanging the output between a file and a link to a secret while it is taken out."""
+    """Replace the output repeatedly by a link to a secret while the launcher copies it."""
     name = OUT / "downlink.packets"
     finish()
     if os.fork() == 0:

@@ -1,10 +1,10 @@
-"""Kinds of attack, and the outcomes of a run that was held."""
+"""Kinds of attack, and the permitted outcomes of their runs."""
 
 EXPECTED: dict[str, tuple[str, ...]] = {
     "explore": ("ok",),
     "leave files": ("ok",),
     "memory bomb": ("memory",),
-    # The limit is the file system's, or that of a look ten times a second.
+    # The limit of the file system, or the limit checked ten times a second, applies.
     "disk fill": ("ok", "disk"),
     "outlive": ("timeout",),
     "daemon": ("ok",),
@@ -13,7 +13,7 @@ EXPECTED: dict[str, tuple[str, ...]] = {
     "pipe out": ("nothing",),
     "folder out": ("nothing",),
     "sparse out": ("disk",),
-    # The link may be there when the output is taken out, which then is not taken.
+    # If the link exists during the copy, the output is not copied.
     "swap out": ("ok", "nothing"),
     "flood": ("ok",),
 }

@@ -1,4 +1,4 @@
-"""Profiles under which a process of the service runs: who it is, what it may do, and what the engine refuses.
+"""Process profiles of the service: user, capabilities, and restrictions of the container engine.
 
     python -m benchmarks.campaigns.hostile.profiles PROFILE [--keep PATH ...] -- COMMAND ...
 
@@ -32,7 +32,7 @@ TMP_MIB = 256
 
 
 def enter(profile: str, keep: Sequence[Path], exchange: Path | None = None) -> None:
-    """Turn this process into one of the profile, with `keep` reachable for every user."""
+    """Apply a profile to this process, with `keep` accessible for every user."""
     if profile in ("user", "root"):
         return
     kernel.unshare(kernel.CLONE_NEWNS)
@@ -51,7 +51,7 @@ def enter(profile: str, keep: Sequence[Path], exchange: Path | None = None) -> N
         os.setgroups([])
         os.setresgid(SERVICE_UID, SERVICE_UID, SERVICE_UID)
         os.setresuid(SERVICE_UID, SERVICE_UID, SERVICE_UID)
-    # A change of the user cancels it.
+    # a change of the user cancels it
     kernel.die_with_parent()
     if profile != "uid 10001":
         kernel.forbid_new_privileges()
@@ -60,7 +60,7 @@ def enter(profile: str, keep: Sequence[Path], exchange: Path | None = None) -> N
 
 
 def become_container(exchange: Path) -> None:
-    """A container without network: own namespaces, everything read-only but /tmp, /dev/shm and the exchange folder."""
+    """Enter a container without network: separate namespaces, mostly read-only, with the exchange folder."""
     kernel.unshare(
         kernel.CLONE_NEWPID
         | kernel.CLONE_NEWNET
@@ -78,7 +78,7 @@ def become_container(exchange: Path) -> None:
     kernel.restrict_mount("/", kernel.MOUNT_ATTR_RDONLY)
     kernel.mount("tmpfs", "/tmp", "tmpfs", kernel.MS_NOSUID | kernel.MS_NODEV, f"size={TMP_MIB}m,mode=1777")
     kernel.mount("tmpfs", "/dev/shm", "tmpfs", kernel.MS_NOSUID | kernel.MS_NODEV, "size=64m,mode=1777")
-    # The same folder at the path that the service knows, writable, without the rest of the disk.
+    # Mount this folder writable at the path that the service uses, without the rest of the disk.
     exchange.mkdir(parents=True, exist_ok=True)
     kernel.mount(f"/proc/self/fd/{held}", str(exchange), "", kernel.MS_BIND)
     kernel.restrict_mount(str(exchange), 0, cleared=kernel.MOUNT_ATTR_RDONLY)
@@ -86,7 +86,7 @@ def become_container(exchange: Path) -> None:
 
 
 def reveal(paths: Sequence[Path]) -> None:
-    """Make paths reachable whose parent folders are closed to others, in this mount namespace only."""
+    """Make paths accessible although their parent folders are closed to others, in this mount namespace only."""
     closed: dict[Path, list[Path]] = {}
     for path in dict.fromkeys(path.resolve() for path in paths):
         for parent in reversed(path.parents):
@@ -105,7 +105,7 @@ def reveal(paths: Sequence[Path]) -> None:
 
 
 def main(words: Sequence[str]) -> int:
-    """Enter a profile and become a command."""
+    """Apply a profile and execute a command."""
     parser = argparse.ArgumentParser(prog="profiles")
     parser.add_argument("profile", choices=PROFILES)
     parser.add_argument("--keep", type=Path, action="append", default=[])
