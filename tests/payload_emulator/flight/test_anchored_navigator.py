@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm
 
 from lunar.camera import nadir_camera_from_mcmf
@@ -21,7 +22,9 @@ from payload_emulator.flight.anchored import (
     frame_limit,
 )
 from payload_emulator.flight.detections import Detections
+from payload_emulator.flight.lost_in_space import Place
 from payload_emulator.flight.outcomes import Outcome
+from payload_emulator.flight.relative import RelativeParameters
 from payload_emulator.flight.sighting import Pose, in_view, landmark_map
 from payload_emulator.flight.tables import BurnTable
 
@@ -282,3 +285,285 @@ def test_a_wide_prior_is_searched_by_votes_and_says_so(orbit: Orbit) -> None:
     assert orbit.error_m(navigator, 0) < 300.0
     following = navigator.step(int(orbit.ticks[1]), orbit.detections(1), orbit.attitude(1))
     assert following.outcome is Outcome.fixed and not following.reacquired
+
+
+def recorded(
+    monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, answer: Any = None
+) -> list[tuple[Any, ...]]:
+    """Put a stand-in in place of a function that keeps what it is given."""
+    calls: list[tuple[Any, ...]] = []
+
+    def keep(*given: Any, **more: Any) -> Any:
+        calls.append((*given, more) if more else given)
+        return answer
+
+    monkeypatch.setattr(owner, name, keep)
+    return calls
+
+
+def test_a_place_found_without_a_prior_turns_the_orbit_with_it(
+    orbit: Orbit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The velocity turns by the shortest rotation from the believed place to the one that was found."""
+    navigator = orbit.navigator()
+    prior = navigator.state
+    found = orbit.detections(0)
+    axis = np.cross(prior.mean[:3], [0.3, -0.5, 0.8])
+    turn = Rotation.from_rotvec(0.4 * axis / np.linalg.norm(axis))
+    there = 1.01 * turn.apply(prior.mean[:3])
+    place = Place(
+        orbit.rotations[0] @ there, np.zeros(3), np.array([30.0, 80.0, 50.0]), np.array([2, 5, 7]), np.array([4, 1, 9]),
+        0.1, -20.0,
+    )  # fmt: skip
+    search = recorded(monkeypatch, anchored, "find_place", place)
+    updated = recorded(monkeypatch, navigator, "_updated", "the fix")
+    pose = Pose(prior.mean[:3], orbit.attitude(0), orbit.rotations[0], np.zeros(3), np.zeros(2), np.zeros(3))
+    assert navigator._found_anywhere(prior, pose, found) == "the fix"
+    ((given, sigma_px, places, camera, parameters),) = search
+    assert given is found and camera is orbit.case.camera and parameters is navigator.parameters.lost
+    np.testing.assert_allclose(sigma_px, 1.0)
+    assert places is navigator._places
+    ((fresh, moved, detected, identification, sighting, more),) = updated
+    assert more == {"reacquired": True} and detected is found
+    np.testing.assert_allclose(fresh.mean[:3], there, rtol=1e-12)
+    np.testing.assert_allclose(fresh.mean[3:6], turn.apply(prior.mean[3:6]), rtol=1e-9)
+    assert fresh.ticks == prior.ticks and not fresh.craters.size
+    sigma = np.sqrt(np.diag(fresh.covariance))
+    # Three times the worst of 30, 80 and 50 m, and 200 m; a metre a second and 1e-3/s of the way.
+    np.testing.assert_allclose(sigma[:3], 440.0)
+    np.testing.assert_allclose(sigma[3:6], 1.0 + 1e-3 * np.linalg.norm(there - prior.mean[:3]))
+    np.testing.assert_allclose(sigma[6:9], navigator._markov_sigma_m_s2)
+    np.testing.assert_allclose(moved.position_icrf_m, there)
+    np.testing.assert_array_equal(moved.camera_from_icrf, pose.camera_from_icrf)
+    assert identification.detection.tolist() == [2, 5, 7] and identification.sighted.tolist() == [0, 1, 2]
+    assert (identification.candidates, identification.needed) == (len(found), 3)
+    assert sighting.index.tolist() == [4, 1, 9]
+    monkeypatch.setattr(anchored, "find_place", lambda *_: None)
+    assert navigator._found_anywhere(prior, pose, found) is None
+
+
+def test_a_widened_search_adds_its_radius_to_what_the_orbit_believes(
+    orbit: Orbit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half a width of 24 km is three sigma: 8 km, and a velocity of 1e-3/s of that."""
+    navigator = orbit.navigator(search_radius_m=24_000.0)
+    prior, found = navigator.state, orbit.detections(0)
+    calls = recorded(monkeypatch, navigator, "_acquired", "the fix")
+    assert navigator._reacquire(prior, "the pose", found) == "the fix"  # type: ignore[arg-type]
+    ((wide, pose, given, radius_m),) = calls
+    assert (pose, radius_m) == ("the pose", 8_000.0) and given is found
+    added = np.zeros_like(prior.covariance)
+    added[:3, :3], added[3:6, 3:6] = np.eye(3) * 64e6, np.eye(3) * 64.0
+    np.testing.assert_allclose(wide.covariance - prior.covariance, added, rtol=1e-9, atol=1e-6)
+    np.testing.assert_array_equal(wide.mean, prior.mean)
+
+
+def test_disagreeing_frames_widen_the_search_and_then_give_the_prior_up(
+    orbit: Orbit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the fourth on the search is widened; from the sixth on every third goes without a prior."""
+    navigator = orbit.navigator(map_landmarks=False)
+    monkeypatch.setattr(navigator, "_fix", lambda *_: (None, 7, 10))
+    widened = recorded(monkeypatch, navigator, "_reacquire")
+    anywhere = recorded(monkeypatch, navigator, "_found_anywhere")
+    counts = []
+    for k in range(13):
+        report = navigator.step(int(orbit.ticks[k]), orbit.detections(k), orbit.attitude(k))
+        assert (report.outcome, report.candidates, report.expected) == (Outcome.refused, 7, 10)
+        counts.append((len(widened), len(anywhere)))
+    assert counts == [
+        (0, 0), (0, 0), (0, 0), (1, 0), (2, 0), (3, 1), (4, 1), (5, 1), (6, 2), (7, 2), (8, 2), (9, 3), (10, 3),
+    ]  # fmt: skip
+    monkeypatch.setattr(navigator, "_fix", lambda *_: (None, 0, 10))
+    report = navigator.step(int(orbit.ticks[13]), orbit.detections(13), orbit.attitude(13))
+    assert report.outcome is Outcome.coasted
+
+
+def test_craters_are_looked_for_as_far_outside_as_the_position_may_be_off(
+    orbit: Orbit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """3.5 sigma over the altitude times the focal length, and 200 px at most."""
+    focal_px = 256.0 / np.tan(np.radians(60.0))
+    for sigma_m in (300.0, 1_400.0, 3_500.0):
+        navigator = orbit.navigator(tracking_limit_m=5_000.0)
+        prior = navigator.state
+        wide = np.zeros_like(prior.covariance)
+        wide[:3, :3] = np.eye(3) * sigma_m**2
+        prior = replace(prior, covariance=wide)
+        pose = Pose(
+            prior.mean[:3], orbit.attitude(0), orbit.rotations[0], np.zeros(3), np.zeros(2), np.zeros(3)
+        )
+        nothing = in_view(orbit.map, pose, orbit.case.camera, 0.0).select(np.zeros(0, dtype=np.int64))
+        calls = recorded(monkeypatch, anchored, "in_view", nothing)
+        assert navigator._fix(prior, pose, orbit.detections(0)) == (None, 0, 0)
+        monkeypatch.undo()
+        altitude_m = np.linalg.norm(prior.mean[:3]) - 1_737_400.0
+        assert calls[0][3] == pytest.approx(min(3.5 * sigma_m / altitude_m * focal_px, 200.0))
+
+
+def test_what_identification_is_given_is_the_spread_of_prediction_and_catalogue(
+    orbit: Orbit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    navigator = orbit.navigator()
+    fly(orbit, navigator, 0, 3)
+    # Some craters are among the states, others are not.
+    prior = navigator.state.only_craters(navigator.state.craters[::2])
+    pose = Pose(prior.mean[:3], orbit.attitude(2), orbit.rotations[2], np.zeros(3), np.zeros(2), np.zeros(3))
+    sighting = in_view(navigator.landmarks, pose, orbit.case.camera, 0.0)
+    calls = recorded(monkeypatch, anchored, "identify", "pairs")
+    found = orbit.detections(2)
+    assert navigator._identify(prior, sighting, found) == "pairs"
+    ((given, seen, spread, own, variance, area_px2, parameters, place),) = calls
+    assert given is found and seen is sighting and parameters is navigator.parameters.identification
+    assert area_px2 == 512.0 * 512.0
+    np.testing.assert_allclose(variance, 1.0)
+    count = len(sighting)
+    rows = np.zeros((2 * count, prior.mean.size))
+    slots = prior.slots(sighting.index)
+    assert np.any(slots >= 0) and np.any(slots < 0)
+    for k in range(count):
+        here = slice(2 * k, 2 * k + 2)
+        rows[here, :3], rows[here, 9:12] = sighting.by_position[k], sighting.by_attitude[k]
+        rows[here, 12:14], rows[here, 14:17] = np.eye(2), sighting.by_offset[k]
+        rows[here, 17] = sighting.by_scale[k]
+        if slots[k] >= 0:
+            rows[here, slots[k] : slots[k] + 3] = sighting.by_offset[k]
+    noise = navigator.parameters.errors.attitude_noise_rad
+    tilt = np.concatenate([sighting.by_attitude[k] for k in range(count)]) * noise
+    dense = (rows @ prior.covariance @ rows.T + tilt @ tilt.T).reshape(count, 2, count, 2)
+    np.testing.assert_allclose(spread, dense, rtol=1e-9, atol=1e-9)
+    for k in range(count):
+        expected = np.zeros((2, 2))
+        if slots[k] < 0:
+            expected = sighting.by_offset[k] @ np.diag([3_600.0] * 3) @ sighting.by_offset[k].T
+        np.testing.assert_allclose(own[k], expected, rtol=1e-9, atol=1e-12)
+        at = sighting.by_position[k]
+        np.testing.assert_allclose(place[k], at @ prior.covariance[:3, :3] @ at.T, rtol=1e-9)
+
+
+def test_the_map_is_shown_the_frame_as_corrected_and_what_no_crater_explains(
+    orbit: Orbit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The attitude turned back by what the filter found of it, the pixels less their bias."""
+    navigator = orbit.navigator()
+    fly(orbit, navigator, 0, 3)
+    found = orbit.detections(2)
+    stray = Detections(*(np.append(column, 300.0) for column in (found.u_px, found.v_px)),
+        np.append(found.diameter_px, 200.0), np.ones(len(found) + 1), np.ones(len(found) + 1))  # fmt: skip
+    state, fix = navigator.state, navigator.last_fix
+    assert fix is not None
+    calls = recorded(monkeypatch, navigator.mapper, "observe", ("a landmark",))
+    navigator.new_landmarks = ("the first",)  # type: ignore[assignment]
+    navigator._map(stray, orbit.attitude(2), orbit.rotations[2])
+    assert navigator.new_landmarks == ("the first", "a landmark")  # type: ignore[comparison-overlap]
+    ((view, shifted, variance, free, surface_m),) = calls
+    rotation = orbit.rotations[2]
+    turn = Rotation.from_rotvec(-(state.mean[9:12] + fix.update.attitude_rad)).as_matrix()
+    np.testing.assert_allclose(view.camera_from_mcmf, turn @ orbit.attitude(2) @ rotation.T, atol=1e-12)
+    np.testing.assert_allclose(view.position_mcmf_m, rotation @ state.mean[:3])
+    np.testing.assert_allclose(view.covariance_m2, rotation @ state.covariance[:3, :3] @ rotation.T)
+    assert (view.ticks, view.attitude_sigma_rad) == (state.ticks, fix.update.attitude_sigma_rad)
+    np.testing.assert_allclose(shifted.u_px, stray.u_px - state.mean[12])
+    np.testing.assert_allclose(shifted.v_px, stray.v_px - state.mean[13])
+    np.testing.assert_allclose(variance, 1.0)
+    # All detections are of craters of the catalogue but the last.
+    assert np.flatnonzero(free).tolist() == [len(found)]
+    heights = np.linalg.norm(orbit.map.position_mcmf_m[fix.index], axis=1) - 1_737_400.0
+    assert heights.min() - 1_000.0 < surface_m < heights.max() + 1_000.0
+    # Without a fix the attitude is taken as measured, with its bias and its noise.
+    navigator.last_fix = None
+    navigator._map(stray, orbit.attitude(2), orbit.rotations[2])
+    errors = navigator.parameters.errors
+    assert calls[1][0].attitude_sigma_rad == pytest.approx(
+        np.hypot(errors.attitude_bias_rad, errors.attitude_noise_rad)
+    )
+    turn = Rotation.from_rotvec(-state.mean[9:12]).as_matrix()
+    np.testing.assert_allclose(
+        calls[1][0].camera_from_mcmf, turn @ orbit.attitude(2) @ rotation.T, atol=1e-12
+    )
+
+
+def test_a_pass_ends_when_nothing_was_seen_for_the_memory_of_craters(
+    orbit: Orbit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """240 s without an image, or a clock that went back; coasted frames in between change nothing of that."""
+    for seconds, ended in ((240, 0), (241, 1), (-1, 1)):
+        navigator = orbit.navigator()
+        fly(orbit, navigator, 0, 3)
+        calls = recorded(monkeypatch, navigator, "_end_pass")
+        navigator.step(int(orbit.ticks[2]) + 100 * SECOND, None, None)
+        navigator.step(
+            int(orbit.ticks[2]) + seconds * SECOND,
+            orbit.detections(3).select(np.zeros(0, dtype=np.int64)),
+            None,
+        )
+        assert len(calls) == ended, seconds
+        # The search takes up where the image was, not where it was coasted to.
+        assert navigator._image_ticks == int(orbit.ticks[2]) + seconds * SECOND
+
+
+def test_the_landmarks_of_a_pass_serve_from_its_end_on(orbit: Orbit, monkeypatch: pytest.MonkeyPatch) -> None:
+    navigator = orbit.navigator()
+    before = navigator.landmarks
+    navigator._places = "searched before"  # type: ignore[assignment]
+    navigator._end_pass()
+    # Nothing was mapped: the map stays.
+    assert navigator.landmarks is before and navigator._places == "searched before"  # type: ignore[comparison-overlap]
+
+    class Mapper:
+        def close(self) -> tuple[str, ...]:
+            return ("new",)
+
+        def __len__(self) -> int:
+            return 1
+
+        def with_catalogue(self, catalogue: Any) -> tuple[str, Any]:
+            return ("with", catalogue)
+
+    navigator.mapper = Mapper()  # type: ignore[assignment]
+    navigator._end_pass()
+    assert navigator.new_landmarks == ("new",)  # type: ignore[comparison-overlap]
+    assert navigator.landmarks == ("with", navigator._catalogue)  # type: ignore[comparison-overlap]
+    assert navigator._places is None
+
+
+def test_the_move_between_frames_is_measured_on_what_no_fix_used(
+    orbit: Orbit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    navigator = orbit.navigator(relative=RelativeParameters(enabled=True))
+    found = orbit.detections(0)
+    navigator.step(int(orbit.ticks[0]), found, orbit.attitude(0))
+    fix, before = navigator.last_fix, navigator._before
+    assert fix is not None and before is not None
+    left = np.setdiff1d(np.arange(len(found)), fix.identification.detection)
+    np.testing.assert_array_equal(before.found.u_px, found.u_px[left])
+    np.testing.assert_allclose(before.variance_px2, np.ones(left.size))
+    np.testing.assert_allclose(before.camera_from_icrf, orbit.attitude(0), atol=1e-12)
+    np.testing.assert_allclose(before.mcmf_from_icrf, orbit.rotations[0], atol=1e-7)
+    prior, later = navigator.state, orbit.detections(1)
+    navigator._surface_m = 123.0
+    calls = recorded(monkeypatch, anchored, "tie", (prior, 4))
+    assert navigator._tied(prior, later, orbit.attitude(1), orbit.rotations[1]) is prior
+    ((state, was, now, camera, surface_m, noise_rad, parameters),) = calls
+    assert state is prior and was is before and camera is orbit.case.camera and surface_m == 123.0
+    assert now.found is later and now.camera_from_icrf is not before.camera_from_icrf
+    np.testing.assert_allclose(now.variance_px2, 1.0)
+    assert noise_rad == navigator.parameters.errors.attitude_noise_rad
+    assert parameters is navigator.parameters.relative and navigator.ties == 4
+    # Each frame is compared once; without one before the clone of the position goes, too.
+    assert navigator._before is None
+    bare = navigator._tied(prior, later, orbit.attitude(1), orbit.rotations[1])
+    assert len(calls) == 1 and navigator.ties == 0
+    assert bare.mean.size == prior.mean.size - 3
+    # A position too uncertain to predict pixels is not tied, and a result that is none is not used.
+    navigator._before = before
+    vague = replace(prior, covariance=prior.covariance + np.eye(prior.mean.size) * 1_600.0**2)
+    assert navigator._tied(vague, later, orbit.attitude(1), orbit.rotations[1]).mean.size == bare.mean.size
+    assert len(calls) == 1
+    navigator._before = before
+    monkeypatch.setattr(
+        anchored, "tie", lambda *_: (replace(prior, mean=np.full(prior.mean.size, np.nan)), 1)
+    )
+    np.testing.assert_array_equal(
+        navigator._tied(prior, later, orbit.attitude(1), orbit.rotations[1]).mean, bare.mean
+    )

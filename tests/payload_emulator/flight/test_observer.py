@@ -12,9 +12,9 @@ from payload_emulator.flight.anchored import AnchoredReport
 from payload_emulator.flight.detections import Detections
 from payload_emulator.flight.loads import FlightParameters, FlightTables
 from payload_emulator.flight.observer import Observer
-from payload_emulator.flight.outcomes import Mode, Outcome
+from payload_emulator.flight.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.preprocess import ImageQuality
-from payload_emulator.flight.tables import pack_anchor_table
+from payload_emulator.flight.tables import pack_anchor_table, table_hash
 
 ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 IMAGE = np.zeros((4, 4), dtype=np.uint8)
@@ -279,3 +279,200 @@ def test_reads_of_the_anchor_are_counted_beyond_the_first(moon: Any) -> None:
     assert "truth_reads_after_start" not in summary
     assert telemetry.names().count("anchor_read") == 2
     assert [values["anchor_reads"] for values in telemetry.named("frame_outcome")] == [1, 2, 3, 4, 5]
+
+
+def test_a_frame_of_odometry_is_reported_in_full(
+    rig: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Longitude -0.3 rad is 342.8 degrees east; velocities, sigmas and NIS do not exist for odometry."""
+    observer = Observer(rig.eye, FlightParameters(modes=(Mode.spherical,)), rig.telemetry, rig.clock)
+    anchor: Any = object()
+    observer._anchor = anchor
+    observer.manual_step = True
+    state = SimpleNamespace(
+        latitude_rad=0.2, longitude_rad=-0.3, altitude_m=31e3, altitude_reads=7, resets=2,
+        features=SimpleNamespace(altitude_m=30e3),
+    )  # fmt: skip
+    report = SimpleNamespace(
+        outcome=Outcome.multi, reset_trigger=ResetTrigger.time_gap, candidate_pairs=9, pairs=4, shift_east_m=12.0,
+        shift_north_m=-5.0,
+    )  # fmt: skip
+    calls = []
+
+    def step(*given: Any, **more: Any) -> tuple[Any, Any]:
+        calls.append((given, more))
+        return state, report
+
+    monkeypatch.setattr("payload_emulator.flight.odometry.step", step)
+    rig.telemetry.frame_number = 5
+    observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
+    observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
+    parameters = observer._parameters
+    for k, (before, manual) in enumerate(((None, True), (state, False))):
+        (was, ticks, found, table, camera, mode, tuned), more = calls[k]
+        assert was is before and more == {"manual_step": manual}
+        assert (ticks, mode) == (rig.telemetry.ticks, Mode.spherical) and len(found) == 6
+        assert table is anchor and camera is parameters.camera and tuned is parameters.odometry
+    nothing = (np.nan,) * 3
+    expected = {
+        "frame_number": 5, "image_ticks": rig.telemetry.ticks, "estimator": 1, "outcome": 1,
+        "latitude_deg": pytest.approx(np.degrees(0.2)), "longitude_deg": pytest.approx(360.0 - np.degrees(0.3)),
+        "altitude_m": 31e3, "velocity_icrf_m_s": pytest.approx(nothing, nan_ok=True),
+        "sigma_rtn_m": pytest.approx(nothing, nan_ok=True), "nis": pytest.approx(np.nan, nan_ok=True), "matched": 4,
+    }  # fmt: skip
+    first, second = rig.telemetry.named("navigation_state")
+    assert first == expected and second == {**expected, "frame_number": 6}
+    assert rig.telemetry.named("frame_outcome")[0] == {
+        "frame_number": 5, "image_ticks": rig.telemetry.ticks, "estimator": 1, "outcome": 1, "reset_trigger": 2,
+        "detections": 6, "candidate_pairs": 9, "pairs": 4, "shift_east_m": 12.0, "shift_north_m": -5.0,
+        "anchor_reads": 7,
+    }  # fmt: skip
+    assert rig.telemetry.events == [("info", "anchor_read", 2.0, 1.0)] * 2
+    assert observer.anchor_reads == 9
+    assert observer.summary()["estimators"]["spherical"] == {
+        "outcomes": {"anchored": 0, "multi": 2, "single": 0, "predicted": 0, "missed": 0, "rejected": 0},
+        "reset_triggers": {"time_gap": 2},
+        "resets": 2,
+        "altitude_reads": 7,
+        # The first of each is the start.
+        "anchor_reads_after_start": 7,
+    }
+
+
+def test_odometry_without_a_position_reports_its_outcome_alone(
+    rig: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    observer = Observer(rig.eye, FlightParameters(modes=(Mode.paper,)), rig.telemetry, rig.clock)
+    nothing = pytest.approx(np.nan, nan_ok=True)
+    observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
+    expected = {
+        "frame_number": 0, "image_ticks": rig.telemetry.ticks, "estimator": 0, "outcome": int(Outcome.missed),
+        "reset_trigger": 0, "detections": 6, "candidate_pairs": 0, "pairs": 0, "shift_east_m": nothing,
+        "shift_north_m": nothing, "anchor_reads": 0,
+    }  # fmt: skip
+    assert rig.telemetry.named("frame_outcome") == [expected]
+    observer._anchor = object()  # type: ignore[assignment]
+    report = SimpleNamespace(
+        outcome=Outcome.rejected, reset_trigger=ResetTrigger.none, candidate_pairs=3, pairs=0, shift_east_m=np.nan,
+        shift_north_m=np.nan,
+    )  # fmt: skip
+    monkeypatch.setattr("payload_emulator.flight.odometry.step", lambda *_, **__: (None, report))
+    observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
+    assert rig.telemetry.named("frame_outcome")[1] == {
+        **expected, "frame_number": 1, "outcome": int(Outcome.rejected), "candidate_pairs": 3,
+    }  # fmt: skip
+    assert rig.telemetry.named("navigation_state") == [] and rig.telemetry.events == []
+    assert observer.summary()["outcomes"] == {
+        "anchored": 0, "multi": 0, "single": 0, "predicted": 0, "missed": 1, "rejected": 1,
+    }  # fmt: skip
+
+
+def test_a_frame_of_the_filter_is_reported_in_full(rig: SimpleNamespace) -> None:
+    rig.telemetry.frame_number, rig.navigator.outcome = 8, Outcome.fixed
+    look(rig)
+    ticks = rig.telemetry.ticks
+    assert rig.telemetry.named("frame_outcome") == [
+        {
+            "frame_number": 8, "image_ticks": ticks, "estimator": 2, "outcome": int(Outcome.fixed), "reset_trigger": 0,
+            "detections": 6, "candidate_pairs": 9, "pairs": 3, "shift_east_m": pytest.approx(np.nan, nan_ok=True),
+            "shift_north_m": pytest.approx(np.nan, nan_ok=True), "anchor_reads": 0,
+        }
+    ]  # fmt: skip
+    assert rig.telemetry.named("navigation_state") == [
+        {
+            "frame_number": 8, "image_ticks": ticks, "estimator": 2, "outcome": int(Outcome.fixed),
+            "latitude_deg": pytest.approx(np.degrees(0.1)), "longitude_deg": pytest.approx(360.0 - np.degrees(0.2)),
+            "altitude_m": 30e3, "velocity_icrf_m_s": (1.0, 2.0, 3.0), "sigma_rtn_m": (4.0, 6.0, 5.0), "nis": 7.0,
+            "matched": 3,
+        }
+    ]  # fmt: skip
+    (sent,) = rig.telemetry.named("filter_estimate")
+    assert (sent["frame_number"], sent["image_ticks"]) == (8, ticks)
+    assert rig.navigator.given[0][0] == ticks
+    summary = rig.observer.summary()
+    assert summary["estimators"]["anchored"]["outcomes"] == {
+        "fixed": 1,
+        "coasted": 0,
+        "refused": 0,
+        "no_image": 0,
+    }
+    assert summary["fixes"] == {"fixed": 1, "coasted": 0, "refused": 0, "no_image": 0, "reacquired": 0}
+    assert {name: summary[name] for name in ("frames_processed", "frames_bad", "detections", "events")} == {
+        "frames_processed": 1, "frames_bad": 0, "detections": 6, "events": 0,
+    }  # fmt: skip
+
+
+def test_new_landmarks_go_down_forty_to_a_packet(
+    rig: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def rows(landmarks: tuple[int, ...]) -> SimpleNamespace:
+        n = np.array(landmarks, dtype=np.float64)
+        return SimpleNamespace(
+            identity=n, latitude_rad=0.01 * n, longitude_rad=-0.01 * n, height_m=n + 1.0, diameter_m=n + 2.0,
+            sigma_m=np.stack([n + 3.0, n + 4.0, n + 5.0], axis=1), sightings=n + 6.0, passes=n + 7.0,
+        )  # fmt: skip
+
+    monkeypatch.setattr("payload_emulator.flight.observer.map_rows", rows)
+    rig.navigator.new_landmarks = tuple(range(41))
+    look(rig)
+    first, second = rig.telemetry.named("landmarks")
+    assert first["items"]["landmark_id"].tolist() == list(range(40))
+    assert (second["frame_number"], second["image_ticks"]) == (0, rig.telemetry.ticks)
+    assert {name: values.tolist() for name, values in second["items"].items()} == {
+        "landmark_id": [40.0], "latitude_deg": [pytest.approx(np.degrees(0.4))],
+        "longitude_deg": [pytest.approx(360.0 - np.degrees(0.4))], "height_m": [41.0], "diameter_m": [42.0],
+        "sigma_east_m": [43.0], "sigma_north_m": [44.0], "sigma_up_m": [45.0], "sightings": [46.0], "passes": [47.0],
+    }  # fmt: skip
+
+
+def test_detections_are_reported_within_the_range_of_their_fields_and_with_their_class(
+    rig: SimpleNamespace,
+) -> None:
+    """From 30 km a crater in the centre of 6, 12 and 20 km is as wide as f D / h; 4 km is no class of 5 to 30 km."""
+    focal_px = 256.0 / np.tan(np.radians(60.0))
+    diameter = focal_px * np.array([6e3, 12e3, 20e3, 4e3, 6e3]) / 30e3
+    rig.eye.found = Detections(
+        np.array([255.5, 255.5, 255.5, 255.5, -3.0]), np.array([255.5, 255.5, 255.5, 255.5, 2_000.0]), diameter,
+        np.array([0.5, 1.5, -0.5, 0.4, 0.3]), np.arange(5.0),
+    )  # fmt: skip
+    look(rig, score_floor=-1.0)
+    (sent,) = rig.telemetry.named("detections")
+    assert (sent["frame_number"], sent["image_ticks"], sent["image_quality"]) == (0, rig.telemetry.ticks, 0)
+    items = sent["items"]
+    assert items["u_px"].tolist() == [255.5] * 4 + [0.0]
+    # A field of 16 bits in 1/64 px.
+    assert items["v_px"].tolist() == [255.5] * 4 + [65_535 / 64.0]
+    np.testing.assert_array_equal(items["diameter_px"], diameter)
+    assert items["score"].tolist() == [0.5, 1.0, 0.0, 0.4, 0.3]
+    assert items["sigma_px"].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert items["size_class"][:3].tolist() == [0, 1, 2] and items["size_class"][3] not in (0, 1, 2)
+
+
+def test_without_an_altitude_no_detection_has_a_class(rig: SimpleNamespace) -> None:
+    rig.observer._navigator = None
+    look(rig)
+    (sent,) = rig.telemetry.named("detections")
+    assert set(sent["items"]["size_class"].tolist()) == {-1}
+
+
+def test_a_damaged_table_is_told_by_its_number_and_its_hash(rig: SimpleNamespace) -> None:
+    octets = b"no table at all"
+    observer = Observer(rig.eye, FlightParameters(modes=(Mode.anchored,)), rig.telemetry, rig.clock)
+    observer.load_tables(FlightTables(catalogue=octets, burns=octets, anchor_ephemeris=octets))
+    assert rig.telemetry.events == [
+        ("high", "table_refused", float(number), float(table_hash(octets))) for number in (1, 2, 10)
+    ]
+    assert observer._navigator is None
+
+
+def test_a_widened_orbit_and_a_reset_reach_the_navigator(rig: SimpleNamespace) -> None:
+    calls: list[tuple[float, float]] = []
+    rig.navigator.widen = lambda position, velocity: calls.append((position, velocity))
+    rig.observer.widen(500.0, 0.5)
+    assert calls == [(500.0, 0.5)]
+    rig.observer._odometry[Mode.paper] = "remembered"
+    rig.observer.reset()
+    # There are no tables to start a new one from.
+    assert rig.observer._navigator is None and rig.observer._odometry == {}
+    rig.observer.widen(500.0, 0.5)
+    assert len(calls) == 1
