@@ -7,7 +7,8 @@ TmtcError
 ├── UnknownPacket         no such name or (APID, service, subtype) in the dictionary
 ├── ValueRefused          a value that its field cannot hold or its range forbids
 ├── FrameError            a transfer frame that cannot be built or read
-└── LinkFormatError       a stream whose framing cannot be told, or settings that contradict each other
+├── LinkFormatError       a stream whose framing cannot be told, or settings that contradict each other
+└── DefinitionError       an imported packet definition that is damaged, contradicts itself or is not supported
 """
 
 from __future__ import annotations
@@ -59,3 +60,7 @@ class FrameError(TmtcError):
 
 class LinkFormatError(TmtcError):
     """A stream whose framing cannot be told, or link settings that contradict each other."""
+
+
+class DefinitionError(TmtcError):
+    """An imported packet definition that is damaged, contradicts itself or uses what is not supported."""

@@ -1,0 +1,641 @@
+"""Packets of other missions decoded through their XTCE, against an independent interpreter and constructed values."""
+
+from __future__ import annotations
+
+import math
+import struct
+import warnings
+
+import numpy as np
+import pytest
+import space_packet_parser as spp
+
+from tests.tmtc import foreign
+from tests.tmtc.foreign import (
+    HEADER,
+    HEADER_CONTAINER,
+    HEADER_PARAMETERS,
+    HEADER_TYPES,
+    Bits,
+    calibrated,
+    comparison,
+    container,
+    default,
+    document,
+    floating,
+    integer,
+    space_packet,
+)
+from tests.tmtc.test_xtce import random_packet
+from tmtc.dictionary import DICTIONARY
+from tmtc.errors import DefinitionError
+from tmtc.stream import PacketCut
+from tmtc.xtce import format_xtce
+from tmtc.xtce_columns import ArrayColumn, OptionalColumn, ValueColumn
+from tmtc.xtce_decode import VERDICTS, XtceDecode, decode_packets
+from tmtc.xtce_import import parse_xtce
+
+
+def whole(packets: list[bytes]) -> tuple[bytes, PacketCut]:
+    """Packets one after another, and a cut that says where they stand."""
+    lengths = np.array([len(p) for p in packets], dtype=np.int64)
+    offsets = np.cumsum(lengths) - lengths
+    none = np.empty((0, 2), dtype=np.int64)
+    ok = np.ones(len(packets), dtype=np.bool_)
+    return b"".join(packets), PacketCut(offsets, lengths, ok, none, none, int(lengths.sum()))
+
+
+def decoded(definition: str, packets: list[bytes], root: str | None = None) -> XtceDecode:
+    return decode_packets(parse_xtce(definition), *whole(packets), root)
+
+
+def verdicts(definition: str, packets: list[bytes]) -> list[str]:
+    return [VERDICTS[v] for v in decoded(definition, packets).verdict.tolist()]
+
+
+def one(types: str, parameters: dict[str, str], entries: list[str], data: bytes) -> dict[str, list]:
+    """Values of one packet of a container without header."""
+    found = decoded(document(types, parameters, container("P", entries)), [data])
+    assert found.verdict.tolist() == [0], found.counts()
+    return {name: column.to_list() for name, column in found.tables["P"].columns.items()}
+
+
+# against an interpreter of another project
+
+
+def rows_of(found: XtceDecode, count: int) -> list[dict[str, tuple]]:
+    """(value, raw) by parameter, for every packet."""
+    rows: list[dict[str, tuple]] = [{} for _ in range(count)]
+    for table in found.tables.values():
+        for name, column in table.columns.items():
+            pairs = zip(column.to_list(), column.to_list(raw=True), strict=True)
+            for packet, pair in zip(table.packet_index.tolist(), pairs, strict=True):
+                rows[packet][name] = pair
+    return rows
+
+
+def same(a, b) -> bool:
+    return a == b or (isinstance(a, float) and isinstance(b, float) and math.isnan(a) and math.isnan(b))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_independent_interpreter_reads_the_same_values_of_another_mission(seed, tmp_path):
+    path = tmp_path / "bus.xml"
+    path.write_text(foreign.BUS, encoding="utf-8")
+    theirs = spp.load_xtce(path)
+    packets = foreign.capture(400, seed)
+    found = decoded(foreign.BUS, packets)
+    assert set(found.tables) == {"Housekeeping", "Event", "UrgentEvent", "Dump", "Bare"}
+    assert found.counts()["decoded"] == 400
+    for packet, row in zip(packets, rows_of(found, 400), strict=True):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            expected = theirs.parse_bytes(packet)
+        assert row.keys() == expected.keys()
+        for name, value in expected.items():
+            assert same(row[name][0], value) and same(row[name][1], value.raw_value), (name, row[name], value)
+            assert isinstance(row[name][0], str) == isinstance(value, str)
+
+
+def test_our_own_definition_is_read_back_and_decodes_to_the_values_of_the_dictionary(tmp_path):
+    rng = np.random.default_rng(5)
+    definitions = [d for d in DICTIONARY.telemetry if d.group is None] * 3
+    packets = [random_packet(d, 0, rng) for d in definitions]
+    found = decoded(format_xtce(), packets)
+    assert found.counts()["decoded"] == len(packets)
+    for definition, packet, row in zip(definitions, packets, rows_of(found, len(packets)), strict=True):
+        ours = DICTIONARY.unpack_packet(packet)
+        for f in definition.fields:
+            if f.size == 1 and not f.labels and f.missing is None:
+                value, raw = row[f"{definition.name}_{f.name}"]
+                assert same(value, ours.values[f.name]) and same(raw, ours.raw[f.name])
+            elif f.labels:
+                assert row[f"{definition.name}_{f.name}"] == (f.label(ours.raw[f.name]), ours.raw[f.name])
+
+
+# integers and floats of any width at any place
+
+
+@pytest.mark.parametrize("bits", range(1, 65))
+def test_integers_of_every_width_stand_at_every_place(bits):
+    rng = np.random.default_rng(bits)
+    types = integer("U", bits) + integer("I", bits, "twosComplement") + integer("PAD", 1)
+    for phase in range(8):
+        parameters = {**{f"P{k}": "PAD" for k in range(phase)}, "A": "U", "B": "I"}
+        text = document(types, parameters, container("P", list(parameters)))
+        packets, expected = [], []
+        extremes = [(0, -(1 << bits - 1)), ((1 << bits) - 1, (1 << bits - 1) - 1)]
+        drawn = [int.from_bytes(rng.bytes(8), "big") >> (64 - bits) for _ in range(6)]
+        pairs = extremes + [(v, w - (1 << bits - 1)) for v, w in zip(drawn[:3], drawn[3:], strict=True)]
+        for unsigned, signed in pairs:
+            packed = Bits().add(0, phase).add(unsigned, bits).add(signed, bits)
+            packets.append(packed.add(0, -packed.count % 8).packed())
+            expected.append((unsigned, signed))
+        columns = decoded(text, packets).tables["P"].columns
+        assert list(zip(columns["A"].to_list(), columns["B"].to_list(), strict=True)) == expected
+        assert columns["A"].raw.dtype == (np.uint64 if bits == 64 else np.int64)
+        assert columns["B"].raw.dtype == np.int64
+
+
+def test_other_signs_are_read():
+    types = integer("ONES", 9, "onesComplement") + integer("SIGN", 9, "signMagnitude") + integer("PAD", 6)
+    for value in (-255, -1, 0, 1, 255):
+        ones = value if value >= 0 else ~-value & 0x1FF
+        sign = value if value >= 0 else 0x100 | -value
+        data = Bits().add(ones, 9).add(sign, 9).add(0, 6).packed()
+        found = one(types, {"A": "ONES", "B": "SIGN", "C": "PAD"}, ["A", "B", "C"], data)
+        assert found["A"] == found["B"] == [value]
+
+
+# The examples of MIL-STD-1750A for 32 and 48 bits, and the least positive step of 48 bits at exponent 0 by hand
+@pytest.mark.parametrize(
+    ("octets", "value"),
+    [
+        ("7FFFFF7F", 0.9999998807907104 * 2.0**127),
+        ("4000007F", 0.5 * 2.0**127),
+        ("50000004", 0.625 * 2.0**4),
+        ("40000001", 0.5 * 2.0**1),
+        ("40000000", 0.5),
+        ("400000FF", 0.5 * 2.0**-1),
+        ("40000080", 0.5 * 2.0**-128),
+        ("00000000", 0.0),
+        ("80000000", -1.0),
+        ("BFFFFF80", -0.5000001192092896 * 2.0**-128),
+        ("9FFFFF04", -0.7500001192092896 * 2.0**4),
+        ("4000007F0000", 0.5 * 2.0**127),
+        ("400000000000", 0.5),
+        ("400000FF0000", 0.5 * 2.0**-1),
+        ("400000800000", 0.5 * 2.0**-128),
+        ("8000007F0000", -(2.0**127)),
+        ("800000000000", -1.0),
+        ("800000FF0000", -1.0 * 2.0**-1),
+        ("800000800000", -(2.0**-128)),
+        ("000000000000", 0.0),
+        ("A00000FF0000", -0.75 * 2.0**-1),
+        ("000000000001", 2.0**-39),
+    ],
+)
+def test_floats_of_mil_std_1750a_are_those_of_the_standard(octets, value):
+    data = bytes.fromhex(octets)
+    assert one(floating("M", 8 * len(data), "MILSTD_1750A"), {"A": "M"}, ["A"], data)["A"] == [value]
+
+
+@pytest.mark.parametrize("bits", [16, 32, 64])
+@pytest.mark.parametrize("phase", [0, 3])
+def test_ieee_floats_stand_at_every_place(bits, phase):
+    code = {16: "e", 32: "f", 64: "d"}[bits]
+    types = floating("F", bits) + floating("L", bits, order=foreign.LITTLE) + integer("PAD", 3)
+    parameters = {**({"P": "PAD"} if phase else {}), "A": "F", "B": "L"}
+    for value in (0.0, -1.5, math.inf, 2.0**-14, 65504.0):
+        packed = (
+            Bits().add(0, phase).octets(struct.pack(f">{code}", value)).octets(struct.pack(f"<{code}", value))
+        )
+        data = packed.add(0, -packed.count % 8).packed()
+        found = one(types, parameters, list(parameters), data)
+        assert found["A"] == found["B"] == [value]
+
+
+def test_a_spline_says_nothing_outside_its_points_unless_told_to():
+    points = [(10.0, 1.0), (20.0, 3.0), (40.0, 5.0)]
+    steps = calibrated("T", 8, "unsigned", default(foreign.spline(points, 0, False)))
+    lines = calibrated("T", 8, "unsigned", default(foreign.spline(points, 1, False)))
+    on = calibrated("T", 8, "unsigned", default(foreign.spline(points, 1, True)))
+    packets = [bytes((k,)) for k in (9, 10, 19, 20, 25, 40, 41)]
+
+    def values(types: str) -> list[float]:
+        return (
+            decoded(document(types, {"A": "T"}, container("P", ["A"])), packets)
+            .tables["P"]
+            .columns["A"]
+            .to_list()
+        )
+
+    assert values(steps) == [1.0, 1.0, 3.0, 3.0, 5.0]
+    assert values(lines) == [1.0, 2.8, 3.0, 3.5, 5.0]
+    assert values(on) == pytest.approx([0.8, 1.0, 2.8, 3.0, 3.5, 5.0, 5.1], rel=1e-15)
+    assert verdicts(document(lines, {"A": "T"}, container("P", ["A"])), packets)[::6] == ["malformed"] * 2
+
+
+def test_a_code_without_a_name_stays_a_number_and_ranges_of_codes_share_one():
+    types = (
+        '<EnumeratedParameterType name="E"><IntegerDataEncoding sizeInBits="8"/><EnumerationList>'
+        '<Enumeration value="1" label="ONE"/><Enumeration value="10" maxValue="19" label="TEENS"/>'
+        "</EnumerationList></EnumeratedParameterType>"
+    )
+    found = decoded(
+        document(types, {"A": "E"}, container("P", ["A"])), [bytes((k,)) for k in (0, 1, 2, 9, 10, 19, 20)]
+    )
+    assert found.tables["P"].columns["A"].to_list() == [0, "ONE", 2, 9, "TEENS", "TEENS", 20]
+
+
+# texts and octets
+
+
+def text_type(size: str, charset: str = "UTF-8", name: str = "T") -> str:
+    encoding = f'<StringDataEncoding encoding="{charset}">{size}</StringDataEncoding>'
+    return f'<StringParameterType name="{name}">{encoding}</StringParameterType>'
+
+
+YAMCS_TAG = (
+    '<Variable maxSizeInBits="{most}"><DynamicValue><ParameterInstanceRef parameterRef="_yamcs_ignore"/></DynamicValue>'
+    "{end}</Variable>"
+)
+
+
+def test_a_text_may_say_its_length_itself():
+    size = YAMCS_TAG.format(most=800, end='<LeadingSize sizeInBitsOfSizeTag="16"/>')
+    types = text_type(size) + integer("N", 8)
+    text = document(types, {"A": "T", "B": "N"}, container("P", ["A", "B"]))
+    packets = [struct.pack(">H", 8 * len(t)) + t + b"\x07" for t in (b"", b"x", "µx".encode(), b"y" * 98)]
+    columns = decoded(text, packets).tables["P"].columns
+    assert columns["A"].to_list() == ["", "x", "µx", "y" * 98] and columns["B"].to_list() == [7] * 4
+    wrong = [
+        struct.pack(">H", 8 * 99) + b"y" * 99 + b"\x07",  # beyond maxSizeInBits
+        struct.pack(">H", 12) + b"yyyy",  # no whole octets
+        struct.pack(">H", 64) + b"y",  # beyond the packet
+        struct.pack(">H", 16) + b"\xc3\x28\x07",  # not UTF-8
+        b"\x00",
+    ]
+    assert verdicts(text, wrong) == ["malformed", "malformed", "too_short", "malformed", "too_short"]
+
+
+def test_a_text_may_end_with_a_character_and_what_follows_begins_there():
+    size = YAMCS_TAG.format(most=80, end="<TerminationChar>00</TerminationChar>")
+    types = text_type(size) + integer("N", 8)
+    text = document(types, {"A": "T", "B": "N"}, container("P", ["A", "B"]))
+    columns = decoded(text, [b"\0\x05", b"ab\0\x06", b"abcdefghi\0\x07"]).tables["P"].columns
+    assert columns["A"].to_list() == ["", "ab", "abcdefghi"] and columns["B"].to_list() == [5, 6, 7]
+    assert verdicts(text, [b"abc", b"abcdefghijk\0\x07"]) == ["malformed", "malformed"]
+
+
+def test_a_terminator_of_two_octets_stands_at_a_whole_character():
+    size = "<SizeInBits><Fixed><FixedValue>64</FixedValue></Fixed><TerminationChar>0000</TerminationChar></SizeInBits>"
+    data = (
+        "aĀ".encode("utf-16-be") + b"\0\0\0x"
+    )  # 00 61 01 00 00 00: the first two zeros are of two characters
+    assert one(text_type(size, "UTF-16BE"), {"A": "T"}, ["A"], data)["A"] == ["aĀ"]
+
+
+def test_texts_and_octets_that_begin_inside_an_octet_are_read():
+    types = (
+        integer("N", 3)
+        + text_type("<SizeInBits><Fixed><FixedValue>16</FixedValue></Fixed></SizeInBits>")
+        + '<BinaryParameterType name="B"><BinaryDataEncoding><SizeInBits><FixedValue>13</FixedValue></SizeInBits>'
+        "</BinaryDataEncoding></BinaryParameterType>"
+    )
+    data = Bits().add(5, 3).octets(b"hi").add(0x1ABC, 13).packed()
+    found = one(types, {"N": "N", "T": "T", "B": "B"}, ["N", "T", "B"], data)
+    assert found == {"N": [5], "T": ["hi"], "B": [b"\x1a\xbc"]}
+
+
+def test_a_size_may_be_looked_up():
+    lookup = "".join(
+        f'<DiscreteLookup value="{bits}">{comparison("N", n)}</DiscreteLookup>'
+        for n, bits in ((1, 8), (2, 24))
+    )
+    types = (
+        integer("N", 8)
+        + f'<BinaryParameterType name="B"><BinaryDataEncoding><SizeInBits><DiscreteLookupList>{lookup}'
+        "</DiscreteLookupList></SizeInBits></BinaryDataEncoding></BinaryParameterType>"
+    )
+    text = document(types, {"N": "N", "B": "B"}, container("P", ["N", "B"]))
+    packets = [b"\x01a", b"\x02abc", b"\x03abc"]
+    assert decoded(text, packets).tables["P"].columns["B"].to_list() == [b"a", b"abc"]
+    assert verdicts(text, packets) == ["decoded", "decoded", "malformed"]
+
+
+# arrays and aggregates
+
+
+def array_type(name: str, element: str, ending: str) -> str:
+    return (
+        f'<ArrayParameterType name="{name}" arrayTypeRef="{element}"><DimensionList>{ending}</DimensionList>'
+        "</ArrayParameterType>"
+    )
+
+
+def dimension(parameter: str = "", intercept: int = -1, last: int = 0, first: int = 0) -> str:
+    ending = f"<FixedValue>{last}</FixedValue>"
+    if parameter:
+        ending = (
+            f'<DynamicValue><ParameterInstanceRef parameterRef="{parameter}"/>'
+            f'<LinearAdjustment intercept="{intercept}"/></DynamicValue>'
+        )
+    return (
+        f"<Dimension><StartingIndex><FixedValue>{first}</FixedValue></StartingIndex>"
+        f"<EndingIndex>{ending}</EndingIndex></Dimension>"
+    )
+
+
+def aggregate(name: str, members: dict[str, str]) -> str:
+    listed = "".join(f'<Member name="{key}" typeRef="{kind}"/>' for key, kind in members.items())
+    return f'<AggregateParameterType name="{name}"><MemberList>{listed}</MemberList></AggregateParameterType>'
+
+
+ARRAY_ENTRY = '<ArrayParameterRefEntry parameterRef="{}"/>'.format
+
+
+def test_arrays_of_aggregates_follow_their_count_as_in_the_pus_examples_of_yamcs():
+    types = (
+        integer("N", 8)
+        + integer("ID", 12)
+        + integer("S", 4, "twosComplement")
+        + aggregate("ELEMENT", {"id": "ID", "status": "S"})
+        + array_type("REPORT", "ELEMENT", dimension("count"))
+    )
+    text = document(
+        types,
+        {"count": "N", "report": "REPORT", "end": "N"},
+        container("P", ["count", ARRAY_ENTRY("report"), "end"]),
+    )
+    expected = [[(k * 100 + i, i % 16 - 8) for i in range(n)] for k, n in enumerate((3, 0, 1, 40))]
+    packets = []
+    for items in expected:
+        bits = Bits().add(len(items), 8)
+        for identity, status in items:
+            bits.add(identity, 12).add(status, 4)
+        packets.append(bits.add(0xEE, 8).packed())
+    table = decoded(text, packets).tables["P"]
+    report = table.columns["report"]
+    assert [[(e["id"], e["status"]) for e in row] for row in report.to_list()] == expected
+    assert table.columns["end"].to_list() == [0xEE] * 4 and table.unread_bits.tolist() == [0] * 4
+    assert isinstance(report, ArrayColumn) and report.counts.tolist() == [3, 0, 1, 40]
+
+
+def test_elements_of_odd_width_begin_anywhere():
+    types = integer("N", 5) + integer("E", 11) + array_type("A", "E", dimension("n"))
+    text = document(types, {"n": "N", "a": "A", "z": "N"}, container("P", ["n", "a", "z"]))
+    rng = np.random.default_rng(3)
+    rows = [rng.integers(0, 2048, n).tolist() for n in (0, 1, 2, 7, 31)]
+    packets = []
+    for row in rows:
+        bits = Bits().add(len(row), 5)
+        for value in row:
+            bits.add(value, 11)
+        bits.add(21, 5)
+        packets.append(bits.add(0, -bits.count % 8).packed())
+    columns = decoded(text, packets).tables["P"].columns
+    assert columns["a"].to_list() == rows and columns["z"].to_list() == [21] * 5
+
+
+def test_arrays_of_two_dimensions_are_lists_of_lists_the_last_index_moving_fastest():
+    types = integer("N", 8) + array_type("A", "N", dimension("n") + dimension(last=4, first=3))
+    found = one(types, {"n": "N", "a": "A"}, ["n", "a"], bytes((3, 1, 2, 3, 4, 5, 6)))
+    assert found["a"] == [[[1, 2], [3, 4], [5, 6]]]
+
+
+def test_elements_that_say_their_own_length_are_read_one_after_another():
+    tagged = YAMCS_TAG.format(most=800, end='<LeadingSize sizeInBitsOfSizeTag="8"/>')
+    types = (
+        integer("N", 8)
+        + text_type(tagged)
+        + aggregate("ENTRY", {"key": "N", "text": "T"})
+        + array_type("A", "ENTRY", dimension("n"))
+    )
+    text = document(types, {"n": "N", "a": "A", "z": "N"}, container("P", ["n", "a", "z"]))
+    rows = [[], [(1, "a")], [(2, "bcd"), (3, ""), (4, "efghij")], [(5, "x" * 31)]]
+    packets = [
+        bytes((len(row),)) + b"".join(bytes((k, 8 * len(t))) + t.encode() for k, t in row) + b"\x63"
+        for row in rows
+    ]
+    broken = bytes((2, 9, 8, 65, 9, 200, 65))  # the second text is longer than the packet
+    found = decoded(text, [*packets, broken])
+    columns = found.tables["P"].columns
+    assert [[(e["key"], e["text"]) for e in row] for row in columns["a"].to_list()] == rows
+    assert columns["z"].to_list() == [0x63] * 4 and found.verdict.tolist() == [0, 0, 0, 0, 3]
+
+
+def test_no_packet_with_an_element_gives_empty_arrays():
+    tagged = YAMCS_TAG.format(most=800, end='<LeadingSize sizeInBitsOfSizeTag="8"/>')
+    types = integer("N", 8) + text_type(tagged) + array_type("A", "T", dimension("n"))
+    text = document(types, {"n": "N", "a": "A"}, container("P", ["n", "a"]))
+    assert decoded(text, [b"\0", b"\0"]).tables["P"].columns["a"].to_list() == [[], []]
+    assert decoded(text, []).tables == {}
+
+
+# layouts
+
+
+def test_entries_may_stand_at_places_counted_from_the_start_or_from_the_entry_before():
+    location = (
+        '<ParameterRefEntry parameterRef="{}"><LocationInContainerInBits referenceLocation="{}">'
+        "<FixedValue>{}</FixedValue></LocationInContainerInBits></ParameterRefEntry>"
+    ).format
+    types = (
+        integer("N", 8)
+        + integer("W", 16)
+        + text_type("<SizeInBits><Fixed><FixedValue>16</FixedValue></Fixed></SizeInBits>")
+    )
+    base = container(
+        "BASE",
+        [
+            location("a", "containerStart", 8),
+            location("b", "previousEntry", 8),
+            location("c", "previousEntry", -24),
+        ],
+    )
+    child = container(
+        "P", ["t", location("d", "containerStart", 0), location("e", "previousEntry", 40)], "BASE"
+    )
+    text = document(types, dict.fromkeys("abde", "N") | {"c": "W", "t": "T"}, base + child)
+    columns = decoded(text, [bytes((0, 1, 2, 65, 66, 5, 6, 7))]).tables["P"].columns
+    assert {name: column.to_list() for name, column in columns.items()} == {
+        "a": [1], "b": [65], "c": [0x0102], "t": ["AB"], "d": [0], "e": [6],
+    }  # fmt: skip
+    before = document(types, {"a": "N"}, container("P", [location("a", "previousEntry", -8)]))
+    beyond = document(types, {"a": "N"}, container("P", [location("a", "containerStart", 800)]))
+    assert verdicts(before, [b"abc"]) == verdicts(beyond, [b"abc"]) == ["too_short"]
+
+
+def test_entries_under_a_condition_are_there_or_not():
+    def under(parameter: str, condition: str) -> str:
+        inside = f"<IncludeCondition>{condition}</IncludeCondition>"
+        return f'<ParameterRefEntry parameterRef="{parameter}">{inside}</ParameterRefEntry>'
+
+    # as in the examples of space_packet_parser: two optional values before one that is always there
+    types = integer("U8", 8) + integer("U16", 16) + integer("U32", 32)
+    text = document(
+        types,
+        {"Mode": "U8", "Flag": "U8", "Data1": "U16", "Data2": "U16", "Always": "U32", "Last": "U8"},
+        container(
+            "P",
+            ["Mode", "Flag", under("Data1", comparison("Mode", 1)), under("Data2", comparison("Flag", 1)), "Always",
+             under("Last", comparison("Data2", 500, ">"))],
+        ),
+    )  # fmt: skip
+    packets = [
+        struct.pack(">BBI", 0, 0, 9),
+        struct.pack(">BBHI", 1, 0, 100, 8),
+        struct.pack(">BBHI", 0, 1, 200, 7),
+        struct.pack(">BBHHIB", 1, 1, 300, 600, 6, 5),
+    ]
+    table = decoded(text, packets).tables["P"]
+    assert {name: column.to_list() for name, column in table.columns.items()} == {
+        "Mode": [0, 1, 0, 1], "Flag": [0, 0, 1, 1], "Data1": [None, 100, None, 300], "Data2": [None, None, 200, 600],
+        "Always": [9, 8, 7, 6], "Last": [None, None, None, 5],
+    }  # fmt: skip
+    assert table.unread_bits.tolist() == [0] * 4 and isinstance(table.columns["Data1"], OptionalColumn)
+    assert verdicts(text, [b"\x01\x00\x05", *packets]) == ["too_short", *["decoded"] * 4]
+
+
+def test_a_container_in_a_container_begins_where_it_stands():
+    location = (
+        '<ParameterRefEntry parameterRef="y"><LocationInContainerInBits referenceLocation="containerStart">'
+        "<FixedValue>8</FixedValue></LocationInContainerInBits></ParameterRefEntry>"
+    )
+    part = container("PART", ["x", location])
+    text = document(
+        integer("N", 8),
+        dict.fromkeys("axyz", "N"),
+        part + container("P", ["a", '<ContainerRefEntry containerRef="PART"/>', "z"]),
+    )
+    found = decoded(text, [bytes((1, 2, 3, 4))])
+    assert {name: column.to_list() for name, column in found.tables["P"].columns.items()} == {
+        "a": [1], "x": [2], "y": [3], "z": [4],
+    }  # fmt: skip
+
+
+def test_names_in_nested_systems_are_found_by_path_and_told_apart():
+    inner = (
+        '<SpaceSystem name="dt"><TelemetryMetaData><ParameterTypeSet>'
+        + integer("u8", 8)
+        + '</ParameterTypeSet></TelemetryMetaData></SpaceSystem><SpaceSystem name="PUS5"><TelemetryMetaData>'
+        '<ParameterTypeSet><IntegerParameterType name="id" baseType="/dt/u8"/></ParameterTypeSet>'
+        '<ParameterSet><Parameter name="x" parameterTypeRef="id"/><Parameter name="y" parameterTypeRef="../dt/u8"/>'
+        '<Parameter name="w" parameterTypeRef="/BUS/dt/u8"/></ParameterSet>'
+        "<ContainerSet>"
+        + container("event", ["x", "y", "w"], "/root", comparison("/x", 7))
+        + "</ContainerSet></TelemetryMetaData></SpaceSystem>"
+    )
+    text = document("", {"x": "dt/u8", "z": "dt/u8"}, container("root", ["x"], abstract=True), more=inner)
+    columns = decoded(text, [bytes((7, 8, 9, 10))]).tables["event"].columns
+    assert {name: column.to_list() for name, column in columns.items()} == {
+        "/BUS/x": [7], "/BUS/PUS5/x": [8], "y": [9], "w": [10],
+    }  # fmt: skip
+
+
+def test_definitions_may_be_spread_over_documents():
+    types = document(integer("u8", 8), {}, "", name="dt")
+    packets = document("", {"x": "/dt/u8"}, container("P", ["x"]), name="PUS")
+    definition = parse_xtce({"dt.xml": types, "pus.xml": packets})
+    found = decode_packets(definition, *whole([b"\x2a"]))
+    assert found.tables["P"].columns["x"].to_list() == [42]
+
+
+# what does not fit
+
+
+def bus_like(*containers: str) -> str:
+    return document(
+        HEADER_TYPES, {**HEADER_PARAMETERS, "N": "U8", "M": "U8"}, HEADER_CONTAINER + "".join(containers)
+    )
+
+
+def test_a_packet_is_decoded_by_one_container_or_told_why_not():
+    text = bus_like(
+        container("A", ["N"], "CCSDSPacket", comparison("PKT_APID", 10, "<=")),
+        container("B", ["N", "M"], "CCSDSPacket", comparison("PKT_APID", 10, ">=")),
+    )
+    packets = [
+        space_packet(9, b"\x01", 0), space_packet(10, b"\x01\x02", 0), space_packet(11, b"\x01\x02", 0),
+        space_packet(11, b"\x01", 0), space_packet(9, b"\x01\x02\x03", 0),
+    ]  # fmt: skip
+    found = decoded(text, packets)
+    assert [VERDICTS[v] for v in found.verdict.tolist()] == [
+        "decoded",
+        "ambiguous",
+        "decoded",
+        "too_short",
+        "decoded",
+    ]
+    assert found.tables["A"].unread_bits.tolist() == [0, 16]
+    assert found.counts() == {
+        "decoded": 3, "no_container": 0, "ambiguous": 1, "too_short": 1, "malformed": 0, "damaged": 0,
+    }  # fmt: skip
+    only = bus_like(container("A", ["N"], "CCSDSPacket", comparison("PKT_APID", 9)))
+    assert verdicts(only, packets[:3]) == ["decoded", "no_container", "no_container"]
+
+
+def test_damaged_packets_are_left_out():
+    octets, cut = whole([b"\x01", b"\x02"])
+    damaged = PacketCut(
+        cut.offsets, cut.lengths, np.array([True, False]), cut.skipped, cut.idle, cut.consumed
+    )
+    found = decode_packets(
+        parse_xtce(document(integer("N", 8), {"a": "N"}, container("P", ["a"]))), octets, damaged
+    )
+    assert found.tables["P"].columns["a"].to_list() == [1] and found.verdict.tolist() == [0, 5]
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 255])
+def test_an_array_cut_off_is_too_short_and_a_negative_count_malformed(count):
+    types = integer("N", 8) + integer("E", 32) + array_type("A", "E", dimension("n", intercept=-3))
+    text = document(types, {"n": "N", "a": "A"}, container("P", ["n", "a"]))
+    full = bytes((count,)) + bytes(4 * max(count - 2, 0))
+    expected = "malformed" if count < 2 else "decoded"
+    assert verdicts(text, [full]) == [expected]
+    if count > 2:
+        assert verdicts(text, [full[:-1]]) == ["too_short"]
+
+
+@pytest.mark.parametrize(
+    ("slope", "verdict"), [(-8, "malformed"), (0.5, "malformed"), (1e300, "too_short"), (8, "decoded")]
+)
+def test_sizes_that_are_none_condemn_the_packet_alone(slope, verdict):
+    types = integer("N", 64) + (
+        '<BinaryParameterType name="B"><BinaryDataEncoding><SizeInBits><DynamicValue>'
+        f'<ParameterInstanceRef parameterRef="n"/><LinearAdjustment slope="{slope}"/></DynamicValue></SizeInBits>'
+        "</BinaryDataEncoding></BinaryParameterType>"
+    )
+    text = document(types, {"n": "N", "b": "B"}, container("P", ["n", "b"]))
+    packets = [struct.pack(">Q", 3) + b"abc", struct.pack(">Q", 2**64 - 1) + b"abc"]
+    found = verdicts(text, packets)
+    assert found[0] == verdict and found[1] != "decoded"
+
+
+def test_every_truncation_of_every_packet_is_a_verdict():
+    definition = parse_xtce(foreign.BUS)
+    for packet in foreign.capture(12, 9):
+        pieces = [packet[:n] for n in range(1, len(packet))]
+        found = decode_packets(definition, *whole(pieces))
+        # an event that is not urgent is whole without the value, and urgent ones are told by what they lack
+        assert {VERDICTS[v] for v in found.verdict.tolist()} <= {"too_short", "malformed"}
+
+
+def test_noise_is_decoded_or_given_a_verdict_and_never_stops_the_others():
+    rng = np.random.default_rng(4)
+    definition = parse_xtce(foreign.BUS)
+    good = foreign.capture(50, 6)
+    noise = [
+        space_packet(int(rng.integers(100, 103)), rng.bytes(int(rng.integers(1, 200))), 0) for _ in range(500)
+    ]
+    mixed = [p for pair in zip(good, noise[:50], strict=True) for p in pair] + noise[50:]
+    found = decode_packets(definition, *whole(mixed))
+    assert found.verdict[0:100:2].tolist() == [0] * 50
+
+
+def test_chunks_of_packets_are_joined(monkeypatch):
+    monkeypatch.setattr("tmtc.xtce_decode._CHUNK", 7)
+    packets = foreign.capture(100, 8)
+    small = rows_of(decoded(foreign.BUS, packets), 100)
+    monkeypatch.undo()
+    assert small == rows_of(decoded(foreign.BUS, packets), 100)
+
+
+def test_the_first_container_is_named_where_there_are_several():
+    text = document(integer("N", 8), {"a": "N"}, container("P", ["a"]) + container("Q", ["a"]))
+    with pytest.raises(
+        DefinitionError, match=r"BUS: expected one container without a base, found 2 \(P, Q\)"
+    ):
+        decoded(text, [b"\x01"])
+    with pytest.raises(DefinitionError, match="expected the name of a container"):
+        decoded(text, [b"\x01"], "R")
+    assert list(decoded(text, [b"\x01"], "Q").tables) == ["Q"]
+
+
+def test_columns_of_numbers_are_arrays():
+    column = decoded(foreign.BUS, foreign.capture(30, 1)).tables["Housekeeping"].columns["VOLTAGE"]
+    assert isinstance(column, ValueColumn)
+    assert column.values.dtype == np.float64 and column.raw.dtype == np.int64
+    assert np.array_equal(column.values, column.raw * 0.25 - 1.5)
+    assert list(HEADER) == list(HEADER_PARAMETERS)

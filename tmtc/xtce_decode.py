@@ -1,0 +1,1065 @@
+"""Packets of an imported definition as columns: all packets of one layout at once, not one after another.
+
+All packets walk the tree of containers together. Stretches of fixed width are gathered as records and split into
+columns; where a width depends on the packet, the positions behind it are an array with one position per packet.
+Elements of arrays are read together if their width is fixed, else all first ones, all second ones and so on. A packet
+that does not fit its container is counted and left out; it never stops the others.
+
+References
+----------
+CCSDS 660.1-G-2; MIL-STD-1750A section 4.1 for its floating point formats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tmtc.errors import DefinitionError
+from tmtc.schema import as_octets, gather
+from tmtc.stream import Octets, PacketCut
+from tmtc.xtce_columns import (
+    ArrayColumn,
+    Column,
+    OptionalColumn,
+    RecordColumn,
+    ValueColumn,
+    concatenated,
+)
+from tmtc.xtce_definition import (
+    AggregateType,
+    AllOf,
+    AnyOf,
+    ArrayType,
+    BinaryEncoding,
+    Calibration,
+    Calibrator,
+    CodeIn,
+    Condition,
+    Container,
+    DataType,
+    Definition,
+    Entry,
+    FloatEncoding,
+    IntegerEncoding,
+    Parameter,
+    Polynomial,
+    Reference,
+    ScalarType,
+    Size,
+    Spline,
+    StringEncoding,
+)
+
+Array = npt.NDArray[Any]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+OctetArray = npt.NDArray[np.uint8]
+
+DECODED, NO_CONTAINER, AMBIGUOUS, TOO_SHORT, MALFORMED, DAMAGED = 0, 1, 2, 3, 4, 5
+VERDICTS = ("decoded", "no_container", "ambiguous", "too_short", "malformed", "damaged")
+"""What came of a packet: decoded; no or several containers match; shorter than its container; a size that is none, a
+text that is none or a number that its calibrator does not cover; a wrong checksum."""
+
+_CHUNK = 1 << 16
+"""Packets decoded together: few enough that what is between stays in the processor's cache."""
+
+_START = "\0start"
+"""Name under which the beginnings of the packets are kept; no parameter is called so."""
+
+_MOST_BITS = 1 << 40
+"""Greater sizes are cut to this: no packet is as long."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class XtceTable:
+    """All packets of one container as columns; `packet_index` (n,) points into the `PacketCut`.
+
+    `unread_bits` (n,) are the bits behind the last entry.
+    """
+
+    name: str
+    packet_index: IntArray
+    columns: dict[str, Column]
+    unread_bits: IntArray
+
+    def __len__(self) -> int:
+        return len(self.packet_index)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class XtceDecode:
+    """Tables by container, and for every packet of the cut an index of `VERDICTS` (n,)."""
+
+    tables: dict[str, XtceTable]
+    verdict: npt.NDArray[np.int8]
+
+    def counts(self) -> dict[str, int]:
+        """Packets by verdict."""
+        found = np.bincount(self.verdict, minlength=len(VERDICTS)).tolist()
+        return dict(zip(VERDICTS, found, strict=True))
+
+
+def choose_root(definition: Definition, name: str | None = None) -> Container:
+    """The container that every packet begins with: the one named, or the only one without a base.
+
+    Raises
+    ------
+    DefinitionError
+        There is no such container, or there are several and none is named.
+    """
+    if name is not None:
+        found = definition.containers.get(name)
+        if found is None:
+            known = ", ".join(sorted(definition.containers)[:12])
+            raise DefinitionError(
+                f"{definition.name}: expected the name of a container ({known}), found {name!r}"
+            )
+        return found
+    if len(definition.roots) == 1:
+        return next(iter(definition.roots.values()))
+    listed = ", ".join(sorted(definition.roots)[:12])
+    raise DefinitionError(
+        f"{definition.name}: expected one container without a base, found {len(definition.roots)} ({listed}); "
+        "name the one that packets begin with"
+    )
+
+
+def decode_packets(
+    definition: Definition, buffer: Octets, cut: PacketCut, root: str | None = None
+) -> XtceDecode:
+    """Decode all packets of `cut`; the first bit of a packet is the first bit of the container `root`."""
+    return Decoder(definition, root).decode(buffer, cut)
+
+
+class Decoder:
+    """A definition with its containers compiled to steps; stateless between calls."""
+
+    def __init__(self, definition: Definition, root: str | None = None) -> None:
+        self.definition = definition
+        self.root = choose_root(definition, root)
+        self._steps: dict[str, list[_Step]] = {}
+
+    def decode(self, buffer: Octets, cut: PacketCut) -> XtceDecode:
+        """Tables of all packets, and a verdict for each."""
+        verdict = np.where(cut.crc_ok, DECODED, DAMAGED).astype(np.int8)
+        run = _Run(as_octets(buffer), cut.offsets, cut.lengths, verdict)
+        packets = np.flatnonzero(cut.crc_ok)
+        pieces: dict[str, list[XtceTable]] = {}
+        for first in range(0, len(packets), _CHUNK):
+            chunk = packets[first : first + _CHUNK]
+            for table in self._tables(run, _Rows(chunk, cut.offsets[chunk] * 8)):
+                pieces.setdefault(table.name, []).append(table)
+        return XtceDecode({name: _joined(found) for name, found in sorted(pieces.items())}, verdict)
+
+    def _tables(self, run: _Run, packets: _Rows) -> Iterator[XtceTable]:
+        pending = [(self.root, packets)]
+        while pending:
+            container, rows = pending.pop()
+            rows = _perform(run, self._compiled(container), rows)
+            if not len(rows):
+                continue
+            matches = [
+                np.ones(len(rows), dtype=np.bool_) if one.condition is None else _holds(one.condition, rows)
+                for one in container.children
+            ]
+            number = np.zeros(len(rows), dtype=np.int64)
+            for match in matches:
+                number += match
+            run.verdict[rows.packet[number > 1]] = AMBIGUOUS
+            for child, match in zip(container.children, matches, strict=True):
+                mine = match & (number == 1)
+                if mine.any():
+                    pending.append((child, rows.narrowed(mine)))
+            last = number == 0
+            if container.abstract:
+                run.verdict[rows.packet[last]] = NO_CONTAINER
+            elif last.any():
+                yield run.table(container.name, rows if last.all() else rows.narrowed(last))
+
+    def _compiled(self, container: Container) -> list[_Step]:
+        if container.path not in self._steps:
+            self._steps[container.path] = _compile(container.entries, _START)
+        return self._steps[container.path]
+
+
+# steps: what a list of entries comes to
+
+
+@dataclass(frozen=True, slots=True)
+class _Fixed:
+    """Parameters of fixed width, `offset` bits from here; `extent` bits must be there, `advance` are passed."""
+
+    fields: tuple[tuple[str, ScalarType, int], ...]
+    extent: int
+    advance: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Seek:
+    """Go to `offset` bits behind a mark (None: behind here)."""
+
+    mark: str | None
+    offset: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Mark:
+    """Remember this position."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Read:
+    """A parameter whose width depends on the packet, or that is an array or aggregate."""
+
+    parameter: Parameter
+
+
+@dataclass(frozen=True, slots=True)
+class _Optional:
+    """Steps for the packets for which the condition holds."""
+
+    condition: Condition
+    steps: tuple[_Step, ...]
+
+
+_Step = _Fixed | _Seek | _Mark | _Read | _Optional
+
+
+def _compile(entries: Sequence[Entry], mark: str) -> list[_Step]:
+    steps: list[_Step] = []
+    fields: list[tuple[str, ScalarType, int]] = []
+    cursor = extent = 0
+
+    def close() -> None:
+        nonlocal cursor, extent
+        if fields or cursor:
+            steps.append(_Fixed(tuple(fields), extent, cursor))
+        fields.clear()
+        cursor = extent = 0
+
+    for entry in entries:
+        item = entry.item
+        bits = item.type.bits if isinstance(item, Parameter) and isinstance(item.type, ScalarType) else None
+        numeric = bits is not None and isinstance(item.type.encoding, (IntegerEncoding, FloatEncoding))  # type: ignore[union-attr]
+        if numeric and not entry.from_start and entry.condition is None and cursor + entry.offset >= 0:
+            assert isinstance(item, Parameter) and isinstance(item.type, ScalarType) and bits is not None
+            if fields and _refers_to_open(item.type, fields):
+                close()
+            if cursor + entry.offset >= 0:
+                fields.append((item.name, item.type, cursor + entry.offset))
+                cursor += entry.offset + bits
+                extent = max(extent, cursor)
+                continue
+        close()
+        own: list[_Step] = []
+        if entry.from_start or entry.offset:
+            own.append(_Seek(mark if entry.from_start else None, entry.offset))
+        if isinstance(item, Parameter):
+            own.append(_Read(item))
+        else:
+            inner = f"{mark}/{len(steps)}"
+            own.append(_Mark(inner))
+            own.extend(_compile(item.entries, inner))
+        if entry.condition is None:
+            steps.extend(own)
+        else:
+            steps.append(_Optional(entry.condition, tuple(own)))
+    close()
+    return steps
+
+
+def _refers_to_open(data_type: ScalarType, fields: list[tuple[str, ScalarType, int]]) -> bool:
+    """Whether the calibrators of a type depend on fields that are read in the same stretch."""
+    encoding = data_type.encoding
+    assert isinstance(encoding, (IntegerEncoding, FloatEncoding))
+    return bool(encoding.calibration.contexts)
+
+
+class _Rows:
+    """Packets that have come the same way: `packet` (n,) in the cut, `at` (n,) bits into the buffer, columns so far.
+
+    The columns of the way here stay with the rows that were there (`parent`); `index` (n,) are their rows that came
+    further.
+    """
+
+    __slots__ = ("at", "columns", "index", "packet", "parent")
+
+    def __init__(
+        self, packet: IntArray, at: IntArray, parent: _Rows | None = None, index: IntArray | None = None
+    ) -> None:
+        self.packet = packet
+        self.at = at
+        self.parent = parent
+        self.index = index
+        self.columns: dict[str, Column] = {}
+
+    def __len__(self) -> int:
+        return len(self.packet)
+
+    def narrowed(self, keep: BoolArray) -> _Rows:
+        """The rows to keep, as rows of their own."""
+        index = np.flatnonzero(keep)
+        return _Rows(self.packet[index], self.at[index], self, index)
+
+    def column(self, name: str) -> Column | None:
+        """The column of an earlier parameter, for these rows."""
+        rows: _Rows | None = self
+        index: IntArray | None = None
+        while rows is not None:
+            if name in rows.columns:
+                found = rows.columns[name]
+                return found if index is None else found.take(index)
+            if rows.index is not None:
+                index = rows.index if index is None else rows.index[index]
+            rows = rows.parent
+        return None
+
+    def all_columns(self, since: _Rows | None = None) -> dict[str, Column]:
+        """All columns in the order of the packet, or those from the rows `since` on; of two of one name the later."""
+        levels: list[tuple[_Rows, IntArray | None]] = []
+        rows: _Rows | None = self
+        index: IntArray | None = None
+        while rows is not None:
+            levels.append((rows, index))
+            if since is not None and rows.columns is since.columns:
+                break
+            if rows.index is not None:
+                index = rows.index if index is None else rows.index[index]
+            rows = rows.parent
+        columns: dict[str, Column] = {}
+        for level, chosen in reversed(levels):
+            for name, column in level.columns.items():
+                if not name.startswith("\0"):
+                    columns[name] = column if chosen is None else column.take(chosen)
+        return columns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Run:
+    """A buffer that is being decoded."""
+
+    octets: OctetArray
+    offsets: IntArray
+    lengths: IntArray
+    verdict: npt.NDArray[np.int8]
+
+    def end(self, rows: _Rows) -> IntArray:
+        """Bits into the buffer at which the packets end."""
+        return (self.offsets[rows.packet] + self.lengths[rows.packet]) * 8
+
+    def keep(self, rows: _Rows, good: BoolArray, verdict: int) -> _Rows:
+        """The good rows; the packets of the others get the verdict."""
+        if good.all():
+            return rows
+        self.verdict[rows.packet[~good]] = verdict
+        return rows.narrowed(good)
+
+    def room(self, rows: _Rows, bits: int | IntArray) -> BoolArray:
+        """Whether so many bits are left."""
+        enough: BoolArray = self.end(rows) - rows.at >= bits
+        return enough
+
+    def table(self, name: str, rows: _Rows) -> XtceTable:
+        """The rows as a table in the order of the stream."""
+        columns = rows.all_columns()
+        unread = self.end(rows) - rows.at
+        return XtceTable(name, rows.packet, columns, unread)
+
+
+def _perform(run: _Run, steps: Sequence[_Step], rows: _Rows) -> _Rows:
+    """Rows behind the steps; packets that do not fit are left out."""
+    if rows.parent is None:  # a container that inherits begins where its root does
+        rows.columns[_START] = ValueColumn(rows.at, rows.at)
+    return _advance(run, steps, rows)
+
+
+def _advance(run: _Run, steps: Sequence[_Step], rows: _Rows) -> _Rows:
+    for step in steps:
+        if not len(rows):
+            return rows
+        if isinstance(step, _Fixed):
+            rows = run.keep(rows, run.room(rows, step.extent), TOO_SHORT)
+            if step.fields:
+                rows = _fixed_columns(run, step, rows)
+            rows = _moved(rows, rows.at + step.advance)
+        elif isinstance(step, _Seek):
+            origin = rows.at if step.mark is None else _mark(rows, step.mark)
+            at = origin + step.offset
+            begin = run.offsets[rows.packet] * 8
+            good = (at >= begin) & (at <= run.end(rows))
+            moved = _moved(rows, at)
+            rows = run.keep(moved, good, TOO_SHORT)
+        elif isinstance(step, _Mark):
+            rows = _moved(rows, rows.at)
+            rows.columns[step.name] = ValueColumn(rows.at, rows.at)
+        elif isinstance(step, _Read):
+            rows = _read_parameter(run, step.parameter, rows)
+        else:
+            rows = _optional(run, step, rows)
+    return rows
+
+
+def _joined(tables: list[XtceTable]) -> XtceTable:
+    """The tables of the chunks as one."""
+    if len(tables) == 1:
+        return tables[0]
+    return XtceTable(
+        tables[0].name,
+        np.concatenate([table.packet_index for table in tables]),
+        {name: concatenated([table.columns[name] for table in tables]) for name in tables[0].columns},
+        np.concatenate([table.unread_bits for table in tables]),
+    )
+
+
+def _moved(rows: _Rows, at: IntArray) -> _Rows:
+    """The same rows at other positions."""
+    moved = _Rows(rows.packet, at, rows.parent, rows.index)
+    moved.columns = rows.columns
+    return moved
+
+
+def _mark(rows: _Rows, name: str) -> IntArray:
+    column = rows.column(name)
+    assert isinstance(column, ValueColumn)
+    marked: IntArray = column.raw
+    return marked
+
+
+def _optional(run: _Run, step: _Optional, rows: _Rows) -> _Rows:
+    inner = rows.narrowed(_holds(step.condition, rows))
+    done = _advance(run, step.steps, inner)
+    if not len(inner):
+        return rows
+    back = np.searchsorted(rows.packet, done.packet)  # packets rise
+    at = rows.at.copy()
+    at[back] = done.at
+    present = np.zeros(len(rows), dtype=np.bool_)
+    present[back] = True
+    keep = run.verdict[rows.packet] == DECODED
+    kept = _moved(rows, at).narrowed(keep)
+    for name, column in done.all_columns(since=inner).items():
+        kept.columns[name] = OptionalColumn(present[keep], column)
+    return kept
+
+
+def _read_parameter(run: _Run, parameter: Parameter, rows: _Rows) -> _Rows:
+    column, at, good = _read(run, parameter.type, rows, parameter.name)
+    kept = _moved(rows if good is None else rows.narrowed(good), at)
+    kept.columns[parameter.name] = column
+    return kept
+
+
+# values
+
+_Found = tuple[Column, IntArray, "BoolArray | None"]
+"""A column and the positions behind it for the rows that could be read, and which these are (None: all)."""
+
+
+def _fixed_columns(run: _Run, step: _Fixed, rows: _Rows) -> _Rows:
+    good = np.ones(len(rows), dtype=np.bool_)
+    raws = _raw_fields(run, rows.at, [(one.encoding, offset) for _, one, offset in step.fields], step.extent)
+    for (name, data_type, _), raw in zip(step.fields, raws, strict=True):
+        values, covered = _calibrated(data_type, raw, rows, name)
+        rows.columns[name] = ValueColumn(raw, values)
+        if covered is not None:
+            good &= covered
+    return run.keep(rows, good, MALFORMED)
+
+
+def _read(run: _Run, data_type: DataType, rows: _Rows, name: str | None = None) -> _Found:
+    if isinstance(data_type, AggregateType):
+        return _read_aggregate(run, data_type, rows)
+    if isinstance(data_type, ArrayType):
+        return _read_array(run, data_type, rows)
+    encoding = data_type.encoding
+    if isinstance(encoding, (IntegerEncoding, FloatEncoding)):
+        enough = run.room(rows, encoding.bits)
+        mine = run.keep(rows, enough, TOO_SHORT)
+        (raw,) = _raw_fields(run, mine.at, [(encoding, 0)], encoding.bits)
+        values, covered = _calibrated(data_type, raw, mine, name)
+        column, at = ValueColumn(raw, values), mine.at + encoding.bits
+        good = None if enough.all() else enough
+        if covered is not None and not covered.all():
+            run.verdict[mine.packet[~covered]] = MALFORMED
+            index = np.flatnonzero(covered)
+            column, at = column.take(index), at[index]
+            whole = enough.copy()
+            whole[np.flatnonzero(enough)] = covered
+            good = whole
+        return column, at, good
+    if isinstance(encoding, BinaryEncoding):
+        bits, sized = _sizes(run, encoding.size, rows, 0)
+        return _read_octets(run, rows, bits, sized, None)
+    if encoding.size is None:
+        return _read_open_text(run, rows, encoding)
+    bits, sized = _sizes(run, encoding.size, rows, 0)
+    if encoding.most_bits is not None:
+        fits = bits <= encoding.most_bits
+        run.verdict[rows.packet[sized & ~fits]] = MALFORMED
+        sized = sized & fits
+    return _read_octets(run, rows, bits, sized, encoding)
+
+
+def _read_aggregate(run: _Run, data_type: AggregateType, rows: _Rows) -> _Found:
+    fixed = _fixed_fields(data_type)
+    if fixed is not None:
+        return _read_records(run, data_type, fixed, rows)
+    members: dict[str, Column] = {}
+    mine, index = rows, np.arange(len(rows), dtype=np.int64)
+    for name, member in data_type.members:
+        column, at, good = _read(run, member, mine)
+        if good is not None:
+            chosen = np.flatnonzero(good)
+            members = {key: value.take(chosen) for key, value in members.items()}
+            index = index[chosen]
+            mine = mine.narrowed(good)
+        members[name] = column
+        mine = _moved(mine, at)
+    kept = np.zeros(len(rows), dtype=np.bool_)
+    kept[index] = True
+    return RecordColumn(members), mine.at, None if kept.all() else kept
+
+
+def _fixed_fields(data_type: DataType, offset: int = 0) -> list[tuple[ScalarType, int]] | None:
+    """The numbers of a type of fixed width and their places, None where its width depends on the packet."""
+    if isinstance(data_type, ScalarType):
+        numeric = isinstance(data_type.encoding, (IntegerEncoding, FloatEncoding))
+        if not numeric or data_type.encoding.calibration.contexts:  # type: ignore[union-attr]
+            return None
+        return [(data_type, offset)]
+    if isinstance(data_type, ArrayType):
+        return None
+    fields: list[tuple[ScalarType, int]] = []
+    for _, member in data_type.members:
+        inner = _fixed_fields(member, offset)
+        if inner is None:
+            return None
+        fields += inner
+        last, place = inner[-1]
+        assert last.bits is not None
+        offset = place + last.bits
+    return fields
+
+
+def _read_records(
+    run: _Run, data_type: DataType, fields: list[tuple[ScalarType, int]], rows: _Rows
+) -> _Found:
+    """Values or aggregates of fixed width."""
+    last, place = fields[-1]
+    assert last.bits is not None
+    bits = place + last.bits
+    enough = run.room(rows, bits)
+    mine = run.keep(rows, enough, TOO_SHORT)
+    raws = _raw_fields(run, mine.at, [(one.encoding, offset) for one, offset in fields], bits)
+    columns: list[Column] = []
+    covered = np.ones(len(mine), dtype=np.bool_)
+    for (one, _), raw in zip(fields, raws, strict=True):
+        values, good = _calibrated(one, raw, mine, None)
+        columns.append(ValueColumn(raw, values))
+        if good is not None:
+            covered &= good
+    column: Column = _assembled(data_type, iter(columns))
+    at = mine.at + bits
+    if enough.all() and covered.all():
+        return column, at, None
+    run.verdict[mine.packet[~covered]] = MALFORMED
+    index = np.flatnonzero(covered)
+    whole = enough.copy()
+    whole[np.flatnonzero(enough)] = covered
+    return column.take(index), at[index], whole
+
+
+def _assembled(data_type: DataType, columns: Any) -> Column:
+    if isinstance(data_type, AggregateType):
+        return RecordColumn({name: _assembled(member, columns) for name, member in data_type.members})
+    column: Column = next(columns)
+    return column
+
+
+def _read_array(run: _Run, data_type: ArrayType, rows: _Rows) -> _Found:
+    last, sized = _sizes(run, data_type.last, rows, None)
+    first, also = _sizes(run, data_type.first, rows, None)
+    counts = last - first + 1
+    good = sized & also
+    wrong = good & (counts < 0)
+    run.verdict[rows.packet[wrong]] = MALFORMED
+    good &= ~wrong
+    fixed = _fixed_fields(data_type.element)
+    bits = 1
+    if fixed is not None:
+        bits = fixed[-1][1] + (fixed[-1][0].bits or 0)
+    # an element takes a bit at least, so that a count alone cannot ask for memory
+    room = good & (counts <= (run.end(rows) - rows.at) // bits)
+    run.verdict[rows.packet[good & ~room]] = TOO_SHORT
+    mine = rows.narrowed(room)
+    counts = counts[room]
+    if fixed is not None:
+        column, at, whole = _read_fixed_elements(run, data_type.element, fixed, mine, counts, bits)
+    else:
+        column, at, whole = _read_open_elements(run, data_type.element, mine, counts)
+    if whole is not None:
+        kept = room.copy()
+        kept[np.flatnonzero(room)] = whole
+        return column, at, kept
+    return column, at, None if room.all() else room
+
+
+def _read_fixed_elements(
+    run: _Run,
+    element: DataType,
+    fields: list[tuple[ScalarType, int]],
+    rows: _Rows,
+    counts: IntArray,
+    bits: int,
+) -> _Found:
+    owner = np.repeat(np.arange(len(rows), dtype=np.int64), counts)
+    place = np.arange(len(owner), dtype=np.int64) - np.repeat(np.cumsum(counts) - counts, counts)
+    elements = _Rows(rows.packet[owner], rows.at[owner] + place * bits, rows, owner)
+    column, _, good = _read_records(run, element, fields, elements)
+    at = rows.at + counts * bits
+    if good is None:
+        return ArrayColumn(counts, column), at, None
+    kept = np.ones(len(rows), dtype=np.bool_)
+    kept[owner[~good]] = False
+    stays = np.flatnonzero(kept[owner[good]])
+    index = np.flatnonzero(kept)
+    return ArrayColumn(counts[index], column.take(stays)), at[index], kept
+
+
+def _read_open_elements(run: _Run, element: DataType, rows: _Rows, counts: IntArray) -> _Found:
+    """Elements whose width depends on the packet: the k-th of all packets together."""
+    at = rows.at.copy()
+    kept = np.ones(len(rows), dtype=np.bool_)
+    pieces: list[Column] = []
+    owners: list[IntArray] = []
+    k = 0
+    while True:
+        active = np.flatnonzero(kept & (counts > k))
+        if not len(active):
+            break
+        elements = _Rows(rows.packet[active], at[active], rows, active)
+        column, behind, good = _read(run, element, elements)
+        if good is not None:
+            kept[active[~good]] = False
+            active = active[good]
+        at[active] = behind
+        pieces.append(column)
+        owners.append(active)
+        k += 1
+    if not pieces:
+        # no packet has an element: a column of none, read from no rows
+        column, _, _ = _read(run, element, rows.narrowed(np.zeros(len(rows), dtype=np.bool_)))
+    else:
+        joined = concatenated(pieces)
+        owner = np.concatenate(owners)
+        stays = np.flatnonzero(kept[owner])
+        column = joined.take(stays[np.argsort(owner[stays], kind="stable")])
+    index = np.flatnonzero(kept)
+    return ArrayColumn(counts[index], column), at[index], None if kept.all() else kept
+
+
+def _sizes(run: _Run, size: Size, rows: _Rows, least: int | None) -> tuple[IntArray, BoolArray]:
+    """Numbers (n,) that a size comes to, and where it is a number at all; the others are malformed."""
+    good = np.ones(len(rows), dtype=np.bool_)
+    if size.fixed is not None:
+        return np.full(len(rows), size.fixed, dtype=np.int64), good
+    if size.reference is not None:
+        values, present = _resolved(size.reference, rows)
+        with np.errstate(all="ignore"):
+            numbers = values.astype(np.float64) * size.slope + size.intercept
+        good = present & np.isfinite(numbers)
+        numbers = np.clip(np.where(good, numbers, 0.0), -_MOST_BITS, _MOST_BITS)
+        good &= numbers == np.rint(numbers)
+        if least is not None:
+            good &= numbers >= least
+        found = np.where(good, numbers, 0.0).astype(np.int64)
+    else:
+        found = np.zeros(len(rows), dtype=np.int64)
+        undecided = good.copy()
+        for condition, value in size.lookup:
+            matched = undecided & _holds(condition, rows)
+            found[matched] = value
+            undecided &= ~matched
+        good = ~undecided
+    run.verdict[rows.packet[~good]] = MALFORMED
+    return found, good
+
+
+def _read_octets(
+    run: _Run, rows: _Rows, bits: IntArray, sized: BoolArray, text: StringEncoding | None
+) -> _Found:
+    """Octets, or texts in buffers, of so many bits (n,) each."""
+    enough = run.room(rows, bits)
+    run.verdict[rows.packet[sized & ~enough]] = TOO_SHORT
+    good = sized & enough
+    index = np.flatnonzero(good)
+    at, bits = rows.at[index], bits[index]
+    raw = _objects(_pieces(run.octets, at, bits, left=text is not None))
+    values, behind = raw, at + bits
+    if text is not None:
+        values, readable = _texts(raw, text)
+        if not readable.all():
+            run.verdict[rows.packet[index[~readable]]] = MALFORMED
+            good[index[~readable]] = False
+            raw, values, behind = raw[readable], values[readable], behind[readable]
+    return ValueColumn(raw, values), behind, None if good.all() else good
+
+
+def _pieces(octets: OctetArray, at: IntArray, bits: IntArray, *, left: bool) -> list[bytes]:
+    """The bits (n,) from `at` on as octets; bits that fill no octet are in the low end of the first (`left` False),
+    or in the high end of the last."""
+    view = octets.data
+    pieces = []
+    for first, count in zip(at.tolist(), bits.tolist(), strict=True):
+        last = first + count
+        if not (first & 7 or count & 7):
+            pieces.append(view[first >> 3 : last >> 3].tobytes())
+            continue
+        number = int.from_bytes(view[first >> 3 : (last + 7) >> 3], "big") >> (-last & 7)
+        number &= (1 << count) - 1
+        size = (count + 7) >> 3
+        pieces.append((number << (-count & 7) if left else number).to_bytes(size, "big"))
+    return pieces
+
+
+def _objects(values: Sequence[Any]) -> Array:
+    array = np.empty(len(values), dtype=object)
+    array[:] = values
+    return array
+
+
+def _texts(buffers: Array, encoding: StringEncoding) -> tuple[Array, BoolArray]:
+    """Texts (n,) in buffers, and which are texts."""
+    texts: list[Any] = []
+    for octets in buffers.tolist():
+        try:
+            texts.append(_text(octets, encoding))
+        except (UnicodeDecodeError, ValueError):
+            texts.append(None)
+    return _objects(texts), np.array([text is not None for text in texts], dtype=np.bool_)
+
+
+def _text(octets: bytes, encoding: StringEncoding) -> str:
+    if encoding.tag_bits:
+        if len(octets) * 8 < encoding.tag_bits:
+            raise ValueError("no room for the size")
+        tagged = (encoding.tag_bits + 7) // 8
+        length = int.from_bytes(octets[:tagged], "big") >> (-encoding.tag_bits & 7)
+        if length % 8 or encoding.tag_bits + length > len(octets) * 8:
+            raise ValueError("a size that is none")
+        rest = int.from_bytes(octets, "big") >> (len(octets) * 8 - encoding.tag_bits - length)
+        octets = (rest & ((1 << length) - 1)).to_bytes(length // 8, "big")
+    elif encoding.terminator:
+        octets = octets[: _terminated(octets, encoding.terminator)]
+    return octets.decode(encoding.charset)
+
+
+def _terminated(octets: bytes, terminator: bytes) -> int:
+    """Where the terminator stands, at a whole character."""
+    place = octets.index(terminator)
+    while place % len(terminator):
+        place = octets.index(terminator, place + 1)
+    return place
+
+
+def _read_open_text(run: _Run, rows: _Rows, encoding: StringEncoding) -> _Found:
+    """Texts without a buffer: as long as the size before them or the terminator says."""
+    most = _MOST_BITS if encoding.most_bits is None else encoding.most_bits
+    if encoding.tag_bits:
+        enough = run.room(rows, encoding.tag_bits)
+        mine = run.keep(rows, enough, TOO_SHORT)
+        tag = IntegerEncoding(encoding.tag_bits)
+        (lengths,) = _raw_fields(run, mine.at, [(tag, 0)], encoding.tag_bits)
+        bits = np.zeros(len(rows), dtype=np.int64)
+        bits[np.flatnonzero(enough)] = lengths + encoding.tag_bits
+    else:
+        enough = np.ones(len(rows), dtype=np.bool_)
+        bits = np.zeros(len(rows), dtype=np.int64)
+        ends = run.end(rows)
+        for row, (at, end) in enumerate(zip(rows.at.tolist(), ends.tolist(), strict=True)):
+            rest = _pieces(run.octets, np.array([at]), np.array([min(end - at, most) // 8 * 8]), left=True)[0]
+            try:
+                bits[row] = (_terminated(rest, encoding.terminator) + len(encoding.terminator)) * 8
+            except ValueError:
+                enough[row] = False
+                run.verdict[rows.packet[row]] = MALFORMED
+    fits = bits <= most
+    run.verdict[rows.packet[enough & ~fits]] = MALFORMED
+    return _read_octets(run, rows, bits, enough & fits, encoding)
+
+
+# numbers
+
+
+def _raw_fields(run: _Run, at: IntArray, fields: Sequence[tuple[Any, int]], bits: int) -> list[Array]:
+    """Raw columns (n,) of numbers at offsets from `at`, all inside `bits` bits that are there."""
+    if not len(at):
+        return [np.empty(0, dtype=_raw_dtype(encoding)) for encoding, _ in fields]
+    phase = at & 7
+    least, greatest = int(phase.min()), int(phase.max())
+    if least == greatest:
+        return _record_fields(run.octets, at >> 3, least, fields, bits)
+    columns: list[Array] = [np.empty(len(at), dtype=_raw_dtype(encoding)) for encoding, _ in fields]
+    for one in range(least, greatest + 1):
+        mine = np.flatnonzero(phase == one)
+        if len(mine):
+            found = _record_fields(run.octets, at[mine] >> 3, one, fields, bits)
+            for column, part in zip(columns, found, strict=True):
+                column[mine] = part
+    return columns
+
+
+def _raw_dtype(encoding: IntegerEncoding | FloatEncoding) -> type:
+    if isinstance(encoding, FloatEncoding):
+        return np.float64
+    return np.uint64 if encoding.bits == 64 and encoding.form == "unsigned" else np.int64
+
+
+def _record_fields(
+    octets: OctetArray, starts: IntArray, phase: int, fields: Sequence[tuple[Any, int]], bits: int
+) -> list[Array]:
+    span = (phase + bits + 7) >> 3
+    records = gather(octets, starts, np.dtype((np.void, span))).view(np.uint8).reshape(-1, span)
+    columns: list[Array] = []
+    for encoding, offset in fields:
+        if isinstance(encoding, IntegerEncoding):
+            columns.append(_integers(records, phase + offset, encoding))
+        else:
+            columns.append(_floats(records, phase + offset, encoding))
+    return columns
+
+
+def _unsigned(records: OctetArray, bit: int, bits: int) -> npt.NDArray[np.uint64]:
+    """Bits `bit` to `bit + bits` of each record as unsigned integers."""
+    n, span = records.shape
+    first, stop = bit >> 3, (bit + bits + 7) >> 3
+    if stop - first == 9:
+        high = _window(records, first, 8).astype(np.uint64)
+        shift = stop * 8 - bit - bits
+        value = high << np.uint64(8 - shift) | records[:, stop - 1] >> np.uint8(shift)
+        return value & np.uint64((1 << bits) - 1)
+    size = 1
+    while size < stop - first:
+        size *= 2
+    begin = stop - size
+    if begin < 0:
+        begin = 0 if span >= size else -1
+    if begin >= 0:
+        value = _window(records, begin, size).astype(np.uint64)
+        end = begin + size
+    else:
+        value = np.zeros(n, dtype=np.uint64)
+        for column in range(first, stop):
+            value = value << np.uint64(8) | records[:, column]
+        begin, end = first, stop
+    if end * 8 - bit - bits:
+        value >>= np.uint64(end * 8 - bit - bits)
+    if bits < 64 and bit > begin * 8:
+        value &= np.uint64((1 << bits) - 1)
+    return value
+
+
+def _window(records: OctetArray, begin: int, size: int, kind: str = "u", order: str = ">") -> Array:
+    """Numbers of whole octets at one place of each record, without a copy."""
+    n, span = records.shape
+    return np.ndarray((n,), dtype=f"{order}{kind}{size}", buffer=records, offset=begin, strides=(span,))
+
+
+def _integers(records: OctetArray, bit: int, encoding: IntegerEncoding) -> Array:
+    bits, form = encoding.bits, encoding.form
+    order = "<" if encoding.little else ">"
+    if not bit & 7 and bits in (8, 16, 32, 64) and form in ("unsigned", "twosComplement"):
+        kind = "u" if form == "unsigned" else "i"
+        return _window(records, bit >> 3, bits >> 3, kind, order).astype(_raw_dtype(encoding))
+    value = _unsigned(records, bit, bits)
+    if encoding.little:
+        value = value.byteswap() >> np.uint64(64 - bits)
+    if form == "unsigned":
+        return value if bits == 64 else value.view(np.int64)
+    sign = (value >> np.uint64(bits - 1)).astype(np.bool_)
+    if form == "twosComplement":
+        if bits == 64:
+            return value.view(np.int64)
+        half = np.int64(1 << bits - 1)
+        return (value.view(np.int64) ^ half) - half
+    if form == "onesComplement":
+        inverted = ~value & np.uint64((1 << bits) - 1) if bits < 64 else ~value
+        magnitude = np.where(sign, inverted, value)
+    else:
+        magnitude = value & np.uint64((1 << bits - 1) - 1)
+    number = magnitude.view(np.int64)
+    return np.where(sign, -number, number)
+
+
+def _floats(records: OctetArray, bit: int, encoding: FloatEncoding) -> Array:
+    bits = encoding.bits
+    order = "<" if encoding.little else ">"
+    if encoding.form == "IEEE754":
+        if not bit & 7:
+            with np.errstate(invalid="ignore"):
+                return _window(records, bit >> 3, bits >> 3, "f", order).astype(np.float64)
+        value = _unsigned(records, bit, bits)
+        if encoding.little:
+            value = value.byteswap() >> np.uint64(64 - bits)
+        with np.errstate(invalid="ignore"):
+            return value.astype(f"=u{bits >> 3}").view(f"=f{bits >> 3}").astype(np.float64)
+    value = _unsigned(records, bit, bits)
+    if encoding.little:
+        value = value.byteswap() >> np.uint64(64 - bits)
+    number = value.view(np.int64)
+    if bits == 32:  # mantissa (24 bits), exponent (8)
+        mantissa, exponent, point = number >> 8, number & 0xFF, 23
+    else:  # mantissa (24), exponent (8), rest of the mantissa (16)
+        mantissa, exponent, point = (number >> 24) << 16 | number & 0xFFFF, number >> 16 & 0xFF, 39
+    mantissa = (mantissa ^ (1 << point)) - (1 << point)
+    exponent = (exponent ^ 0x80) - 0x80
+    return np.ldexp(mantissa.astype(np.float64), (exponent - point).astype(np.int32))
+
+
+# what numbers mean
+
+
+def _calibrated(
+    data_type: ScalarType, raw: Array, rows: _Rows, name: str | None
+) -> tuple[Array, BoolArray | None]:
+    """Values of raw numbers, and which of them a calibrator covers (None: all)."""
+    if data_type.is_boolean:
+        return raw != 0, None
+    if data_type.labels:
+        return _named(data_type, raw), None
+    encoding = data_type.encoding
+    assert isinstance(encoding, (IntegerEncoding, FloatEncoding))
+    calibration = encoding.calibration
+    if not calibration.contexts:
+        return (raw, None) if calibration.default is None else _applied(calibration.default, raw)
+    return _in_context(calibration, raw, rows, name)
+
+
+def _named(data_type: ScalarType, raw: Array) -> Array:
+    """Names of codes; a code without a name stays an integer."""
+    firsts = np.array([first for first, _, _ in data_type.labels], dtype=raw.dtype)
+    lasts = np.array([last for _, last, _ in data_type.labels], dtype=raw.dtype)
+    names = _objects([label for _, _, label in data_type.labels])
+    place = np.searchsorted(firsts, raw, side="right") - 1
+    known = (place >= 0) & (raw <= lasts[np.maximum(place, 0)])
+    values: Array = names[np.maximum(place, 0)]
+    if not known.all():
+        values[~known] = raw[~known].tolist()
+    return values
+
+
+def _in_context(
+    calibration: Calibration, raw: Array, rows: _Rows, name: str | None
+) -> tuple[Array, BoolArray | None]:
+    """Values by the first calibrator whose condition holds; a condition may ask for the raw value itself."""
+    values = raw.astype(np.float64)
+    covered = np.ones(len(raw), dtype=np.bool_)
+    left = np.ones(len(raw), dtype=np.bool_)
+    here = rows
+    if name is not None:
+        here = rows.narrowed(np.ones(len(rows), dtype=np.bool_))
+        here.columns[name] = ValueColumn(raw, raw)
+    choices = [*calibration.contexts, (None, calibration.default)]
+    for condition, calibrator in choices:
+        chosen = left if condition is None else left & _holds(condition, here)
+        left = left & ~chosen
+        if calibrator is not None and chosen.any():
+            values[chosen], good = _applied(calibrator, raw[chosen])
+            if good is not None:
+                covered[np.flatnonzero(chosen)[~good]] = False
+    return values, None if covered.all() else covered
+
+
+def _applied(calibrator: Calibrator, raw: Array) -> tuple[Array, BoolArray | None]:
+    """Calibrated values (n,), and which lie where the calibrator says something (None: all)."""
+    x = raw.astype(np.float64)
+    if isinstance(calibrator, Polynomial):
+        total = np.zeros(len(x))
+        with np.errstate(all="ignore"):
+            for coefficient, exponent in calibrator.terms:
+                total = total + coefficient * (x if exponent == 1 else x**exponent)
+        return total, None
+    return _splined(calibrator, x)
+
+
+def _splined(spline: Spline, x: Array) -> tuple[Array, BoolArray | None]:
+    raws = np.array([point[0] for point in spline.points])
+    calibrated = np.array([point[1] for point in spline.points])
+    place = np.clip(np.searchsorted(raws, x, side="right") - 1, 0, len(raws) - 1)
+    if spline.order == 0:
+        values = calibrated[place]
+    else:
+        left = np.minimum(place, len(raws) - 2)
+        slope = (calibrated[left + 1] - calibrated[left]) / (raws[left + 1] - raws[left])
+        values = slope * (x - raws[left]) + calibrated[left]
+    inside = (x >= raws[0]) & (x <= raws[-1])
+    if spline.extrapolate:
+        inside = ~np.isnan(x)
+    return values, None if inside.all() else inside
+
+
+# conditions
+
+
+def _resolved(reference: Reference, rows: _Rows) -> tuple[Array, BoolArray]:
+    """Values (n,) of an earlier parameter, and which packets have it; zeros where there is none."""
+    column = rows.column(reference.parameter)
+    present = np.ones(len(rows), dtype=np.bool_)
+    if column is None:
+        return np.zeros(len(rows)), ~present
+    if isinstance(column, OptionalColumn):
+        present, column = column.present, column.column
+    for member in reference.members:
+        assert isinstance(column, RecordColumn)
+        column = column.members[member]
+    assert isinstance(column, ValueColumn)
+    values = column.values if reference.calibrated else column.raw
+    if not present.all():
+        whole = np.zeros(len(rows), dtype=values.dtype)
+        whole[present] = values
+        values = whole
+    return values, present
+
+
+def _holds(condition: Condition, rows: _Rows) -> BoolArray:
+    """Where a condition holds (n,); a comparison with a parameter that a packet does not have does not."""
+    if isinstance(condition, (AllOf, AnyOf)):
+        parts = [_holds(one, rows) for one in condition.conditions]
+        joined: BoolArray = np.all(parts, axis=0) if isinstance(condition, AllOf) else np.any(parts, axis=0)
+        return joined
+    if isinstance(condition, CodeIn):
+        codes, present = _resolved(Reference(condition.left.parameter, condition.left.members, False), rows)
+        inside = np.zeros(len(codes), dtype=np.bool_)
+        for first, last in condition.ranges:
+            inside |= (codes >= first) & (codes <= last)
+        return present & (~inside if condition.negated else inside)
+    left, present = _resolved(condition.left, rows)
+    right: Any = condition.right
+    if isinstance(right, Reference):
+        right, also = _resolved(right, rows)
+        present = present & also
+    return present & _compare(left, condition.operator, right)
+
+
+def _compare(left: Array, operator: str, right: Any) -> BoolArray:
+    result: Any
+    if operator == "==":
+        result = left == right
+    elif operator == "!=":
+        result = left != right
+    elif operator == "<":
+        result = left < right
+    elif operator == "<=":
+        result = left <= right
+    elif operator == ">":
+        result = left > right
+    else:
+        result = left >= right
+    return np.asarray(result, dtype=np.bool_)

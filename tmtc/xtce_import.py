@@ -1,0 +1,996 @@
+"""XTCE documents as packet definitions: the subset that the decoder supports, all else refused by name.
+
+Types are `Integer`, `Float`, `Enumerated`, `Boolean`, `String`, `Binary`, `AbsoluteTime`, `RelativeTime`, `Array` and
+`AggregateParameterType` in nested space systems; containers inherit under comparisons and boolean expressions. Only
+what the containers use is read: a type or algorithm that no container needs is not looked at, and neither are
+commands. Nothing that could change a value is passed over.
+
+References
+----------
+OMG XTCE 1.2 (CCSDS 660.0-B-2), CCSDS 660.1-G-2; the same elements of XTCE 1.1 and 1.3 are read.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from tmtc.errors import DefinitionError
+from tmtc.packets import PACKET_MAX_LENGTH
+from tmtc.xtce_definition import (
+    AggregateType,
+    AllOf,
+    AnyOf,
+    ArrayType,
+    BinaryEncoding,
+    Calibration,
+    Calibrator,
+    CodeIn,
+    Comparison,
+    Condition,
+    Container,
+    DataType,
+    Definition,
+    Encoding,
+    Entry,
+    FloatEncoding,
+    IntegerEncoding,
+    IntegerForm,
+    Operator,
+    Parameter,
+    Polynomial,
+    Reference,
+    ScalarType,
+    Size,
+    Spline,
+    StringEncoding,
+)
+from tmtc.xtce_xml import Node, parse_xml
+
+MAX_BITS = PACKET_MAX_LENGTH * 8
+"""Bits of the longest packet: no size and no position is greater."""
+MAX_VALUES = 100_000
+"""Values that a type or a container may hold once all that it refers to is written out."""
+MAX_INHERITANCE = 2_000
+MAX_TYPE_DEPTH = 16
+MAX_EXPONENT = 30
+
+_DESCRIPTION = ("LongDescription", "AliasSet", "AncillaryDataSet")
+_NAMED = ("name", "shortDescription")
+_TYPE_CHILDREN = (
+    *_DESCRIPTION, "UnitSet", "ToString", "ValidRange", "ValidRangeSet", "SizeRangeInCharacters", "DefaultAlarm",
+    "ContextAlarmList", "BinaryContextAlarmList", "EnumerationList", "IntegerDataEncoding", "FloatDataEncoding",
+    "StringDataEncoding", "BinaryDataEncoding",
+)  # fmt: skip
+_TYPE_ATTRIBUTES = (
+    *_NAMED, "baseType", "initialValue", "signed", "sizeInBits", "oneStringValue", "zeroStringValue",
+    "restrictionPattern", "characterWidth",
+)  # fmt: skip
+_ENCODINGS = ("IntegerDataEncoding", "FloatDataEncoding", "StringDataEncoding", "BinaryDataEncoding")
+_ENCODINGS_OF_NUMBERS = _ENCODINGS[:2]
+_ENCODINGS_OF = {
+    "IntegerParameterType": ("IntegerDataEncoding",),
+    "FloatParameterType": ("IntegerDataEncoding", "FloatDataEncoding"),
+    "EnumeratedParameterType": ("IntegerDataEncoding",),
+    "BooleanParameterType": ("IntegerDataEncoding",),
+    "StringParameterType": ("StringDataEncoding",),
+    "BinaryParameterType": ("BinaryDataEncoding",),
+    "AbsoluteTimeParameterType": _ENCODINGS,
+    "RelativeTimeParameterType": _ENCODINGS,
+}
+_INTEGER_FORMS: dict[str, IntegerForm] = {
+    "unsigned": "unsigned",
+    "twosComplement": "twosComplement",
+    "twosCompliment": "twosComplement",  # so spelt in XTCE 1.0 and 1.1
+    "signed": "twosComplement",
+    "onesComplement": "onesComplement",
+    "signMagnitude": "signMagnitude",
+}
+_OPERATORS: dict[str, Operator] = {
+    "==": "==", "eq": "==", "!=": "!=", "neq": "!=", "<": "<", "lt": "<", "<=": "<=", "leq": "<=", ">": ">", "gt": ">",
+    ">=": ">=", "geq": ">=",
+}  # fmt: skip
+_CHARSETS = {
+    "US-ASCII": "ascii", "ISO-8859-1": "latin-1", "Windows-1252": "cp1252", "UTF-8": "utf-8", "UTF-16": "utf-16",
+    "UTF-16LE": "utf-16-le", "UTF-16BE": "utf-16-be", "UTF-32": "utf-32", "UTF-32LE": "utf-32-le",
+    "UTF-32BE": "utf-32-be",
+}  # fmt: skip
+_NO_PARAMETER = "_yamcs_ignore"
+"""Name that Yamcs gives where the schema asks for a size parameter but the size tag or terminator says it all."""
+
+
+def parse_xtce(documents: str | bytes | Mapping[str, str | bytes]) -> Definition:
+    """Return what XTCE documents define.
+
+    Parameters
+    ----------
+    documents
+        One document, or several by name; the names appear in errors. References may cross documents.
+
+    Raises
+    ------
+    DefinitionError
+        A document is damaged, contradicts itself, or uses an element that is not supported: one line that names the
+        document, the line, the element, what was expected and what was found.
+    """
+    if isinstance(documents, (str, bytes)):
+        documents = {"XTCE": documents}
+    top: list[_System] = []
+    for name, text in documents.items():
+        root = parse_xml(text, name)
+        if root.tag != "SpaceSystem":
+            raise root.error("a SpaceSystem", root.tag)
+        system = _system(root, None)
+        if any(other.name == system.name for other in top):
+            raise root.error("different names of space systems", f"{system.name!r} twice")
+        top.append(system)
+    return _Importer(top).definition()
+
+
+@dataclass(slots=True, eq=False)
+class _System:
+    """A space system: its elements by kind and name."""
+
+    name: str
+    path: str
+    parent: _System | None
+    node: Node
+    types: dict[str, Node] = field(default_factory=dict)
+    parameters: dict[str, Node] = field(default_factory=dict)
+    containers: dict[str, Node] = field(default_factory=dict)
+    systems: dict[str, _System] = field(default_factory=dict)
+
+
+def _system(node: Node, parent: _System | None) -> _System:
+    node.only(
+        (
+            *_DESCRIPTION,
+            "Header",
+            "TelemetryMetaData",
+            "CommandMetaData",
+            "ServiceSet",
+            "Service",
+            "SpaceSystem",
+        ),
+        (*_NAMED, "operationalStatus", "ID"),
+    )
+    name = node.attribute("name")
+    system = _System(name, f"{parent.path if parent else ''}/{name}", parent, node)
+    metadata = node.child("TelemetryMetaData")
+    if metadata is not None:
+        sets = ("ParameterTypeSet", "ParameterSet", "ContainerSet")
+        metadata.only((*_DESCRIPTION, *sets, "MessageSet", "StreamSet", "AlgorithmSet"))
+        for tag, found in zip(sets, (system.types, system.parameters, system.containers), strict=True):
+            group = metadata.child(tag)
+            for element in group.children if group is not None else ():
+                if tag == "ParameterSet":
+                    _expect(element, element.tag == "Parameter", "a Parameter", element.tag)
+                if tag == "ContainerSet":
+                    _expect(element, element.tag == "SequenceContainer", "a SequenceContainer", element.tag)
+                key = element.attribute("name")
+                _expect(
+                    element,
+                    key not in found,
+                    "a name of its own",
+                    f"one taken at line {found[key].line if key in found else 0}",
+                )
+                found[key] = element
+    for inner in node.all("SpaceSystem"):
+        child = _system(inner, system)
+        _expect(inner, child.name not in system.systems, "a name of its own", f"a second {child.name!r}")
+        system.systems[child.name] = child
+    return system
+
+
+def _expect(node: Node, right: bool, expected: str, found: str) -> None:
+    if not right:
+        raise node.error(expected, found)
+
+
+class _Importer:
+    """Elements by name as values, each made once."""
+
+    def __init__(self, top: list[_System]) -> None:
+        self.top = top
+        self.systems: list[_System] = []
+        pending = list(reversed(top))
+        while pending:
+            system = pending.pop()
+            self.systems.append(system)
+            pending.extend(reversed(system.systems.values()))
+        self.types: dict[int, DataType] = {}
+        self.values: dict[int, int] = {}
+        self.open: list[Node] = []
+        self.parameters: dict[str, Parameter] = {}
+        self.names = _column_names([(s.path, name) for s in self.systems for name in s.parameters])
+
+    def definition(self) -> Definition:
+        """Everything, once every reference holds."""
+        owner = {id(node): (system, node) for system in self.systems for node in system.containers.values()}
+        bases: dict[int, int] = {}
+        followers: dict[int, list[int]] = {key: [] for key in owner}
+        for key, (system, node) in owner.items():
+            base = node.child("BaseContainer")
+            if base is not None:
+                base.only(("RestrictionCriteria",), ("containerRef",))
+                _, found = self.find("containers", base.attribute("containerRef"), system, base)
+                bases[key] = id(found)
+                followers[id(found)].append(key)
+        _check_chains(bases, {key: node for key, (_, node) in owner.items()})
+        included: set[int] = set()
+        made: dict[int, Container] = {}
+        sizes: dict[int, int] = {}
+        names = _column_names([(system.path, name) for system in self.systems for name in system.containers])
+        parts: dict[int, tuple[Entry, ...]] = {}
+
+        def entries(key: int) -> tuple[Entry, ...]:
+            """Entries of a container; those of containers in it are made first."""
+            if key in parts:
+                return parts[key]
+            system, node = owner[key]
+            if node in self.open:
+                raise node.error(
+                    "containers that do not contain themselves", f"{node.attributes['name']!r} in itself"
+                )
+            _expect(
+                node, len(self.open) < MAX_TYPE_DEPTH, f"containers at most {MAX_TYPE_DEPTH} deep", "deeper"
+            )
+            self.open.append(node)
+            found, size = [], 0
+            listed = node.required("EntryList")
+            for element in listed.children:
+                if element.tag == "ContainerRefEntry":
+                    _, inner = self.find("containers", element.attribute("containerRef"), system, element)
+                    if id(inner) in bases or followers[id(inner)]:
+                        raise element.error(
+                            "a container without base and without containers that inherit from it",
+                            inner.attributes["name"],
+                        )
+                    included.add(id(inner))
+                    content = Container(
+                        names[owner[id(inner)][0].path, inner.attributes["name"]],
+                        f"{owner[id(inner)][0].path}/{inner.attributes['name']}",
+                        entries(id(inner)), False, None, (),
+                    )  # fmt: skip
+                    size += sizes[id(inner)]
+                    found.append(self.entry(element, content, system, ("containerRef",)))
+                else:
+                    parameter, count = self.parameter_entry(element, system)
+                    size += count
+                    found.append(self.entry(element, parameter, system, ("parameterRef",)))
+                _expect(node, size <= MAX_VALUES, f"at most {MAX_VALUES} values", "more")
+            self.open.pop()
+            sizes[key] = size
+            parts[key] = tuple(found)
+            return parts[key]
+
+        for key in _children_first(followers, bases):
+            system, node = owner[key]
+            node.only(
+                (*_DESCRIPTION, "DefaultRateInStream", "RateInStreamSet", "EntryList", "BaseContainer"),
+                (*_NAMED, "abstract", "idlePattern", "sizeInBits"),
+            )
+            base = node.child("BaseContainer")
+            criteria = base.child("RestrictionCriteria") if base is not None else None
+            made[key] = Container(
+                name=names[system.path, node.attributes["name"]],
+                path=f"{system.path}/{node.attributes['name']}",
+                entries=entries(key),
+                abstract=_boolean(node, "abstract", False),
+                condition=None if criteria is None else self.condition(criteria, system),
+                children=tuple(made[follower] for follower in followers[key]),
+                description=node.attributes.get("shortDescription", ""),
+            )
+        roots = [key for key in owner if key not in bases and key not in included]
+        if not roots:
+            raise self.top[0].node.error("a container without a base", "none")
+        for key in roots:
+            _check_order(made[key], owner[key][1].document)
+        return Definition(
+            name=self.top[0].name,
+            roots={made[key].name: made[key] for key in roots},
+            parameters={parameter.name: parameter for parameter in self.parameters.values()},
+            containers={container.name: container for container in made.values()},
+        )
+
+    # references
+
+    def find(self, kind: str, reference: str, system: _System, node: Node) -> tuple[_System, Node]:
+        """The element that a name refers to, seen from a system: `name`, `a/name`, `../name` or `/a/b/name`."""
+        *steps, name = reference.split("/")
+        if steps and steps[0] == "":
+            path = steps[1:]
+            if path:
+                named = [top for top in self.top if top.name == path[0]]
+                found = self._descend(named[0], path[1:], kind, name) if named else None
+                if found is not None:
+                    return found
+            for top in self.top:  # the name of the root may be left out
+                found = self._descend(top, path, kind, name)
+                if found is not None:
+                    return found
+        else:
+            start: _System | None = system
+            while start is not None:
+                found = self._descend(start, steps, kind, name)
+                if found is not None:
+                    return found
+                start = start.parent
+        what = {"types": "parameter type", "parameters": "parameter", "containers": "container"}[kind]
+        raise node.error(f"the name of a {what}", repr(reference))
+
+    def _descend(
+        self, start: _System | None, steps: list[str], kind: str, name: str
+    ) -> tuple[_System, Node] | None:
+        for step in steps:
+            if start is None:
+                return None
+            if step == "..":
+                start = start.parent
+            elif step != ".":
+                start = start.systems.get(step)
+        if start is None or name not in getattr(start, kind):
+            return None
+        return start, getattr(start, kind)[name]
+
+    def reference(self, node: Node, system: _System) -> tuple[Reference, ScalarType]:
+        """What a `parameterRef` names, and its type."""
+        instance = node.attributes.get("instance", "0")
+        _expect(node, instance == "0", "instance 0, the one of this packet", instance)
+        text = node.attribute("parameterRef")
+        members: list[str] = []
+        while True:
+            try:
+                owner, found = self.find("parameters", text, system, node)
+                break
+            except DefinitionError:
+                text, dot, member = text.rpartition(".")
+                if not dot:
+                    self.find("parameters", node.attribute("parameterRef"), system, node)
+                    raise
+                members.insert(0, member)
+        _, type_node = self.find("types", found.attribute("parameterTypeRef"), owner, found)
+        if any(type_node is opened for opened in self.open):
+            return self.own_reference(node, self.names[owner.path, found.attributes["name"]], type_node)
+        parameter = self.parameter(owner, found)
+        data_type = parameter.type
+        for member in members:
+            inner = dict(data_type.members).get(member) if isinstance(data_type, AggregateType) else None
+            if inner is None:
+                raise node.error(f"a member of {data_type.name!r}", repr(member))
+            data_type = inner
+        if not isinstance(data_type, ScalarType):
+            raise node.error("a parameter with one value", f"{data_type.name!r}")
+        calibrated = _boolean(node, "useCalibratedValue", True)
+        return Reference(parameter.name, tuple(members), calibrated), data_type
+
+    def own_reference(self, node: Node, name: str, type_node: Node) -> tuple[Reference, ScalarType]:
+        """A reference to the parameter that is being calibrated: to its raw value, for it has no other yet."""
+        encoding = next((child for child in type_node.children if child.tag in _ENCODINGS_OF_NUMBERS), None)
+        _expect(node, encoding is not None, "a parameter whose type is another", f"{name!r} itself")
+        calibrated = _boolean(node, "useCalibratedValue", True)
+        _expect(node, not calibrated, "useCalibratedValue false for the parameter itself", "true")
+        assert encoding is not None
+        is_float = encoding.tag == "FloatDataEncoding"
+        own = ScalarType(type_node.attributes["name"], FloatEncoding(64) if is_float else IntegerEncoding(64))
+        return Reference(name, (), False), own
+
+    def parameter(self, system: _System, node: Node) -> Parameter:
+        """The parameter of an element."""
+        path = f"{system.path}/{node.attributes['name']}"
+        if path not in self.parameters:
+            node.only((*_DESCRIPTION, "ParameterProperties"), (*_NAMED, "parameterTypeRef", "initialValue"))
+            column = self.names[system.path, node.attributes["name"]]
+            owner, type_node = self.find("types", node.attribute("parameterTypeRef"), system, node)
+            data_type = self.type(owner, type_node)
+            self.parameters[path] = Parameter(
+                column, path, data_type, node.attributes.get("shortDescription", "")
+            )
+        return self.parameters[path]
+
+    # types
+
+    def type(self, system: _System, node: Node) -> DataType:
+        """The type of an element, made once."""
+        key = id(node)
+        if key not in self.types:
+            if node in self.open:
+                raise node.error(
+                    "types that do not contain themselves", f"{node.attributes['name']!r} in itself"
+                )
+            _expect(node, len(self.open) < MAX_TYPE_DEPTH, f"types at most {MAX_TYPE_DEPTH} deep", "deeper")
+            self.open.append(node)
+            if node.tag == "ArrayParameterType":
+                data_type, values = self.array(system, node)
+            elif node.tag == "AggregateParameterType":
+                data_type, values = self.aggregate(system, node)
+            elif node.tag in _ENCODINGS_OF:
+                data_type, values = self.scalar(system, node), 1
+            else:
+                raise node.error("a parameter type that is supported", f"{node.tag}, which is not")
+            _expect(node, values <= MAX_VALUES, f"at most {MAX_VALUES} values", f"{values}")
+            self.open.pop()
+            self.types[key], self.values[key] = data_type, values
+        return self.types[key]
+
+    def array(self, system: _System, node: Node, dimensions: Node | None = None) -> tuple[DataType, int]:
+        """An array type; of several dimensions, the last index moves fastest."""
+        node.only((*_DESCRIPTION, "DimensionList"), (*_NAMED, "arrayTypeRef", "numberOfDimensions"))
+        owner, found = self.find("types", node.attribute("arrayTypeRef"), system, node)
+        made = self.type(owner, found)
+        dimensions = dimensions if dimensions is not None else node.child("DimensionList")
+        if dimensions is None:
+            raise node.error("a DimensionList", "none")
+        dimensions.only(("Dimension",))
+        listed = list(dimensions.all("Dimension"))
+        _expect(dimensions, 1 <= len(listed) <= 4, "1 to 4 dimensions", f"{len(listed)}")
+        for dimension in reversed(listed):
+            dimension.only(("StartingIndex", "EndingIndex"))
+            first = self.size(dimension.required("StartingIndex"), system, least=None)
+            last = self.size(dimension.required("EndingIndex"), system, least=None)
+            if first.fixed is not None and last.fixed is not None:
+                count = last.fixed - first.fixed + 1
+                _expect(dimension, 0 <= count <= MAX_BITS, f"0 to {MAX_BITS} elements", f"{count}")
+            made = ArrayType(node.attributes["name"], made, first, last)
+        return made, self.values[id(found)]
+
+    def aggregate(self, system: _System, node: Node) -> tuple[DataType, int]:
+        """An aggregate type."""
+        node.only((*_DESCRIPTION, "MemberList"), _NAMED)
+        listed = node.required("MemberList")
+        listed.only(("Member",))
+        members: dict[str, DataType] = {}
+        values = 0
+        for member in listed.children:
+            member.only(_DESCRIPTION, (*_NAMED, "typeRef", "initialValue"))
+            name = member.attribute("name")
+            _expect(member, name not in members, "a name of its own", "a second one")
+            owner, found = self.find("types", member.attribute("typeRef"), system, member)
+            members[name] = self.type(owner, found)
+            values += self.values[id(found)]
+            _expect(node, values <= MAX_VALUES, f"at most {MAX_VALUES} values", "more")
+        _expect(listed, bool(members), "a member", "none")
+        return AggregateType(node.attributes["name"], tuple(members.items())), values
+
+    def scalar(self, system: _System, node: Node) -> ScalarType:
+        """A type of one value; what it does not say it has from its base type."""
+        chain = [(system, node)]
+        while "baseType" in chain[-1][1].attributes:
+            here, last = chain[-1]
+            chain.append(self.find("types", last.attributes["baseType"], here, last))
+            if any(chain[-1][1] is other for _, other in chain[:-1]):
+                raise node.error("a base type that is another", f"{last.attributes['baseType']!r} again")
+            _expect(node, chain[-1][1].tag == node.tag, f"a base type that is a {node.tag}", chain[-1][1].tag)
+        is_time = "Time" in node.tag
+        for _, one in chain:
+            children = (*_DESCRIPTION, "Encoding", "ReferenceTime") if is_time else _TYPE_CHILDREN
+            one.only(children, _TYPE_ATTRIBUTES)
+        encoding, place, home = None, node, system
+        scale: tuple[float, float] | None = None
+        for home, one in chain:
+            holder = one.child("Encoding") if is_time else one
+            if holder is not None and is_time:
+                holder.only(_ENCODINGS, ("units", "scale", "offset"))
+            found = [child for child in (holder.children if holder else ()) if child.tag in _ENCODINGS]
+            if found:
+                _expect(found[-1], len(found) == 1, "one encoding", f"{len(found)}")
+                place = found[0]
+                _expect(
+                    place,
+                    place.tag in _ENCODINGS_OF[node.tag],
+                    f"one of {', '.join(_ENCODINGS_OF[node.tag])} for a {node.tag}",
+                    place.tag,
+                )
+                if holder is not None and is_time and holder.attributes.keys() & {"scale", "offset"}:
+                    scale = _number(holder, "scale", 1.0), _number(holder, "offset", 0.0)
+                encoding = self.encoding(place, home, scale)
+                break
+        if encoding is None:
+            raise node.error("a data encoding", "none")
+        labels = next(
+            (listed for _, one in chain if (listed := one.child("EnumerationList")) is not None), None
+        )
+        units = next((u for _, one in chain if (u := one.child("UnitSet")) is not None), None)
+        return ScalarType(
+            name=node.attributes["name"],
+            encoding=encoding,
+            labels=_labels(node, labels, encoding) if node.tag == "EnumeratedParameterType" else (),
+            is_boolean=node.tag == "BooleanParameterType",
+            unit=" ".join(u.text for u in units.children) if units is not None else "",
+            epoch=_epoch(node) if is_time else "",
+        )
+
+    def encoding(self, node: Node, system: _System, scale: tuple[float, float] | None) -> Encoding:
+        """The encoding of an element; `scale` (scale, offset) of a time stands for a calibrator."""
+        order = node.attributes.get("bitOrder", "mostSignificantBitFirst")
+        _expect(node, order == "mostSignificantBitFirst", "bitOrder mostSignificantBitFirst", order)
+        if node.tag == "StringDataEncoding":
+            _expect(node, scale is None, "a number where scale and offset are given", "text")
+            return self.string(node, system)
+        order = node.attributes.get("byteOrder", "mostSignificantByteFirst")
+        orders = ("mostSignificantByteFirst", "leastSignificantByteFirst")
+        _expect(node, order in orders, f"byteOrder {' or '.join(orders)}", order)
+        little = order == orders[1]
+        if node.tag == "BinaryDataEncoding":
+            node.only(("SizeInBits",), ("bitOrder", "byteOrder"))
+            _expect(node, not little, "octets in their order", order)
+            _expect(node, scale is None, "a number where scale and offset are given", "octets")
+            return BinaryEncoding(self.size(node.required("SizeInBits"), system, least=1))
+        node.only(
+            ("DefaultCalibrator", "ContextCalibratorList"),
+            ("bitOrder", "byteOrder", "encoding", "sizeInBits", "changeThreshold"),
+        )
+        calibration = self.calibration(node, system)
+        if scale is not None:
+            _expect(node, calibration == Calibration(), "scale and offset or a calibrator", "both")
+            calibration = Calibration(Polynomial(((scale[1], 0), (scale[0], 1))))
+        if node.tag == "IntegerDataEncoding":
+            bits = _integer(node, "sizeInBits", 8)
+            _expect(node, 1 <= bits <= 64, "sizeInBits of 1 to 64", f"{bits}")
+            form = node.attributes.get("encoding", "unsigned")
+            _expect(node, form in _INTEGER_FORMS, f"encoding {', '.join(_INTEGER_FORMS)}", form)
+            _expect(
+                node, not little or bits % 8 == 0, "whole octets where the least comes first", f"{bits} bits"
+            )
+            return IntegerEncoding(bits, _INTEGER_FORMS[form], little, calibration)
+        bits = _integer(node, "sizeInBits", 32)
+        form = node.attributes.get("encoding", "IEEE754_1985")
+        form = {"IEEE-754": "IEEE754", "MIL-1750A": "MILSTD_1750A"}.get(
+            form, form
+        )  # so spelt in older documents
+        if form in ("IEEE754", "IEEE754_1985"):
+            _expect(node, bits in (16, 32, 64), "sizeInBits 16, 32 or 64", f"{bits}")
+            return FloatEncoding(bits, "IEEE754", little, calibration)
+        _expect(node, form == "MILSTD_1750A", "encoding IEEE754, IEEE754_1985 or MILSTD_1750A", form)
+        _expect(node, bits in (32, 48), "sizeInBits 32 or 48", f"{bits}")
+        return FloatEncoding(bits, "MILSTD_1750A", little, calibration)
+
+    def string(self, node: Node, system: _System) -> StringEncoding:
+        """A text: its buffer, and what says where the text ends in it."""
+        node.only(("SizeInBits", "Variable"), ("bitOrder", "byteOrder", "encoding"))
+        name = node.attributes.get("encoding", "UTF-8")
+        _expect(node, name in _CHARSETS, f"encoding {', '.join(_CHARSETS)}", name)
+        charset = _CHARSETS[name]
+        if charset in ("utf-16", "utf-32"):
+            order = node.attribute("byteOrder")
+            ends = {"mostSignificantByteFirst": "-be", "leastSignificantByteFirst": "-le"}
+            _expect(node, order in ends, f"byteOrder {' or '.join(ends)}", order)
+            charset += ends[order]
+        fixed, variable = node.child("SizeInBits"), node.child("Variable")
+        holder = fixed if fixed is not None else variable
+        if holder is None or (fixed is not None and variable is not None):
+            raise node.error("either SizeInBits or Variable", "both" if holder is not None else "neither")
+        end, tag = holder.child("TerminationChar"), holder.child("LeadingSize")
+        _expect(holder, end is None or tag is None, "a TerminationChar or a LeadingSize", "both")
+        size: Size | None = None
+        most: int | None = None
+        if fixed is not None:
+            fixed.only(("Fixed", "TerminationChar", "LeadingSize"))
+            value = fixed.child("Fixed")
+            if value is not None:
+                value.only(("FixedValue",))
+                size = Size(fixed=_fixed(value.required("FixedValue"), 1))
+        else:
+            holder.only(
+                ("DynamicValue", "DiscreteLookupList", "TerminationChar", "LeadingSize"), ("maxSizeInBits",)
+            )
+            most = min(_integer(holder, "maxSizeInBits", MAX_BITS), MAX_BITS)
+            dynamic = holder.child("DynamicValue")
+            name_of = dynamic.required("ParameterInstanceRef") if dynamic is not None else None
+            if name_of is None or name_of.attributes.get("parameterRef") != _NO_PARAMETER:
+                size = self.size(holder, system, least=0, others=("TerminationChar", "LeadingSize"))
+        terminator, tag_bits = b"", 0
+        if end is not None:
+            try:
+                terminator = bytes.fromhex(end.text)
+            except ValueError:
+                raise end.error("hexadecimal digits", repr(end.text)) from None
+            try:
+                character = terminator.decode(charset)
+            except UnicodeDecodeError:
+                character = ""
+            _expect(end, len(character) == 1, f"one character of {name}", repr(end.text))
+        if tag is not None:
+            tag.only((), ("sizeInBitsOfSizeTag",))
+            tag_bits = _integer(tag, "sizeInBitsOfSizeTag", 16)
+            _expect(tag, 1 <= tag_bits <= 32, "sizeInBitsOfSizeTag of 1 to 32", f"{tag_bits}")
+        _expect(holder, size is not None or end is not None or tag is not None, "a size of the text", "none")
+        return StringEncoding(charset, size, terminator, tag_bits, most)
+
+    def size(self, node: Node, system: _System, least: int | None, others: tuple[str, ...] = ()) -> Size:
+        """A fixed or dynamic number; a fixed one is not below `least`."""
+        kinds = ("FixedValue", "DynamicValue", "DiscreteLookupList")
+        node.only((*kinds, *others), ("maxSizeInBits",) if others else ())
+        listed = [child for child in node.children if child.tag in kinds]
+        _expect(node, len(listed) == 1, f"one of {', '.join(kinds)}", f"{len(listed)}")
+        value = listed[0]
+        if value.tag == "FixedValue":
+            return Size(fixed=_fixed(value, least))
+        if value.tag == "DynamicValue":
+            value.only(("ParameterInstanceRef", "LinearAdjustment"))
+            instance = value.required("ParameterInstanceRef")
+            instance.only((), ("parameterRef", "useCalibratedValue", "instance"))
+            reference, data_type = self.reference(instance, system)
+            numeric = isinstance(data_type.encoding, (IntegerEncoding, FloatEncoding))
+            named = (data_type.labels or data_type.is_boolean) and reference.calibrated
+            _expect(instance, numeric and not named, "a number", f"{data_type.name!r}")
+            adjustment = value.child("LinearAdjustment")
+            if adjustment is None:
+                return Size(reference=reference)
+            adjustment.only((), ("slope", "intercept"))
+            slope, intercept = _number(adjustment, "slope", 1.0), _number(adjustment, "intercept", 0.0)
+            return Size(reference=reference, slope=slope, intercept=intercept)
+        lookup = []
+        for one in value.children:
+            _expect(one, one.tag == "DiscreteLookup", "a DiscreteLookup", one.tag)
+            number = _integer(one, "value", None)
+            _expect(
+                one,
+                least is None or least <= number <= MAX_BITS,
+                f"a value of {least} to {MAX_BITS}",
+                f"{number}",
+            )
+            lookup.append((self.condition(one, system, ("value",)), number))
+        _expect(value, bool(lookup), "a DiscreteLookup", "none")
+        return Size(lookup=tuple(lookup))
+
+    # calibrators
+
+    def calibration(self, node: Node, system: _System) -> Calibration:
+        default = node.child("DefaultCalibrator")
+        contexts = []
+        listed = node.child("ContextCalibratorList")
+        for context in listed.children if listed is not None else ():
+            context.only(("ContextMatch", "Calibrator"))
+            condition = self.condition(context.required("ContextMatch"), system)
+            contexts.append((condition, _calibrator(context.required("Calibrator"))))
+        return Calibration(None if default is None else _calibrator(default), tuple(contexts))
+
+    # conditions
+
+    def condition(self, node: Node, system: _System, attributes: tuple[str, ...] = ()) -> Condition:
+        """The condition that an element holds; all comparisons of a list must hold."""
+        kinds = ("Comparison", "ComparisonList", "BooleanExpression")
+        node.only(kinds, attributes)
+        _expect(node, len(node.children) == 1, f"one of {', '.join(kinds)}", f"{len(node.children)}")
+        inner = node.children[0]
+        if inner.tag == "Comparison":
+            return self.comparison(inner, system)
+        if inner.tag == "ComparisonList":
+            inner.only(("Comparison",))
+            _expect(inner, bool(inner.children), "a Comparison", "none")
+            return AllOf(tuple(self.comparison(one, system) for one in inner.children))
+        inner.only(("Condition", "ANDedConditions", "ORedConditions"))
+        _expect(inner, len(inner.children) == 1, "one condition", f"{len(inner.children)}")
+        return self.expression(inner.children[0], system)
+
+    def expression(self, node: Node, system: _System) -> Condition:
+        if node.tag != "Condition":
+            node.only(("Condition", "ANDedConditions", "ORedConditions"))
+            _expect(node, bool(node.children), "a condition", "none")
+            parts = tuple(self.expression(one, system) for one in node.children)
+            return AllOf(parts) if node.tag == "ANDedConditions" else AnyOf(parts)
+        node.only(("ParameterInstanceRef", "ComparisonOperator", "Value"))
+        references = list(node.all("ParameterInstanceRef"))
+        for one in references:
+            one.only((), ("parameterRef", "useCalibratedValue", "instance"))
+        operator = node.required("ComparisonOperator")
+        value = node.child("Value")
+        given = len(references) + (value is not None)
+        _expect(node, given == 2 and bool(references), "two sides, the first a parameter", f"{given} sides")
+        left, left_type = self.reference(references[0], system)
+        if value is not None:
+            return _compared(node, left, left_type, operator.text, value.text)
+        right, right_type = self.reference(references[1], system)
+        for side, data_type in ((left, left_type), (right, right_type)):
+            plain = not (data_type.labels or data_type.is_boolean) or not side.calibrated
+            number = isinstance(data_type.encoding, (IntegerEncoding, FloatEncoding)) and plain
+            _expect(node, number, "numbers on both sides", f"{data_type.name!r}")
+        return Comparison(left, _operator(node, operator.text), right)
+
+    def comparison(self, node: Node, system: _System) -> Condition:
+        node.only((), ("parameterRef", "useCalibratedValue", "instance", "value", "comparisonOperator"))
+        reference, data_type = self.reference(node, system)
+        operator = node.attributes.get("comparisonOperator", "==")
+        return _compared(node, reference, data_type, operator, node.attribute("value"))
+
+    # entries
+
+    def parameter_entry(self, node: Node, system: _System) -> tuple[Parameter, int]:
+        """The parameter of an entry and the number of its values."""
+        tags = ("ParameterRefEntry", "ArrayParameterRefEntry", "ContainerRefEntry")
+        _expect(node, node.tag in tags, f"an entry that is supported ({', '.join(tags)})", node.tag)
+        owner, found = self.find("parameters", node.attribute("parameterRef"), system, node)
+        parameter = self.parameter(owner, found)
+        type_owner, type_node = self.find("types", found.attribute("parameterTypeRef"), owner, found)
+        dimensions = node.child("DimensionList")
+        if node.tag == "ArrayParameterRefEntry":
+            _expect(node, isinstance(parameter.type, ArrayType), "an array", f"{parameter.type.name!r}")
+            if dimensions is not None:
+                array, _ = self.array(type_owner, type_node, dimensions)
+                parameter = Parameter(parameter.name, parameter.path, array, parameter.description)
+        return parameter, self.values[id(type_node)]
+
+    def entry(
+        self, node: Node, item: Parameter | Container, system: _System, attributes: tuple[str, ...]
+    ) -> Entry:
+        """The entry: where it begins and whether it is there."""
+        extra = ("DimensionList",) if node.tag == "ArrayParameterRefEntry" else ()
+        children = (*_DESCRIPTION, "LocationInContainerInBits", "IncludeCondition", "TimeAssociation", *extra)
+        node.only(children, (*attributes, "shortDescription", "lastEntryForThisArrayInstance"))
+        location, condition = node.child("LocationInContainerInBits"), node.child("IncludeCondition")
+        offset, from_start = 0, False
+        if location is not None:
+            location.only(("FixedValue",), ("referenceLocation",))
+            where = location.attributes.get("referenceLocation", "previousEntry")
+            places = ("previousEntry", "containerStart")
+            _expect(location, where in places, f"referenceLocation {' or '.join(places)}", where)
+            from_start = where == "containerStart"
+            offset = _fixed(location.required("FixedValue"), 0 if from_start else None)
+        return Entry(
+            item, offset, from_start, None if condition is None else self.condition(condition, system)
+        )
+
+
+def _check_chains(bases: Mapping[int, int], nodes: Mapping[int, Node]) -> None:
+    """Refuse a container that inherits from itself, or over too many steps."""
+    depths: dict[int, int] = {}
+    for key in nodes:
+        chain: list[int] = []
+        at = key
+        while at in bases and at not in depths:
+            if len(chain) > MAX_INHERITANCE:
+                raise nodes[key].error(
+                    "a base that ends in a container without one", "itself or too many steps"
+                )
+            chain.append(at)
+            at = bases[at]
+        depth = depths.get(at, 0)
+        for link in reversed(chain):
+            depth += 1
+            depths[link] = depth
+        if depth > MAX_INHERITANCE:
+            found = f"more than {MAX_INHERITANCE} steps"
+            raise nodes[key].error("a base that ends in a container without one", found)
+
+
+def _children_first(followers: Mapping[int, list[int]], bases: Mapping[int, int]) -> list[int]:
+    order = []
+    pending = [key for key in followers if key not in bases]
+    while pending:
+        key = pending.pop()
+        order.append(key)
+        pending.extend(followers[key])
+    return order[::-1]
+
+
+def _column_names(elements: list[tuple[str, str]]) -> dict[tuple[str, str], str]:
+    """Names for (path of the system, name): the name alone where there is one of it."""
+    counts: dict[str, int] = {}
+    for _, name in elements:
+        counts[name] = counts.get(name, 0) + 1
+    return {(path, name): name if counts[name] == 1 else f"{path}/{name}" for path, name in elements}
+
+
+def _check_order(root: Container, document: str) -> None:
+    """Refuse references to parameters that no packet holds before them."""
+    pending: list[tuple[Container, frozenset[str]]] = [(root, frozenset())]
+    while pending:
+        container, known = pending.pop()
+        names = set(known)
+        place = f"{document}, container {container.path}"
+        if container.condition is not None:
+            _check_known(_of_condition(container.condition), names, place)
+        _check_entries(container.entries, names, place)
+        after = frozenset(names)
+        pending.extend((child, after) for child in container.children)
+
+
+def _check_entries(entries: tuple[Entry, ...], names: set[str], place: str) -> None:
+    for entry in entries:
+        if entry.condition is not None:
+            _check_known(_of_condition(entry.condition), names, place)
+            twice = sorted(_names_of(entry.item) & names)
+            if twice:
+                raise DefinitionError(
+                    f"{place}: expected a parameter once where it is under a condition, "
+                    f"found {twice[0]!r} again"
+                )
+        if isinstance(entry.item, Container):
+            _check_entries(entry.item.entries, names, place)
+        else:
+            _check_known(_of_type(entry.item.type) - {entry.item.name}, names, place)
+            names.add(entry.item.name)
+
+
+def _names_of(item: Parameter | Container) -> set[str]:
+    if isinstance(item, Parameter):
+        return {item.name}
+    return set().union(*(_names_of(entry.item) for entry in item.entries))
+
+
+def _check_known(wanted: set[str], names: set[str], place: str) -> None:
+    missing = sorted(wanted - names)
+    if missing:
+        raise DefinitionError(
+            f"{place}: expected references to parameters that stand before, found {missing[0]!r}"
+        )
+
+
+def _of_condition(condition: Condition) -> set[str]:
+    if isinstance(condition, (AllOf, AnyOf)):
+        return set().union(*(_of_condition(one) for one in condition.conditions))
+    names = {condition.left.parameter}
+    if isinstance(condition, Comparison) and isinstance(condition.right, Reference):
+        names.add(condition.right.parameter)
+    return names
+
+
+def _of_size(size: Size | None) -> set[str]:
+    if size is None:
+        return set()
+    names: set[str] = set().union(*(_of_condition(condition) for condition, _ in size.lookup))
+    return names | ({size.reference.parameter} if size.reference is not None else set())
+
+
+def _of_type(data_type: DataType) -> set[str]:
+    if isinstance(data_type, AggregateType):
+        return set().union(*(_of_type(member) for _, member in data_type.members))
+    if isinstance(data_type, ArrayType):
+        return _of_type(data_type.element) | _of_size(data_type.first) | _of_size(data_type.last)
+    encoding = data_type.encoding
+    if isinstance(encoding, (StringEncoding, BinaryEncoding)):
+        return _of_size(encoding.size)
+    return set().union(*(_of_condition(condition) for condition, _ in encoding.calibration.contexts))
+
+
+def _operator(node: Node, text: str) -> Operator:
+    _expect(node, text in _OPERATORS, f"an operator ({', '.join(_OPERATORS)})", repr(text))
+    return _OPERATORS[text]
+
+
+def _compared(node: Node, left: Reference, data_type: ScalarType, operator_text: str, text: str) -> Condition:
+    """The comparison of a parameter with a value written as text."""
+    operator = _operator(node, operator_text)
+    encoding = data_type.encoding
+    named = data_type.labels or data_type.is_boolean
+    if (named and left.calibrated) or isinstance(encoding, StringEncoding):
+        _expect(node, operator in ("==", "!="), "== or != for a name", operator)
+    if data_type.labels and left.calibrated:
+        ranges = tuple((first, last) for first, last, label in data_type.labels if label == text)
+        known = ", ".join(repr(label) for _, _, label in data_type.labels[:8])
+        _expect(node, bool(ranges), f"a name of a code ({known})", repr(text))
+        return CodeIn(left, ranges, operator == "!=")
+    if data_type.is_boolean and left.calibrated:
+        truth = {"true": True, "1": True, "false": False, "0": False}.get(text.lower())
+        if truth is None:
+            raise node.error("true or false", repr(text))
+        return Comparison(left, operator, truth)
+    if isinstance(encoding, StringEncoding):
+        return Comparison(left, operator, text)
+    if isinstance(encoding, BinaryEncoding):
+        raise node.error(
+            "a comparison of a number, a text or a name", f"one of the octets {left.parameter!r}"
+        )
+    calibrated = left.calibrated and encoding.calibration != Calibration()
+    try:
+        if isinstance(encoding, IntegerEncoding) and not calibrated:
+            return Comparison(left, operator, _whole(text))
+        value = float(text)
+    except ValueError:
+        raise node.error("a number", repr(text)) from None
+    _expect(node, not math.isnan(value), "a number", repr(text))
+    return Comparison(left, operator, value)
+
+
+def _calibrator(node: Node) -> Calibrator:
+    kinds = ("PolynomialCalibrator", "SplineCalibrator")
+    node.only((*kinds, "AncillaryDataSet"), _NAMED)
+    listed = [child for child in node.children if child.tag in kinds]
+    _expect(node, len(listed) == 1, f"one of {' and '.join(kinds)}", f"{len(listed)}")
+    inner = listed[0]
+    if inner.tag == "PolynomialCalibrator":
+        inner.only(("Term", "AncillaryDataSet"), _NAMED)
+        terms = []
+        for term in inner.all("Term"):
+            exponent = _integer(term, "exponent", None)
+            _expect(term, 0 <= exponent <= MAX_EXPONENT, f"an exponent of 0 to {MAX_EXPONENT}", f"{exponent}")
+            terms.append((_number(term, "coefficient", None), exponent))
+        _expect(inner, bool(terms), "a Term", "none")
+        return Polynomial(tuple(terms))
+    inner.only(("SplinePoint", "AncillaryDataSet"), (*_NAMED, "order", "extrapolate"))
+    points = [(_number(p, "raw", None), _number(p, "calibrated", None)) for p in inner.all("SplinePoint")]
+    order = _integer(inner, "order", 1)
+    _expect(inner, order in (0, 1), "order 0 or 1", f"{order}")
+    _expect(inner, len(points) >= 2, "two points or more", f"{len(points)}")
+    rising = all(a[0] < b[0] for a, b in itertools.pairwise(points))
+    _expect(inner, rising, "points with rising raw values", "others")
+    return Spline(tuple(points), order, _boolean(inner, "extrapolate", False))
+
+
+def _labels(node: Node, listed: Node | None, encoding: Encoding) -> tuple[tuple[int, int, str], ...]:
+    """(first code, last code, name), codes rising."""
+    if listed is None:
+        raise node.error("an EnumerationList", "none")
+    assert isinstance(encoding, IntegerEncoding)
+    listed.only(("Enumeration",))
+    least, greatest = _range(encoding)
+    labels = []
+    for one in listed.children:
+        one.only((), ("value", "maxValue", "label", "shortDescription"))
+        first = _integer(one, "value", None)
+        last = _integer(one, "maxValue", first)
+        _expect(
+            one, least <= first <= last <= greatest, f"codes of {least} to {greatest}", f"{first} to {last}"
+        )
+        labels.append((first, last, one.attribute("label")))
+    _expect(listed, bool(labels), "an Enumeration", "none")
+    labels.sort(key=lambda label: label[0])
+    for before, after in itertools.pairwise(labels):
+        _expect(listed, before[1] < after[0], "one name for each code", f"two for {after[0]}")
+    return tuple(labels)
+
+
+def _range(encoding: IntegerEncoding) -> tuple[int, int]:
+    if encoding.form == "unsigned":
+        return 0, (1 << encoding.bits) - 1
+    return -(1 << encoding.bits - 1), (1 << encoding.bits - 1) - 1
+
+
+def _epoch(node: Node) -> str:
+    reference = node.child("ReferenceTime")
+    epoch = reference.child("Epoch") if reference is not None else None
+    return "" if epoch is None else epoch.text
+
+
+def _fixed(node: Node, least: int | None) -> int:
+    try:
+        value = _whole(node.text)
+    except ValueError:
+        raise node.error("a whole number", repr(node.text)) from None
+    low = -MAX_BITS if least is None else least
+    _expect(node, low <= value <= MAX_BITS, f"a number of {low} to {MAX_BITS}", f"{value}")
+    return value
+
+
+def _whole(text: str) -> int:
+    if len(text) > 40:
+        raise ValueError("too long")
+    plain = text.strip().lower()
+    sign = -1 if plain.startswith("-") else 1
+    digits = plain.lstrip("+-")
+    for prefix, base in (("0x", 16), ("0b", 2), ("0o", 8)):
+        if digits.startswith(prefix):
+            return sign * int(digits[2:], base)
+    return int(plain)
+
+
+def _integer(node: Node, name: str, default: int | None) -> int:
+    if default is not None and name not in node.attributes:
+        return default
+    text = node.attribute(name)
+    try:
+        return _whole(text)
+    except ValueError:
+        raise node.error(f"a whole number as {name}", repr(text[:40])) from None
+
+
+def _number(node: Node, name: str, default: float | None) -> float:
+    if default is not None and name not in node.attributes:
+        return default
+    text = node.attribute(name)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    _expect(node, math.isfinite(value), f"a finite number as {name}", repr(text[:40]))
+    return value
+
+
+def _boolean(node: Node, name: str, default: bool) -> bool:
+    text = node.attributes.get(name, "true" if default else "false")
+    known = {"true": True, "1": True, "false": False, "0": False}
+    _expect(node, text.lower() in known, f"true or false as {name}", repr(text))
+    return known[text.lower()]
