@@ -19,8 +19,10 @@ import multiprocessing
 import os
 import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from sqlalchemy import text
@@ -100,7 +102,7 @@ def measure(database_url: str | None, count: int, pieces: int) -> dict[str, Any]
     with tempfile.TemporaryDirectory() as name:
         if database_url:
             prepare_database(database_url, upgrade=True).engine.dispose()
-        with open_ground(Path(name) / "home", database_url=database_url) as ground:
+        with open_ground(Path(name) / "home", database_url=database_url) as ground, ExitStack() as opened:
             commit = ground.database.engine.dialect.do_commit
 
             def timed_commit(connection: Any) -> None:
@@ -108,7 +110,7 @@ def measure(database_url: str | None, count: int, pieces: int) -> dict[str, Any]
                 commit(connection)
                 commits.append(1e3 * (time.perf_counter() - begun))
 
-            ground.database.engine.dialect.do_commit = timed_commit  # type: ignore[method-assign]
+            opened.enter_context(patch.object(ground.database.engine.dialect, "do_commit", timed_commit))
             reader = DownlinkReader()
             for _ in reader.batches([stream[:100_000]]):
                 pass
@@ -126,8 +128,7 @@ def measure(database_url: str | None, count: int, pieces: int) -> dict[str, Any]
                     note("piece_commits_ms", sum(commits[before:]))
 
             take(0, 2)  # compiles
-            Joiner.join, Joiner._store = timed, timed_store  # type: ignore[method-assign]
-            try:
+            with patch.object(Joiner, "join", timed), patch.object(Joiner, "_store", timed_store):
                 for state, begin in (("empty", 2), ("full", 2 + pieces)):
                     taken.clear()
                     take(begin, begin + pieces)
@@ -143,8 +144,6 @@ def measure(database_url: str | None, count: int, pieces: int) -> dict[str, Any]
                             vehicle = repository.find(connection, repository.VEHICLES, ccsds_id=SPACECRAFT)
                         assert vehicle is not None
                         fill(ground, reader.link, count, f"channel {vehicle['id']} 0 6 1113")
-            finally:
-                Joiner.join, Joiner._store = join, store  # type: ignore[method-assign]
     return figures
 
 

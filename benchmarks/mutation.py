@@ -23,6 +23,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from scipy.stats import binomtest
 
@@ -228,9 +229,9 @@ def run_group(name: str, sample: int, seed: int, children: int) -> dict[str, obj
     }
 
 
-def line_of(name: str, result: dict[str, object]) -> str:
+def line_of(name: str, result: dict[str, Any]) -> str:
     """Return the figures of a group as one line."""
-    low, high = result["interval"]  # type: ignore[misc]
+    low, high = result["interval"]
     return (
         f"{name}: {result['killed']} of {result['tested']} mutants killed "
         f"(score {result['score']:.2f}, 95 % interval {low:.2f} to {high:.2f}; {result['mutants']} mutants in all)"

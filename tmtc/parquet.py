@@ -83,8 +83,8 @@ def _plain(values: Sequence[object]) -> tuple[int, int | None, bytes]:
     Whole numbers are signed, or unsigned where one does not fit; a column that fits neither is written as text.
     """
     present = [value for value in values if value is not None]
-    if present and all(isinstance(value, (int, np.integer)) for value in present):
-        numbers = [int(value) for value in present]  # type: ignore[call-overload]
+    numbers = [int(value) for value in present if isinstance(value, (int, np.integer))]
+    if present and len(numbers) == len(present):
         least, greatest = min(numbers), max(numbers)
         if least >= -(1 << 63) and greatest < 1 << 63:
             return _INT64, None, np.array(numbers, dtype="<i8").tobytes()

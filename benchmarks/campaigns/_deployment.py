@@ -183,12 +183,23 @@ class PostgresServer:
         data = place / "data"
         subprocess.run(
             [*user, str(self._bin / "initdb"), "-D", str(data), "-U", "linna", "-A", "trust", "--no-sync"],
-            check=True, cwd=place, stdout=subprocess.DEVNULL,
-        )  # fmt: skip
+            check=True,
+            cwd=place,
+            stdout=subprocess.DEVNULL,
+        )
         server = [
-            str(self._bin / "postgres"), "-D", str(data), "-p", str(self._port), "-k", str(place), "-h", "127.0.0.1",
-            "-c", "fsync=off",
-        ]  # fmt: skip
+            str(self._bin / "postgres"),
+            "-D",
+            str(data),
+            "-p",
+            str(self._port),
+            "-k",
+            str(place),
+            "-h",
+            "127.0.0.1",
+            "-c",
+            "fsync=off",
+        ]
         self.part = Part([*user, *server], folder / "postgres.log", self._answers, cwd=place)
         self.part.start()
         create = [
@@ -237,9 +248,18 @@ class Deployment:
         )
         linna = [sys.executable, "-m", "linna"]
         redis = [
-            "redis-server", "--port", str(broker), "--bind", "127.0.0.1", "--dir", str(folder), "--save", "",
-            "--appendonly", "no",
-        ]  # fmt: skip
+            "redis-server",
+            "--port",
+            str(broker),
+            "--bind",
+            "127.0.0.1",
+            "--dir",
+            str(folder),
+            "--save",
+            "",
+            "--appendonly",
+            "no",
+        ]
         addresses = []
         try:
             self._prepare(database.url)
@@ -295,9 +315,18 @@ class ManyApis:
             LINNA_RATE_LIMIT_PER_S="0",
         )
         redis = [
-            "redis-server", "--port", str(broker), "--bind", "127.0.0.1", "--dir", str(folder), "--save", "",
-            "--appendonly", "no",
-        ]  # fmt: skip
+            "redis-server",
+            "--port",
+            str(broker),
+            "--bind",
+            "127.0.0.1",
+            "--dir",
+            str(folder),
+            "--save",
+            "",
+            "--appendonly",
+            "no",
+        ]
         try:
             self._add("broker", Part(redis, folder / "redis.log", lambda: listens(broker)))
             for number, port in enumerate(ports, start=1):

@@ -78,8 +78,13 @@ def fill(ground: Ground, folder: Path, packets: int) -> None:
     for name in ("mixed.cadu", "rest.cadu"):
         ingest_file(ground, folder / name)
     define_pass(
-        ground, name="pass", start_utc_ns=START, stop_utc_ns=START + NS, spacecraft_id=SPACECRAFT, instance="flight"
-    )  # fmt: skip
+        ground,
+        name="pass",
+        start_utc_ns=START,
+        stop_utc_ns=START + NS,
+        spacecraft_id=SPACECRAFT,
+        instance="flight",
+    )
     for name, role in (("ann", "admin"), ("bob", "operator")):
         add_user(ground, name, role)
     add_window(ground, WindowEntry("w", START, START + NS, 15.0, SPACECRAFT), actor="ann")
@@ -124,8 +129,12 @@ def _invented(connection: Connection, table: Table) -> dict[str, Any]:
         if column.foreign_keys:
             parent = next(iter(column.foreign_keys)).column
             row[column.name] = connection.execute(select(parent).order_by(parent).limit(1)).scalar()
-        elif not (column.primary_key and column.autoincrement is not False and len(table.primary_key) == 1
-                  and _is_integer(column)):  # fmt: skip
+        elif not (
+            column.primary_key
+            and column.autoincrement is not False
+            and len(table.primary_key) == 1
+            and _is_integer(column)
+        ):
             row[column.name] = _plain_value(column)
     return row
 
@@ -408,10 +417,14 @@ def campaign(
         for kind in dict.fromkeys(harm.kind for harm in wanted)
     }
     return {
-        "damage": sum(done.values()), "found": sum(done.values()) - len(missed), "missed": missed,
-        "refused_by_the_database": refused, "kinds": table, "rows_and_files": sum(clean.checked.values()),
+        "damage": sum(done.values()),
+        "found": sum(done.values()) - len(missed),
+        "missed": missed,
+        "refused_by_the_database": refused,
+        "kinds": table,
+        "rows_and_files": sum(clean.checked.values()),
         "verify_s_median": round(float(np.median(seconds)), 3) if seconds else None,
-    }  # fmt: skip
+    }
 
 
 def _names(result: Verification, harm: Harm) -> bool:

@@ -38,8 +38,14 @@ ROOT = Path(__file__).resolve().parents[2]
 SECRET = "hostile-campaign-secret"
 LEFTOVER = "hostile-campaign-leftover"
 LIMITS = {
-    "wall_s": 60, "cpu_s": 20, "memory_mib": 384, "file_mib": 8, "folder_mib": 24, "open_files": 256, "processes": 32,
-}  # fmt: skip
+    "wall_s": 60,
+    "cpu_s": 20,
+    "memory_mib": 384,
+    "file_mib": 8,
+    "folder_mib": 24,
+    "open_files": 256,
+    "processes": 32,
+}
 SHORT_S = 2
 SCENARIOS = ("root", "uid 10001", "image", "no unshare", "no unshare, runner")
 

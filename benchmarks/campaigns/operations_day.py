@@ -102,9 +102,23 @@ class Payload:
     def __init__(self, scenario: str, log: Path) -> None:
         self.telemetry, self.telecommands, console = free_port(), free_port(), free_port()
         command = [
-            sys.executable, "-m", "linna", "emulate", scenario, "--live", "--no-operator", "--paused", "--rate", "0",
-            "--port", str(self.telemetry), "--tc-port", str(self.telecommands), "--console-port", str(console),
-        ]  # fmt: skip
+            sys.executable,
+            "-m",
+            "linna",
+            "emulate",
+            scenario,
+            "--live",
+            "--no-operator",
+            "--paused",
+            "--rate",
+            "0",
+            "--port",
+            str(self.telemetry),
+            "--tc-port",
+            str(self.telecommands),
+            "--console-port",
+            str(console),
+        ]
         with log.open("ab") as stream:
             self.process = subprocess.Popen(command, stdout=stream, stderr=stream)
         wait_until(
@@ -260,13 +274,31 @@ def plan(desk: Transcript, api: Client, scenario: str, folder: Path, now_utc_ns:
     desk.linna("mission", "add", folder / "mission.toml")
     desk.linna("plan", "ephemeris", reference)
     desk.linna(
-        "plan", "search", "--start", format_utc(start), "--stop", format_utc(stop), "--step-s", 10,
-        "--minimum-duration-s", 60, "--maximum-duration-s", round(minutes * 60),
-    )  # fmt: skip
+        "plan",
+        "search",
+        "--start",
+        format_utc(start),
+        "--stop",
+        format_utc(stop),
+        "--step-s",
+        10,
+        "--minimum-duration-s",
+        60,
+        "--maximum-duration-s",
+        round(minutes * 60),
+    )
     desk.linna(
-        "plan", "add", "--start", format_utc(start), "--stop", format_utc(stop), "--spacecraft-id", SPACECRAFT_ID,
-        "--name", "observation of the day",
-    )  # fmt: skip
+        "plan",
+        "add",
+        "--start",
+        format_utc(start),
+        "--stop",
+        format_utc(stop),
+        "--spacecraft-id",
+        SPACECRAFT_ID,
+        "--name",
+        "observation of the day",
+    )
     window = int(api.list_windows(1)["items"][0]["id"])
     desk.linna("plan", "approve", window, by="bob")
     desk.linna("plan", "uplink", window, by="bob")
@@ -287,8 +319,12 @@ def execute(desk: Transcript, api: Client, payload: Payload, window: int) -> Non
     for until, state in (((start + stop) // 2, "executing"), (stop + AFTER_S * NS, "downlinked")):
         now, mode = payload.fly(until)
         desk.say(f"# the payload at {format_utc(now)[:19]}Z: mode {mode}")
+
+        def is_reached(wanted: str = state) -> bool:
+            return bool(api.get_window(window)["state"] == wanted)
+
         wait_until(
-            lambda wanted=state: api.get_window(window)["state"] == wanted,  # type: ignore[misc]
+            is_reached,
             f"window {state}, found {api.get_window(window)['state']}",
             PATIENCE_S,
         )

@@ -377,9 +377,8 @@ class Campaign:
                 .group_by(audit.c.action, audit.c.target)
             ).all()
             stray = connection.execute(select(func.count()).select_from(ingests)).scalar_one()
-            entered = dict(
-                connection.execute(select(jobs.c.kind, func.count()).group_by(jobs.c.kind)).all()  # type: ignore[arg-type]
-            )
+            kinds = connection.execute(select(jobs.c.kind, func.count()).group_by(jobs.c.kind))
+            entered = {kind: int(number) for kind, number in kinds}
         for vehicle, count, times in counts:
             self.tally.fault("shared_counts", "all", f"vehicle {vehicle}, count {count}", times - 1)
         for command, times in self.tally.handed_out.items():

@@ -442,9 +442,13 @@ def main(words: list[str] | None = None) -> int:
     given = parser.parse_args(words)
     with tempfile.TemporaryDirectory() as name:
         figures = campaign(
-            Path(name), uploads=given.uploads, half=given.half_sent, sockets=given.sockets,
-            postgres=given.postgres, packets=given.packets,
-        )  # fmt: skip
+            Path(name),
+            uploads=given.uploads,
+            half=given.half_sent,
+            sockets=given.sockets,
+            postgres=given.postgres,
+            packets=given.packets,
+        )
     faults = verdict(figures)
     if given.json:
         print(json.dumps({**figures, "faults": faults}))

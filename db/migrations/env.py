@@ -1,11 +1,12 @@
-"""Alembic environment: runs the migrations on the connection that the program hands over, then installs the triggers.
+"""Alembic environment: migrations on the connection of the program, followed by installation of the triggers.
 
-Triggers follow from the tables of this version, so they are made anew after every migration.
+The triggers depend on the tables of this version, so they are recreated after every migration.
 """
 
 from __future__ import annotations
 
 from alembic import context
+from sqlalchemy import Connection
 
 from ground_service.store.database import install_triggers
 from ground_service.store.models import Base
@@ -25,15 +26,15 @@ def run() -> None:
         _migrate(connection)
 
 
-def _migrate(connection: object) -> None:
+def _migrate(connection: Connection) -> None:
     context.configure(
-        connection=connection,  # type: ignore[arg-type]
+        connection=connection,
         target_metadata=Base.metadata,
         render_as_batch=True,
         transaction_per_migration=False,
     )
     context.run_migrations()
-    install_triggers(connection)  # type: ignore[arg-type]
+    install_triggers(connection)
 
 
 run()

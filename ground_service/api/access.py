@@ -132,9 +132,15 @@ def list_audit(
     if times[0] is not None and times[1] is not None and times[0] > times[1]:
         raise InvalidInput("audit", "until", f"a time after {since}", str(until))
     found, total = audit_log.list_entries(
-        ground, actor=actor, action=action, target=target, since_utc_ns=times[0], until_utc_ns=times[1],
-        limit=limit, offset=offset,
-    )  # fmt: skip
+        ground,
+        actor=actor,
+        action=action,
+        target=target,
+        since_utc_ns=times[0],
+        until_utc_ns=times[1],
+        limit=limit,
+        offset=offset,
+    )
     return page_of(found, total, limit, offset)
 
 

@@ -11,14 +11,14 @@ import hashlib
 import json
 import tomllib
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Final, Literal, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from ground_service.errors import InvalidInput
 from tmtc.effects import EFFECTS
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION: Final = 1
 MISSION_LIMIT_OCTETS = 1 << 20
 NOT_STATED = "not stated"
 
@@ -171,8 +171,11 @@ class Evidence(Section):
                 return None
             return "3" if self.unseen_share == 1.0 else "3s"
         levels: dict[str | None, Level] = {
-            "unit-geometry": "1", "procedural": "2", "other-renderer": "4", "photographs": "5",
-        }  # fmt: skip
+            "unit-geometry": "1",
+            "procedural": "2",
+            "other-renderer": "4",
+            "photographs": "5",
+        }
         return levels.get(self.world)
 
     @property
@@ -258,7 +261,7 @@ class Approval(Section):
 class Mission(Section):
     """Mission description of one spacecraft."""
 
-    schema_version: Literal[1] = SCHEMA_VERSION  # type: ignore[assignment]
+    schema_version: Literal[1] = SCHEMA_VERSION
     name: Annotated[str, Field(min_length=1, max_length=200)]
     spacecraft: Spacecraft = Spacecraft()
     dictionary: DictionarySection = DictionarySection()

@@ -330,23 +330,43 @@ def _resources(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
 
     coldest = values.get("temperature_c")
     yield _limited(
-        "resources.cpu", "CPU load", "%", found.cpu_percent, limits.cpu_percent, at_most=True,
-        note="processor time of a step over the cadence, largest mean between two reports",
-    )  # fmt: skip
-    yield _limited(
-        "resources.memory", "memory in use", "MiB", greatest("memory_used_kib", 1.0 / 1024.0), limits.memory_mib,
+        "resources.cpu",
+        "CPU load",
+        "%",
+        found.cpu_percent,
+        limits.cpu_percent,
         at_most=True,
-    )  # fmt: skip
+        note="processor time of a step over the cadence, largest mean between two reports",
+    )
     yield _limited(
-        "resources.storage", "packet store in use", "%", greatest("storage_used_permille", 0.1),
-        limits.storage_percent, at_most=True,
-    )  # fmt: skip
+        "resources.memory",
+        "memory in use",
+        "MiB",
+        greatest("memory_used_kib", 1.0 / 1024.0),
+        limits.memory_mib,
+        at_most=True,
+    )
     yield _limited(
-        "resources.temperature_max", "highest temperature", "°C", greatest("temperature_c"),
-        limits.temperature_max_c, at_most=True,
-    )  # fmt: skip
+        "resources.storage",
+        "packet store in use",
+        "%",
+        greatest("storage_used_permille", 0.1),
+        limits.storage_percent,
+        at_most=True,
+    )
     yield _limited(
-        "resources.temperature_min", "lowest temperature", "°C",
+        "resources.temperature_max",
+        "highest temperature",
+        "°C",
+        greatest("temperature_c"),
+        limits.temperature_max_c,
+        at_most=True,
+    )
+    yield _limited(
+        "resources.temperature_min",
+        "lowest temperature",
+        "°C",
         float(coldest.min()) if coldest is not None and len(coldest) else None,
-        limits.temperature_min_c, at_most=False,
-    )  # fmt: skip
+        limits.temperature_min_c,
+        at_most=False,
+    )

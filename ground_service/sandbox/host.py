@@ -203,9 +203,14 @@ def protection() -> Protection:
     with tempfile.TemporaryDirectory(prefix="sandbox-") as folder:
         printed = Path(folder) / "printed.txt"
         limits = {
-            "wall_s": 30, "cpu_s": 20, "memory_mib": 512, "file_mib": 1, "folder_mib": 8, "open_files": 64,
+            "wall_s": 30,
+            "cpu_s": 20,
+            "memory_mib": 512,
+            "file_mib": 1,
+            "folder_mib": 8,
+            "open_files": 64,
             "processes": 16,
-        }  # fmt: skip
+        }
         run = Run(
             "namespaces",
             (sys.executable, "-I", "-S", probe.__file__, str(os.getpid())),

@@ -211,19 +211,30 @@ def _ingest_again(
 ) -> None:
     """Ingest every raw file into the scratch archive, as in its first ingest."""
     ingests, vehicles, files, pieces = (
-        repository.INGESTS, repository.VEHICLES, repository.FILES, repository.PIECES,
-    )  # fmt: skip
+        repository.INGESTS,
+        repository.VEHICLES,
+        repository.FILES,
+        repository.PIECES,
+    )
     query = (
         select(
-            ingests.c.id, ingests.c.file_sha256, ingests.c.state, vehicles.c.ccsds_id, vehicles.c.instance,
-            files.c.name, files.c.octets, pieces.c.scope, pieces.c.spacecraft_id, pieces.c.stream,
+            ingests.c.id,
+            ingests.c.file_sha256,
+            ingests.c.state,
+            vehicles.c.ccsds_id,
+            vehicles.c.instance,
+            files.c.name,
+            files.c.octets,
+            pieces.c.scope,
+            pieces.c.spacecraft_id,
+            pieces.c.stream,
             pieces.c.position,
         )
         .outerjoin(pieces, pieces.c.ingest_id == ingests.c.id)
         .outerjoin(vehicles, vehicles.c.id == ingests.c.vehicle_id)
         .outerjoin(files, files.c.sha256 == ingests.c.file_sha256)
         .order_by(ingests.c.id)
-    )  # fmt: skip
+    )
     seen = set()
     for row in connection.execute(query).mappings().all():
         ground.check_stopping()

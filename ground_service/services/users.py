@@ -369,12 +369,17 @@ def _token_row(ground: Ground, token: str) -> repository.Row | None:
     users, tokens = repository.USERS, repository.TOKENS
     query = (
         select(
-            tokens.c.id, tokens.c.expires_utc_ns, tokens.c.revoked_utc_ns, tokens.c.used_utc_ns,
-            users.c.name, users.c.role, users.c.state,
+            tokens.c.id,
+            tokens.c.expires_utc_ns,
+            tokens.c.revoked_utc_ns,
+            tokens.c.used_utc_ns,
+            users.c.name,
+            users.c.role,
+            users.c.state,
         )
         .join(users, users.c.id == tokens.c.user_id)
         .where(tokens.c.token_sha256 == token_sha256(token))
-    )  # fmt: skip
+    )
     with ground.database.reading() as connection:
         row = connection.execute(query).mappings().first()
     return dict(row) if row is not None else None

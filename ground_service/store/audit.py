@@ -17,10 +17,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, Table, func, insert, select, text, update
+from sqlalchemy import Connection, func, insert, select, text, update
 
 from ground_service.errors import AuditBroken
-from ground_service.store.models import AuditEntry, AuditHead
+from ground_service.store.models import AuditEntry, AuditHead, Base
 
 GENESIS = "0" * 64
 """Previous hash of the first entry."""
@@ -31,8 +31,8 @@ PENDING = "linna_audit"
 BLOCK_ROWS = 1000
 HEAD_ID = 1
 
-_ENTRIES: Table = AuditEntry.__table__  # type: ignore[assignment]
-_HEAD: Table = AuditHead.__table__  # type: ignore[assignment]
+_ENTRIES = Base.metadata.tables[AuditEntry.__tablename__]
+_HEAD = Base.metadata.tables[AuditHead.__tablename__]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +65,14 @@ class BrokenEntry:
 def entry_sha256(previous_sha256: str, number: int, note: Note) -> str:
     """Return the hash (hex) of an entry: SHA-256 of its canonical JSON with the hash of the previous entry."""
     content = [
-        previous_sha256, number, note.utc_ns, note.actor, note.action, note.target, plain_detail(note.detail),
-    ]  # fmt: skip
+        previous_sha256,
+        number,
+        note.utc_ns,
+        note.actor,
+        note.action,
+        note.target,
+        plain_detail(note.detail),
+    ]
     return hashlib.sha256(_canonical(content).encode()).hexdigest()
 
 
@@ -113,11 +119,16 @@ def append_pending(connection: Connection) -> None:
         sha256 = entry_sha256(previous, number, note)
         rows.append(
             {
-                "id": number, "utc_ns": note.utc_ns, "actor": note.actor, "action": note.action,
-                "target": note.target, "detail": plain_detail(note.detail),
-                "previous_sha256": previous, "sha256": sha256,
+                "id": number,
+                "utc_ns": note.utc_ns,
+                "actor": note.actor,
+                "action": note.action,
+                "target": note.target,
+                "detail": plain_detail(note.detail),
+                "previous_sha256": previous,
+                "sha256": sha256,
             }
-        )  # fmt: skip
+        )
         previous = sha256
     connection.execute(insert(_ENTRIES), rows)
     connection.execute(update(_HEAD).where(_HEAD.c.id == HEAD_ID).values(number=number, sha256=previous))

@@ -44,9 +44,11 @@ def copied_tables() -> list[Table]:
 def row_blocks(connection: Connection, table: Table) -> Iterator[list[Row]]:
     """Yield all rows of a table in the order of its key, which is the same in both databases."""
     key = [
-        collate(column, "C") if connection.dialect.name == "postgresql" and isinstance(column.type, String) else column
+        collate(column, "C")
+        if connection.dialect.name == "postgresql" and isinstance(column.type, String)
+        else column
         for column in table.primary_key.columns
-    ]  # fmt: skip
+    ]
     rows = connection.execution_options(yield_per=BLOCK_ROWS).execute(select(table).order_by(*key))
     for part in rows.mappings().partitions(BLOCK_ROWS):
         yield [dict(row) for row in part]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 from linna.commands._ground import add_service_options, open_service
 from linna.output import add_json_flag, emit, log, progress
@@ -88,7 +90,7 @@ def _archives(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, metavar="N", help="replays at a time (default: one a core)")
 
 
-def _finish(parser: argparse.ArgumentParser, handler) -> None:  # type: ignore[no-untyped-def]
+def _finish(parser: argparse.ArgumentParser, handler: Callable[[argparse.Namespace], int]) -> None:
     add_service_options(parser)
     add_json_flag(parser)
     parser.set_defaults(handler=handler)
@@ -339,5 +341,5 @@ def _listed(given: list[str]) -> list[str]:
     return found
 
 
-def _bar(items, total):  # type: ignore[no-untyped-def]
+def _bar(items: Iterable[Any], total: int) -> Any:
     return progress(items, total, "replays", "replay")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from linna.output import add_json_flag, emit, progress
 
@@ -108,7 +110,7 @@ def _run_command(arguments: argparse.Namespace, archive: Path) -> int:
     return 0 if summary["outcome"] == "ok" else 1
 
 
-def _bar(items, total):  # type: ignore[no-untyped-def]
+def _bar(items: Iterable[Any], total: int) -> Any:
     return progress(items, total, "frames", "frame")
 
 

@@ -48,8 +48,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
     revoking.add_argument("token_id", type=int, metavar="ID", help="number shown by 'linna user tokens'")
     revoking.set_defaults(handler=revoke)
     for action in (
-        adding, renewing, ensuring, disabling, enabling, ranking, listing, showing, revoking,
-    ):  # fmt: skip
+        adding,
+        renewing,
+        ensuring,
+        disabling,
+        enabling,
+        ranking,
+        listing,
+        showing,
+        revoking,
+    ):
         add_service_options(action)
         add_json_flag(action)
 

@@ -71,17 +71,17 @@ def test_what_a_shared_fixture_calls_is_credited_to_every_test_that_uses_it(stat
     set_up(state, "alone", "function", {"other"})
     assert state._stats == {"own", "inner", "other"}
     state._stats.clear()
-    mutation_plugin.pytest_runtest_teardown(SimpleNamespace(fixturenames=["shared", "alone"]))  # type: ignore[arg-type]
+    mutation_plugin.pytest_runtest_teardown(SimpleNamespace(fixturenames=["shared", "alone"]))
     assert state._stats == {"inner"}
     state._stats.clear()
-    mutation_plugin.pytest_runtest_teardown(SimpleNamespace(fixturenames=["alone"]))  # type: ignore[arg-type]
+    mutation_plugin.pytest_runtest_teardown(SimpleNamespace(fixturenames=["alone"]))
     assert state._stats == set()
 
 
 def test_the_time_of_a_test_holds_that_of_its_fixtures(state: Any) -> None:
     for when, total in (("call", 1.0), ("setup", 3.5)):
         mutation_plugin.pytest_runtest_makereport(
-            SimpleNamespace(nodeid="a"),  # type: ignore[arg-type]
+            SimpleNamespace(nodeid="a"),
             SimpleNamespace(when=when, duration=2.5),
         )
         assert state.duration_by_test == {"a": total}

@@ -110,7 +110,7 @@ def _series(
     position = unit * (radius + error_rtn_m[:, 0])[:, None]
     position = position + along * error_rtn_m[:, 1:2] + cross * error_rtn_m[:, 2:3]
     latitude, longitude, altitude = _geodetic(position)
-    return NavigationSeries(name, kind, utc_ns, latitude, longitude, altitude, error_rtn_m, **more)  # type: ignore[arg-type]
+    return NavigationSeries(name, kind, utc_ns, latitude, longitude, altitude, error_rtn_m, **more)
 
 
 def _odometry(

@@ -35,7 +35,7 @@ def series(name: str = "anchored", **more: object) -> NavigationSeries:
         "error_rtn_m": np.full((N, 3), 20.0),
         **more,
     }
-    return NavigationSeries(**fields)  # type: ignore[arg-type]
+    return NavigationSeries(**fields)
 
 
 TRACK = TrackSeries(TIMES, np.linspace(-10.0, 10.0, N), np.full(N, 300.0), np.linspace(20_000.0, 30_000.0, N))

@@ -35,7 +35,7 @@ def _series(n: int, **more: object) -> NavigationSeries:
         "error_rtn_m": np.full((n, 3), 20.0),
         **more,
     }
-    return NavigationSeries(**fields)  # type: ignore[arg-type]
+    return NavigationSeries(**fields)
 
 
 def test_every_tag_of_the_page_is_closed(page: Page) -> None:

@@ -42,5 +42,5 @@ def test_the_verdict_names_what_went_wrong() -> None:
         ({"stop_s": 30.1}, "stopped after 30.1 s"),
         ({"files_left": 1}, "1 temporary files"),
     ):
-        (fault,) = verdict({**good, **change})  # type: ignore[dict-item]
+        (fault,) = verdict({**good, **change})
         assert words in fault

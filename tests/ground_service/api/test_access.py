@@ -24,7 +24,7 @@ Tokens = dict[str, dict[str, str]]
 def service(tmp_path: Path) -> Iterator[tuple[TestClient, Tokens]]:
     """An empty service with one user of each role, and the headers of each."""
     with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as client:
-        ground = client.app.state.ground  # type: ignore[attr-defined]
+        ground = client.app.state.ground
         yield (
             client,
             {

@@ -32,7 +32,7 @@ def client(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> Ite
     """A service without users, with the synthetic pass in it; not to be given users."""
     settings = Settings(home=tmp_path_factory.mktemp("api"), upload_limit_mib=2)
     with TestClient(create_app(settings, inline_jobs=True)) as opened:
-        import_archive(opened.app.state.ground, synthetic_pass.folder)  # type: ignore[attr-defined]
+        import_archive(opened.app.state.ground, synthetic_pass.folder)
         yield opened
 
 
@@ -40,7 +40,7 @@ def client(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> Ite
 def guarded(tmp_path: Path) -> Iterator[tuple[TestClient, dict[str, str]]]:
     """An empty service with one user of each role, and their tokens."""
     with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as opened:
-        ground = opened.app.state.ground  # type: ignore[attr-defined]
+        ground = opened.app.state.ground
         yield opened, {role: add_user(ground, role, role) for role in ("viewer", "operator", "admin")}
 
 
@@ -523,7 +523,7 @@ def test_figures_of_work_that_is_over_go_away(tmp_path: Path) -> None:
     from ground_service.services.jobs import enter_job, run_job
 
     with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as opened:
-        ground = opened.app.state.ground  # type: ignore[attr-defined]
+        ground = opened.app.state.ground
         job = enter_job(ground, "report", {"pass_id": 1})
         assert 'linna_jobs{kind="report",state="queued"} 1.0' in opened.get("/metrics").text
         run_job(ground, job)

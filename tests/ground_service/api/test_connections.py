@@ -201,7 +201,7 @@ def test_a_client_that_does_not_read_is_dropped() -> None:
     async def test() -> None:
         async with guarded(Echo(answer_octets=30_000_000)) as server:
             reader, writer = await server.connect(GET)
-            reader._limit = 1 << 10  # type: ignore[attr-defined]
+            reader._limit = 1 << 10
             await asyncio.sleep(0.2)
             assert len(server.state.connections) == 1
             while server.state.connections:

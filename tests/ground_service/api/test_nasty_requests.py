@@ -66,7 +66,7 @@ def client(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> Ite
     """A service with one of everything; errors are answered, not raised, as they are in operation."""
     settings = Settings(home=tmp_path_factory.mktemp("nasty"), upload_limit_mib=1, rate_limit_per_s=0.0)
     with TestClient(create_app(settings, inline_jobs=True), raise_server_exceptions=False) as opened:
-        ground = opened.app.state.ground  # type: ignore[attr-defined]
+        ground = opened.app.state.ground
         import_archive(ground, synthetic_pass.folder)
         enter_command(ground, "test_connection", {}, spacecraft_id=76, actor="ann")
         add_window(ground, WindowEntry("w", 2_000_000_000 * NS, 2_000_000_100 * NS, 15.0, 76), actor="ann")

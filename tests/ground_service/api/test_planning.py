@@ -217,7 +217,7 @@ def test_a_plan_goes_from_one_service_to_another(
     approved(client, 100, 200, predecessor_id=first, name="second")
     plan = client.get(f"{V1}/plan").json()
     assert client.post(f"{V1}/plan", json=plan).json()["windows"] == {"w1": 1, "w2": 2}  # already there
-    home = tmp_path_factory.mktemp("other")  # type: ignore[attr-defined]
+    home = tmp_path_factory.mktemp("other")
     with TestClient(create_app(Settings(home=home), inline_jobs=True)) as other:
         made = other.post(f"{V1}/plan", json=plan)
         assert made.status_code == 201, made.text

@@ -112,7 +112,7 @@ def test_something_else_than_a_zip_is_no_build(client: TestClient) -> None:
 def test_only_an_administrator_registers_a_program(
     client: TestClient, make_build: Callable, tmp_path: Path
 ) -> None:
-    ground = client.app.state.ground  # type: ignore[attr-defined]
+    ground = client.app.state.ground
     tokens = {role: add_user(ground, role, role) for role in ("viewer", "operator", "admin")}
     body = zipped(make_build("program").parent, tmp_path / "b.zip")
     found = {

@@ -135,7 +135,7 @@ def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def test_no_request_model_takes_a_value_of_one_type_for_another(client: TestClient) -> None:
-    routes = client.app.state.operations  # type: ignore[attr-defined]
+    routes = client.app.state.operations
     bodies = [body for route in routes if isinstance(route, APIRoute) for body in route.dependant.body_params]
     models = {model for body in bodies for model in models_in(body.field_info.annotation)}
     assert {TimePointIn, ReceptionIn, WindowIn, RegressionRequest} <= models

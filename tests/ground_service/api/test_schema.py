@@ -79,7 +79,7 @@ def client(
     with ground_from_settings(deployment) as ground:
         import_archive(ground, synthetic_pass.folder)
     with TestClient(create_app(deployment, inline_jobs=True), raise_server_exceptions=False) as opened:
-        opened.app.state.dispatcher = Queue(opened.app.state.ground)  # type: ignore[attr-defined]
+        opened.app.state.dispatcher = Queue(opened.app.state.ground)
         yield opened
 
 

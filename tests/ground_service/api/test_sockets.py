@@ -35,7 +35,7 @@ def client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TestClie
 
 
 def ground_of(client: TestClient) -> Any:
-    return client.app.state.ground  # type: ignore[attr-defined]
+    return client.app.state.ground
 
 
 def bearer(token: str) -> dict[str, str]:
@@ -205,7 +205,7 @@ def test_a_client_that_reads_too_slowly_is_closed_and_may_come_back(
 ) -> None:
     ground = ground_of(client)
     with client.websocket_connect(LIVE) as socket:
-        hub = client.app.state.sockets  # type: ignore[attr-defined]
+        hub = client.app.state.sockets
         until = time.monotonic() + 30.0
         while not hub._readers and time.monotonic() < until:
             time.sleep(0.01)

@@ -74,7 +74,7 @@ def test_a_database_that_may_not_be_written_is_not_ready(client: TestClient, mon
 def test_an_ingest_that_a_full_disk_stops_is_done_when_there_is_space(
     client: TestClient, synthetic_pass: Any, monkeypatch: Any
 ) -> None:
-    ground = client.app.state.ground  # type: ignore[attr-defined]
+    ground = client.app.state.ground
     stored = ground.files.put_file(synthetic_pass.folder / "downlink.cadu")
     _, job = enter_ingest(ground, stored, "d", spacecraft_id=76, instance="flight")
 
@@ -88,7 +88,7 @@ def test_an_ingest_that_a_full_disk_stops_is_done_when_there_is_space(
     stopped = client.get(f"{V1}/jobs/{job}").json()
     assert (stopped["state"], stopped["attempts"]) == ("queued", 0)
     assert client.get(f"{V1}/ingests/1").json()["state"] == "running"
-    client.app.state.dispatcher.resume()  # type: ignore[attr-defined]
+    client.app.state.dispatcher.resume()
     assert client.get(f"{V1}/jobs/{job}").json()["state"] == "done"
     with ground.database.reading() as connection:
         found = archive_hash(connection, 1)

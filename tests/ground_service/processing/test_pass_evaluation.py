@@ -586,7 +586,7 @@ def test_frames_are_accounted_for(report: PassReport) -> None:
         quality={"ok": 11, "dark": 1},
     )  # fmt: skip
     more = anchored(frame_number=np.repeat(100 + np.arange(6), 2))
-    assert evaluate_pass(inputs(navigation=(more,))).accounting.navigated == 6  # type: ignore[union-attr]
+    assert evaluate_pass(inputs(navigation=(more,))).accounting.navigated == 6
 
 
 def test_the_pointing_is_told_from_what_is_known_of_it() -> None:
@@ -601,7 +601,7 @@ def test_the_pointing_is_told_from_what_is_known_of_it() -> None:
         np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) @ nadir
     ).as_quat()[:, [3, 0, 1, 2]]
     some = evaluate_pass(inputs(viewing=Viewing(CAMERA, attitude_utc_ns=TIMES[:5], q_wxyz=turned[:5])))
-    assert [one.detected_true for one in some.detector.per_class] == [10, 6, 5]  # type: ignore[union-attr]
+    assert [one.detected_true for one in some.detector.per_class] == [10, 6, 5]
     assert "into the camera in its telemetered attitude, if available;" in scored(some)[1]
     assert some.remarks[-1] == "the attitude of 7 of 12 frames is unknown; the declared attitude is used"
     refused = evaluate_pass(inputs(refused={"camera": "the camera is not declared"}))

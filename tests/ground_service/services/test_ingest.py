@@ -383,10 +383,10 @@ def test_an_ingest_that_ends_after_any_commit_is_made_up_for_by_the_next(
                 if left[0] == 0:
                     raise PowerFailure
 
-            dialect.do_commit = failing  # type: ignore[method-assign]
+            dialect.do_commit = failing
             with contextlib.suppress(PowerFailure):
                 ingest(ground, pieces[2], tmp_path)
-            dialect.do_commit = commit  # type: ignore[method-assign]
+            dialect.do_commit = commit
             ingest(ground, pieces[2], tmp_path)
             assert archive(ground) == expected, f"after commit {commits}"
 

@@ -375,7 +375,7 @@ def test_changes_that_cannot_be_made_are_refused_with_what_was_expected(ground: 
         ({"role": "root"}, "user role: expected viewer, operator, admin, found 'root'"),
     ):
         with pytest.raises(InvalidInput) as caught:
-            change_user(ground, "ann", **change)  # type: ignore[arg-type]
+            change_user(ground, "ann", **change)
         assert str(caught.value).replace(",", "") == message.replace(",", "")
     with pytest.raises(NotFound, match="bob"):
         change_user(ground, "bob", state="disabled")

@@ -186,7 +186,7 @@ def test_a_file_cut_off_while_stored_leaves_nothing(tmp_path: Path) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with pytest.raises(StorageFull):
-        archive.put(broken())  # type: ignore[arg-type]
+        archive.put(broken())
     assert not [p for p in archive.root.rglob("*") if p.is_file()]
 
 

@@ -59,7 +59,7 @@ def test_a_transaction_that_the_database_gave_up_may_be_tried_again(sqlstate: st
     from sqlalchemy.exc import DBAPIError
 
     original = Original("deadlock detected")
-    original.sqlstate = sqlstate  # type: ignore[attr-defined]
+    original.sqlstate = sqlstate
     error = database_error(DBAPIError("UPDATE", {}, original), "postgresql://secret@db/linna")
     assert isinstance(error, DatabaseBusy)
     assert "secret" not in str(error)

@@ -250,7 +250,7 @@ class Drift:
 def test_a_prediction_carries_each_part_by_its_own_law() -> None:
     landmarks, index = craters(), np.array([2, 0])
     prior, model = prior_state(landmarks, index), Drift()
-    found = kalman.predict(prior, 1_300 * SECOND, model, ERRORS)  # type: ignore[arg-type]
+    found = kalman.predict(prior, 1_300 * SECOND, model, ERRORS)
     assert found is not None
     # 300 s at memories of 1000 s and 500 s.
     tilt, shift = np.exp(-0.3), np.exp(-0.6)
@@ -270,7 +270,7 @@ def test_a_prediction_carries_each_part_by_its_own_law() -> None:
     )
     np.testing.assert_array_equal(found.covariance, found.covariance.T)
     assert found.ticks == 1_300 * SECOND and found.craters.tolist() == [2, 0]
-    assert kalman.predict(prior, 6_000 * SECOND, model, ERRORS) is None  # type: ignore[arg-type]
+    assert kalman.predict(prior, 6_000 * SECOND, model, ERRORS) is None
 
 
 def test_slow_errors_come_to_rest_at_the_size_they_are_said_to_have() -> None:
@@ -281,7 +281,7 @@ def test_slow_errors_come_to_rest_at_the_size_they_are_said_to_have() -> None:
             return Prediction(state, np.eye(9), np.zeros((9, 9)))
 
     for k in range(1, 400):
-        following = kalman.predict(state, 100 * k * SECOND, Still(), ERRORS)  # type: ignore[arg-type]
+        following = kalman.predict(state, 100 * k * SECOND, Still(), ERRORS)
         assert following is not None
         state = following
     sigma = np.sqrt(np.diag(state.covariance))

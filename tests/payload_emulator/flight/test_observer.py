@@ -101,8 +101,8 @@ def detections(count: int) -> Detections:
 @pytest.fixture
 def rig() -> SimpleNamespace:
     eye, telemetry, clock, navigator = Eye(), Recorder(), Clock(), Navigator()
-    observer = Observer(eye, FlightParameters(modes=(Mode.anchored,)), telemetry, clock)  # type: ignore[arg-type]
-    observer._navigator = navigator  # type: ignore[assignment]
+    observer = Observer(eye, FlightParameters(modes=(Mode.anchored,)), telemetry, clock)
+    observer._navigator = navigator
     return SimpleNamespace(eye=eye, telemetry=telemetry, clock=clock, navigator=navigator, observer=observer)
 
 
@@ -261,7 +261,7 @@ def test_what_cannot_be_inverted_ends_in_a_fresh_start(rig: SimpleNamespace) -> 
 def test_reads_of_the_anchor_are_counted_beyond_the_first(moon: Any) -> None:
     """The odometry reads an altitude every frame and a position at each reset: the first of each is the start."""
     telemetry = Recorder()
-    observer = Observer(Eye(), FlightParameters(modes=(Mode.paper,)), telemetry, Clock())  # type: ignore[arg-type]
+    observer = Observer(Eye(), FlightParameters(modes=(Mode.paper,)), telemetry, Clock())
     seconds = np.arange(0.0, 400.0, 30.0)
     octets = pack_anchor_table([moon.ticks_at(second) for second in seconds], moon.orbit(seconds))
     observer.load_tables(FlightTables(anchor_ephemeris=octets))
