@@ -9,7 +9,7 @@ BASE_PIP := $(shell $(PYTHON) -m pip --version >/dev/null 2>&1 && echo yes)
 PIP       = $(if $(BASE_PIP),$(PYTHON) -m pip --python $(BIN)/python,$(BIN)/python -m pip) \
             install --quiet --disable-pip-version-check --root-user-action=ignore
 
-# Real terrain needs a raster library; it is installed only where real data are at hand.
+# Real terrain needs a raster library; it is installed only if real data are available.
 DEMO_STAMPS := $(VENV)/.runtime $(if $(LINNA_DATA),$(VENV)/.terrain)
 DEMO_OUT    ?= linna-demo
 

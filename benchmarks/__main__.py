@@ -1,4 +1,4 @@
-"""`python -m benchmarks [name ...]`: every benchmark, one after another, each beside its named alternatives."""
+"""`python -m benchmarks [name ...]`: all benchmarks in sequence, each compared with its named alternatives."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Latency and memory of the shipped detector, beside the network of the first studies: python -m benchmarks detector.
+"""Latency and memory of the shipped detector, compared with the first network: python -m benchmarks detector.
 
 Where torch is missing the second is left out. A time in ms belongs to a machine; `of_first` is the ratio of the two
 networks on this one, in the same run.

@@ -1,4 +1,4 @@
-"""Ephemeris files and interpolation beside what one would pick instead: python benchmarks/ephemeris.py."""
+"""Benchmark of ephemeris files and interpolation, compared with alternatives: python benchmarks/ephemeris.py."""
 
 from __future__ import annotations
 

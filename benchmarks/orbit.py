@@ -1,4 +1,4 @@
-"""Gravity kernel and propagation beside what one would pick instead: python -m benchmarks orbit.
+"""Benchmark of gravity kernel and propagation, compared with alternatives: python -m benchmarks orbit.
 
 Rivals in the same run: the textbook recursion in numba, brahe (Rust) and heyoka's scalar compiled function on the same
 coefficients and places, and SciPy's DOP853 over the same right-hand side.

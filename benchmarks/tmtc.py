@@ -1,4 +1,4 @@
-"""Telemetry decoding beside other libraries, checksums included in ours: python -m benchmarks.tmtc.
+"""Benchmark of telemetry decoding (with checksums), compared with other libraries: python -m benchmarks.tmtc.
 
 Rates are by processor time of one thread, best of a few rounds: on a quiet machine that is the time that passes, and
 a busy one changes it little. Slow rivals decode fewer packets of the same kind. Every decoder's values are compared

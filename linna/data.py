@@ -22,7 +22,7 @@ def data_directory() -> Path:
 
 
 def data_folder() -> DataFolder:
-    """The data products at hand; an empty folder object when there are none. A wrong $LINNA_DATA is an error."""
+    """Return the folder of available data products; empty if there are none. An invalid $LINNA_DATA is an error."""
     named = os.environ.get("LINNA_DATA")
     if named:
         return find_data(Path(named))

@@ -24,7 +24,7 @@ from lunar.visibility import (
 Span = tuple[int, int]
 
 _LIGHT_TIME_NS = 2 * NS
-"""A link is told by its reception; what was sent up to 1.4 s before must lie in the ephemeris."""
+"""Margin of the ephemeris before a reception time: the transmission was up to 1.4 s earlier."""
 
 
 @dataclass(frozen=True, slots=True)

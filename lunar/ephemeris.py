@@ -247,7 +247,7 @@ def ephemeris_from_states(
 
 
 def load_ephemeris(path: Path | str) -> Ephemeris:
-    """Return the ephemeris in a CCSDS OEM (KVN) or STK ``.e`` file, told apart by content.
+    """Return the ephemeris in a CCSDS OEM (KVN) or STK ``.e`` file, distinguished by content.
 
     Raises
     ------

@@ -170,7 +170,7 @@ class Omission:
 def measured_omission(
     truth: GravityField, flown: GravityField, revolutions: int = 16, seed: int = 1
 ) -> Omission:
-    """Measure what `flown` lacks or has wrong beside `truth`, over revolutions with nodes and perilunes at random."""
+    """Measure the errors of `flown` relative to `truth`, over revolutions with random nodes and perilunes."""
     rng = np.random.default_rng(seed)
     period_s = float(2.0 * np.pi * np.sqrt(_SEMI_MAJOR_M**3 / truth.gm_m3_s2))
     differences, far = [], []

@@ -1,1 +1,1 @@
-"""The LINNA payload in its world: `sim` is the truth, `flight` is what would fly, `training` makes its detector."""
+"""LINNA payload and its environment: `sim` (truth), `flight` (flight software) and `training` (detector)."""

@@ -1,4 +1,4 @@
-"""Fault campaigns: a scenario flown with every fault and every seed, and what became of each.
+"""Fault campaigns: a scenario simulated with every fault and every seed, and the outcomes.
 
 A case is *detected* when one of the events that it names comes down after the fault began; it ends *recovered* when the
 payload works on frames after the fault has gone, *contained* when it waits in safe mode or standby as the case says
@@ -53,7 +53,7 @@ class Campaign:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What became of one case with one seed; `latency_s` from fault to event, NaN without one."""
+    """Outcome of one case with one seed; `latency_s` from fault to event, NaN without one."""
 
     case: str
     seed: int

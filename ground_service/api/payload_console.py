@@ -1,7 +1,7 @@
 """The WebSocket `payload`: the console of a payload that is flown live, handed on to a browser.
 
 The console is another program's (`linna emulate --live`): one JSON object a line comes from it, one word a line goes to
-it. Viewers may look, operators may also pause, run, step and set the rate. Nobody can end the payload from here.
+it. Viewers may look, operators may also pause, run, step and set the rate. The payload cannot be stopped from here.
 """
 
 from __future__ import annotations

@@ -216,7 +216,7 @@ class CommandReport(Schema):
 
 
 class Telecommand(Schema):
-    """A telecommand and what became of it."""
+    """Telecommand and its verification state."""
 
     id: int
     name: str

@@ -43,7 +43,7 @@ WINDOW_OCTETS = 2 << 20
 decoding and storing take about ten times as much."""
 
 PROBE_OCTETS = 256 << 10
-"""Octets from which the settings of a link are told; the whole window where the stream begins with noise."""
+"""Number of octets used to determine the link settings; the whole window if the stream begins with noise."""
 
 CADU_MAX_OCTETS = 2048 + 2 * 16 * 8 + ASM_LENGTH
 """Length of the longest CADU of the known link settings."""
@@ -411,7 +411,7 @@ def _rebuffered(blocks: Iterable[bytes], octets: int) -> Iterator[bytes]:
 
 
 def _last_marked(blocks: Iterable[bytes]) -> Iterator[tuple[bytes, bool]]:
-    """Every block, with True beside the last one."""
+    """Yield every block, and whether it is the last one."""
     previous: bytes | None = None
     for block in blocks:
         if previous is not None:

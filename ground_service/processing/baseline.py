@@ -1,6 +1,6 @@
 """What the ground would know without any camera: the start state, propagated to every sample.
 
-Two baselines are shown beside every estimate: the two-body orbit, and propagation with a gravity field of moderate
+Every estimate is compared with two baselines: the two-body orbit, and propagation with a gravity field of moderate
 degree with the Earth and the Sun. An estimate that is no better than these has learnt nothing from its images.
 """
 

@@ -1,6 +1,6 @@
 """Landmarks that the payload mapped itself, compared with the ground's catalogue.
 
-A landmark that is a crater of the catalogue tells how good the map is: its offset, and whether the claimed sigma
+Landmarks that are catalogued craters show the quality of the map: its offset, and whether the claimed sigma
 covers it. The others are new: candidates for the next anchoring catalogue. Frame: mean-Earth.
 """
 
@@ -110,7 +110,7 @@ def latest(mapped: MappedCraters) -> MappedCraters:
 
 
 def compare_map(mapped: MappedCraters, catalogue: CraterCatalogue) -> MapComparison:
-    """Return which landmarks the catalogue knows, and how they lie beside it; every crater serves one landmark."""
+    """Return which landmarks are catalogued, and their offsets; each crater is matched to at most one landmark."""
     count = len(mapped)
     crater, offset = np.full(count, -1, dtype=np.int64), np.full((count, 3), np.nan)
     distance = np.full(count, np.inf)

@@ -1,4 +1,4 @@
-"""What a pass report says beside the errors themselves: the Sun, wrong fixes, and positions from single frames."""
+"""Additional contents of a pass report: Sun geometry, wrong fixes, and positions from single frames."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ STATIONS = (
     GroundStation("Canberra", math.radians(-35.4024), math.radians(148.9813), 690.0),
     GroundStation("Madrid", math.radians(40.4314), math.radians(355.7520), 830.0),
 )
-"""Sites of the Deep Space Network, to a kilometre (DSN 810-005, module 301): somebody always sees the Moon."""
+"""Sites of the Deep Space Network, to a kilometre (DSN 810-005, module 301); the Moon is always visible from one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +139,7 @@ class _Geometry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Planner:
-    """Searches one ephemeris; `mare` and `catalogue` are None where they are not at hand."""
+    """Window search in one ephemeris; `mare` and `catalogue` are None if not available."""
 
     ephemeris: Ephemeris
     orientation: Orientation

@@ -44,7 +44,7 @@ class DetectionSamples:
     """Detections of all frames, in time order.
 
     Frame arrays are (f,); the detections of frame ``i`` are rows ``offsets[i]`` to ``offsets[i + 1]`` of the item
-    arrays (n,). `usable` is False where the payload judged the image unfit; `correlation_id` (f,) tells which time
+    arrays (n,). `usable` is False if the payload rejected the image; `correlation_id` (f,) tells which time
     correlation gave `utc_ns`, where that is known.
     """
 

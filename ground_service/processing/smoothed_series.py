@@ -1,4 +1,4 @@
-"""The smoothed orbit of a pass as a series of the report, beside the filter that it came from."""
+"""Smoothed orbit of a pass as a series of the report, in addition to its filter."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ class SmootherModel:
 def smooth(filtered: FilterStates, model: SmootherModel) -> FilterStates:
     """The states given everything that was seen, before and after.
 
-    Where a state does not follow on the one before it (a jump of the clock, a restart, a burn nobody commanded), the
+    Where a state does not follow on the one before it (a jump of the clock, a restart, an uncommanded burn), the
     stretches on either side are smoothed alone.
 
     References

@@ -1,4 +1,4 @@
-"""What became of a telecommand, from the verification reports that came down about it (PUS service 1).
+"""Verification state of a telecommand, from its received verification reports (PUS service 1).
 
 A report names its telecommand by the first four octets of the packet, and those return after 16384 commands. So a
 report counts for a command only when it was made after the command was sent and before the same octets were sent

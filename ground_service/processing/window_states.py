@@ -32,7 +32,7 @@ class WindowFacts:
     frames
         Frames of it that came down.
     started, stopped
-        Whether an event report or a verification report tells that the observation began, and ended.
+        Whether an event report or a verification report shows the start, and the end, of the observation.
     heard_after
         Whether telemetry from after its end has come down.
     lost

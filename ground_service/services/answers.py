@@ -1,7 +1,7 @@
-"""What was answered under an idempotency key, so that a request that is sent again does nothing and is told the same.
+"""Idempotency keys: stored responses, so that a repeated request has no effect and gets the same response.
 
-A key is taken before the work is begun. Where a crash leaves it without an answer, nobody knows whether the work was
-done: the key is then refused, and whoever asked has to look.
+A key is stored before the work starts. If a crash leaves it without a response, it is unknown whether the work was
+done: the key is then refused, and the caller must check the state.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""One run of a build over one archived pass: an external program inside limits, and what became of it."""
+"""One run of a build over one archived pass: an external program with resource limits, and its outcome."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Payload builds: what a build file says, and builds as they are registered.
 
 A build is a program (any command that keeps the contract in docs/build-contract.md), or a network and a parameter file
-on the flight code at hand. Its identity is the hash of everything that decides what it does: command and files, or
+on the installed flight code. Its identity is the hash of everything that decides what it does: command and files, or
 network, parameters and the flight code itself.
 """
 
@@ -41,7 +41,7 @@ _KEYS = (
     "schema_version", "name", "version", "description", "command", "files", "model", "parameters", "camera",
     "limits", "provenance",
 )  # fmt: skip
-# What the flight code of this checkout consists of, beside the shipped network.
+# Packages of the flight code of this installation, in addition to the shipped network.
 _FLIGHT_CODE = (
     "payload_emulator/flight",
     "payload_emulator/replay.py",
@@ -338,7 +338,7 @@ def registered_builds(ground: Ground) -> list[dict[str, Any]]:
 
 
 def flight_code_hash() -> str:
-    """SHA-256 over the sources of the flight code at hand, which is never imported here."""
+    """Return the SHA-256 of the sources of the installed flight code, which is never imported here."""
     digest = hashlib.sha256()
     root = _root()
     for place in _FLIGHT_CODE:
@@ -363,7 +363,7 @@ def _current() -> Build:
         version="",
         digest=_digest({"model": model, "parameters": "", "flight_code": code, "camera": {}}),
         file=Path(CURRENT),
-        description="the flight code at hand with its own network and the parameters that flew",
+        description="the installed flight code with its own network and the parameters used in flight",
         flight_code=code,
     )
 

@@ -1,4 +1,4 @@
-"""What every service needs: the database, the archive of files and the public data products at hand."""
+"""Resources of the ground service: database, file archive and available public data products."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 class Ground:
     """An opened ground service: pass it to the functions of `ground_service.services`.
 
-    Whoever is about to close it sets `stopping`; long work then ends between two transactions.
+    `stopping` is set before it is closed; long work then ends between two transactions.
     """
 
     database: Database
@@ -51,7 +51,7 @@ class Ground:
 
     @property
     def orientation(self) -> Orientation:
-        """The lunar orientation of the data at hand."""
+        """Lunar orientation of the available data."""
         return _orientation(self.data)
 
     def __enter__(self) -> Ground:

@@ -315,7 +315,7 @@ def _put_back(ground: Ground, job_id: str, attempt: int) -> None:
 
 
 def _progress_of(ground: Ground, job_id: str) -> Callable[[float], None]:
-    """Keeps the share of a job that is done in its row, in steps that cost nothing beside the work."""
+    """Progress of a job, stored in its row in steps with negligible cost."""
     kept = 0.0
 
     def keep(share: float) -> None:

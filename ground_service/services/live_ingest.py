@@ -43,7 +43,7 @@ Report = Callable[[Path, "dict[str, Any] | GroundError"], None]
 class Spool:
     """Octets on their way into the archive, in segments under `folder`.
 
-    What the ingest refuses (noise) is told to `report` and not tried again: the archive of files has it.
+    Data that the ingest refuses (noise) are reported to `report` and not tried again; the file archive keeps them.
     """
 
     folder: Path
@@ -129,7 +129,7 @@ def follow_tcp(address: tuple[str, int], spool: Spool, *, reconnect: bool, stop:
     Raises
     ------
     InvalidInput
-        If nobody answers there within `CONNECT_S`.
+        If there is no connection within `CONNECT_S`.
     """
     spool.recover()
     taken = 0

@@ -78,7 +78,7 @@ class PlanConflicts(Conflict):
 
 @dataclass(frozen=True, slots=True)
 class WindowEntry:
-    """A window as somebody asks for it."""
+    """Request of a window."""
 
     name: str
     start_utc_ns: int
@@ -112,14 +112,14 @@ def search_windows(
     ephemeris_id
         Which ephemeris; the one that covers the start of the span best when None.
     catalogue_pass_id
-        Take the crater catalogue of this pass; the public one at hand when None.
+        Use the crater catalogue of this pass; None: the available public one.
     spacecraft_id
         Count with the storage that the windows of this spacecraft claim already.
 
     Raises
     ------
     InvalidInput
-        If a constraint needs data that are not at hand, or the span is too long for its step.
+        If a constraint needs data that are not available, or the span is too long for its step.
     NotFound
         If there is no such ephemeris or pass.
     """
@@ -380,7 +380,7 @@ def window_row(connection: Connection, window_id: int) -> repository.Row:
 
 
 def entry_of(row: Mapping[str, Any]) -> WindowEntry:
-    """What somebody would have to enter to get this window."""
+    """Return the entry that requests this window."""
     return WindowEntry(
         name=row["name"],
         start_utc_ns=row["start_utc_ns"],

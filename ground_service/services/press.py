@@ -1,7 +1,7 @@
 """A second process that sets a long report as PDF while the first writes its page and its JSON.
 
-Both draw every figure anew, and drawing keeps to one core: of a day's report each of the two takes about as long as the
-other. The process is started before the pass is evaluated, so that it is ready when there is something to print.
+Both draw every figure again, and drawing keeps to one core: of a day's report each of the two takes about as long as
+the other. The process is started before the pass is evaluated, so that it is ready when there is something to print.
 """
 
 from __future__ import annotations

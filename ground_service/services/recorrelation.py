@@ -323,7 +323,7 @@ def time_reports(ground: Ground, connection: Connection, vehicle: int) -> TimeRe
 
 
 def lock_vehicle(connection: Connection, vehicle: int) -> int:
-    """The vehicle, which nobody else correlates until this transaction ends."""
+    """Lock a vehicle against concurrent correlation until the transaction ends, and return it."""
     table = repository.VEHICLES
     connection.execute(select(table.c.id).where(table.c.id == vehicle).with_for_update())
     return vehicle

@@ -1,4 +1,4 @@
-"""Decoding the archive again with another dictionary: its rows stand beside the old ones, packets stay as they are.
+"""Decoding of the archive with another dictionary: new rows are added to the old ones, packets are unchanged.
 
 Every block of packets is one transaction with the note of how far it has come, so a re-decoding that is cut off goes on
 where it was, and several at once share the work. Until it is complete, everything is read as the older version decoded
@@ -121,7 +121,7 @@ def _go_on(ground: Ground, vehicle: int, dictionary: Dictionary) -> int:
         with ground.database.writing() as connection:
             row = _locked(connection, vehicle)
             if row["redecoding_version"] != dictionary.version:
-                return rows  # somebody else has finished it
+                return rows  # another process has finished it
             done = _block(connection, row, dictionary)
             if done is None:
                 return rows

@@ -1,4 +1,4 @@
-"""Regressions as jobs: a replay for every archive and build, spread over whoever takes jobs, and then the verdict.
+"""Regressions as jobs: a replay for every archive and build, distributed over the workers, and then the verdict.
 
 The verdict's own job does what replays are still missing, so nothing hangs on another worker: a replay that two workers
 do at the same time is kept once.
@@ -55,7 +55,7 @@ def prepared(ground: Ground, candidate: str, baseline: str, archives: Sequence[s
 
 
 def named_build(ground: Ground, name: str) -> Build:
-    """A registered build by its identity, or the flight code at hand."""
+    """Return a registered build by its identity, or the installed flight code."""
     if name == CURRENT:
         return register_build(ground, load_build(CURRENT))
     return registered_build(ground, name)

@@ -44,7 +44,7 @@ Progress = Callable[[Sequence[Any], int], Iterator[Any]]
 
 @dataclass(frozen=True, slots=True)
 class KeptReplay:
-    """A replay that was done: what became of it, and where its downlink lies."""
+    """Completed replay: its outcome, and the location of its downlink."""
 
     outcome: str
     detail: str
@@ -325,7 +325,7 @@ def keep_regression(ground: Ground, outcome: RegressionOutcome, *, regression_id
 
 
 def pass_figures(frames: PassFrames) -> dict[str, Any]:
-    """What a pass's own line in a verdict tells beside the gates: outcomes, costs in milliseconds, memory."""
+    """Return the additional values of a pass in a verdict: outcomes, costs in milliseconds, memory."""
     return {
         "outcome_shares": outcome_shares(frames),
         "stages_ms": {

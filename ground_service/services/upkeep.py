@@ -32,11 +32,11 @@ TREND_POINTS = 60
 RETENTION_DAYS = 90
 DAY_NS = 86_400_000_000_000
 ABANDONED_S = 86_400.0
-"""Temporary files this old belong to nobody."""
+"""Age from which temporary files are leftovers."""
 
 
 def nightly_job_id(utc_ns: int) -> str:
-    """The id of the nightly job of a day: whoever enters it, and how often, it is one job."""
+    """Return the id of the nightly job of a day, which makes repeated additions the same job."""
     return hashlib.sha256(f"nightly {format_utc(utc_ns)[:10]}".encode()).hexdigest()[:32]
 
 

@@ -59,7 +59,7 @@ class Caller:
 
 
 LOCAL_CALLER = Caller("local", "admin")
-"""Whoever sits at the machine of a service that has no users and listens to that machine alone."""
+"""Caller of a service without users, which listens only on the local machine."""
 
 
 class User(BaseModel):
@@ -266,7 +266,7 @@ def revoke_token(ground: Ground, token_id: int, *, actor: str = "local") -> Toke
 
 
 def has_users(ground: Ground) -> bool:
-    """Whether anybody has been added."""
+    """Return whether the service has users."""
     with ground.database.reading() as connection:
         return connection.execute(_ANYBODY).first() is not None
 

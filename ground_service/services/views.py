@@ -101,7 +101,7 @@ def job_view(row: Row) -> View:
 
 
 def telecommand_view(view: Any) -> View:
-    """A telecommand (`services.commanding.CommandView`) and what became of it."""
+    """Return a telecommand (`services.commanding.CommandView`) with its verification state."""
     row, fate = view.row, view.fate
     return {
         "id": row["id"],

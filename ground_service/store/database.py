@@ -99,7 +99,7 @@ class Database:
                 audit.append_pending(connection)
 
     def require_writable(self) -> None:
-        """Refuse a SQLite file that may not be written to; nobody who writes now is waited for.
+        """Refuse a SQLite file without write permission, without waiting for writers.
 
         Raises
         ------
@@ -238,7 +238,7 @@ def install_triggers(connection: Connection) -> None:
 
 
 def migrations_folder() -> Path:
-    """Where the migration scripts lie: beside the packages of this project."""
+    """Return the folder of the migration scripts, next to the packages of this project."""
     return Path(ground_service.__file__).resolve().parent.parent / "db" / "migrations"
 
 

@@ -680,7 +680,7 @@ class RegressionArchive(Base):
 
 
 class Replay(Base):
-    """What became of one build on one archive, once; `id` is the hash of both identities."""
+    """Result of one build on one archive; `id` is the hash of both identities."""
 
     __tablename__ = "replays"
     id: Mapped[str] = mapped_column(String(64), primary_key=True)

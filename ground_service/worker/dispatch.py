@@ -31,7 +31,7 @@ class Dispatcher(Protocol):
         """Have a job done that was entered already."""
 
     def resume(self) -> None:
-        """Take up jobs that somebody left unfinished; may be called as often as one likes."""
+        """Start unfinished jobs of ended processes again; may be called repeatedly."""
 
     def close(self) -> None:
         """End what runs here: a job that can be broken off goes on at the next start, others come to their end."""

@@ -1,4 +1,4 @@
-"""`linna catalogue landmarks`: the payload's own map, from a downlink, beside a catalogue."""
+"""`linna catalogue landmarks`: the payload's own map, from a downlink, compared with a catalogue."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from linna.output import add_json_flag, emit
 def configure(landmarks: argparse.ArgumentParser) -> None:
     landmarks.add_argument("downlink", type=Path, metavar="FILE", help="downlink (CADUs or packets)")
     landmarks.add_argument(
-        "--catalogue", metavar="F", help="catalogue to compare with (default: the one at hand)"
+        "--catalogue", metavar="F", help="catalogue to compare with (default: the available one)"
     )
     add_json_flag(landmarks)
     landmarks.set_defaults(handler=run, seed=1)

@@ -48,7 +48,7 @@ def _make(arguments: argparse.Namespace) -> int:
     from payload_emulator.training.recipe import load_recipe
 
     if arguments.run is not None and arguments.dataset is None:
-        raise UsageError("--run: expected the data set it was trained on beside it (--dataset), found none")
+        raise UsageError("--run: expected the data set it was trained on (--dataset), found none")
     job = Job(
         out=arguments.out,
         recipe=load_recipe(arguments.recipe),

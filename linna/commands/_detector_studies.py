@@ -21,7 +21,7 @@ def configure(verbs: Any) -> None:
     from linna.output import add_json_flag
 
     quantise = verbs.add_parser(
-        "quantise", help="the network in 8-bit integers, beside the one it comes from"
+        "quantise", help="compare the network in 8-bit integers with the original one"
     )
     add_model(quantise)
     quantise.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
@@ -43,7 +43,7 @@ def configure(verbs: Any) -> None:
         type=float,
         default=0.0,
         metavar="SHARE",
-        help="hide this share of the catalogue first and tell how many landmarks were hidden craters",
+        help="hide this share of the catalogue first and report how many landmarks were hidden craters",
     )
     landmarks.add_argument("--out", type=Path, default=None, metavar="F.csv")
     add_json_flag(landmarks)

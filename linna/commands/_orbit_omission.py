@@ -1,4 +1,4 @@
-"""`linna orbit omission`: what a filter's gravity field lacks beside a better one, as process noise."""
+"""`linna orbit omission`: errors of a filter's gravity field relative to a better one, as process noise."""
 
 from __future__ import annotations
 

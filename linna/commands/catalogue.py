@@ -41,7 +41,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     from linna.commands._catalogue_minimum import configure as configure_minimum
 
     configure_landmarks(
-        commands.add_parser("landmarks", help="the map that the payload made itself, beside a catalogue")
+        commands.add_parser("landmarks", help="compare the map made by the payload with a catalogue")
     )
 
     configure_minimum(
@@ -56,7 +56,7 @@ def _configure_curate(curate: argparse.ArgumentParser) -> None:
         nargs="+",
         type=Path,
         metavar="F",
-        help="height rasters in longitude and latitude (default: the 128 px/deg tiles of the data at hand)",
+        help="height rasters in longitude and latitude (default: the 128 px/deg tiles of the available data)",
     )
     curate.add_argument(
         "--out",
@@ -193,7 +193,7 @@ def _region(text: str):
 
 
 def open_catalogue(name: str | None, seed: int) -> CraterCatalogue:
-    """The catalogue of a file or of one of `SYNTHETIC`; without a name, the most complete of the data at hand.
+    """The catalogue of a file or of one of `SYNTHETIC`; without a name, the most complete available one.
 
     The paper's density comes from the real catalogue, completed with random craters where it is silent, or is all
     synthetic where there is none at hand.

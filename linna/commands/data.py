@@ -11,7 +11,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     from linna.output import add_json_flag
 
     verbs = parser.add_subparsers(title="verbs", required=True)
-    listing = verbs.add_parser("list", help="the products: what is at hand, size, licence, address")
+    listing = verbs.add_parser("list", help="list the products: available files, size, licence, address")
     fetch = verbs.add_parser("fetch", help="download products into the data folder; resumes what broke off")
     fetch.add_argument("names", nargs="*", metavar="PRODUCT", help="default: the small ones all need")
     fetch.add_argument(

@@ -27,7 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     build.set_defaults(handler=_build)
     for name, handler, text in (
         ("check", _check, "find missing and damaged files"),
-        ("stats", _stats, "frames by split, crater instances by class, beside the paper's"),
+        ("stats", _stats, "frames by split, crater instances by class, compared with the paper"),
     ):
         verb = verbs.add_parser(name, help=text)
         verb.add_argument("folder", type=Path, metavar="DIR")

@@ -87,7 +87,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=Path,
         default=None,
         metavar="TABLE",
-        help="rims from `linna catalogue curate`: distances from these beside the catalogue's places",
+        help="rims from `linna catalogue curate`: distances from these in addition to the catalogue positions",
     )
     evaluate.add_argument(
         "--rims-shift",

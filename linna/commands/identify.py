@@ -24,7 +24,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
             "catalogue",
             nargs="?",
             metavar="FILE",
-            help="anchoring table of `linna catalogue curate`, or a catalogue (default: the one at hand)",
+            help="anchoring table of `linna catalogue curate`, or a catalogue (default: the available one)",
         )
         command.add_argument("--frames", type=int, default=frames, help=f"default: {frames}")
         command.add_argument("--seed", type=int, default=1, help="default: 1")
