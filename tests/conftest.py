@@ -10,7 +10,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
 os.environ.setdefault("NUMBA_SLP_VECTORIZE", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
-# Databases of tests belong to the role that the tests use; tests of the roles take this away.
+# The role of the tests owns the databases of the tests; tests of the roles remove this.
 os.environ.setdefault("LINNA_ALLOW_DATABASE_OWNER", "true")
 
 # Properties are tried on the same examples everywhere, and a busy machine is no failure.

@@ -1,4 +1,4 @@
-"""The groups of the mutation tests, and which mutants they leave out."""
+"""Groups of the mutation tests, and excluded mutants."""
 
 import json
 from pathlib import Path

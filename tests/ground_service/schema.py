@@ -1,4 +1,4 @@
-"""The schema of a database as plain values, to compare two databases."""
+"""Schema of a database as plain values, to compare two databases."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ground_service.store.database import Database
 
 
 def described_schema(database: Database) -> dict[str, Any]:
-    """Columns, keys, constraints and indexes of every table, without the table of Alembic."""
+    """Return columns, keys, constraints and indexes of every table, except the table of Alembic."""
     with database.reading() as connection:
         inspector = inspect(connection)
         tables = {

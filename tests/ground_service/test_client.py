@@ -1,4 +1,4 @@
-"""The client of the HTTP interface against a server that is busy: what it asks again, for how long, and what not."""
+"""Client of the HTTP interface with a busy server: repeated requests, their duration, and their limits."""
 
 import json
 import threading
@@ -16,7 +16,7 @@ EPHEMERIS = {"id": 1}
 
 
 class Clock:
-    """The time of the client, which passes while it sleeps."""
+    """Clock of the client, which advances during sleep."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -31,7 +31,7 @@ class Clock:
 
 
 class Service:
-    """A server that gives the answers it was told, the last one again and again, and keeps the bodies it got."""
+    """Server with prepared responses, of which the last one is repeated; it records the received bodies."""
 
     def __init__(self) -> None:
         self.answers: list[tuple[int, dict[str, str]]] = []

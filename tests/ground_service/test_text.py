@@ -1,4 +1,4 @@
-"""Names and reasons: one printable line."""
+"""Names and reasons are one printable line."""
 
 import pytest
 from pydantic import BaseModel, Field, ValidationError

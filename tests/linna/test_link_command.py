@@ -1,4 +1,4 @@
-"""`linna link check`: proposals, contradictions with a mission description, and what cannot be told."""
+"""`linna link check`: proposals, contradictions with a mission description, and unknown settings."""
 
 import json
 from pathlib import Path

@@ -194,7 +194,7 @@ def test_an_anchoring_table_that_is_none_is_refused_before_the_flight(tmp_path: 
 def test_reads_of_the_truth_are_counted_where_they_happen(
     reads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A payload cannot read the truth; one that is handed it behind its back is found out."""
+    """A payload cannot read the truth; a payload with access to it is detected."""
     stolen: list[Any] = []
     build, step = emulator.build_world, Payload.step
 

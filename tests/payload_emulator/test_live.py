@@ -239,7 +239,7 @@ def test_a_port_in_use_is_named_and_nothing_stays_open(flown: tuple[World, Loade
 
 
 def reset(connection: socket.socket) -> None:
-    """Close a connection with RST in place of FIN."""
+    """Close a connection with RST instead of FIN."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
     connection.close()
 

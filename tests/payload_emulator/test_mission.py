@@ -1,4 +1,4 @@
-"""The mission description that the emulator writes, and the terrain that training has seen."""
+"""Mission description written by the emulator, and terrain used in training."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""What the figures show, by the geometry of what is drawn."""
+"""Content of figures, checked by the drawn geometry."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ TRACK = TrackSeries(TIMES, np.linspace(-10.0, 10.0, N), np.full(N, 300.0), np.li
 
 
 def drawn(draw: Callable[[Canvas], None], height_in: float = 3.6) -> Figure:
-    """The figure that a function draws."""
+    """Return the figure that a function draws."""
     figure = Figure(figsize=(9.0, height_in))
     draw(Canvas(figure, 9.0, height_in))
     return figure
@@ -76,7 +76,7 @@ def test_no_estimate_has_the_colour_of_the_reference() -> None:
 
 
 def test_errors_are_binned_by_the_altitude_of_the_reference() -> None:
-    """An estimate whose altitude is wrong by ten kilometres belongs to the bin in which it was flown."""
+    """An estimate whose altitude is wrong by ten kilometres belongs to the bin of the true altitude."""
     one = series(altitude_m=np.linspace(20_000.0, 30_000.0, N) + 10_000.0)
     ((name, label, bins),) = consistency.dependences(one, TRACK)
     assert (name, label) == ("altitude", "reference altitude, km")

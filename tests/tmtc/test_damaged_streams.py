@@ -1,4 +1,4 @@
-"""Streams as stations deliver them: weak stretches, noise, station headers, gaps, slips, several receivers, any order.
+"""Streams of ground stations: weak signals, noise, station headers, gaps, bit slips, several receivers, any order.
 
 For each stream the packets that a decoder with known settings can find at best follow from the construction.
 """
@@ -32,7 +32,7 @@ ZONE = 1115 - 6 - 2
 
 @functools.cache
 def cadus() -> np.ndarray:
-    """The undamaged stream, one CADU a row."""
+    """Return the undamaged stream, one CADU per row."""
     octets = encode_cadus(PACKETS, spacecraft_id=76)
     return np.frombuffer(octets, dtype=np.uint8).reshape(-1, SETTINGS.cadu_length)
 
@@ -44,7 +44,7 @@ def with_bit_errors(rows: np.ndarray, rate: float, seed: int) -> np.ndarray:
 
 
 def packets_within(received: set[int]) -> list[bytes]:
-    """The packets of which every frame was received."""
+    """Return the packets whose frames were all received."""
     at, whole = 0, []
     for packet in PACKETS:
         frames = range(at // ZONE, (at + len(packet) - 1) // ZONE + 1)

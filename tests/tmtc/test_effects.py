@@ -1,4 +1,4 @@
-"""Effects of telecommands: stated for every one, inherited by what carries another, gravest where not known."""
+"""Effects of telecommands: stated for all, inherited by scheduling telecommands, most severe if unknown."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The damage campaign in short: one damage of each kind to every table at once, and every damage to files."""
+"""Short damage campaign: one damage of each kind to every table, and every damage to files."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,7 +27,7 @@ def wanted(copies: SqliteCopies) -> Iterator[list[Harm]]:
 def test_damage_to_every_table_is_found(
     copies: SqliteCopies, wanted: list[Harm], change: str, sources: bool
 ) -> None:
-    """The last column of each row is changed; digests and heads have tests of their own."""
+    """The last column of each row is changed; digests and heads have separate tests."""
     chosen = {
         harm.kind: harm
         for harm in wanted
@@ -65,7 +65,7 @@ def test_damage_to_every_file_is_found(copies: SqliteCopies, wanted: list[Harm])
 
 
 def test_packets_removed_with_their_values_are_found_by_ingesting_again(copies: SqliteCopies) -> None:
-    """Packets that are removed with their values leave nothing that does not fit, but the raw file has them."""
+    """Without packets and their values the database is consistent, but the raw file still has the packets."""
     with copies.copy() as ground:
         with outside(ground.database.engine.url) as connection:
             connection.exec_driver_sql(

@@ -1,4 +1,4 @@
-"""The hostile build against the sandbox; the campaign takes every profile, this the shortest way through each."""
+"""Hostile build against the sandbox: the shortest run with each profile of the campaign."""
 
 from __future__ import annotations
 

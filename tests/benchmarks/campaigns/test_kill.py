@@ -1,4 +1,4 @@
-"""The kill campaign in its shortest form: the API and its jobs on SQLite, killed during ingest and commanding."""
+"""Shortest kill campaign: API and jobs with SQLite, killed during ingest and commanding."""
 
 import json
 import random

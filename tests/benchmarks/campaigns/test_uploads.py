@@ -1,4 +1,4 @@
-"""The campaign of simultaneous uploads in short: a real server with few places, many clients, and a stop."""
+"""Short campaign of simultaneous uploads: a real server with few upload slots, many clients, and a stop."""
 
 from pathlib import Path
 

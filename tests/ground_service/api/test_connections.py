@@ -1,4 +1,4 @@
-"""Connections that take too long, are too many, or never end their request: ended, and others are served meanwhile."""
+"""Slow, surplus and incomplete connections: they are closed, and others are served meanwhile."""
 
 import asyncio
 import json
@@ -22,7 +22,7 @@ PATIENCE_S = 20.0
 
 
 class Echo:
-    """An application that answers with the length of the body, and notes how requests went."""
+    """Application that responds with the length of the body and records the outcome of requests."""
 
     def __init__(self, answer_octets: int = 0) -> None:
         self.answer_octets = answer_octets
@@ -51,7 +51,7 @@ class Echo:
 
 
 class Guarded:
-    """A server with a door, on a port of its own."""
+    """Server with admission control on a separate port."""
 
     def __init__(self, app: Any, limits: ConnectionLimits, proxies: tuple[str, ...] = ()) -> None:
         self.door = Door(limits, TrustedProxies(proxies))
@@ -97,7 +97,7 @@ async def guarded(
 
 
 def run(test: Callable[[], Awaitable[None]]) -> None:
-    """Run a test in a loop of its own: tests in a browser leave a loop running in theirs."""
+    """Run a test in a separate event loop, because browser tests leave a running loop."""
 
     async def limited() -> None:
         async with asyncio.timeout(PATIENCE_S):
@@ -108,7 +108,7 @@ def run(test: Callable[[], Awaitable[None]]) -> None:
 
 
 async def answer(reader: asyncio.StreamReader) -> tuple[int, bytes]:
-    """Status and body of the next answer; (0, b"") where the connection ends without one."""
+    """Return status and body of the next response; (0, b"") if the connection ends without one."""
     try:
         line = await reader.readline()
         if not line:
@@ -236,7 +236,7 @@ def test_one_client_leaves_room_for_others_and_for_supervisors() -> None:
                 assert status == 503 and b"too many connections" in body
                 reader, _ = await server.connect(GET.replace(b"/x", b"/readyz"))
                 assert (await answer(reader))[0] == 200
-            # The reserve is full of connections that ask for nothing, and a supervisor is answered all the same.
+            # The reserve is full of idle connections; a health check is still answered.
             idle = [await server.connect() for _ in range(6)]
             reader, _ = await server.connect(GET.replace(b"/x", b"/healthz"))
             assert (await answer(reader))[0] == 200

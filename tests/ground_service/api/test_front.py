@@ -1,4 +1,4 @@
-"""The front process: health is answered whatever the server does, and all else is handed over untouched."""
+"""Front process: health checks are answered at any load of the server, other connections are passed on unchanged."""
 
 import mmap
 import os
@@ -21,7 +21,7 @@ OTHER = b"GET /readyz HTTP/1.1\r\nHost: a\r\n\r\n"
 
 
 class Front:
-    """A front process with this test in the place of the server."""
+    """Front process with this test as the server."""
 
     def __init__(self) -> None:
         self.listener = socket.create_server(("127.0.0.1", 0))
@@ -48,7 +48,7 @@ class Front:
         return client
 
     def handed(self) -> socket.socket:
-        """The next connection that is handed over."""
+        """Return the next connection that is passed on."""
         message, descriptors, _, _ = socket.recv_fds(self.channel, 1, 1)
         assert message == b"c"
         client = socket.socket(fileno=descriptors[0])
@@ -69,13 +69,15 @@ def fronted() -> Iterator[Front]:
 
 
 def answer(client: socket.socket) -> bytes:
-    """All that a connection brings until its end."""
+    """Return all octets of a connection until its end."""
     with client, client.makefile("rb") as stream:
         return stream.read()
 
 
 def test_health_is_answered_while_the_server_takes_no_connection(fronted: Front) -> None:
-    held = [fronted.connect(OTHER) for _ in range(700)]  # more than the channel to the server holds
+    held = [
+        fronted.connect(OTHER) for _ in range(700)
+    ]  # more connections than the channel to the server can hold
     for request in (HEALTH, HEALTH.replace(b"healthz", b"healthz?x=1")):
         told = answer(fronted.connect(request))
         assert told.startswith(b"HTTP/1.1 200 OK\r\n") and told.endswith(b'\r\n\r\n{"status":"ok"}')

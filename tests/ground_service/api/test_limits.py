@@ -47,7 +47,7 @@ def statuses(guard: RateLimit, count: int, token: str, address: str = "192.0.2.1
 
 
 async def answer(scope: Any, _receive: object, send: object) -> None:
-    """An application that knows two users by their tokens, and answers anybody."""
+    """Respond to every request, and verify the tokens of two users."""
     known = {b"Bearer one": "ann", b"Bearer new": "ann", b"Bearer two": "bob"}
     caller = known.get(dict(scope["headers"]).get(b"authorization"))
     if caller is not None:
@@ -93,7 +93,7 @@ def test_the_addresses_of_one_ipv6_network_share_a_budget() -> None:
 
 
 class Bodies:
-    """Requests to a guarded application that reads bodies; each body comes in parts, when the test sends them."""
+    """Requests to a guarded application that reads bodies; the test sends each body in parts."""
 
     def __init__(self) -> None:
         self.guard = BodyLimit(self._read, upload_paths=("/upload",), upload_limit_octets=1 << 20)
@@ -109,7 +109,7 @@ class Bodies:
         await send({"type": "http.response.body", "body": b""})
 
     def ask(self, path: str = "/x") -> tuple[asyncio.Queue[tuple[bytes, bool]], asyncio.Task[Any]]:
-        """Begin a request; the queue takes parts of its body, and whether more follow."""
+        """Start a request; the queue takes the parts of its body, and whether more follow."""
         parts: asyncio.Queue[tuple[bytes, bool]] = asyncio.Queue()
         started: list[Any] = []
 
@@ -137,9 +137,7 @@ def test_bodies_of_all_requests_together_are_held_within_one_budget(monkeypatch:
         first_parts, first = bodies.ask()
         first_parts.put_nowait((b"x" * 600, True))
         await asyncio.sleep(0.01)
-        upload_parts, upload = bodies.ask(
-            "/upload"
-        )  # goes to the archive as it comes, and counts for nothing
+        upload_parts, upload = bodies.ask("/upload")  # is streamed to the archive and not counted
         upload_parts.put_nowait((b"x" * 5000, False))
         assert await upload == (200, None)
         parts, second = bodies.ask()
@@ -183,7 +181,7 @@ def test_processes_with_a_broker_share_one_budget(redis_url: str) -> None:
 
     with ThreadPoolExecutor(1) as pool:
         mine, theirs, wait_s = pool.submit(anyio.run, ask).result()
-    # Four at once, and one more every half second: a slow machine may earn some while it asks.
+    # Four at once, and one more every half second; a slow machine may gain some during the requests.
     assert mine[:4] == [True] * 4 and not mine[-1]
     assert theirs == [True, True]
     assert 0.0 < wait_s <= 0.5

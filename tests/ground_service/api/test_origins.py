@@ -1,4 +1,4 @@
-"""Pages of other origins can neither read the API nor change anything through the browser of a user."""
+"""Pages of other origins cannot read or change data through the browser of a user."""
 
 import warnings
 from collections.abc import Iterator

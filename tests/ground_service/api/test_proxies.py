@@ -1,4 +1,4 @@
-"""The client behind a chain of reverse proxies."""
+"""Client address behind a chain of reverse proxies."""
 
 import pytest
 

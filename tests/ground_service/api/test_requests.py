@@ -1,5 +1,4 @@
-"""Requests that mean nothing or more than one thing are refused before an operation sees them, and errors tell no more
-than the caller may know."""
+"""Invalid and ambiguous requests are refused before the operations; errors contain only public information."""
 
 import os
 import stat

@@ -38,7 +38,7 @@ CHECKS = [
     response_schema_conformance,
 ]  # fmt: skip
 EXAMPLES = int(os.environ.get("SCHEMA_EXAMPLES", "3"))
-"""Requests to each operation, of each kind; more are asked with SCHEMA_EXAMPLES=50, for instance."""
+"""Number of requests of each kind to each operation; SCHEMA_EXAMPLES=50, for instance, sends more."""
 
 
 @schemathesis.serializer("application/zip")

@@ -1,4 +1,4 @@
-"""WebSockets: closed when their caller may no longer look, limited in number, and read from one feed."""
+"""WebSockets: closed after loss of authorisation, limited in number, and served from one feed."""
 
 import asyncio
 import time
@@ -26,7 +26,7 @@ LIVE = "/api/v1/live"
 
 @pytest.fixture
 def client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TestClient]:
-    """A service that allows three sockets of one caller and five in all, and verifies callers at once."""
+    """Service with limits of three sockets per caller and five in total, which verifies callers immediately."""
     monkeypatch.setattr(sockets, "VERIFY_S", 0.05)
     monkeypatch.setattr(sockets, "POLL_S", 0.05)
     settings = Settings(home=tmp_path, sockets_per_user=3, sockets=5)
@@ -48,7 +48,7 @@ def say(ground: Any, number: int) -> None:
 
 
 def closing_code(socket: Any) -> int:
-    """The code that a socket is closed with, messages before that skipped."""
+    """Return the close code of a socket; skip earlier messages."""
     with pytest.raises(WebSocketDisconnect) as closed:
         while True:
             socket.receive_text()

@@ -1,4 +1,4 @@
-"""Mission descriptions: what is refused, what is not stated, revisions, and the passes that refer to them."""
+"""Mission descriptions: refused values, values that are not stated, revisions, and references of passes."""
 
 import json
 import warnings

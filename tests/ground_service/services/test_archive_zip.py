@@ -83,7 +83,7 @@ def test_too_many_files_files_twice_and_no_zip_at_all_are_refused(
 
 
 def directory_of(entries: int) -> bytes:
-    """A central directory of empty files, each named by its number."""
+    """Return a central directory of empty files, named by number."""
     record = zipfile.ZipInfo("0000000")
     fixed = b"PK\1\2" + bytes(24) + len(record.filename).to_bytes(2, "little") + bytes(16)
     return b"".join(fixed + b"%07d" % number for number in range(entries))
@@ -93,7 +93,7 @@ def directory_of(entries: int) -> bytes:
 def test_a_great_directory_is_refused_before_it_is_read(
     ground: Ground, tmp_path: Path, claimed: int | None
 ) -> None:
-    """The number of entries is that of the directory, whatever the end record claims."""
+    """The number of entries is counted in the directory, not taken from the end record."""
     entries = 1_200_000 if claimed is None else 100_000
     directory = directory_of(entries)
     count = min(entries, 0xFFFF) if claimed is None else claimed

@@ -1,4 +1,4 @@
-"""Backup and restore: everything comes back, damage is told, nothing is overwritten."""
+"""Backup and restore: all data are restored, damage is reported, nothing is overwritten."""
 
 import json
 import re
@@ -35,7 +35,7 @@ def everything(ground: Ground) -> dict[str, list[Any]]:
 
 
 def rows_of_an_empty_service(ground: Ground) -> bool:
-    """Whether nothing is in the database but the head of an empty audit chain."""
+    """Check that the database contains only the head of an empty audit chain."""
     return {name: rows for name, rows in everything(ground).items() if rows} == {
         "audit_head": [(1, 0, "0" * 64)]
     }

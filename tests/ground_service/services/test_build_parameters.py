@@ -1,4 +1,4 @@
-"""Parameters of builds on the flight code are checked, confined, before a build is registered."""
+"""Parameters of builds on the flight code are checked in the sandbox before registration."""
 
 from __future__ import annotations
 

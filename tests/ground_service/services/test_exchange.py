@@ -1,4 +1,4 @@
-"""Export and import: the same archive on either database, damage found first, and databases before version 1.0."""
+"""Export and import: equal archives with both databases, detection of damage, and databases before version 1.0."""
 
 import json
 import sqlite3
@@ -58,7 +58,7 @@ def export(ground: Ground, out: Path, **how: Any) -> Any:
 def exported(
     synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Ground, Path, str]]:
-    """A filled service, its export, and the token of a user."""
+    """Return a filled service, its export, and the token of a user."""
     folder = tmp_path_factory.mktemp("exported")
     with open_ground(folder / "home") as ground:
         import_archive(ground, synthetic_pass.folder)
@@ -116,7 +116,7 @@ def test_an_export_without_files_needs_the_files(exported: tuple[Ground, Path, s
 
 
 def altered(path: Path, out: Path, change: Callable[[str, bytes], bytes | None]) -> Path:
-    """The export with its entries changed, or left out where `change` gives none."""
+    """Return the export with changed entries, without those for which `change` returns None."""
     with zipfile.ZipFile(path) as source, zipfile.ZipFile(out, "w") as target:
         for name in source.namelist():
             octets = change(name, source.read(name))
@@ -175,7 +175,7 @@ def test_a_later_form_of_export_is_named(
 
 @pytest.fixture
 def earlier(tmp_path: Path, synthetic_pass: Any) -> Path:
-    """The home of a service whose database has the last revision before version 1.0, with content."""
+    """Return the home of a service whose filled database has the last revision before version 1.0."""
     home = tmp_path / "earlier"
     home.mkdir()
     stored = FileArchive(home / "files").put_file(synthetic_pass.folder / "downlink.cadu")

@@ -1,4 +1,4 @@
-"""Filter estimates of both packet versions in the archive, and the consistency that the report computes of them."""
+"""Filter estimates of both packet versions in the archive, and their consistency in the report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Golden reports: constructed passes of which every figure is known before they are evaluated."""
+"""Golden reports: constructed passes with known figures."""
 
 import json
 import math
@@ -118,7 +118,7 @@ def test_a_whole_pass(make_pass: Callable[..., Any], ground: Ground) -> None:
 
 
 def test_half_a_downlink(make_pass: Callable[..., Any], ground: Ground) -> None:
-    """Six of twelve frames came: no count has a gap, and yet half of the packets of images are missing."""
+    """Six of twelve frames were received: no count has a gap, but half of the image packets are missing."""
     made = make_pass(
         frames=FRAMES,
         seed=42,
@@ -283,7 +283,7 @@ def test_no_reference(make_pass: Callable[..., Any], ground: Ground) -> None:
 
 
 def test_the_wrong_orientation_is_refused(make_pass: Callable[..., Any], ground: Ground) -> None:
-    """Nothing that needs the Moon's orientation is known where the declared one is not there."""
+    """Values that need the orientation of the Moon are unknown if the declared one is not available."""
     mission = MISSION.replace("IAU WGCCRE 2009", "DE421")
     report = evaluated(ground, make_pass(frames=FRAMES, seed=48, mission=mission).folder)
     judged = statuses(report)
@@ -299,7 +299,7 @@ TILT_DEG = 10.0
 
 
 def test_a_tilted_camera_with_a_lens(make_pass: Callable[..., Any], ground: Ground) -> None:
-    """Seen as declared, all that was put in comes back; seen as a nadir pinhole, next to nothing would."""
+    """The declared camera finds all detections; a nadir pinhole camera would find almost none."""
     tilted = MISSION.replace("k1 = 0.0", f"k1 = -0.02\np1 = 5e-4\ntilt_deg = {TILT_DEG}\nyaw_deg = 0.0")
 
     def pass_of(seed: int, mission: str) -> Any:

@@ -186,7 +186,7 @@ def random_pieces(octets: bytes, seed: int, count: int, smallest: int = 1) -> li
 def test_a_stream_of_frames_may_be_cut_at_any_octet(
     ground: Ground, packets: list[bytes], expected: str, tmp_path: Path, seed: int, frame_length: int
 ) -> None:
-    """Pieces of any size: of less than a CADU, without a marker, cut within one; without a word of their place."""
+    """Pieces of any size without position: shorter than a CADU, without a marker, or cut within one."""
     stream = encode_cadus(packets, spacecraft_id=SPACECRAFT, frame_length=frame_length)
     pieces = random_pieces(stream, seed, 12)
     if frame_length == 223:  # a piece has to show the link where it is not the usual one
@@ -238,7 +238,7 @@ def test_bare_packets_may_be_cut_at_any_octet(
 def test_pieces_of_a_few_octets_are_joined_by_their_place(
     ground: Ground, packets: list[bytes], tmp_path: Path, bare: bool, placed: bool
 ) -> None:
-    """In order of arrival without a place, in any order with one."""
+    """In order of arrival without a position, in any order with one."""
     chosen = packets[:4]
     stream = b"".join(chosen) if bare else encode_cadus(chosen, spacecraft_id=SPACECRAFT, frame_length=223)
     size = 40
@@ -290,7 +290,7 @@ def test_octets_that_wait_are_counted_and_are_no_error(
 def test_octets_that_fit_by_length_and_count_alone_make_no_packet(
     ground: Ground, packets: list[bytes], tmp_path: Path
 ) -> None:
-    """The end of another spacecraft's CADU of the same count: the code tells that it does not belong here."""
+    """The end of another spacecraft's CADU of the same count: the code shows that it does not belong here."""
     stream = encode_cadus(packets, spacecraft_id=SPACECRAFT)
     other = encode_cadus([bytes(reversed(packet)) for packet in packets], spacecraft_id=SPACECRAFT)
     ingest(ground, stream[:700], tmp_path)
@@ -319,7 +319,7 @@ def test_frames_of_two_receivers_are_merged(
 def test_pieces_with_a_place_are_not_searched_for_by_content(
     ground: Ground, packets: list[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bare: bool
 ) -> None:
-    """Many small pieces with a place would be tried in every order otherwise, each time one comes."""
+    """Otherwise, many small pieces would be tried in every order for each new piece."""
     roles: list[int] = []
     original = edges.candidates
     monkeypatch.setattr(
@@ -392,7 +392,7 @@ def test_an_ingest_that_ends_after_any_commit_is_made_up_for_by_the_next(
 
 
 def ingest_pieces(url: str, home: str, pieces: list[tuple[int, bytes]], placed: bool) -> None:
-    """The work of one worker process."""
+    """Ingest pieces as one worker process."""
     with open_ground(Path(home), database_url=url) as ground:
         for number, (start, octets) in enumerate(pieces):
             path = Path(home) / f"piece-{os.getpid()}-{number}"

@@ -1,4 +1,4 @@
-"""Verification ingests raw files again as they were ingested the first time."""
+"""Verification ingests raw files again as in their first ingest."""
 
 import itertools
 from pathlib import Path
@@ -34,7 +34,7 @@ def stream_of(spacecraft: int, count: int = 40) -> bytes:
 def test_what_was_stated_with_a_downlink_holds_for_its_verification(
     ground: Ground, tmp_path: Path, stated: dict[str, Any]
 ) -> None:
-    """A filter of spacecraft leaves out the same packets; pieces with a place are joined by it."""
+    """A spacecraft filter excludes the same packets; pieces with a position are joined by position."""
     octets = stream_of(SPACECRAFT) + stream_of(SPACECRAFT + 1)
     place = stated.pop("place", None)
     cuts = [0, len(octets)] if place is None else [*range(0, 1200, 60), len(octets)]

@@ -1,4 +1,4 @@
-"""Jobs: every one comes to an end, once, and says what went wrong in a line that anybody may read."""
+"""Jobs: each ends exactly once, and reports its error in one public line."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_a_result_that_the_database_cannot_hold_fails_the_job(
 def test_an_attempt_that_another_has_overtaken_changes_nothing(
     ground: Ground, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As after a network failure, when the database gives the lock of the first worker to a second one."""
+    """This occurs after a network failure, if the database grants the lock of the first worker to a second one."""
 
     def work(_ground: Ground, _arguments: Any, job_id: str) -> Row:
         with ground.database.writing() as connection:

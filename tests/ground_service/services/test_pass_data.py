@@ -1,4 +1,4 @@
-"""What the evaluation is given: the declared models and camera, whatever this machine has."""
+"""Inputs of the evaluation: the declared models and camera, independent of the local data."""
 
 import json
 import math

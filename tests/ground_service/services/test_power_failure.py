@@ -1,4 +1,4 @@
-"""A power failure at any operation of an ingest: what was acknowledged is there, whole, and the rest can follow."""
+"""A power failure at any operation of an ingest: acknowledged data are complete, and the rest can be ingested later."""
 
 import shutil
 

@@ -464,7 +464,7 @@ def test_the_shipped_policy_gives_a_reason_for_every_number() -> None:
 
 
 def changed_here_and_there(items: dict[str, Any]) -> dict[str, Any]:
-    """Detections of a build that is a little different: every twelfth is missing on some frames."""
+    """Return detections of a slightly different build: every twelfth is missing in some frames."""
     kept = np.arange(len(items["u_px"])) % 12 != int(items["u_px"].sum()) % 17
     return {name: values[kept] for name, values in items.items()}
 

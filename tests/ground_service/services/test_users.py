@@ -1,4 +1,4 @@
-"""Users and tokens: states that are compared and set, and refusals that hold at once."""
+"""Users and tokens: compare-and-set of states, and immediate refusals."""
 
 import threading
 from collections.abc import Callable
@@ -117,7 +117,7 @@ def test_the_last_administrator_stays(either: Ground) -> None:
 
 
 def race(*tasks: Callable[[], object]) -> list[object]:
-    """What each task returned or raised, all begun at once."""
+    """Run tasks simultaneously; return what each returned or raised."""
     barrier, results = threading.Barrier(len(tasks)), [None] * len(tasks)
 
     def run(index: int) -> None:

@@ -1,4 +1,4 @@
-"""The audit chain: entries in the order of commits, changes that break it, and many processes at once."""
+"""Audit chain: entries in the order of commits, changes that break it, and concurrent processes."""
 
 import hashlib
 import json
@@ -38,7 +38,7 @@ def head(database: Database) -> audit.Head | None:
 
 
 def without_guards(database: Database, *statements: Any) -> None:
-    """Change the log as somebody could who may change the schema."""
+    """Change the log as a user with the right to change the schema."""
     with database.writing() as connection:
         for name in audit.GUARD_NAMES:
             on = " ON audit" if database.dialect == "postgresql" else ""

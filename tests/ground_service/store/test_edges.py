@@ -1,4 +1,4 @@
-"""Edges that wait: every look-up is answered from an index, however many edges there are."""
+"""Waiting edges: every query uses an index, with any number of edges."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -35,7 +35,7 @@ def many() -> Iterator[Edge]:
 
 
 def plans(database: Database, look_up: Any) -> list[str]:
-    """How the database answers each query that `look_up` makes."""
+    """Return the query plan of each query of `look_up`."""
     asked: list[tuple[str, Any]] = []
 
     def note(_c: Any, _cursor: Any, statement: str, parameters: Any, *_: Any) -> None:

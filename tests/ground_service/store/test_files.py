@@ -1,4 +1,4 @@
-"""The archive of files: whole or not at all, durable before it is acknowledged, no leftovers."""
+"""File archive: atomic and durable storage, no leftovers."""
 
 import os
 import subprocess
@@ -16,7 +16,7 @@ from ground_service.store.files import FileArchive, make_durable_folder, replace
 
 @pytest.fixture
 def ended_process() -> int:
-    """Id of a process that has ended."""
+    """Return the id of a process that has ended."""
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     return process.pid

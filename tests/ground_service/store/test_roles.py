@@ -1,4 +1,4 @@
-"""The database role of the service on real PostgreSQL: what it can do, and what it cannot."""
+"""Privileges of the database role of the service with PostgreSQL."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Digests of rows: they follow what the program writes, and show what anything else changed."""
+"""Digests of rows: updated by changes of the program, and mismatched after any other change."""
 
 import sqlite3
 import struct
@@ -38,7 +38,7 @@ def strays(database: Database) -> list[StrayRow]:
 
 
 def outside(database: Database, *statements: str) -> None:
-    """What another program does: a plain connection."""
+    """Return a connection of another program."""
     engine = create_engine(database.engine.url)
     with engine.begin() as connection:
         for statement in statements:

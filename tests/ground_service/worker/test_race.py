@@ -1,4 +1,4 @@
-"""The race campaign in its shortest form: two API processes over HTTP and one PostgreSQL database."""
+"""Shortest race campaign: two API processes over HTTP and one PostgreSQL database."""
 
 from __future__ import annotations
 

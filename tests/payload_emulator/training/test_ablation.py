@@ -89,7 +89,7 @@ def test_variants_are_trained_once_and_shown_side_by_side(halves, tmp_path):
 
 
 class WithoutTest(Halves):
-    """A data set that refuses to show its test split."""
+    """Data set that refuses access to its test split."""
 
     def frames(self, split="", source=""):
         assert split != "test"
