@@ -100,9 +100,12 @@ class Client:
         try:
             with packed.open("rb") as stream:
                 job = self._json(
-                    "POST", "/archives", query={"name": f"{folder.name}.zip"}, body=stream,
+                    "POST",
+                    "/archives",
+                    query={"name": f"{folder.name}.zip"},
+                    body=stream,
                     octets=packed.stat().st_size,
-                )  # fmt: skip
+                )
         finally:
             packed.unlink()
         return int(self._finished(job["id"])["result"]["pass_id"])
@@ -188,9 +191,11 @@ class Client:
     def correlate(self, spacecraft_id: int, instance: str, points: list[View]) -> View:
         """Fit the time correlation of a spacecraft."""
         return self._json(
-            "POST", f"/spacecraft/{spacecraft_id}/correlations", query={"instance": instance},
+            "POST",
+            f"/spacecraft/{spacecraft_id}/correlations",
+            query={"instance": instance},
             body={"points": points},
-        )  # fmt: skip
+        )
 
     def correlations(self, spacecraft_id: int, instance: str) -> View:
         """Time correlations of a spacecraft, the newest first."""
@@ -205,9 +210,11 @@ class Client:
     def enter_receptions(self, spacecraft_id: int, instance: str, receptions: list[View]) -> View:
         """Tell when time reports were received; the correlations then in force."""
         return self._json(
-            "POST", f"/spacecraft/{spacecraft_id}/receptions", query={"instance": instance},
+            "POST",
+            f"/spacecraft/{spacecraft_id}/receptions",
+            query={"instance": instance},
             body={"receptions": receptions},
-        )  # fmt: skip
+        )
 
     def time_reports(self, spacecraft_id: int, instance: str) -> View:
         """Received time reports with their residuals."""

@@ -105,9 +105,13 @@ def save_class_histogram(path: Path, diameter_km: FloatArray, caption: str, bin_
             mine = (edges[:-1] >= low - 1e-9) & (edges[:-1] < high - 1e-9)
             total = int(counts[mine].sum())
             axes.bar(
-                edges[:-1][mine], counts[mine], bin_km * 0.92, align="edge", color=color(role),
+                edges[:-1][mine],
+                counts[mine],
+                bin_km * 0.92,
+                align="edge",
+                color=color(role),
                 label=f"{name}: {total:,}".replace(",", " "),
-            )  # fmt: skip
+            )
         if counts.any():
             axes.set_yscale("log")
             axes.set_ylim(bottom=max(0.8, 0.5 * float(counts.min())))
@@ -140,9 +144,13 @@ def save_altitude_plot(
         for value in (low, mean, high):
             over_time.axhline(value, color=color("ink"), linewidth=0.7, linestyle=(0, (4, 2)))
             over_time.text(
-                1.008, value, f"{value:.1f} km", transform=over_time.get_yaxis_transform(), va="center",
+                1.008,
+                value,
+                f"{value:.1f} km",
+                transform=over_time.get_yaxis_transform(),
+                va="center",
                 fontsize="small",
-            )  # fmt: skip
+            )
         over_time.set_ylim(min(0.0, low) - 3.0, high + 5.0)
         time_axis(over_time, time)
         over_time.set_ylabel("altitude, km")

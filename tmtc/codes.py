@@ -12,8 +12,12 @@ OUTCOMES: Labels = (
     (6, "fixed"), (7, "coasted"), (8, "refused"), (9, "no_image"),
 )  # fmt: skip
 RESET_TRIGGERS: Labels = (
-    (0, "none"), (1, "initialization"), (2, "time_gap"), (3, "manual_step"), (4, "safety_timeout"),
-)  # fmt: skip
+    (0, "none"),
+    (1, "initialization"),
+    (2, "time_gap"),
+    (3, "manual_step"),
+    (4, "safety_timeout"),
+)
 SIZE_CLASSES: Labels = ((-1, "none"), (0, "5-10 km"), (1, "10-15 km"), (2, "15-30 km"), (3, "3-5 km"))
 CLOCK_STATES: Labels = ((0, "free_running"), (1, "synchronised"), (2, "suspect"))
 EVENTS_1: Labels = (
@@ -55,9 +59,12 @@ EVENTS: Labels = (
 )  # fmt: skip
 FAILURES: Labels = (*FAILURES_1, (18, "unknown_structure"), (19, "structures_full"))
 FUNCTIONS: Labels = (
-    *FUNCTIONS_1, (11, "widen_estimate"), (12, "resynchronise_commands"), (13, "downlink_thumbnail"),
+    *FUNCTIONS_1,
+    (11, "widen_estimate"),
+    (12, "resynchronise_commands"),
+    (13, "downlink_thumbnail"),
     (14, "downlink_map"),
-)  # fmt: skip
+)
 # What the two arguments of a function may mean.
 ARGUMENTS_1 = ("mode, duration in s, table number", "cadence in s")
 ARGUMENTS = ("mode, duration in s, table number, m", "cadence in s, m/s")

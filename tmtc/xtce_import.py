@@ -252,8 +252,11 @@ class _Importer:
                     content = Container(
                         names[owner[id(inner)][0].path, inner.attributes["name"]],
                         f"{owner[id(inner)][0].path}/{inner.attributes['name']}",
-                        entries(id(inner)), False, None, (),
-                    )  # fmt: skip
+                        entries(id(inner)),
+                        False,
+                        None,
+                        (),
+                    )
                     size += sizes[id(inner)]
                     found.append(self.entry(element, content, system, ("containerRef",)))
                 else:

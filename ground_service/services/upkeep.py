@@ -56,12 +56,15 @@ def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> 
                 }
             )
     broken = [
-        {**{key: one[key] for key in ("spacecraft_id", "instance")}, "parameter": trend["parameter"],
-         "limit_state": trend["limit_state"]}
+        {
+            **{key: one[key] for key in ("spacecraft_id", "instance")},
+            "parameter": trend["parameter"],
+            "limit_state": trend["limit_state"],
+        }
         for one in found
         for trend in one["trends"]
         if trend["limit_state"] != "within"
-    ]  # fmt: skip
+    ]
     if broken:
         with ground.database.writing() as connection:
             publish(connection, "limits", {"broken": broken})

@@ -160,9 +160,12 @@ class LandmarkMapper:
         parameters = self.parameters
         spread = float(np.sqrt(np.trace(view.covariance_m2) / 3.0))
         usable = (
-            free & np.isfinite(found.u_px) & np.isfinite(found.v_px) & (found.diameter_px > 0.0)
+            free
+            & np.isfinite(found.u_px)
+            & np.isfinite(found.v_px)
+            & (found.diameter_px > 0.0)
             & np.isfinite(variance_px2)
-        )  # fmt: skip
+        )
         ready = self._closed(view.ticks)
         if not (np.isfinite(spread) and spread < parameters.position_limit_m):
             return ready

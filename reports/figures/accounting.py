@@ -57,9 +57,13 @@ def draw_completeness(
     for mask, tint in ((whole, "blue"), (~whole & np.isfinite(share), "vermillion")):
         if mask.any():
             axes.bar(
-                edges[:-1][mask], share[mask], np.diff(edges)[mask] * 0.9, align="edge", color=color(tint),
+                edges[:-1][mask],
+                share[mask],
+                np.diff(edges)[mask] * 0.9,
+                align="edge",
+                color=color(tint),
                 linewidth=0,
-            )  # fmt: skip
+            )
     for gap in gaps:
         left, right = float(time.x(gap.start_utc_ns)), float(time.x(gap.stop_utc_ns))
         axes.plot(

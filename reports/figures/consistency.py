@@ -82,8 +82,10 @@ def draw_consistency(
         ]
         axes.set_yticks(ticks, [f"{t:g}" for t in ticks])
         axes.set_yticks([], minor=True)
-        within = np.mean((value[keep][finite] >= chi2_quantile(0.025, freedom[finite]))
-                         & (value[keep][finite] <= chi2_quantile(0.975, freedom[finite])))  # fmt: skip
+        within = np.mean(
+            (value[keep][finite] >= chi2_quantile(0.025, freedom[finite]))
+            & (value[keep][finite] <= chi2_quantile(0.975, freedom[finite]))
+        )
         axes.text(
             1.015, 0.96,
             f"mean {float(np.mean(scaled[finite])):.2f}\n{100 * float(within):.0f} % inside 95 "
@@ -127,8 +129,11 @@ def draw_dependence(
 ) -> None:
     """Median (dot) and 95th percentile (bar) of the error by altitude, light, matches and time since a fix."""
     known = {one.name: dependences(one, track) for one in series}
-    names = [n for n in ("altitude", "sun_elevation", "matched", "time_since_fix")
-             if any(n == name for items in known.values() for name, _, _ in items)]  # fmt: skip
+    names = [
+        n
+        for n in ("altitude", "sun_elevation", "matched", "time_since_fix")
+        if any(n == name for items in known.values() for name, _, _ in items)
+    ]
     terrain = sorted({t for one in series for t in one.terrain if t})
     panels = len(names) + bool(terrain)
     if not panels:

@@ -224,9 +224,12 @@ def _image_map(canvas: Canvas, axes: Axes, residuals: ResidualSeries) -> None:
         scale=1.0, color=color("blue"), width=0.008, headwidth=3.6, headlength=4.2, headaxislength=4.0,
     )  # fmt: skip
     axes.plot(
-        [size * 1.05, size * 1.05 + key * factor], [size * 0.06, size * 0.06], color=color("blue"),
-        linewidth=canvas.pt(2.0), clip_on=False,
-    )  # fmt: skip
+        [size * 1.05, size * 1.05 + key * factor],
+        [size * 0.06, size * 0.06],
+        color=color("blue"),
+        linewidth=canvas.pt(2.0),
+        clip_on=False,
+    )
     axes.text(size * 1.05, size * 0.09, f"{key:g} px", va="top", fontsize="small", color=color("muted"))
 
 
@@ -273,9 +276,13 @@ def draw_curves(
         most = max(b.count for b in calibration)
         axes.plot(score, true, color=color("blue"), linewidth=canvas.pt(1.2))
         axes.scatter(
-            score, true, s=[canvas.pt(3 + 6 * (b.count / max(most, 1)) ** 0.5) ** 2 for b in calibration],
-            color=color("blue"), linewidth=0, zorder=3,
-        )  # fmt: skip
+            score,
+            true,
+            s=[canvas.pt(3 + 6 * (b.count / max(most, 1)) ** 0.5) ** 2 for b in calibration],
+            color=color("blue"),
+            linewidth=0,
+            zorder=3,
+        )
         axes.set_xlabel("score of the detector")
         axes.set_ylabel("share that is true")
         axes.set_title("calibration (dot size: number)")

@@ -47,9 +47,13 @@ def draw_housekeeping(
         finite = np.isfinite(parameter.values)
         alone = int(finite.sum()) == 1
         axes.plot(
-            time.x(parameter.utc_ns), parameter.values, "o" if alone else "-", color=color("blue"),
-            linewidth=canvas.pt(1.2), markersize=canvas.pt(3.5),
-        )  # fmt: skip
+            time.x(parameter.utc_ns),
+            parameter.values,
+            "o" if alone else "-",
+            color=color("blue"),
+            linewidth=canvas.pt(1.2),
+            markersize=canvas.pt(3.5),
+        )
         axes.locator_params(axis="y", nbins=4)
         if finite.any():
             low, high = float(parameter.values[finite].min()), float(parameter.values[finite].max())

@@ -365,9 +365,13 @@ def draw_drift(canvas: Canvas, series: Sequence[NavigationSeries], styles: Style
             p95 = np.array([d.p95_percent for d in one.drift_by_length])
             axes.fill_between(x, median, p95, color=tint, alpha=0.14, linewidth=0)
             axes.plot(
-                x, median, color=tint, marker="o", markersize=canvas.pt(3.5),
+                x,
+                median,
+                color=tint,
+                marker="o",
+                markersize=canvas.pt(3.5),
                 linestyle=canvas.dashes(dashes),
-            )  # fmt: skip
+            )
         left += width + gap
     last = None
     if reset:
@@ -377,9 +381,13 @@ def draw_drift(canvas: Canvas, series: Sequence[NavigationSeries], styles: Style
         for one, value in zip(reset, values, strict=True):
             shown = value[np.isfinite(value)]
             axes.plot(
-                np.arange(1, len(shown) + 1), shown, marker="o", markersize=canvas.pt(3.5),
-                linewidth=canvas.pt(0.7), color=styles[one.name][0],
-            )  # fmt: skip
+                np.arange(1, len(shown) + 1),
+                shown,
+                marker="o",
+                markersize=canvas.pt(3.5),
+                linewidth=canvas.pt(0.7),
+                color=styles[one.name][0],
+            )
         most = max(int(np.isfinite(value).sum()) for value in values)
         axes.set_xlim(0.5, most + 0.5)
         axes.set_xticks(np.arange(1, most + 1, max(1, -(-most // 8))))

@@ -94,13 +94,19 @@ def draw_strips(
             inside_time = (one.utc_ns >= utc_ns[part[0]]) & (one.utc_ns <= utc_ns[part[-1]])
             tint, dashes = styles[one.name]
             axes.plot(
-                _unwrapped(one.longitude_deg[inside_time], middle), one.latitude_deg[inside_time], color=tint,
-                linestyle=canvas.dashes(dashes), linewidth=canvas.pt(1.3),
-            )  # fmt: skip
+                _unwrapped(one.longitude_deg[inside_time], middle),
+                one.latitude_deg[inside_time],
+                color=tint,
+                linestyle=canvas.dashes(dashes),
+                linewidth=canvas.pt(1.3),
+            )
         axes.plot(
-            _unwrapped(longitude[part], middle), latitude[part], color=color("ink"), linewidth=canvas.pt(1.0),
+            _unwrapped(longitude[part], middle),
+            latitude[part],
+            color=color("ink"),
+            linewidth=canvas.pt(1.0),
             linestyle=(0, (5, 2)),
-        )  # fmt: skip
+        )
         for side in ("top", "right"):
             axes.spines[side].set_visible(True)
         if i == 0:
@@ -150,9 +156,12 @@ def _line(canvas: Canvas, axes: Axes, track: TrackSeries, keep: BoolArray, tint:
     # No line over the edge of the map, and none through places that nobody sampled.
     jump = (np.abs(np.diff(longitude, prepend=longitude[:1])) > 180.0) | silent
     axes.plot(
-        np.insert(longitude, np.flatnonzero(jump), np.nan), np.insert(latitude, np.flatnonzero(jump), np.nan),
-        color=tint, linewidth=canvas.pt(width), solid_capstyle="butt",
-    )  # fmt: skip
+        np.insert(longitude, np.flatnonzero(jump), np.nan),
+        np.insert(latitude, np.flatnonzero(jump), np.nan),
+        color=tint,
+        linewidth=canvas.pt(width),
+        solid_capstyle="butt",
+    )
 
 
 def draw_underlay(canvas: Canvas, axes: Axes, terrain: TerrainMap | None, middle: float = 180.0) -> None:

@@ -65,9 +65,13 @@ def test_tracking_identification_is_measured_on_an_anchoring_table(
     count = 400
     path = tmp_path / "anchors.tbl"
     table = CatalogueTable(
-        np.arange(count), rng.uniform(-0.1, 0.1, count), rng.uniform(1.0, 1.2, count),
-        rng.uniform(5e3, 15e3, count), rng.normal(0.0, 200.0, count), np.full((count, 3), 80.0),
-    )  # fmt: skip
+        np.arange(count),
+        rng.uniform(-0.1, 0.1, count),
+        rng.uniform(1.0, 1.2, count),
+        rng.uniform(5e3, 15e3, count),
+        rng.normal(0.0, 200.0, count),
+        np.full((count, 3), 80.0),
+    )
     path.write_bytes(pack_catalogue_table(table))
     assert run(["identify", "tracking", str(path), "--frames", "60", "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)

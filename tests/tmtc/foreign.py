@@ -159,9 +159,10 @@ _TYPES = (
     + calibrated("LINEAR", 8, "unsigned", default(spline(_LINEAR, 1, True)))
     + calibrated("STEPS", 8, "unsigned", default(spline(_STEPS, 0, True)))
     + calibrated(
-        "GAIN", 16, "unsigned",
-        default(polynomial(0.0, 2.0))
-        + "<ContextCalibratorList>"
+        "GAIN",
+        16,
+        "unsigned",
+        default(polynomial(0.0, 2.0)) + "<ContextCalibratorList>"
         f"<ContextCalibrator><ContextMatch>{comparison('MODE', 'SAFE')}</ContextMatch>"
         f"<Calibrator>{polynomial(100.0, -1.0)}</Calibrator></ContextCalibrator>"
         f"<ContextCalibrator><ContextMatch>{comparison('GAIN', 40000, '>=', False)}</ContextMatch>"
@@ -180,7 +181,7 @@ _TYPES = (
     + "</SizeInBits></BinaryDataEncoding></BinaryParameterType>"
     + '<BinaryParameterType name="KEY"><UnitSet/><BinaryDataEncoding><SizeInBits><FixedValue>24</FixedValue>'
     "</SizeInBits></BinaryDataEncoding></BinaryParameterType>"
-)  # fmt: skip
+)
 
 # name: type, in the order of the packet; each housekeeping value stands under its own name
 HOUSEKEEPING = {
@@ -215,7 +216,9 @@ BUS = document(
     _PARAMETERS,
     HEADER_CONTAINER
     + container(
-        "TIMED", ["DAY", "MILLISECOND", "MICROSECOND"], "CCSDSPacket",
+        "TIMED",
+        ["DAY", "MILLISECOND", "MICROSECOND"],
+        "CCSDSPacket",
         both(comparison("VERSION", 0), comparison("SEC_HDR_FLG", 1), comparison("PKT_APID", APID_DUMP, "!=")),
         abstract=True,
     )
@@ -224,10 +227,12 @@ BUS = document(
     + container("UrgentEvent", ["VALUE"], "Event", comparison("REASON", 200, ">="))
     + container("Dump", ["COARSE", "FINE", "DUMP", "VALUE"], "CCSDSPacket", comparison("PKT_APID", APID_DUMP))
     + container(
-        "Bare", ["VALUE"], "CCSDSPacket",
+        "Bare",
+        ["VALUE"],
+        "CCSDSPacket",
         _either(("PKT_APID", "==", APID_BARE), ("PKT_APID", "==", APID_BARE + 1)),
     ),
-)  # fmt: skip
+)
 
 
 @dataclass

@@ -366,10 +366,14 @@ def test_integer_columns_do_not_wrap_in_arithmetic():
 @pytest.mark.parametrize("value", [0, 2**63 - 1, 2**63, 2**64 - 1])
 def test_unsigned_integers_of_64_bits_stay_what_was_sent(value):
     definition = PacketDefinition(
-        "wide", 1, 3, 25, "",
+        "wide",
+        1,
+        3,
+        25,
+        "",
         (Field("number", "u64", ""), Field("vector", "u64", "", size=2), Field("count", "u8", "")),
         Group("count", (Field("item", "u64", ""),)),
-    )  # fmt: skip
+    )
     dictionary = Dictionary(1, (definition,))
     values = {"number": value, "vector": [1, value], "items": [{"item": value}, {"item": 7}]}
     octets = dictionary.pack("wide", values, ticks=0, sequence_count=0)

@@ -15,9 +15,13 @@ from tmtc.stream import cut_packets
 
 def tables():
     items = {
-        "u_px": [1.5, 2.0], "v_px": [3.0, 4.0], "diameter_px": [10.0, 20.0], "score": [1.0, 0.0],
-        "size_class": [0, -1], "sigma_px": [0.5, np.nan],
-    }  # fmt: skip
+        "u_px": [1.5, 2.0],
+        "v_px": [3.0, 4.0],
+        "diameter_px": [10.0, 20.0],
+        "score": [1.0, 0.0],
+        "size_class": [0, -1],
+        "sigma_px": [0.5, np.nan],
+    }
     detections = {"frame_number": 1, "image_ticks": 7, "image_quality": "dark"}
     event = {"event_id": "boot", "frame_number": 0, "value_1": 0.25, "value_2": np.nan}
     state = {

@@ -471,9 +471,13 @@ def test_entries_under_a_condition_are_there_or_not():
     ]
     table = decoded(text, packets).tables["P"]
     assert {name: column.to_list() for name, column in table.columns.items()} == {
-        "Mode": [0, 1, 0, 1], "Flag": [0, 0, 1, 1], "Data1": [None, 100, None, 300], "Data2": [None, None, 200, 600],
-        "Always": [9, 8, 7, 6], "Last": [None, None, None, 5],
-    }  # fmt: skip
+        "Mode": [0, 1, 0, 1],
+        "Flag": [0, 0, 1, 1],
+        "Data1": [None, 100, None, 300],
+        "Data2": [None, None, 200, 600],
+        "Always": [9, 8, 7, 6],
+        "Last": [None, None, None, 5],
+    }
     assert table.unread_bits.tolist() == [0] * 4 and isinstance(table.columns["Data1"], OptionalColumn)
     assert verdicts(text, [b"\x01\x00\x05", *packets]) == ["too_short", *["decoded"] * 4]
 
@@ -491,8 +495,11 @@ def test_a_container_in_a_container_begins_where_it_stands():
     )
     found = decoded(text, [bytes((1, 2, 3, 4))])
     assert {name: column.to_list() for name, column in found.tables["P"].columns.items()} == {
-        "a": [1], "x": [2], "y": [3], "z": [4],
-    }  # fmt: skip
+        "a": [1],
+        "x": [2],
+        "y": [3],
+        "z": [4],
+    }
 
 
 def test_names_in_nested_systems_are_found_by_path_and_told_apart():
@@ -510,8 +517,11 @@ def test_names_in_nested_systems_are_found_by_path_and_told_apart():
     text = document("", {"x": "dt/u8", "z": "dt/u8"}, container("root", ["x"], abstract=True), more=inner)
     columns = decoded(text, [bytes((7, 8, 9, 10))]).tables["event"].columns
     assert {name: column.to_list() for name, column in columns.items()} == {
-        "/BUS/x": [7], "/BUS/PUS5/x": [8], "y": [9], "w": [10],
-    }  # fmt: skip
+        "/BUS/x": [7],
+        "/BUS/PUS5/x": [8],
+        "y": [9],
+        "w": [10],
+    }
 
 
 def test_definitions_may_be_spread_over_documents():
@@ -537,9 +547,12 @@ def test_a_packet_is_decoded_by_one_container_or_told_why_not():
         container("B", ["N", "M"], "CCSDSPacket", comparison("PKT_APID", 10, ">=")),
     )
     packets = [
-        space_packet(9, b"\x01", 0), space_packet(10, b"\x01\x02", 0), space_packet(11, b"\x01\x02", 0),
-        space_packet(11, b"\x01", 0), space_packet(9, b"\x01\x02\x03", 0),
-    ]  # fmt: skip
+        space_packet(9, b"\x01", 0),
+        space_packet(10, b"\x01\x02", 0),
+        space_packet(11, b"\x01\x02", 0),
+        space_packet(11, b"\x01", 0),
+        space_packet(9, b"\x01\x02\x03", 0),
+    ]
     found = decoded(text, packets)
     assert [VERDICTS[v] for v in found.verdict.tolist()] == [
         "decoded",

@@ -24,8 +24,12 @@ MARKER = TARGETS["marker"].encode()
 OUT = pathlib.Path(sys.argv[3])
 LIBC = ctypes.CDLL(None, use_errno=True)
 NAMESPACE_FLAGS = {
-    "user": 0x1000_0000, "mount": 0x2_0000, "network": 0x4000_0000, "process": 0x2000_0000, "ipc": 0x800_0000,
-}  # fmt: skip
+    "user": 0x1000_0000,
+    "mount": 0x2_0000,
+    "network": 0x4000_0000,
+    "process": 0x2000_0000,
+    "ipc": 0x800_0000,
+}
 FORKS = 600
 SYSTEM_CALLS = {
     "x86_64": {"clone": 56, "clone3": 435, "setns": 308, "pivot_root": 155, "ptrace": 101, "bpf": 321,

@@ -43,9 +43,13 @@ def test_a_lost_packet_or_an_unfinished_job_fails_the_campaign() -> None:
     }  # fmt: skip
     assert holds(totals([run, run]))
     for injury in (
-        {"lost": 1}, {"doubled": 1}, {"archive_identical": False}, {"jobs": {"failed": 1}}, {"ingests": {"running": 1}},
+        {"lost": 1},
+        {"doubled": 1},
+        {"archive_identical": False},
+        {"jobs": {"failed": 1}},
+        {"ingests": {"running": 1}},
         *({name: 1} for name in FAULTS),
-    ):  # fmt: skip
+    ):
         assert not holds(totals([run, {**run, **injury}]))
 
 
@@ -59,9 +63,11 @@ for row in ROWS:
     row.update(vehicle_id=1, requested_by="ann", arguments={"argument_1": 10.0 + row["id"]})
 LINES = [
     *(AuditLine("enter", number, "ann") for number in (1, 2, 3, 4)),
-    AuditLine("release", 1, "ann"), AuditLine("send", 1, "bob"),
-    AuditLine("reject", 2, "bob"), AuditLine("release", 3, "bob"),
-]  # fmt: skip
+    AuditLine("release", 1, "ann"),
+    AuditLine("send", 1, "bob"),
+    AuditLine("reject", 2, "bob"),
+    AuditLine("release", 3, "bob"),
+]
 
 
 def what_clients_were_told() -> Ledger:

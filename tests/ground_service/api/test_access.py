@@ -43,8 +43,11 @@ def test_an_administrator_manages_users(service: tuple[TestClient, Tokens]) -> N
     assert client.get(f"{V1}/passes", headers=mine).status_code == 200
     assert client.get(f"{V1}/users/ann", headers=admin).json() == made.json()["user"]
     assert [one["name"] for one in client.get(f"{V1}/users", headers=admin).json()["items"]] == [
-        "admin", "ann", "operator", "viewer",
-    ]  # fmt: skip
+        "admin",
+        "ann",
+        "operator",
+        "viewer",
+    ]
     (token,) = client.get(f"{V1}/tokens?user=ann", headers=admin).json()["items"]
     assert set(token) == {"id", "user", "hint", "state", "created", "expires", "revoked", "used"}
     assert made.json()["token"] not in str(token)
@@ -67,10 +70,14 @@ def test_an_administrator_manages_users(service: tuple[TestClient, Tokens]) -> N
 def test_nobody_else_does(service: tuple[TestClient, Tokens], role: str) -> None:
     client, heads = service
     for method, path, body in (
-        ("GET", "users", None), ("GET", "users/admin", None), ("GET", "tokens", None), ("DELETE", "tokens/1", None),
-        ("POST", "users", {"name": "x", "role": "admin"}), ("PATCH", "users/admin", {"state": "disabled"}),
+        ("GET", "users", None),
+        ("GET", "users/admin", None),
+        ("GET", "tokens", None),
+        ("DELETE", "tokens/1", None),
+        ("POST", "users", {"name": "x", "role": "admin"}),
+        ("PATCH", "users/admin", {"state": "disabled"}),
         ("POST", "users/admin/tokens", {}),
-    ):  # fmt: skip
+    ):
         answer = client.request(method, f"{V1}/{path}", json=body, headers=heads[role])
         assert answer.status_code == 403, (method, path)
 

@@ -57,9 +57,13 @@ def test_control_characters_in_a_path_are_refused(client: TestClient) -> None:
 
 @pytest.mark.parametrize(
     ("query", "words"),
-    [("limti=5", "expected 'limit', found 'limti'"), ("kinds=report", "expected 'kind', found 'kinds'"),
-     ("x=1", "expected one of kind, limit, offset, found 'x'"), ("limit=5&__=", "found '__'")],
-)  # fmt: skip
+    [
+        ("limti=5", "expected 'limit', found 'limti'"),
+        ("kinds=report", "expected 'kind', found 'kinds'"),
+        ("x=1", "expected one of kind, limit, offset, found 'x'"),
+        ("limit=5&__=", "found '__'"),
+    ],
+)
 def test_an_unknown_query_key_is_refused_with_the_nearest_known(
     client: TestClient, query: str, words: str
 ) -> None:

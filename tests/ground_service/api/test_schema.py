@@ -34,9 +34,12 @@ with warnings.catch_warnings():
 
 V1 = "/api/v1"
 CHECKS = [
-    not_a_server_error, status_code_conformance, content_type_conformance, response_headers_conformance,
+    not_a_server_error,
+    status_code_conformance,
+    content_type_conformance,
+    response_headers_conformance,
     response_schema_conformance,
-]  # fmt: skip
+]
 EXAMPLES = int(os.environ.get("SCHEMA_EXAMPLES", "3"))
 """Number of requests of each kind to each operation; SCHEMA_EXAMPLES=50, for instance, sends more."""
 
@@ -93,20 +96,27 @@ def test_every_operation_answers_as_its_schema_says(client: TestClient, mode: Ge
         operation = found.ok()
 
         @settings(
-            max_examples=EXAMPLES, deadline=None, database=None, derandomize=True,
-            phases=[Phase.generate], suppress_health_check=list(HealthCheck),
-        )  # fmt: skip
+            max_examples=EXAMPLES,
+            deadline=None,
+            database=None,
+            derandomize=True,
+            phases=[Phase.generate],
+            suppress_health_check=list(HealthCheck),
+        )
         @given(case=operation.as_strategy(generation_mode=mode))
         def ask(case: Any) -> None:
             asked.add((case.method, case.operation.path))
             wanted = case.as_transport_kwargs(base_url="http://testserver")
             answer = client.request(
-                wanted["method"], wanted["url"], **{
-                    name: wanted[name] for name in ("params", "headers", "json", "content", "files")
+                wanted["method"],
+                wanted["url"],
+                **{
+                    name: wanted[name]
+                    for name in ("params", "headers", "json", "content", "files")
                     if wanted.get(name) is not None
                 },
                 **({"content": wanted["data"]} if isinstance(wanted.get("data"), (bytes, str)) else {}),
-            )  # fmt: skip
+            )
             case.validate_response(answer, checks=CHECKS)
 
         try:

@@ -102,12 +102,15 @@ def test_a_damaged_file_is_found_before_anything_is_restored(saved: Path, tmp_pa
     [
         ("UPDATE windows SET cadence_s = 15.000000000000002", "windows: expected the rows that were saved"),
         ("UPDATE packets SET ticks = ticks + 1 WHERE id = 3", "packets: expected the rows that were saved"),
-        ("UPDATE housekeeping SET power_w = power_w + 1e-9", "housekeeping: expected the rows that were saved"),
+        (
+            "UPDATE housekeeping SET power_w = power_w + 1e-9",
+            "housekeeping: expected the rows that were saved",
+        ),
         ("DELETE FROM tokens", "tokens: expected 1 rows, found 0"),
         ("INSERT INTO vehicles (ccsds_id, instance) VALUES (3, 'x')", "vehicles: expected"),
         ("UPDATE audit_head SET number = 2", "audit_head: expected the rows that were saved"),
     ],
-)  # fmt: skip
+)
 def test_a_changed_row_of_a_backup_is_not_restored(
     saved: Path, tmp_path: Path, statement: str, reason: str
 ) -> None:

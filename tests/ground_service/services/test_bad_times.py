@@ -38,11 +38,13 @@ def housekeeping(day: int) -> list[bytes]:
     first = int(ticks_from_utc_ns(START + day * DAY * NS))
     return [
         DICTIONARY.pack(
-            "housekeeping", {**values, "frames_processed": k}, ticks=first + k * 10 * 65_536,
+            "housekeeping",
+            {**values, "frames_processed": k},
+            ticks=first + k * 10 * 65_536,
             sequence_count=(16_300 + (day + 1) * FRAMES + k) % 16_384,
         )
         for k in range(FRAMES)
-    ]  # fmt: skip
+    ]
 
 
 def day_pass(ground: Ground, day: int) -> int:

@@ -408,9 +408,13 @@ def test_each_step_keeps_what_was_done_when_by_whom_and_tells_those_who_watch(
     release_command(ground, command, actor="bob")
     octets = DICTIONARY.pack_command("perform_function", START, sequence_count=0)
     expected |= {
-        "state": "released", "decided_by": "bob", "decided_utc_ns": NOW + 1, "sequence_count": 0, "octets": octets,
+        "state": "released",
+        "decided_by": "bob",
+        "decided_utc_ns": NOW + 1,
+        "sequence_count": 0,
+        "octets": octets,
         "request_id": int.from_bytes(octets[:4], "big"),
-    }  # fmt: skip
+    }
     row = get_command(ground, command).row
     assert {name: row[name] for name in expected} == expected
     clock(NOW + 2)
@@ -431,8 +435,11 @@ def test_a_rejection_keeps_its_reason(ground: Ground, clock: Callable[[int], Non
     reject_command(ground, command, actor="bob", reason="wrong cadence")
     row = get_command(ground, command).row
     assert (row["state"], row["decided_by"], row["decided_utc_ns"], row["reason"]) == (
-        "rejected", "bob", NOW + 5, "wrong cadence",
-    )  # fmt: skip
+        "rejected",
+        "bob",
+        NOW + 5,
+        "wrong cadence",
+    )
     assert notes(ground, command)[1] == ("bob", "reject telecommand", {"reason": "wrong cadence"})
     assert told(ground)[-1] == {"id": command, "state": "rejected"}
 
@@ -501,9 +508,11 @@ def test_a_command_is_judged_by_reports_newer_than_those_known_when_it_was_sent(
     first = sent(ground)
     request = get_command(ground, first).row["request_id"]
     downlink(
-        ground, tmp_path, ("verification_accepted", 900, {"request_id": request}),
+        ground,
+        tmp_path,
+        ("verification_accepted", 900, {"request_id": request}),
         ("verification_completed", 1200, {"request_id": request}),
-    )  # fmt: skip
+    )
     assert get_command(ground, sent(ground)).row["sent_after_ticks"] == 1200
     other = enter_command(ground, "test_connection", {}, spacecraft_id=77, actor="ann")
     release_command(ground, other, actor="ann")

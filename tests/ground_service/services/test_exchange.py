@@ -198,11 +198,15 @@ def earlier(tmp_path: Path, synthetic_pass: Any) -> Path:
             "INSERT INTO packets (vehicle_id, apid, sequence_count, ticks, digest, octets) VALUES (3, ?, ?, ?, ?, ?)",
             list(
                 zip(
-                    batch.apid.tolist(), batch.sequence_count.tolist(), batch.ticks.tolist(), batch.digest,
-                    batch.octets, strict=True,
+                    batch.apid.tolist(),
+                    batch.sequence_count.tolist(),
+                    batch.ticks.tolist(),
+                    batch.digest,
+                    batch.octets,
+                    strict=True,
                 )
             ),
-        )  # fmt: skip
+        )
         connection.execute("INSERT INTO users (id, name, role, created_utc_ns) VALUES (2, 'ann', 'admin', 7)")
         connection.execute(
             "INSERT INTO tokens (user_id, token_sha256, created_utc_ns) VALUES (2, ?, 8)",

@@ -93,12 +93,13 @@ def flown(request: Any, tmp_path: Path, make_pass: Any) -> tuple[Path, Any, int]
 
 
 def with_pass(ground: Ground, made: Any) -> int:
-    return (
-        define_pass(
-            ground, name="p", start_utc_ns=int(made.utc_ns[0]) - NS, stop_utc_ns=int(made.utc_ns[-1]) + NS,
-            spacecraft_id=SPACECRAFT,
-        )
-    )  # fmt: skip
+    return define_pass(
+        ground,
+        name="p",
+        start_utc_ns=int(made.utc_ns[0]) - NS,
+        stop_utc_ns=int(made.utc_ns[-1]) + NS,
+        spacecraft_id=SPACECRAFT,
+    )
 
 
 def archive_with(made: Any, packets: list[bytes]) -> Path:

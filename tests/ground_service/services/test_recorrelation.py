@@ -120,9 +120,12 @@ def test_every_boot_gets_its_line_and_every_derived_time_names_it(
         )  # a tick (15 us) over 14 minutes is 18 ppb
         assert row["residual_rms_ns"] < 15_259
     key = define_pass(
-        ground, name="p", start_utc_ns=START - 60 * NS, stop_utc_ns=START + REPORTS * 60 * NS,
+        ground,
+        name="p",
+        start_utc_ns=START - 60 * NS,
+        stop_utc_ns=START + REPORTS * 60 * NS,
         spacecraft_id=SPACECRAFT,
-    )  # fmt: skip
+    )
     found = events(ground, key)
     np.testing.assert_allclose([event.utc_ns for event in found], spacecraft.sent, atol=20_000)
     assert [event.correlation_id for event in found] == [rows[0]["id"]] * 15 + [rows[1]["id"]] * 15

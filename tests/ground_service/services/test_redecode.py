@@ -41,9 +41,12 @@ def fill_with_the_old(home: Path, made: Any) -> None:
             store_batch(connection, vehicle, batch_of_cut(found.buffer, found.cut, OLD, 76))
             repository.change(connection, repository.VEHICLES, vehicle, decoded_version=OLD.version)
         define_pass(
-            ground, name="p", start_utc_ns=int(made.utc_ns[0]) - NS, stop_utc_ns=int(made.utc_ns[-1]) + NS,
+            ground,
+            name="p",
+            start_utc_ns=int(made.utc_ns[0]) - NS,
+            stop_utc_ns=int(made.utc_ns[-1]) + NS,
             spacecraft_id=76,
-        )  # fmt: skip
+        )
 
 
 @pytest.fixture

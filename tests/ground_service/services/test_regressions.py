@@ -185,14 +185,18 @@ def test_a_wrong_position_fails_as_navigation(judge, packets: Packets) -> None:
     [
         ("raise SystemExit('no network found')", "candidate crashed: exit status 1: no network found"),
         ("import time; time.sleep(60)", "candidate hung: stopped at its time limit"),
-        ("import sys, pathlib\npathlib.Path(sys.argv[2], 'downlink.packets').write_bytes(b'garbage' * 900)",
-         "candidate wrote a downlink that is no telemetry"),
-        ("import sys, pathlib\npathlib.Path(sys.argv[2], 'x').write_bytes(bytes(9 << 20))",
-         "candidate wrote more than it is allowed"),
+        (
+            "import sys, pathlib\npathlib.Path(sys.argv[2], 'downlink.packets').write_bytes(b'garbage' * 900)",
+            "candidate wrote a downlink that is no telemetry",
+        ),
+        (
+            "import sys, pathlib\npathlib.Path(sys.argv[2], 'x').write_bytes(bytes(9 << 20))",
+            "candidate wrote more than it is allowed",
+        ),
         ("x = bytearray(1 << 30)", "candidate ran out of the memory it is allowed"),
         ("pass", "candidate ended without a downlink"),
     ],
-)  # fmt: skip
+)
 def test_a_build_that_fails_on_a_pass_is_told_so_and_fails(judge, passes, program: str, told: str) -> None:
     limits = "[limits]\nwall_s = 2\nmemory_mib = 300\nfile_mib = 4\n"
     outcome = judge(archives=[passes[0].folder], program=program, extra=limits)

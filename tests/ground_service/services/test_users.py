@@ -50,9 +50,11 @@ def test_a_disabled_user_is_refused_at_once_in_every_process(either: Ground, tmp
         change_user(other, "bob", state="active")
         assert authenticate(either, token).role == "operator"
     assert actions(either) == [
-        ("local", "add user", "ann"), ("ann", "add user", "bob"), ("ann", "disable user", "bob"),
+        ("local", "add user", "ann"),
+        ("ann", "add user", "bob"),
+        ("ann", "disable user", "bob"),
         ("local", "enable user", "bob"),
-    ]  # fmt: skip
+    ]
 
 
 def test_a_revoked_token_is_refused_and_others_stay(either: Ground) -> None:

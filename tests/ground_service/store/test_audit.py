@@ -101,7 +101,7 @@ DAMAGE: dict[str, tuple[Any, str]] = {
     "head hash": (update(HEAD).values(sha256="1" * 64), "expected the head at the newest entry"),
     "another head": (HEAD.insert().values(id=2, number=1, sha256="1" * 64), "found 1 more"),
     "head row": (delete(HEAD), "the head of the chain is missing"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("what", DAMAGE)

@@ -122,8 +122,10 @@ def test_a_row_that_was_damaged_is_not_made_to_fit_by_a_later_change(database: D
         connection.execute(text("INSERT INTO vehicles (id, ccsds_id, instance) VALUES (3, 5, 'again')"))
         connection.execute(text("DELETE FROM telecommands"))
     assert {(one.table, one.key) for one in strays(database)} == {
-        ("vehicles", "2"), ("vehicles", "3"), ("telecommands", "1"),
-    }  # fmt: skip
+        ("vehicles", "2"),
+        ("vehicles", "3"),
+        ("telecommands", "1"),
+    }
 
 
 def test_a_schema_that_is_made_again_has_its_triggers_again(database: Database) -> None:

@@ -62,8 +62,12 @@ def test_pulls_that_cancel_over_all_suns_remain_in_their_octants():
 
 def test_octants_of_a_few_craters_name_no_worst_one():
     truth, found = shifted_scene(10.0, (2.0, 0.0))
-    few = FrameTruth(*(value[:5] if isinstance(value, np.ndarray) else value for value in
-                       (getattr(truth, name) for name in truth.__slots__)))  # fmt: skip
+    few = FrameTruth(
+        *(
+            value[:5] if isinstance(value, np.ndarray) else value
+            for value in (getattr(truth, name) for name in truth.__slots__)
+        )
+    )
     _, overall = bias_of((few, found))
     assert overall["pairs"] == 5 and overall["worst_octant"] is None
 
