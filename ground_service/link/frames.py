@@ -175,11 +175,11 @@ class ChannelReader:
                 segments += [(filled + start, filled + stop) for start, stop in ranges]
                 filled += len(octets)
         buffer = b"".join(bytes(part) for part in parts)
-        ranges = np.array(segments, dtype=np.int64).reshape(-1, 2)
-        cut = cut_packets(buffer, segments=ranges)
+        used = np.array(segments, dtype=np.int64).reshape(-1, 2)
+        cut = cut_packets(buffer, segments=used)
         self.packets += int(np.count_nonzero(cut.crc_ok))
         self.crc_errors += cut.crc_errors
-        self.octets_unused += _not_in_packets(ranges, cut)
+        self.octets_unused += _not_in_packets(used, cut)
         return buffer, cut
 
     def close(self) -> None:
