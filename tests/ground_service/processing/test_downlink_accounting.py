@@ -98,3 +98,10 @@ def test_a_file_without_a_readable_packet_belongs_to_no_pass() -> None:
     assert file.span is None
     assert account_raw([file], 0, 1 << 48).octets_skipped == 0
     assert account_raw([], 0, 1 << 48).frames is None
+
+
+def test_a_pass_of_one_frame_at_the_start_of_a_file_has_its_own_time() -> None:
+    short = stream(10 * HOUR, 20)
+    assert len(short) == CADU
+    one = account_raw([read_raw(short + SECOND, SPACECRAFT)], 10 * HOUR, 11 * HOUR)
+    assert (one.frames, one.octets) == (1, CADU)
