@@ -11,6 +11,7 @@ from ground_service.errors import Conflict, InvalidInput, NotAuthorised, NotFoun
 from ground_service.services.audit_log import list_entries
 from ground_service.services.ground import Ground, open_ground
 from ground_service.services.users import (
+    _note_use,
     add_token,
     add_user,
     authenticate,
@@ -277,7 +278,9 @@ def test_further_tokens_expire_too(
     assert list_tokens(ground)[0].expires == "2027-01-15T20:00:01.234567890Z"
     clock(NOW + 12 * HOUR_NS)
     assert not token_valid(ground, token)
-    with pytest.raises(InvalidInput, match="days valid: expected more than 0, at most 36500, found -1"):
+    with pytest.raises(
+        InvalidInput, match=r"^token, days valid: expected more than 0, at most 36500, found -1"
+    ):
         make(ground, "ann", days_valid=-1)
     with pytest.raises(NotFound):
         make(ground, "bob")
@@ -301,6 +304,18 @@ def test_the_use_of_a_token_is_noted_after_an_hour_and_not_before(
     clock(501_000 * HOUR_NS - 1 + HOUR_NS)
     authenticate(ground, token)
     assert list_tokens(ground)[0].used == "2027-02-26T00:00:00.000000000Z"
+
+
+def test_of_two_requests_at_once_the_first_notes_the_use(
+    ground: Ground, clock: Callable[[int], None]
+) -> None:
+    """Both read that the token was not used; the second finds the hour written when it comes to write."""
+    add_user(ground, "ann", "viewer")
+    _note_use(ground, 1, NOW)
+    _note_use(ground, 1, NOW + HOUR_NS - 1 - NOW % HOUR_NS)
+    assert list_tokens(ground)[0].used == "2027-01-15T08:00:00.000000000Z"
+    _note_use(ground, 1, NOW - NOW % HOUR_NS + HOUR_NS)
+    assert list_tokens(ground)[0].used == "2027-01-15T09:00:00.000000000Z"
 
 
 def test_only_the_token_itself_is_accepted(ground: Ground) -> None:
@@ -383,7 +398,7 @@ def test_changes_that_cannot_be_made_are_refused_with_what_was_expected(ground: 
         change_user(ground, "bob", state="disabled")
     with pytest.raises(NotFound, match="bob"):
         get_user(ground, "bob")
-    with pytest.raises(InvalidInput, match="service"):
+    with pytest.raises(InvalidInput, match=r"^user, name: .*service"):
         change_user(ground, "service", role="viewer")
 
 
