@@ -211,3 +211,83 @@ def search(
             ):
                 return q
     return limit
+
+
+CHAIN = 32
+_AHEAD = 256
+
+
+@njit
+def header_at(buffer: Array, p: int, stop: int, packet_type: int, longest: int) -> int:
+    """Octets that the header at `p` claims, whether or not they are there; 0 where no header can stand."""
+    if stop - p < 7 or (buffer[p] >> 4) != packet_type:
+        return 0
+    length = (np.int64(buffer[p + 4]) << 8 | np.int64(buffer[p + 5])) + 7
+    return length if length <= longest else 0
+
+
+@njit
+def walk_unchecked(
+    buffer: Array, p: int, stop: int, packet_type: int, longest: int, last: Array, rows: Array, count: int
+) -> tuple[int, int]:
+    """Like `walk` for packets without error control: goes on as long as headers follow each other.
+
+    Idle packets are rows of their own kind; `last` (2048,) keeps the sequence count of each APID.
+    """
+    while p < stop and count < rows.shape[0]:
+        length = header_at(buffer, p, stop, packet_type, longest)
+        if length == 0 or length > stop - p:
+            break
+        idle = is_idle(buffer, p)
+        if not idle:
+            apid = (np.int64(buffer[p]) & 0x07) << 8 | np.int64(buffer[p + 1])
+            last[apid] = (np.int64(buffer[p + 2]) & 0x3F) << 8 | np.int64(buffer[p + 3])
+        rows[count, 0] = 3 if idle else GOOD
+        rows[count, 1] = p
+        p += length
+        rows[count, 2] = p
+        count += 1
+    return p, count
+
+
+@njit
+def proves(
+    buffer: Array, q: int, stop: int, packet_type: int, longest: int, last: Array, is_begin: bool
+) -> bool:
+    """Whether packets without error control begin at `q`.
+
+    Headers must follow each other until one continues the sequence counts of its APID: those before the damage, or
+    those of another packet of this chain. At the beginning of a segment it is also enough that they lead to its end, or
+    that three follow each other.
+    """
+    apids = np.empty(CHAIN, dtype=np.int64)
+    counts = np.empty(CHAIN, dtype=np.int64)
+    p = q
+    for k in range(CHAIN):
+        if p == stop:
+            return is_begin and k > 0
+        length = header_at(buffer, p, stop, packet_type, longest)
+        if length == 0 or length > stop - p:
+            return is_begin and k >= 3
+        apids[k] = (np.int64(buffer[p]) & 0x07) << 8 | np.int64(buffer[p + 1])
+        counts[k] = (np.int64(buffer[p + 2]) & 0x3F) << 8 | np.int64(buffer[p + 3])
+        if apids[k] != 0x7FF:
+            before = last[apids[k]]
+            if before >= 0 and 1 <= (counts[k] - before) % 16384 <= _AHEAD:
+                return True
+            for j in range(k):
+                if apids[j] == apids[k] and (counts[k] - counts[j]) % 16384 == 1:
+                    return True
+        p += length
+    return is_begin
+
+
+@njit
+def search_unchecked(
+    buffer: Array, first: int, stop: int, packet_type: int, longest: int, last: Array
+) -> int:
+    """First position in [first, stop) at which packets without error control begin, or `stop`."""
+    for q in range(first, stop):
+        if (buffer[q] >> 4) == packet_type and proves(buffer, q, stop, packet_type, longest, last, False):
+            return q
+    return stop

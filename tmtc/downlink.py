@@ -333,6 +333,7 @@ def decode(
     settings: LinkSettings | None = None,
     spacecraft_id: int | None = None,
     dictionary: Dictionary = DICTIONARY,
+    error_control: bool = True,
 ) -> DownlinkDecode:
     """Everything that a downlink file holds: a stream of CADUs or of bare packets, told apart by their
     content.
@@ -343,6 +344,8 @@ def decode(
         Of the link; found out by trial when not given.
     spacecraft_id
         Frames of other spacecraft are not used; the commonest id by default.
+    error_control
+        False: packets do not end with a checksum; they are told by their headers and sequence counts.
 
     Raises
     ------
@@ -351,35 +354,39 @@ def decode(
     """
     stream = as_octets(octets)
     if settings is None:
-        settings = settings_of(stream, dictionary)
+        settings = settings_of(stream, dictionary, error_control=error_control)
     if settings is None:
-        return _bare_packets(stream, dictionary)
+        return _bare_packets(stream, dictionary, error_control)
     synchronised = cadu.synchronise(stream, settings.cadu_length, verify=proof_of(stream, settings))
-    return _frames_to_packets(stream, synchronised, settings, spacecraft_id, dictionary)
+    return _frames_to_packets(stream, synchronised, settings, spacecraft_id, dictionary, error_control)
 
 
-def propose_settings(octets: Octets, dictionary: Dictionary = DICTIONARY) -> LinkProposal:
+def propose_settings(
+    octets: Octets, dictionary: Dictionary = DICTIONARY, *, error_control: bool = True
+) -> LinkProposal:
     """Return the link settings that the whole stream supports, with the evidence."""
     stream = as_octets(octets)
 
     def count_packets(sync: cadu.CaduSync, settings: LinkSettings) -> tuple[int, float]:
-        found = _frames_to_packets(stream, sync, settings, None, dictionary)
+        found = _frames_to_packets(stream, sync, settings, None, dictionary, error_control)
         filled = found.octets["packets"] + found.octets["idle_packets"] + found.octets["idle_frames"]
         return found.packets, filled / max(len(sync.start_bits) * settings.frame_length, 1)
 
     return propose_link(stream, count_packets)
 
 
-def settings_of(octets: Octets, dictionary: Dictionary = DICTIONARY) -> LinkSettings | None:
+def settings_of(
+    octets: Octets, dictionary: Dictionary = DICTIONARY, *, error_control: bool = True
+) -> LinkSettings | None:
     """Return the link settings of a stream of CADUs; None for bare packets.
-
     Raises
     ------
     LinkFormatError
         The stream contains markers, but no frame is valid under any known link setting.
     """
-    proposal = propose_settings(octets, dictionary)
-    if proposal.settings is None and proposal.has_regular_markers and not _holds_packets(octets):
+    proposal = propose_settings(octets, dictionary, error_control=error_control)
+    no_frames = proposal.settings is None and proposal.has_regular_markers
+    if no_frames and not _holds_packets(octets, error_control):
         distance = next(iter(proposal.distances), 0)
         raise LinkFormatError(
             f"downlink: found {proposal.markers} markers in the stream, mostly {distance} octets apart, but no "
@@ -389,14 +396,14 @@ def settings_of(octets: Octets, dictionary: Dictionary = DICTIONARY) -> LinkSett
     return proposal.settings
 
 
-def _holds_packets(octets: Octets) -> bool:
+def _holds_packets(octets: Octets, error_control: bool) -> bool:
     """Return whether bare packets fill most of a stream."""
-    cut = cut_packets(octets)
+    cut = cut_packets(octets, error_control=error_control)
     return 2 * int(cut.lengths[cut.crc_ok].sum()) > as_octets(octets).size
 
 
-def _bare_packets(stream: OctetArray, dictionary: Dictionary) -> DownlinkDecode:
-    cut = cut_packets(stream)
+def _bare_packets(stream: OctetArray, dictionary: Dictionary, error_control: bool) -> DownlinkDecode:
+    cut = cut_packets(stream, error_control=error_control)
     headers = primary_headers(stream, cut)
     octets = _octet_account(stream.size, cut)
     return DownlinkDecode(
@@ -421,6 +428,7 @@ def _frames_to_packets(
     settings: LinkSettings,
     spacecraft_id: int | None,
     dictionary: Dictionary,
+    error_control: bool,
 ) -> DownlinkDecode:
     frames, corrected = _read_frames(stream, sync, settings)
     header = frame_headers(frames)
@@ -458,7 +466,10 @@ def _frames_to_packets(
     for channel, start, stop in np.unique(layout[good & (zone_start < zone_stop)], axis=0).tolist():
         mine = np.flatnonzero(good & (layout == (channel, start, stop)).all(axis=1))
         rebuilt = _rebuild(
-            frames[mine, start:stop], header.channel_count[mine], header.first_header_pointer[mine]
+            frames[mine, start:stop],
+            header.channel_count[mine],
+            header.first_header_pointer[mine],
+            error_control,
         )
         used = mine[header.first_header_pointer[mine] != ONLY_IDLE_DATA]
         buffer_offset[used] = filled + (stop - start) * np.arange(used.size)
@@ -472,7 +483,7 @@ def _frames_to_packets(
         frames_lost += rebuilt.frames_lost
     buffer = np.concatenate(parts) if parts else np.empty(0, dtype=np.uint8)
     ranges = np.concatenate(segments) if segments else np.empty((0, 2), dtype=np.int64)
-    cut = cut_packets(buffer, segments=ranges)
+    cut = cut_packets(buffer, segments=ranges, error_control=error_control)
     headers = primary_headers(buffer, cut)
     n_good = int(np.count_nonzero(good))
     octets = _octet_account(int((ranges[:, 1] - ranges[:, 0]).sum()), cut)
@@ -564,7 +575,7 @@ class _Rebuilt:
     frames_lost: int
 
 
-def _rebuild(zones: OctetArray, count: IntArray, pointer: IntArray) -> _Rebuilt:
+def _rebuild(zones: OctetArray, count: IntArray, pointer: IntArray, error_control: bool) -> _Rebuilt:
     """Return the packet octets of one virtual channel and their contiguous segments.
 
     A segment starts with the first packet that begins in it; earlier octets belong to a packet whose start was lost. A
@@ -581,7 +592,7 @@ def _rebuild(zones: OctetArray, count: IntArray, pointer: IntArray) -> _Rebuilt:
     buffer = np.ascontiguousarray(zones).reshape(-1)
     segments = _segments(pointer, run, zone)
     octets = buffer.size
-    if not in_order and segments.size:
+    if not in_order and segments.size and error_control:  # else nothing proves that parts belong together
         run = _split_where_damaged(buffer, segments, run, zone)
         segments = _segments(pointer, run, zone)
         completed, joined = _complete(zones, count, pointer, run, buffer, segments)

@@ -4,6 +4,9 @@ A stream of packets has no marks between them: one wrong length field and everyt
 unless the cutter finds its way back. `cut_packets` accepts a packet when its checksum holds, keeps a
 damaged one (right length, wrong checksum) as such, and skips what is neither until a right packet stands
 again. No whole packet is lost to damage before it.
+
+Packets without error control are accepted by their headers alone: each must lead to the next, and sequence
+counts must continue. Damage inside such a packet cannot be detected.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import numpy.typing as npt
 
 from tmtc.arrays import IntArray
 from tmtc.crc import crc16
+from tmtc.errors import ValueRefused
 from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, TYPE_TELEMETRY
 from tmtc.schema import as_octets
 
@@ -87,6 +91,7 @@ def cut_packets(
     longest: int = PACKET_MAX_LENGTH,
     segments: IntArray | None = None,
     final: bool = True,
+    error_control: bool = True,
 ) -> PacketCut:
     """Where packets stand in `buffer`.
 
@@ -100,13 +105,22 @@ def cut_packets(
         Ranges that are cut each for itself, for example between lost frames; the whole buffer by default.
     final
         False when more octets may follow: `consumed` then tells from where to go on.
+    error_control
+        False: packets do not end with a checksum, as in most captures of other missions. `crc_ok` then says that the
+        headers before and after fit. Supported for whole streams (`final`) only.
     """
+    if not error_control and not final:
+        raise ValueRefused("packet stream", "final", final, "true for packets without error control")
     octets = as_octets(buffer).view()
     octets.flags.writeable = False  # one compiled variant for bytes and arrays alike
     if segments is None:
         segments = np.array([[0, octets.size]], dtype=np.int64)
     consumed = 0
-    cutter = _Cutter(octets, packet_type, longest)
+    cutter: _Cutter | _UncheckedCutter = (
+        _Cutter(octets, packet_type, longest)
+        if error_control
+        else _UncheckedCutter(octets, packet_type, longest)
+    )
     for start, stop in segments.tolist():
         consumed = cutter.cut(start, stop, final)
     rows = cutter.rows[: cutter.count]
@@ -233,6 +247,70 @@ class _Cutter:
         """Whether a whole packet with a right checksum, or the header of an idle packet, stands at `p`."""
         length = self.length_at(p, stop)
         return bool(length) and (self.is_idle(p) or crc16(self.octets[p : p + length].data) == 0)
+
+
+class _UncheckedCutter:
+    """One pass over packets without error control: walk over headers, search where they end."""
+
+    def __init__(self, octets: npt.NDArray[np.uint8], packet_type: int, longest: int) -> None:
+        from tmtc import _cutting
+
+        self.kernels: Any = _cutting
+        self.octets = octets
+        self.packet_type = packet_type
+        self.longest = longest
+        self.rows = np.empty((octets.size // 128 + 64, 3), dtype=np.int64)
+        self.count = 0
+        self.last = np.full(1 << 11, -1, dtype=np.int64)
+
+    def cut(self, start: int, stop: int, final: bool) -> int:
+        """Cut [start, stop), where a packet is expected at `start`."""
+        kernels, key = self.kernels, (stop, self.packet_type, self.longest)
+        p = start
+        if p < stop and not kernels.proves(self.octets, p, *key, self.last, True):
+            p = self.skip(p, *key)
+        while p < stop:
+            before = self.count
+            p, self.count = kernels.walk_unchecked(self.octets, p, *key, self.last, self.rows, self.count)
+            if self.count == self.rows.shape[0]:
+                self.grow()
+            elif p < stop and (self.count == before or self.is_begun(p, *key)):
+                p = self.skip(p, *key)  # a packet whose end is missing; those before it fit
+            elif p < stop:
+                # the length of the last packet leads to no header: it is wrong, or what follows is no packet
+                begin = int(self.rows[self.count - 1, 1])
+                q = int(kernels.search_unchecked(self.octets, begin + 1, *key, self.last))
+                if q < p:
+                    self.count -= 1
+                    p = begin
+                else:  # nothing follows that would confirm the packet: octets of it may be missing
+                    self.rows[self.count - 1, 0] = _BAD
+                self.note(p, q)
+                p = q
+        return p
+
+    def is_begun(self, p: int, stop: int, packet_type: int, longest: int) -> bool:
+        """Return whether a packet can begin at `p` and end behind `stop`."""
+        if stop - p <= PRIMARY_HEADER_LENGTH:
+            return bool(self.octets[p] >> 4 == packet_type)
+        return bool(self.kernels.header_at(self.octets, p, stop, packet_type, longest))
+
+    def skip(self, p: int, stop: int, packet_type: int, longest: int) -> int:
+        """Skip from `p` to the next position at which packets begin; return it."""
+        q = int(self.kernels.search_unchecked(self.octets, p + 1, stop, packet_type, longest, self.last))
+        self.note(p, q)
+        return q
+
+    def note(self, p: int, q: int) -> None:
+        """Write a row of skipped octets."""
+        if self.count == self.rows.shape[0]:
+            self.grow()
+        self.rows[self.count] = _SKIPPED, p, q
+        self.count += 1
+
+    def grow(self) -> None:
+        """Make room for more rows."""
+        self.rows = np.concatenate((self.rows, np.empty_like(self.rows)))
 
 
 @dataclass(slots=True)

@@ -68,6 +68,9 @@ text that is none or a number that its calibrator does not cover; a wrong checks
 _CHUNK = 1 << 16
 """Packets decoded together: few enough that what is between stays in the processor's cache."""
 
+_SHORT_TEXT = 64
+"""Octets of texts that are decoded together."""
+
 _START = "\0start"
 """Name under which the beginnings of the packets are kept; no parameter is called so."""
 
@@ -147,11 +150,16 @@ class Decoder:
     def decode(self, buffer: Octets, cut: PacketCut) -> XtceDecode:
         """Tables of all packets, and a verdict for each."""
         verdict = np.where(cut.crc_ok, DECODED, DAMAGED).astype(np.int8)
-        run = _Run(as_octets(buffer), cut.offsets, cut.lengths, verdict)
+        octets = as_octets(buffer)
         packets = np.flatnonzero(cut.crc_ok)
         pieces: dict[str, list[XtceTable]] = {}
         for first in range(0, len(packets), _CHUNK):
             chunk = packets[first : first + _CHUNK]
+            base = int(cut.offsets[chunk].min())
+            end = int((cut.offsets[chunk] + cut.lengths[chunk]).max())
+            data = octets[base:end].tobytes() + bytes(_SHORT_TEXT)
+            padded = np.frombuffer(data, dtype=np.uint8)
+            run = _Run(octets, cut.offsets, cut.lengths, verdict, data, padded, base)
             for table in self._tables(run, _Rows(chunk, cut.offsets[chunk] * 8)):
                 pieces.setdefault(table.name, []).append(table)
         return XtceDecode({name: _joined(found) for name, found in sorted(pieces.items())}, verdict)
@@ -343,12 +351,18 @@ class _Rows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Run:
-    """A buffer that is being decoded."""
+    """A buffer that is being decoded; `data` are the octets of this chunk of packets, from `base` on.
+
+    `padded` are the same octets with `_SHORT_TEXT` zeros behind them.
+    """
 
     octets: OctetArray
     offsets: IntArray
     lengths: IntArray
     verdict: npt.NDArray[np.int8]
+    data: bytes
+    padded: OctetArray
+    base: int
 
     def end(self, rows: _Rows) -> IntArray:
         """Bits into the buffer at which the packets end."""
@@ -701,15 +715,89 @@ def _read_octets(
     good = sized & enough
     index = np.flatnonzero(good)
     at, bits = rows.at[index], bits[index]
-    raw = _objects(_pieces(run.octets, at, bits, left=text is not None))
-    values, behind = raw, at + bits
-    if text is not None:
-        values, readable = _texts(raw, text)
-        if not readable.all():
-            run.verdict[rows.packet[index[~readable]]] = MALFORMED
-            good[index[~readable]] = False
-            raw, values, behind = raw[readable], values[readable], behind[readable]
-    return ValueColumn(raw, values), behind, None if good.all() else good
+    aligned = not ((at | bits) & 7).any()
+    if aligned:
+        column = _slices(run, at >> 3, bits >> 3)
+    else:
+        column = _objects(_pieces(run.octets, at, bits, left=text is not None))
+    behind = at + bits
+    if text is None:
+        return ValueColumn(column, column), behind, None if good.all() else good
+    plain = _aligned_texts(run, at, bits, text) if aligned else None
+    if plain is not None:
+        return ValueColumn(column, plain), behind, None if good.all() else good
+    texts = _texts(column.tolist(), text)
+    readable = np.array([one is not None for one in texts], dtype=np.bool_)
+    run.verdict[rows.packet[index[~readable]]] = MALFORMED
+    good[index[~readable]] = False
+    found = ValueColumn(column[readable], _objects(texts)[readable])
+    return found, behind[readable], None if good.all() else good
+
+
+def _slices(run: _Run, starts: IntArray, sizes: IntArray) -> Array:
+    """So many octets (n,) of the buffer from `starts` (n,) on, as objects."""
+    if len(sizes) and 0 < sizes[0] <= 4096 and (sizes == sizes[0]).all():
+        found: Array = gather(run.octets, starts, np.dtype((np.void, int(sizes[0])))).astype(object)
+        return found
+    data = run.data
+    first = starts - run.base
+    last = first + sizes
+    return _objects([data[a:b] for a, b in zip(first.tolist(), last.tolist(), strict=True)])
+
+
+def _aligned_texts(run: _Run, at: IntArray, bits: IntArray, encoding: StringEncoding) -> Array | None:
+    """Texts (n,) in buffers of whole octets; None where one of them is no text or the layout is not a plain one."""
+    starts, sizes = at >> 3, bits >> 3
+    if encoding.tag_bits:
+        if encoding.tag_bits & 7 or (bits < encoding.tag_bits).any():
+            return None
+        tag = IntegerEncoding(encoding.tag_bits)
+        (lengths,) = _raw_fields(run, at, [(tag, 0)], encoding.tag_bits)
+        if (lengths & 7).any() or (lengths + encoding.tag_bits > bits).any():
+            return None
+        starts, sizes = at + encoding.tag_bits >> 3, lengths >> 3
+    elif encoding.terminator:
+        size = int(sizes[0]) if len(sizes) else 0
+        if len(encoding.terminator) > 1 or size == 0 or (sizes != size).any():
+            return None
+        buffers = gather(run.octets, starts, np.dtype((np.void, size))).view(np.uint8).reshape(-1, size)
+        ends = buffers == encoding.terminator[0]
+        if not ends.any(axis=1).all():
+            return None
+        sizes = ends.argmax(axis=1)
+    return _decoded_texts(run, starts, sizes, encoding.charset)
+
+
+def _decoded_texts(run: _Run, starts: IntArray, sizes: IntArray, charset: str) -> Array | None:
+    """Texts (n,) of so many octets each; None where one of them is no text.
+
+    Short ones are widened to four octets a character and made strings by numpy, which takes zeros at the end for none.
+    """
+    width = {"ascii": 1, "latin-1": 1, "utf-8": 1, "utf-16-be": 2, "utf-16-le": 2}.get(charset, 0)
+    longest = -(-int(sizes.max(initial=0)) // max(width, 1)) * max(width, 1)
+    slow = np.ones(len(sizes), dtype=np.bool_)
+    texts = np.empty(len(sizes), dtype=object)
+    if width and 0 < longest <= _SHORT_TEXT:
+        octets = gather(run.padded, starts - run.base, np.dtype((np.void, longest)))
+        units = octets.view(">u2" if charset == "utf-16-be" else f"<u{width}").reshape(-1, longest // width)
+        counts = sizes // width
+        units[np.arange(longest // width) >= counts[:, None]] = 0
+        slow = (counts > 0) & (units[np.arange(len(counts)), np.maximum(counts, 1) - 1] == 0)
+        slow |= sizes % width != 0
+        if charset in ("ascii", "utf-8"):
+            slow |= (units > 0x7F).any(axis=1)
+        elif width == 2:  # surrogates
+            slow |= (units >> 11 == 0x1B).any(axis=1)
+        texts = units.astype("=u4").view(f"=U{longest // width}")[:, 0].astype(object)
+    rows = np.flatnonzero(slow)
+    if len(rows):
+        try:
+            texts[rows] = _objects(
+                [piece.decode(charset) for piece in _slices(run, starts[rows], sizes[rows])]
+            )
+        except UnicodeDecodeError:
+            return None
+    return texts
 
 
 def _pieces(octets: OctetArray, at: IntArray, bits: IntArray, *, left: bool) -> list[bytes]:
@@ -719,9 +807,6 @@ def _pieces(octets: OctetArray, at: IntArray, bits: IntArray, *, left: bool) -> 
     pieces = []
     for first, count in zip(at.tolist(), bits.tolist(), strict=True):
         last = first + count
-        if not (first & 7 or count & 7):
-            pieces.append(view[first >> 3 : last >> 3].tobytes())
-            continue
         number = int.from_bytes(view[first >> 3 : (last + 7) >> 3], "big") >> (-last & 7)
         number &= (1 << count) - 1
         size = (count + 7) >> 3
@@ -735,15 +820,15 @@ def _objects(values: Sequence[Any]) -> Array:
     return array
 
 
-def _texts(buffers: Array, encoding: StringEncoding) -> tuple[Array, BoolArray]:
-    """Texts (n,) in buffers, and which are texts."""
-    texts: list[Any] = []
-    for octets in buffers.tolist():
+def _texts(buffers: list[bytes], encoding: StringEncoding) -> list[str | None]:
+    """Texts in buffers, None where a buffer holds none."""
+    texts: list[str | None] = []
+    for octets in buffers:
         try:
             texts.append(_text(octets, encoding))
-        except (UnicodeDecodeError, ValueError):
+        except ValueError:  # that of decoding included
             texts.append(None)
-    return _objects(texts), np.array([text is not None for text in texts], dtype=np.bool_)
+    return texts
 
 
 def _text(octets: bytes, encoding: StringEncoding) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,8 @@ from linna.output import add_json_flag, emit
 
 if TYPE_CHECKING:
     from tmtc.downlink import DownlinkDecode
+    from tmtc.schema import Dictionary
+    from tmtc.xtce_decode import XtceDecode
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -22,6 +25,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     decode.add_argument("file", type=Path, metavar="FILE")
     decode.add_argument("--format", choices=("json", "csv", "parquet"), default="json")
     decode.add_argument("--out", type=Path, metavar="F", help="write there (default: standard output)")
+    _add_definition_options(decode)
+    decode.add_argument(
+        "--raw", action="store_true", help="values as transmitted, neither calibrated nor named (with --xtce)"
+    )
     decode.add_argument(
         "--packet", metavar="NAME", action="append", help="only packets of this name (repeatable)"
     )
@@ -34,6 +41,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     check.add_argument(
         "--strict", action="store_true", help="exit 1 when anything is damaged, missing or skipped"
     )
+    _add_definition_options(check)
     _add_link_options(check)
     add_json_flag(check)
     check.set_defaults(handler=run_check)
@@ -53,6 +61,9 @@ def run_decode(arguments: argparse.Namespace) -> int:
     from tmtc.dictionary import DICTIONARY
     from tmtc.export import format_records, packet_records
 
+    if arguments.xtce:
+        return _decode_foreign(arguments)
+    _refuse_without_definition(arguments)
     for name in arguments.packet or ():
         DICTIONARY.packet(name)
     decoded = _read(arguments)
@@ -64,19 +75,75 @@ def run_decode(arguments: argparse.Namespace) -> int:
         emit(arguments, {**decoded.accounting(), "telemetry": records})
         return 0
     octets = format_records(records, arguments.format)
+    return _write(arguments, octets, len(records), decoded.accounting(), _describe(decoded))
+
+
+def _decode_foreign(arguments: argparse.Namespace) -> int:
+    """Decode packets of another mission through its XTCE."""
+    from linna.errors import UsageError
+    from tmtc.xtce_records import format_xtce_records, xtce_records
+
+    decoded, found, known = _read_foreign(arguments)
+    wanted = set(arguments.packet or ())
+    if wanted - known:
+        listed = ", ".join(sorted(known)[:12])
+        raise UsageError(f"--packet: expected a container ({listed}), found {min(wanted - known)!r}")
+    if wanted:
+        found = replace(found, tables={name: t for name, t in found.tables.items() if name in wanted})
+    records = xtce_records(found, raw=arguments.raw)
+    figures = {**decoded.accounting(), "verdicts": found.counts()}
+    if arguments.json and arguments.out is None:
+        emit(arguments, {**figures, "telemetry": records})
+        return 0
+    octets = format_xtce_records(records, arguments.format)
+    text = f"{_describe(decoded)}\n{_describe_verdicts(found)}"
+    return _write(arguments, octets, len(records), figures, text)
+
+
+def _write(
+    arguments: argparse.Namespace, octets: bytes, count: int, figures: dict[str, object], text: str
+) -> int:
     if arguments.out is None:
         sys.stdout.buffer.write(octets)
         return 0
     _save(arguments.out, octets)
-    figures = {**decoded.accounting(), "written": len(records), "out": str(arguments.out)}
-    emit(arguments, figures, text=f"{len(records)} packets written to {arguments.out}\n{_describe(decoded)}")
+    figures = {**figures, "written": count, "out": str(arguments.out)}
+    emit(arguments, figures, text=f"{count} packets written to {arguments.out}\n{text}")
     return 0
 
 
 def run_check(arguments: argparse.Namespace) -> int:
-    decoded = _read(arguments)
-    emit(arguments, decoded.accounting(), text=_describe(decoded))
+    if arguments.xtce:
+        decoded, found, _ = _read_foreign(arguments)
+        figures = {**decoded.accounting(), "verdicts": found.counts()}
+        emit(arguments, figures, text=f"{_describe(decoded)}\n{_describe_verdicts(found)}")
+    else:
+        _refuse_without_definition(arguments)
+        decoded = _read(arguments)
+        emit(arguments, decoded.accounting(), text=_describe(decoded))
     return 1 if arguments.strict and not decoded.complete else 0
+
+
+def _read_foreign(arguments: argparse.Namespace) -> tuple[DownlinkDecode, XtceDecode, set[str]]:
+    """The downlink, its packets through the definition, and the names of the containers."""
+    from tmtc.schema import Dictionary
+    from tmtc.xtce_decode import DECODED, Decoder
+    from tmtc.xtce_import import parse_xtce
+
+    definition = parse_xtce({str(path): path.read_bytes() for path in arguments.xtce})
+    decoder = Decoder(definition, arguments.container)
+    decoded = _read(arguments, Dictionary(version=0, telemetry=()))
+    found = decoder.decode(decoded.buffer, decoded.cut)
+    unknown = int((decoded.cut.crc_ok & (found.verdict != DECODED)).sum())
+    return replace(decoded, unknown=unknown), found, set(definition.containers)
+
+
+def _refuse_without_definition(arguments: argparse.Namespace) -> None:
+    from linna.errors import UsageError
+
+    if arguments.container is not None or getattr(arguments, "raw", False):
+        option = "--raw" if arguments.container is None else "--container"
+        raise UsageError(f"{option}: expected --xtce DEFINITION with it, found none")
 
 
 def run_icd(arguments: argparse.Namespace) -> int:
@@ -104,6 +171,23 @@ def _document(arguments: argparse.Namespace, text: str) -> int:
     return 0
 
 
+def _add_definition_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("packets of other missions")
+    group.add_argument(
+        "--xtce",
+        type=Path,
+        metavar="DEFINITION",
+        action="append",
+        help="decode through this XTCE file in place of the payload's dictionary (repeatable)",
+    )
+    group.add_argument(
+        "--container", metavar="NAME", help="container that packets begin with, where there are several"
+    )
+    group.add_argument(
+        "--no-error-control", action="store_true", help="packets do not end with a checksum (CRC-16)"
+    )
+
+
 def _add_link_options(parser: argparse.ArgumentParser) -> None:
     link = parser.add_argument_group("link", "settings of the link; found out from the file where not given")
     link.add_argument("--frame-length", type=int, metavar="N", help="octets of a transfer frame")
@@ -114,8 +198,9 @@ def _add_link_options(parser: argparse.ArgumentParser) -> None:
     link.add_argument("--spacecraft-id", type=lambda text: int(text, 0), metavar="ID")
 
 
-def _read(arguments: argparse.Namespace) -> DownlinkDecode:
+def _read(arguments: argparse.Namespace, dictionary: Dictionary | None = None) -> DownlinkDecode:
     from linna.errors import UsageError
+    from tmtc.dictionary import DICTIONARY
     from tmtc.downlink import LinkSettings, decode
 
     octets = arguments.file.read_bytes()
@@ -129,7 +214,13 @@ def _read(arguments: argparse.Namespace) -> DownlinkDecode:
     if arguments.no_frame_checksum:
         chosen["checksum"] = False
     settings = LinkSettings(**chosen) if chosen else None
-    decoded = decode(octets, settings=settings, spacecraft_id=arguments.spacecraft_id)
+    decoded = decode(
+        octets,
+        settings=settings,
+        spacecraft_id=arguments.spacecraft_id,
+        dictionary=DICTIONARY if dictionary is None else dictionary,
+        error_control=not arguments.no_error_control,
+    )
     if not decoded.packets and not decoded.frame_count:
         raise UsageError(
             f"{arguments.file}: expected CADUs or space packets, found none in its {len(octets)} octets"
@@ -145,6 +236,11 @@ def _save(path: Path, octets: bytes) -> None:
         unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def _describe_verdicts(found: XtceDecode) -> str:
+    counts = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in found.counts().items() if count)
+    return "definition: " + (counts or "no packets")
 
 
 def _describe(decoded: DownlinkDecode) -> str:

@@ -144,3 +144,130 @@ def test_the_icd_and_the_xtce_are_written(tmp_path, capsys):
     assert run(["tm", "xtce", "--out", str(out), "--json"]) == 0
     assert figures(capsys)["dictionary_hash"] == DICTIONARY.hash
     assert out.read_text().startswith("<?xml")
+
+
+# packets of other missions
+
+
+@pytest.fixture
+def foreign(tmp_path):
+    """A capture of another mission without error control, its definition and its packets."""
+    from tests.tmtc import foreign
+
+    definition, capture = tmp_path / "bus.xml", tmp_path / "bus.bin"
+    definition.write_text(foreign.BUS, encoding="utf-8")
+    packets = foreign.capture(120, 11)
+    capture.write_bytes(b"".join(packets))
+    return definition, capture, packets
+
+
+def test_packets_without_error_control_are_checked_only_when_told(foreign, capsys):
+    definition, capture, packets = foreign
+    assert run(["tm", "check", str(capture)]) == 2
+    assert "found none" in capsys.readouterr().err
+    assert run(["tm", "check", str(capture), "--no-error-control", "--json"]) == 0
+    told = figures(capsys)
+    assert told["packets"] == told["unknown"] == len(packets) and told["gaps"] == 0
+    strict = ["tm", "check", str(capture), "--no-error-control", "--xtce", str(definition), "--strict"]
+    assert run(strict) == 0
+    assert "definition: decoded 120" in capsys.readouterr().out
+    capture.write_bytes(b"".join([*packets, packets[-1][:-1]]))
+    assert run(strict) == 1
+
+
+def test_packets_of_another_mission_are_decoded_through_their_definition(foreign, tmp_path, capsys):
+    import space_packet_parser
+
+    definition, capture, packets = foreign
+    theirs = space_packet_parser.load_xtce(definition)
+    expected = [theirs.parse_bytes(p) for p in packets]
+    options = ["--xtce", str(definition), "--no-error-control"]
+    assert run(["tm", "decode", str(capture), *options]) == 0
+    records = json.loads(capsys.readouterr().out)
+    for record, packet in zip(records, expected, strict=True):
+        assert list(record)[1:] == list(packet)
+        for name, value in packet.items():
+            assert record[name] == (value.hex() if isinstance(value, bytes) else value)
+    assert run(["tm", "decode", str(capture), *options, "--raw", "--packet", "Housekeeping"]) == 0
+    raw = json.loads(capsys.readouterr().out)
+    chosen = [p for p in expected if "MODE" in p]
+    assert [r["MODE"] for r in raw] == [p["MODE"].raw_value for p in chosen]
+    assert [r["SERIAL"] for r in raw] == [p["SERIAL"] for p in chosen] and max(
+        r["SERIAL"] for r in raw
+    ) >= 2**63
+    out = tmp_path / "bus.csv"
+    assert run(["tm", "decode", str(capture), *options, "--format", "csv", "--out", str(out), "--json"]) == 0
+    told = figures(capsys)
+    assert told["written"] == 120 and told["verdicts"]["decoded"] == 120
+    rows = list(csv.DictReader(out.read_text().splitlines()))
+    assert [r["packet"] for r in rows] == [r["packet"] for r in records]
+    serials = [str(p["SERIAL"]) if "SERIAL" in p else "" for p in expected]
+    assert [r["SERIAL"] for r in rows] == serials
+    out = tmp_path / "bus.parquet"
+    assert run(["tm", "decode", str(capture), *options, "--format", "parquet", "--out", str(out)]) == 0
+    assert out.read_bytes()[:4] == b"PAR1"
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "words"),
+    [
+        (('sizeInBits="64"', 'sizeInBits="640"'), [], "sizeInBits of 1 to 64, found 640"),
+        (("</SpaceSystem>", ""), [], "well-formed XML"),
+        (("", ""), ["--container", "Absent"], "expected the name of a container"),
+        (("", ""), ["--packet", "Absent"], "expected a container"),
+    ],
+)
+def test_a_definition_that_cannot_be_used_is_refused_in_one_line(
+    foreign, tmp_path, change, options, words, capsys
+):
+    definition, capture, _ = foreign
+    definition.write_text(definition.read_text().replace(*change) if change[0] else definition.read_text())
+    out = tmp_path / "out.json"
+    command = [
+        "tm",
+        "decode",
+        str(capture),
+        "--xtce",
+        str(definition),
+        "--no-error-control",
+        "--out",
+        str(out),
+    ]
+    assert run([*command, *options]) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1 and not out.exists()
+
+
+def test_options_of_a_definition_need_one(downlink, capsys):
+    assert run(["tm", "decode", str(downlink), "--raw"]) == 2
+    assert "--raw: expected --xtce" in capsys.readouterr().err
+    assert run(["tm", "check", str(downlink), "--container", "x"]) == 2
+    assert "--container: expected --xtce" in capsys.readouterr().err
+
+
+def test_arrays_and_aggregates_are_lists_and_mappings_and_columns_of_a_table(tmp_path, capsys):
+    from tests.tmtc.foreign import container, document, integer
+    from tests.tmtc.test_xtce_decode import ARRAY_ENTRY, aggregate, array_type, dimension
+
+    types = (
+        integer("u8", 8)
+        + aggregate("pair", {"a": "u8", "b": "u8"})
+        + array_type("list", "u8", dimension("n"))
+    )
+    parameters = {"head": "head", "n": "u8", "pair": "pair", "packet": "u8", "list": "list"}
+    types += integer("head", 48)
+    definition, capture = tmp_path / "d.xml", tmp_path / "c.bin"
+    entries = ["head", "n", "pair", "packet", ARRAY_ENTRY("list")]
+    definition.write_text(document(types, parameters, container("P", entries)))
+    capture.write_bytes(
+        bytes((0, 5, 0xC0, 0, 0, 5, 2, 3, 4, 5, 6, 7)) + bytes((0, 5, 0xC0, 1, 0, 3, 0, 8, 9, 10))
+    )
+    options = ["tm", "decode", str(capture), "--xtce", str(definition), "--no-error-control"]
+    assert run(options) == 0
+    first, second = json.loads(capsys.readouterr().out)
+    assert first["pair"] == {"a": 3, "b": 4} and first["list"] == [6, 7] and first["packet_"] == 5
+    assert first["packet"] == "P" and second["list"] == []
+    assert run([*options, "--format", "csv"]) == 0
+    rows = list(csv.reader(capsys.readouterr().out.splitlines()))
+    assert rows[0] == ["packet", "head", "n", "pair.a", "pair.b", "packet_", "list"]
+    assert rows[1][2:] == ["2", "3", "4", "5", "[6, 7]"] and rows[2][2:] == ["0", "8", "9", "10", "[]"]

@@ -324,7 +324,13 @@ def bare(rng: np.random.Generator, count: int) -> bytes:
 
 
 def capture(packets: int, seed: int) -> list[bytes]:
-    """Packets of all kinds, mixed."""
+    """Packets of all kinds, mixed; every APID counts for itself."""
     rng = np.random.default_rng(seed)
     makers = (housekeeping, event, dump, bare)
-    return [makers[int(rng.integers(4))](rng, k) for k in range(packets)]
+    counts: dict[bytes, int] = {}
+    made = []
+    for _ in range(packets):
+        packet = makers[int(rng.integers(4))](rng, 0)
+        count = counts[packet[:2]] = counts.get(packet[:2], -1) + 1
+        made.append(packet[:2] + struct.pack(">H", 0xC000 | count & 0x3FFF) + packet[4:])
+    return made

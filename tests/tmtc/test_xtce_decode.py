@@ -606,6 +606,17 @@ def test_sizes_that_are_none_condemn_the_packet_alone(slope, verdict):
     assert found[0] == verdict and found[1] != "decoded"
 
 
+def test_an_element_that_its_calibrator_does_not_cover_condemns_its_packet_alone():
+    element = calibrated("E", 8, "unsigned", default(foreign.spline([(0, 0), (100, 50)], 1, False)))
+    types = integer("N", 8) + element + array_type("A", "E", dimension("n"))
+    text = document(types, {"n": "N", "a": "A", "z": "N"}, container("P", ["n", "a", "z"]))
+    packets = [bytes((2, 10, 20, 1)), bytes((3, 30, 101, 40, 2)), bytes((1, 100, 3)), bytes((0, 4))]
+    found = decoded(text, packets)
+    assert [VERDICTS[v] for v in found.verdict.tolist()] == ["decoded", "malformed", "decoded", "decoded"]
+    columns = found.tables["P"].columns
+    assert columns["a"].to_list() == [[5.0, 10.0], [50.0], []] and columns["z"].to_list() == [1, 3, 4]
+
+
 def test_every_truncation_of_every_packet_is_a_verdict():
     definition = parse_xtce(foreign.BUS)
     for packet in foreign.capture(12, 9):

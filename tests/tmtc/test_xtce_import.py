@@ -378,6 +378,21 @@ def test_comparisons_mean_what_they_say(operator, expected, types):
     assert values == expected
 
 
+@pytest.mark.parametrize(("operator", "expected"), [("==", [1]), ("!=", [0, 2])])
+def test_names_of_codes_are_compared(operator, expected):
+    text = document(MODES, {"a": "m"}, PLAIN + container("Q", [], "P", comparison("a", "ON", operator)))
+    found = decode_packets(parse_xtce(text), *whole([b"\0", b"\1", b"\2"]))
+    assert found.tables["Q"].packet_index.tolist() == expected
+
+
+@pytest.mark.parametrize("spelling", ["IEEE-754", "IEEE754", "IEEE754_1985"])
+def test_floats_are_known_by_their_older_names(spelling):
+    text = document(floating("f", 32, spelling), {"a": "f"}, PLAIN)
+    assert decode_packets(parse_xtce(text), *whole([b"\x3f\xc0\0\0"])).tables["P"].columns["a"].to_list() == [
+        1.5
+    ]
+
+
 def test_comparisons_hold_over_the_whole_of_64_bits():
     value = 2**64 - 2
     text = document(integer("t", 64), {"a": "t"}, PLAIN + container("Q", [], "P", comparison("a", value)))

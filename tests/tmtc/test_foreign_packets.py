@@ -1,0 +1,251 @@
+"""Packets without error control and with other secondary headers, compared with readers of other projects."""
+
+from __future__ import annotations
+
+import io
+import logging
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from spacepackets.ccsds import CdsShortTimestamp, PacketId, PacketType
+from spacepackets.ccsds.spacepacket import parse_space_packets
+
+from tests.tmtc.foreign import (
+    HEADER_CONTAINER,
+    HEADER_PARAMETERS,
+    HEADER_TYPES,
+    capture,
+    comparison,
+    container,
+    document,
+    floating,
+    integer,
+    space_packet,
+)
+from tmtc.downlink import DownlinkDecode, decode, encode_cadus
+from tmtc.errors import ValueRefused
+from tmtc.packets import idle_packet
+from tmtc.stream import PacketCut, cut_packets
+from tmtc.xtce_decode import decode_packets
+from tmtc.xtce_import import parse_xtce
+
+
+def ephemeris(count: int) -> bytes:
+    """An attitude and ephemeris packet as of a weather satellite: 71 octets, CDS time, no error control."""
+    rng = np.random.default_rng(count)
+    time = struct.pack(">HIH", 23109, count * 1000, 0)
+    body = bytes((159,)) + time + rng.normal(size=6).astype(">f4").tobytes() + time
+    return space_packet(11, time + body + rng.normal(size=4).astype(">f4").tobytes() + b"\x00" * 8, count)
+
+
+def cut(octets: bytes) -> PacketCut:
+    found = cut_packets(octets, error_control=False)
+    rows = [(s, s + n) for s, n in zip(found.offsets.tolist(), found.lengths.tolist(), strict=True)]
+    rows += [tuple(r) for r in found.skipped.tolist()] + [tuple(r) for r in found.idle.tolist()]
+    rows.sort()
+    assert [a for a, _ in rows] == [0, *(b for _, b in rows[:-1])] and rows[-1][1] == len(octets)
+    return found
+
+
+def packets_of(octets: bytes) -> list[bytes]:
+    return list(cut(octets).packets(octets))
+
+
+def test_a_capture_of_7200_packets_without_error_control_is_read_whole():
+    packets = [ephemeris(k) for k in range(7200)]
+    octets = b"".join(packets)
+    assert packets_of(octets) == packets
+    theirs = parse_space_packets(octets, [PacketId(PacketType.TM, True, 11)])
+    assert [bytes(p) for p in theirs.tm_list] == packets
+    decoded = decode(octets, error_control=False)
+    assert (decoded.packets, decoded.gaps, decoded.octets_skipped) == (7200, 0, 0)
+    assert decoded.by_apid == {11: 7200}
+
+
+def test_without_being_told_nothing_is_taken_for_a_packet():
+    octets = b"".join(ephemeris(k) for k in range(100))
+    assert decode(octets).packets == 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_packets_of_all_kinds_with_and_without_secondary_header_are_read(seed):
+    packets = capture(300, seed)
+    assert packets_of(b"".join(packets)) == packets
+
+
+def test_ccsdspy_reads_the_same_columns():
+    import ccsdspy
+
+    ccsdspy.log.setLevel(logging.ERROR)
+    packets = [ephemeris(k) for k in range(500)]
+    octets = b"".join(packets)
+    fields = [
+        *(
+            ccsdspy.PacketField(name=name, data_type="uint", bit_length=bits)
+            for name, bits in (("DAY", 16), ("MS", 32), ("US", 16), ("ID", 8), ("TIME", 64))
+        ),
+        *(ccsdspy.PacketField(name=f"P{k}", data_type="float", bit_length=32) for k in range(6)),
+        ccsdspy.PacketField(name="AGAIN", data_type="uint", bit_length=64),
+        *(ccsdspy.PacketField(name=f"Q{k}", data_type="float", bit_length=32) for k in range(4)),
+        ccsdspy.PacketField(name="REST", data_type="uint", bit_length=64),
+    ]  # fmt: skip
+    theirs = ccsdspy.FixedLength(fields).load(io.BytesIO(octets))
+    own = {
+        "DAY": "U16",
+        "MS": "U32",
+        "US": "U16",
+        "ID": "U8",
+        "TIME": "U64",
+        **{f"P{k}": "F" for k in range(6)},
+    }
+    own |= {"AGAIN": "U64", **{f"Q{k}": "F" for k in range(4)}, "REST": "U64"}
+    text = document(
+        HEADER_TYPES + integer("U64", 64) + floating("F", 32),
+        {**HEADER_PARAMETERS, **own},
+        HEADER_CONTAINER + container("ephemeris", list(own), "CCSDSPacket", comparison("PKT_APID", 11)),
+    )
+    ours = decode_packets(parse_xtce(text), octets, cut(octets)).tables["ephemeris"].columns
+    for name in own:
+        assert np.array_equal(ours[name].to_list(), theirs[name]), name
+
+
+# times of secondary headers
+
+
+@pytest.mark.parametrize("coarse", range(1, 8))
+@pytest.mark.parametrize("fine", [0, 1, 2, 3, 5])
+def test_cuc_times_of_every_width_are_read_through_a_definition(coarse, fine):
+    rng = np.random.default_rng(coarse * 10 + fine)
+    parameters = {"COARSE": "C", **({"FINE": "F"} if fine else {}), "N": "U8"}
+    types = HEADER_TYPES + integer("C", 8 * coarse) + (integer("F", 8 * fine) if fine else "")
+    text = document(
+        types,
+        {**HEADER_PARAMETERS, **parameters},
+        HEADER_CONTAINER + container("P", list(parameters), "CCSDSPacket"),
+    )
+    times = [(rng.bytes(coarse), rng.bytes(fine)) for _ in range(20)]
+    packets = [space_packet(5, c + f + b"\x2a", k) for k, (c, f) in enumerate(times)]
+    octets = b"".join(packets)
+    columns = decode_packets(parse_xtce(text), octets, cut(octets)).tables["P"].columns
+    assert columns["COARSE"].to_list() == [int.from_bytes(c, "big") for c, _ in times]
+    assert columns["N"].to_list() == [42] * 20
+    if fine:
+        assert columns["FINE"].to_list() == [int.from_bytes(f, "big") for _, f in times]
+
+
+def test_a_cds_header_made_by_spacepackets_is_read():
+    cds = CdsShortTimestamp(ccsds_days=25000, ms_of_day=86_399_999)
+    data = bytes(cds.pack())
+    text = document(
+        HEADER_TYPES,
+        {**HEADER_PARAMETERS, "P_FIELD": "U8", "DAY": "U16", "MS": "U32"},
+        HEADER_CONTAINER + container("P", ["P_FIELD", "DAY", "MS"], "CCSDSPacket"),
+    )
+    octets = b"".join(space_packet(5, data, k) for k in range(3))
+    columns = decode_packets(parse_xtce(text), octets, cut(octets)).tables["P"].columns
+    assert columns["DAY"].to_list() == [25000] * 3 and columns["MS"].to_list() == [86_399_999] * 3
+    assert columns["P_FIELD"].to_list() == [0x40] * 3
+
+
+# damage
+
+
+def test_octets_between_packets_cost_the_packet_before_which_nothing_confirms():
+    rng = np.random.default_rng(1)
+    packets = capture(200, 5)
+    parts = []
+    for k, packet in enumerate(packets):
+        parts.append(packet)
+        if k % 40 == 20:
+            parts.append(b"\xff" + rng.bytes(int(rng.integers(5, 90))))
+    octets = b"".join(parts)
+    assert packets_of(octets) == [p for k, p in enumerate(packets) if k % 40 != 20]
+    assert cut(octets).crc_errors == 5
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_hole_costs_the_packets_it_touches(seed):
+    rng = np.random.default_rng(seed)
+    packets = capture(300, seed)
+    octets = b"".join(packets)
+    ends = np.cumsum([len(p) for p in packets])
+    start = int(rng.integers(len(octets) // 4, len(octets) // 2))
+    stop = start + int(rng.integers(1, 3000))
+    first, last = np.searchsorted(ends, [start, stop], side="right")
+    whole_again = last if stop in (0, *ends) else last + 1
+    assert packets_of(octets[:start] + octets[stop:]) == packets[:first] + packets[whole_again:]
+
+
+def test_a_wrong_length_costs_its_packet():
+    packets = capture(100, 2)
+    broken = bytearray(packets[50])
+    broken[4:6] = struct.pack(">H", len(broken) + 100)
+    found = packets_of(b"".join([*packets[:50], bytes(broken), *packets[51:]]))
+    assert found == packets[:50] + packets[51:]
+
+
+def test_a_beginning_and_an_end_that_are_missing_cost_no_more_than_their_packets():
+    packets = capture(60, 3)
+    octets = b"".join(packets)
+    assert packets_of(octets[5:]) == packets[1:]
+    assert packets_of(octets[:-5]) == packets[:-1]
+    assert packets_of(packets[0]) == packets[:1]
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_noise_is_no_packet(seed):
+    noise = np.random.default_rng(seed).integers(0, 256, 20_000, dtype=np.uint8).tobytes()
+    assert len(cut(noise)) == 0
+
+
+@given(st.binary(max_size=400), st.lists(st.integers(0, 400), max_size=3))
+def test_every_octet_of_anything_is_accounted_for(octets, ends):
+    packet = space_packet(7, b"abc", 1)
+    mixed = octets
+    for place in ends:
+        mixed = mixed[:place] + packet + mixed[place:]
+    found = cut_packets(mixed, error_control=False)
+    total = int(found.lengths.sum()) + found.octets_skipped + found.octets_idle
+    assert total == len(mixed)
+
+
+def test_idle_packets_are_told_from_the_others():
+    packets = [space_packet(9, bytes((k,)), k) for k in range(10)]
+    found = cut(b"".join(p + idle_packet(20) for p in packets))
+    assert len(found) == 10 and found.octets_idle == 200
+
+
+def test_pieces_of_a_stream_are_refused_without_error_control():
+    with pytest.raises(ValueRefused, match="final"):
+        cut_packets(b"abc", error_control=False, final=False)
+
+
+# in transfer frames
+
+
+def check(decoded: DownlinkDecode, packets: list[bytes]) -> None:
+    assert list(decoded.cut.packets(decoded.buffer)) == packets
+    assert decoded.gaps == decoded.packets_missing == 0
+
+
+def test_packets_without_error_control_are_taken_out_of_frames():
+    packets = capture(400, 7)
+    octets = encode_cadus(packets, spacecraft_id=42)
+    check(decode(octets, error_control=False), packets)
+    uncoded = encode_cadus(packets, spacecraft_id=42, coding="none", frame_length=223)
+    check(decode(uncoded, error_control=False), packets)
+
+
+def test_a_lost_frame_costs_the_packets_that_are_in_it():
+    packets = capture(400, 8)
+    octets = encode_cadus(packets, spacecraft_id=42)
+    size = 1279
+    decoded = decode(octets[: 5 * size] + octets[6 * size :], error_control=False)
+    zone = 1115 - 6 - 2
+    ends = np.cumsum([len(p) for p in packets])
+    starts = ends - [len(p) for p in packets]
+    kept = [p for p, a, b in zip(packets, starts, ends, strict=True) if b <= 5 * zone or a >= 6 * zone]
+    assert list(decoded.cut.packets(decoded.buffer)) == kept and decoded.frames_lost == 1
