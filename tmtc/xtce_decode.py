@@ -65,8 +65,8 @@ VERDICTS = ("decoded", "no_container", "ambiguous", "too_short", "malformed", "d
 """What came of a packet: decoded; no or several containers match; shorter than its container; a size that is none, a
 text that is none or a number that its calibrator does not cover; a wrong checksum."""
 
-_CHUNK = 1 << 16
-"""Packets decoded together: few enough that what is between stays in the processor's cache."""
+_CHUNK = 1 << 17
+"""Packets decoded together: bounds the memory for what is between."""
 
 _SHORT_TEXT = 64
 """Octets of texts that are decoded together."""
@@ -152,14 +152,15 @@ class Decoder:
         verdict = np.where(cut.crc_ok, DECODED, DAMAGED).astype(np.int8)
         octets = as_octets(buffer)
         packets = np.flatnonzero(cut.crc_ok)
+        begins, ends = cut.offsets * 8, (cut.offsets + cut.lengths) * 8
         pieces: dict[str, list[XtceTable]] = {}
         for first in range(0, len(packets), _CHUNK):
             chunk = packets[first : first + _CHUNK]
             base = int(cut.offsets[chunk].min())
             end = int((cut.offsets[chunk] + cut.lengths[chunk]).max())
-            data = octets[base:end].tobytes() + bytes(_SHORT_TEXT)
+            data = b"".join((octets[base:end].data, bytes(_SHORT_TEXT)))
             padded = np.frombuffer(data, dtype=np.uint8)
-            run = _Run(octets, cut.offsets, cut.lengths, verdict, data, padded, base)
+            run = _Run(octets, begins, ends, verdict, data, padded, base)
             for table in self._tables(run, _Rows(chunk, cut.offsets[chunk] * 8)):
                 pieces.setdefault(table.name, []).append(table)
         return XtceDecode({name: _joined(found) for name, found in sorted(pieces.items())}, verdict)
@@ -357,8 +358,8 @@ class _Run:
     """
 
     octets: OctetArray
-    offsets: IntArray
-    lengths: IntArray
+    begins: IntArray
+    ends: IntArray
     verdict: npt.NDArray[np.int8]
     data: bytes
     padded: OctetArray
@@ -366,7 +367,8 @@ class _Run:
 
     def end(self, rows: _Rows) -> IntArray:
         """Bits into the buffer at which the packets end."""
-        return (self.offsets[rows.packet] + self.lengths[rows.packet]) * 8
+        found: IntArray = self.ends[rows.packet]
+        return found
 
     def keep(self, rows: _Rows, good: BoolArray, verdict: int) -> _Rows:
         """The good rows; the packets of the others get the verdict."""
@@ -406,7 +408,7 @@ def _advance(run: _Run, steps: Sequence[_Step], rows: _Rows) -> _Rows:
         elif isinstance(step, _Seek):
             origin = rows.at if step.mark is None else _mark(rows, step.mark)
             at = origin + step.offset
-            begin = run.offsets[rows.packet] * 8
+            begin = run.begins[rows.packet]
             good = (at >= begin) & (at <= run.end(rows))
             moved = _moved(rows, at)
             rows = run.keep(moved, good, TOO_SHORT)
@@ -723,7 +725,7 @@ def _read_octets(
     behind = at + bits
     if text is None:
         return ValueColumn(column, column), behind, None if good.all() else good
-    plain = _aligned_texts(run, at, bits, text) if aligned else None
+    plain = _aligned_texts(run, at, bits, column, text) if aligned else None
     if plain is not None:
         return ValueColumn(column, plain), behind, None if good.all() else good
     texts = _texts(column.tolist(), text)
@@ -745,8 +747,10 @@ def _slices(run: _Run, starts: IntArray, sizes: IntArray) -> Array:
     return _objects([data[a:b] for a, b in zip(first.tolist(), last.tolist(), strict=True)])
 
 
-def _aligned_texts(run: _Run, at: IntArray, bits: IntArray, encoding: StringEncoding) -> Array | None:
-    """Texts (n,) in buffers of whole octets; None where one of them is no text or the layout is not a plain one."""
+def _aligned_texts(
+    run: _Run, at: IntArray, bits: IntArray, raw: Array, encoding: StringEncoding
+) -> Array | None:
+    """Texts (n,) in buffers `raw` of whole octets; None where one is no text or the layout is not a plain one."""
     starts, sizes = at >> 3, bits >> 3
     if encoding.tag_bits:
         if encoding.tag_bits & 7 or (bits < encoding.tag_bits).any():
@@ -765,13 +769,17 @@ def _aligned_texts(run: _Run, at: IntArray, bits: IntArray, encoding: StringEnco
         if not ends.any(axis=1).all():
             return None
         sizes = ends.argmax(axis=1)
-    return _decoded_texts(run, starts, sizes, encoding.charset)
+    plain = not encoding.tag_bits and not encoding.terminator
+    return _decoded_texts(run, starts, sizes, encoding.charset, raw if plain else None)
 
 
-def _decoded_texts(run: _Run, starts: IntArray, sizes: IntArray, charset: str) -> Array | None:
+def _decoded_texts(
+    run: _Run, starts: IntArray, sizes: IntArray, charset: str, whole: Array | None
+) -> Array | None:
     """Texts (n,) of so many octets each; None where one of them is no text.
 
     Short ones are widened to four octets a character and made strings by numpy, which takes zeros at the end for none.
+    The others are decoded one by one, out of `whole` where these are their octets.
     """
     width = {"ascii": 1, "latin-1": 1, "utf-8": 1, "utf-16-be": 2, "utf-16-le": 2}.get(charset, 0)
     longest = -(-int(sizes.max(initial=0)) // max(width, 1)) * max(width, 1)
@@ -781,20 +789,23 @@ def _decoded_texts(run: _Run, starts: IntArray, sizes: IntArray, charset: str) -
         octets = gather(run.padded, starts - run.base, np.dtype((np.void, longest)))
         units = octets.view(">u2" if charset == "utf-16-be" else f"<u{width}").reshape(-1, longest // width)
         counts = sizes // width
-        units[np.arange(longest // width) >= counts[:, None]] = 0
+        if (counts != longest // width).any():
+            units[np.arange(longest // width) >= counts[:, None]] = 0
         slow = (counts > 0) & (units[np.arange(len(counts)), np.maximum(counts, 1) - 1] == 0)
         slow |= sizes % width != 0
         if charset in ("ascii", "utf-8"):
-            slow |= (units > 0x7F).any(axis=1)
+            slow |= units.max(axis=1) > 0x7F
         elif width == 2:  # surrogates
             slow |= (units >> 11 == 0x1B).any(axis=1)
-        texts = units.astype("=u4").view(f"=U{longest // width}")[:, 0].astype(object)
+        if 2 * int(slow.sum()) > len(slow):
+            slow[:] = True
+        else:
+            texts = units.astype("=u4").view(f"=U{longest // width}")[:, 0].astype(object)
     rows = np.flatnonzero(slow)
     if len(rows):
+        pieces = _slices(run, starts[rows], sizes[rows]) if whole is None else whole[rows]
         try:
-            texts[rows] = _objects(
-                [piece.decode(charset) for piece in _slices(run, starts[rows], sizes[rows])]
-            )
+            texts[rows] = _objects([piece.decode(charset) for piece in pieces.tolist()])
         except UnicodeDecodeError:
             return None
     return texts
