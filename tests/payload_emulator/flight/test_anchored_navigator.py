@@ -532,6 +532,7 @@ def test_the_move_between_frames_is_measured_on_what_no_fix_used(
 ) -> None:
     navigator = orbit.navigator(relative=RelativeParameters(enabled=True))
     found = orbit.detections(0)
+    assert navigator.ties == 0
     navigator.step(int(orbit.ticks[0]), found, orbit.attitude(0))
     fix, before = navigator.last_fix, navigator._before
     assert fix is not None and before is not None
