@@ -314,6 +314,9 @@ def test_of_two_requests_at_once_the_first_notes_the_use(
     _note_use(ground, 1, NOW)
     _note_use(ground, 1, NOW + HOUR_NS - 1 - NOW % HOUR_NS)
     assert list_tokens(ground)[0].used == "2027-01-15T08:00:00.000000000Z"
+    # One that began before, or on a clock that is behind, does not set it back.
+    _note_use(ground, 1, NOW - HOUR_NS // 2)
+    assert list_tokens(ground)[0].used == "2027-01-15T08:00:00.000000000Z"
     _note_use(ground, 1, NOW - NOW % HOUR_NS + HOUR_NS)
     assert list_tokens(ground)[0].used == "2027-01-15T09:00:00.000000000Z"
 
