@@ -155,6 +155,12 @@ SEEN_MARK = "s"
 SEEN_WORDS = "real terrain seen in training"
 
 
+def evidence_ladder() -> str:
+    """Return all evidence levels in one line."""
+    named = [f"{number} {words}" for number, words in enumerate(EVIDENCE_LEVELS, 1)]
+    return ", ".join([*named[:2], f"3{SEEN_MARK} {SEEN_WORDS}", *named[2:]])
+
+
 def evidence_number(level: str) -> int | None:
     """Return the number at the start of the text of an evidence level; None for other text."""
     text = level.strip().lower().removeprefix("level").strip(" (:")

@@ -25,6 +25,7 @@ from reports.document import (
     Verdict,
     cells,
     evidence_label,
+    evidence_ladder,
     evidence_number,
     evidence_text,
 )
@@ -135,7 +136,7 @@ def _headline(block: Headline) -> str:
 def _ladder(level: str | None) -> str:
     if level is None:
         return ""
-    ladder = ", ".join(f"{i} {name}" for i, name in enumerate(EVIDENCE_LEVELS, 1))
+    ladder = evidence_ladder()
     stands = "No evidence level was stated for these figures."
     if level:
         stands = f"These figures are at {evidence_text(level)}."

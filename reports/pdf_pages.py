@@ -14,7 +14,6 @@ from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 from reports.document import (
-    EVIDENCE_LEVELS,
     Absent,
     Block,
     Bullets,
@@ -32,6 +31,7 @@ from reports.document import (
     Verdict,
     cells,
     evidence_label,
+    evidence_ladder,
     evidence_text,
 )
 from reports.figures.canvas import Canvas
@@ -407,7 +407,7 @@ def _headline(block: Headline) -> list[_Piece]:
 
     if block.evidence_level is None:
         return [_Piece(height + 0.1, draw)]
-    ladder = ", ".join(f"{i} {name}" for i, name in enumerate(EVIDENCE_LEVELS, 1))
+    ladder = evidence_ladder()
     stands = "No evidence level was stated for these figures."
     if block.evidence_level:
         stands = f"These figures are at {evidence_text(block.evidence_level)}."

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, select, update
 from sqlalchemy.exc import IntegrityError
 
 from ground_service.errors import NotFound
@@ -23,10 +23,21 @@ REVISION_PREFIX = 8
 def add_revision(
     connection: Connection, mission: Mission, text: str, *, actor: str, now_utc_ns: int
 ) -> tuple[int, bool]:
-    """Add a revision; return its id, and whether it is new. The same content gives the same entry."""
+    """Enter a revision; its id, and whether it is new. The same content again gives the same entry.
+
+    A revision that came with an archive becomes that of the person who enters it, from then on in force.
+    """
     known = repository.find(connection, MISSIONS, revision=mission.revision)
     if known is not None:
-        return int(known["id"]), False
+        taken_over = (
+            actor != ARCHIVE_ACTOR
+            and connection.execute(
+                update(MISSIONS)
+                .where(MISSIONS.c.id == known["id"], MISSIONS.c.entered_by == ARCHIVE_ACTOR)
+                .values(entered_by=actor, created_utc_ns=now_utc_ns)
+            ).rowcount
+        )
+        return int(known["id"]), bool(taken_over)
     try:
         with connection.begin_nested():
             return int(
@@ -83,9 +94,15 @@ def list_revisions(connection: Connection, *, limit: int, offset: int) -> tuple[
 
 
 def newest_of_spacecraft(connection: Connection, ccsds_id: int) -> int | None:
-    """Return the id of the newest revision of a spacecraft; None without any."""
+    """Return the id of the revision of a spacecraft that a person entered last; None without any.
+
+    The description that comes with an archive holds for its own pass: another pass may have flown another world.
+    """
     found = connection.execute(
-        select(MISSIONS.c.id).where(MISSIONS.c.ccsds_id == ccsds_id).order_by(MISSIONS.c.id.desc()).limit(1)
+        select(MISSIONS.c.id)
+        .where(MISSIONS.c.ccsds_id == ccsds_id, MISSIONS.c.entered_by != ARCHIVE_ACTOR)
+        .order_by(MISSIONS.c.created_utc_ns.desc(), MISSIONS.c.id.desc())
+        .limit(1)
     ).scalar()
     return None if found is None else int(found)
 
@@ -98,7 +115,7 @@ def approval_in_force(connection: Connection, ccsds_id: int) -> Approval:
     found = connection.execute(
         select(MISSIONS.c.id)
         .where(MISSIONS.c.ccsds_id == ccsds_id, MISSIONS.c.entered_by != ARCHIVE_ACTOR)
-        .order_by(MISSIONS.c.id.desc())
+        .order_by(MISSIONS.c.created_utc_ns.desc(), MISSIONS.c.id.desc())
         .limit(1)
     ).scalar()
     return Approval() if found is None else get_mission(connection, int(found)).approval

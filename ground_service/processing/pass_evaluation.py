@@ -44,7 +44,7 @@ from ground_service.processing.reference_error import error_budget, reference_co
 from ground_service.processing.samples import DetectionSamples, NavigationSamples, OutcomeSamples
 from ground_service.processing.smoothed_series import SMOOTHED, smoothed_series, smoother_model
 from ground_service.processing.smoother import CommandedBurn, FilterStates
-from ground_service.processing.verdict import Evaluated, Limits, requirements, verdict_of
+from ground_service.processing.verdict import Evaluated, Limits, requirements, verdict_of, without_mission
 from ground_service.processing.viewing import Viewing
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
@@ -111,6 +111,8 @@ class PassInputs:
         Declared 1-sigma error of the reference in radial, transverse and normal.
     limits
         Limits of the verdict.
+    no_mission
+        Where the pass refers to no mission description: what is missing and the remedy.
     cpu_percent
         Largest processor time of a step over the cadence.
     """
@@ -138,6 +140,7 @@ class PassInputs:
     refused: Mapping[str, str] = field(default_factory=dict)
     reference_sigma_rtn_m: tuple[float, float, float] | None = None
     limits: Limits = field(default_factory=Limits)
+    no_mission: str = ""
     cpu_percent: float | None = None
     frames_expected: int | None = None
     cadence_s: float | None = None
@@ -180,6 +183,8 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
         inputs.limits,
         Evaluated(navigation, detector, accounting, inputs.packets, inputs.housekeeping, inputs.cpu_percent),
     )
+    if inputs.no_mission:
+        table = without_mission(table, inputs.no_mission)
     verdict, level = verdict_of(table)
     return PassReport(
         title=inputs.title,
@@ -772,13 +777,17 @@ def _headline(
             "Median position error",
             own.statistics.median_3d_m if own else None,
             "m",
-            f"{own.name}; 95 % below {_length(own.statistics.p95_3d_m)}" if own else absent,
+            f"{own.name}; {_below(own.statistics.p95_3d_m)}" if own else absent,
         ),
         HeadlineFigure(
             "Propagation alone, same start",
             only.statistics.median_3d_m if only else None,
             "m",
-            f"95 % below {_length(only.statistics.p95_3d_m)}" if only else "no start state",
+            _below(only.statistics.p95_3d_m)
+            if only
+            else "no start state"
+            if inputs.start_state is None
+            else "not computed",
         ),
         HeadlineFigure(
             "Drift",
@@ -792,10 +801,14 @@ def _headline(
             "%",
             f"precision {100.0 * micro.precision:.0f} %, centre {micro.localisation_px:.2f} px"
             if micro
-            else "",
+            else "not evaluated",
         ),
         HeadlineFigure("Packets missing", packets.missing, "", f"of {count_text(packets.expected)} expected"),
     )
+
+
+def _below(p95_m: float) -> str:
+    return f"95 % below {_length(p95_m)}" if np.isfinite(p95_m) else "no error is known"
 
 
 def _length(value_m: float) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +24,8 @@ from reports.values import (
 )
 
 NEES_DEGREES = 3
+NO_MISSION = "mission"
+"""Key of the row that says that a pass has no mission description."""
 LARGEST_SENTENCE = 5
 """Largest number of failed requirements named in the sentence; the table has all."""
 
@@ -76,6 +78,15 @@ def requirements(limits: Limits, found: Evaluated) -> tuple[Requirement, ...]:
     )
 
 
+def without_mission(table: Sequence[Requirement], remedy: str) -> tuple[Requirement, ...]:
+    """Return the verdict table of a pass without a mission description: no limit is known, so that all is unknown."""
+    missing = Requirement(NO_MISSION, "mission description", "", None, None, True, "unknown", remedy)
+    return missing, *(
+        replace(one, status="unknown", note=one.note or "no limit") if one.status == "not judged" else one
+        for one in table
+    )
+
+
 def verdict_of(table: Sequence[Requirement]) -> tuple[str, str]:
     """Return the sentence on a verdict table, failures first, and its level: "good", "caution" or "bad"."""
     judged = [one for one in table if one.status != "not judged"]
@@ -84,6 +95,8 @@ def verdict_of(table: Sequence[Requirement]) -> tuple[str, str]:
     met = len(judged) - len(failed) - len(unknown)
     if not judged:
         return "No requirement has a limit in the mission description: nothing is judged.", "caution"
+    if judged[0].key == NO_MISSION:
+        return f"Nothing can be judged: {judged[0].note}", "caution"
     parts = []
     if failed:
         named = "; ".join(_said(one) for one in failed[:LARGEST_SENTENCE])

@@ -151,6 +151,7 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             refused=_refused(declared, mission.camera),
             reference_sigma_rtn_m=mission.reference.sigma_rtn_m,
             limits=Limits(**mission.requirements.model_dump()),
+            no_mission="" if record["mission_id"] is not None else _no_mission(vehicle["ccsds_id"]),
             cpu_percent=_cpu_percent(connection, span, manifest.get("cadence_s")),
             frames_expected=manifest.get("frames_expected"),
             cadence_s=manifest.get("cadence_s"),
@@ -432,6 +433,13 @@ def _refused(declared: DeclaredFrames, camera: Camera) -> dict[str, str]:
     return refused
 
 
+def _no_mission(spacecraft: int) -> str:
+    return (
+        f"no mission description of spacecraft {spacecraft} was registered when this pass was planned or defined. "
+        "Write one (linna mission write SCENARIO), enter it (linna mission add FILE), then define the pass again."
+    )
+
+
 def start_state_of(manifest: Mapping[str, Any]) -> StartState | None:
     """The state that the estimators were started from, where the manifest names it."""
     given = manifest.get("start_state")
@@ -583,7 +591,11 @@ def _provenance(
         "gravity of the truth": f"{gravity['truth']}, degree {gravity.get('degree', '?')}"
         if "truth" in gravity
         else "",
-        "mission description": f"{mission.name}, revision {mission.revision[:16]}",
+        "mission description": (
+            "none registered"
+            if record["mission_id"] is None
+            else f"{mission.name}, revision {mission.revision[:16]}"
+        ),
         "lunar orientation": declared.orientation.name if declared.orientation is not None else "",
         "dictionary": _dictionary_text(span.dictionary_version),
         "time correlation": ", ".join(str(c.id) for c in span.correlations) or "0 (ideal clock)",

@@ -39,23 +39,29 @@ _MEDIA = {
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A page: its address, its template and script, its name in the navigation ('' for none)."""
+    """A page: its address, its template and script, its name in the navigation ('' for none).
+
+    `section` is the page whose name the navigation marks as current; "" for its own.
+    """
 
     path: str
     name: str
     title: str
     entry: str
+    section: str = ""
 
 
 PAGES = (
     Page("/", "overview", "Overview", "Overview"),
     Page("/planner", "planner", "Planner", "Planner"),
     Page("/passes", "passes", "Passes", "Passes"),
-    Page("/passes/{pass_id}", "pass", "Pass", ""),
+    Page("/passes/{pass_id}", "pass", "Pass", "", "passes"),
     Page("/telemetry", "telemetry", "Telemetry", "Telemetry"),
     Page("/commands", "commands", "Commands", "Commands"),
     Page("/regression", "regression", "Regression", "Regression"),
     Page("/live", "live", "Live", "Live"),
+    Page("/missions", "missions", "Missions", "Missions"),
+    Page("/missions/{revision}", "mission", "Mission", "", "missions"),
     Page("/audit", "audit", "Audit log", "Audit"),
     Page("/licences", "licences", "Licences", ""),
 )

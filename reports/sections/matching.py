@@ -1,4 +1,4 @@
-"""What the matchers did."""
+"""Matching outcomes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from reports.values import FIX_OUTCOMES, NavigationSeries
 
 
 def matching(view: PassView) -> list[Block]:
-    blocks: list[Block] = [Heading("What the matchers did")]
+    blocks: list[Block] = [Heading("Matching outcomes")]
     series = view.with_outcomes
     if not series:
         blocks.append(view.absent("outcomes", "Matcher outcomes"))

@@ -1,4 +1,4 @@
-"""Truth-use ledger and configuration."""
+"""Reads of the anchor ephemeris, and configuration."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _MOST_READS = 30
 
 def ledger(view: PassView) -> list[Block]:
     report = view.report
-    blocks: list[Block] = [Heading("Truth-use ledger")]
+    blocks: list[Block] = [Heading("Reads of the anchor ephemeris")]
     if not view.estimates:
-        blocks.append(view.absent("navigation", "Truth-use ledger"))
+        blocks.append(view.absent("navigation", "Reads of the anchor ephemeris"))
         return blocks
     clean = [s.name for s in view.estimates if (s.anchor_reads_after_start or 0) == 0 and not s.anchor_reads]
     users = [s.name for s in view.estimates if s.name not in clean]
@@ -59,11 +59,12 @@ def ledger(view: PassView) -> list[Block]:
             tuple(rows),
         )
     )
-    if report.truth_ledger:
-        rest = len(report.truth_ledger) - _MOST_READS
+    resets = [read for read in report.truth_ledger if read.trigger != "none"]
+    if resets:
+        rest = len(resets) - _MOST_READS
         blocks.append(
             Table(
-                "Every read.",
+                "Reads that reset an estimator.",
                 (
                     Column("time, UTC", numeric=False),
                     Column("estimator", numeric=False),
@@ -75,11 +76,12 @@ def ledger(view: PassView) -> list[Block]:
                         utc_text(r.utc_ns).removesuffix(" UTC"),
                         r.estimator,
                         count_text(r.frame_number),
-                        TRIGGERS.get(r.trigger, "no reset" if r.trigger == "none" else r.trigger),
+                        TRIGGERS.get(r.trigger, r.trigger),
                     )
-                    for r in report.truth_ledger[:_MOST_READS]
+                    for r in resets[:_MOST_READS]
                 ),
-                note=f"{rest} further reads are in the JSON form of this report." if rest > 0 else "",
+                note=(f"{rest} further resets. " if rest > 0 else "")
+                + "Every read is in the JSON form of this report.",
             )
         )
     return blocks

@@ -1,6 +1,7 @@
 """The page of a pass: complete, self-contained, the same bytes every time."""
 
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from reports.errors import InconsistentReport, UnknownReportKind
 from reports.render import render_html
 from reports.values import (
+    AnchorRead,
     FrameAccounting,
     HeadlineFigure,
     NavigationSeries,
@@ -99,9 +101,24 @@ def test_times_are_utc_and_the_axis_names_the_day(page: Page) -> None:
 
 
 def test_the_ledger_counts_every_read_of_the_anchor_ephemeris(page: Page) -> None:
-    ledger = page.text[page.text.rindex("Truth-use ledger") :]
+    ledger = page.text[page.text.rindex("Never read") :]
     assert "Never read the anchor ephemeris: anchored." in ledger
     assert "Read it: paper, spherical." in ledger
+
+
+def test_the_list_of_evidence_levels_has_terrain_seen_in_training(page: Page) -> None:
+    assert "2 procedural Moon, 3s real terrain seen in training, 3 real terrain never used" in page.text
+
+
+def test_the_ledger_lists_the_reads_that_reset_an_estimator_only(whole_pass: PassReport) -> None:
+    reads = tuple(
+        AnchorRead("paper", whole_pass.truth_ledger[0].utc_ns, trigger, 700 + number)
+        for number, trigger in enumerate(("none", "safety_timeout", "none"))
+    )
+    text = Page(render_html(replace(whole_pass, truth_ledger=reads))).text
+    resets = text[text.index("Reads that reset an estimator.") : text.index("Every read is in the JSON form")]
+    assert "701 safety timeout" in resets
+    assert "700" not in resets and "702" not in resets
 
 
 def test_a_title_with_markup_is_text(whole_pass: PassReport) -> None:

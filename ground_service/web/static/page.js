@@ -45,7 +45,8 @@ export function table(caption, columns, rows, empty) {
     { class: "scroll", tabindex: "0", role: "group", "aria-label": caption },
     element(
       "table",
-      {},
+      // Many columns do not fit on a telephone: its table scrolls rather than break words.
+      { class: columns.length > 4 ? "wide" : null },
       element("caption", { class: "hidden" }, caption),
       element("thead", {}, element("tr", {}, head)),
       element("tbody", {}, body),

@@ -197,6 +197,12 @@ async function load() {
   byId("span").textContent =
     `${timeText(pass.start)} to ${timeText(pass.stop)}, ${lengthText(seconds(pass.stop) - seconds(pass.start))}, ` +
     `spacecraft ${pass.spacecraft_id} (${pass.instance})`;
+  show(
+    "mission",
+    pass.mission_revision
+      ? ["Mission description: ", element("a", { href: `/missions/${pass.mission_revision.slice(0, 16)}` }, `${pass.mission}, revision ${pass.mission_revision.slice(0, 12)}`)]
+      : element("strong", {}, "No mission description was registered when this pass was planned: nothing can be judged. Enter one with linna mission add, then define the pass again."),
+  );
   const { scenario_toml: _, files: __, ...origin } = pass.manifest;
   show("origin", Object.keys(origin).length ? element("details", {}, element("summary", {}, "Manifest"), element("pre", {}, JSON.stringify(origin, null, 2))) : element("p", { class: "hint" }, "Defined by hand: no archive, no manifest."));
   await Promise.all([

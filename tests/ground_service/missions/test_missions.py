@@ -26,6 +26,7 @@ from ground_service.missions.service import (
     mission_of_pass,
     read_mission,
 )
+from ground_service.missions.store import approval_in_force, newest_of_spacecraft
 from ground_service.services.archive_import import import_archive
 from ground_service.services.commanding import enter_command, release_command
 from ground_service.services.ground import open_ground
@@ -187,6 +188,43 @@ def test_the_description_in_an_archive_becomes_a_revision(ground, make_pass) -> 
     _manifest_again(folder)
     detail = get_pass(ground, import_archive(ground, folder))
     assert (detail["mission"], detail["mission_revision"]) == ("test", parse_mission(TEXT).revision)
+
+
+def test_the_description_of_an_archive_holds_for_its_own_pass_only(ground, make_pass) -> None:
+    folder = make_pass(frames=2, seed=33).folder
+    (folder / "mission.toml").write_text(TEXT)
+    _manifest_again(folder)
+
+    def define() -> dict:
+        return get_pass(
+            ground, define_pass(ground, name="p", start_utc_ns=0, stop_utc_ns=10**9, spacecraft_id=76)
+        )
+
+    import_archive(ground, folder)
+    assert define()["mission_revision"] is None
+    entered = add_mission(ground, TEXT.replace("120", "90").encode())
+    import_archive(ground, make_pass(frames=2, seed=34).folder)
+    assert define()["mission_revision"] == entered.revision
+
+
+def test_a_description_that_came_with_an_archive_is_in_force_once_a_person_enters_it(
+    ground, make_pass
+) -> None:
+    folder = make_pass(frames=2, seed=35).folder
+    (folder / "mission.toml").write_text(
+        TEXT + '\n[approval]\none_person_for = ["perform_function/set_mode"]\n'
+    )
+    _manifest_again(folder)
+    import_archive(ground, folder)
+    add_mission(ground, TEXT.replace("120", "90").encode(), actor="ada")
+    taken = add_mission(ground, (folder / "mission.toml").read_bytes(), actor="bob")
+    assert taken.entered_by == "bob"
+    again = add_mission(ground, (folder / "mission.toml").read_bytes(), actor="eve")
+    assert again == taken
+    with ground.database.reading() as connection:
+        assert newest_of_spacecraft(connection, 76) == taken.id
+        assert approval_in_force(connection, 76).one_person_for == ("perform_function/set_mode",)
+        assert approval_in_force(connection, 77).one_person_for is None
 
 
 def test_a_description_of_another_spacecraft_is_refused_and_nothing_is_stored(ground, make_pass) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from ground_service.missions.model import Requirements
 from ground_service.processing.reference_error import error_budget, reference_covariance_m2
-from ground_service.processing.verdict import Evaluated, Limits, requirements, verdict_of
+from ground_service.processing.verdict import Evaluated, Limits, requirements, verdict_of, without_mission
 from reports.values import (
     ClassScore,
     DetectorScore,
@@ -318,3 +318,13 @@ def test_the_first_sample_is_no_reset_and_a_series_without_outcomes_has_no_count
 def test_a_limit_that_is_no_number_judges_nothing_as_met(limit: float) -> None:
     one = row("accuracy.median", replace(EVERY_LIMIT, median_error_m=limit), found())
     assert (one.limit, one.status) == (None, "unknown")
+
+
+def test_without_a_mission_description_every_requirement_is_unknown_and_the_remedy_is_said_first() -> None:
+    plain = requirements(Limits(), found(CONSISTENT, detector=DETECTOR, housekeeping=HOUSEKEEPING))
+    assert {one.status for one in plain} == {"not judged"}
+    table = without_mission(plain, "none is registered; enter one")
+    assert {one.status for one in table} == {"unknown"}
+    assert [one.key for one in table] == ["mission", *(one.key for one in plain)]
+    assert [one.value for one in table[1:]] == [one.value for one in plain]
+    assert verdict_of(table) == ("Nothing can be judged: none is registered; enter one", "caution")

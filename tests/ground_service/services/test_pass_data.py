@@ -4,7 +4,7 @@ import json
 import math
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,15 @@ from ground_service.errors import EvaluationError, InvalidInput
 from ground_service.missions import frames as declared
 from ground_service.missions.frames import declared_frames
 from ground_service.missions.model import Camera, Frames, Mission
+from ground_service.missions.service import add_mission
+from ground_service.processing.pass_evaluation import evaluate_pass
+from ground_service.processing.verdict import Limits
 from ground_service.services.archive_import import import_archive
 from ground_service.services.attitudes import HEADER, load_attitudes
 from ground_service.services.ground import Ground, open_ground
+from ground_service.services.ingest import ingest_file
 from ground_service.services.pass_data import camera_of, load_pass_inputs, orientation_of
+from ground_service.services.passes import define_pass
 from ground_service.services.reports import evaluate
 from lunar.camera import PinholeCamera
 from lunar.datafolder import DataFolder
@@ -86,6 +91,51 @@ def test_without_the_declared_orientation_no_figure_that_needs_it_is_given(
     assert {one.kind for one in report.navigation} == {"estimate"}
     assert all(np.isnan(one.error_rtn_m).all() for one in report.navigation)
     assert report.verdict_level != "good"
+    inputs = load_pass_inputs(ground, int(report.pass_id))
+    declared_one = evaluate_pass(replace(inputs, limits=Limits(estimator="spherical")))
+    assert declared_one.headline[0].note == "spherical; no error is known"
+    assert declared_one.headline[3].note == "not evaluated"
+
+
+def test_a_pass_of_a_spacecraft_without_a_mission_description_says_so_and_how_to_enter_one(
+    synthetic_pass: Any, ground: Ground
+) -> None:
+    """As of a pass flown live, whose mission description nobody has entered: the packets come, no document does."""
+    ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
+    pass_id = define_pass(
+        ground,
+        name="live",
+        start_utc_ns=int(synthetic_pass.utc_ns[0]),
+        stop_utc_ns=int(synthetic_pass.utc_ns[-1]),
+        spacecraft_id=76,
+    )
+    report = evaluate(ground, pass_id)
+    assert report.verdict.startswith("Nothing can be judged: no mission description of spacecraft 76")
+    assert "linna mission write SCENARIO" in report.verdict and "linna mission add FILE" in report.verdict
+    assert report.verdict_level == "caution"
+    assert report.requirements[0].key == "mission"
+    assert {one.status for one in report.requirements} == {"unknown"}
+    assert report.provenance["mission description"] == "none registered"
+
+    add_mission(ground, MISSION_76)
+    again = define_pass(
+        ground,
+        name="live, again",
+        start_utc_ns=int(synthetic_pass.utc_ns[0]),
+        stop_utc_ns=int(synthetic_pass.utc_ns[-1]),
+        spacecraft_id=76,
+    )
+    table = {one.key: one.status for one in evaluate(ground, again).requirements}
+    assert "mission" not in table
+    assert table["completeness.packets"] in ("met", "unknown") and table["detector.recall"] == "not judged"
+
+
+MISSION_76 = b"""name = "live"
+[spacecraft]
+id = 76
+[requirements]
+packets_percent = 10.0
+"""
 
 
 def test_a_pass_is_evaluated_in_the_orientation_that_it_declares(

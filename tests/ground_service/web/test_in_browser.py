@@ -20,12 +20,21 @@ PATHS = [
     "/commands",
     "/regression",
     "/live",
+    "/missions",
+    "/missions/{revision}",
+    "/audit",
     "/licences",
 ]
 NS = 1_000_000_000
 
 
+def newest_revision(page):
+    return page.request.get("/api/v1/missions").json()["items"][0]["revision"]
+
+
 def settled(page, path):
+    if "{revision}" in path:
+        path = path.format(revision=newest_revision(page)[:16])
     page.goto(path)
     expect(page.locator("#feed-light")).to_have_class("light on")
 
@@ -51,11 +60,23 @@ def test_a_narrow_screen_scrolls_down_only(page):
         assert page.evaluate("document.documentElement.scrollWidth") <= 768, path
 
 
+def test_a_telephone_scrolls_wide_tables_rather_than_break_words(page):
+    page.set_viewport_size({"width": 390, "height": 844})
+    for path in ("/missions", "/missions/{revision}", "/audit"):
+        settled(page, path)
+        expect(page.locator("tbody tr").first).to_be_visible()
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390, path
+    settled(page, "/missions")
+    cell = page.locator("#revisions tbody td").first
+    assert cell.locator("a").bounding_box()["height"] < 30.0  # one line
+
+
 def test_the_pass_page_shows_what_came_and_makes_a_report(page):
     settled(page, "/passes")
     page.get_by_role("link", name="synthetic pass").click()
     expect(page.get_by_role("heading", name="synthetic pass")).to_be_visible()
     expect(page.locator("#completeness")).to_contain_text("0 lost")
+    expect(page.locator("#mission").get_by_role("link")).to_contain_text("synthetic, revision")
     expect(page.get_by_label("chart: altitude, m")).to_be_visible()
     expect(page.locator("#map-legend")).to_contain_text("spherical")
     page.get_by_role("button", name="Make a report").click()
@@ -64,6 +85,51 @@ def test_the_pass_page_shows_what_came_and_makes_a_report(page):
     with page.expect_popup() as opened:
         page.get_by_role("button", name="Open HTML").click()
     expect(opened.value.get_by_role("heading", level=1)).to_be_visible()
+
+
+MISSION = """name = "shown"
+
+[spacecraft]
+id = 76
+
+[frames]
+orientation = "DE421"
+
+[requirements]
+estimator = "anchored"
+median_error_m = 100.0
+
+[approval]
+windows = "manual"
+second_person_for = ["perform_function/set_mode"]
+"""
+
+
+def test_a_mission_description_is_shown_with_its_limits_approval_and_frames(page):
+    entered = page.request.post("/api/v1/missions", data=MISSION, headers={"Content-Type": "text/plain"})
+    assert entered.status == 201
+    settled(page, "/missions")
+    row = page.locator("#revisions tbody tr").first
+    expect(row).to_contain_text("shown")
+    expect(row).to_contain_text(entered.json()["revision"][:12])
+    expect(page.locator("#range")).to_contain_text("1 to 2 of 2")
+    row.get_by_role("link", name="shown").click()
+    expect(page.get_by_role("heading", level=1)).to_have_text("shown")
+    expect(page.locator("#limits tr", has_text="median error, m")).to_contain_text("100")
+    expect(page.locator("#limits tr", has_text="recall")).to_contain_text("not stated")
+    expect(page.locator("#approval tr", has_text="windows")).to_contain_text("manual")
+    expect(page.locator("#approval tr", has_text="second person for")).to_contain_text(
+        "perform_function/set_mode"
+    )
+    expect(page.locator("#frames")).to_contain_text("DE421")
+    expect(page.locator("#unknown")).to_contain_text("camera.width_px")
+    page.get_by_text("mission.toml as entered").click()
+    expect(page.locator("#document")).to_contain_text("median_error_m = 100.0")
+
+
+def test_a_mission_description_that_is_not_entered_is_told(page):
+    page.goto("/missions/" + "0" * 16)
+    expect(page.locator("#notices .bad")).to_contain_text("mission revision")
 
 
 def test_a_chart_is_zoomed_with_the_keyboard(page):

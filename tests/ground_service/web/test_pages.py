@@ -13,7 +13,7 @@ from ground_service.services.surface import WIDTH_PX
 from ground_service.web.basemap import basemap_jpeg
 from ground_service.web.pages import PAGES, POLICY
 
-PATHS = [page.path.replace("{pass_id}", "1") for page in PAGES]
+PATHS = [page.path.replace("{pass_id}", "1").replace("{revision}", "0" * 16) for page in PAGES]
 
 
 def ask(url):
@@ -36,6 +36,14 @@ def test_a_page_runs_only_scripts_of_this_service(service, path):
         assert source.startswith((b"/", b"#", b"data:")), source
         if source.startswith(b"/static/"):
             assert ask(service.url + source.decode())[0] == 200, source
+
+
+@pytest.mark.parametrize(
+    ("path", "entry"), [("/passes/1", "Passes"), ("/missions/00000000", "Missions"), ("/audit", "Audit")]
+)
+def test_the_navigation_marks_the_page_that_a_detail_belongs_to(service, path, entry):
+    _, body, _ = ask(service.url + path)
+    assert re.findall(rb'aria-current="page">([^<]+)<', body) == [entry.encode()]
 
 
 def test_files_with_a_version_are_kept_and_without_one_are_asked_for_again(service):
