@@ -44,13 +44,18 @@ _OMITTED_M2_S3 = {
 # Fields made before GRAIL: tracked over the near side only, because an orbiter over the far side is not visible from
 # the Earth.
 _OLDER = ("LP", "GLGM", "JGL")
-# LP165P against GRAIL, both to degree 100: the difference is 2 to 6 mGal over the near side, and 30 to 43 mGal with
-# periods of about 300 s over the far side. The far-side values are means over 208 s on 40 circular polar orbits at 30
-# km. Over the altitudes of the paper's orbit, `linna orbit omission --flown FILE --revolutions 40` gives 25 % more. A
-# quarter of these values, tuned on the NEES of a polar track, was too small: the filter was overconfident after a coast
-# over the far side on a track inclined by 60 degrees.
-_NEAR_SIDE_M2_S3 = (5e-8, 3e-9, 5e-8)
-_FAR_SIDE_M2_S3 = (5.3e-6, 1.8e-6, 4.6e-6)
+# LP165P against GRAIL, both to degree 100, from means over 1/12 of a revolution (555 s, about the memory of a filter with
+# a fix of some 50 m every 15 s) on circular orbits at 30 km. The difference is 2 to 6 mGal over the near side and 30 to
+# 43 mGal over the far side. Its slow part depends on the track. The field was fitted to polar orbits: its far-side errors
+# cancel along a meridian within minutes and accumulate on an oblique track. The radial density is 2.3, 3.7, 10, 12, 12,
+# 17 and 25e-6 m^2/s^3 at inclinations of 89, 85, 80, 75, 70, 60 and 45 degrees (each known to 20 %). A constant and a
+# term in the cosine of the inclination fit these values (`linna orbit omission --flown FILE --inclination-deg I`).
+_NEAR_SIDE_M2_S3 = (2.2e-8, 9e-10, 1.8e-8)
+_FAR_SIDE_M2_S3 = (1.7e-6, 2.8e-7, 1.4e-6)
+_FAR_SIDE_OBLIQUE_M2_S3 = (3.0e-5, 1.4e-6, 2.6e-5)
+# The part omitted by a truncation is larger over the highlands of the far side: at 30 km, truncated at degree 100, the
+# radial density is 5.9e-8 m^2/s^3 over the near side and 1.2e-7 over the far side.
+_NEAR_SIDE_OMISSION, _FAR_SIDE_OMISSION = 0.7, 1.4
 
 
 # The acceleration of a harmonic of degree n decreases with height as (R/r)^(n+2), its spectral density as the square.
@@ -72,13 +77,17 @@ class FieldNoise:
     Attributes
     ----------
     near_psd_m2_s3, far_psd_m2_s3
-        Two-sided spectral density at `REFERENCE_ALTITUDE_M` over the near and the far side, radial, transverse, normal.
+        Two-sided spectral density at `REFERENCE_ALTITUDE_M` over the near and the far side, radial, transverse, normal,
+        on a polar orbit.
+    far_oblique_psd_m2_s3
+        Density added over the far side, multiplied by the cosine of the inclination.
     near_scale_height_m, far_scale_height_m
         Height difference over which the density decreases to 1/e.
     """
 
     near_psd_m2_s3: Densities
     far_psd_m2_s3: Densities
+    far_oblique_psd_m2_s3: Densities
     near_scale_height_m: float
     far_scale_height_m: float
 
@@ -90,20 +99,24 @@ def field_noise(name: str, degree: int) -> FieldNoise:
     decreases to 1/e over a height H, the mean over an orbit of mean altitude h and amplitude a e is exp((30 km - h) /
     H) I0(ae / H) times that at 30 km.
     """
-    omitted = (omission_psd_m2_s3(degree), _scale_height_m(degree + _OMITTED_ABOVE))
+    omitted, height_m = omission_psd_m2_s3(degree), _scale_height_m(degree + _OMITTED_ABOVE)
     if not name.upper().startswith(_OLDER):
-        psd = _at_reference(*omitted)
-        return FieldNoise(psd, psd, omitted[1], omitted[1])
+        psd = _at_reference(omitted, height_m)
+        return FieldNoise(psd, psd, (0.0, 0.0, 0.0), height_m, height_m)
     sides = []
-    for wrong, wrong_degree in ((_NEAR_SIDE_M2_S3, _NEAR_SIDE_DEGREE), (_FAR_SIDE_M2_S3, _FAR_SIDE_DEGREE)):
-        parts = [omitted, (wrong, _scale_height_m(wrong_degree))]
+    for wrong, wrong_degree, share in (
+        (_NEAR_SIDE_M2_S3, _NEAR_SIDE_DEGREE, _NEAR_SIDE_OMISSION),
+        (_FAR_SIDE_M2_S3, _FAR_SIDE_DEGREE, _FAR_SIDE_OMISSION),
+    ):
+        parts = [(_times(omitted, share), height_m), (wrong, _scale_height_m(wrong_degree))]
         densities = [_at_reference(*part) for part in parts]
         # Approximate the sum of two exponentials by one with the same slope at the reference altitude.
         slope = sum(psd[0] / height for psd, (_, height) in zip(densities, parts, strict=True))
         total = _sum(*densities)
         sides.append((total, total[0] / slope))
     (near, near_height), (far, far_height) = sides
-    return FieldNoise(near, far, near_height, far_height)
+    oblique = _at_reference(_FAR_SIDE_OBLIQUE_M2_S3, _scale_height_m(_FAR_SIDE_DEGREE))
+    return FieldNoise(near, far, oblique, near_height, far_height)
 
 
 def _scale_height_m(degree: float) -> float:
@@ -127,33 +140,41 @@ def omission_psd_m2_s3(degree: int) -> Densities:
     return r, t, n
 
 
-def field_psd_m2_s3(name: str, degree: int) -> tuple[Densities, Densities]:
+def field_psd_m2_s3(
+    name: str, degree: int, inclination_rad: float = 0.5 * np.pi
+) -> tuple[Densities, Densities]:
     """Spectral densities of what a field by its name, cut at a degree, lacks or has wrong: near side and far side."""
     omitted = omission_psd_m2_s3(degree)
     if not name.upper().startswith(_OLDER):
         return omitted, omitted
-    return _sum(omitted, _NEAR_SIDE_M2_S3), _sum(omitted, _FAR_SIDE_M2_S3)
+    oblique = _times(_FAR_SIDE_OBLIQUE_M2_S3, abs(float(np.cos(inclination_rad))))
+    near = _sum(_times(omitted, _NEAR_SIDE_OMISSION), _NEAR_SIDE_M2_S3)
+    return near, _sum(_sum(_times(omitted, _FAR_SIDE_OMISSION), _FAR_SIDE_M2_S3), oblique)
 
 
 def _sum(one: Densities, other: Densities) -> Densities:
     return one[0] + other[0], one[1] + other[1], one[2] + other[2]
 
 
+def _times(one: Densities, factor: float) -> Densities:
+    return factor * one[0], factor * one[1], factor * one[2]
+
+
 _MOON_TURN_RAD_S = 2.6617e-6
-_SAMPLES, _WAVES = 1_024, 30
-_PIECES = 32
+_SAMPLES, _WAVES = 960, 30
+_PIECES = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Omission:
-    """Acceleration by which two gravity fields differ along low polar orbits: radial, transverse, normal.
+    """Acceleration by which two gravity fields differ along low orbits: radial, transverse, normal.
 
     Attributes
     ----------
     psd_m2_s3
         Two-sided spectral density over 1 to 30 waves a revolution, transverse over 16 to 30; shape (3,).
     near_psd_m2_s3, far_psd_m2_s3
-        The same by side of the Moon, from means over a 32nd of a revolution.
+        The same by side of the Moon, from means over a twelfth of a revolution that lies on one side.
     rms_m_s2, near_rms_m_s2, far_rms_m_s2
         Root mean square, all waves.
     """
@@ -168,14 +189,18 @@ class Omission:
 
 
 def measured_omission(
-    truth: GravityField, flown: GravityField, revolutions: int = 16, seed: int = 1
+    truth: GravityField,
+    flown: GravityField,
+    revolutions: int = 16,
+    seed: int = 1,
+    inclination_rad: float = 0.5 * np.pi,
 ) -> Omission:
     """Measure the errors of `flown` relative to `truth`, over revolutions with random nodes and perilunes."""
     rng = np.random.default_rng(seed)
     period_s = float(2.0 * np.pi * np.sqrt(_SEMI_MAJOR_M**3 / truth.gm_m3_s2))
     differences, far = [], []
     for node_rad, perilune_rad in rng.uniform(0.0, 2.0 * np.pi, (revolutions, 2)):
-        position, rtn = _revolution(node_rad, perilune_rad, period_s)
+        position, rtn = _revolution(inclination_rad, node_rad, perilune_rad, period_s)
         missing = acceleration(truth, position) - acceleration(flown, position)
         differences.append(np.einsum("nij,nj->ni", rtn, missing))
         far.append(position[:, 0] < FAR_SIDE_COSINE * np.linalg.norm(position, axis=1))
@@ -184,29 +209,32 @@ def measured_omission(
     slow = spectrum[:, 1 : _WAVES + 1].mean(axis=(0, 1))
     slow[1] = spectrum[:, 1 + _WAVES // 2 : _WAVES + 1, 1].mean()
     pieces = along.reshape(-1, _SAMPLES // _PIECES, 3).mean(axis=1) ** 2 * period_s / _PIECES
-    piece_beyond = beyond.reshape(-1, _SAMPLES // _PIECES).mean(axis=1) > 0.5
+    piece_beyond = beyond.reshape(-1, _SAMPLES // _PIECES).mean(axis=1)
     rows, row_beyond = along.reshape(-1, 3), beyond.reshape(-1)
     return Omission(
         revolutions,
         slow,
-        pieces[~piece_beyond].mean(axis=0),
-        pieces[piece_beyond].mean(axis=0),
+        pieces[piece_beyond == 0.0].mean(axis=0),
+        pieces[piece_beyond == 1.0].mean(axis=0),
         _rms(rows),
         _rms(rows[~row_beyond]),
         _rms(rows[row_beyond]),
     )
 
 
-def _revolution(node_rad: float, perilune_rad: float, period_s: float) -> tuple[Float, Float]:
-    """Return positions (n, 3) in Moon-fixed axes over one polar revolution, and the axes R, T, N there (n, 3, 3)."""
+def _revolution(
+    inclination_rad: float, node_rad: float, perilune_rad: float, period_s: float
+) -> tuple[Float, Float]:
+    """Return positions (n, 3) in Moon-fixed axes over a revolution, and the axes R, T, N there (n, 3, 3)."""
     # Even steps of the argument of latitude: at this eccentricity within 1 % of even steps of time.
     angle = np.arange(_SAMPLES) / _SAMPLES * 2.0 * np.pi
     node = node_rad - _MOON_TURN_RAD_S * period_s * angle / (2.0 * np.pi)
     zero = np.zeros_like(node)
     outwards = np.stack([np.cos(node), np.sin(node), zero], axis=1)
-    north = np.array([0.0, 0.0, 1.0])
-    radial = np.cos(angle)[:, None] * outwards + np.sin(angle)[:, None] * north
-    transverse = -np.sin(angle)[:, None] * outwards + np.cos(angle)[:, None] * north
+    east = np.stack([-np.sin(node), np.cos(node), zero], axis=1)
+    ahead = np.cos(inclination_rad) * east + np.sin(inclination_rad) * np.array([0.0, 0.0, 1.0])
+    radial = np.cos(angle)[:, None] * outwards + np.sin(angle)[:, None] * ahead
+    transverse = -np.sin(angle)[:, None] * outwards + np.cos(angle)[:, None] * ahead
     rtn = np.stack([radial, transverse, np.cross(radial, transverse)], axis=1)
     radius = _SEMI_MAJOR_M * (1.0 - _ECCENTRICITY**2) / (1.0 + _ECCENTRICITY * np.cos(angle - perilune_rad))
     return radius[:, None] * radial, rtn

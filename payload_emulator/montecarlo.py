@@ -44,6 +44,7 @@ Index = NDArray[np.int64]
 
 _NS = 1_000_000_000
 _ORIENTATION_STEP_NS = 7_200 * _NS
+_PUSH_S = 60.0
 _ORIENTATION_MARGIN_NS = 5 * _ORIENTATION_STEP_NS
 
 
@@ -131,6 +132,9 @@ class NavigationCase:
         correlation time (infinite: constant for a run).
     on_board
         Mask of the craters in the uploaded catalogue; None for all.
+    lasting_m_s2, lasting_correlation_s
+        Slowly varying acceleration of the truth, such as solar radiation pressure: first-order Gauss-Markov process,
+        radial, transverse, normal, 1 sigma.
     any_node, node_longitudes_deg
         Each run rotates the orbit about the Moon's axis by a random angle, such that the longitude of the ascending
         node at the epoch lies between two values, if they are given.
@@ -157,6 +161,8 @@ class NavigationCase:
     attitude_correlation_s: float = float("inf")
     kidnap: Kidnap | None = None
     on_board: NDArray[np.bool_] | None = None
+    lasting_m_s2: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lasting_correlation_s: float = 900.0
     any_node: bool = False
     node_longitudes_deg: tuple[float, float] | None = None
     parameters: AnchoredParameters = field(default_factory=AnchoredParameters)
@@ -250,7 +256,7 @@ def fly(case: NavigationCase, seed: int) -> NavigationRun:
     table = _with_errors(catalogue_table(case.craters), case.catalogue_errors, rng)
     if case.on_board is not None:
         table = table.select(case.on_board)
-    states, rotations = _truth(case, rng)
+    states, rotations = _truth(case, rng, np.random.default_rng((seed, 4)))
     ticks = np.asarray(ticks_from_utc_ns(case.frame_utc_ns), dtype=np.int64)
     navigator = _navigator(case, table, states[0], int(ticks[0]), rng)
     bias_rad = case.attitude_bias_rad * rng.standard_normal(3)
@@ -376,7 +382,7 @@ def _with_drawn_biases(case: NavigationCase, rng: np.random.Generator) -> Naviga
 
 
 def _wandering(
-    first: Float, sigma: float, correlation_s: float, elapsed_s: Float, rng: np.random.Generator
+    first: Float, sigma: float | Float, correlation_s: float, elapsed_s: Float, rng: np.random.Generator
 ) -> Float:
     """Return a stationary first-order Gauss-Markov process (n + 1, k) from its first value over n steps."""
     decay = np.exp(-elapsed_s / correlation_s)
@@ -423,14 +429,17 @@ def _with_errors(table: CatalogueTable, errors: CatalogueErrors, rng: np.random.
     return unpack_catalogue_table(pack_catalogue_table(moved))
 
 
-def _truth(case: NavigationCase, rng: np.random.Generator) -> tuple[Float, Float]:
+def _truth(case: NavigationCase, rng: np.random.Generator, slow: np.random.Generator) -> tuple[Float, Float]:
     """Return true states (n, 6) and rotations mcmf_from_icrf (n, 3, 3) at the frames."""
     model = ForceModel(case.gravity, case.orientation, case.gravity_degree)
     tdb_s = np.asarray(tdb_s_from_utc_ns(case.frame_utc_ns), dtype=np.float64)
     epoch_s = float(tdb_s_from_utc_ns(case.epoch_utc_ns))
     last_s = float(tdb_s[-1]) - epoch_s + 1.0
-    flown = propagate(epoch_s, case.position_icrf_m, case.velocity_icrf_m_s, last_s, model)
-    states = flown.state(tdb_s)
+    if any(case.lasting_m_s2):
+        states = _pushed(case, model, epoch_s, tdb_s, slow)
+    else:
+        flown = propagate(epoch_s, case.position_icrf_m, case.velocity_icrf_m_s, last_s, model)
+        states = flown.state(tdb_s)
     if case.kidnap is not None:
         k = case.kidnap.frame
         heading = rng.uniform(0.0, 2.0 * np.pi)
@@ -446,6 +455,29 @@ def _truth(case: NavigationCase, rng: np.random.Generator) -> tuple[Float, Float
         )
         states = np.concatenate([states[:k], moved.state(tdb_s[k:])])
     return states, case.orientation.mcmf_from_icrf(tdb_s)
+
+
+def _pushed(
+    case: NavigationCase, model: ForceModel, epoch_s: float, tdb_s: Float, rng: np.random.Generator
+) -> Float:
+    """Return true states at times (n,) with a slowly varying acceleration, applied as one impulse per minute.
+
+    An impulse at the beginning of a minute in place of 2e-6 m/s^2 throughout moves the orbit by 4 mm.
+    """
+    starts = np.arange(epoch_s, float(tdb_s[-1]) + 1.0, _PUSH_S)
+    sigma = np.array(case.lasting_m_s2)
+    lasting = _wandering(
+        sigma * rng.standard_normal(3), sigma, case.lasting_correlation_s, np.diff(starts), rng
+    )
+    state = np.concatenate([case.position_icrf_m, case.velocity_icrf_m_s])
+    states = np.empty((tdb_s.size, 6))
+    for start, push in zip(starts, lasting, strict=True):
+        velocity = state[3:] + rtn_from_inertial(state[:3], state[3:]).T @ (push * _PUSH_S)
+        arc = propagate(float(start), state[:3], velocity, _PUSH_S + 1.0, model)
+        within = (tdb_s >= start) & (tdb_s < start + _PUSH_S)
+        states[within] = arc.state(tdb_s[within])
+        state = arc.state(float(start) + _PUSH_S)
+    return states
 
 
 def _navigator(

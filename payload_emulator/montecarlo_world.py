@@ -118,7 +118,7 @@ def standard_case(data: DataFolder, track: Track, hours: float, noise_factor: fl
         gravity.gm_m3_s2,
     )
     parameters = AnchoredParameters(gravity_degree=_FILTER_DEGREE)
-    errors = parameters.errors
+    errors, shipped = parameters.errors, process_noise(_FILTER_DEGREE, other.name)
     frames = round(hours * 240.0)
     # Two arcs of 37 minutes in each period of 111, with gaps of 18 over the poles.
     elapsed_s = np.arange(frames) * 15.0
@@ -148,9 +148,9 @@ def standard_case(data: DataFolder, track: Track, hours: float, noise_factor: fl
         attitude_noise_rad=errors.attitude_noise_rad,
         attitude_bias_rad=errors.attitude_bias_rad,
         attitude_correlation_s=errors.attitude_correlation_s,
-        parameters=replace(
-            parameters, noise=_scaled(process_noise(_FILTER_DEGREE, other.name), noise_factor)
-        ),
+        lasting_m_s2=shipped.markov_sigma_m_s2,
+        lasting_correlation_s=shipped.correlation_s,
+        parameters=replace(parameters, noise=_scaled(shipped, noise_factor)),
     )
 
 
@@ -164,4 +164,5 @@ def _scaled(noise: ProcessNoise, factor: float) -> ProcessNoise:
         white_psd_m2_s3=times(noise.white_psd_m2_s3, factor),
         markov_sigma_m_s2=times(noise.markov_sigma_m_s2, float(np.sqrt(factor))),
         far_side_psd_m2_s3=None if far is None else times(far, factor),
+        far_side_oblique_psd_m2_s3=times(noise.far_side_oblique_psd_m2_s3, factor),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,9 @@ def configure_omission(commands: Any) -> None:
         "--truth-degree", type=int, metavar="N", help="its degree (default 150; as flown with --flown)"
     )
     omission.add_argument("--revolutions", type=int, default=16, metavar="N", help="revolutions (default 16)")
+    omission.add_argument(
+        "--inclination-deg", type=float, default=90.0, metavar="I", help="inclination (default 90)"
+    )
     omission.add_argument("--seed", type=int, default=1, help="seed of nodes and perilunes (default 1)")
     add_json_flag(omission)
     omission.set_defaults(handler=run_omission)
@@ -52,13 +56,15 @@ def run_omission(arguments: argparse.Namespace) -> int:
     truth = full.truncated(min(highest, full.degree))
     other = full if arguments.flown is None else load_gravity(arguments.flown)
     flown = other.truncated(min(arguments.degree, other.degree))
-    found = measured_omission(truth, flown, arguments.revolutions, arguments.seed)
-    near, far = field_psd_m2_s3(flown.name, flown.degree)
+    inclination_rad = math.radians(arguments.inclination_deg)
+    found = measured_omission(truth, flown, arguments.revolutions, arguments.seed, inclination_rad)
+    near, far = field_psd_m2_s3(flown.name, flown.degree, inclination_rad)
     figures = {
         "truth": {"name": truth.name, "degree": truth.degree},
         "flown": {"name": flown.name, "degree": flown.degree},
         "revolutions": found.revolutions,
         "seed": arguments.seed,
+        "inclination_deg": arguments.inclination_deg,
         "psd_m2_s3": found.psd_m2_s3.tolist(),
         "near_psd_m2_s3": found.near_psd_m2_s3.tolist(),
         "far_psd_m2_s3": found.far_psd_m2_s3.tolist(),

@@ -30,6 +30,8 @@ _STEP_S = 5.0
 _LOWEST_M, _HIGHEST_M = 10_000.0, 100_000.0
 # The gradient of a field of degree 12 is right to a few parts in a thousand at 15 km.
 _GRADIENT_DEGREE = 12
+# Keeps the cosine of an inclination finite for a state without motion, which is no orbit.
+_TINY = 1e-30
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +47,9 @@ class ProcessNoise:
     far_side_psd_m2_s3
         White acceleration over the far side, for a field that was determined without tracking there; None if the field
         has the same accuracy on both sides.
+    far_side_oblique_psd_m2_s3
+        Density added to it, multiplied by the cosine of the inclination: errors of a field fitted to polar orbits cancel
+        along a meridian and accumulate on an oblique track.
     scale_height_m, far_side_scale_height_m
         Height difference over which the density of each side decreases to 1/e: a field omits the highest degrees, whose
         power decreases by a factor of 50 between 15 and 45 km (degree 100). Densities are those at 30 km; None:
@@ -57,6 +62,7 @@ class ProcessNoise:
     far_side_psd_m2_s3: tuple[float, float, float] | None = None
     scale_height_m: float | None = None
     far_side_scale_height_m: float | None = None
+    far_side_oblique_psd_m2_s3: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def process_noise(degree: int, field: str = "") -> ProcessNoise:
@@ -68,6 +74,7 @@ def process_noise(degree: int, field: str = "") -> ProcessNoise:
         far_side_psd_m2_s3=None if same else found.far_psd_m2_s3,
         scale_height_m=found.near_scale_height_m,
         far_side_scale_height_m=found.far_scale_height_m,
+        far_side_oblique_psd_m2_s3=found.far_oblique_psd_m2_s3,
     )
 
 
@@ -139,19 +146,27 @@ class OrbitModel:
                 _third_bodies((edges[k] + edges[k + 1]) // 2),
                 _THIRD_BODY_GMS,
                 self._noise.correlation_s,
-                np.array(self._white_psd(start @ state[:3])),
+                np.array(self._white_psd(start @ state[:3], start @ state[3:6])),
                 np.array(self._noise.markov_sigma_m_s2),
             )
             total = transition @ total
             noise = transition @ noise @ transition.T + added
         return Prediction(state, total, noise)
 
-    def _white_psd(self, position_mcmf_m: Float) -> tuple[float, float, float]:
-        """Return the spectral density of white acceleration at a place."""
+    def _white_psd(self, position_mcmf_m: Float, velocity_mcmf_m_s: Float) -> tuple[float, float, float]:
+        """Return the spectral density of white acceleration at a place, for an inertial velocity."""
         noise, radius_m = self._noise, float(np.linalg.norm(position_mcmf_m))
         psd, height_m = noise.white_psd_m2_s3, noise.scale_height_m
         if noise.far_side_psd_m2_s3 is not None and position_mcmf_m[0] <= FAR_SIDE_COSINE * radius_m:
-            psd, height_m = noise.far_side_psd_m2_s3, noise.far_side_scale_height_m
+            normal = np.cross(position_mcmf_m, velocity_mcmf_m_s)
+            cosine = abs(float(normal[2])) / max(float(np.linalg.norm(normal)), _TINY)
+            far, oblique = noise.far_side_psd_m2_s3, noise.far_side_oblique_psd_m2_s3
+            psd = (
+                far[0] + cosine * oblique[0],
+                far[1] + cosine * oblique[1],
+                far[2] + cosine * oblique[2],
+            )
+            height_m = noise.far_side_scale_height_m
         if height_m is None:
             return psd
         altitude_m = min(max(radius_m - MOON_RADIUS_M, _LOWEST_M), _HIGHEST_M)

@@ -70,6 +70,9 @@ def test_noise_by_altitude_has_the_mean_over_the_orbit_that_the_table_gives(name
         factor = np.exp((REFERENCE_ALTITUDE_M - altitude_m) / height_m).mean()
         # Two exponentials stand as one where a field has errors of its own.
         np.testing.assert_allclose(np.array(psd) * factor, mean, rtol=1e-3 if name == "GRGM" else 0.05)
+    level = np.subtract(field_psd_m2_s3(name, degree, 0.0)[1], far)
+    factor = np.exp((REFERENCE_ALTITUDE_M - altitude_m) / noise.far_scale_height_m).mean()
+    np.testing.assert_allclose(np.array(noise.far_oblique_psd_m2_s3) * factor, level, rtol=0.05)
     assert (noise.near_psd_m2_s3 == noise.far_psd_m2_s3) is (name == "GRGM")
 
 
@@ -105,3 +108,19 @@ def test_the_table_of_the_filter_is_what_is_measured(data_path: Path) -> None:
     for degree in (20, 50, 70, 100):
         found = measured_omission(truth.truncated(150), truth.truncated(degree))
         assert found.psd_m2_s3 == pytest.approx(omission_psd_m2_s3(degree), rel=0.35), degree
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("inclination_deg", [89.0, 60.0])
+def test_errors_of_an_older_field_over_the_far_side_grow_with_the_obliqueness_of_the_track(
+    data_path: Path, inclination_deg: float
+) -> None:
+    products = find_data(data_path)
+    assert products.gravity is not None and products.gravity_alternative is not None
+    truth, other = load_gravity(products.gravity), load_gravity(products.gravity_alternative)
+    inclination = float(np.radians(inclination_deg))
+    found = measured_omission(truth.truncated(100), other.truncated(100), 30, 1, inclination)
+    _, held = field_psd_m2_s3(other.name, 100, inclination)
+    # Thirty revolutions know it to a fifth; the transverse part, a tenth of the others, is held to a factor of two.
+    np.testing.assert_allclose(found.far_psd_m2_s3[[0, 2]], np.array(held)[[0, 2]], rtol=0.4)
+    assert 0.5 < held[1] / found.far_psd_m2_s3[1] < 2.0

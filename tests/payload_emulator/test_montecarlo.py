@@ -10,6 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 from lunar.datafolder import DataFolder
+from lunar.frames import rtn_from_inertial
 from lunar.timescales import tdb_s_from_utc_ns
 from payload_emulator import montecarlo
 from payload_emulator.flight.anchored import AnchoredParameters
@@ -254,6 +255,32 @@ def test_slow_errors_wander_with_the_memory_they_are_given() -> None:
     assert np.mean(values[10:] * values[:-10]) / 0.25 == pytest.approx(np.exp(-1.0), abs=0.05)
     still = montecarlo._wandering(np.array([0.3, -0.2]), 0.5, float("inf"), elapsed_s, rng)
     np.testing.assert_array_equal(still, np.broadcast_to([0.3, -0.2], still.shape))
+
+
+def test_an_acceleration_that_lasts_moves_the_truth_as_it_should(shipped: Any) -> None:
+    """A nearly constant push across the plane over ten minutes."""
+    still = replace(shipped, lasting_m_s2=(0.0, 0.0, 0.0))
+    pushed = replace(shipped, lasting_m_s2=(0.0, 0.0, 1e-4), lasting_correlation_s=1e9)
+    rng = np.random.default_rng(0)
+    (here, _), (there, _) = (
+        montecarlo._truth(case, rng, np.random.default_rng(3)) for case in (still, pushed)
+    )
+    acceleration = 1e-4 * np.random.default_rng(3).standard_normal(3)[2]
+    np.testing.assert_allclose(there[0, :3], here[0, :3], atol=1e-6)
+    k = 40  # ten minutes
+    normal = rtn_from_inertial(here[k, :3], here[k, 3:])[2]
+    rate = 2.0 * np.pi / 6_672.0
+    # Across the plane the orbit is an oscillator: a / n^2 (1 - cos n t).
+    expected = acceleration / rate**2 * (1.0 - np.cos(rate * 600.0))
+    assert normal @ (there[k, :3] - here[k, :3]) == pytest.approx(expected, rel=0.12)
+
+
+def test_every_error_that_the_filter_allows_for_is_drawn(shipped: Any) -> None:
+    noise = shipped.parameters.noise
+    assert shipped.lasting_m_s2 == noise.markov_sigma_m_s2 == (2e-6, 2e-6, 2e-6)
+    assert shipped.lasting_correlation_s == noise.correlation_s
+    louder = standard_case(DataFolder(), "tuning", SHIPPED_HOURS, 4.0)
+    assert louder.lasting_m_s2 == shipped.lasting_m_s2  # the factor is the filter's, not the truth's
 
 
 def test_tracks_differ_and_draw_their_nodes_where_they_say() -> None:

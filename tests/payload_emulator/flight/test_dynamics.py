@@ -91,6 +91,9 @@ def test_less_gravity_on_board_means_more_process_noise() -> None:
     assert densities == sorted(densities, reverse=True)
 
 
+POLAR_M_S = np.array([0.0, 0.0, 1_665.0])
+
+
 def test_noise_falls_with_altitude_and_differs_by_side() -> None:
     noise = ProcessNoise((4e-7, 2e-7, 1e-7), (1e-12,) * 3, 900.0, (9e-7, 9e-7, 9e-7), 8_000.0, 30_000.0)
     orbit = model(noise)
@@ -98,7 +101,7 @@ def test_noise_falls_with_altitude_and_differs_by_side() -> None:
     def density(altitude_m: float, longitude_deg: float) -> tuple[float, float, float]:
         radius = 1_737_400.0 + altitude_m
         longitude = np.radians(longitude_deg)
-        return orbit._white_psd(radius * np.array([np.cos(longitude), np.sin(longitude), 0.0]))
+        return orbit._white_psd(radius * np.array([np.cos(longitude), np.sin(longitude), 0.0]), POLAR_M_S)
 
     np.testing.assert_allclose(density(30_000.0, 20.0), [4e-7, 2e-7, 1e-7], rtol=1e-9)
     np.testing.assert_allclose(density(38_000.0, 20.0), np.array([4e-7, 2e-7, 1e-7]) / np.e, rtol=1e-9)
@@ -108,4 +111,44 @@ def test_noise_falls_with_altitude_and_differs_by_side() -> None:
     assert density(2_000.0, 0.0) == density(10_000.0, 0.0)
     assert density(100e3, 180.0) == density(500e3, 180.0)
     flat = model(ProcessNoise((4e-7, 2e-7, 1e-7)))
-    assert flat._white_psd(np.array([1_800e3, 0.0, 0.0])) == (4e-7, 2e-7, 1e-7)
+    assert flat._white_psd(np.array([1_800e3, 0.0, 0.0]), POLAR_M_S) == (4e-7, 2e-7, 1e-7)
+
+
+@pytest.mark.parametrize("inclination_deg", [90.0, 60.0, 120.0, 0.0])
+def test_noise_over_the_far_side_grows_with_the_cosine_of_the_inclination(inclination_deg: float) -> None:
+    noise = ProcessNoise(
+        (4e-7, 2e-7, 1e-7),
+        far_side_psd_m2_s3=(3e-6, 2e-6, 1e-6),
+        far_side_oblique_psd_m2_s3=(8e-6, 0.0, 6e-6),
+    )
+    inclination = np.radians(inclination_deg)
+    # Over 180 degrees of longitude on the equator, going up: east is -y there.
+    velocity = 1_665.0 * np.array([0.0, -np.cos(inclination), np.sin(inclination)])
+    share = abs(np.cos(inclination))
+    found = model(noise)._white_psd(np.array([-1_768e3, 0.0, 0.0]), velocity)
+    np.testing.assert_allclose(found, [3e-6 + share * 8e-6, 2e-6, 1e-6 + share * 6e-6], rtol=1e-9)
+    near = model(noise)._white_psd(np.array([1_768e3, 0.0, 0.0]), velocity)
+    assert near == (4e-7, 2e-7, 1e-7)
+
+
+def test_the_noise_that_the_filter_adds_is_that_of_its_inclination() -> None:
+    noise = ProcessNoise(
+        (1e-12,) * 3,
+        (1e-12,) * 3,
+        900.0,
+        far_side_psd_m2_s3=(1e-12,) * 3,
+        far_side_oblique_psd_m2_s3=(2e-6,) * 3,
+    )
+    added = []
+    for inclination_deg in (90.0, 60.0):
+        inclination = np.radians(inclination_deg)
+        rotation = model().mcmf_from_icrf(START)
+        assert rotation is not None
+        velocity = 1_665.0 * np.array([0.0, -np.cos(inclination), np.sin(inclination)])
+        state = np.concatenate([rotation.T @ [-1_768e3, 0.0, 0.0], rotation.T @ velocity, np.zeros(3)])
+        predicted = model(noise).propagate(state, START, START + 60 * 65_536)
+        assert predicted is not None
+        added.append(np.diag(predicted.noise)[3:6])
+    # Half of 2e-6 for a minute at 60 degrees, nothing on a polar orbit.
+    np.testing.assert_allclose(added[1], 60.0 * 1e-6, rtol=0.01)
+    np.testing.assert_allclose(added[0], 0.0, atol=60.0 * 1e-8)
