@@ -119,8 +119,9 @@ def test_errors_of_an_older_field_over_the_far_side_grow_with_the_obliqueness_of
     assert products.gravity is not None and products.gravity_alternative is not None
     truth, other = load_gravity(products.gravity), load_gravity(products.gravity_alternative)
     inclination = float(np.radians(inclination_deg))
-    found = measured_omission(truth.truncated(100), other.truncated(100), 30, 1, inclination)
+    found = measured_omission(truth.truncated(100), other.truncated(100), 60, 1, inclination)
     _, held = field_psd_m2_s3(other.name, 100, inclination)
-    # Thirty revolutions know it to a fifth; the transverse part, a tenth of the others, is held to a factor of two.
+    # Sixty revolutions know it to a fifth, and over the altitudes of this orbit it is a quarter more than at 30 km. The
+    # transverse part, a tenth of the others, is held to a factor of two.
     np.testing.assert_allclose(found.far_psd_m2_s3[[0, 2]], np.array(held)[[0, 2]], rtol=0.4)
     assert 0.5 < held[1] / found.far_psd_m2_s3[1] < 2.0
