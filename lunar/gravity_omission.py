@@ -44,12 +44,13 @@ _OMITTED_M2_S3 = {
 # Fields made before GRAIL: tracked over the near side only, because an orbiter over the far side is not visible from
 # the Earth.
 _OLDER = ("LP", "GLGM", "JGL")
-# LP165P against GRAIL, both to degree 100, from means over 1/12 of a revolution (555 s, about the memory of a filter with
-# a fix of some 50 m every 15 s) on circular orbits at 30 km. The difference is 2 to 6 mGal over the near side and 30 to
-# 43 mGal over the far side. Its slow part depends on the track. The field was fitted to polar orbits: its far-side errors
-# cancel along a meridian within minutes and accumulate on an oblique track. The radial density is 2.3, 3.7, 10, 12, 12,
-# 17 and 25e-6 m^2/s^3 at inclinations of 89, 85, 80, 75, 70, 60 and 45 degrees (each known to 20 %). A constant and a
-# term in the cosine of the inclination fit these values (`linna orbit omission --flown FILE --inclination-deg I`).
+# LP165P against GRAIL, both to degree 100, from means over 1/12 of a revolution (555 s, about the memory of a filter
+# with a fix of some 50 m every 15 s) on circular orbits at 30 km. The difference is 2 to 6 mGal over the near side and
+# 30 to 43 mGal over the far side. Its slow part depends on the track. The field was fitted to polar orbits: its
+# far-side errors cancel along a meridian within minutes and accumulate on an oblique track. The radial density is 2.3,
+# 3.7, 10, 12, 12, 17 and 25e-6 m^2/s^3 at inclinations of 89, 85, 80, 75, 70, 60 and 45 degrees (each known to 20 %).
+# A constant and a term in the cosine of the inclination fit these values (`linna orbit omission --flown FILE
+# --inclination-deg I`).
 _NEAR_SIDE_M2_S3 = (2.2e-8, 9e-10, 1.8e-8)
 _FAR_SIDE_M2_S3 = (1.7e-6, 2.8e-7, 1.4e-6)
 _FAR_SIDE_OBLIQUE_M2_S3 = (3.0e-5, 1.4e-6, 2.6e-5)

@@ -48,8 +48,8 @@ class ProcessNoise:
         White acceleration over the far side, for a field that was determined without tracking there; None if the field
         has the same accuracy on both sides.
     far_side_oblique_psd_m2_s3
-        Density added to it, multiplied by the cosine of the inclination: errors of a field fitted to polar orbits cancel
-        along a meridian and accumulate on an oblique track.
+        Density added to it, multiplied by the cosine of the inclination: errors of a field fitted to polar orbits
+        cancel along a meridian and accumulate on an oblique track.
     scale_height_m, far_side_scale_height_m
         Height difference over which the density of each side decreases to 1/e: a field omits the highest degrees, whose
         power decreases by a factor of 50 between 15 and 45 km (degree 100). Densities are those at 30 km; None:
