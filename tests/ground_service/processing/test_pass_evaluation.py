@@ -706,7 +706,7 @@ def test_no_other_estimator_stands_in_for_the_declared_one(estimator: str | None
     assert [(one.value, one.note) for one in report.headline[::2]] == [
         (None, reason), (None, reason), (100, "of 2\u202f000 expected"),
     ]  # fmt: skip
-    assert (report.headline[3].value, report.headline[3].note) == (None, "")
+    assert (report.headline[3].value, report.headline[3].note) == (None, "not evaluated")
 
 
 @pytest.mark.parametrize(
