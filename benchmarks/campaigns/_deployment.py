@@ -114,7 +114,11 @@ class Part:
 
 def bare_environment(**settings: str) -> dict[str, str]:
     """The environment with these settings of the service and none that it had before."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("LINNA_")}
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith("LINNA_") or name == "LINNA_DATA"
+    }
     return {**kept, **settings}
 
 
