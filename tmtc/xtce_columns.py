@@ -59,7 +59,7 @@ class ArrayColumn:
         """A list for each row."""
         elements = self.elements.to_list(raw)
         stops = np.cumsum(self.counts).tolist()
-        return [elements[start:stop] for start, stop in zip([0, *stops[:-1]], stops, strict=True)]
+        return [elements[start:stop] for start, stop in zip([0, *stops][:-1], stops, strict=True)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

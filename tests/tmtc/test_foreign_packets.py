@@ -179,6 +179,18 @@ def test_a_hole_costs_the_packets_it_touches(seed):
     assert packets_of(octets[:start] + octets[stop:]) == packets[:first] + packets[whole_again:]
 
 
+def test_a_header_alone_at_the_end_proves_nothing():
+    assert packets_of(b"\xff" * 100 + space_packet(5, b"abc", 0)) == []
+
+
+def test_headers_that_do_not_continue_the_counts_of_their_apid_are_no_packets():
+    packets = [space_packet(9, b"abc", k) for k in range(20)]
+    headers = space_packet(9, b"\xff" * 30, 9000) + space_packet(9, b"\xff" * 30, 4000)
+    noise = b"\xff" * 20 + headers + b"\xff" * 5
+    found = packets_of(b"".join(packets[:10]) + noise + b"".join(packets[10:]))
+    assert found == packets[:9] + packets[10:]
+
+
 def test_a_wrong_length_costs_its_packet():
     packets = capture(100, 2)
     broken = bytearray(packets[50])

@@ -276,6 +276,17 @@ def test_a_terminator_of_two_octets_stands_at_a_whole_character():
     assert one(text_type(size, "UTF-16BE"), {"A": "T"}, ["A"], data)["A"] == ["aĀ"]
 
 
+@pytest.mark.parametrize("charset", ["US-ASCII", "UTF-8", "ISO-8859-1", "UTF-16BE", "UTF-16LE"])
+def test_zeros_at_the_end_of_a_text_belong_to_it(charset):
+    text = document(text_type(foreign.fixed_size(64), charset), {"A": "T"}, container("P", ["A"]))
+    expected = ["ab\0\0", "\0\0\0\0", "a\0b\0", "abcd"] * (2 if charset.startswith("UTF-16") else 1)
+    if not charset.startswith("UTF-16"):
+        expected = [one * 2 for one in expected]
+    expected += [one.replace("\0", "z") for one in expected] * 3
+    packets = [one.encode(charset) for one in expected]
+    assert decoded(text, packets).tables["P"].columns["A"].to_list() == expected
+
+
 def test_texts_and_octets_that_begin_inside_an_octet_are_read():
     types = (
         integer("N", 3)
@@ -403,6 +414,15 @@ def test_elements_that_say_their_own_length_are_read_one_after_another():
     columns = found.tables["P"].columns
     assert [[(e["key"], e["text"]) for e in row] for row in columns["a"].to_list()] == rows
     assert columns["z"].to_list() == [0x63] * 4 and found.verdict.tolist() == [0, 0, 0, 0, 3]
+
+
+def test_arrays_in_arrays_of_which_there_are_none_are_empty():
+    types = integer("N", 8) + array_type("A", "N", dimension("n"))
+    types += aggregate("ROW", {"k": "N", "a": "A"}) + array_type("B", "ROW", dimension("n"))
+    text = document(types, {"n": "N", "b": "B"}, container("P", ["n", "b"]))
+    assert decoded(text, [b"\0"]).tables["P"].columns["b"].to_list() == [[]]
+    two = decoded(text, [b"\0", bytes((2, 7, 1, 2, 8, 3, 4))]).tables["P"].columns["b"]
+    assert two.to_list() == [[], [{"k": 7, "a": [1, 2]}, {"k": 8, "a": [3, 4]}]]
 
 
 def test_no_packet_with_an_element_gives_empty_arrays():
