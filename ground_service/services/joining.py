@@ -67,6 +67,9 @@ Counts are derived from the frames around a CADU, and are wrong if these are of 
 REPAIRS_LIMIT = 4
 """Largest number of arrangements that are corrected if none is free of errors."""
 
+FOREIGN_SHARE = 0.25
+"""Octets of which a larger share is corrected belong to another CADU; noise that can be corrected has 6 %."""
+
 PATHS_LIMIT = 256
 """Largest number of sequences of middles that are tried for one packet."""
 
@@ -248,7 +251,12 @@ class Joiner:
                 continue
             block = read_frames(stream, slots, settings)
             for offset in self._take_frames(block):
-                self._found.parts += [(domain, part) for part in _within(parts, offset, offset + length)]
+                wrong = _repaired(stream, offset, block)
+                for part in _within(parts, offset, offset + length):
+                    octets = part.stop - part.start
+                    if not _is_foreign(wrong[:octets]):
+                        self._found.parts.append((domain, part))
+                    wrong = wrong[octets:]
 
     def _join_cadu_by_content(
         self, connection: repository.Connection, domain: str, settings: LinkSettings, edge: StoredEdge
@@ -332,7 +340,11 @@ class Joiner:
             block = read_frames(stream, offsets, settings)
             for offset in self._take_frames(block):
                 if is_checked(settings):
-                    self._use(some[offset // length])
+                    wrong = _repaired(stream, offset, block)
+                    for edge in some[offset // length]:
+                        if not _is_foreign(wrong[: len(edge.edge.octets)]):
+                            self._use([edge])
+                        wrong = wrong[len(edge.edge.octets) :]
                     return True
         return False
 
@@ -584,6 +596,20 @@ def _known_beginnings(connection: repository.Connection, domain: str, parts: Seq
             places.append(position + start - part.start)
         position += part.stop - part.start
     return places
+
+
+def _repaired(stream: OctetArray, offset: int, block: FrameBlock) -> NDArray[np.bool_]:
+    """Return which octets of the marker and of the frame of the CADU at an offset the code has corrected."""
+    frame = block.frames[int(np.flatnonzero(block.offsets == offset)[0])]
+    first = offset + ASM_LENGTH
+    # The code is systematic: the frame comes first. The whole block is derandomised, as the sequence begins with it.
+    received = randomise(stream[None, first : offset + block.settings.cadu_length], block.settings.randomiser)
+    return np.concatenate((np.zeros(ASM_LENGTH, dtype=np.bool_), received[0, : frame.size] != frame))
+
+
+def _is_foreign(wrong: NDArray[np.bool_]) -> bool:
+    """Return whether octets were not part of a CADU but repaired into it, which the code can do with a short edge."""
+    return bool(np.count_nonzero(wrong) > FOREIGN_SHARE * wrong.size)
 
 
 def _counts_fit(one: int, other: int) -> bool:

@@ -357,6 +357,22 @@ def test_a_piece_is_stored_in_few_transactions(ground: Ground, packets: list[byt
     assert len(commits) <= 6
 
 
+@pytest.mark.parametrize("order", [(0, 3, 2, 1), (3, 0, 1, 2), (2, 0, 3, 1)])
+def test_the_beginning_of_another_cadu_that_the_code_repairs_is_not_used_up(
+    ground: Ground, packets: list[bytes], expected: str, tmp_path: Path, order: tuple[int, ...]
+) -> None:
+    """Two CADUs are cut at the same octet; 73 wrong octets of a frame are within what the code corrects.
+
+    A third piece of the first CADU keeps its end from being repaired in the same way.
+    """
+    stream = encode_cadus(packets, spacecraft_id=SPACECRAFT)
+    cuts = [0, 1279 + 77, 1279 + 300, 3 * 1279 + 77, len(stream)]
+    pieces = [stream[a:b] for a, b in itertools.pairwise(cuts)]
+    for number in order:
+        ingest(ground, pieces[number], tmp_path)
+    assert archive(ground) == expected
+
+
 class PowerFailure(Exception):
     """The process ends here."""
 
