@@ -19,7 +19,12 @@ settings.load_profile("linna")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Tests of real data run whenever LINNA_DATA is set; only a machine without the products leaves them out."""
+    """Browser tests run last, and tests of real data only if LINNA_DATA is set.
+
+    A driven browser keeps an event loop in the thread of the tests, in which `asyncio.run` is then refused.
+    """
+    driven = {item.path for item in items if "browser" in getattr(item, "fixturenames", ())}
+    items.sort(key=lambda item: item.path in driven)
     if os.environ.get("LINNA_DATA"):
         return
     skip = pytest.mark.skip(reason="LINNA_DATA is not set: no real data on this machine")

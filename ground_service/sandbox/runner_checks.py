@@ -42,13 +42,18 @@ def runner_faults(exchange: Path) -> list[str]:
 
 
 def build_remains() -> Iterator[str]:
-    """Yield the processes of build users, and their files in the world-writable folders."""
+    """Yield the processes of build users, and their files in the world-writable folders.
+
+    Processes in other PID namespaces end with these and are not those of a runner's builds.
+    """
+    own = os.readlink("/proc/self/ns/pid")
     for status in Path("/proc").glob("[0-9]*/status"):
         try:
             user = next(line for line in status.read_text().splitlines() if line.startswith("Uid:"))
+            namespace = os.readlink(status.parent / "ns" / "pid")
         except (OSError, StopIteration):
             continue
-        if int(user.split()[1]) >= launcher.FIRST_BUILD_UID:
+        if int(user.split()[1]) >= launcher.FIRST_BUILD_UID and namespace == own:
             yield f"process {status.parent.name}"
     for place in launcher.WORLD_WRITABLE:
         for folder, names, files in os.walk(place):

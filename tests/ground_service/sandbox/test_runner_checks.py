@@ -36,9 +36,9 @@ def test_files_in_a_folder_without_permissions_are_removed(shared: Path) -> None
 
     launcher.as_user(UID, leave)
     (shared / "of the runner").touch()
-    assert sorted(build_remains())[0] == str(shared / "hidden")
+    assert str(shared / "hidden") in build_remains()
     launcher.as_user(UID, lambda: launcher.remove_owned(UID))
-    assert list(build_remains()) == []
+    assert [one for one in build_remains() if one.startswith(str(shared))] == []
     assert [path.name for path in shared.iterdir()] == ["of the runner"]
 
 
@@ -46,4 +46,4 @@ def test_a_process_of_a_build_is_found_until_it_is_killed(shared: Path) -> None:
     with subprocess.Popen(["sleep", "60"], user=UID) as process:
         assert f"process {process.pid}" in build_remains()
         launcher.kill_user(UID)
-    assert list(build_remains()) == []
+    assert f"process {process.pid}" not in build_remains()
