@@ -22,6 +22,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Browser tests run last, and tests of real data only if LINNA_DATA is set.
 
     A driven browser keeps an event loop in the thread of the tests, in which `asyncio.run` is then refused.
+    With several processes this needs `--no-loadscope-reorder`.
     """
     driven = {item.path for item in items if "browser" in getattr(item, "fixturenames", ())}
     items.sort(key=lambda item: item.path in driven)
