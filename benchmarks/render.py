@@ -55,7 +55,7 @@ class Region:
 
 
 PROCEDURAL = Region((-55.0, 55.0), (0.0, 360.0), (10.0, 20.0))
-# Western Procellarum to the southern highlands, away from the edges of the tiles at hand.
+# Western Procellarum to the southern highlands, away from the edges of the available tiles.
 REAL = Region((-50.0, 50.0), (286.0, 298.0), (-25.0, 295.0))
 
 

@@ -257,7 +257,7 @@ def integrate(
     below ``event_radius_m``, or an aposelene above it, whichever ``event`` asks for.  GROUND: the last step met
     radius ``ground_m``, at its end or at a periselene in it.
 
-    One loop over stages, with the forces evaluated in one place (each further one would be compiled anew).  Stage 0
+    One loop over stages, with the forces evaluated in one place (each further one would be compiled again).  Stage 0
     is at a new knot; only there is the step that led to it searched for events, as its quintic needs the
     acceleration at both ends.
     """

@@ -43,7 +43,7 @@ class Patience:
 
 @dataclass(frozen=True, slots=True)
 class Fetched:
-    """What became of a file: "present", "fetched" or "fetched, differs from the tested copy"; octets now on disk."""
+    """State of a file: "present", "fetched" or "fetched, differs from the tested copy"; octets now on disk."""
 
     path: str
     status: str
@@ -202,7 +202,7 @@ def _receive(file: ProductFile, arriving: Path, timeout_s: float, report: Report
     except urllib.error.HTTPError as error:
         if error.code != 416 or not have:
             raise
-        # Nothing lies beyond what we have: it is whole, or of another file and asked for anew.
+        # Nothing lies beyond what we have: it is whole, or of another file and requested again.
         error.close()
         if error.headers.get("Content-Range") == f"bytes */{have}":
             return True

@@ -34,7 +34,7 @@ SPACECRAFT_ID = 0x4C
 
 _NS = 1_000_000_000
 PLAYBACK_CHANNEL = 1
-# Source of the planned telecommands; whoever commands by hand has another one, with counts of its own.
+# Source of the planned telecommands; a person who commands by hand has another one, with separate counts.
 _PLANNING_SOURCE = 1
 _TIME_RATE_EXPONENT = 1  # a clock known to be off is watched: a time report every second frame of telemetry
 _LATE_TICKS = 120 * TICKS_PER_SECOND
@@ -66,7 +66,7 @@ class Moment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Flown:
-    """What became of a moment; `clcw` is the state of the telecommand receiver after it, as frames carry it."""
+    """Outcome of one time step; `clcw` is the state of the telecommand receiver after it, as frames carry it."""
 
     moment: Moment
     exposure: Exposure | None

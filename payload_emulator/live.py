@@ -1,11 +1,11 @@
 """The payload as a process to watch and to command: telemetry out and telecommands in over TCP, and a console.
 
-Three ports. Telemetry: CADUs to whoever is connected, from the moment of connection on. Telecommands: CLTUs or bare
+Three ports. Telemetry: CADUs to every connected client, from the moment of connection on. Telecommands: CLTUs or bare
 telecommand packets, told apart by their first octets; both are on their way for the light time (by the rate of the
 simulated clock, so not at all at rate 0), and what arrives while no station sees the spacecraft is lost, as in space.
 Console: what really happens, at once. One JSON object a line out, one word a line in (`pause`,
 `run`, `step`, `rate X`, `quit`). A step by hand, or going on after a pause, breaks the continuity of time for those who
-watch: as in the simulator of the paper, the odometries are told to start anew (trigger `manual_step`).
+watch: as in the simulator of the paper, the odometries are told to start again (trigger `manual_step`).
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ _ANCHOR_STEP_NS = 15_000_000_000
 _ORIENTATION_STEP_NS = 3_600_000_000_000
 _ORIENTATION_MARGIN_NS = 4 * _ORIENTATION_STEP_NS
 
-# Without a second field at hand the filter flies the built-in one cut to this degree: never the field of the truth.
+# Without a second available field the filter flies the built-in one cut to this degree: never the field of the truth.
 _CUT_DEGREE = 8
 # Craters shallower than this share of their diameter can hardly be seen by anyone; a quarter of a real list is so.
 _VISIBLE_DEPTH_RATIO = 0.025
@@ -69,7 +69,7 @@ _SMALLEST_SIGMA_M = 10.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadedPayload:
-    """A payload ready to observe, what it can be started anew from, and what the archive records of its loading."""
+    """A payload ready to observe, what it can be restarted from, and what the archive records of its loading."""
 
     payload: Payload
     parameters: BuildParameters

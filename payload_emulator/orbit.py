@@ -34,7 +34,7 @@ class ScenarioOrbit:
 
 
 def open_gravity(name: str, data: DataFolder) -> GravityField:
-    """The field a scenario names: "auto" (the best at hand), "builtin", or a coefficient file."""
+    """The field a scenario names: "auto" (the best available), "builtin", or a coefficient file."""
     if name == "auto":
         return default_gravity(data)
     return builtin_gravity() if name == "builtin" else load_gravity(Path(name))
@@ -53,7 +53,7 @@ def open_orientation(name: str, data: DataFolder) -> Orientation:
 
 
 def force_model(scenario: Scenario, data: DataFolder) -> ForceModel:
-    """The forces of a scenario; its degree is cut to what the field at hand holds."""
+    """The forces of a scenario; its degree is cut to what the available field holds."""
     dynamics = scenario.dynamics
     gravity = open_gravity(dynamics.gravity, data)
     orientation = open_orientation(dynamics.orientation, data)

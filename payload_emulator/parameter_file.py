@@ -155,7 +155,7 @@ def _toml(value: Any) -> str:
 def _changed(
     value: Any, kind: type, table: Any, source: str, path: str, dropped: list[str] | None = None
 ) -> Any:
-    """A dataclass with the fields that `table` names changed; built anew where there was none."""
+    """A dataclass with the fields that `table` names changed; created where there was none."""
     if not isinstance(table, dict):
         raise ParameterError(source, path, "a table", repr(table)[:SHOWN])
     hints = get_type_hints(kind)

@@ -76,7 +76,7 @@ class PassRecord:
     Attributes
     ----------
     dropped
-        Parameters and tables of the record that the flight code at hand does not have any more.
+        Parameters and tables of the record that the present flight code no longer has.
     """
 
     inputs: tuple[StepInput, ...]

@@ -311,7 +311,7 @@ class RecordedBoard(BareBoard):
     asked_to_reset: bool = False
 
     def tell(self, item: StepInput) -> bool:
-        """Take the place of the board in a step; whether the processor starts anew before it."""
+        """Take the place of the board in a step; whether the processor restarts before it."""
         self.uptime, self.downlink = item.uptime_ticks, item.downlink_octets
         if np.isfinite(item.sensors).all():
             self.readings = item.sensors

@@ -41,7 +41,7 @@ class OrbitSection:
 
 @dataclass(frozen=True, slots=True)
 class DynamicsSection:
-    """Forces on the true spacecraft. `gravity`: "auto" (best field at hand), "builtin", or a coefficient file.
+    """Forces on the true spacecraft. `gravity`: "auto" (best available field), "builtin", or a coefficient file.
 
     Sunlight pushes where the cross-section over mass is positive; the reflection is 1 for black, 2 for a mirror.
     """
@@ -74,7 +74,7 @@ class ManeuverSection:
 class WindowSection:
     """When the payload observes.
 
-    `search`: "terrain" takes the first window of the wanted direction whose whole track lies over the terrain at hand,
+    `search`: "terrain" takes the first window of the wanted direction that lies entirely over the available terrain,
     no earlier than `start` (the orbit's epoch when empty), between the two longitudes (east-positive; the second may
     exceed 360); "none" observes from `start` for `duration_s`.
     Frames are taken where the sub-satellite latitude is within `latitude_limit_deg`, on one of so many arcs as
@@ -118,7 +118,7 @@ class CameraSection:
 
 @dataclass(frozen=True, slots=True)
 class LightSection:
-    """`paper`: the Sun drawn anew for each frame (section V-B.4); `real`: from the ephemeris.
+    """`paper`: the Sun drawn again for each frame (section V-B.4); `real`: from the ephemeris.
 
     `photometry` is the law by which the ground scatters it.
     """
@@ -133,7 +133,7 @@ class LightSection:
 
 @dataclass(frozen=True, slots=True)
 class TerrainSection:
-    """`auto`: the real terrain where its rasters are at hand, else the procedural Moon.
+    """`auto`: the real terrain where its rasters are available, else the procedural Moon.
 
     `catalogue`: the craters of the data folder's catalogue, at their places and sizes, on a procedural base.
     """

@@ -37,7 +37,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def untrained(folder: Path) -> Path:
-    """A build whose network has the shipped one's shape and weights drawn anew, as a training starts from."""
+    """A build whose network has the shipped one's shape and newly drawn weights, as a training starts from."""
     import onnx
     from onnx import numpy_helper
 

@@ -208,7 +208,7 @@ class FrameTable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DownlinkDecode:
-    """What came out of a downlink, and what became of every octet of it.
+    """What came out of a downlink, and the accounting of every octet.
 
     `buffer` holds the packet octets that `cut` points into. `unknown` counts packets with a right checksum that the
     dictionary does not know or that are not as long as it says. `octets` says where the octets of the input went;

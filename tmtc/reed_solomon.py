@@ -1,7 +1,7 @@
 """Reed-Solomon (255,223) and (255,239) of CCSDS 131.0-B: interleaved, shortened, dual or conventional basis.
 
 Encoding and the check whether codewords are clean are linear over bits, so both are sums (exclusive or) of
-one table row per symbol, done for all codewords at once; the tables are made for the basis at hand and no
+one table row per symbol, done for all codewords at once; the tables are made for the basis in use and no
 symbol is converted. Only codewords with errors go through the decoder proper, in the conventional basis, again
 many at once, so that a stream of nothing but noise does not hold up its reader.
 

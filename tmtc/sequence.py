@@ -23,7 +23,7 @@ from tmtc.packets import SEQUENCE_COUNT_LIMIT
 
 FIRST, DUPLICATE, CONFLICT = 0, 1, 2
 
-# A sender that starts anew counts from zero; a count that falls far, to nearly zero, as time goes on is such a start
+# A sender that restarts counts from zero; a count that falls far, to nearly zero, as time goes on is such a start
 _RESET_FALL = 64
 _RESET_COUNT = 64
 
@@ -33,7 +33,7 @@ class ApidAccount:
     """What came of one APID during one boot.
 
     `missing_ranges` (m, 2) are ranges [first, last] of extended counts that never came; `received` counts
-    different packets, not copies; `restarts` tells how often the counter began anew.
+    different packets, not copies; `restarts` tells how often the counter restarted.
     """
 
     boot: int
@@ -89,7 +89,7 @@ class SequenceReport:
 def extend_counts(
     sequence_count: IntArray, ticks: IntArray, expected_rate: float | None = None
 ) -> tuple[IntArray, IntArray]:
-    """(extended counts (n,), extended counts at which the counter began anew (r,)) of one APID and boot.
+    """(extended counts (n,), extended counts at which the counter restarted (r,)) of one APID and boot.
 
     Parameters
     ----------

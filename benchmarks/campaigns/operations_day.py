@@ -60,7 +60,7 @@ LEAD_S = 180
 
 AFTER_S = 90
 SLOW_RATE = 3
-"""While the operators look; a pause would have the payload's odometries start anew."""
+"""While the operators look; a pause would make the payload's odometries start again."""
 PATIENCE_S = 300.0
 
 

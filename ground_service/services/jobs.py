@@ -1,6 +1,6 @@
 """Jobs: named pieces of work that can be asked for, watched and done again without harm.
 
-A job is a row before it is anything else, so it is visible from the moment it is asked for, whoever does it: this
+A job is a row before it is anything else, so it is visible from the moment of the request, whether it runs in this
 process, a thread of the server, or a worker on another machine. Doing a finished job again does nothing.
 """
 

@@ -196,7 +196,7 @@ def open_catalogue(name: str | None, seed: int) -> CraterCatalogue:
     """The catalogue of a file or of one of `SYNTHETIC`; without a name, the most complete available one.
 
     The paper's density comes from the real catalogue, completed with random craters where it is silent, or is all
-    synthetic where there is none at hand.
+    synthetic where none is available.
     """
     from linna.data import data_folder
     from lunar.catalogue import completed_to_paper, load_catalogue, paper_density_catalogue

@@ -235,7 +235,7 @@ def fit_place(
     """Return place, attitude, their covariance, the crater of each detection (-1: none) and what chance would give.
 
     Least squares on the pairs of detections and craters that are each other's nearest, over place (east, north, up)
-    and a small rotation of the camera whose size is known; pairs are chosen anew in every round, ever closer.
+    and a small rotation of the camera whose size is known; pairs are chosen again in every round, ever closer.
 
     Parameters
     ----------

@@ -193,7 +193,7 @@ class AnchoredParameters:
 
 @dataclass(frozen=True, slots=True)
 class AnchoredReport:
-    """What became of one frame, and where the spacecraft is believed to be.
+    """Outcome of one frame, and where the spacecraft is believed to be.
 
     Attributes
     ----------
@@ -282,7 +282,7 @@ class AnchoredNavigator:
         self._places: PlaceIndex | None = None
 
     def step(self, ticks: int, found: Detections | None, camera_from_icrf: Float | None) -> AnchoredReport:
-        """Return what became of one frame.
+        """Return the outcome of one frame.
 
         Parameters
         ----------

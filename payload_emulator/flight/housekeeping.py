@@ -46,7 +46,7 @@ class Housekeeping:
         return now
 
     def restart(self) -> None:
-        """Count anew: the clock has moved."""
+        """Restart the intervals: the clock has moved."""
         for structure in self.structures.values():
             structure.next_ticks = None
 

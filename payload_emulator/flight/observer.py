@@ -1,4 +1,4 @@
-"""One frame from image to telemetry: detector, estimators, and the packets that say what became of it."""
+"""One frame from image to telemetry: detector, estimators, and the packets that report its outcome."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Observer:
         return sum(state.altitude_reads + state.resets for state in self._odometry.values() if state)
 
     def load_tables(self, tables: FlightTables) -> None:
-        """Begin anew with these tables; a damaged one is reported and not used."""
+        """Start again with these tables; a damaged one is reported and not used."""
         self._tables = tables
         self._odometry.clear()
         self._anchor = self._load("anchor_ephemeris", unpack_anchor_table)
@@ -147,7 +147,7 @@ class Observer:
         telemetry.frame_number += 1
 
     def summary(self) -> dict[str, Any]:
-        """Return what became of the frames since boot, for the operators of the emulator."""
+        """Return the outcomes of the frames since boot, for the operators of the emulator."""
         estimators = {mode.name: self._summary_of(mode) for mode in self._parameters.modes}
         modes = self._parameters.modes
         primary = Mode.anchored if Mode.anchored in modes else next(iter(modes), None)

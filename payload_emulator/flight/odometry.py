@@ -122,7 +122,7 @@ class OdometryState:
 
 @dataclass(frozen=True, slots=True)
 class OdometryReport:
-    """What became of one frame."""
+    """Outcome of one frame."""
 
     outcome: Outcome
     reset_trigger: ResetTrigger
@@ -143,7 +143,7 @@ def step(
     *,
     manual_step: bool = False,
 ) -> tuple[OdometryState | None, OdometryReport]:
-    """Return the state after one frame and what became of the frame.
+    """Return the state after one frame and the outcome of the frame.
 
     A frame that needs a reset where the anchor ephemeris has nothing is `missed`: before the first reset the
     state stays None, afterwards it is held and the reset stays due.

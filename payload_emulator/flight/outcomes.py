@@ -14,7 +14,7 @@ class Mode(IntEnum):
 
 
 class Outcome(IntEnum):
-    """What became of one frame: 0 to 5 are the paper's six (section VII-A), 6 to 9 belong to `anchored`."""
+    """Outcome of one frame: 0 to 5 are the paper's six (section VII-A), 6 to 9 belong to `anchored`."""
 
     anchored = 0
     multi = 1

@@ -258,7 +258,7 @@ class Payload:
     # Time, telecommands, schedule
 
     def _check_clock(self, ticks: int) -> None:
-        """Notice a clock that jumps; what hangs on it starts anew."""
+        """Notice a clock that jumps; what depends on it starts again."""
         machine = self._machine
         uptime = machine.board.uptime_ticks()
         if self._last_ticks is not None:

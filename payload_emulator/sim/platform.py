@@ -150,7 +150,7 @@ class SimulatedBoard:
         return bool(self._loads & _CAMERA)
 
     def reset(self, cause: int) -> None:
-        """Start the processor anew: working memory is gone, the rest stays."""
+        """Restart the processor: working memory is gone, the rest stays."""
         self.reset_cause, self.reset_requested = cause, None
         self.memory, self._stage, self._loads = {}, 0, 0
 

@@ -118,7 +118,7 @@ def _vary_tone(
 
 @functools.cache
 def _noise() -> NDArray[np.float32]:
-    """One large picture of unit noise; crops take a window of it, which is ten times quicker than drawing anew."""
+    """One large picture of unit noise; crops take a window of it, which is ten times quicker than drawing again."""
     return np.random.Generator(np.random.PCG64(5)).standard_normal(
         (_NOISE_SIZE, _NOISE_SIZE), dtype=np.float32
     )

@@ -1,4 +1,4 @@
-"""Latency and memory of the flight detector on the machine at hand."""
+"""Latency and memory of the flight detector on this machine."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ def _bias(tallied: Tally, chosen: NDArray[np.bool_], sun_azimuth_rad: Floats) ->
 
 
 def _resampled_means(errors: Floats, frame: NDArray[np.int64]) -> Floats:
-    """Means (rounds, k) of errors (n, k) over frames drawn anew."""
+    """Means (rounds, k) of errors (n, k) over resampled frames."""
     _, place = np.unique(frame, return_inverse=True)
     count = np.bincount(place).astype(float)
     sums = np.stack([np.bincount(place, weights=column) for column in errors.T], axis=1)

@@ -1,4 +1,4 @@
-"""A cached kernel is compiled anew when the file of a kernel that it calls has changed."""
+"""A cached kernel is compiled again when the file of a kernel that it calls has changed."""
 
 import os
 import subprocess

@@ -277,7 +277,7 @@ def test_verifying_finds_every_change(server, tmp_path):
     assert [c.status for c in verify(tmp_path, products)] == ["damaged", "damaged"]
     (tmp_path / "dem/a.bin").unlink()
     assert [c.status for c in verify(tmp_path, products)] == ["missing", "damaged"]
-    # A damaged file is fetched anew.
+    # A damaged file is fetched again.
     assert fetch(products[0].files[1], tmp_path, QUICK).status == "fetched"
 
 

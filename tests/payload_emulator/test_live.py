@@ -125,7 +125,7 @@ def test_a_session_of_watching_stepping_and_commanding(running: tuple[LivePayloa
     assert first["catalogue"] and {"id", "u_px", "v_px", "diameter_px"} <= set(first["catalogue"][0])
     assert first["estimates"]["spherical"]["outcome"] == "anchored"
     assert first["estimates"]["spherical"]["error_m"] < 50.0
-    # A frame stepped by hand starts the odometry anew.
+    # A frame stepped by hand restarts the odometry.
     watcher.say("step")
     second = watcher.until(lambda message: message["kind"] == "frame")[-1]
     assert second["estimates"]["spherical"]["reset_trigger"] == "manual_step"

@@ -10,7 +10,7 @@ let contacts = [];
 let chosen = null;
 let view = [0, 1]; // seconds of UTC [from, to]
 let viewChosen = false; // else the view follows what there is to see
-let dragging = false; // what is in the hand is not drawn anew
+let dragging = false; // what is in the hand is not drawn again
 
 const selectable = (row) => ({ start: seconds(row.start), stop: seconds(row.stop) });
 

@@ -35,7 +35,7 @@ class AlbedoMap:
 class AlbedoTiles:
     """Georeferenced reflectance (LROC WAC mosaics), averaged over the steps of the grid asked for.
 
-    The mean is the median of the tiles at hand; ground without data has it.
+    The mean is the median of the available tiles; ground without data has it.
     """
 
     def __init__(self, paths: Sequence[Path | str]) -> None:

@@ -40,7 +40,7 @@ def stream(synthetic_pass: Any) -> bytes:
 
 @contextmanager
 def sender(pieces: list[bytes], pause_s: float = 0.0) -> Iterator[tuple[str, int]]:
-    """A port that gives the pieces to whoever connects, pausing between them, and closes."""
+    """A port that gives the pieces to each client, pausing between them, and closes."""
     listener = socket.create_server(("127.0.0.1", 0))
     done = threading.Event()
 

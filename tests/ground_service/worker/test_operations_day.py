@@ -101,7 +101,7 @@ def served(settings: Settings) -> Iterator[list[str]]:
 
 @contextmanager
 def antenna(stream: bytes) -> Iterator[str]:
-    """A TCP port that gives a downlink to whoever connects."""
+    """A TCP port that gives a downlink to each client."""
     listener = socket.create_server(("127.0.0.1", 0))
 
     def send() -> None:

@@ -349,7 +349,7 @@ def test_a_widened_search_adds_its_radius_to_what_the_orbit_believes(
     navigator = orbit.navigator(search_radius_m=24_000.0)
     prior, found = navigator.state, orbit.detections(0)
     calls = recorded(monkeypatch, navigator, "_acquired", "the fix")
-    assert navigator._reacquire(prior, "the pose", found) == "the fix"  # type: ignore[arg-type]
+    assert navigator._reacquire(prior, "the pose", found) == "the fix"
     ((wide, pose, given, radius_m),) = calls
     assert (pose, radius_m) == ("the pose", 8_000.0) and given is found
     added = np.zeros_like(prior.covariance)
@@ -453,9 +453,9 @@ def test_the_map_is_shown_the_frame_as_corrected_and_what_no_crater_explains(
     state, fix = navigator.state, navigator.last_fix
     assert fix is not None
     calls = recorded(monkeypatch, navigator.mapper, "observe", ("a landmark",))
-    navigator.new_landmarks = ("the first",)  # type: ignore[assignment]
+    navigator.new_landmarks = ("the first",)
     navigator._map(stray, orbit.attitude(2), orbit.rotations[2])
-    assert navigator.new_landmarks == ("the first", "a landmark")  # type: ignore[comparison-overlap]
+    assert navigator.new_landmarks == ("the first", "a landmark")
     ((view, shifted, variance, free, surface_m),) = calls
     rotation = orbit.rotations[2]
     turn = Rotation.from_rotvec(-(state.mean[9:12] + fix.update.attitude_rad)).as_matrix()
@@ -505,10 +505,10 @@ def test_a_pass_ends_when_nothing_was_seen_for_the_memory_of_craters(
 def test_the_landmarks_of_a_pass_serve_from_its_end_on(orbit: Orbit, monkeypatch: pytest.MonkeyPatch) -> None:
     navigator = orbit.navigator()
     before = navigator.landmarks
-    navigator._places = "searched before"  # type: ignore[assignment]
+    navigator._places = "searched before"
     navigator._end_pass()
     # Nothing was mapped: the map stays.
-    assert navigator.landmarks is before and navigator._places == "searched before"  # type: ignore[comparison-overlap]
+    assert navigator.landmarks is before and navigator._places == "searched before"
 
     class Mapper:
         def close(self) -> tuple[str, ...]:
@@ -520,10 +520,10 @@ def test_the_landmarks_of_a_pass_serve_from_its_end_on(orbit: Orbit, monkeypatch
         def with_catalogue(self, catalogue: Any) -> tuple[str, Any]:
             return ("with", catalogue)
 
-    navigator.mapper = Mapper()  # type: ignore[assignment]
+    navigator.mapper = Mapper()
     navigator._end_pass()
-    assert navigator.new_landmarks == ("new",)  # type: ignore[comparison-overlap]
-    assert navigator.landmarks == ("with", navigator._catalogue)  # type: ignore[comparison-overlap]
+    assert navigator.new_landmarks == ("new",)
+    assert navigator.landmarks == ("with", navigator._catalogue)
     assert navigator._places is None
 
 

@@ -351,7 +351,7 @@ def test_odometry_without_a_position_reports_its_outcome_alone(
         "shift_north_m": nothing, "anchor_reads": 0,
     }  # fmt: skip
     assert rig.telemetry.named("frame_outcome") == [expected]
-    observer._anchor = object()  # type: ignore[assignment]
+    observer._anchor = object()
     report = SimpleNamespace(
         outcome=Outcome.rejected, reset_trigger=ResetTrigger.none, candidate_pairs=3, pairs=0, shift_east_m=np.nan,
         shift_north_m=np.nan,

@@ -1,7 +1,7 @@
 """The Cycles renderer up to the process boundary: the scene, what Blender is told, what comes back, what goes wrong.
 
 Blender itself (a 374 MB wheel under the GPL) is no part of the test requirements; `linna render --compare` and the
-benchmark run it where it is at hand.
+benchmark run it where it is available.
 """
 
 import math
