@@ -13,6 +13,7 @@ COPY lunar lunar
 COPY tmtc tmtc
 COPY reports reports
 COPY payload_emulator payload_emulator
+COPY studies studies
 COPY ground_service ground_service
 COPY linna linna
 COPY db db

@@ -11,7 +11,7 @@ import json
 from typing import Any
 
 from payload_emulator.flight.models import load_shipped_model
-from payload_emulator.training.bench import bench, beside, prototype_model
+from payload_emulator.training.model.bench import bench, beside, prototype_model
 
 PROTOTYPE = "prototype (small, stride 4, 64 channels, untrained)"
 PROTOTYPE_MS = 6.2

@@ -108,7 +108,13 @@ GROUPS = {
     ),
     "filter": Group(
         tuple(
-            f"{_FLIGHT}/{name}.py" for name in ("navigation_filter", "anchored", "observer", "acquisition")
+            f"{_FLIGHT}/{name}.py"
+            for name in (
+                "navigation/filter",
+                "navigation/anchored",
+                "onboard/observer",
+                "navigation/acquisition",
+            )
         ),
         tuple(
             f"{_FLIGHT_TESTS}/test_{name}.py"
@@ -136,7 +142,7 @@ GROUPS = {
         (
             "ground_service/services/commanding.py",
             f"{_PROCESSING}/verification.py",
-            f"{_FLIGHT}/commanding.py",
+            f"{_FLIGHT}/onboard/commanding.py",
         ),
         (
             f"{_GROUND_TESTS}/services/test_commanding.py",

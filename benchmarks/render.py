@@ -28,17 +28,17 @@ from lunar.datafolder import find_data
 from lunar.errors import LunarError
 from lunar.frames import mcmf_from_spherical
 from lunar.lens import pointed_camera_from_mcmf
-from payload_emulator.comparison import compare_renderings, thinned
 from payload_emulator.errors import PayloadError
-from payload_emulator.sim import raymarch, renderer
-from payload_emulator.sim.cycles import render_scene
-from payload_emulator.sim.cycles_scene import CyclesSettings, describe_scene
-from payload_emulator.sim.labels import label_frame
-from payload_emulator.sim.light import paper_light, sun_direction_mcmf
-from payload_emulator.sim.rims import rim_errors
-from payload_emulator.sim.sensor import SensorModel, expose
+from payload_emulator.sim.render import raymarch, renderer
+from payload_emulator.sim.render.cycles import render_scene
+from payload_emulator.sim.render.cycles_scene import CyclesSettings, describe_scene
+from payload_emulator.sim.render.labels import label_frame
+from payload_emulator.sim.render.light import paper_light, sun_direction_mcmf
+from payload_emulator.sim.render.rims import rim_errors
+from payload_emulator.sim.render.sensor import SensorModel, expose
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.tiles import TiledTerrain
+from studies.renderers import compare_renderings, thinned
 
 REPEATS = 9
 CAMERA = PinholeCamera()

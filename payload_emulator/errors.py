@@ -5,7 +5,6 @@ PayloadError
 ├── TerrainError       a terrain source is missing, damaged or does not cover the place asked for
 ├── RendererError      a renderer is not installed, or cannot render what is asked for
 ├── ModelError         a detector model is not the one that flight expects
-├── TableError         an uploaded table (anchor ephemeris, catalogue, gravity) is damaged or of another kind
 ├── ParameterError     a parameter file cannot be read
 ├── RecordError        an archived pass cannot be flown again
 ├── DatasetError       a data set is missing, incomplete or of another camera
@@ -32,10 +31,6 @@ class RendererError(PayloadError):
 
 class ModelError(PayloadError):
     """A detector model has other inputs or outputs than flight expects, or fails its hash."""
-
-
-class TableError(PayloadError):
-    """An uploaded table is truncated, fails its checksum, or is of another kind or version."""
 
 
 class DatasetError(PayloadError):

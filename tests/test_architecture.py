@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("lunar", "tmtc", "reports", "payload_emulator", "ground_service", "linna")
+PACKAGES = ("lunar", "tmtc", "reports", "payload_emulator", "studies", "ground_service", "linna")
 
 
 def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
@@ -49,10 +49,10 @@ def test_every_import_contract_is_kept() -> None:
 @pytest.mark.parametrize(
     ("module", "planted"),
     [
-        ("payload_emulator/flight/odometry.py", "import payload_emulator.sim"),
-        ("payload_emulator/flight/odometry.py", "import torch"),
+        ("payload_emulator/flight/navigation/odometry.py", "import payload_emulator.sim"),
+        ("payload_emulator/flight/navigation/odometry.py", "import torch"),
         ("payload_emulator/flight/payload.py", "import payload_emulator.training"),
-        ("payload_emulator/emulator.py", "import ground_service"),
+        ("payload_emulator/session/emulator.py", "import ground_service"),
         ("ground_service/__init__.py", "import payload_emulator"),
         ("lunar/camera.py", "import tmtc"),
         ("ground_service/processing/__init__.py", "import sqlalchemy"),

@@ -15,7 +15,7 @@ import pytest
 from linna import cli
 from lunar.datafolder import DataFolder
 from payload_emulator.flight.models import load_shipped_model
-from payload_emulator.suite import SUITE, suite_scenarios, write_suite
+from payload_emulator.session.suite import SUITE, suite_scenarios, write_suite
 
 FRAMES = 8
 

@@ -7,6 +7,7 @@ TmtcError
 ├── UnknownPacket         no such name or (APID, service, subtype) in the dictionary
 ├── ValueRefused          a value that its field cannot hold or its range forbids
 ├── FrameError            a transfer frame that cannot be built or read
+├── TableError            an uploaded table (anchor ephemeris, catalogue, gravity) is damaged or of another kind
 ├── LinkFormatError       a stream whose framing cannot be told, or settings that contradict each other
 └── DefinitionError       an imported packet definition that is damaged, contradicts itself or is not supported
 """
@@ -56,6 +57,10 @@ class ValueRefused(TmtcError):
 
 class FrameError(TmtcError):
     """A transfer frame that cannot be built or read."""
+
+
+class TableError(TmtcError):
+    """An uploaded table is truncated, fails its checksum, or is of another kind or version."""
 
 
 class LinkFormatError(TmtcError):

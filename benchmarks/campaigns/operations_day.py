@@ -50,8 +50,8 @@ from ground_service.services.integrity import verify
 from ground_service.services.users import add_user
 from linna.cli import run
 from lunar.timescales import format_utc, parse_utc
-from payload_emulator.flying import SPACECRAFT_ID
-from payload_emulator.scenario import load_scenario
+from payload_emulator.session.flying import SPACECRAFT_ID
+from payload_emulator.session.scenario import load_scenario
 
 NS = 1_000_000_000
 DAY_NS = 86_400 * NS

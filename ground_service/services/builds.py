@@ -44,9 +44,9 @@ _KEYS = (
 # Packages of the flight code of this installation, in addition to the shipped network.
 _FLIGHT_CODE = (
     "payload_emulator/flight",
-    "payload_emulator/replay.py",
-    "payload_emulator/recording.py",
-    "payload_emulator/parameter_file.py",
+    "payload_emulator/session/replay.py",
+    "payload_emulator/session/recording.py",
+    "payload_emulator/session/parameter_file.py",
     "lunar",
     "tmtc",
 )

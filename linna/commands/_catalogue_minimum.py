@@ -30,8 +30,8 @@ def configure(minimum: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
     from linna.errors import UsageError
-    from payload_emulator.anchoring_study import study_sizes
-    from payload_emulator.montecarlo_world import standard_case
+    from studies.anchoring import study_sizes
+    from studies.montecarlo_world import standard_case
 
     try:
         shares = [float(part) for part in arguments.shares.split(",")]

@@ -41,7 +41,7 @@ def restart_for_training() -> None:
     import os
     import sys
 
-    from payload_emulator.training.train import ENVIRONMENT, set_environment
+    from payload_emulator.training.model.train import ENVIRONMENT, set_environment
 
     if (
         any(os.environ.get(name) is None for name in ENVIRONMENT)

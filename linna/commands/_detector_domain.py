@@ -40,8 +40,8 @@ def configure(verbs: Any) -> None:
 
 def _domain(arguments: argparse.Namespace) -> int:
     from linna.output import emit, log, progress
-    from payload_emulator.training.dataset import Dataset
-    from payload_emulator.training.domain import compare_renderers, format_domains
+    from payload_emulator.training.data.dataset import Dataset
+    from studies.domain import compare_renderers, format_domains
 
     figures = compare_renderers(
         model_octets(arguments.model),

@@ -43,9 +43,9 @@ def _make(arguments: argparse.Namespace) -> int:
     from linna.output import as_json, emit, log, progress
 
     need_torch()
-    from payload_emulator.training.feeder import TrainParameters
-    from payload_emulator.training.pipeline import Job, format_made, make_dataset, make_model
-    from payload_emulator.training.recipe import load_recipe
+    from payload_emulator.session.recipe import load_recipe
+    from payload_emulator.training.data.feeder import TrainParameters
+    from studies.pipeline import Job, format_made, make_dataset, make_model
 
     if arguments.run is not None and arguments.dataset is None:
         raise UsageError("--run: expected the data set it was trained on (--dataset), found none")

@@ -122,8 +122,8 @@ def _add_test(parser: argparse.ArgumentParser, what: str) -> None:
 
 def _choose(arguments: argparse.Namespace) -> int:
     from linna.output import emit, progress
-    from payload_emulator.training.choice import choose, format_choice
-    from payload_emulator.training.dataset import Dataset
+    from payload_emulator.training.data.dataset import Dataset
+    from payload_emulator.training.evaluate.choice import choose, format_choice
 
     document = choose(
         {name: model_octets(None if name == "shipped" else Path(name)) for name in arguments.models},
@@ -139,7 +139,9 @@ def _ablate(arguments: argparse.Namespace) -> int:
     from linna.output import emit, log
 
     need_torch()
-    from payload_emulator.training.ablation import (
+    from payload_emulator.training.data.dataset import Dataset
+    from payload_emulator.training.data.refits import load_refitted
+    from studies.ablation import (
         VARIANTS,
         AblationParameters,
         Material,
@@ -148,8 +150,6 @@ def _ablate(arguments: argparse.Namespace) -> int:
         format_ablation,
         score_chosen_variant,
     )
-    from payload_emulator.training.dataset import Dataset
-    from payload_emulator.training.refits import load_refitted
 
     known = {variant.name: variant for variant in VARIANTS}
     wanted = list(known) if arguments.only is None else arguments.only
@@ -188,10 +188,10 @@ def _quantise(arguments: argparse.Namespace) -> int:
 
     from linna.errors import UsageError
     from linna.output import emit
-    from payload_emulator.training.bench import beside
-    from payload_emulator.training.dataset import Dataset
-    from payload_emulator.training.evaluate import evaluate
-    from payload_emulator.training.quantise import quantise
+    from payload_emulator.training.data.dataset import Dataset
+    from payload_emulator.training.evaluate.evaluate import evaluate
+    from payload_emulator.training.model.bench import beside
+    from payload_emulator.training.model.quantise import quantise
 
     if importlib.util.find_spec("onnx") is None:
         raise UsageError("quantisation needs onnx: install the extra 'train' (pip install 'linna[train]')")
@@ -226,9 +226,9 @@ def _quantise(arguments: argparse.Namespace) -> int:
 def _landmarks(arguments: argparse.Namespace) -> int:
     from linna.errors import UsageError
     from linna.output import emit, progress
-    from payload_emulator.training.dataset import Dataset
-    from payload_emulator.training.evaluate import open_for_evaluation, run
-    from payload_emulator.training.landmarks import RecurrenceRule, format_landmarks, study
+    from payload_emulator.training.data.dataset import Dataset
+    from payload_emulator.training.evaluate.evaluate import open_for_evaluation, run
+    from payload_emulator.training.evaluate.landmarks import RecurrenceRule, format_landmarks, study
 
     if not 0.0 <= arguments.hide < 1.0:
         raise UsageError(f"--hide: expected a share from 0 to below 1, found {arguments.hide:g}")
@@ -258,10 +258,10 @@ def _landmarks(arguments: argparse.Namespace) -> int:
 
 def _trials(arguments: argparse.Namespace) -> int:
     from linna.output import emit, progress
-    from payload_emulator.training.dataset import Dataset
-    from payload_emulator.training.evaluate import open_for_evaluation, run
-    from payload_emulator.training.trials import format_trials, run_trials, score_chosen_trial
-    from payload_emulator.training.two_suns import format_two_suns, score_chosen_way, study_two_suns
+    from payload_emulator.training.data.dataset import Dataset
+    from payload_emulator.training.evaluate.evaluate import open_for_evaluation, run
+    from studies.trials import format_trials, run_trials, score_chosen_trial
+    from studies.two_suns import format_two_suns, score_chosen_way, study_two_suns
 
     def shown(frames: Sequence[Any]) -> Any:
         return progress(frames, len(frames), "trial", "frames")

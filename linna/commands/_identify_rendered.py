@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from linna.output import emit, log, progress
 
 if TYPE_CHECKING:
-    from payload_emulator.lost_frames import Share
+    from studies.lost_in_space import Share
 
 LEAST_CATALOGUED = 6
 
@@ -21,13 +21,13 @@ def run(arguments: argparse.Namespace) -> int:
 
     from linna.data import data_folder
     from linna.errors import UsageError
-    from payload_emulator import lost_frames as study
-    from payload_emulator.flight.detector import DetectorParameters, OnnxDetector
-    from payload_emulator.flight.lost_in_space import FRAMES_COMBINED, LostParameters
     from payload_emulator.flight.models import load_shipped_model
-    from payload_emulator.mission import level_of, level_text, unseen_share
-    from payload_emulator.scenario import format_scenario, load_scenario
-    from payload_emulator.world import build_world
+    from payload_emulator.flight.navigation.lost_in_space import FRAMES_COMBINED, LostParameters
+    from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
+    from payload_emulator.session.mission import level_of, level_text, unseen_share
+    from payload_emulator.session.scenario import format_scenario, load_scenario
+    from payload_emulator.session.world import build_world
+    from studies import lost_in_space as study
 
     if arguments.frames < FRAMES_COMBINED:
         raise UsageError(f"--frames: expected at least {FRAMES_COMBINED}, found {arguments.frames}")

@@ -121,8 +121,8 @@ def run_curate(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
     from linna.errors import UsageError
     from lunar.catalogue import format_catalogue, load_catalogue
-    from payload_emulator.curation import CurationRules, RasterHeights, curate
-    from payload_emulator.flight.tables import pack_catalogue_table, table_hash
+    from payload_emulator.sim.terrain.curation import CurationRules, RasterHeights, curate
+    from tmtc.tables import pack_catalogue_table, table_hash
 
     region = _region(arguments.region)
     if not 0.5 <= arguments.min_diameter < arguments.max_diameter <= 200.0:
@@ -181,7 +181,7 @@ def run_curate(arguments: argparse.Namespace) -> int:
 
 def _region(text: str):
     from linna.errors import UsageError
-    from payload_emulator.curation import Region
+    from payload_emulator.sim.terrain.curation import Region
 
     try:
         west, east, south, north = (float(part) for part in text.split(","))

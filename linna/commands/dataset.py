@@ -50,9 +50,9 @@ def _build(arguments: argparse.Namespace) -> int:
 
     from linna.data import blender_python, data_folder
     from linna.output import emit, log
-    from payload_emulator.training.build import build
-    from payload_emulator.training.recipe import load_recipe
-    from payload_emulator.training.summary import summarise
+    from payload_emulator.session.recipe import load_recipe
+    from payload_emulator.training.data.build import build
+    from payload_emulator.training.data.summary import summarise
 
     chosen = {key: getattr(arguments, key) for key in ("seed", "bits", "renderer")}
     recipe = dataclasses.replace(
@@ -85,8 +85,8 @@ def _build(arguments: argparse.Namespace) -> int:
 
 def _check(arguments: argparse.Namespace) -> int:
     from linna.output import emit, log
-    from payload_emulator.training.integrity import check
-    from payload_emulator.training.summary import summarise
+    from payload_emulator.training.data.integrity import check
+    from payload_emulator.training.data.summary import summarise
 
     problems = check(arguments.folder)
     for problem in problems:
@@ -101,7 +101,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
 def _stats(arguments: argparse.Namespace) -> int:
     from linna.output import emit
-    from payload_emulator.training.summary import summarise
+    from payload_emulator.training.data.summary import summarise
 
     figures = summarise(arguments.folder)
     emit(arguments, figures, _text(figures))
@@ -111,8 +111,8 @@ def _stats(arguments: argparse.Namespace) -> int:
 def _sheet(arguments: argparse.Namespace) -> int:
     from linna.errors import UsageError
     from linna.output import emit
-    from payload_emulator.training.dataset import Dataset, write_picture
-    from payload_emulator.training.sheet import draw_sheet
+    from payload_emulator.training.data.dataset import Dataset, write_picture
+    from payload_emulator.training.data.sheet import draw_sheet
 
     if arguments.out.suffix.lower() != ".png":
         raise UsageError(f"--out: expected a .png file, found {arguments.out.name}")

@@ -29,8 +29,8 @@ def run(arguments: argparse.Namespace) -> int:
     from ground_service.services.ground import open_ground
     from ground_service.services.reports import make_report
     from linna.data import data_folder
-    from payload_emulator.emulator import emulate
-    from payload_emulator.scenario import load_scenario
+    from payload_emulator.session.emulator import emulate
+    from payload_emulator.session.scenario import load_scenario
 
     started = time.monotonic()
     data = data_folder()

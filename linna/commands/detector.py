@@ -137,10 +137,10 @@ def _train(arguments: argparse.Namespace) -> int:
     from linna.output import emit, log
 
     need_torch()
-    from payload_emulator.training.dataset import Dataset
-    from payload_emulator.training.feeder import TrainParameters
-    from payload_emulator.training.landmarks import load_landmarks
-    from payload_emulator.training.train import train
+    from payload_emulator.training.data.dataset import Dataset
+    from payload_emulator.training.data.feeder import TrainParameters
+    from payload_emulator.training.evaluate.landmarks import load_landmarks
+    from payload_emulator.training.model.train import train
 
     restart_for_training()
     parameters = TrainParameters(
@@ -171,8 +171,8 @@ def _export(arguments: argparse.Namespace) -> int:
     from linna.output import emit
 
     need_torch()
-    from payload_emulator.training.dataset import Dataset
-    from payload_emulator.training.export import export
+    from payload_emulator.training.data.dataset import Dataset
+    from payload_emulator.training.model.export import export
 
     checkpoint = arguments.run
     if checkpoint.is_dir():
@@ -194,9 +194,9 @@ def _export(arguments: argparse.Namespace) -> int:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     from linna.output import emit, progress
-    from payload_emulator.training.dataset import Dataset
-    from payload_emulator.training.evaluate import format_figures, open_for_evaluation, run, summary
-    from payload_emulator.training.refits import load_refitted
+    from payload_emulator.training.data.dataset import Dataset
+    from payload_emulator.training.data.refits import load_refitted
+    from payload_emulator.training.evaluate.evaluate import format_figures, open_for_evaluation, run, summary
 
     datasets = [Dataset(folder) for folder in arguments.dataset]
     rims = None if arguments.rims is None else load_refitted(arguments.rims, *arguments.rims_shift)
@@ -212,7 +212,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     )
     figures = summary(detector, datasets, scored, arguments.split, arguments.source, rims)
     if arguments.report is not None:
-        from payload_emulator.training.report import detector_report
+        from payload_emulator.training.evaluate.report import detector_report
         from reports.render import render_html
 
         report = detector_report(detector, scored, figures, arguments.run)
@@ -229,8 +229,8 @@ def _detect(arguments: argparse.Namespace) -> int:
     from linna.errors import UsageError
     from linna.output import emit
     from lunar.catalogue import size_class
-    from payload_emulator.flight.detections import states
-    from payload_emulator.flight.detector import DetectorParameters, OnnxDetector
+    from payload_emulator.flight.vision.detections import states
+    from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
 
     if arguments.altitude_km is not None and not arguments.altitude_km > 0.0:
         raise UsageError(
@@ -296,7 +296,7 @@ def _read_image(path: Path) -> Any:
 
 def _bench(arguments: argparse.Namespace) -> int:
     from linna.output import emit
-    from payload_emulator.training.bench import bench
+    from payload_emulator.training.model.bench import bench
 
     emit(arguments, bench(model_octets(arguments.model), arguments.threads, arguments.frames))
     return 0
@@ -306,7 +306,7 @@ def _info(arguments: argparse.Namespace) -> int:
     import json
 
     from linna.output import emit
-    from payload_emulator.flight.detector import OnnxDetector
+    from payload_emulator.flight.vision.detector import OnnxDetector
 
     octets = model_octets(arguments.model)
     detector = OnnxDetector(octets)

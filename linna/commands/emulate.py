@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from linna.output import add_json_flag, emit, log, progress
 
 if TYPE_CHECKING:
-    from payload_emulator.scenario import Scenario
+    from payload_emulator.session.scenario import Scenario
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -70,8 +70,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
     from linna.errors import UsageError
-    from payload_emulator.emulator import emulate
-    from payload_emulator.scenario import load_scenario
+    from payload_emulator.session.emulator import emulate
+    from payload_emulator.session.scenario import load_scenario
 
     scenario = load_scenario(arguments.scenario).with_choices(
         modes=arguments.mode, seed=arguments.seed, anchoring_catalogue=arguments.anchoring_catalogue
@@ -98,7 +98,7 @@ def _campaign(arguments: argparse.Namespace, scenario: Scenario) -> int:
     from dataclasses import asdict
 
     from linna.data import data_folder
-    from payload_emulator.campaign import load_campaign, run_campaign, table
+    from payload_emulator.session.campaign import load_campaign, run_campaign, table
 
     campaign = load_campaign(arguments.campaign)
     results = run_campaign(
@@ -137,9 +137,9 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
 
     from linna.data import data_folder
     from linna.errors import UsageError
-    from payload_emulator.emulator import load_scenario_payload, new_spacecraft
-    from payload_emulator.live import LivePayload
-    from payload_emulator.world import build_world
+    from payload_emulator.session.emulator import load_scenario_payload, new_spacecraft
+    from payload_emulator.session.live import LivePayload
+    from payload_emulator.session.world import build_world
 
     if not arguments.rate >= 0.0:
         raise UsageError(f"--rate: expected a number from 0, found {arguments.rate}")

@@ -59,8 +59,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run_lost(arguments: argparse.Namespace) -> int:
     import math
 
-    from payload_emulator.flight.lost_in_space import place_index
-    from payload_emulator.identification_study import KINDS, study_lost, study_lost_in_frames
+    from payload_emulator.flight.navigation.lost_in_space import place_index
+    from studies.identification import KINDS, study_lost, study_lost_in_frames
 
     if arguments.scenario is not None:
         from linna.commands._identify_rendered import run as run_rendered
@@ -108,7 +108,7 @@ def run_lost(arguments: argparse.Namespace) -> int:
 
 
 def run_tracking(arguments: argparse.Namespace) -> int:
-    from payload_emulator.identification_study import KINDS, study_tracking
+    from studies.identification import KINDS, study_tracking
 
     model = _model(arguments)
     world = _world(arguments)
@@ -157,7 +157,7 @@ def _provenance(arguments: argparse.Namespace, name: str, model) -> dict[str, ob
 
 def _model(arguments: argparse.Namespace):
     from linna.errors import UsageError
-    from payload_emulator.identification_study import DetectionModel
+    from studies.identification import DetectionModel
 
     if arguments.frames < 1:
         raise UsageError(f"--frames: expected at least 1, found {arguments.frames}")
@@ -178,8 +178,8 @@ def _model(arguments: argparse.Namespace):
 
 def _world(arguments: argparse.Namespace):
     from linna.commands.catalogue import open_catalogue
-    from payload_emulator.curation import catalogue_of_table
-    from payload_emulator.identification_study import study_world
+    from payload_emulator.sim.terrain.curation import catalogue_of_table
+    from studies.identification import study_world
 
     name = arguments.catalogue
     table = None

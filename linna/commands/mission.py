@@ -38,8 +38,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def write(arguments: argparse.Namespace) -> int:
     from ground_service.missions.model import parse_mission
     from linna.data import data_folder
-    from payload_emulator.mission import scenario_mission_text
-    from payload_emulator.scenario import load_scenario
+    from payload_emulator.session.mission import scenario_mission_text
+    from payload_emulator.session.scenario import load_scenario
 
     text = scenario_mission_text(load_scenario(arguments.scenario), data_folder())
     mission = parse_mission(text, str(arguments.out))

@@ -31,8 +31,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
     from linna.errors import UsageError
-    from payload_emulator.montecarlo import consistency, fly_many, verdict
-    from payload_emulator.montecarlo_world import standard_case
+    from studies.montecarlo import consistency, fly_many, verdict
+    from studies.montecarlo_world import standard_case
 
     if arguments.runs < 1 or not arguments.hours > 0.1 or not arguments.noise_factor > 0.0:
         raise UsageError(

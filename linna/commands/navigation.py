@@ -19,7 +19,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run_table(arguments: argparse.Namespace) -> int:
-    from payload_emulator.navigation_table import format_markdown, format_text, load_row
+    from studies.navigation_table import format_markdown, format_text, load_row
 
     rows = [load_row(archive) for archive in arguments.archives]
     figures = {

@@ -176,7 +176,7 @@ def _baseline(arguments: argparse.Namespace) -> int:
 
 def _suite(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
-    from payload_emulator.suite import suite_scenarios, write_suite
+    from payload_emulator.session.suite import suite_scenarios, write_suite
 
     scenarios = suite_scenarios(arguments.scenario, frames=arguments.frames, seeds=arguments.seeds)
     written = write_suite(

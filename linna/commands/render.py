@@ -96,8 +96,8 @@ def run_render(arguments: argparse.Namespace) -> int:
 def _run_frame(arguments: argparse.Namespace) -> int:
     from linna.data import blender_python, data_folder
     from lunar.timescales import parse_utc
-    from payload_emulator.frame import render_frame
-    from payload_emulator.sheets import draw_labels, save_octets, save_png
+    from payload_emulator.session.frame import render_frame
+    from payload_emulator.training.evaluate.sheets import draw_labels, save_octets, save_png
 
     frame = render_frame(
         _scenario(arguments),
@@ -132,8 +132,8 @@ def _run_frame(arguments: argparse.Namespace) -> int:
 
 def _run_sheet(arguments: argparse.Namespace) -> int:
     from linna.data import blender_python
-    from payload_emulator.frame import take_frame, view_at
-    from payload_emulator.sheets import contact_sheet, draw_labels, eight_bits, save_png
+    from payload_emulator.session.frame import take_frame, view_at
+    from payload_emulator.training.evaluate.sheets import contact_sheet, draw_labels, eight_bits, save_png
 
     world, epochs = _views(arguments)
     views = [view_at(world, utc_ns) for utc_ns in epochs]
@@ -162,9 +162,9 @@ def _run_sheet(arguments: argparse.Namespace) -> int:
 
 def _run_compare(arguments: argparse.Namespace) -> int:
     from linna.data import blender_python
-    from payload_emulator.comparison import compare_on_views
-    from payload_emulator.frame import blender_at_hand, view_at
-    from payload_emulator.sheets import comparison_sheet, save_png
+    from payload_emulator.session.frame import blender_at_hand, view_at
+    from payload_emulator.training.evaluate.sheets import comparison_sheet, save_png
+    from studies.renderers import compare_on_views
 
     world, epochs = _views(arguments)
     views = [view_at(world, utc_ns) for utc_ns in epochs]
@@ -197,7 +197,7 @@ def _run_compare(arguments: argparse.Namespace) -> int:
 
 def _scenario(arguments: argparse.Namespace) -> Any:
     """The scenario with what the command line says otherwise."""
-    from payload_emulator.scenario import load_scenario
+    from payload_emulator.session.scenario import load_scenario
 
     scenario = load_scenario(arguments.scenario)
     replaced = {
@@ -219,7 +219,7 @@ def _views(arguments: argparse.Namespace) -> tuple[Any, list[int]]:
     """The world, and the epochs named or those spread over its observation windows."""
     from linna.data import data_folder
     from lunar.timescales import parse_utc
-    from payload_emulator.frame import window_epochs, world_at
+    from payload_emulator.session.frame import window_epochs, world_at
 
     if not arguments.epoch:
         return window_epochs(_scenario(arguments), data_folder(), arguments.views)
@@ -228,7 +228,7 @@ def _views(arguments: argparse.Namespace) -> tuple[Any, list[int]]:
 
 
 def _caption(world: Any, view: Any) -> str:
-    from payload_emulator.frame import metadata_of
+    from payload_emulator.session.frame import metadata_of
 
     row = metadata_of(world, view)
     return (

@@ -147,7 +147,7 @@ def _refuse_without_definition(arguments: argparse.Namespace) -> None:
 
 
 def run_icd(arguments: argparse.Namespace) -> int:
-    from payload_emulator.flight.interfaces import format_interfaces
+    from payload_emulator.flight.onboard.icd import format_interfaces
     from tmtc.icd import format_icd
 
     return _document(arguments, f"{format_icd()}\n{format_interfaces()}")

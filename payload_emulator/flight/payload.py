@@ -14,23 +14,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from payload_emulator.flight.commanding import Command, Refusal, failure, parse_commands
-from payload_emulator.flight.detections import Detector
-from payload_emulator.flight.fdir import Monitors, Reaction
-from payload_emulator.flight.housekeeping import StageTimer
-from payload_emulator.flight.loads import MODEL_NUMBER, TABLE_NUMBERS, FlightParameters, FlightTables
-from payload_emulator.flight.machine import PARAMETERS_NUMBER, Machine, Observation
-from payload_emulator.flight.memory import ProtectedMemory
-from payload_emulator.flight.modes import PayloadMode
-from payload_emulator.flight.observer import Observer
-from payload_emulator.flight.parameters import ParameterStore
+from payload_emulator.flight.onboard.commanding import Command, Refusal, failure, parse_commands
+from payload_emulator.flight.onboard.fdir import Monitors, Reaction
+from payload_emulator.flight.onboard.housekeeping import StageTimer
+from payload_emulator.flight.onboard.housekeeping_packets import send_large_data, send_structure
+from payload_emulator.flight.onboard.loads import MODEL_NUMBER, TABLE_NUMBERS, FlightParameters, FlightTables
+from payload_emulator.flight.onboard.machine import PARAMETERS_NUMBER, Machine, Observation
+from payload_emulator.flight.onboard.memory import ProtectedMemory
+from payload_emulator.flight.onboard.modes import PayloadMode
+from payload_emulator.flight.onboard.observer import Observer
+from payload_emulator.flight.onboard.parameters import ParameterStore
+from payload_emulator.flight.onboard.settings import Recovery, Settings
+from payload_emulator.flight.onboard.telecommands import check, execute, name_of
 from payload_emulator.flight.ports import BareBoard, Board, Load, ResetCause, Stage
-from payload_emulator.flight.products import thumbnail_octets
-from payload_emulator.flight.reports import send_large_data, send_structure
-from payload_emulator.flight.services import check, execute, name_of
-from payload_emulator.flight.settings import Recovery, Settings
-from payload_emulator.flight.store import PacketStore, StoreClass
-from payload_emulator.flight.telemetry import Telemetry
+from payload_emulator.flight.telemetry.packets import Telemetry
+from payload_emulator.flight.telemetry.products import thumbnail_octets
+from payload_emulator.flight.telemetry.store import PacketStore, StoreClass
+from payload_emulator.flight.vision.detections import Detector
 from tmtc.cuc import TICKS_LIMIT, TICKS_PER_SECOND
 from tmtc.pus import ACK_ACCEPTANCE, ACK_COMPLETION, ACK_START
 

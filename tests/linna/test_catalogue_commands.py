@@ -10,8 +10,8 @@ import pytest
 
 from linna.cli import run
 from lunar.catalogue import make_catalogue, save_catalogue
-from payload_emulator.flight.tables import CatalogueTable, pack_catalogue_table
 from tmtc.dictionary import DICTIONARY
+from tmtc.tables import CatalogueTable, pack_catalogue_table
 
 
 def landmarks_packet(latitude: list[float], identity: int = 3_000_000_000) -> bytes:

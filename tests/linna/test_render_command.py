@@ -92,7 +92,7 @@ def test_a_sheet_holds_the_epochs_named(scenario, tmp_path, capsys):
 
 def test_renderers_are_compared_with_figures(scenario, tmp_path, capsys, monkeypatch):
     monkeypatch.delenv("LINNA_BLENDER_PYTHON", raising=False)
-    monkeypatch.setattr("payload_emulator.frame.blender_at_hand", lambda python: False)
+    monkeypatch.setattr("payload_emulator.session.frame.blender_at_hand", lambda python: False)
     out = tmp_path / "e.png"
     status, figures, log = run(capsys, scenario, "--epoch", EPOCHS[0], "--out", str(out), "--compare")
     assert status == 0 and figures["renderers"] == ["fast", "raymarch"]

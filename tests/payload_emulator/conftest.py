@@ -11,8 +11,8 @@ import pytest
 from lunar.elements import Elements, icrf_state_from_elements
 from lunar.frames import IauOrientation
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
-from payload_emulator.montecarlo import NavigationCase
-from payload_emulator.montecarlo_world import crater_world, rough_gravity
+from studies.montecarlo import NavigationCase
+from studies.montecarlo_world import crater_world, rough_gravity
 
 EPOCH = parse_utc("2029-08-07T00:00:00Z")
 TRUTH_DEGREE = 60

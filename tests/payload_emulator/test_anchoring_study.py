@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from lunar.catalogue import CraterCatalogue, make_catalogue
-from payload_emulator.anchoring_study import CHOICES, chosen_craters, study_sizes
-from payload_emulator.flight.anchored import AnchoredParameters
-from payload_emulator.montecarlo import NavigationCase
+from payload_emulator.flight.navigation.anchored import AnchoredParameters
+from studies.anchoring import CHOICES, chosen_craters, study_sizes
+from studies.montecarlo import NavigationCase
 
 
 @pytest.fixture(scope="module")

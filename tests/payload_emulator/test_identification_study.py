@@ -8,7 +8,7 @@ import pytest
 from lunar.camera import PinholeCamera
 from lunar.catalogue import make_catalogue
 from lunar.frames import mcmf_from_spherical
-from payload_emulator.identification_study import (
+from studies.identification import (
     DetectionModel,
     StudyWorld,
     draw_frame,

@@ -11,8 +11,8 @@ from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.third_bodies import earth_position_icrf_m
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.errors import ScenarioError
-from payload_emulator.link import Receiver, Transmitter, contacts, station, transmit
-from payload_emulator.scenario import LinkSection
+from payload_emulator.session.scenario import LinkSection
+from payload_emulator.sim.board.link import Receiver, Transmitter, contacts, station, transmit
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import LinkSettings, decode
 from tmtc.frames import Clcw, pack_clcw, unpack_clcw

@@ -18,16 +18,16 @@ import pytest
 
 from lunar.datafolder import DataFolder, find_data
 from lunar.timescales import parse_utc
-from payload_emulator.campaign import Case, fly_case, load_campaign, table
-from payload_emulator.emulator import load_scenario_payload, new_spacecraft
 from payload_emulator.errors import LinkError, ScenarioError
-from payload_emulator.flight.modes import PayloadMode
-from payload_emulator.flying import Flown, Moment, Operator
-from payload_emulator.live import Flight, LivePayload, TelecommandBuffer
-from payload_emulator.live_ports import CLIENT_LIMIT, UNSENT_LIMIT_OCTETS, Server
-from payload_emulator.loading import LoadedPayload
-from payload_emulator.scenario import parse_scenario
-from payload_emulator.world import World, build_world
+from payload_emulator.flight.onboard.modes import PayloadMode
+from payload_emulator.session.campaign import Case, fly_case, load_campaign, table
+from payload_emulator.session.emulator import load_scenario_payload, new_spacecraft
+from payload_emulator.session.flying import Flown, Moment, Operator
+from payload_emulator.session.live import Flight, LivePayload, TelecommandBuffer
+from payload_emulator.session.live_ports import CLIENT_LIMIT, UNSENT_LIMIT_OCTETS, Server
+from payload_emulator.session.loading import LoadedPayload
+from payload_emulator.session.scenario import parse_scenario
+from payload_emulator.session.world import World, build_world
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
 from tmtc.uplink import UplinkEncoder
@@ -195,7 +195,7 @@ def test_telecommands_and_telemetry_of_the_live_payload_take_the_light_time(
     live = LivePayload(world, new_spacecraft(world, loaded), rate=1.0)
     sent: list[bytes] = []
     clock = [1000.0]
-    monkeypatch.setattr("payload_emulator.live.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("payload_emulator.session.live.time.monotonic", lambda: clock[0])
     monkeypatch.setattr(Server, "send", lambda server, octets: sent.append(octets) or None)
     with selectors.DefaultSelector() as selector:
         live._take_telecommands(UplinkEncoder(0x4C).encode([ping(3)]))
@@ -395,7 +395,7 @@ def test_faults_are_flown_judged_and_counted(flown: tuple[World, LoadedPayload])
 
 
 def test_the_shipped_campaign_names_every_kind_of_fault() -> None:
-    from payload_emulator.sim.faults import FAULT_KINDS
+    from payload_emulator.sim.board.faults import FAULT_KINDS
 
     campaign = load_campaign("faults")
     page = (Path(__file__).resolve().parents[2] / "docs" / "payload.md").read_text()

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from lunar.datafolder import find_data
-from payload_emulator import lost_frames as study
 from payload_emulator.errors import RecordError
-from payload_emulator.flight.detections import Detections
-from payload_emulator.flight.detector import OnnxDetector
-from payload_emulator.flight.lost_in_space import LostParameters
 from payload_emulator.flight.models import load_shipped_model
-from payload_emulator.lost_frames import LostRow, SeenFrames, Share
-from payload_emulator.scenario import load_scenario
-from payload_emulator.world import World, build_world
+from payload_emulator.flight.navigation.lost_in_space import LostParameters
+from payload_emulator.flight.vision.detections import Detections
+from payload_emulator.flight.vision.detector import OnnxDetector
+from payload_emulator.session.scenario import load_scenario
+from payload_emulator.session.world import World, build_world
+from studies import lost_in_space as study
+from studies.lost_in_space import LostRow, SeenFrames, Share
 
 
 @pytest.fixture(scope="module")

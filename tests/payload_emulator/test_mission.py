@@ -8,9 +8,9 @@ import pytest
 from ground_service.missions.model import parse_mission
 from lunar.datafolder import DataFolder
 from lunar.frames import mcmf_from_spherical
-from payload_emulator.mission import mission_text, seen_in_training, unseen_share
-from payload_emulator.scenario import parse_scenario
-from payload_emulator.world import build_world
+from payload_emulator.session.mission import mission_text, seen_in_training, unseen_share
+from payload_emulator.session.scenario import parse_scenario
+from payload_emulator.session.world import build_world
 
 SCENARIO = """
 name = "small"

@@ -12,12 +12,12 @@ from scipy.stats import chi2
 from lunar.datafolder import DataFolder
 from lunar.frames import rtn_from_inertial
 from lunar.timescales import tdb_s_from_utc_ns
-from payload_emulator import montecarlo
-from payload_emulator.flight.anchored import AnchoredParameters
-from payload_emulator.flight.dynamics import ProcessNoise, process_noise
-from payload_emulator.flight.navigation_filter import CommonErrors
-from payload_emulator.flight.outcomes import Outcome
-from payload_emulator.montecarlo import (
+from payload_emulator.flight.navigation.anchored import AnchoredParameters
+from payload_emulator.flight.navigation.dynamics import ProcessNoise, process_noise
+from payload_emulator.flight.navigation.filter import CommonErrors
+from payload_emulator.flight.navigation.outcomes import Outcome
+from studies import montecarlo
+from studies.montecarlo import (
     CatalogueErrors,
     Consistency,
     Kidnap,
@@ -28,7 +28,7 @@ from payload_emulator.montecarlo import (
     fly_many,
     verdict,
 )
-from payload_emulator.montecarlo_world import TRACKS, standard_case
+from studies.montecarlo_world import TRACKS, standard_case
 
 # Tuned on other seeds than the tests use: what degree 50 leaves out of the field of degree 60 in the fixture.
 NOISE = ProcessNoise(

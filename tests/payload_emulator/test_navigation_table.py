@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from payload_emulator.errors import RecordError
-from payload_emulator.navigation_table import format_markdown, format_text, load_row
+from studies.navigation_table import format_markdown, format_text, load_row
 
 
 def _summary(**changes: Any) -> dict[str, Any]:

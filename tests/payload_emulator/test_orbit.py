@@ -4,8 +4,8 @@ import numpy as np
 
 from lunar.datafolder import find_data
 from lunar.propagation import SolarPressure
-from payload_emulator.orbit import force_model, propagate_scenario
-from payload_emulator.scenario import parse_scenario
+from payload_emulator.session.orbit import force_model, propagate_scenario
+from payload_emulator.session.scenario import parse_scenario
 
 BARE = 'name = "x"\n[maneuvers]\nenabled = false\n[dynamics]\ngravity = "builtin"\norientation = "iau"\n'
 

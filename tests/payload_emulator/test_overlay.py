@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from lunar.datafolder import DataFolder
-from payload_emulator.flying import craters_in_view
-from payload_emulator.scenario import parse_scenario
-from payload_emulator.world import Exposure, build_world
+from payload_emulator.session.flying import craters_in_view
+from payload_emulator.session.scenario import parse_scenario
+from payload_emulator.session.world import Exposure, build_world
 
 SCENARIO = """
 name = "overlay"

@@ -9,8 +9,8 @@ import pytest
 from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import rtn_from_inertial
 from payload_emulator.errors import ScenarioError
-from payload_emulator.scenario import SHIPPED, ReferenceSection, load_scenario, parse_scenario
-from payload_emulator.world import with_reference_error
+from payload_emulator.session.scenario import SHIPPED, ReferenceSection, load_scenario, parse_scenario
+from payload_emulator.session.world import with_reference_error
 
 GM = 4.9028e12
 RADIUS_M = 1_767_400.0

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 
 from lunar.datafolder import DataFolder
-from payload_emulator.emulator import emulate
 from payload_emulator.errors import ParameterError, RecordError
 from payload_emulator.flight.payload import FlightParameters
-from payload_emulator.parameter_file import (
+from payload_emulator.session.emulator import emulate
+from payload_emulator.session.parameter_file import (
     BuildParameters,
     flat_parameters,
     format_parameters,
     parse_parameters,
     with_values,
 )
-from payload_emulator.recording import load_image, load_record, missing_frames
-from payload_emulator.replay import (
+from payload_emulator.session.recording import load_image, load_record, missing_frames
+from payload_emulator.session.replay import (
     FlightBuild,
     complete_archive,
     load_flight_build,
@@ -30,8 +30,8 @@ from payload_emulator.replay import (
     replay_archive,
     stored_images,
 )
-from payload_emulator.scenario import parse_scenario
-from payload_emulator.suite import SUITE, suite_scenarios
+from payload_emulator.session.scenario import parse_scenario
+from payload_emulator.session.suite import SUITE, suite_scenarios
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
 

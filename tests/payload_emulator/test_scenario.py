@@ -5,7 +5,13 @@ import tomllib
 import pytest
 
 from payload_emulator.errors import ScenarioError
-from payload_emulator.scenario import SHIPPED, Scenario, format_scenario, load_scenario, parse_scenario
+from payload_emulator.session.scenario import (
+    SHIPPED,
+    Scenario,
+    format_scenario,
+    load_scenario,
+    parse_scenario,
+)
 
 # A file with a [dataset] table is a recipe of a data set, not a scenario to fly.
 FLOWN = [file for file in sorted(SHIPPED.glob("*.toml")) if "dataset" not in tomllib.loads(file.read_text())]

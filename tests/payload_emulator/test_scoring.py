@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from payload_emulator.scoring import frames_to_recover
+from payload_emulator.session.scoring import frames_to_recover
 
 
 @pytest.mark.parametrize(

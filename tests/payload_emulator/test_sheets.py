@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from payload_emulator.comparison import compare_renderings, thinned
-from payload_emulator.sheets import contact_sheet, draw_labels, save_png, shadow_map
-from payload_emulator.sim.renderer import Rendering
+from payload_emulator.sim.render.renderer import Rendering
+from payload_emulator.training.evaluate.sheets import contact_sheet, draw_labels, save_png, shadow_map
+from studies.renderers import compare_renderings, thinned
 
 
 def label(size_class, u, inside=True):

@@ -31,10 +31,10 @@ from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
 from lunar.oem import save_oem
 from lunar.timescales import parse_utc, ticks_from_utc_ns
-from payload_emulator.flight.detections import Detections
 from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload, PayloadMode
-from payload_emulator.flight.preprocess import ImageQuality
-from payload_emulator.spacecraft import new_board
+from payload_emulator.flight.vision.detections import Detections
+from payload_emulator.flight.vision.preprocess import ImageQuality
+from payload_emulator.session.spacecraft import new_board
 from tmtc.downlink import encode_cadus
 from tmtc.uplink import UplinkDecoder
 

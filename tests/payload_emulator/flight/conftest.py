@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from payload_emulator.flight.detections import Detections
 from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload, PayloadMode
-from payload_emulator.flight.preprocess import ImageQuality
-from payload_emulator.spacecraft import new_board
+from payload_emulator.flight.vision.detections import Detections
+from payload_emulator.flight.vision.preprocess import ImageQuality
+from payload_emulator.session.spacecraft import new_board
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 

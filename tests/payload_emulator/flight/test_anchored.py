@@ -12,12 +12,14 @@ from lunar.camera import nadir_camera_from_mcmf
 from lunar.frames import quaternion_from_matrix
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
-from payload_emulator.flight.detections import Detections, no_detections
-from payload_emulator.flight.outcomes import Mode, Outcome
+from payload_emulator.flight.navigation.outcomes import Mode, Outcome
+from payload_emulator.flight.navigation.sighting import Pose, in_view, landmark_map
 from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload
-from payload_emulator.flight.preprocess import ImageQuality
-from payload_emulator.flight.sighting import Pose, in_view, landmark_map
-from payload_emulator.flight.tables import (
+from payload_emulator.flight.vision.detections import Detections, no_detections
+from payload_emulator.flight.vision.preprocess import ImageQuality
+from studies.montecarlo import catalogue_table
+from tmtc.dictionary import DICTIONARY
+from tmtc.tables import (
     GravityTable,
     InitialState,
     pack_catalogue_table,
@@ -25,8 +27,6 @@ from payload_emulator.flight.tables import (
     pack_initial_state,
     pack_orientation_table,
 )
-from payload_emulator.montecarlo import catalogue_table
-from tmtc.dictionary import DICTIONARY
 
 IMAGE = np.zeros((4, 4), dtype=np.uint8)
 FRAMES = 14

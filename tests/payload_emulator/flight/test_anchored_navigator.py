@@ -13,20 +13,20 @@ from scipy.stats import chi2, norm
 from lunar.camera import nadir_camera_from_mcmf
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
-from payload_emulator import montecarlo
-from payload_emulator.flight import anchored
-from payload_emulator.flight.anchored import (
+from payload_emulator.flight.navigation import anchored
+from payload_emulator.flight.navigation.anchored import (
     AnchoredLimits,
     AnchoredNavigator,
     AnchoredParameters,
     frame_limit,
 )
-from payload_emulator.flight.detections import Detections
-from payload_emulator.flight.lost_in_space import Place
-from payload_emulator.flight.outcomes import Outcome
-from payload_emulator.flight.relative import RelativeParameters
-from payload_emulator.flight.sighting import Pose, in_view, landmark_map
-from payload_emulator.flight.tables import BurnTable
+from payload_emulator.flight.navigation.lost_in_space import Place
+from payload_emulator.flight.navigation.outcomes import Outcome
+from payload_emulator.flight.navigation.relative import RelativeParameters
+from payload_emulator.flight.navigation.sighting import Pose, in_view, landmark_map
+from payload_emulator.flight.vision.detections import Detections
+from studies import montecarlo
+from tmtc.tables import BurnTable
 
 SECOND = 65_536
 

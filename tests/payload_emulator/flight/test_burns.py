@@ -9,10 +9,10 @@ from lunar.elements import Elements, icrf_state_from_elements
 from lunar.frames import IauOrientation
 from lunar.gravity import builtin_gravity
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
-from payload_emulator.errors import TableError
-from payload_emulator.flight import navigation_filter as kalman
-from payload_emulator.flight.dynamics import OrbitModel, ProcessNoise, flown
-from payload_emulator.flight.tables import (
+from payload_emulator.flight.navigation import filter as kalman
+from payload_emulator.flight.navigation.dynamics import OrbitModel, ProcessNoise, flown
+from tmtc.errors import TableError
+from tmtc.tables import (
     BurnTable,
     GravityTable,
     no_burns,

@@ -6,7 +6,7 @@ import binascii
 
 import pytest
 
-from payload_emulator.flight.commanding import (
+from payload_emulator.flight.onboard.commanding import (
     Command,
     CommandHistory,
     Refusal,

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from payload_emulator.errors import ModelError
-from payload_emulator.flight.detections import Detections, states
-from payload_emulator.flight.detector import (
+from payload_emulator.flight.models import load_shipped_model
+from payload_emulator.flight.vision.detections import Detections, states
+from payload_emulator.flight.vision.detector import (
     DetectorParameters,
     OnnxDetector,
     decode,
     drop_duplicates,
     remove_parallax,
 )
-from payload_emulator.flight.models import load_shipped_model
-from payload_emulator.flight.preprocess import ImageQuality
+from payload_emulator.flight.vision.preprocess import ImageQuality
 
 
 @pytest.fixture(scope="module")

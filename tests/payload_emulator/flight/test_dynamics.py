@@ -10,9 +10,9 @@ from lunar.frames import IauOrientation
 from lunar.gravity import builtin_gravity
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns, utc_ns_from_ticks
-from payload_emulator.flight.dynamics import OrbitModel, ProcessNoise, process_noise
-from payload_emulator.flight.tables import GravityTable, OrientationTable, pack_orientation_table
-from payload_emulator.flight.tables import unpack_orientation_table as unpack
+from payload_emulator.flight.navigation.dynamics import OrbitModel, ProcessNoise, process_noise
+from tmtc.tables import GravityTable, OrientationTable, pack_orientation_table
+from tmtc.tables import unpack_orientation_table as unpack
 
 EPOCH = parse_utc("2029-08-07T00:00:00Z")
 START = int(ticks_from_utc_ns(EPOCH))

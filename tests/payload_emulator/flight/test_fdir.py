@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from payload_emulator.flight.loads import MODEL_NUMBER, FlightTables
-from payload_emulator.flight.machine import PARAMETERS_NUMBER
-from payload_emulator.flight.parameters import PARAMETERS
+from payload_emulator.flight.onboard.loads import MODEL_NUMBER, FlightTables
+from payload_emulator.flight.onboard.machine import PARAMETERS_NUMBER
+from payload_emulator.flight.onboard.parameters import PARAMETERS
+from payload_emulator.flight.onboard.settings import Settings
 from payload_emulator.flight.payload import PayloadMode
 from payload_emulator.flight.ports import ResetCause
-from payload_emulator.flight.preprocess import ImageQuality
-from payload_emulator.flight.settings import Settings
+from payload_emulator.flight.vision.preprocess import ImageQuality
 
 NUMBERS = {parameter.name: parameter.number for parameter in PARAMETERS}
 NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)

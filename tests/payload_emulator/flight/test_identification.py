@@ -7,9 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from payload_emulator.flight.detections import Detections
-from payload_emulator.flight.identification import IdentificationParameters, identify, minimum_members
-from payload_emulator.flight.sighting import Sighting
+from payload_emulator.flight.navigation.identification import (
+    IdentificationParameters,
+    identify,
+    minimum_members,
+)
+from payload_emulator.flight.navigation.sighting import Sighting
+from payload_emulator.flight.vision.detections import Detections
 
 
 def poisson_at_least(mean: float, count: int) -> float:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from payload_emulator.flight.interfaces import format_interfaces
-from payload_emulator.flight.modes import ALLOWED
-from payload_emulator.flight.parameters import PARAMETERS
+from payload_emulator.flight.onboard.icd import format_interfaces
+from payload_emulator.flight.onboard.modes import ALLOWED
+from payload_emulator.flight.onboard.parameters import PARAMETERS
 from payload_emulator.flight.ports import Board
 from tmtc.dictionary import DICTIONARY
 from tmtc.icd import format_icd

@@ -9,8 +9,7 @@ import pytest
 
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.frames import mcmf_from_spherical
-from payload_emulator.flight.detections import Detections, no_detections
-from payload_emulator.flight.landmark_map import (
+from payload_emulator.flight.navigation.landmark_map import (
     FIRST_LANDMARK_ID,
     Landmark,
     LandmarkMapper,
@@ -19,8 +18,9 @@ from payload_emulator.flight.landmark_map import (
     intersected,
     unclaimed,
 )
-from payload_emulator.flight.sighting import Sighting
-from payload_emulator.flight.tables import CatalogueTable
+from payload_emulator.flight.navigation.sighting import Sighting
+from payload_emulator.flight.vision.detections import Detections, no_detections
+from tmtc.tables import CatalogueTable
 
 RADIUS_M = 1_737_400.0
 CAMERA = PinholeCamera()

@@ -9,8 +9,7 @@ import pytest
 
 from lunar.camera import PinholeCamera
 from lunar.frames import enu_from_mcmf, mcmf_from_spherical
-from payload_emulator.flight.detections import Detections, no_detections
-from payload_emulator.flight.lost_in_space import (
+from payload_emulator.flight.navigation.lost_in_space import (
     NADIR_NORTH_UP,
     LostFrame,
     LostParameters,
@@ -21,8 +20,9 @@ from payload_emulator.flight.lost_in_space import (
     log_poisson_tail,
     place_index,
 )
-from payload_emulator.flight.sighting import LandmarkMap, landmark_map
-from payload_emulator.flight.tables import CatalogueTable
+from payload_emulator.flight.navigation.sighting import LandmarkMap, landmark_map
+from payload_emulator.flight.vision.detections import Detections, no_detections
+from tmtc.tables import CatalogueTable
 
 RADIUS_M = 1_737_400.0
 CAMERA = PinholeCamera()

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from payload_emulator.flight.modes import ALLOWED, TRANSITIONS, PayloadMode
+from payload_emulator.flight.onboard.modes import ALLOWED, TRANSITIONS, PayloadMode
 from tmtc.dictionary import DICTIONARY
 
 SAFE, STANDBY, OBSERVING, DOWNLINKING = PayloadMode

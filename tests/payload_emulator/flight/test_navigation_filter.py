@@ -13,11 +13,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lunar.camera import PinholeCamera
-from payload_emulator.flight import navigation_filter as kalman
-from payload_emulator.flight.dynamics import Prediction
-from payload_emulator.flight.navigation_filter import CommonErrors, FilterState
-from payload_emulator.flight.sighting import LandmarkMap, landmark_map, look
-from payload_emulator.flight.tables import CatalogueTable
+from payload_emulator.flight.navigation import filter as kalman
+from payload_emulator.flight.navigation.dynamics import Prediction
+from payload_emulator.flight.navigation.filter import CommonErrors, FilterState
+from payload_emulator.flight.navigation.sighting import LandmarkMap, landmark_map, look
+from tmtc.tables import CatalogueTable
 
 CAMERA = PinholeCamera()
 RADIUS_M = 1_737_400.0

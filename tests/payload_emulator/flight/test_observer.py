@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from payload_emulator.flight.anchored import AnchoredReport
-from payload_emulator.flight.detections import Detections
-from payload_emulator.flight.loads import FlightParameters, FlightTables
-from payload_emulator.flight.observer import Observer
-from payload_emulator.flight.outcomes import Mode, Outcome, ResetTrigger
-from payload_emulator.flight.preprocess import ImageQuality
-from payload_emulator.flight.tables import pack_anchor_table, table_hash
+from payload_emulator.flight.navigation.anchored import AnchoredReport
+from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
+from payload_emulator.flight.onboard.loads import FlightParameters, FlightTables
+from payload_emulator.flight.onboard.observer import Observer
+from payload_emulator.flight.vision.detections import Detections
+from payload_emulator.flight.vision.preprocess import ImageQuality
+from tmtc.tables import pack_anchor_table, table_hash
 
 ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 IMAGE = np.zeros((4, 4), dtype=np.uint8)
@@ -303,7 +303,7 @@ def test_a_frame_of_odometry_is_reported_in_full(
         calls.append((given, more))
         return state, report
 
-    monkeypatch.setattr("payload_emulator.flight.odometry.step", step)
+    monkeypatch.setattr("payload_emulator.flight.navigation.odometry.step", step)
     rig.telemetry.frame_number = 5
     observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
     observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
@@ -356,7 +356,7 @@ def test_odometry_without_a_position_reports_its_outcome_alone(
         outcome=Outcome.rejected, reset_trigger=ResetTrigger.none, candidate_pairs=3, pairs=0, shift_east_m=np.nan,
         shift_north_m=np.nan,
     )  # fmt: skip
-    monkeypatch.setattr("payload_emulator.flight.odometry.step", lambda *_, **__: (None, report))
+    monkeypatch.setattr("payload_emulator.flight.navigation.odometry.step", lambda *_, **__: (None, report))
     observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
     assert rig.telemetry.named("frame_outcome")[1] == {
         **expected, "frame_number": 1, "outcome": int(Outcome.rejected), "candidate_pairs": 3,
@@ -412,7 +412,7 @@ def test_new_landmarks_go_down_forty_to_a_packet(
             sigma_m=np.stack([n + 3.0, n + 4.0, n + 5.0], axis=1), sightings=n + 6.0, passes=n + 7.0,
         )  # fmt: skip
 
-    monkeypatch.setattr("payload_emulator.flight.observer.map_rows", rows)
+    monkeypatch.setattr("payload_emulator.flight.onboard.observer.map_rows", rows)
     rig.navigator.new_landmarks = tuple(range(41))
     look(rig)
     first, second = rig.telemetry.named("landmarks")

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from lunar.camera import PinholeCamera
-from payload_emulator.flight import odometry
-from payload_emulator.flight.matcher import GroundFeatures, Match
-from payload_emulator.flight.odometry import OdometryParameters, OdometryState
-from payload_emulator.flight.outcomes import Mode, Outcome, ResetTrigger
-from payload_emulator.flight.tables import AnchorTable, pack_anchor_table, unpack_anchor_table
+from payload_emulator.flight.navigation import odometry
+from payload_emulator.flight.navigation.matcher import GroundFeatures, Match
+from payload_emulator.flight.navigation.odometry import OdometryParameters, OdometryState
+from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
+from tmtc.tables import AnchorTable, pack_anchor_table, unpack_anchor_table
 
 CAMERA = PinholeCamera()
 # Two passes between -60 and 60 degrees of latitude, seconds after the epoch of Table I. The ascending one

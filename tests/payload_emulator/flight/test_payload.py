@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from payload_emulator.flight.detections import Detections, no_detections
-from payload_emulator.flight.outcomes import Mode
+from payload_emulator.flight.navigation.outcomes import Mode
 from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload
-from payload_emulator.flight.preprocess import ImageQuality
-from payload_emulator.flight.tables import pack_anchor_table, table_hash
+from payload_emulator.flight.vision.detections import Detections, no_detections
+from payload_emulator.flight.vision.preprocess import ImageQuality
 from tmtc.dictionary import DICTIONARY
 from tmtc.packets import unpack_primary_header
+from tmtc.tables import pack_anchor_table, table_hash
 
 IMAGE = np.zeros((4, 4, 3), dtype=np.uint8)
 ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])

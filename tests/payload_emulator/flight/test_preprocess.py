@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from payload_emulator.flight.preprocess import (
+from payload_emulator.flight.vision.preprocess import (
     ImageQuality,
     gray_levels,
     prepare_image,

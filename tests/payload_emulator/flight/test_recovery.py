@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from payload_emulator.flight.anchored import AnchoredParameters
-from payload_emulator.flight.lost_in_space import LostParameters
-from payload_emulator.montecarlo import CatalogueErrors, Kidnap, NavigationCase, NavigationRun, fly
+from payload_emulator.flight.navigation.anchored import AnchoredParameters
+from payload_emulator.flight.navigation.lost_in_space import LostParameters
+from studies.montecarlo import CatalogueErrors, Kidnap, NavigationCase, NavigationRun, fly
 
 FRAME = 20
 PARAMETERS = AnchoredParameters(gravity_degree=50)

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from payload_emulator.flight.anchored import AnchoredParameters
-from payload_emulator.flight.dynamics import ProcessNoise
-from payload_emulator.flight.navigation_filter import CommonErrors
-from payload_emulator.flight.relative import CLONE, RelativeParameters, with_clone, without_clone
-from payload_emulator.montecarlo import CatalogueErrors, SimulatedDetector, fly
+from payload_emulator.flight.navigation.anchored import AnchoredParameters
+from payload_emulator.flight.navigation.dynamics import ProcessNoise
+from payload_emulator.flight.navigation.filter import CommonErrors
+from payload_emulator.flight.navigation.relative import CLONE, RelativeParameters, with_clone, without_clone
+from studies.montecarlo import CatalogueErrors, SimulatedDetector, fly
 
 NOISE = ProcessNoise((1.2e-7, 6e-8, 6e-8), (1e-7, 1e-7, 1e-7), 900.0)
 OFF = AnchoredParameters(
@@ -37,7 +37,7 @@ def blind(navigation_case: Any, velocity_m_s: float, parameters: AnchoredParamet
 
 
 def test_a_clone_is_the_position_itself_until_the_orbit_moves_on(navigation_case: Any) -> None:
-    from payload_emulator.flight.navigation_filter import initial_filter_state
+    from payload_emulator.flight.navigation.filter import initial_filter_state
 
     state = initial_filter_state(0, np.ones(3), np.ones(3), 100.0, 0.1, (1e-7,) * 3, CommonErrors())
     kept = with_clone(state)

@@ -12,15 +12,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from payload_emulator.flight.loads import TABLE_NUMBERS
-from payload_emulator.flight.parameters import PARAMETERS, find_parameter
+from payload_emulator.flight.onboard.loads import TABLE_NUMBERS
+from payload_emulator.flight.onboard.parameters import PARAMETERS, find_parameter
 from payload_emulator.flight.payload import PayloadMode
 from payload_emulator.flight.ports import ResetCause
-from payload_emulator.flight.products import map_octets, unpack_map, unpack_thumbnail
-from payload_emulator.flight.tables import pack_anchor_table
+from payload_emulator.flight.telemetry.products import map_octets, unpack_map, unpack_thumbnail
 from tmtc.crc import append_crc
 from tmtc.dictionary import DICTIONARY
 from tmtc.large_data import LargeDataReceiver, split
+from tmtc.tables import pack_anchor_table
 
 NUMBERS = {parameter.name: parameter.number for parameter in PARAMETERS}
 

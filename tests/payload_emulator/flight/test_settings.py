@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from payload_emulator.flight.settings import Recovery, Settings
+from payload_emulator.flight.onboard.settings import Recovery, Settings
 
 VALUES = {"boot_count": 3, "parameters": {"scrub_interval_s": 5.0}, "schedule": [[17, "18a0"]]}
 

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from payload_emulator.flight.store import SHARES, PacketStore, StoreClass
+from payload_emulator.flight.telemetry.store import SHARES, PacketStore, StoreClass
 from tmtc.dictionary import DICTIONARY
 
 HEADER = 13

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from payload_emulator.errors import TableError
-from payload_emulator.flight import tables
+from lunar.constants import MOON_RADIUS_M
+from tmtc import tables
+from tmtc.errors import TableError
 
 
 def small_anchor(moon: Any) -> bytes:
@@ -193,3 +194,7 @@ def test_a_table_with_values_that_are_not_finite_is_refused(moon: Any) -> None:
         tables.unpack_anchor_table(octets)
     with pytest.raises(TableError, match="strictly increasing"):
         tables.pack_anchor_table([3, 2], np.ones((2, 3)))
+
+
+def test_heights_refer_to_the_sphere_of_the_maps() -> None:
+    assert tables.MAP_RADIUS_M == MOON_RADIUS_M

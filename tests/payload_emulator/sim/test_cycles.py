@@ -17,10 +17,10 @@ from lunar.constants import MOON_RADIUS_M
 from lunar.frames import axis_rotation, enu_from_mcmf, mcmf_from_spherical
 from lunar.lens import BrownCamera
 from payload_emulator.errors import RendererError, TerrainError
-from payload_emulator.sim import cycles, cycles_worker, renderer
-from payload_emulator.sim.cycles_scene import GRID, MATT_SPECULAR_IOR, CyclesSettings, describe_scene
-from payload_emulator.sim.light import sun_direction_mcmf
-from payload_emulator.sim.photometry import Photometry
+from payload_emulator.sim.render import cycles, cycles_worker, renderer
+from payload_emulator.sim.render.cycles_scene import GRID, MATT_SPECULAR_IOR, CyclesSettings, describe_scene
+from payload_emulator.sim.render.light import sun_direction_mcmf
+from payload_emulator.sim.render.photometry import Photometry
 from tests.payload_emulator.sim.exr_file import exr_octets
 
 CAMERA = PinholeCamera()

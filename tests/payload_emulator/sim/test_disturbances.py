@@ -11,9 +11,9 @@ from lunar.gravity import builtin_gravity
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.errors import ScenarioError
-from payload_emulator.scenario import parse_scenario
-from payload_emulator.sim.disturbances import changed, executed, turned_state
-from payload_emulator.sim.truth import Truth
+from payload_emulator.session.scenario import parse_scenario
+from payload_emulator.sim.orbit.disturbances import changed, executed, turned_state
+from payload_emulator.sim.orbit.truth import Truth
 
 EPOCH = parse_utc("2029-08-07T00:00:00Z")
 MODEL = ForceModel(builtin_gravity(), IauOrientation(), 8)

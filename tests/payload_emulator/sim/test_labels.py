@@ -7,14 +7,14 @@ from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import make_catalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import axis_rotation, mcmf_from_spherical
-from payload_emulator.sim import raymarch
-from payload_emulator.sim.labels import (
+from payload_emulator.sim.render import raymarch
+from payload_emulator.sim.render.labels import (
     label_frame,
     label_frame_as_the_paper,
     project_as_the_paper,
     project_craters,
 )
-from payload_emulator.sim.light import sun_direction_mcmf
+from payload_emulator.sim.render.light import sun_direction_mcmf
 
 CAMERA = PinholeCamera()
 

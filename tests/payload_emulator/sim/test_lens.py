@@ -11,10 +11,10 @@ from lunar.catalogue import make_catalogue
 from lunar.errors import LensError
 from lunar.frames import mcmf_from_spherical
 from lunar.lens import BrownCamera, pointed_camera_from_mcmf
-from payload_emulator.sim import raymarch, renderer
-from payload_emulator.sim.labels import project_craters
-from payload_emulator.sim.lens import pixel_shifts
-from payload_emulator.sim.light import sun_direction_mcmf
+from payload_emulator.sim.render import raymarch, renderer
+from payload_emulator.sim.render.labels import project_craters
+from payload_emulator.sim.render.lens import pixel_shifts
+from payload_emulator.sim.render.light import sun_direction_mcmf
 
 BARREL = {"k1": -0.02, "k2": 1.0e-3, "k3": 1.0e-4, "p1": 1.0e-3, "p2": -5.0e-4}
 PLACE = math.radians(10.2), math.radians(20.3)

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from payload_emulator.sim.light import paper_light, sun_angles, sun_direction_mcmf
+from payload_emulator.sim.render.light import paper_light, sun_angles, sun_direction_mcmf
 
 
 def test_the_papers_light_stays_within_its_span_and_fills_it():

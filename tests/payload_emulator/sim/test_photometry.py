@@ -7,9 +7,9 @@ from lunar.camera import PinholeCamera
 from lunar.frames import mcmf_from_spherical
 from lunar.lens import pointed_camera_from_mcmf
 from payload_emulator.errors import PayloadError
-from payload_emulator.sim import raymarch, renderer
-from payload_emulator.sim.light import sun_direction_mcmf
-from payload_emulator.sim.photometry import LAWS, TABLE_SIZE, Photometry
+from payload_emulator.sim.render import raymarch, renderer
+from payload_emulator.sim.render.light import sun_direction_mcmf
+from payload_emulator.sim.render.photometry import LAWS, TABLE_SIZE, Photometry
 
 
 def entry(table, phase_deg):

@@ -7,8 +7,8 @@ import pytest
 
 from payload_emulator.errors import ScenarioError
 from payload_emulator.flight import ports
-from payload_emulator.sim.faults import FAULT_KINDS, Fault, parse_fault
-from payload_emulator.sim.platform import PlatformModel, SimulatedBoard
+from payload_emulator.sim.board.faults import FAULT_KINDS, Fault, parse_fault
+from payload_emulator.sim.board.platform import PlatformModel, SimulatedBoard
 
 
 def board(**options: object) -> SimulatedBoard:

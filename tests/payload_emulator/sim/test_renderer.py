@@ -9,9 +9,9 @@ from lunar.camera import PinholeCamera, intersect_sphere, nadir_camera_from_mcmf
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import axis_rotation, mcmf_from_spherical
 from payload_emulator.errors import TerrainError
-from payload_emulator.sim import raymarch, renderer
-from payload_emulator.sim.light import sun_direction_mcmf
-from payload_emulator.sim.photometry import Photometry
+from payload_emulator.sim.render import raymarch, renderer
+from payload_emulator.sim.render.light import sun_direction_mcmf
+from payload_emulator.sim.render.photometry import Photometry
 
 CAMERA = PinholeCamera()
 LAMBERT = Photometry("lambert", phase_slope_per_rad=0.0)

@@ -11,9 +11,9 @@ from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import find_data
 from lunar.frames import mcmf_from_spherical
 from lunar.lens import BrownCamera, pointed_camera_from_mcmf
-from payload_emulator.sim.labels import label_frame, project_craters
-from payload_emulator.sim.raymarch import cast
-from payload_emulator.sim.rims import rim_errors
+from payload_emulator.sim.render.labels import label_frame, project_craters
+from payload_emulator.sim.render.raymarch import cast
+from payload_emulator.sim.render.rims import rim_errors
 from payload_emulator.sim.terrain.opening import open_terrain
 
 CAMERA = PinholeCamera()

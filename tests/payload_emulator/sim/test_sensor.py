@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from payload_emulator.errors import PayloadError
-from payload_emulator.sim.sensor import (
+from payload_emulator.sim.render.sensor import (
     COLOUR,
     SensorModel,
     auto_exposure,

@@ -10,7 +10,7 @@ from lunar.constants import MOON_RADIUS_M
 from lunar.frames import matrix_from_quaternion, spherical_from_mcmf
 from lunar.timescales import tdb_s_from_utc_ns
 from payload_emulator.errors import ScenarioError
-from payload_emulator.sim.truth import (
+from payload_emulator.sim.orbit.truth import (
     ReadCount,
     Truth,
     attitude_message,

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from payload_emulator.training import dataset as store
-from payload_emulator.training.finishing import write_index
-from payload_emulator.training.recipe import Recipe, Source
+from payload_emulator.session.recipe import Recipe, Source
+from payload_emulator.training.data import dataset as store
+from payload_emulator.training.data.finishing import write_index
 
 SIZE = 512
 

@@ -9,8 +9,12 @@ import pytest
 pytest.importorskip("torch")
 
 from payload_emulator.errors import DatasetError, ModelError
-from payload_emulator.training import ablation
-from payload_emulator.training.ablation import (
+from payload_emulator.training.data.dataset import Dataset
+from payload_emulator.training.data.feeder import Feeder, TrainParameters
+from payload_emulator.training.data.targets import Tier, make_targets
+from payload_emulator.training.model.model import CraterNet, ModelConfig
+from studies import ablation
+from studies.ablation import (
     BASELINE,
     STRIP_DEG,
     VARIANTS,
@@ -23,10 +27,6 @@ from payload_emulator.training.ablation import (
     format_ablation,
     score_chosen_variant,
 )
-from payload_emulator.training.dataset import Dataset
-from payload_emulator.training.feeder import Feeder, TrainParameters
-from payload_emulator.training.model import CraterNet, ModelConfig
-from payload_emulator.training.targets import Tier, make_targets
 
 TINY = AblationParameters(
     steps=1, crop_px=64, real_frames=2, procedural_frames=2, validation_frames=1, test_frames=1, seeds=(1,)

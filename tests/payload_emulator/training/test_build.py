@@ -15,10 +15,10 @@ import pytest
 
 from lunar.datafolder import find_data
 from payload_emulator.errors import DatasetError, RendererError
-from payload_emulator.training import dataset as store
-from payload_emulator.training.build import _runs, build, make_shard, plan_shards
-from payload_emulator.training.integrity import check
-from payload_emulator.training.recipe import Recipe, Source, load_recipe
+from payload_emulator.session.recipe import Recipe, Source, load_recipe
+from payload_emulator.training.data import dataset as store
+from payload_emulator.training.data.build import _runs, build, make_shard, plan_shards
+from payload_emulator.training.data.integrity import check
 
 ROOT = Path(__file__).parents[3]
 RECIPE = Recipe(
@@ -85,7 +85,7 @@ def test_a_finished_data_set_is_not_made_again(built, monkeypatch):
     def refuse(*arguments):
         raise AssertionError("a finished shard was rendered again")
 
-    monkeypatch.setattr("payload_emulator.training.build.make_shard", refuse)
+    monkeypatch.setattr("payload_emulator.training.data.build.make_shard", refuse)
     assert list(build(RECIPE, folder, 3, find_data(None))) == [(4, 4)]
 
 
@@ -144,7 +144,7 @@ def test_a_full_disk_loses_nothing_that_was_finished(tmp_path):
 
 
 def test_a_dead_worker_is_said_in_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr("payload_emulator.training.build._follow_parent", functools.partial(os._exit, 9))
+    monkeypatch.setattr("payload_emulator.training.data.build._follow_parent", functools.partial(os._exit, 9))
     with pytest.raises(DatasetError, match=r"a worker process died .*; 0 of 4 frames are kept"):
         list(build(RECIPE, tmp_path / "set", 3, find_data(None), workers=2))
 

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from payload_emulator.training.calibrate import fit_parallax, paper_threshold, without_parallax
-from payload_emulator.training.scoring import FrameDetections, FrameTruth
+from payload_emulator.training.data.truth import FrameTruth
+from payload_emulator.training.evaluate.scoring import FrameDetections
+from payload_emulator.training.model.calibrate import fit_parallax, paper_threshold, without_parallax
 
 SHARE = 4e-4
 

@@ -9,8 +9,8 @@ import pytest
 from linna.cli import run
 from payload_emulator.errors import DatasetError
 from payload_emulator.flight.models import load_shipped_model
-from payload_emulator.training.dataset import Dataset, write_gray
-from payload_emulator.training.domain import common_scenes, compare_renderers, format_domains, renderer_of
+from payload_emulator.training.data.dataset import Dataset, write_gray
+from studies.domain import common_scenes, compare_renderers, format_domains, renderer_of
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,10 @@ import pytest
 
 from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.flight.models import load_shipped_model
-from payload_emulator.training import choice
-from payload_emulator.training.choice import choose, format_choice
-from payload_emulator.training.dataset import Dataset, frame_truth
-from payload_emulator.training.evaluate import (
+from payload_emulator.training.data.dataset import Dataset, frame_truth
+from payload_emulator.training.evaluate import choice
+from payload_emulator.training.evaluate.choice import choose, format_choice
+from payload_emulator.training.evaluate.evaluate import (
     Scored,
     detect_by_class,
     evaluate,
@@ -21,10 +21,12 @@ from payload_emulator.training.evaluate import (
     run,
     summary,
 )
-from payload_emulator.training.figures import Scene, Thresholds
-from payload_emulator.training.report import detector_report
-from payload_emulator.training.scoring import FrameDetections
-from payload_emulator.training.trials import (
+from payload_emulator.training.evaluate.metrics import Scene, Thresholds
+from payload_emulator.training.evaluate.report import detector_report
+from payload_emulator.training.evaluate.scoring import FrameDetections
+from reports.json_form import to_json
+from reports.render import render_html
+from studies.trials import (
     AS_FLOWN,
     PER_CLASS,
     TRIALS,
@@ -32,9 +34,7 @@ from payload_emulator.training.trials import (
     run_trials,
     score_chosen_trial,
 )
-from payload_emulator.training.two_suns import format_two_suns, fuse, score_chosen_way, study_two_suns
-from reports.json_form import to_json
-from reports.render import render_html
+from studies.two_suns import format_two_suns, fuse, score_chosen_way, study_two_suns
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +190,7 @@ def test_trials_and_eight_bits_refuse_frames_of_another_camera(detector, make_bl
     with pytest.raises(DatasetError, match="expected frames of the detector's camera"):
         run_trials(detector, [other])
     pytest.importorskip("onnx")
-    from payload_emulator.training.quantise import quantise
+    from payload_emulator.training.model.quantise import quantise
 
     detector.metadata["camera_fov_deg"] = "120"
     with pytest.raises(DatasetError, match="expected frames of the detector's camera"):

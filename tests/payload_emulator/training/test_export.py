@@ -9,12 +9,12 @@ import pytest
 pytest.importorskip("torch")
 
 from payload_emulator.errors import ModelError
-from payload_emulator.flight.detector import OnnxDetector
-from payload_emulator.training.evaluate import evaluate
-from payload_emulator.training.export import PARITY_LIMIT, export
-from payload_emulator.training.feeder import TrainParameters
-from payload_emulator.training.quantise import quantise
-from payload_emulator.training.train import train
+from payload_emulator.flight.vision.detector import OnnxDetector
+from payload_emulator.training.data.feeder import TrainParameters
+from payload_emulator.training.evaluate.evaluate import evaluate
+from payload_emulator.training.model.export import PARITY_LIMIT, export
+from payload_emulator.training.model.quantise import quantise
+from payload_emulator.training.model.train import train
 
 ONE_STEP = TrainParameters(
     minutes=0.0, steps=1, batch=2, crop_px=96, validation_frames=1, replicas=1, detail_blocks=0

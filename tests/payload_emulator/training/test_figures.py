@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from payload_emulator.training.figures import Scene, Thresholds, repeatability, score
-from payload_emulator.training.scoring import FrameDetections, FrameTruth, average_precision, tally
+from payload_emulator.training.data.truth import FrameTruth
+from payload_emulator.training.evaluate.metrics import Scene, Thresholds, repeatability, score
+from payload_emulator.training.evaluate.scoring import FrameDetections, average_precision, tally
 
 THRESHOLDS = Thresholds(0.5, 0.3, 0.7)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from payload_emulator.errors import DatasetError
-from payload_emulator.training.landmarks import (
+from payload_emulator.training.evaluate.landmarks import (
     RecurrenceRule,
     find_landmarks,
     format_landmarks,
@@ -14,7 +14,7 @@ from payload_emulator.training.landmarks import (
     study,
     with_landmarks,
 )
-from payload_emulator.training.scoring import FrameDetections
+from payload_emulator.training.evaluate.scoring import FrameDetections
 
 
 def looks(dataset, count, azimuths):

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from payload_emulator.errors import DatasetError
-from payload_emulator.flight.tables import CatalogueTable, pack_catalogue_table
-from payload_emulator.training.dataset import Frame, frame_truth
-from payload_emulator.training.localisation import against_rims, bias_by_octant, bias_overall
-from payload_emulator.training.refits import load_refitted, refitted_frame
-from payload_emulator.training.scoring import FrameDetections, FrameTruth, tally
+from payload_emulator.training.data.dataset import Frame, frame_truth
+from payload_emulator.training.data.refits import load_refitted, refitted_frame
+from payload_emulator.training.data.truth import FrameTruth
+from payload_emulator.training.evaluate.localisation import against_rims, bias_by_octant, bias_overall
+from payload_emulator.training.evaluate.scoring import FrameDetections, tally
+from tmtc.tables import CatalogueTable, pack_catalogue_table
 
 METRES_PER_DEGREE = 1_737_400.0 * np.pi / 180.0
 

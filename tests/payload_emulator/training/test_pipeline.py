@@ -10,12 +10,15 @@ pytest.importorskip("torch")
 from linna.output import as_json
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import DatasetError, ModelError
-from payload_emulator.flight.detector import OnnxDetector
 from payload_emulator.flight.models import load_shipped_model
-from payload_emulator.training import build, evaluate, export, pipeline, train
-from payload_emulator.training.feeder import TrainParameters
-from payload_emulator.training.pipeline import Job, format_made, make_dataset, make_model
-from payload_emulator.training.recipe import procedural_recipe
+from payload_emulator.flight.vision.detector import OnnxDetector
+from payload_emulator.session.recipe import procedural_recipe
+from payload_emulator.training.data import build
+from payload_emulator.training.data.feeder import TrainParameters
+from payload_emulator.training.evaluate import evaluate
+from payload_emulator.training.model import export, train
+from studies import pipeline
+from studies.pipeline import Job, format_made, make_dataset, make_model
 
 TINY = TrainParameters(
     minutes=0.0, steps=1, batch=2, crop_px=96, validation_frames=1, replicas=1, detail_blocks=0

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lunar.catalogue import size_class
-from payload_emulator.training.scoring import (
+from payload_emulator.training.data.truth import FrameTruth
+from payload_emulator.training.evaluate.scoring import (
     FrameDetections,
-    FrameTruth,
     MatchRule,
     best_threshold,
     bootstrap_f1,

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from payload_emulator.flight.detector import decode
-from payload_emulator.training.targets import Tier, make_targets
+from payload_emulator.flight.vision.detector import decode
+from payload_emulator.training.data.targets import Tier, make_targets
 
 
 def perfect_maps(u, v, diameter):

@@ -14,9 +14,9 @@ from lunar.frames import IauOrientation, mcmf_from_spherical, spherical_from_mcm
 from lunar.oem import save_oem
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.errors import DatasetError
-from payload_emulator.training.recipe import PAPER_SPLIT, Box, Source, load_recipe
-from payload_emulator.training.shots import pose_at
-from payload_emulator.training.track import lay_track, order_by_ground, split_track
+from payload_emulator.session.recipe import PAPER_SPLIT, Box, Source, load_recipe
+from payload_emulator.training.data.shots import pose_at
+from payload_emulator.training.data.track import lay_track, order_by_ground, split_track
 
 ROOT = Path(__file__).parents[3]
 START = parse_utc("2029-08-07T00:00:00Z")

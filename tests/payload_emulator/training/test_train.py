@@ -13,11 +13,11 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from payload_emulator.errors import DatasetError, ModelError  # noqa: E402
-from payload_emulator.training import train as training  # noqa: E402
-from payload_emulator.training.export import load_network  # noqa: E402
-from payload_emulator.training.feeder import TrainParameters  # noqa: E402
-from payload_emulator.training.landmarks import Landmarks  # noqa: E402
-from payload_emulator.training.train import train  # noqa: E402
+from payload_emulator.training.data.feeder import TrainParameters  # noqa: E402
+from payload_emulator.training.evaluate.landmarks import Landmarks  # noqa: E402
+from payload_emulator.training.model import train as training  # noqa: E402
+from payload_emulator.training.model.export import load_network  # noqa: E402
+from payload_emulator.training.model.train import train  # noqa: E402
 
 SHORT = TrainParameters(
     minutes=0.0,
@@ -168,8 +168,8 @@ def test_a_run_killed_and_resumed_reaches_the_figures_of_one_left_alone(blob_dat
     parameters = replace(SHORT, steps=5, batch=2, crop_px=96, replicas=1, validate_every_minutes=0.0)
     code = (
         "import sys, time; from dataclasses import replace; from pathlib import Path\n"
-        "from payload_emulator.training import train as t; from payload_emulator.training.dataset import Dataset\n"
-        "from payload_emulator.training.feeder import TrainParameters\n"
+        "from payload_emulator.training.model import train as t; from payload_emulator.training.data.dataset import Dataset\n"
+        "from payload_emulator.training.data.feeder import TrainParameters\n"
         "save = t._save\n"
         "def slow(path, *rest):\n"
         "    save(path, *rest); print(path.name, flush=True); time.sleep(0.4)\n"

@@ -1,0 +1,1 @@
+"""On-board navigation: odometry, anchored filter, identification of craters, lost in space."""

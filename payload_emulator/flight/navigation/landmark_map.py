@@ -1,0 +1,476 @@
+"""Craters that no catalogue holds: tracked over a pass, triangulated, kept in a map, used on later passes.
+
+A detection that belongs to no catalogued crater begins a track. Later detections join it where a point standing still
+on the ground would be seen; a track of enough of them becomes a landmark, placed by least squares on its sightings.
+False detections do not stand still and never get so far.
+
+The errors of a landmark are its own, from the noise of its sightings, and those of the spacecraft while it was seen.
+The latter do not average out over a pass, are shared by all landmarks of the pass, and are still in the filter: they
+are added in full to the landmark's covariance, and a landmark is used only on later passes, as one more uncertain
+crater (Schmidt). Sightings of several passes are joined by covariance intersection (Julier and Uhlmann 1997), which
+holds whatever the correlation of their errors: nothing is counted twice.
+
+Frame: MCMF (ME). Memory is bounded: tracks, sightings per track and landmarks have limits, the poorest give way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lunar.camera import PinholeCamera
+from lunar.constants import MOON_RADIUS_M
+from lunar.frames import enu_from_mcmf
+from payload_emulator.flight.navigation.sighting import LandmarkMap, Sighting, landmark_map
+from payload_emulator.flight.vision.detections import Detections
+from tmtc.cuc import TICKS_PER_SECOND
+from tmtc.tables import CatalogueTable
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+FIRST_LANDMARK_ID = 3_000_000_000
+"""Identities of landmarks begin here; catalogues stay below."""
+
+# Chi-square of 2 and of 3 degrees of freedom at 0.99; of a track's residuals per degree of freedom, far in the tail.
+_GATE, _GATE_3 = 9.2, 11.3
+_RESIDUAL_LIMIT = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class MappingParameters:
+    """Rules of the map.
+
+    Attributes
+    ----------
+    sightings
+        Sightings in one pass that make a track a landmark.
+    height_sigma_m
+        How far craters lie from the height of their surroundings, before parallax tells.
+    log_diameter_gate
+        Largest difference of the logarithms of the diameters of a track and a detection.
+    position_limit_m
+        Position sigma above which nothing is mapped.
+    track_memory_s
+        A track not seen for this long is closed.
+    tracks, sightings_kept, landmarks
+        Limits of memory.
+    diameter_limits_m
+        Diameters that are mapped.
+    """
+
+    sightings: int = 3
+    height_sigma_m: float = 800.0
+    log_diameter_gate: float = 0.3
+    position_limit_m: float = 600.0
+    track_memory_s: float = 50.0
+    tracks: int = 150
+    sightings_kept: int = 8
+    landmarks: int = 3_000
+    diameter_limits_m: tuple[float, float] = (1_500.0, 30_000.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Landmark:
+    """A crater of the map.
+
+    Attributes
+    ----------
+    position_mcmf_m, covariance_m2
+        Shapes (3,) and (3, 3), spacecraft error included.
+    sightings, passes
+        Sightings in all, and passes on which it was mapped.
+    ticks
+        When it was last mapped.
+    """
+
+    identity: int
+    position_mcmf_m: Float
+    covariance_m2: Float
+    diameter_m: float
+    sightings: int
+    passes: int
+    ticks: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """From where and how a frame was seen, as estimated: MCMF.
+
+    Attributes
+    ----------
+    camera_from_mcmf
+        Shape (3, 3).
+    position_mcmf_m, covariance_m2
+        Of the camera, shapes (3,) and (3, 3).
+    attitude_sigma_rad
+        What is uncertain of the attitude, per axis.
+    """
+
+    ticks: int
+    camera_from_mcmf: Float
+    position_mcmf_m: Float
+    covariance_m2: Float
+    attitude_sigma_rad: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Track:
+    """Sightings of what may be one crater: views, pixels (n, 2), variances (n,), and the place they give."""
+
+    views: tuple[View, ...]
+    uv_px: Float
+    variance_px2: Float
+    diameter_m: float
+    position_mcmf_m: Float
+    own_covariance_m2: Float
+    surface_m: float
+
+
+class LandmarkMapper:
+    """The map under construction: takes what each frame's fix left over."""
+
+    def __init__(self, camera: PinholeCamera, parameters: MappingParameters = MappingParameters()) -> None:
+        self.parameters = parameters
+        self.landmarks: dict[int, Landmark] = {}
+        # Places of the landmarks in the order of the dictionary, for the search.
+        self._places = np.empty((0, 3))
+        self._camera = camera
+        self._tracks: list[_Track] = []
+        self._next = FIRST_LANDMARK_ID
+
+    def __len__(self) -> int:
+        return len(self.landmarks)
+
+    def observe(
+        self, view: View, found: Detections, variance_px2: Float, free: NDArray[np.bool_], surface_m: float
+    ) -> tuple[Landmark, ...]:
+        """Take a frame; return landmarks that it completed or that closed tracks improved.
+
+        Parameters
+        ----------
+        free
+            Detections that belong to no crater of the catalogue, shape (n,).
+        surface_m
+            Height of the ground around, as the catalogue has it.
+        """
+        parameters = self.parameters
+        spread = float(np.sqrt(np.trace(view.covariance_m2) / 3.0))
+        usable = (
+            free
+            & np.isfinite(found.u_px)
+            & np.isfinite(found.v_px)
+            & (found.diameter_px > 0.0)
+            & np.isfinite(variance_px2)
+        )
+        ready = self._closed(view.ticks)
+        if not (np.isfinite(spread) and spread < parameters.position_limit_m):
+            return ready
+        uv = np.stack([found.u_px, found.v_px], axis=1)
+        size_m = self._ground_diameter(view, uv, found.diameter_px, surface_m)
+        low, high = parameters.diameter_limits_m
+        usable &= (size_m >= low) & (size_m <= high)
+        joined = self._join(view, uv, variance_px2, size_m, usable)
+        self._begin(view, uv, variance_px2, size_m, np.flatnonzero(usable & ~joined), surface_m)
+        return ready
+
+    def close(self) -> tuple[Landmark, ...]:
+        """End all tracks, as before a gap; return the landmarks that came of them."""
+        return self._closed(None)
+
+    def with_catalogue(self, catalogue: CatalogueTable) -> LandmarkMap:
+        """Return the catalogue with the landmarks added, ready for use."""
+        if not self.landmarks:
+            return landmark_map(catalogue)
+        rows = map_rows(list(self.landmarks.values()))
+        return landmark_map(
+            CatalogueTable(
+                np.concatenate([catalogue.ids, rows.identity]),
+                np.concatenate([catalogue.latitude_rad, rows.latitude_rad]),
+                np.concatenate([catalogue.longitude_rad, rows.longitude_rad]),
+                np.concatenate([catalogue.diameter_m, rows.diameter_m]),
+                np.concatenate([catalogue.rim_height_m, rows.height_m]),
+                np.concatenate([catalogue.sigma_m, rows.sigma_m]),
+            )
+        )
+
+    def _ground_diameter(self, view: View, uv: Float, diameter_px: Float, surface_m: float) -> Float:
+        """Return diameters on the ground of detections, NaN off it."""
+        points = self._on_sphere(view, uv, surface_m)
+        depth = (points - view.position_mcmf_m) @ view.camera_from_mcmf[2]
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.nan_to_num(diameter_px * depth / self._camera.focal_px, nan=-1.0))
+
+    def _on_sphere(self, view: View, uv: Float, height_m: float) -> Float:
+        """Return where lines of sight meet a sphere (n, 3), NaN where they do not."""
+        sight = self._camera.rays(uv) @ view.camera_from_mcmf
+        along = -(sight @ view.position_mcmf_m)
+        below = view.position_mcmf_m @ view.position_mcmf_m - (MOON_RADIUS_M + height_m) ** 2
+        with np.errstate(invalid="ignore"):
+            reach = along - np.sqrt(along**2 - below)
+        return np.asarray(view.position_mcmf_m + reach[:, None] * sight)
+
+    def _begin(
+        self, view: View, uv: Float, variance_px2: Float, size_m: Float, rows: Index, surface_m: float
+    ) -> None:
+        """Begin tracks with detections, on the ground around; where memory is full the poorest tracks give way."""
+        places = self._on_sphere(view, uv[rows], surface_m)
+        rows, places = rows[np.isfinite(places[:, 0])], places[np.isfinite(places[:, 0])]
+        _, by_point = self._projected(view, places)
+        up = places / np.linalg.norm(places, axis=1, keepdims=True)
+        normal = up[:, :, None] * up[:, None, :] / self.parameters.height_sigma_m**2
+        normal = normal + np.swapaxes(by_point, 1, 2) @ by_point / variance_px2[rows, None, None]
+        own = np.linalg.inv(normal)
+        for k, i in enumerate(rows):
+            track = _Track(
+                (view,),
+                uv[i : i + 1],
+                variance_px2[i : i + 1],
+                float(size_m[i]),
+                places[k],
+                own[k],
+                surface_m,
+            )
+            self._tracks.append(track)
+        for _ in range(len(self._tracks) - self.parameters.tracks):
+            self._drop_poorest_track()
+
+    def _join(
+        self, view: View, uv: Float, variance_px2: Float, size_m: Float, usable: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Add detections to the tracks they continue, each other's nearest only; return which were added."""
+        joined = np.zeros(usable.size, dtype=np.bool_)
+        rows = np.flatnonzero(usable)
+        if not rows.size or not self._tracks:
+            return joined
+        places = np.stack([track.position_mcmf_m for track in self._tracks])
+        own = np.stack([track.own_covariance_m2 for track in self._tracks])
+        sizes = np.array([track.diameter_m for track in self._tracks])
+        predicted, by_point = self._projected(view, places)
+        # Between frames the spacecraft's own error is the same: only the track's is left.
+        spread = by_point @ own @ np.swapaxes(by_point, 1, 2)
+        offset = uv[rows][None] - predicted[:, None]
+        total = spread[:, None] + variance_px2[rows][None, :, None, None] * np.eye(2)
+        with np.errstate(invalid="ignore"):
+            distance = np.einsum("tna,tnab,tnb->tn", offset, np.linalg.inv(total), offset)
+            alike = np.abs(np.log(size_m[rows][None] / sizes[:, None])) <= self.parameters.log_diameter_gate
+        distance = np.where(alike & np.isfinite(distance), distance, np.inf)
+        best_track, best_row = np.argmin(distance, axis=0), np.argmin(distance, axis=1)
+        for t in range(len(self._tracks)):
+            k = int(best_row[t])
+            if best_track[k] != t or not distance[t, k] < _GATE:
+                continue
+            i = int(rows[k])
+            joined[i] = True
+            self._tracks[t] = self._longer(
+                self._tracks[t], view, uv[i], float(variance_px2[i]), float(size_m[i])
+            )
+        return joined
+
+    def _longer(self, track: _Track, view: View, uv: Float, variance_px2: float, diameter_m: float) -> _Track:
+        kept = self.parameters.sightings_kept
+        count = len(track.views)
+        longer = replace(
+            track,
+            views=(*track.views, view)[-kept:],
+            uv_px=np.concatenate([track.uv_px, uv[None]])[-kept:],
+            variance_px2=np.append(track.variance_px2, variance_px2)[-kept:],
+            diameter_m=float(np.exp((count * np.log(track.diameter_m) + np.log(diameter_m)) / (count + 1))),
+        )
+        return self._placed(longer)
+
+    def _placed(self, track: _Track) -> _Track:
+        """Return the track with its place by least squares: its sightings, and the height of the ground around."""
+        place, f, centre = track.position_mcmf_m, self._camera.focal_px, np.array(self._camera.centre_px)
+        rotation = np.stack([view.camera_from_mcmf for view in track.views])
+        position = np.stack([view.position_mcmf_m for view in track.views])
+        weight = np.repeat(1.0 / track.variance_px2, 2)
+        normal = np.eye(3)
+        for _ in range(2):
+            radius = float(np.sqrt(place @ place))
+            up = place / radius
+            seen = np.einsum("kij,kj->ki", rotation, place - position)
+            scale = f / seen[:, 2]
+            predicted = seen[:, :2] * scale[:, None] + centre
+            by_seen = np.zeros((len(track.views), 2, 3))
+            by_seen[:, 0, 0] = by_seen[:, 1, 1] = scale
+            by_seen[:, :, 2] = -seen[:, :2] * (scale / seen[:, 2])[:, None]
+            design = (by_seen @ rotation).reshape(-1, 3)
+            left = (track.uv_px - predicted).reshape(-1)
+            normal = np.outer(up, up) / self.parameters.height_sigma_m**2 + (design.T * weight) @ design
+            pull = (track.surface_m - (radius - MOON_RADIUS_M)) / self.parameters.height_sigma_m**2
+            place = place + np.linalg.solve(normal, up * pull + design.T @ (weight * left))
+        own = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+        return replace(track, position_mcmf_m=place, own_covariance_m2=own)
+
+    def _projected(self, view: View, places: Float) -> tuple[Float, Float]:
+        """Return pixels (n, 2) of places and their derivatives (n, 2, 3); NaN behind the camera."""
+        seen = (places - view.position_mcmf_m) @ view.camera_from_mcmf.T
+        depth = np.where(seen[:, 2] > 0.0, seen[:, 2], np.nan)
+        f, x, y = self._camera.focal_px, seen[:, 0] / depth, seen[:, 1] / depth
+        by_seen = np.zeros((depth.size, 2, 3))
+        by_seen[:, 0, 0] = by_seen[:, 1, 1] = f / depth
+        by_seen[:, 0, 2], by_seen[:, 1, 2] = -f * x / depth, -f * y / depth
+        uv = f * np.stack([x, y], axis=1) + np.array(self._camera.centre_px)
+        return uv, by_seen @ view.camera_from_mcmf
+
+    def _closed(self, ticks: int | None) -> tuple[Landmark, ...]:
+        """Close tracks not seen for a while (all, without a time) and return the landmarks that came of them."""
+        memory = self.parameters.track_memory_s * TICKS_PER_SECOND
+        done: list[_Track] = []
+        going: list[_Track] = []
+        for track in self._tracks:
+            old = ticks is None or not 0 <= ticks - track.views[-1].ticks <= memory
+            (done if old else going).append(track)
+        self._tracks = going
+        made = [self._landmark(track) for track in done if len(track.views) >= self.parameters.sightings]
+        return tuple(landmark for landmark in made if landmark is not None)
+
+    def _landmark(self, track: _Track) -> Landmark | None:
+        """Put a track into the map; None where its sightings contradict each other."""
+        misfit = 0.0
+        for view, uv, variance in zip(track.views, track.uv_px, track.variance_px2, strict=True):
+            left = uv - self._projected(view, track.position_mcmf_m[None])[0][0]
+            misfit += float(left @ left) / float(variance)
+        # Each sighting brings two numbers, a place takes three.
+        if not misfit <= _RESIDUAL_LIMIT * max(2 * len(track.views) - 3, 1):
+            return None
+        middle = track.views[len(track.views) // 2]
+        reach = float(np.linalg.norm(track.position_mcmf_m - middle.position_mcmf_m))
+        covariance = (
+            track.own_covariance_m2
+            + np.mean([view.covariance_m2 for view in track.views], axis=0)
+            + np.eye(3) * (reach * middle.attitude_sigma_rad) ** 2
+        )
+        new = Landmark(
+            self._next,
+            track.position_mcmf_m,
+            covariance,
+            track.diameter_m,
+            len(track.views),
+            1,
+            track.views[-1].ticks,
+        )
+        known = self._known(new)
+        if known is not None:
+            new = intersected(known, new)
+        else:
+            self._next += 1
+            if len(self.landmarks) >= self.parameters.landmarks:
+                poorest = min(
+                    self.landmarks.values(), key=lambda landmark: (landmark.sightings, landmark.ticks)
+                )
+                self._places = np.delete(self._places, list(self.landmarks).index(poorest.identity), axis=0)
+                del self.landmarks[poorest.identity]
+        if new.identity in self.landmarks:
+            self._places[list(self.landmarks).index(new.identity)] = new.position_mcmf_m
+        else:
+            self._places = np.concatenate([self._places, new.position_mcmf_m[None]])
+        self.landmarks[new.identity] = new
+        return new
+
+    def _known(self, new: Landmark) -> Landmark | None:
+        """Return the landmark of the map that a new one is, None for none."""
+        if not self.landmarks:
+            return None
+        away_m = np.abs(self._places - new.position_mcmf_m).max(axis=1)
+        near = np.flatnonzero(away_m < max(new.diameter_m, 4_000.0))
+        if not near.size:
+            return None
+        chosen = list(self.landmarks.values())
+        best, nearest = None, _GATE_3
+        # Two mappings of one crater lie no farther apart than this, whatever the covariances.
+        for k in near:
+            landmark = chosen[k]
+            offset = landmark.position_mcmf_m - new.position_mcmf_m
+            if abs(np.log(landmark.diameter_m / new.diameter_m)) > self.parameters.log_diameter_gate:
+                continue
+            away = float(offset @ np.linalg.solve(landmark.covariance_m2 + new.covariance_m2, offset))
+            if away < nearest:
+                best, nearest = landmark, away
+        return best
+
+    def _drop_poorest_track(self) -> None:
+        poorest = min(
+            range(len(self._tracks)),
+            key=lambda t: (len(self._tracks[t].views), self._tracks[t].views[-1].ticks),
+        )
+        del self._tracks[poorest]
+
+
+def intersected(first: Landmark, second: Landmark) -> Landmark:
+    """Return two mappings of one crater as one, by the covariance intersection of least trace."""
+    inverse_1, inverse_2 = np.linalg.inv(first.covariance_m2), np.linalg.inv(second.covariance_m2)
+    best: tuple[float, Float, Float] | None = None
+    for weight in np.linspace(0.0, 1.0, 21):
+        covariance = np.linalg.inv(weight * inverse_1 + (1.0 - weight) * inverse_2)
+        if best is None or float(np.trace(covariance)) < best[0]:
+            information = weight * inverse_1 @ first.position_mcmf_m
+            information = information + (1.0 - weight) * inverse_2 @ second.position_mcmf_m
+            best = float(np.trace(covariance)), covariance, covariance @ information
+    assert best is not None
+    total = first.sightings + second.sightings
+    log_diameter = (
+        first.sightings * np.log(first.diameter_m) + second.sightings * np.log(second.diameter_m)
+    ) / total
+    return Landmark(
+        first.identity,
+        best[2],
+        best[1],
+        float(np.exp(log_diameter)),
+        total,
+        first.passes + second.passes,
+        max(first.ticks, second.ticks),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapRows:
+    """Landmarks as columns of one length; heights above the sphere of the maps, sigma east, north, up (n, 3)."""
+
+    identity: Index
+    latitude_rad: Float
+    longitude_rad: Float
+    height_m: Float
+    diameter_m: Float
+    sigma_m: Float
+    sightings: Index
+    passes: Index
+
+
+def map_rows(landmarks: Sequence[Landmark]) -> MapRows:
+    """Return landmarks as columns."""
+    places = np.array([landmark.position_mcmf_m for landmark in landmarks]).reshape(-1, 3)
+    radius = np.linalg.norm(places, axis=1)
+    latitude, longitude = np.arcsin(places[:, 2] / radius), np.arctan2(places[:, 1], places[:, 0])
+    axes = enu_from_mcmf(latitude, longitude)
+    covariance = np.array([landmark.covariance_m2 for landmark in landmarks]).reshape(-1, 3, 3)
+    local = axes @ covariance @ np.swapaxes(axes, 1, 2)
+    return MapRows(
+        np.array([landmark.identity for landmark in landmarks], dtype=np.int64),
+        latitude,
+        longitude,
+        radius - MOON_RADIUS_M,
+        np.array([landmark.diameter_m for landmark in landmarks]),
+        np.sqrt(np.maximum(np.diagonal(local, axis1=1, axis2=2), 1.0)),
+        np.array([landmark.sightings for landmark in landmarks], dtype=np.int64),
+        np.array([landmark.passes for landmark in landmarks], dtype=np.int64),
+    )
+
+
+def unclaimed(
+    found: Detections, sighting: Sighting, used: Index, reach_px: float = 12.0
+) -> NDArray[np.bool_]:
+    """Return which detections belong to no crater of the catalogue: not used, and none of their size near by."""
+    free = np.ones(len(found), dtype=np.bool_)
+    free[used] = False
+    if len(sighting):
+        uv = np.stack([found.u_px, found.v_px], axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            away = np.linalg.norm(uv[:, None] - sighting.uv_px[None], axis=2)
+            alike = np.abs(np.log(found.diameter_px[:, None] / sighting.diameter_px[None])) < 0.5
+        free &= ~np.any((away < reach_px) & alike, axis=1)
+    return free

@@ -1,0 +1,1 @@
+"""On-board data handling: modes, schedule, telecommands, parameters, FDIR, housekeeping, observation."""

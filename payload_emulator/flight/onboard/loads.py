@@ -1,0 +1,90 @@
+"""What flight software is loaded with at boot: parameters of its build, and tables."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from lunar.camera import PinholeCamera
+from payload_emulator.flight.navigation.anchored import AnchoredParameters
+from payload_emulator.flight.navigation.odometry import OdometryParameters
+from payload_emulator.flight.navigation.outcomes import Mode
+from tmtc.tables import (
+    unpack_anchor_table,
+    unpack_burn_table,
+    unpack_catalogue_table,
+    unpack_gravity_table,
+    unpack_initial_state,
+    unpack_orientation_table,
+)
+
+# Numbers of tables, as in the dictionary's table of tables.
+TABLE_NUMBERS = {
+    "anchor_ephemeris": 1,
+    "catalogue": 2,
+    "gravity": 3,
+    "orientation": 8,
+    "initial_state": 9,
+    "burns": 10,
+}
+MODEL_NUMBER = 5
+UNPACKERS: dict[str, Callable[[bytes], object]] = {
+    "anchor_ephemeris": unpack_anchor_table,
+    "catalogue": unpack_catalogue_table,
+    "gravity": unpack_gravity_table,
+    "orientation": unpack_orientation_table,
+    "initial_state": unpack_initial_state,
+    "burns": unpack_burn_table,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class FlightParameters:
+    """What a build of the payload is tuned to; what may change in flight is in `parameters`.
+
+    Attributes
+    ----------
+    camera
+        The camera as calibrated on the ground.
+    modes
+        Estimators to run on each frame's detections.
+    odometry
+        Rules of `paper` and `spherical`.
+    anchored
+        Rules of `anchored`.
+    housekeeping_interval_s
+        Time between housekeeping packets until it is changed by telecommand.
+    """
+
+    camera: PinholeCamera = field(default_factory=PinholeCamera)
+    modes: tuple[Mode, ...] = (Mode.paper, Mode.spherical)
+    odometry: OdometryParameters = field(default_factory=OdometryParameters)
+    anchored: AnchoredParameters = field(default_factory=AnchoredParameters)
+    housekeeping_interval_s: float = 60.0
+
+    @property
+    def hash(self) -> int:
+        """First 32 bits of the SHA-256 of the parameters as text."""
+        return int.from_bytes(hashlib.sha256(repr(self).encode()).digest()[:4], "big")
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the parameters as text, hexadecimal."""
+        return hashlib.sha256(repr(self).encode()).hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class FlightTables:
+    """Tables as uploaded; empty octets where there is none.
+
+    `paper` and `spherical` need the anchor ephemeris; `anchored` needs all the others but the burns, which are only
+    there where some are planned, and never reads that one.
+    """
+
+    anchor_ephemeris: bytes = b""
+    catalogue: bytes = b""
+    gravity: bytes = b""
+    orientation: bytes = b""
+    initial_state: bytes = b""
+    burns: bytes = b""

@@ -1,0 +1,446 @@
+"""One frame from image to telemetry: detector, estimators, and the packets that report its outcome."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lunar.catalogue import size_class
+from lunar.frames import matrix_from_quaternion
+from payload_emulator.flight.navigation import filter as kalman
+from payload_emulator.flight.navigation import odometry
+from payload_emulator.flight.navigation.anchored import AnchoredNavigator
+from payload_emulator.flight.navigation.landmark_map import map_rows
+from payload_emulator.flight.navigation.odometry import OdometryState
+from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
+from payload_emulator.flight.onboard.housekeeping import StageTimer
+from payload_emulator.flight.onboard.loads import TABLE_NUMBERS, FlightParameters, FlightTables
+from payload_emulator.flight.ports import Stage
+from payload_emulator.flight.telemetry.packets import Telemetry
+from payload_emulator.flight.vision.detections import Detections, Detector, no_detections
+from payload_emulator.flight.vision.preprocess import ImageQuality
+from tmtc.errors import TableError
+from tmtc.tables import (
+    AnchorTable,
+    table_hash,
+    unpack_anchor_table,
+    unpack_burn_table,
+    unpack_catalogue_table,
+    unpack_gravity_table,
+    unpack_initial_state,
+    unpack_orientation_table,
+)
+
+Float = NDArray[np.float64]
+Table = TypeVar("Table")
+
+_NAN = float("nan")
+_UNKNOWN_VECTOR = (_NAN, _NAN, _NAN)
+_PIXEL_LIMIT = 65_535 / 64.0
+# No camera has a detection out there: what the network gives beyond, or as no number, is passed over.
+_FARTHEST_PX = 1e5
+_MILLISECOND_NS = 1e6
+_LANDMARKS_A_PACKET = 40
+_ORBIT_TRIANGLE = np.triu_indices(kalman.ORBIT.stop)
+
+
+class Observer:
+    """Everything of flight software that looks at frames.
+
+    Parameters
+    ----------
+    detector
+        Finds craters in images.
+    parameters
+        As loaded at boot.
+    telemetry, timer
+        Where packets go, and what processor time is counted with.
+    """
+
+    def __init__(
+        self,
+        detector: Detector,
+        parameters: FlightParameters,
+        telemetry: Telemetry,
+        timer: StageTimer,
+    ) -> None:
+        self.detector = detector
+        self.last_quality = ImageQuality.OK
+        self.detector_ms = 0.0
+        self.detector_failed = False
+        self.counts: Counter[str] = Counter()
+        self.reacquisitions = 0
+        self.manual_step = False
+        self.sightings: Counter[int] = Counter()
+        self._parameters = parameters
+        self._telemetry = telemetry
+        self._timer = timer
+        self._outcomes: dict[Mode, Counter[Outcome]] = {mode: Counter() for mode in parameters.modes}
+        self._triggers: dict[Mode, Counter[ResetTrigger]] = {mode: Counter() for mode in parameters.modes}
+        self._odometry: dict[Mode, OdometryState | None] = {}
+        self._anchor: AnchorTable | None = None
+        self._navigator: AnchoredNavigator | None = None
+        self._in_trouble: set[str] = set()
+        self._tables = FlightTables()
+
+    @property
+    def anchor_reads(self) -> int:
+        """Reads of the anchor ephemeris since boot, all estimators."""
+        return sum(state.altitude_reads + state.resets for state in self._odometry.values() if state)
+
+    def load_tables(self, tables: FlightTables) -> None:
+        """Start again with these tables; a damaged one is reported and not used."""
+        self._tables = tables
+        self._odometry.clear()
+        self._anchor = self._load("anchor_ephemeris", unpack_anchor_table)
+        self._start_navigator()
+
+    def reset(self) -> None:
+        """Forget all estimates; each estimator starts from its tables."""
+        self._odometry.clear()
+        self._start_navigator()
+
+    def widen(self, position_m: float, velocity_m_s: float) -> None:
+        """Trust the orbit no more than this."""
+        if self._navigator is not None:
+            self._navigator.widen(position_m, velocity_m_s)
+
+    def frame(
+        self, image: NDArray[Any], attitude: Float, score_floor: float, timeout_s: float, quiet: bool
+    ) -> None:
+        """Detect craters in one frame, run every estimator on them, report both.
+
+        `quiet` leaves out the event about the quality of the image.
+        """
+        telemetry = self._telemetry
+        sun = attitude[4:7] if attitude.size == 7 and np.all(np.isfinite(attitude[4:7])) else None
+        camera_from_icrf = _rotation(attitude)
+        if camera_from_icrf is None:
+            telemetry.event("low", "attitude_missing")
+        quality, found = self._detect(image, sun, timeout_s)
+        numbers = np.stack([found.u_px, found.v_px, found.diameter_px])
+        somewhere = np.all(np.abs(numbers) < _FARTHEST_PX, axis=0)
+        found = found.select(somewhere & ~(found.score < score_floor))
+        self.last_quality = quality
+        if quality is not ImageQuality.OK:
+            self.counts["frames_bad"] += 1
+            if not quiet:
+                telemetry.event("low", f"image_{quality.name.lower()}")
+        self._timer.enter(Stage.navigation)
+        altitude_m = _NAN
+        for mode in self._parameters.modes:
+            if mode is Mode.anchored:
+                usable = found if quality is ImageQuality.OK and not self.detector_failed else None
+                below_m = self._anchored_frame(usable, camera_from_icrf)
+            else:
+                below_m = self._odometry_frame(mode, found)
+            altitude_m = below_m if np.isfinite(below_m) else altitude_m
+        self._timer.enter(Stage.telemetry)
+        self._report_detections(found, altitude_m)
+        self.manual_step = False
+        self.counts["frames"] += 1
+        self.counts["detections"] += len(found)
+        telemetry.frame_number += 1
+
+    def summary(self) -> dict[str, Any]:
+        """Return the outcomes of the frames since boot, for the operators of the emulator."""
+        estimators = {mode.name: self._summary_of(mode) for mode in self._parameters.modes}
+        modes = self._parameters.modes
+        primary = Mode.anchored if Mode.anchored in modes else next(iter(modes), None)
+        chosen = estimators[primary.name] if primary is not None else {}
+        return {
+            "estimators": estimators,
+            "outcomes": chosen.get("outcomes", {}),
+            "fixes": {**estimators["anchored"]["outcomes"], "reacquired": self.reacquisitions}
+            if "anchored" in estimators
+            else {},
+            "anchor_reads_after_start": chosen.get("anchor_reads_after_start", 0),
+            "frames_processed": self.counts["frames"],
+            "frames_bad": self.counts["frames_bad"],
+            "detections": self.counts["detections"],
+            "events": self._telemetry.counts["events"],
+        }
+
+    def _summary_of(self, mode: Mode) -> dict[str, Any]:
+        names = [outcome for outcome in Outcome if (outcome >= Outcome.fixed) is (mode is Mode.anchored)]
+        state = self._odometry.get(mode)
+        altitude_reads, resets = (0, 0) if state is None else (state.altitude_reads, state.resets)
+        return {
+            "outcomes": {outcome.name: self._outcomes[mode][outcome] for outcome in names},
+            "reset_triggers": {trigger.name: n for trigger, n in sorted(self._triggers[mode].items())},
+            "resets": resets,
+            "altitude_reads": altitude_reads,
+            "anchor_reads_after_start": max(0, altitude_reads - 1) + max(0, resets - 1),
+        }
+
+    def _load(self, name: str, unpack: Callable[[bytes], Table]) -> Table | None:
+        """Return a table as uploaded; None, with an event, where it is damaged, and None where there is none."""
+        octets: bytes = getattr(self._tables, name)
+        if not octets:
+            return None
+        number, identity = float(TABLE_NUMBERS[name]), float(table_hash(octets))
+        try:
+            table = unpack(octets)
+        except TableError:
+            self._telemetry.event("high", "table_refused", number, identity)
+            return None
+        self._telemetry.event("info", "table_loaded", number, identity)
+        return table
+
+    def _detect(
+        self, image: NDArray[Any], sun: Float | None, timeout_s: float
+    ) -> tuple[ImageQuality, Detections]:
+        """Run the detector; what fails or comes too late is an event and no detection."""
+        started_ns = self._timer.enter(Stage.detector)
+        self.detector_failed = False
+        try:
+            quality, found = self.detector.examine(image, sun)
+        except Exception as error:  # whatever the inference library throws must not stop the payload
+            self._telemetry.event("high", "detector_error", float(len(str(error))))
+            self.detector_failed, quality, found = True, ImageQuality.OK, no_detections()
+        self.detector_ms = (self._timer.enter(Stage.telemetry) - started_ns) / _MILLISECOND_NS
+        if self.detector_ms > 1e3 * timeout_s:
+            self.counts["detector_timeouts"] += 1
+            self._telemetry.event("medium", "detector_timeout", self.detector_ms / 1e3, timeout_s)
+            self.detector_failed, found = True, no_detections()
+        return quality, found
+
+    def _start_navigator(self) -> None:
+        self._navigator = None
+        if Mode.anchored not in self._parameters.modes:
+            return
+        catalogue = self._load("catalogue", unpack_catalogue_table)
+        gravity = self._load("gravity", unpack_gravity_table)
+        orientation = self._load("orientation", unpack_orientation_table)
+        state = self._load("initial_state", unpack_initial_state)
+        burns = self._load("burns", unpack_burn_table)
+        if catalogue and gravity and orientation and state:
+            self._navigator = AnchoredNavigator(
+                catalogue,
+                gravity,
+                orientation,
+                state,
+                self._parameters.camera,
+                self._parameters.anchored,
+                burns,
+            )
+
+    def _anchored_frame(self, found: Detections | None, camera_from_icrf: Float | None) -> float:
+        """Run the anchored estimator on one frame, report it, and return its altitude."""
+        mode, detections = Mode.anchored, 0 if found is None else len(found)
+        navigator = self._navigator
+        report = None
+        if navigator is not None:
+            try:
+                report = navigator.step(self._telemetry.ticks, found, camera_from_icrf)
+            except np.linalg.LinAlgError:
+                self._telemetry.event("high", "estimator_error", float(mode))
+                # What no longer can be inverted is of no use: begin again from the tables.
+                self._start_navigator()
+                navigator = self._navigator
+        outcome = Outcome.refused if report is None else report.outcome
+        self._outcomes[mode][outcome] += 1
+        self._send_outcome(
+            mode,
+            outcome,
+            ResetTrigger.none,
+            detections,
+            (0, 0) if report is None else (report.candidates, report.matched),
+            (_NAN, _NAN),
+            0,
+        )
+        if report is None or navigator is None or not np.isfinite(report.latitude_rad):
+            return _NAN
+        if report.reacquired:
+            self.reacquisitions += 1
+            self._telemetry.event("medium", "filter_reset", float(report.matched), max(report.sigma_rtn_m))
+        self._trouble(
+            "fix_refused", outcome is Outcome.refused, float(report.candidates), float(report.expected)
+        )
+        self._trouble("filter_divergence", navigator.lost, max(report.sigma_rtn_m), 0.0)
+        self._telemetry.send(
+            "navigation_state",
+            {
+                "frame_number": self._telemetry.frame_number,
+                "image_ticks": self._telemetry.ticks,
+                "estimator": int(mode),
+                "outcome": int(outcome),
+                "latitude_deg": float(np.degrees(report.latitude_rad)),
+                "longitude_deg": float(np.degrees(report.longitude_rad)) % 360.0,
+                "altitude_m": report.altitude_m,
+                "velocity_icrf_m_s": report.velocity_icrf_m_s,
+                "sigma_rtn_m": report.sigma_rtn_m,
+                "nis": report.nis,
+                "matched": report.matched,
+            },
+        )
+        self._send_filter(navigator, found)
+        return report.altitude_m
+
+    def _send_filter(self, navigator: AnchoredNavigator, found: Detections | None) -> None:
+        """Send what the ground needs to judge and to smooth the filter: its orbit in full, the pairs of its fix."""
+        frame = {"frame_number": self._telemetry.frame_number, "image_ticks": self._telemetry.ticks}
+        mean, fix = navigator.state.mean, navigator.last_fix
+        self._telemetry.send(
+            "filter_estimate",
+            {
+                **frame,
+                "position_icrf_m": mean[kalman.POSITION],
+                "velocity_icrf_m_s": mean[kalman.VELOCITY],
+                "acceleration_rtn_m_s2": mean[kalman.ACCELERATION],
+                "covariance": navigator.state.covariance[kalman.ORBIT, kalman.ORBIT][_ORBIT_TRIANGLE],
+                "innovation_degrees": 0 if fix is None else 2 * fix.index.size,
+            },
+        )
+        if fix is not None and found is not None:
+            reported = _reported(found)
+            sent = np.isin(fix.identification.detection, reported)
+            pairs = {
+                "detection": np.searchsorted(reported, fix.identification.detection[sent]),
+                "crater_id": navigator.landmarks.ids[fix.index[sent]],
+            }
+            self.sightings.update(pairs["crater_id"].tolist())
+            self._telemetry.send("identifications", {**frame, "items": pairs})
+        for first in range(0, len(navigator.new_landmarks), _LANDMARKS_A_PACKET):
+            rows = map_rows(navigator.new_landmarks[first : first + _LANDMARKS_A_PACKET])
+            items = {
+                "landmark_id": rows.identity,
+                "latitude_deg": np.degrees(rows.latitude_rad),
+                "longitude_deg": np.degrees(rows.longitude_rad) % 360.0,
+                "height_m": rows.height_m,
+                "diameter_m": rows.diameter_m,
+                "sigma_east_m": rows.sigma_m[:, 0],
+                "sigma_north_m": rows.sigma_m[:, 1],
+                "sigma_up_m": rows.sigma_m[:, 2],
+                "sightings": rows.sightings,
+                "passes": rows.passes,
+            }
+            self._telemetry.send("landmarks", {**frame, "items": items})
+
+    def _trouble(self, event: str, present: bool, value_1: float, value_2: float) -> None:
+        """Report the beginning of a lasting trouble, once."""
+        if present and event not in self._in_trouble:
+            self._telemetry.event("medium", event, value_1, value_2)
+        (self._in_trouble.add if present else self._in_trouble.discard)(event)
+
+    def _odometry_frame(self, mode: Mode, found: Detections) -> float:
+        """Run one odometry on one frame, report it, and return the altitude it scaled the frame with."""
+        if self._anchor is None:
+            self._outcomes[mode][Outcome.missed] += 1
+            self._send_outcome(mode, Outcome.missed, ResetTrigger.none, len(found), (0, 0), (_NAN, _NAN), 0)
+            return _NAN
+        state, report = odometry.step(
+            self._odometry.get(mode),
+            self._telemetry.ticks,
+            found,
+            self._anchor,
+            self._parameters.camera,
+            mode,
+            self._parameters.odometry,
+            manual_step=self.manual_step,
+        )
+        self._odometry[mode] = state
+        self._outcomes[mode][report.outcome] += 1
+        if report.reset_trigger is not ResetTrigger.none:
+            self._triggers[mode][report.reset_trigger] += 1
+            self._telemetry.event("info", "anchor_read", float(report.reset_trigger), float(mode))
+        self._send_outcome(
+            mode,
+            report.outcome,
+            report.reset_trigger,
+            len(found),
+            (report.candidate_pairs, report.pairs),
+            (report.shift_east_m, report.shift_north_m),
+            0 if state is None else state.altitude_reads,
+        )
+        if state is None:
+            return _NAN
+        self._telemetry.send(
+            "navigation_state",
+            {
+                "frame_number": self._telemetry.frame_number,
+                "image_ticks": self._telemetry.ticks,
+                "estimator": int(mode),
+                "outcome": int(report.outcome),
+                "latitude_deg": float(np.degrees(state.latitude_rad)),
+                "longitude_deg": float(np.degrees(state.longitude_rad)) % 360.0,
+                "altitude_m": state.altitude_m,
+                "velocity_icrf_m_s": _UNKNOWN_VECTOR,
+                "sigma_rtn_m": _UNKNOWN_VECTOR,
+                "nis": _NAN,
+                "matched": report.pairs,
+            },
+        )
+        return state.features.altitude_m
+
+    def _send_outcome(
+        self,
+        mode: Mode,
+        outcome: Outcome,
+        trigger: ResetTrigger,
+        detections: int,
+        pairs: tuple[int, int],
+        shift_m: tuple[float, float],
+        reads: int,
+    ) -> None:
+        self._telemetry.send(
+            "frame_outcome",
+            {
+                "frame_number": self._telemetry.frame_number,
+                "image_ticks": self._telemetry.ticks,
+                "estimator": int(mode),
+                "outcome": int(outcome),
+                "reset_trigger": int(trigger),
+                "detections": detections,
+                "candidate_pairs": pairs[0],
+                "pairs": pairs[1],
+                "shift_east_m": shift_m[0],
+                "shift_north_m": shift_m[1],
+                "anchor_reads": reads,
+            },
+        )
+
+    def _report_detections(self, found: Detections, altitude_m: float) -> None:
+        kept = found.select(_reported(found))
+        self._telemetry.send(
+            "detections",
+            {
+                "frame_number": self._telemetry.frame_number,
+                "image_ticks": self._telemetry.ticks,
+                "image_quality": int(self.last_quality),
+                "items": {
+                    "u_px": np.clip(kept.u_px, 0.0, _PIXEL_LIMIT),
+                    "v_px": np.clip(kept.v_px, 0.0, _PIXEL_LIMIT),
+                    "diameter_px": np.clip(kept.diameter_px, 0.0, _PIXEL_LIMIT),
+                    "score": np.clip(np.nan_to_num(kept.score), 0.0, 1.0),
+                    "size_class": self._size_class(kept, altitude_m),
+                    "sigma_px": kept.sigma_px,
+                },
+            },
+        )
+
+    def _size_class(self, found: Detections, altitude_m: float) -> NDArray[np.int8]:
+        """Return size classes by diameter on the sphere below the given altitude; -1 where it is unknown."""
+        camera = self._parameters.camera
+        depth = odometry.depth_on_sphere(found.u_px, found.v_px, altitude_m, camera)
+        return size_class(found.diameter_px * depth / camera.focal_px)
+
+
+def _rotation(attitude: Float) -> Float | None:
+    """Return camera_from_icrf of an ADCS message, None where it holds no rotation."""
+    if attitude.size != 7 or not np.all(np.isfinite(attitude[:4])):
+        return None
+    length = float(np.linalg.norm(attitude[:4]))
+    # Rounding of a unit quaternion is far below this; anything else is no attitude.
+    if abs(length - 1.0) > 1e-3:
+        return None
+    return matrix_from_quaternion(attitude[:4] / length)
+
+
+def _reported(found: Detections) -> NDArray[np.int64]:
+    """Return the detections that fit into a packet, the strongest, in their order."""
+    return np.sort(np.argsort(-found.score, kind="stable")[:255])

@@ -1,0 +1,1 @@
+"""On-board telemetry: packets, the packet store, files sent as large data."""

@@ -1,0 +1,1 @@
+"""On-board image processing and crater detection."""

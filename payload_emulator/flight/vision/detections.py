@@ -1,0 +1,90 @@
+"""What a detector hands to navigation: crater positions and sizes in one image, in pixels.
+
+Pixel centres lie at integer coordinates, u to the right, v down.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from payload_emulator.flight.vision.preprocess import ImageQuality
+
+Float = NDArray[np.float64]
+
+FRESH_DEPTH_RATIO = 0.10
+DEGRADED_DEPTH_RATIO = 0.06
+"""Above the first a crater is called fresh, below the second degraded: the bins of degradation used in scoring."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detections:
+    """Craters found in one image; float64 arrays of one length n, NaN where a quantity is not known.
+
+    `depth_ratio` is None where the network does not tell it.
+
+    Attributes
+    ----------
+    u_px, v_px
+        Centre of the crater.
+    diameter_px
+        Diameter across the line of sight: focal length times diameter over depth along the boresight.
+    score
+        Confidence, 0 to 1.
+    sigma_px
+        Standard deviation of the centre along each axis.
+    depth_ratio
+        Depth over diameter as it looks: about 0.2 fresh, under `DEGRADED_DEPTH_RATIO` worn down.
+    """
+
+    u_px: Float
+    v_px: Float
+    diameter_px: Float
+    score: Float
+    sigma_px: Float
+    depth_ratio: Float | None = None
+
+    def __len__(self) -> int:
+        return int(self.u_px.shape[0])
+
+    def select(self, which: NDArray[Any]) -> Detections:
+        """Return the detections of a mask or of indices, in that order."""
+        return Detections(
+            self.u_px[which],
+            self.v_px[which],
+            self.diameter_px[which],
+            self.score[which],
+            self.sigma_px[which],
+            None if self.depth_ratio is None else self.depth_ratio[which],
+        )
+
+
+def states(found: Detections) -> list[str]:
+    """Return "fresh", "worn" or "degraded" for each detection, "" where the network does not tell."""
+    if found.depth_ratio is None:
+        return [""] * len(found)
+    return [
+        "fresh" if ratio >= FRESH_DEPTH_RATIO else "worn" if ratio >= DEGRADED_DEPTH_RATIO else "degraded"
+        for ratio in found.depth_ratio
+    ]
+
+
+def no_detections() -> Detections:
+    """Return an empty set of detections."""
+    return Detections(*(np.empty(0) for _ in range(5)))
+
+
+class Detector(Protocol):
+    """Anything that finds craters in a camera frame."""
+
+    def examine(
+        self, image: NDArray[Any], sun_in_camera: Float | None = None
+    ) -> tuple[ImageQuality, Detections]:
+        """Return the verdict on an image (H, W) or (H, W, 3) and its craters; none unless the verdict is OK.
+
+        The Sun vector, camera frame, helps and may be absent.
+        """
+        ...

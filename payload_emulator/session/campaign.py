@@ -1,0 +1,213 @@
+"""Fault campaigns: a scenario simulated with every fault and every seed, and the outcomes.
+
+A case is *detected* when one of the events that it names comes down after the fault began; it ends *recovered* when the
+payload works on frames after the fault has gone, *contained* when it waits in safe mode or standby as the case says
+it shall, and *lost* otherwise.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from lunar.datafolder import DataFolder
+from payload_emulator.errors import ScenarioError
+from payload_emulator.flight.onboard.modes import PayloadMode
+from payload_emulator.session.emulator import load_scenario_payload, new_spacecraft
+from payload_emulator.session.flying import fly
+from payload_emulator.session.loading import LoadedPayload
+from payload_emulator.session.scenario import SHIPPED, FaultsSection, Scenario
+from payload_emulator.session.world import World, build_world, clock_ticks
+from payload_emulator.sim.board.faults import Fault, parse_fault
+from tmtc.cuc import TICKS_PER_SECOND
+from tmtc.dictionary import DICTIONARY
+
+CAMPAIGNS = SHIPPED / "campaigns"
+_SETTLING_S = 240.0
+_KEYS = {"name": str, "faults": list, "events": list, "safe": bool}
+
+Progress = Callable[[Iterable[Any], int], Iterator[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Faults that come together, the events of which one tells of them, and whether the payload shall end waiting."""
+
+    name: str
+    faults: tuple[str, ...] = ()
+    events: tuple[str, ...] = ()
+    safe: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Campaign:
+    """Cases to be flown with each of the seeds."""
+
+    name: str
+    seeds: tuple[int, ...]
+    cases: tuple[Case, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """Outcome of one case with one seed; `latency_s` from fault to event, NaN without one."""
+
+    case: str
+    seed: int
+    outcome: str
+    detected: bool
+    latency_s: float
+    frames_expected: int
+    frames_processed: int
+    resets: int
+    end_mode: str
+    events: tuple[str, ...]
+
+
+def load_campaign(path: Path | str) -> Campaign:
+    """The campaign in a TOML file, or one of those shipped, by name.
+
+    Raises
+    ------
+    ScenarioError
+        The file is missing or says something else; the message names the place.
+    """
+    where = Path(path)
+    if not where.exists() and (CAMPAIGNS / f"{where.name}.toml").exists():
+        where = CAMPAIGNS / f"{where.name}.toml"
+    try:
+        table = tomllib.loads(where.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        shipped = ", ".join(sorted(file.stem for file in CAMPAIGNS.glob("*.toml")))
+        raise ScenarioError(f"{path}: no such campaign file; shipped campaigns: {shipped}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{where}: not TOML: {error}") from None
+    seeds, cases = table.get("seeds", [1]), table.get("case", [])
+    if not isinstance(seeds, list) or not seeds or not all(type(seed) is int and seed >= 0 for seed in seeds):
+        raise ScenarioError(f"{where}: seeds must be a list of whole numbers from 0, found {seeds!r}")
+    if not isinstance(cases, list) or not cases:
+        raise ScenarioError(f"{where}: expected one [[case]] or more, found none")
+    return Campaign(
+        str(table.get("name", where.stem)),
+        tuple(seeds),
+        tuple(_case(entry, f"{where}, case {k + 1}") for k, entry in enumerate(cases)),
+    )
+
+
+def _case(entry: dict[str, Any], where: str) -> Case:
+    for key, value in entry.items():
+        if key not in _KEYS:
+            raise ScenarioError(f"{where}: unknown key {key!r}; known keys: {', '.join(_KEYS)}")
+        if type(value) is not _KEYS[key]:
+            raise ScenarioError(f"{where}: {key} must be a {_KEYS[key].__name__}, found {value!r}")
+    known = DICTIONARY.labels("event_info", "event_id").values()
+    for event in entry.get("events", []):
+        if event not in known:
+            raise ScenarioError(f"{where}: events must be names of the dictionary, found {event!r}")
+    for text in entry.get("faults", []):
+        parse_fault(text)
+    return Case(
+        str(entry.get("name", where)),
+        tuple(entry.get("faults", [])),
+        tuple(entry.get("events", [])),
+        bool(entry.get("safe", False)),
+    )
+
+
+def run_campaign(
+    scenario: Scenario, campaign: Campaign, data: DataFolder, progress: Progress | None = None
+) -> list[Result]:
+    """Fly every case with every seed; the world is made once."""
+    world = build_world(scenario, data)
+    loaded, _, _ = load_scenario_payload(world, data)
+    runs = [(case, seed) for case in campaign.cases for seed in campaign.seeds]
+    return [
+        fly_case(world, loaded, case, seed)
+        for case, seed in (progress(runs, len(runs)) if progress else runs)
+    ]
+
+
+def fly_case(world: World, loaded: LoadedPayload, case: Case, seed: int) -> Result:
+    """Fly one case with one seed."""
+    scenario = replace(world.scenario, seed=seed, faults=FaultsSection(case.faults))
+    world = replace(world, scenario=scenario)
+    spacecraft = new_spacecraft(world, loaded)
+    faults = tuple(parse_fault(text) for text in case.faults)
+    labels = DICTIONARY.labels("event_info", "event_id")
+    first_ticks = clock_ticks(world, int(world.frame_utc_ns[0]))
+    events: list[tuple[float, str]] = []
+    processed: list[float] = []
+    for flown in fly(world, spacecraft):
+        second = (flown.moment.utc_ns - int(world.frame_utc_ns[0])) / 1e9
+        for packet in flown.packets:
+            name, values = DICTIONARY.unpack(packet)
+            if name.startswith("event_"):
+                made_s = (int.from_bytes(packet[14:20], "big") - first_ticks) / TICKS_PER_SECOND
+                events.append((made_s, labels[values["event_id"]]))
+            elif name == "detections" and values["image_quality"] == 0:
+                processed.append(second)
+    told = _detection(faults, case, events, spacecraft.payload.mode)
+    return Result(
+        case.name,
+        seed,
+        _outcome(faults, case, processed, float((world.frame_utc_ns[-1] - world.frame_utc_ns[0]) / 1e9)),
+        told is not None,
+        float("nan") if told is None else told,
+        int(world.frame_utc_ns.size),
+        len(processed),
+        len(spacecraft.resets),
+        spacecraft.payload.mode.name,
+        tuple(dict.fromkeys(event for _, event in events)),
+    )
+
+
+def _detection(
+    faults: tuple[Fault, ...], case: Case, events: list[tuple[float, str]], mode: PayloadMode
+) -> float | None:
+    """Seconds from the first fault to the first event that tells of it; without faults 0 if nothing was told."""
+    if not faults:
+        return None if mode is PayloadMode.safe else 0.0
+    began_s = min(fault.at_s for fault in faults)
+    # A clock that has jumped dates its own events wrongly: the order in which they came is what counts.
+    told = [made_s for made_s, event in events if event in case.events]
+    return max(told[0] - began_s, 0.0) if told else None
+
+
+def _outcome(faults: tuple[Fault, ...], case: Case, processed: list[float], last_s: float) -> str:
+    gone_s = max((fault.at_s + fault.duration_s for fault in faults), default=0.0)
+    if case.safe:
+        # Some minutes are allowed for counting to a limit, or for the next check of memory.
+        settled_s = min(max(fault.at_s for fault in faults) + _SETTLING_S, last_s)
+        return "lost" if any(second > settled_s for second in processed) else "contained"
+    return "recovered" if any(second > gone_s for second in processed) else "lost"
+
+
+def table(results: Iterable[Result]) -> list[dict[str, Any]]:
+    """One row a case: runs, how many were detected, recovered, contained and lost, and the longest detection."""
+    rows: dict[str, dict[str, Any]] = {}
+    for result in results:
+        row = rows.setdefault(
+            result.case,
+            {
+                "case": result.case,
+                "runs": 0,
+                "detected": 0,
+                "recovered": 0,
+                "contained": 0,
+                "lost": 0,
+                "latency_max_s": 0.0,
+                "frames_processed": 0,
+                "frames_expected": 0,
+            },
+        )
+        row["runs"] += 1
+        row["detected"] += result.detected
+        row[result.outcome] += 1
+        row["frames_processed"] += result.frames_processed
+        row["frames_expected"] += result.frames_expected
+        if result.detected:
+            row["latency_max_s"] = max(row["latency_max_s"], result.latency_s)
+    return list(rows.values())

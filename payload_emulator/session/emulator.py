@@ -1,0 +1,281 @@
+"""The emulator: flies a scenario, shows the payload what its camera would see, writes the pass archive.
+
+Truth (trajectory, terrain, light) stays on this side of `Payload.step`; what the payload says comes back as space
+packets, becomes CADUs, and goes through the link model into `downlink.cadu`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lunar.catalogue import CraterCatalogue, save_catalogue
+from lunar.datafolder import DataFolder
+from lunar.ephemeris import Ephemeris
+from lunar.frames import spherical_from_mcmf
+from lunar.oem import save_oem
+from lunar.timescales import format_utc
+from payload_emulator.errors import ScenarioError
+from payload_emulator.flight.ports import ResetCause
+from payload_emulator.session.flying import SPACECRAFT_ID, CatalogueDetector, Sender, fly, timeline
+from payload_emulator.session.loading import LoadedPayload, load_payload
+from payload_emulator.session.mission import save_attitudes, save_mission
+from payload_emulator.session.recording import (
+    StepInput,
+    save_frame_times,
+    save_image,
+    save_record,
+    step_input,
+)
+from payload_emulator.session.scenario import Scenario, format_scenario
+from payload_emulator.session.scoring import score_navigation
+from payload_emulator.session.spacecraft import Spacecraft, new_board
+from payload_emulator.session.world import (
+    World,
+    build_world,
+    catalogue_near_track,
+    sample_truth,
+    with_reference_error,
+)
+from payload_emulator.sim.board.faults import parse_fault
+from payload_emulator.sim.board.link import Reception, save_receptions, save_time_receptions, transmit
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import LinkSettings
+
+Progress = Callable[[Iterable[Any], int], Iterator[Any]]
+
+
+def emulate(
+    scenario: Scenario,
+    data: DataFolder,
+    out: Path,
+    *,
+    frames_kept: int | None = 0,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Fly a scenario and write its pass archive into the folder `out`; the summary comes back.
+
+    Parameters
+    ----------
+    frames_kept
+        How many images, evenly spread, go into the archive; None keeps all.
+    progress
+        Wraps the iteration over frames (items, total), for a progress bar.
+
+    Raises
+    ------
+    ScenarioError
+        The scenario cannot be flown, or `out` holds something that is no pass archive.
+    """
+    started = time.monotonic()
+    _require_replaceable(out)
+    world = build_world(scenario, data)
+    partial = out.with_name(f".{out.name}.partial-{os.getpid()}")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        summary = _emulate_into(world, data, partial, frames_kept, progress, started)
+        if out.exists():
+            shutil.rmtree(out)
+        partial.rename(out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return summary
+
+
+def new_spacecraft(world: World, loaded: LoadedPayload) -> Spacecraft:
+    """The payload of a scenario on a new board, with the faults of the scenario ahead of it."""
+    scenario = world.scenario
+    return Spacecraft(
+        loaded,
+        new_board(scenario.seed),
+        int(world.frame_utc_ns[0]),
+        tuple(parse_fault(text) for text in scenario.faults.events),
+        CatalogueDetector(world) if scenario.camera.images == "reduced" else None,
+    )
+
+
+def load_scenario_payload(world: World, data: DataFolder) -> tuple[LoadedPayload, Ephemeris, CraterCatalogue]:
+    """The payload loaded for a world, with the reference and the catalogue that the ground made its tables of."""
+    scenario = world.scenario
+    truth_ephemeris = sample_truth(world.truth, world.frame_utc_ns)
+    reference = with_reference_error(truth_ephemeris, scenario.reference, scenario.seed)
+    catalogue = catalogue_near_track(world)
+    loaded = load_payload(
+        scenario,
+        world.camera,
+        reference,
+        catalogue,
+        world.truth.orientation,
+        data,
+        int(world.frame_utc_ns[0]),
+        world.burns,
+    )
+    return loaded, reference, catalogue
+
+
+def _emulate_into(
+    world: World,
+    data: DataFolder,
+    folder: Path,
+    frames_kept: int | None,
+    progress: Progress | None,
+    started: float,
+) -> dict[str, Any]:
+    scenario = world.scenario
+    loaded, reference, catalogue = load_scenario_payload(world, data)
+    total = int(world.frame_utc_ns.size)
+    kept = (
+        set(range(total))
+        if frames_kept is None
+        else set(np.linspace(0, total - 1, frames_kept + 2, dtype=int)[1:-1])
+    )
+    spacecraft = new_spacecraft(world, loaded)
+    sender = Sender(world, LinkSettings(coding=scenario.link.coding))
+    inputs: list[StepInput] = []
+    attitudes = np.full((total, 3, 3), np.nan)
+    flown = fly(world, spacecraft)
+    for moment in progress(flown, len(timeline(world))) if progress else flown:
+        sender.take(moment)
+        given, number = spacecraft.given, moment.moment.frame
+        if moment.exposure is not None:
+            attitudes[number] = moment.exposure.camera_from_mcmf
+        if given is None:
+            continue
+        inputs.append(step_input(number, given))
+        if number in kept:
+            save_image(folder, number, given.image)
+    sender.flush()
+    reception = transmit(sender.transmitter.dumps, sender.transmitter.settings, scenario.link, scenario.seed)
+    save_record(folder, inputs, loaded.parameters, loaded.tables)
+    save_frame_times(folder, world.frame_utc_ns)
+    save_attitudes(folder, inputs)
+    save_mission(folder, world, data)
+    save_oem(sample_truth(world.truth, world.frame_utc_ns), folder / "truth.oem")
+    save_oem(reference, folder / "reference.oem")
+    save_catalogue(catalogue, folder / "catalogue.csv")
+    (folder / "downlink.cadu").write_bytes(reception.octets)
+    save_receptions(folder, sender.transmitter.dumps)
+    emitted = np.array([utc_ns for _, utc_ns in sender.time_reports], dtype=np.int64)
+    save_time_receptions(
+        folder, [packet for packet, _ in sender.time_reports], emitted, world.truth.states(emitted)[0]
+    )
+    packets = [packet for dump in sender.transmitter.dumps for packet in dump.packets]
+    wall_s = time.monotonic() - started
+    summary = _summary(world, loaded, spacecraft, packets, reception, len(kept), wall_s)
+    summary |= score_navigation(world, loaded, catalogue, attitudes, b"".join(packets))
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    (folder / "manifest.json").write_text(json.dumps(_manifest(world, loaded, folder), indent=2) + "\n")
+    return summary
+
+
+def _summary(
+    world: World,
+    loaded: LoadedPayload,
+    spacecraft: Spacecraft,
+    packets: list[bytes],
+    reception: Reception,
+    kept: int,
+    wall_s: float,
+) -> dict[str, Any]:
+    scenario = world.scenario
+    total = int(world.frame_utc_ns.size)
+    _, longitude, altitude = spherical_from_mcmf(world.truth.positions_mcmf(world.frame_utc_ns))
+    return {
+        "scenario": scenario.name,
+        "seed": scenario.seed,
+        "frames": total,
+        "frames_kept": kept,
+        "packets": len(packets),
+        "downlink_octets": len(reception.octets),
+        "start_utc": format_utc(int(world.frame_utc_ns[0])),
+        "stop_utc": format_utc(int(world.frame_utc_ns[-1])),
+        "altitude_km": {
+            "min": float(altitude.min()) / 1e3,
+            "mean": float(altitude.mean()) / 1e3,
+            "max": float(altitude.max()) / 1e3,
+        },
+        "longitude_deg": {
+            "first": float(np.degrees(longitude[0])) % 360.0,
+            "last": float(np.degrees(longitude[-1])) % 360.0,
+        },
+        "maneuvers": len(world.burns),
+        **spacecraft.payload.summary(),
+        "truth_reads_after_start": spacecraft.truth_reads.count,
+        "link": reception.account,
+        "resets": [ResetCause(cause).name for cause in spacecraft.resets],
+        "mode": spacecraft.payload.mode.name,
+        "data": list(world.data_names),
+        "wall_s": round(wall_s, 3),
+        "realtime_factor": round(total * scenario.camera.frame_interval_s / wall_s, 2),
+    }
+
+
+def _manifest(world: World, loaded: LoadedPayload, folder: Path) -> dict[str, Any]:
+    """What the ground needs to know of a pass, with the hash of every file of the archive but itself."""
+    scenario, camera = world.scenario, world.scenario.camera
+    return {
+        "schema_version": 1,
+        "pass_name": f"{scenario.name}-{format_utc(int(world.frame_utc_ns[0]), 0)}",
+        "spacecraft_id": SPACECRAFT_ID,
+        "scenario": scenario.name,
+        "scenario_toml": format_scenario(scenario),
+        "seed": scenario.seed,
+        "build": loaded.build,
+        "dictionary": {"version": DICTIONARY.version, "hash": DICTIONARY.hash},
+        "data_sources": list(world.data_names),
+        "start_utc": format_utc(int(world.frame_utc_ns[0])),
+        "stop_utc": format_utc(int(world.frame_utc_ns[-1])),
+        "cadence_s": camera.frame_interval_s,
+        "frames_expected": int(world.frame_utc_ns.size),
+        "light": scenario.light.mode,
+        "terrain": world.terrain.name,
+        "camera": {"width_px": camera.width_px, "height_px": camera.height_px, "fov_deg": camera.fov_deg},
+        "estimators": list(scenario.navigation.estimators),
+        "start_state": loaded.start_state,
+        "burns": [
+            {
+                "utc": format_utc(burn.utc_ns, 9),
+                "delta_v_icrf_m_s": burn.planned_m_s.tolist(),
+                "sigma_m_s": burn.sigma_m_s,
+            }
+            for burn in world.burns
+            if burn.declared and int(world.frame_utc_ns[0]) <= burn.utc_ns <= int(world.frame_utc_ns[-1])
+        ],
+        "gravity": {
+            "truth": world.gravity.name,
+            "degree": min(world.gravity.degree, scenario.dynamics.degree),
+            **loaded.gravity,
+        },
+        "tables": loaded.table_hashes,
+        "files": file_entries(folder),
+    }
+
+
+def file_entries(folder: Path) -> dict[str, dict[str, Any]]:
+    """Size and SHA-256 of every file of an archive but its manifest, by name."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / "manifest.json")
+    return {
+        path.relative_to(folder).as_posix(): {
+            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+            "bytes": path.stat().st_size,
+        }
+        for path in files
+    }
+
+
+def _require_replaceable(out: Path) -> None:
+    """Refuse to overwrite anything that is not a pass archive of an earlier run."""
+    if out.exists() and not (out.is_dir() and (not any(out.iterdir()) or (out / "manifest.json").is_file())):
+        raise ScenarioError(
+            f"{out}: expected a new folder or an earlier pass archive, found something else; "
+            "choose another --out"
+        )

@@ -1,0 +1,242 @@
+"""The mission description (`mission.toml`) of a scenario, and the attitude table of a pass.
+
+The description states what a ground segment needs to know about the spacecraft and the simulated world. It is plain
+TOML, read by the ground service.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+
+from lunar.arrays import BoolArray, FloatArray
+from lunar.constants import MOON_RADIUS_M
+from lunar.datafolder import DataFolder
+from lunar.frames import IauOrientation, spherical_from_mcmf
+from payload_emulator.session.flying import PLAYBACK_CHANNEL, SPACECRAFT_ID
+from payload_emulator.session.loading import filter_field
+from payload_emulator.session.recipe import Box, Source, load_recipe
+from payload_emulator.session.recording import StepInput
+from payload_emulator.session.scenario import SHIPPED, RequirementsSection, Scenario
+from payload_emulator.session.world import World, build_world
+from tmtc.cuc import TICKS_PER_SECOND
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import LinkSettings
+
+MISSION_FILE = "mission.toml"
+ATTITUDE_FILE = "attitude.csv"
+ATTITUDE_HEADER = "image_ticks,q_w,q_x,q_y,q_z"
+"""Columns: on-board time of the image, and the quaternion from ICRF axes to the camera reported by attitude control."""
+
+DETECTOR_RECIPE = SHIPPED / "detector-dataset.toml"
+"""Data set that the shipped detector was trained on."""
+
+SEEN_SPLITS = ("train", "val")
+"""Splits whose terrain counts as seen; the validation split was used to choose thresholds."""
+
+SPACECRAFT_NAME = "SelenITA"
+CLOCK_EPOCH = "2000-01-01T00:00:00 TAI"
+
+Value = bool | int | float | str | Sequence[float] | Sequence[str] | None
+
+
+def scenario_mission_text(scenario: Scenario, data: DataFolder) -> str:
+    """Return the mission description of a scenario; the scenario is simulated as far as its windows require."""
+    return mission_text(build_world(scenario, data), data)
+
+
+def mission_text(world: World, data: DataFolder) -> str:
+    """Return the mission description of a world as TOML; unknown values are left out."""
+    scenario, camera, link = (
+        world.scenario,
+        world.scenario.camera,
+        LinkSettings(coding=world.scenario.link.coding),
+    )
+    flown_field = filter_field(scenario.navigation.filter_gravity, scenario.navigation.filter_degree, data)
+    sections: dict[str, dict[str, Value]] = {
+        "spacecraft": {"id": SPACECRAFT_ID, "name": SPACECRAFT_NAME},
+        "dictionary": {"version": DICTIONARY.version, "hash": DICTIONARY.hash},
+        "link": {
+            "frame_length": link.frame_length,
+            "coding": link.coding,
+            "randomiser": link.randomiser,
+            "interleave": None if link.code is None else link.code.interleave,
+            "rs_errors": link.rs_errors,
+            "dual_basis": link.dual_basis,
+            "frame_checksum": link.checksum,
+            "packet_checksum": "crc16",
+            "virtual_channels": [0, PLAYBACK_CHANNEL],
+        },
+        "time": {
+            "epoch": CLOCK_EPOCH,
+            "ticks_per_second": TICKS_PER_SECOND,
+            "clock": "CUC 4+2",
+            "correlation": "automatic",
+        },
+        "frames": {
+            "orientation": world.truth.orientation.name,
+            "gravity_field": world.gravity.name,
+            "gravity_degree": min(world.gravity.degree, scenario.dynamics.degree),
+            "onboard_orientation": IauOrientation().name,
+            "onboard_gravity_field": flown_field.name,
+            "onboard_gravity_degree": flown_field.degree,
+        },
+        "camera": {
+            "width_px": camera.width_px,
+            "height_px": camera.height_px,
+            "fov_deg": camera.fov_deg,
+            "k1": camera.k1,
+            "k2": camera.k2,
+            "k3": camera.k3,
+            "p1": camera.p1,
+            "p2": camera.p2,
+            "pointing": "nadir",
+            "tilt_deg": camera.tilt_deg,
+            "yaw_deg": camera.yaw_deg,
+            "frame_interval_s": camera.frame_interval_s,
+        },
+        "catalogue": {
+            "source": world.terrain.catalogue.source,
+            "registration_north_m": world.terrain.registration_north_m,
+            "registration_east_m": world.terrain.registration_east_m,
+        },
+        "reference": _reference(scenario),
+        "evidence": _evidence(world),
+        "requirements": _requirements(scenario),
+    }
+    lines = ["schema_version = 1", f"name = {_toml(scenario.name)}"]
+    for name, values in sections.items():
+        stated = [f"{key} = {_toml(value)}" for key, value in values.items() if value is not None]
+        if stated:
+            lines += ["", f"[{name}]", *stated]
+    return "\n".join(lines) + "\n"
+
+
+def save_mission(folder: Path, world: World, data: DataFolder) -> None:
+    """Write the mission description into an archive."""
+    (folder / MISSION_FILE).write_text(mission_text(world, data), encoding="utf-8")
+
+
+def save_attitudes(folder: Path, inputs: Iterable[StepInput]) -> None:
+    """Write the attitude of every frame, as the attitude control reported it, into an archive."""
+    rows = [
+        f"{item.clock_ticks},{','.join(repr(float(value)) for value in item.attitude[:4])}\n"
+        for item in inputs
+        if item.number >= 0 and np.isfinite(item.attitude[:4]).all()
+    ]
+    (folder / ATTITUDE_FILE).write_text(f"{ATTITUDE_HEADER}\n{''.join(rows)}", encoding="utf-8")
+
+
+def unseen_share(world: World) -> float | None:
+    """Return the share of frames none of whose ground was used in training; None without real terrain.
+
+    The ground of a frame is sampled at the centre, edges and corners of its footprint.
+    """
+    if not world.terrain.is_real:
+        return None
+    latitude, longitude, altitude = spherical_from_mcmf(world.truth.positions_mcmf(world.frame_utc_ns))
+    camera = world.scenario.camera
+    half_u = np.tan(np.radians(camera.fov_deg) / 2.0) * altitude / MOON_RADIUS_M
+    half_v = half_u * camera.height_px / camera.width_px
+    seen = np.zeros(latitude.size, dtype=np.bool_)
+    for right in (-1.0, 0.0, 1.0):
+        for up in (-1.0, 0.0, 1.0):
+            there = np.clip(latitude + up * half_v, -np.pi / 2.0, np.pi / 2.0)
+            east = longitude + right * half_u / np.maximum(np.cos(there), 1e-3)
+            seen |= seen_in_training(np.degrees(there), np.degrees(east))
+    return float(np.count_nonzero(~seen) / seen.size) if seen.size else None
+
+
+def seen_in_training(latitude_deg: FloatArray, longitude_deg: FloatArray) -> BoolArray:
+    """Return whether real ground (n,) lies is in the training or validation data of the shipped detector."""
+    seen = np.zeros(np.shape(latitude_deg), dtype=np.bool_)
+    for source in _seen_sources():
+        inside = _in_any(source.boxes, latitude_deg, longitude_deg, 0.0)
+        seen |= inside & ~_in_any(source.avoid, latitude_deg, longitude_deg, source.buffer_km)
+    return seen
+
+
+@functools.lru_cache(maxsize=1)
+def _seen_sources() -> tuple[Source, ...]:
+    sources = load_recipe(DETECTOR_RECIPE).sources
+    return tuple(one for one in sources if one.terrain == "real" and one.split in SEEN_SPLITS)
+
+
+def _in_any(
+    boxes: Sequence[Box], latitude_deg: FloatArray, longitude_deg: FloatArray, margin_km: float
+) -> BoolArray:
+    inside = np.zeros(np.shape(latitude_deg), dtype=np.bool_)
+    margin_deg = math.degrees(margin_km * 1e3 / MOON_RADIUS_M)
+    along_deg = margin_deg / np.maximum(np.cos(np.radians(latitude_deg)), 1e-3)
+    for box in boxes:
+        east = (longitude_deg - box.west_deg + along_deg) % 360.0
+        inside |= (
+            (latitude_deg >= box.south_deg - margin_deg)
+            & (latitude_deg <= box.north_deg + margin_deg)
+            & (east <= box.east_deg - box.west_deg + 2.0 * along_deg)
+        )
+    return inside
+
+
+def level_of(world: str, unseen: float | None) -> str:
+    """Return the evidence level ("2", "3s", "3") of a world with a share of frames over unseen terrain; "" if unknown.
+
+    Parameters
+    ----------
+    world
+        World as the mission description names it: "procedural" or "real-terrain".
+    """
+    if world == "procedural":
+        return "2"
+    if world != "real-terrain" or unseen is None:
+        return ""
+    return "3" if unseen == 1.0 else "3s"
+
+
+def level_text(level: str, unseen: float | None) -> str:
+    """Return a level with the share of frames over unseen terrain where it is 3s; "not stated" for an unknown level."""
+    share = f", {100.0 * unseen:.0f} % of frames unseen" if level == "3s" and unseen is not None else ""
+    return f"{level or 'not stated'}{share}"
+
+
+def _evidence(world: World) -> dict[str, Value]:
+    if world.terrain.is_real:
+        share = unseen_share(world)
+        return {"world": "real-terrain", "seed": world.scenario.seed, "unseen_share": share}
+    return {"world": "procedural", "seed": world.scenario.seed}
+
+
+def _reference(scenario: Scenario) -> dict[str, Value]:
+    return {
+        "source": "simulated orbit determination, one solution for the whole pass",
+        "sigma_rtn_m": list(scenario.reference.sigma_rtn_m),
+    }
+
+
+def _requirements(scenario: Scenario) -> dict[str, Value]:
+    section, flown = scenario.requirements, scenario.navigation.estimators
+    values: dict[str, Value] = {
+        "estimator": section.estimator or ("anchored" if "anchored" in flown else flown[0]),
+        "better_than": list(section.better_than),
+    }
+    for item in fields(RequirementsSection):
+        limit = getattr(section, item.name)
+        if isinstance(limit, float) and limit >= 0.0:
+            values[item.name] = limit
+    return values
+
+
+def _toml(value: Value) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+        return f'"{escaped}"'
+    if isinstance(value, int | float):
+        return repr(value)
+    return "[" + ", ".join(_toml(item) for item in value or ()) + "]"

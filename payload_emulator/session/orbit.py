@@ -1,0 +1,163 @@
+"""The true orbit of a scenario: its forces, its first state, its propagation with or without burns, as an ephemeris."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lunar.arrays import FloatArray, IntArray
+from lunar.datafolder import DataFolder, default_gravity, default_orientation
+from lunar.elements import Elements, icrf_state_from_elements, state_from_elements
+from lunar.ephemeris import Ephemeris, EphemerisSegment
+from lunar.errors import ImpactError
+from lunar.frames import IauOrientation, Orientation
+from lunar.gravity import GravityField, builtin_gravity, load_gravity
+from lunar.maneuvers import Maneuver, ManeuverRule, propagate_with_maneuvers
+from lunar.propagation import ForceModel, SolarPressure, Trajectory, propagate
+from lunar.timescales import tai_ns_from_utc_ns, tdb_minus_tt_s, tdb_s_from_utc_ns
+from payload_emulator.errors import ScenarioError
+from payload_emulator.session.scenario import Scenario
+
+_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScenarioOrbit:
+    """A propagated scenario."""
+
+    trajectory: Trajectory
+    maneuvers: tuple[Maneuver, ...]
+    model: ForceModel
+    epoch_utc_ns: int
+
+
+def open_gravity(name: str, data: DataFolder) -> GravityField:
+    """The field a scenario names: "auto" (the best available), "builtin", or a coefficient file."""
+    if name == "auto":
+        return default_gravity(data)
+    return builtin_gravity() if name == "builtin" else load_gravity(Path(name))
+
+
+def open_orientation(name: str, data: DataFolder) -> Orientation:
+    """The lunar orientation a scenario names: "auto", "iau" or "de421"."""
+    if name == "iau":
+        return IauOrientation()
+    if name == "de421" and data.orientation_bpc is None:
+        raise ScenarioError(
+            "dynamics.orientation 'de421' needs the binary orientation kernel of the data folder, found none; "
+            "use 'auto' or 'iau'"
+        )
+    return default_orientation(data)
+
+
+def force_model(scenario: Scenario, data: DataFolder) -> ForceModel:
+    """The forces of a scenario; its degree is cut to what the available field holds."""
+    dynamics = scenario.dynamics
+    gravity = open_gravity(dynamics.gravity, data)
+    orientation = open_orientation(dynamics.orientation, data)
+    area_to_mass = dynamics.solar_area_to_mass_m2_kg
+    return ForceModel(
+        gravity,
+        orientation,
+        min(dynamics.degree, gravity.degree),
+        earth=dynamics.earth,
+        sun=dynamics.sun,
+        solar_pressure=SolarPressure(area_to_mass, dynamics.solar_reflection) if area_to_mass > 0.0 else None,
+    )
+
+
+def initial_state_icrf(scenario: Scenario, gm_m3_s2: float) -> FloatArray:
+    """Position (m) and velocity (m/s), shape (6,), Moon-centred ICRF axes, of a scenario's elements at its epoch."""
+    orbit = scenario.orbit
+    elements = Elements(
+        orbit.semi_major_axis_km * 1e3,
+        orbit.eccentricity,
+        *np.radians(
+            [orbit.inclination_deg, orbit.raan_deg, orbit.argument_of_perilune_deg, orbit.true_anomaly_deg]
+        ).tolist(),
+    )
+    if orbit.frame == "ICRF":
+        return np.concatenate(state_from_elements(elements, gm_m3_s2))
+    epoch_tdb_s = tdb_s_from_utc_ns(scenario.epoch_utc_ns)
+    return np.concatenate(icrf_state_from_elements(elements, epoch_tdb_s, gm_m3_s2))
+
+
+def propagate_scenario(scenario: Scenario, model: ForceModel, duration_s: float) -> ScenarioOrbit:
+    """The orbit from the scenario's epoch on, with the burns of its rule where that is enabled.
+
+    Raises
+    ------
+    ImpactError
+        The orbit hits the Moon.
+    ScenarioError
+        The scenario flies an ephemeris file, so that there is nothing to propagate.
+    """
+    if scenario.orbit.oem:
+        raise ScenarioError(
+            f"scenario {scenario.name}: expected orbital elements to propagate, "
+            f"found the ephemeris {scenario.orbit.oem}"
+        )
+    epoch_tdb_s = tdb_s_from_utc_ns(scenario.epoch_utc_ns)
+    state = initial_state_icrf(scenario, model.gm_m3_s2)
+    rule, integrator = scenario.maneuvers, scenario.dynamics.integrator
+    maneuvers: tuple[Maneuver, ...] = ()
+    if rule.enabled:
+        trajectory, maneuvers = propagate_with_maneuvers(
+            epoch_tdb_s,
+            state[:3],
+            state[3:],
+            duration_s,
+            model,
+            ManeuverRule(rule.periselene_altitude_km * 1e3, rule.semi_major_axis_km * 1e3, rule.eccentricity),
+            integrator=integrator,
+        )
+    else:
+        trajectory = propagate(epoch_tdb_s, state[:3], state[3:], duration_s, model, integrator=integrator)
+    return ScenarioOrbit(trajectory, maneuvers, model, scenario.epoch_utc_ns)
+
+
+def free_impact(scenario: Scenario, model: ForceModel, duration_s: float) -> ImpactError | None:
+    """Where and when the orbit hits the Moon if nobody burns, None if it does not within the span."""
+    state = initial_state_icrf(scenario, model.gm_m3_s2)
+    try:
+        propagate(tdb_s_from_utc_ns(scenario.epoch_utc_ns), state[:3], state[3:], duration_s, model)
+    except ImpactError as impact:
+        return impact
+    return None
+
+
+def sample(
+    orbit: ScenarioOrbit, step_s: float, object_name: str = "SELENITA"
+) -> tuple[Ephemeris, FloatArray]:
+    """The ephemeris on a regular grid, a segment between burns with a state at each end; the grid's states (n, 6)."""
+    last_s = float(orbit.trajectory.elapsed_s[-1])
+    steps = int(np.floor(last_s / step_s + 1e-9))
+    grid = orbit.epoch_utc_ns + np.rint(np.arange(steps + 1) * (step_s * _NS)).astype(np.int64)
+    elapsed = np.minimum(_elapsed_s(grid, orbit.epoch_utc_ns), last_s)
+    edges = [int(grid[0]), *(burn.utc_ns for burn in orbit.maneuvers), int(grid[-1])]
+    segments = []
+    for arc, start, stop in zip(orbit.trajectory.arcs(), edges[:-1], edges[1:], strict=True):
+        inside = grid[(grid > start) & (grid < stop)]
+        utc_ns = np.unique(np.concatenate([[start], inside, [stop]]))
+        at = np.clip(_elapsed_s(utc_ns, orbit.epoch_utc_ns), arc.elapsed_s[0], arc.elapsed_s[-1])
+        states = arc.state_after(at)
+        segments.append(
+            EphemerisSegment(
+                utc_ns,
+                states[:, :3],
+                states[:, 3:],
+                object_name=object_name,
+                object_id=object_name,
+                degree=min(7, 2 * len(utc_ns) - 1),
+            )
+        )
+    return Ephemeris(tuple(segments)), orbit.trajectory.state_after(elapsed)
+
+
+def _elapsed_s(utc_ns: IntArray, epoch_utc_ns: int) -> FloatArray:
+    """TDB seconds since an epoch; differences of integers first, so that nothing is lost to the size of TDB."""
+    tai_s = (tai_ns_from_utc_ns(utc_ns) - tai_ns_from_utc_ns(epoch_utc_ns)) / _NS
+    start_s = tdb_s_from_utc_ns(epoch_utc_ns)
+    return np.asarray(tai_s + tdb_minus_tt_s(start_s + tai_s) - tdb_minus_tt_s(start_s), dtype=np.float64)

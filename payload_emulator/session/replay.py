@@ -1,0 +1,422 @@
+"""An archived pass flown again: the current flight code, with the model and parameters of a build, on its record.
+
+A replay sees its archive and its build, nothing else: no data folder, no clock, no network. The same build on the same
+archive gives the same octets. What it costs is measured around the payload, in the CPU time of this thread, and never
+enters the downlink; beside each frame a fixed computation is timed as a yardstick, so that a busy machine or a slow one
+can be told from a slow build.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+import tomllib
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lunar.arrays import FloatArray
+from lunar.datafolder import DataFolder
+from payload_emulator.errors import ModelError, ParameterError, RecordError
+from payload_emulator.flight.models import load_shipped_model
+from payload_emulator.flight.onboard.modes import PayloadMode
+from payload_emulator.flight.payload import Payload
+from payload_emulator.flight.ports import UNLIMITED, BareBoard, ResetCause
+from payload_emulator.flight.vision.detections import Detections
+from payload_emulator.flight.vision.detector import OnnxDetector
+from payload_emulator.flight.vision.preprocess import ImageQuality
+from payload_emulator.session.parameter_file import BuildParameters, parse_parameters
+from payload_emulator.session.recording import (
+    PassRecord,
+    StepInput,
+    check_image,
+    load_image,
+    load_record,
+    missing_frames,
+    save_image,
+)
+from tmtc.downlink import encode_cadus
+
+Image = NDArray[Any]
+Progress = Callable[[Iterable[Any], int], Iterator[Any]]
+CpuClock = Callable[[], float]
+
+STAGES = ("network", "detector", "navigation")
+"""The network; the rest of the detector (image preparation, decoding); everything after it, telemetry included."""
+
+YARDSTICK_SIZE = 256
+YARDSTICK_EVERY = 3
+"""The fixed computation is a product of matrices of this size, timed at every third frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class FlightBuild:
+    """A build on the current flight code: a network (None: the shipped one) and changes to the flown parameters."""
+
+    name: str = "current"
+    version: str = ""
+    model: bytes | None = None
+    parameters: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Replay:
+    """What a replay gave: packets, counts of the payload, CPU milliseconds of stages by frame and of the yardstick."""
+
+    packets: list[bytes]
+    summary: dict[str, Any]
+    stages_ms: dict[str, FloatArray]
+    yardstick_ms: FloatArray
+
+
+def load_flight_build(path: Path) -> FlightBuild:
+    """A build from its TOML file: `name`, `version`, `model` and `parameters` (files beside it).
+
+    Raises
+    ------
+    ParameterError
+        The file is no build on the flight code.
+    """
+    table = _build_table(path)
+    if "command" in table:
+        raise ParameterError(str(path), "command", "a build of a model and parameters", "one with a command")
+
+    def octets_of(key: str) -> bytes:
+        try:
+            return (path.parent / str(table[key])).read_bytes()
+        except OSError as error:
+            raise ParameterError(str(path), key, f"a file {table[key]}", f"none ({error.strerror})") from None
+
+    return FlightBuild(
+        str(table.get("name", path.stem)),
+        str(table.get("version", "")),
+        octets_of("model") if "model" in table else None,
+        octets_of("parameters").decode() if "parameters" in table else "",
+    )
+
+
+def check_parameters(path: Path) -> None:
+    """Refuse a build file with parameters that are unknown to this flight code or have invalid values.
+
+    Raises
+    ------
+    ParameterError
+        The message names the parameter file, the key, what was expected and what was found.
+    """
+    name = str(_build_table(path).get("parameters", ""))
+    if not name:
+        return
+    try:
+        text = (path.parent / name).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ParameterError(name, "", "parameters (TOML, UTF-8)", str(error)) from None
+    parse_parameters(text, source=name)
+
+
+def names_command(path: Path) -> bool:
+    """Whether a build file names a program of its own instead of a network and parameters."""
+    return "command" in _build_table(path)
+
+
+def replay_archive(
+    archive: Path,
+    build: FlightBuild,
+    out: Path,
+    *,
+    data: DataFolder | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Fly an archived pass again and write `downlink.cadu`, `performance.json` and `summary.json` into `out`.
+
+    Parameters
+    ----------
+    data
+        Products to render frames from that the archive does not hold; None refuses such an archive.
+
+    Raises
+    ------
+    RecordError
+        The archive cannot be flown again, or an image of it is not the recorded one.
+    """
+    manifest = _manifest(archive)
+    record = load_record(archive)
+    lacking = missing_frames(archive, record.inputs)
+    if lacking and data is None:
+        raise RecordError(
+            f"{archive}: expected every frame, found {len(lacking)} missing, the first {lacking[0]}; "
+            "complete the archive first (linna replay --complete)"
+        )
+    images = rendered_images(archive, record, data) if lacking and data else stored_images(archive, record)
+    started = time.monotonic()
+    flown = replay(record, images, build, progress=progress)
+    wall_s = time.monotonic() - started
+    out.mkdir(parents=True, exist_ok=True)
+    octets = encode_cadus(
+        flown.packets, spacecraft_id=int(manifest["spacecraft_id"]), coding=_coding(manifest)
+    )
+    (out / "downlink.cadu").write_bytes(octets)
+    _write_json(
+        out / "performance.json",
+        {
+            "clock": "CPU time of the thread",
+            "unit": "ms",
+            "stages": {name: values.tolist() for name, values in flown.stages_ms.items()},
+            "yardstick": flown.yardstick_ms.tolist(),
+        },
+    )
+    cpu_ms = float(sum(values.sum() for values in flown.stages_ms.values()))
+    frames = len(flown.stages_ms[STAGES[0]])
+    summary = {
+        "archive": str(manifest.get("pass_name", "")),
+        "build": {"name": build.name, "version": build.version},
+        "frames": frames,
+        "packets": len(flown.packets),
+        "downlink_octets": len(octets),
+        "dropped": list(record.dropped),
+        **flown.summary,
+        # a replay uses only the recording; it has no truth to read
+        "truth_reads_after_start": 0,
+        "cpu_ms_per_frame": cpu_ms / max(frames, 1),
+        "wall_s": round(wall_s, 3),
+        "realtime_factor": round(frames * float(manifest.get("cadence_s") or 0.0) / max(wall_s, 1e-9), 2),
+    }
+    _write_json(out / "summary.json", summary)
+    return summary
+
+
+def replay(
+    record: PassRecord,
+    images: Iterable[Image],
+    build: FlightBuild = FlightBuild(),
+    *,
+    progress: Progress | None = None,
+    cpu_clock: CpuClock = time.thread_time,
+) -> Replay:
+    """The packets that a build makes of a recorded pass."""
+    parameters = parameters_of(build, record.parameters)
+    detector = _TimedDetector(
+        load_shipped_model() if build.model is None else build.model, parameters, cpu_clock
+    )
+    board = RecordedBoard()
+
+    def started() -> Payload:
+        return Payload(
+            detector,
+            parameters.flight,
+            record.tables,
+            model_hash=detector.onnx.model_hash,
+            model_octets=detector.onnx.model_octets,
+            board=board,
+            mode=PayloadMode.standby,
+            make_detector=lambda octets: _TimedDetector(octets, parameters, cpu_clock),
+        )
+
+    payload = started()
+    packets: list[bytes] = []
+    rows: list[tuple[float, float, float]] = []
+    yardstick_ms: list[float] = []
+    pairs: Iterable[tuple[StepInput, Image]] = zip(record.inputs, images, strict=True)
+    weights = np.random.default_rng(0).standard_normal((YARDSTICK_SIZE, YARDSTICK_SIZE)).astype(np.float32)
+    for item, image in progress(pairs, len(record.inputs)) if progress else pairs:
+        if board.tell(item) and item is not record.inputs[0]:
+            payload = started()
+        detector.reset()
+        began = cpu_clock()
+        packets += payload.step(image, item.attitude, item.clock_ticks, item.telecommands)
+        step_s = cpu_clock() - began
+        if item.number < 0:
+            continue
+        rows.append(
+            (detector.network_s, detector.examine_s - detector.network_s, step_s - detector.examine_s)
+        )
+        if item.number % YARDSTICK_EVERY == 0:
+            yardstick_ms.append(1e3 * _yardstick_s(weights, cpu_clock))
+    stages = 1e3 * np.array(rows, dtype=np.float64).reshape(-1, len(STAGES))
+    return Replay(
+        packets,
+        payload.summary(),
+        {name: stages[:, i] for i, name in enumerate(STAGES)},
+        np.array(yardstick_ms),
+    )
+
+
+def parameters_of(build: FlightBuild, flown: BuildParameters) -> BuildParameters:
+    """The parameters that a build flies with: those of the pass, with the changes of the build."""
+    return parse_parameters(build.parameters, flown, source=f"parameters of {build.name}")
+
+
+def stored_images(archive: Path, record: PassRecord) -> Iterator[Image]:
+    """The images of a pass from its archive, the next one read while this one is worked on."""
+    return _ahead(lambda item: load_image(archive, item), record.inputs)
+
+
+def rendered_images(archive: Path, record: PassRecord, data: DataFolder) -> Iterator[Image]:
+    """The images of a pass, those that its archive lacks rendered from scenario and seed and found to be the same."""
+    from payload_emulator.session.scenario import parse_scenario
+    from payload_emulator.session.world import build_world, expose_frame
+
+    text = _manifest(archive).get("scenario_toml")
+    if not text:
+        raise RecordError(f"{archive}: expected frames, or a scenario to render them from, found neither")
+    world = build_world(parse_scenario(str(text), source=f"scenario of {archive}"), data)
+    world.terrain.hand_over()
+    absent = set(missing_frames(archive, record.inputs))
+
+    def image_of(item: StepInput) -> Image:
+        if item.number not in absent or not item.image_sha256:
+            return load_image(archive, item)
+        if item.number >= world.frame_utc_ns.size:
+            raise RecordError(
+                f"{archive}: expected a scenario with frame {item.number}, found {world.frame_utc_ns.size} frames"
+            )
+        image = expose_frame(world, item.number).image
+        check_image(item, image, f"frame {item.number} rendered from the scenario of {archive}")
+        return image
+
+    return _ahead(image_of, record.inputs)
+
+
+def complete_archive(
+    archive: Path, out: Path, data: DataFolder, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Write a copy of an archive that holds all its frames; the new manifest comes back."""
+    from payload_emulator.session.emulator import file_entries
+
+    record, manifest = load_record(archive), _manifest(archive)
+    if out.exists():
+        raise RecordError(f"{out}: expected a new folder, found something there; choose another --out")
+    shutil.copytree(archive, out)
+    absent = set(missing_frames(archive, record.inputs))
+    pairs = zip(record.inputs, rendered_images(archive, record, data), strict=True)
+    for item, image in progress(pairs, len(record.inputs)) if progress else pairs:
+        if item.number in absent:
+            save_image(out, item.number, image)
+    manifest["files"] = file_entries(out)
+    _write_json(out / "manifest.json", manifest)
+    return manifest
+
+
+@dataclass(slots=True, eq=False)
+class RecordedBoard(BareBoard):
+    """The board as it was when the pass was flown: its readings and its link, whatever the build does with it."""
+
+    uptime: int = -1
+    downlink: int = UNLIMITED
+    asked_to_reset: bool = False
+
+    def tell(self, item: StepInput) -> bool:
+        """Take the place of the board in a step; whether the processor restarts before it."""
+        self.uptime, self.downlink = item.uptime_ticks, item.downlink_octets
+        if np.isfinite(item.sensors).all():
+            self.readings = item.sensors
+        starts = item.boot is not None or self.asked_to_reset
+        if item.boot is not None:
+            self.reset_cause = ResetCause(item.boot)
+        self.asked_to_reset = False
+        return starts
+
+    def uptime_ticks(self) -> int:
+        return self.uptime
+
+    def downlink_octets(self) -> int:
+        return self.downlink
+
+    def request_reset(self, cause: int) -> None:
+        self.reset_cause, self.asked_to_reset = ResetCause(cause), True
+
+
+@dataclass(slots=True, eq=False)
+class _TimedDetector:
+    """The detector of flight with the CPU time that it takes."""
+
+    model: bytes
+    parameters: BuildParameters
+    clock: CpuClock
+    onnx: OnnxDetector = field(init=False)
+    examine_s: float = field(default=0.0, init=False)
+    network_s: float = field(default=0.0, init=False)
+
+    def __post_init__(self) -> None:
+        timed = self
+
+        class Onnx(OnnxDetector):
+            def run_network(
+                self, tile: NDArray[np.float32]
+            ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+                began = timed.clock()
+                maps = OnnxDetector.run_network(self, tile)
+                timed.network_s += timed.clock() - began
+                return maps
+
+        if not self.model:
+            raise ModelError("detector model: expected an ONNX file, found no octets")
+        self.onnx = Onnx(self.model, self.parameters.detector)
+
+    def reset(self) -> None:
+        self.examine_s = self.network_s = 0.0
+
+    def examine(
+        self, image: NDArray[Any], sun_in_camera: FloatArray | None = None
+    ) -> tuple[ImageQuality, Detections]:
+        began = self.clock()
+        found = self.onnx.examine(image, sun_in_camera)
+        self.examine_s += self.clock() - began
+        return found
+
+
+def _yardstick_s(weights: NDArray[np.float32], clock: CpuClock) -> float:
+    """CPU time of a fixed product of matrices: what this machine takes for work of the network's kind just now."""
+    began = clock()
+    product = weights
+    for _ in range(4):
+        product = product @ weights
+        product = product * np.float32(1.0 / YARDSTICK_SIZE)
+    return clock() - began
+
+
+def _ahead(load: Callable[[StepInput], Image], inputs: tuple[StepInput, ...]) -> Iterator[Image]:
+    with ThreadPoolExecutor(max_workers=1) as reader:
+        pending = [reader.submit(load, item) for item in inputs[:2]]
+        for number in range(len(inputs)):
+            if number + 2 < len(inputs):
+                pending.append(reader.submit(load, inputs[number + 2]))
+            yield pending.pop(0).result()
+
+
+def _build_table(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ParameterError(str(path), "", "a build file", f"none ({error.strerror})") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ParameterError(str(path), "", "a build file (TOML)", str(error)) from None
+
+
+def _manifest(archive: Path) -> dict[str, Any]:
+    try:
+        manifest = json.loads((archive / "manifest.json").read_text())
+        int(manifest["spacecraft_id"])
+    except FileNotFoundError:
+        raise RecordError(f"{archive}: expected a pass archive with manifest.json, found none") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise RecordError(
+            f"{archive / 'manifest.json'}: expected a pass manifest, found something else ({error})"
+        ) from None
+    return dict(manifest)
+
+
+def _coding(manifest: dict[str, Any]) -> Literal["rs", "none"]:
+    """Coding of the archived downlink, as its manifest or its scenario says."""
+    text = str(manifest.get("scenario_toml") or "")
+    said = manifest.get("coding") or tomllib.loads(text).get("link", {}).get("coding", "rs")
+    return "none" if said == "none" else "rs"
+
+
+def _write_json(path: Path, value: dict[str, Any]) -> None:
+    path.write_text(json.dumps(value, indent=1) + "\n")

@@ -1,0 +1,541 @@
+"""Emulation scenarios: one TOML file, parsed into frozen values; unknown keys are refused with the nearest known one.
+
+Degrees, kilometres and seconds stand in the file and in these values' names; users of a scenario convert once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from lunar.errors import LunarError
+from lunar.timescales import parse_utc
+from payload_emulator.errors import ScenarioError
+from payload_emulator.sim.board.faults import parse_fault
+from payload_emulator.sim.board.link import LinkSection
+from payload_emulator.sim.render.sensor import SensorModel
+
+SHIPPED = Path(__file__).resolve().parents[2] / "scenarios"
+
+
+@dataclass(frozen=True, slots=True)
+class OrbitSection:
+    """Where the spacecraft is at the epoch: Keplerian elements (osculating), or an OEM file that flies the truth."""
+
+    epoch: str = "2029-08-07T00:00:00Z"
+    frame: Literal["MCI", "ICRF"] = "MCI"
+    semi_major_axis_km: float = 1768.180
+    eccentricity: float = 0.006908
+    inclination_deg: float = 89.076
+    raan_deg: float = 3.164
+    argument_of_perilune_deg: float = 333.604
+    true_anomaly_deg: float = 8.882
+    oem: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class DynamicsSection:
+    """Forces on the true spacecraft. `gravity`: "auto" (best available field), "builtin", or a coefficient file.
+
+    Sunlight pushes where the cross-section over mass is positive; the reflection is 1 for black, 2 for a mirror.
+    """
+
+    gravity: str = "auto"
+    degree: int = 100
+    orientation: Literal["auto", "iau", "de421"] = "auto"
+    earth: bool = True
+    sun: bool = True
+    integrator: Literal["rkn86", "dop853", "rkf78"] = "rkn86"
+    solar_area_to_mass_m2_kg: float = 0.0
+    solar_reflection: float = 1.3
+
+
+@dataclass(frozen=True, slots=True)
+class ManeuverSection:
+    """The paper's orbit maintenance (section V-B.1).
+
+    The payload is told of planned burns; what is carried out differs from the plan by a share of it (1 sigma per axis).
+    """
+
+    enabled: bool = True
+    periselene_altitude_km: float = 15.0
+    semi_major_axis_km: float = 1768.180
+    eccentricity: float = 0.006
+    execution_error_fraction: float = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class WindowSection:
+    """When the payload observes.
+
+    `search`: "terrain" takes the first window of the wanted direction that lies entirely over the available terrain,
+    no earlier than `start` (the orbit's epoch when empty), between the two longitudes (east-positive; the second may
+    exceed 360); "none" observes from `start` for `duration_s`.
+    Frames are taken where the sub-satellite latitude is within `latitude_limit_deg`, on one of so many arcs as
+    `arc_interval` says (1: on every one).
+    """
+
+    search: Literal["terrain", "none"] = "terrain"
+    start: str = ""
+    duration_s: float = 0.0
+    passes: int = 1
+    direction: Literal["ascending", "descending", "any"] = "ascending"
+    latitude_limit_deg: float = 60.0
+    arc_interval: int = 1
+    longitude_min_deg: float = 0.0
+    longitude_max_deg: float = 360.0
+    search_days: float = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSection:
+    """The camera (paper, section V-B.3).
+
+    `yaw_deg` turns it clockwise from image up to the north, then `tilt_deg` leans it from nadir toward image up.
+    `k1` to `p2` are Brown's coefficients of the true lens: flight software knows a pinhole, so they are what its
+    calibration missed.
+    """
+
+    width_px: int = 512
+    height_px: int = 512
+    fov_deg: float = 120.0
+    frame_interval_s: float = 15.0
+    images: Literal["rendered", "reduced"] = "rendered"
+    tilt_deg: float = 0.0
+    yaw_deg: float = 0.0
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class LightSection:
+    """`paper`: the Sun drawn again for each frame (section V-B.4); `real`: from the ephemeris.
+
+    `photometry` is the law by which the ground scatters it.
+    """
+
+    mode: Literal["paper", "real"] = "paper"
+    photometry: Literal["lunar-lambert", "lambert", "hapke", "matt"] = "lunar-lambert"
+    elevation_min_deg: float = 5.0
+    elevation_max_deg: float = 15.0
+    azimuth_min_deg: float = -45.0
+    azimuth_max_deg: float = 45.0
+
+
+@dataclass(frozen=True, slots=True)
+class TerrainSection:
+    """`auto`: the real terrain where its rasters are available, else the procedural Moon.
+
+    `catalogue`: the craters of the data folder's catalogue, at their places and sizes, on a procedural base.
+    """
+
+    source: Literal["auto", "raster", "procedural", "catalogue"] = "auto"
+
+
+@dataclass(frozen=True, slots=True)
+class NavigationSection:
+    """Estimators on board, and what they are started and fed with.
+
+    The initial errors are of the state that starts the filter (1 sigma per axis declared, that length drawn). Errors of
+    the on-board catalogue come on top of those that the terrain's own catalogue has. `anchoring_catalogue` names a
+    table made by `linna catalogue curate`; it is uploaded as it is, in place of the terrain's catalogue.
+    """
+
+    estimators: tuple[str, ...] = ("paper", "spherical", "anchored")
+    initial_position_error_m: float = 1000.0
+    initial_velocity_error_m_s: float = 1.0
+    filter_gravity: str = "auto"
+    filter_degree: int = 100
+    anchoring_catalogue: str = ""
+    catalogue_min_diameter_km: float = 3.0
+    catalogue_max_diameter_km: float = 30.0
+    catalogue_error_fraction_of_diameter: float = 0.0
+    catalogue_height_error_m: float = 0.0
+    safety_timeout_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeSection:
+    """Pointing of the camera and what the ADCS knows of it, 1 sigma per axis."""
+
+    pointing_error_deg: float = 0.0
+    knowledge_noise_deg: float = 0.0
+    knowledge_bias_deg: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class DisturbancesSection:
+    """What happens on the way; times in seconds after the first frame, nothing happens where a size is zero.
+
+    - kidnap: the spacecraft is found elsewhere, turned about the Moon's centre by a distance on the ground; `told`: the
+      payload is told by telecommand that its estimate is worth no more than that distance;
+    - outage: the camera gives no image;
+    - burn: along the velocity; `declared`: the payload has it in its burn table. `maneuvers` gives its execution error.
+    """
+
+    kidnap_at_s: float = 0.0
+    kidnap_distance_km: float = 0.0
+    kidnap_told: bool = False
+    outage_at_s: float = 0.0
+    outage_duration_s: float = 0.0
+    burn_at_s: float = 0.0
+    burn_delta_v_m_s: float = 0.0
+    burn_declared: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class ClockSection:
+    """The on-board clock: reading minus ideal = offset + drift x elapsed."""
+
+    offset_s: float = 0.0
+    drift_ppm: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class FaultsSection:
+    """What breaks: a line each, `KIND at SECONDS [for SECONDS] [size NUMBER]`; the kinds are in `sim.faults`."""
+
+    events: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceSection:
+    """Errors of the ground's reference ephemeris, 1 sigma.
+
+    `radial_m`, `transverse_m` and `normal_m` are the errors of one orbit determination: an orbit of the same period
+    that differs in eccentricity, phase and plane, so that errors are correlated over the whole arc and repeat with each
+    revolution. The orbital dynamics require a transverse error of at least twice the radial error. `position_error_m`
+    adds a constant offset in R/T/N.
+    """
+
+    position_error_m: float = 0.0
+    radial_m: float = 0.0
+    transverse_m: float = 0.0
+    normal_m: float = 0.0
+
+    @property
+    def sigma_rtn_m(self) -> tuple[float, float, float]:
+        """Standard deviations of the whole error in radial, transverse and normal."""
+        own = (self.radial_m, self.transverse_m, self.normal_m)
+        return (
+            math.hypot(self.position_error_m, own[0]),
+            math.hypot(self.position_error_m, own[1]),
+            math.hypot(self.position_error_m, own[2]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class RequirementsSection:
+    """Limits that the mission description states for verdicts; a negative limit is not stated.
+
+    `estimator` names the estimator whose accuracy is judged; the default is the filter if it is used, otherwise the
+    first listed. Errors are 3-D position errors. Consistency is the share of NEES and NIS values inside their 95 %
+    bounds, which is 95 % for a consistent filter; 90 % allows for the few samples of one pass. The temperature is the
+    warning limit of the packet dictionary, the limits of other resources leave a fifth free.
+    """
+
+    estimator: Literal["", "paper", "spherical", "anchored"] = ""
+    median_error_m: float = 100.0
+    p95_error_m: float = 300.0
+    better_than: tuple[str, ...] = ("propagate-only", "snapshot")
+    consistency_inside_percent: float = 90.0
+    packets_percent: float = 99.9
+    frames_percent: float = 99.0
+    images_percent: float = 95.0
+    recall: float = 0.25
+    precision: float = 0.8
+    anchor_reads: float = 0.0
+    resets: float = 0.0
+    cpu_percent: float = 80.0
+    memory_mib: float = -1.0
+    storage_percent: float = 80.0
+    temperature_max_c: float = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """Everything an emulation is made of; two runs of equal scenarios give equal octets."""
+
+    name: str
+    title: str = ""
+    seed: int = 1
+    orbit: OrbitSection = field(default_factory=OrbitSection)
+    dynamics: DynamicsSection = field(default_factory=DynamicsSection)
+    maneuvers: ManeuverSection = field(default_factory=ManeuverSection)
+    window: WindowSection = field(default_factory=WindowSection)
+    camera: CameraSection = field(default_factory=CameraSection)
+    sensor: SensorModel = field(default_factory=SensorModel)
+    light: LightSection = field(default_factory=LightSection)
+    terrain: TerrainSection = field(default_factory=TerrainSection)
+    navigation: NavigationSection = field(default_factory=NavigationSection)
+    attitude: AttitudeSection = field(default_factory=AttitudeSection)
+    disturbances: DisturbancesSection = field(default_factory=DisturbancesSection)
+    clock: ClockSection = field(default_factory=ClockSection)
+    link: LinkSection = field(default_factory=LinkSection)
+    faults: FaultsSection = field(default_factory=FaultsSection)
+    reference: ReferenceSection = field(default_factory=ReferenceSection)
+    requirements: RequirementsSection = field(default_factory=RequirementsSection)
+
+    @property
+    def epoch_utc_ns(self) -> int:
+        return parse_utc(self.orbit.epoch)
+
+    def with_choices(
+        self,
+        *,
+        modes: Sequence[str] | None = None,
+        seed: int | None = None,
+        anchoring_catalogue: Path | None = None,
+    ) -> Scenario:
+        """The same scenario with other estimators, seed or table of craters; None keeps what it has."""
+        navigation = self.navigation
+        if modes is not None:
+            navigation = dataclasses.replace(navigation, estimators=tuple(dict.fromkeys(modes)))
+        if anchoring_catalogue is not None:
+            navigation = dataclasses.replace(navigation, anchoring_catalogue=str(anchoring_catalogue))
+        return dataclasses.replace(self, navigation=navigation, seed=self.seed if seed is None else seed)
+
+
+def load_scenario(path: Path | str) -> Scenario:
+    """The scenario in a TOML file; a bare name means one of those shipped (`scenarios/NAME.toml`).
+
+    Raises
+    ------
+    ScenarioError
+        The file is missing, no TOML, has unknown keys, values of a wrong type or an impossible orbit.
+    """
+    where = Path(path)
+    if not where.is_file() and where.suffix == "" and (SHIPPED / f"{where.name}.toml").exists():
+        where = SHIPPED / f"{where.name}.toml"
+    try:
+        text = where.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        shipped = ", ".join(sorted(file.stem for file in SHIPPED.glob("*.toml")))
+        raise ScenarioError(f"{path}: no such scenario file; shipped scenarios: {shipped}") from None
+    except UnicodeDecodeError as error:
+        raise ScenarioError(
+            f"{where}: expected UTF-8 text, found octet {error.object[error.start]:#04x} at {error.start}"
+        ) from None
+    return parse_scenario(text, source=str(where))
+
+
+def parse_scenario(text: str, source: str = "scenario") -> Scenario:
+    """The scenario written in `text`; `source` names it in error messages."""
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{source}: not TOML: {error}") from None
+    if "name" not in table:
+        raise ScenarioError(f"{source}: key 'name' is missing, expected a short text")
+    scenario = _build(Scenario, table, source, "")
+    _check(scenario, source)
+    return scenario
+
+
+def format_scenario(scenario: Scenario) -> str:
+    """TOML text that parses to an equal scenario (every key written out)."""
+    lines: list[str] = []
+    sections: list[str] = []
+    for item in dataclasses.fields(scenario):
+        value = getattr(scenario, item.name)
+        if dataclasses.is_dataclass(value):
+            sections += ["", f"[{item.name}]"]
+            sections += [
+                f"{key.name} = {_toml(getattr(value, key.name))}" for key in dataclasses.fields(value)
+            ]
+        else:
+            lines.append(f"{item.name} = {_toml(value)}")
+    return "\n".join(lines + sections) + "\n"
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n") + '"'
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_toml(item) for item in value) + "]"
+    return repr(value)
+
+
+def _build(kind: type, table: Any, source: str, path: str) -> Any:
+    if not isinstance(table, dict):
+        raise ScenarioError(f"{source}: [{path}] must be a table, found {type(table).__name__}")
+    hints = get_type_hints(kind)
+    known = [item.name for item in dataclasses.fields(kind)]
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        place = f"{path}.{key}" if path else key
+        if key not in known:
+            close = difflib.get_close_matches(key, known, n=1)
+            hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(known)}"
+            raise ScenarioError(f"{source}: unknown key '{place}'; {hint}")
+        values[key] = _convert(hints[key], value, source, place)
+    return kind(**values)
+
+
+def _convert(hint: Any, value: Any, source: str, place: str) -> Any:
+    origin = get_origin(hint)
+    if dataclasses.is_dataclass(hint):
+        return _build(hint, value, source, place)  # type: ignore[arg-type]
+    if origin is Literal:
+        if value not in get_args(hint):
+            expected = ", ".join(repr(item) for item in get_args(hint))
+            raise ScenarioError(f"{source}: {place} must be one of {expected}, found {value!r}")
+        return value
+    if origin is tuple:
+        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+            raise ScenarioError(f"{source}: {place} must be a list of texts, found {value!r}")
+        return tuple(value)
+    if origin in (Union, UnionType):
+        raise TypeError(f"scenario field {place} has a union type, which the parser does not read")
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if type(value) is not hint:
+        raise ScenarioError(f"{source}: {place} must be {_NAMES[hint]}, found {value!r}")
+    if hint is float and not math.isfinite(value):
+        raise ScenarioError(f"{source}: {place} must be finite, found {value!r}")
+    return value
+
+
+_NAMES = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
+ESTIMATORS = ("paper", "spherical", "anchored")
+
+
+def _check(scenario: Scenario, source: str) -> None:
+    """Refuse what cannot be flown; each message names the key, what is expected and what was found."""
+
+    def require(good: bool, key: str, expected: str, found: object) -> None:
+        if not good:
+            raise ScenarioError(f"{source}: {key} must be {expected}, found {found!r}")
+
+    orbit, camera, window = scenario.orbit, scenario.camera, scenario.window
+    for key, text in (("orbit.epoch", orbit.epoch), ("window.start", window.start)):
+        try:
+            if text or key == "orbit.epoch":
+                parse_utc(text)
+        except (LunarError, ValueError):
+            require(False, key, "a UTC time such as 2029-08-07T00:00:00Z", text)
+    if not orbit.oem:
+        require(
+            0.0 <= orbit.eccentricity < 1.0, "orbit.eccentricity", "from 0 to below 1", orbit.eccentricity
+        )
+        perilune_km = orbit.semi_major_axis_km * (1.0 - orbit.eccentricity)
+        require(
+            perilune_km > 1737.4,
+            "orbit.semi_major_axis_km and eccentricity",
+            "an orbit above the ground (perilune radius over 1737.4 km)",
+            round(perilune_km, 3),
+        )
+        require(
+            0.0 <= orbit.inclination_deg <= 180.0,
+            "orbit.inclination_deg",
+            "from 0 to 180",
+            orbit.inclination_deg,
+        )
+    require(
+        2 <= scenario.dynamics.degree <= 1200, "dynamics.degree", "from 2 to 1200", scenario.dynamics.degree
+    )
+    dynamics = scenario.dynamics
+    require(
+        0.0 <= dynamics.solar_area_to_mass_m2_kg <= 1e3,
+        "dynamics.solar_area_to_mass_m2_kg",
+        "from 0 to 1000",
+        dynamics.solar_area_to_mass_m2_kg,
+    )
+    require(
+        0.0 <= dynamics.solar_reflection <= 2.0,
+        "dynamics.solar_reflection",
+        "from 0 to 2",
+        dynamics.solar_reflection,
+    )
+    require(16 <= camera.width_px <= 8192, "camera.width_px", "from 16 to 8192", camera.width_px)
+    require(16 <= camera.height_px <= 8192, "camera.height_px", "from 16 to 8192", camera.height_px)
+    require(1.0 <= camera.fov_deg <= 170.0, "camera.fov_deg", "from 1 to 170", camera.fov_deg)
+    require(-60.0 <= camera.tilt_deg <= 60.0, "camera.tilt_deg", "from -60 to 60", camera.tilt_deg)
+    require(camera.frame_interval_s > 0.0, "camera.frame_interval_s", "positive", camera.frame_interval_s)
+    require(
+        0.0 < window.latitude_limit_deg <= 90.0,
+        "window.latitude_limit_deg",
+        "over 0 and up to 90",
+        window.latitude_limit_deg,
+    )
+    require(
+        0.0 < window.longitude_max_deg - window.longitude_min_deg <= 360.0,
+        "window.longitude_max_deg",
+        "over window.longitude_min_deg by up to 360",
+        window.longitude_max_deg,
+    )
+    require(window.passes >= 1, "window.passes", "at least 1", window.passes)
+    require(window.arc_interval >= 1, "window.arc_interval", "at least 1", window.arc_interval)
+    moved = scenario.disturbances.kidnap_distance_km > 0.0 or scenario.disturbances.burn_delta_v_m_s != 0.0
+    require(
+        not (moved and (scenario.maneuvers.enabled or orbit.oem)),
+        "maneuvers.enabled",
+        "false, and orbit.oem empty, where [disturbances] change the orbit",
+        scenario.maneuvers.enabled,
+    )
+    require(
+        scenario.disturbances.kidnap_distance_km >= 0.0,
+        "disturbances.kidnap_distance_km",
+        "zero or more",
+        scenario.disturbances.kidnap_distance_km,
+    )
+    require(
+        window.search != "none" or window.duration_s > 0.0,
+        "window.duration_s",
+        "positive when window.search is 'none'",
+        window.duration_s,
+    )
+    light = scenario.light
+    require(
+        light.elevation_min_deg <= light.elevation_max_deg,
+        "light.elevation_min_deg",
+        "no more than light.elevation_max_deg",
+        light.elevation_min_deg,
+    )
+    require(
+        light.azimuth_min_deg <= light.azimuth_max_deg,
+        "light.azimuth_min_deg",
+        "no more than light.azimuth_max_deg",
+        light.azimuth_min_deg,
+    )
+    for name in scenario.navigation.estimators:
+        require(name in ESTIMATORS, "navigation.estimators", f"of {', '.join(ESTIMATORS)}", name)
+    require(len(scenario.navigation.estimators) > 0, "navigation.estimators", "at least one estimator", ())
+    reference = scenario.reference
+    for key in ("position_error_m", "radial_m", "transverse_m", "normal_m"):
+        require(getattr(reference, key) >= 0.0, f"reference.{key}", "zero or more", getattr(reference, key))
+    require(
+        reference.transverse_m >= 2.0 * reference.radial_m,
+        "reference.transverse_m",
+        "at least twice reference.radial_m",
+        reference.transverse_m,
+    )
+    link = scenario.link
+    for key in (
+        "frame_loss",
+        "burst_start",
+        "burst_end",
+        "burst_frame_loss",
+        "repeat_share",
+        "reorder_share",
+    ):
+        share = getattr(link, key)
+        require(0.0 <= share <= 1.0, f"link.{key}", "from 0 to 1", share)
+    for key in ("bit_error_rate", "burst_bit_error_rate"):
+        rate = getattr(link, key)
+        require(0.0 <= rate <= 0.5, f"link.{key}", "from 0 to 0.5", rate)
+    require(link.rate_bps > 0.0, "link.rate_bps", "positive", link.rate_bps)
+    for text in scenario.faults.events:
+        parse_fault(text)

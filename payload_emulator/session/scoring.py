@@ -1,0 +1,411 @@
+"""Anchored navigation of an emulated session against the truth, from what came down and nothing else of the payload.
+
+Positions are compared in mean-Earth axes, since the payload flies its own orientation of the Moon, and split along
+the true orbit (radial, transverse, normal). Beside every figure stands what propagation of the start state alone
+would have given.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lunar.camera import project_mcmf
+from lunar.catalogue import CraterCatalogue
+from lunar.frames import rtn_from_inertial, spherical_from_mcmf
+from lunar.timescales import format_utc, tdb_s_from_utc_ns
+from payload_emulator.flight.navigation.dynamics import OrbitModel, flown, process_noise
+from payload_emulator.flight.navigation.outcomes import Mode, Outcome
+from payload_emulator.session.loading import LoadedPayload
+from payload_emulator.session.world import World, clock_ticks
+from tmtc.dictionary import DICTIONARY
+from tmtc.estimates import ESTIMATE_PACKETS, FilterEstimates, filter_estimates
+from tmtc.schema import Table
+from tmtc.stream import cut_packets
+from tmtc.tables import (
+    BurnTable,
+    OrientationTable,
+    no_burns,
+    unpack_burn_table,
+    unpack_gravity_table,
+    unpack_initial_state,
+    unpack_orientation_table,
+)
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_NS = 1_000_000_000
+_PACKETS = (*ESTIMATE_PACKETS, "identifications", "navigation_state", "frame_outcome", "detections")
+# Frames further apart than this belong to different arcs: the shortest gap, over a pole, takes 18 minutes.
+_ARC_GAP_NS = 600 * _NS
+# A session of several arcs is judged from the third on, a single one after this many frames.
+_SETTLED_ARC, _SETTLED_FRAMES = 2, 20
+# A pair is right if the crater truly lies within this of the detection: six pixels, or a quarter of its diameter.
+_RIGHT_PX, _RIGHT_OF_DIAMETER = 6.0, 0.25
+_LOG_DIAMETER_GATE = 0.4
+# A fix that leaves the position further off than this is wrong, whatever it was made of.
+_WRONG_FIX_M = 1_000.0
+# After a disturbance the estimate is back once it is this close, and stays so for as many frames with an image.
+_BACK_M, _BACK_FRAMES = 500.0, 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlownErrors:
+    """Errors of the filter after each frame, a row per frame of the session that the filter spoke in.
+
+    Attributes
+    ----------
+    frame
+        Number of the frame in the session.
+    state_error_rtn
+        Estimate minus truth, position (m) and velocity (m/s), shape (n, 6).
+    nees
+        Normalised estimation error squared, 6 degrees of freedom.
+    only_error_m
+        Length of the position error of propagation alone.
+    coast_end_m
+        Length of the error right before the first image after a gap; NaN elsewhere.
+    """
+
+    frame: Index
+    state_error_rtn: Float
+    nees: Float
+    only_error_m: Float
+    coast_end_m: Float
+
+    @property
+    def position_m(self) -> Float:
+        return np.asarray(np.linalg.norm(self.state_error_rtn[:, :3], axis=1), dtype=np.float64)
+
+
+def score_navigation(
+    world: World,
+    loaded: LoadedPayload,
+    catalogue: CraterCatalogue,
+    camera_from_mcmf: Float,
+    octets: bytes,
+) -> dict[str, Any]:
+    """The section `navigation` of a summary; nothing where the anchored estimator did not run.
+
+    Parameters
+    ----------
+    catalogue
+        True craters near the track.
+    camera_from_mcmf
+        True attitude at each frame, shape (n, 3, 3).
+    octets
+        All packets of the payload, end to end.
+    """
+    tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=_PACKETS)
+    estimates = filter_estimates(tables)
+    if not len(estimates):
+        return {}
+    frame_ticks = np.array([clock_ticks(world, int(utc_ns)) for utc_ns in world.frame_utc_ns])
+    outcomes, nis, matched = _outcomes(tables, frame_ticks)
+    imaging = (outcomes >= 0) & (outcomes != Outcome.no_image)
+    errors = _errors(world, loaded, estimates, frame_ticks, imaging)
+    pairs = _judged_pairs(world, catalogue, camera_from_mcmf, tables, frame_ticks)
+    arcs = _arcs(world.frame_utc_ns, imaging)
+    rows = [_arc_row(world, errors, outcomes, arc) for arc in arcs]
+    first = arcs[_SETTLED_ARC][0] if len(arcs) > _SETTLED_ARC else _SETTLED_FRAMES
+    settled = imaging[errors.frame] & (errors.frame >= first)
+    fixed = outcomes == Outcome.fixed
+    right, findable = pairs
+    wrong_share = np.divide(
+        right[:, 1], right.sum(axis=1), out=np.zeros(len(right)), where=right.sum(axis=1) > 0
+    )
+    off = np.zeros(outcomes.size, dtype=bool)
+    off[errors.frame] = errors.position_m > _WRONG_FIX_M
+    rich = imaging & (findable >= 4)
+    tracked = fixed & np.isfinite(nis)
+    coast = errors.coast_end_m[errors.frame >= first]
+    return {
+        "navigation": {
+            "counted_from": "third arc" if len(arcs) > _SETTLED_ARC else f"frame {_SETTLED_FRAMES}",
+            "arcs": len(arcs),
+            "imaging": _statistics(errors.position_m[settled]),
+            "imaging_from_start": _statistics(errors.position_m[imaging[errors.frame]]),
+            "end_of_coast": _statistics(coast[np.isfinite(coast)]),
+            "propagate_only": _statistics(errors.only_error_m[settled]),
+            "velocity_p95_m_s": _percentile(
+                np.linalg.norm(errors.state_error_rtn[settled, 3:], axis=1), 95.0
+            ),
+            "bias_rtn_m": _means(errors.state_error_rtn[settled, :3]),
+            "nees6": _means(errors.nees[settled, None])[0],
+            "nis_per_degree": _ratio(float(np.sum(nis[tracked])), float(2 * np.sum(matched[tracked]))),
+            "fixed_share_imaging": _ratio(float(np.sum(fixed & imaging)), float(np.sum(imaging))),
+            "fixed_share_four_findable": _ratio(float(np.sum(fixed & rich)), float(np.sum(rich))),
+            "frames_four_findable": int(np.sum(rich)),
+            "pairs": int(right.sum()),
+            "wrong_pairs_share": _ratio(float(right[:, 1].sum()), float(right.sum())),
+            "wrong_fixes": int(np.sum(fixed & (wrong_share > 0.5))),
+            "fixes_off_by_1_km": int(np.sum(fixed & off & (np.arange(outcomes.size) >= first))),
+            "recovery": _recovery(world, errors, imaging),
+            "per_arc": rows,
+        }
+    }
+
+
+def _first_of_each(image_ticks: Index, frame_ticks: Index) -> tuple[Index, Index]:
+    """Return the rows (n,) of frames of the session, each frame once (frames that were played back occur twice)."""
+    ticks = image_ticks.astype(np.int64)
+    at = np.minimum(np.searchsorted(frame_ticks, ticks), frame_ticks.size - 1)
+    rows = np.flatnonzero(frame_ticks[at] == ticks)
+    frames, first = np.unique(at[rows], return_index=True)
+    return rows[first], frames.astype(np.int64)
+
+
+def _outcomes(tables: dict[str, Table], frame_ticks: Index) -> tuple[Index, Float, Index]:
+    """Outcome of each frame (-1: none), and NIS and matched craters of its fix."""
+    outcome = np.full(frame_ticks.size, -1, dtype=np.int64)
+    nis, matched = np.full(frame_ticks.size, np.nan), np.zeros(frame_ticks.size, dtype=np.int64)
+    for name in ("frame_outcome", "navigation_state"):
+        mine = tables[name].columns["estimator"] == int(Mode.anchored)
+        columns = {key: values[mine] for key, values in tables[name].columns.items()}
+        at = np.minimum(np.searchsorted(frame_ticks, columns["image_ticks"]), frame_ticks.size - 1)
+        known = frame_ticks[at] == columns["image_ticks"]
+        outcome[at[known]] = columns["outcome"][known]
+        if name == "navigation_state":
+            nis[at[known]], matched[at[known]] = columns["nis"][known], columns["matched"][known]
+    return outcome, nis, matched
+
+
+def _errors(
+    world: World,
+    loaded: LoadedPayload,
+    estimates: FilterEstimates,
+    frame_ticks: Index,
+    imaging: NDArray[np.bool_],
+) -> FlownErrors:
+    which, frame = _first_of_each(estimates.image_ticks, frame_ticks)
+    own, covariance = estimates.state[which], estimates.covariance[which]
+    ticks = frame_ticks[frame]
+    orientation = unpack_orientation_table(loaded.tables.orientation)
+    burns = unpack_burn_table(loaded.tables.burns) if loaded.tables.burns else no_burns()
+    gravity = unpack_gravity_table(loaded.tables.gravity)
+    degree = gravity.c_bar.shape[0] - 1
+    model = OrbitModel(gravity, orientation, degree, process_noise(degree))
+    utc_ns = world.frame_utc_ns[frame]
+    position, velocity = world.truth.states(utc_ns)
+    truth = np.concatenate([position, velocity], axis=1)
+    rotation = world.truth.orientation.mcmf_from_icrf(np.asarray(tdb_s_from_utc_ns(utc_ns), dtype=np.float64))
+    to_truth = _turns(rotation, orientation, ticks)
+    rtn = rtn_from_inertial(truth[:, :3], truth[:, 3:])
+    error = _split(own[:, :6], truth, to_truth, rtn)
+    own_error = np.einsum("nji,nkj->nki", to_truth, _halves(_turned(own[:, :6], to_truth) - truth))
+    nees = _nees(own_error.reshape(-1, 6), covariance[:, :6, :6])
+    only = _propagated(loaded, model, burns, ticks)
+    only_error = np.linalg.norm(_split(only, truth, to_truth, rtn)[:, :3], axis=1)
+    coast_end = np.full(frame.size, np.nan)
+    for first, _ in _arcs(world.frame_utc_ns, imaging)[1:]:
+        at = int(np.searchsorted(frame, first))
+        if 0 < at < frame.size and frame[at] == first:
+            prior = flown(model, own[at - 1], int(ticks[at - 1]), int(ticks[at]), burns)
+            if prior is not None:
+                here = slice(at, at + 1)
+                coast_end[at] = np.linalg.norm(
+                    _split(prior[None, :6], truth[here], to_truth[here], rtn[here])[0, :3]
+                )
+    return FlownErrors(frame, error, nees, only_error, coast_end)
+
+
+def _turns(rotation: Float, orientation: OrientationTable, ticks: Index) -> Float:
+    """Rotations (n, 3, 3) from the payload's inertial axes to the true ones, by way of the Moon both look at."""
+    own = [orientation.at(int(tick)) for tick in ticks]
+    known = np.array([np.full((3, 3), np.nan) if matrix is None else matrix for matrix in own])
+    return np.asarray(np.einsum("nji,njk->nik", rotation, known), dtype=np.float64)
+
+
+def _halves(states: Float) -> Float:
+    """Position and velocity of states (n, 6) as (n, 2, 3)."""
+    return states.reshape(-1, 2, 3)
+
+
+def _turned(states: Float, turn: Float) -> Float:
+    return np.asarray(np.einsum("nij,nkj->nki", turn, _halves(states)).reshape(-1, 6), dtype=np.float64)
+
+
+def _split(states: Float, truth: Float, turn: Float, rtn: Float) -> Float:
+    """Errors (n, 6) of the payload's states along the axes of the true orbit."""
+    return _turned(_turned(states, turn) - truth, rtn)
+
+
+def _nees(error: Float, block: Float) -> Float:
+    """Return the normalised errors squared (n,) of position and velocity (n, 6) under covariances (n, 6, 6)."""
+    scale = np.sqrt(np.maximum(np.einsum("nii->ni", block), 1e-30))
+    whitened = error / scale
+    correlation = block / (scale[:, :, None] * scale[:, None, :])
+    solved = np.linalg.solve(correlation, whitened[..., None])[..., 0]
+    return np.asarray(np.einsum("ni,ni->n", whitened, solved), dtype=np.float64)
+
+
+def _propagated(loaded: LoadedPayload, model: OrbitModel, burns: BurnTable, ticks: Index) -> Float:
+    """States (n, 6) of the start state flown on without any image, NaN where the orbit model ends."""
+    start = unpack_initial_state(loaded.tables.initial_state)
+    state: Float | None = np.concatenate([start.position_icrf_m, start.velocity_icrf_m_s, np.zeros(3)])
+    at, states = start.ticks, np.full((ticks.size, 6), np.nan)
+    for row, tick in enumerate(ticks.tolist()):
+        state = None if state is None else flown(model, state, at, tick, burns)
+        if state is None:
+            break
+        at, states[row] = tick, state[:6]
+    return states
+
+
+def _judged_pairs(
+    world: World,
+    catalogue: CraterCatalogue,
+    camera_from_mcmf: Float,
+    tables: dict[str, Table],
+    frame_ticks: Index,
+) -> tuple[Index, Index]:
+    """Right and wrong pairs of each frame's fix, shape (n, 2), and detections that are catalogued craters (n,).
+
+    Landmarks that the payload mapped itself are in no catalogue and are not judged.
+    """
+    frames = world.frame_utc_ns.size
+    judged, findable = np.zeros((frames, 2), dtype=np.int64), np.zeros(frames, dtype=np.int64)
+    seen = tables["detections"]
+    places = np.stack([seen.items["u_px"], seen.items["v_px"], seen.items["diameter_px"]], axis=1)
+    position = world.truth.positions_mcmf(world.frame_utc_ns)
+    rim = catalogue.position_mcmf_m
+    used = tables.get("identifications")
+    used_row = (
+        {}
+        if used is None
+        else dict(zip(*_first_of_each(used.columns["image_ticks"], frame_ticks)[::-1], strict=True))
+    )
+    order = np.argsort(catalogue.ids)
+    latitude, longitude, altitude = spherical_from_mcmf(position)
+    for row, number in zip(*_first_of_each(seen.columns["image_ticks"], frame_ticks), strict=True):
+        mine = places[_rows_of(seen.item_owner, row)]
+        if not len(mine):
+            continue
+        reach = 4.0 * altitude[number] + 50_000.0
+        near = catalogue.near(float(latitude[number]), float(longitude[number]), float(reach))
+        uv, diameter = _seen(world, camera_from_mcmf[number], position[number], rim, catalogue, near)
+        away = np.linalg.norm(mine[:, None, :2] - uv[None], axis=2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            alike = np.abs(np.log(mine[:, None, 2] / diameter[None])) < _LOG_DIAMETER_GATE
+        limit = np.maximum(_RIGHT_PX, _RIGHT_OF_DIAMETER * mine[:, 2])
+        findable[number] = np.count_nonzero(np.any(alike & (away < limit[:, None]), axis=1))
+        if used is None or number not in used_row:
+            continue
+        pairs = _rows_of(used.item_owner, used_row[number])
+        named = used.items["crater_id"][pairs].astype(np.int64)
+        listed = np.isin(named, catalogue.ids)
+        detection = used.items["detection"][pairs].astype(np.int64)[listed]
+        crater = order[np.searchsorted(catalogue.ids[order], named[listed])]
+        at, _ = _seen(world, camera_from_mcmf[number], position[number], rim, catalogue, crater)
+        right = np.linalg.norm(mine[detection, :2] - at, axis=1) < limit[detection]
+        judged[number] = np.count_nonzero(right), np.count_nonzero(~right)
+    return judged, findable
+
+
+def _rows_of(owner: Index, value: int) -> slice:
+    low, high = np.searchsorted(owner, [value, value + 1])
+    return slice(int(low), int(high))
+
+
+def _seen(
+    world: World,
+    camera_from_mcmf: Float,
+    position: Float,
+    rim: Float,
+    catalogue: CraterCatalogue,
+    which: Index,
+) -> tuple[Float, Float]:
+    uv = project_mcmf(world.camera, camera_from_mcmf, position, rim[which])
+    depth = (rim[which] - position) @ camera_from_mcmf[2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return uv, catalogue.diameter_m[which] * world.camera.focal_px / np.where(depth > 0.0, depth, np.nan)
+
+
+def _arcs(utc_ns: Index, imaging: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and last frame of each stretch of images without a long gap."""
+    at = np.flatnonzero(imaging)
+    if not at.size:
+        return []
+    cuts = np.flatnonzero(np.diff(utc_ns[at]) > _ARC_GAP_NS) + 1
+    return [(int(part[0]), int(part[-1])) for part in np.split(at, cuts)]
+
+
+def _arc_row(world: World, errors: FlownErrors, outcomes: Index, arc: tuple[int, int]) -> dict[str, Any]:
+    first, last = arc
+    mine = (errors.frame >= first) & (errors.frame <= last)
+    middle = world.frame_utc_ns[(first + last) // 2]
+    _, longitude, _ = spherical_from_mcmf(world.truth.positions_mcmf(middle))
+    _, _, altitude = spherical_from_mcmf(world.truth.positions_mcmf(world.frame_utc_ns[first : last + 1]))
+    inside = outcomes[first : last + 1]
+    before = errors.coast_end_m[mine]
+    before = before[np.isfinite(before)]
+    return {
+        "start_utc": format_utc(int(world.frame_utc_ns[first]), 0),
+        "longitude_deg": round(float(np.degrees(longitude[0])) % 360.0, 2),
+        "altitude_km": round(float(altitude.mean()) / 1e3, 2),
+        "frames": int(inside.size),
+        "fixed": int(np.sum(inside == Outcome.fixed)),
+        "coast_end_m": round(float(before[0]), 1) if before.size else None,
+        **_statistics(errors.position_m[mine]),
+        "radial_bias_m": _means(errors.state_error_rtn[mine, :1])[0],
+        "propagate_only_m": _percentile(errors.only_error_m[mine], 50.0),
+    }
+
+
+def frames_to_recover(error_m: Float) -> int | None:
+    """Return which frame with an image is the first to be back (1: the first of all), None where none is.
+
+    Parameters
+    ----------
+    error_m
+        Position errors after the frames with an image since the disturbance, shape (n,).
+    """
+    close = error_m < _BACK_M
+    for first in np.flatnonzero(close).tolist():
+        if close[first : first + _BACK_FRAMES].all():
+            return first + 1
+    return None
+
+
+def _recovery(world: World, errors: FlownErrors, imaging: NDArray[np.bool_]) -> dict[str, Any] | None:
+    """How many frames with an image it took to be back after a kidnap or an outage; None without either."""
+    section = world.scenario.disturbances
+    if section.kidnap_distance_km > 0.0:
+        event = "kidnap told" if section.kidnap_told else "silent kidnap"
+        after_s = section.kidnap_at_s
+    elif section.outage_duration_s > 0.0:
+        event, after_s = "camera outage", section.outage_at_s + section.outage_duration_s
+    else:
+        return None
+    utc_ns = world.frame_utc_ns
+    since = (utc_ns[errors.frame] >= utc_ns[0] + round(after_s * _NS)) & imaging[errors.frame]
+    frames = frames_to_recover(errors.position_m[since])
+    return {"after": event, "frames_with_image": int(np.sum(since)), "frames_until_below_500_m": frames}
+
+
+def _statistics(values: Float) -> dict[str, Any]:
+    return {
+        "count": int(values.size),
+        "median_m": _percentile(values, 50.0),
+        "p95_m": _percentile(values, 95.0),
+        "max_m": _percentile(values, 100.0),
+    }
+
+
+def _percentile(values: Float, percent: float) -> float | None:
+    values = values[np.isfinite(values)]
+    return round(float(np.percentile(values, percent)), 3) if values.size else None
+
+
+def _means(values: Float) -> list[float | None]:
+    if not len(values):
+        return [None] * values.shape[1]
+    return [round(float(value), 3) for value in values.mean(axis=0)]
+
+
+def _ratio(part: float, whole: float) -> float | None:
+    return round(part / whole, 5) if whole > 0.0 else None

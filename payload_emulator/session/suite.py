@@ -1,0 +1,77 @@
+"""Small archived passes for regression tests of payload builds, emulated from the scenarios of a suite."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from lunar.datafolder import DataFolder
+from payload_emulator.errors import ScenarioError
+from payload_emulator.session.emulator import emulate
+from payload_emulator.session.scenario import SHIPPED, Scenario, load_scenario
+
+Progress = Callable[[Iterable[Any], int], Iterator[Any]]
+
+SUITE = SHIPPED / "suite"
+
+
+@dataclass(frozen=True, slots=True)
+class SuitePass:
+    """A pass of a suite as it was written."""
+
+    folder: Path
+    scenario: str
+    frames: int
+    altitude_km: tuple[float, float]
+
+
+def suite_scenarios(
+    given: Sequence[str] = (), *, frames: int | None = None, seeds: int = 1
+) -> list[Scenario]:
+    """The scenarios of a suite: those shipped, or those given, each with so many seeds.
+
+    Parameters
+    ----------
+    frames
+        Length of each pass; None keeps the scenario's own.
+    seeds
+        The scenario's own seed and those that follow it: another Moon where it is procedural, other light, other noise.
+    """
+    paths: Sequence[Path | str] = given or sorted(SUITE.glob("*.toml"))
+    if frames is not None and frames < 1:
+        raise ScenarioError(f"suite: expected at least one frame a pass, found {frames}")
+    scenarios = []
+    for path in paths:
+        scenario = load_scenario(path)
+        if frames is not None:
+            duration_s = frames * scenario.camera.frame_interval_s
+            scenario = replace(scenario, window=replace(scenario.window, duration_s=duration_s))
+        scenarios += [
+            scenario
+            if number == 0
+            else replace(scenario, seed=scenario.seed + number, name=f"{scenario.name}-{number}")
+            for number in range(seeds)
+        ]
+    return scenarios
+
+
+def write_suite(
+    scenarios: Sequence[Scenario], data: DataFolder, out: Path, *, progress: Progress | None = None
+) -> list[SuitePass]:
+    """Emulate every scenario into an archive of its own, all frames kept; an archive that is there is left alone."""
+    written = []
+    for scenario in scenarios:
+        folder = out / scenario.name
+        if not (folder / "manifest.json").is_file():
+            emulate(scenario, data, folder, frames_kept=None, progress=progress)
+        written.append(_described(folder, scenario))
+    return written
+
+
+def _described(folder: Path, scenario: Scenario) -> SuitePass:
+    summary = json.loads((folder / "summary.json").read_text())
+    altitude = summary["altitude_km"]
+    return SuitePass(folder, scenario.name, int(summary["frames"]), (altitude["min"], altitude["max"]))

@@ -1,0 +1,487 @@
+"""The simulated world of a scenario: its true flight, its terrain, its light, and what the payload's senses get."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Generator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lunar.arrays import FloatArray, IntArray
+from lunar.camera import PinholeCamera
+from lunar.catalogue import CraterCatalogue
+from lunar.constants import MOON_RADIUS_M
+from lunar.datafolder import DataFolder
+from lunar.ephemeris import Ephemeris, EphemerisSegment
+from lunar.frames import Orientation, rtn_from_inertial, spherical_from_mcmf
+from lunar.gravity import GravityField
+from lunar.lens import BrownCamera, pointed_camera_from_mcmf
+from lunar.oem import load_oem
+from lunar.propagation import ForceModel
+from lunar.third_bodies import sun_position_icrf_m
+from lunar.timescales import parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns, utc_ns_from_tdb_s
+from payload_emulator.errors import ScenarioError
+from payload_emulator.session.orbit import force_model, propagate_scenario
+from payload_emulator.session.scenario import ReferenceSection, Scenario
+from payload_emulator.sim.orbit.disturbances import TrueBurn, changed, executed, turned_state
+from payload_emulator.sim.orbit.truth import (
+    Truth,
+    attitude_message,
+    find_windows,
+    frame_times,
+    perturbed,
+    require_above_ground,
+)
+from payload_emulator.sim.render.light import sun_direction_mcmf
+from payload_emulator.sim.render.photometry import Photometry
+from payload_emulator.sim.render.renderer import render
+from payload_emulator.sim.render.sensor import Picture, take_picture
+from payload_emulator.sim.terrain.opening import open_terrain
+from payload_emulator.sim.terrain.tiles import TiledTerrain
+from tmtc.cuc import TICKS_PER_SECOND
+from tmtc.dictionary import DICTIONARY
+
+_NS = 1_000_000_000
+_EPHEMERIS_STEP_NS = 10 * _NS
+_EPHEMERIS_MARGIN_NS = 120 * _NS
+_BEFORE_JUMP_NS = 10_000
+_SEARCH_CHUNK_DAYS = 15.0
+_CATALOGUE_MARGIN_M = 15_000.0
+# What stands for an image where none is rendered.
+_REDUCED_PX = 8
+# No ground of the Moon reaches so far above the sphere of the maps: its highest point lies at 10.8 km (LOLA).
+_HIGHEST_GROUND_M = 12_000.0
+# With the Sun this far below the horizon of the sub-satellite point no ground in view is lit, mountains included.
+_NIGHT_RAD = np.radians(12.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class World:
+    """The simulated world of a scenario: what is true in it, and when the payload looks."""
+
+    scenario: Scenario
+    truth: Truth
+    terrain: TiledTerrain
+    gravity: GravityField
+    burns: tuple[TrueBurn, ...]
+    frame_utc_ns: IntArray
+    data_names: tuple[str, ...]
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """The camera as flight and ground know it."""
+        section = self.scenario.camera
+        return PinholeCamera(section.width_px, section.height_px, np.radians(section.fov_deg))
+
+    @property
+    def true_camera(self) -> PinholeCamera:
+        """The camera that takes the pictures: with the distortion of its lens, where it has some."""
+        section, ideal = self.scenario.camera, self.camera
+        distortion = (section.k1, section.k2, section.k3, section.p1, section.p2)
+        if not any(distortion):
+            return ideal
+        return BrownCamera(ideal.width_px, ideal.height_px, ideal.fov_rad, *distortion)
+
+    def camera_from_mcmf(self, position_mcmf_m: FloatArray) -> FloatArray:
+        """Rotation (3, 3) to the camera as it is meant to point from a position (3,)."""
+        section = self.scenario.camera
+        return pointed_camera_from_mcmf(
+            position_mcmf_m, np.radians(section.tilt_deg), np.radians(section.yaw_deg)
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Exposure:
+    """One frame as the payload receives it, and the truth it was taken from (which stays here).
+
+    Attributes
+    ----------
+    camera_from_mcmf
+        True attitude, shape (3, 3).
+    """
+
+    utc_ns: int
+    image: Picture
+    attitude: FloatArray
+    clock_ticks: int
+    camera_from_mcmf: FloatArray
+
+
+def build_world(scenario: Scenario, data: DataFolder) -> World:
+    """The world of a scenario, flown as far as its observation windows reach.
+
+    Raises
+    ------
+    ScenarioError
+        No window over the terrain within the days searched, or a trajectory below the ground.
+    """
+    terrain = open_terrain(scenario.terrain.source, data, scenario.seed)
+    model = force_model(scenario, data)
+    gravity = model.gravity
+    truth, burns, windows = _fly_to_windows(scenario, model, terrain)
+    interval_ns = round(scenario.camera.frame_interval_s * _NS)
+    limit_rad = np.radians(scenario.window.latitude_limit_deg)
+    frames = [frame_times(truth, start, stop, interval_ns, limit_rad) for start, stop in windows]
+    frame_utc_ns = np.concatenate(frames) if frames else np.zeros(0, dtype=np.int64)
+    frame_utc_ns = _one_arc_of(scenario.window.arc_interval, frame_utc_ns, interval_ns)
+    if frame_utc_ns.size == 0:
+        raise ScenarioError(
+            f"scenario {scenario.name}: the observation window holds no frame within "
+            f"{scenario.window.latitude_limit_deg} deg of latitude"
+        )
+    truth, burns = _disturbed(scenario, truth, burns, int(frame_utc_ns[0]), model)
+    require_above_ground(truth, frame_utc_ns, terrain.height_m, _HIGHEST_GROUND_M)
+    names = (
+        *terrain.data_names,
+        f"gravity {gravity.name} to degree {model.degree}",
+        f"orientation {model.orientation.name}",
+    )
+    return World(scenario, truth, terrain, gravity, burns, frame_utc_ns, names)
+
+
+def _one_arc_of(interval: int, frame_utc_ns: IntArray, step_ns: int) -> IntArray:
+    """The frames of one arc out of so many; an arc ends where the latitude limit interrupts the frames."""
+    arc = np.cumsum(np.diff(frame_utc_ns, prepend=frame_utc_ns[:1]) > step_ns)
+    return frame_utc_ns[arc % interval == 0]
+
+
+def _disturbed(
+    scenario: Scenario, truth: Truth, burns: tuple[TrueBurn, ...], first_utc_ns: int, model: ForceModel
+) -> tuple[Truth, tuple[TrueBurn, ...]]:
+    """The flight with the disturbances of the scenario, and all its burns."""
+    section = scenario.disturbances
+    if section.burn_delta_v_m_s != 0.0:
+        utc_ns = first_utc_ns + round(section.burn_at_s * _NS)
+        velocity = truth.states(utc_ns)[1][0]
+        done = section.burn_delta_v_m_s * velocity / np.linalg.norm(velocity)
+        burn = executed(utc_ns, done, scenario.maneuvers.execution_error_fraction, (scenario.seed, 2**36))
+        truth = changed(truth, utc_ns, lambda state: state + np.concatenate([np.zeros(3), done]), model)
+        burns = (*burns, replace(burn, declared=section.burn_declared))
+    if section.kidnap_distance_km > 0.0:
+        heading = np.random.default_rng((scenario.seed, 2**37)).uniform(0.0, 2.0 * np.pi)
+        truth = changed(
+            truth,
+            first_utc_ns + round(section.kidnap_at_s * _NS),
+            lambda state: turned_state(state, 1e3 * section.kidnap_distance_km, heading),
+            model,
+        )
+    return truth, burns
+
+
+def exposures(world: World) -> Generator[Exposure]:
+    """The frames of a world in time order, the next ones rendered while the payload works on this one.
+
+    One thread renders, as a terrain wants it; a second lets the sensor take the picture of what the first has rendered.
+    """
+    world.terrain.hand_over()
+    try:
+        with ThreadPoolExecutor(max_workers=1) as renderer, ThreadPoolExecutor(max_workers=1) as sensor:
+
+            def begin(number: int) -> Future[Exposure]:
+                scene = renderer.submit(_scene, world, number)
+                return sensor.submit(lambda: _exposed(world, scene.result()))
+
+            pending = [begin(0)]
+            for number in range(world.frame_utc_ns.size):
+                if number + 1 < world.frame_utc_ns.size:
+                    pending.append(begin(number + 1))
+                yield pending.pop(0).result()
+    finally:
+        world.terrain.hand_over()
+
+
+def orders_before(world: World, number: int) -> bytes:
+    """Telecommands that reach the payload with a frame: after a told kidnap, to trust its estimate less."""
+    section = world.scenario.disturbances
+    if not (section.kidnap_told and section.kidnap_distance_km > 0.0):
+        return b""
+    moved_utc_ns = int(world.frame_utc_ns[0]) + round(section.kidnap_at_s * _NS)
+    if int(world.frame_utc_ns[number]) < moved_utc_ns or (
+        number and int(world.frame_utc_ns[number - 1]) >= moved_utc_ns
+    ):
+        return b""
+    distance_m = 1e3 * section.kidnap_distance_km
+    return DICTIONARY.pack_command(
+        "perform_function",
+        # A jump of place on an orbit comes with one of velocity: 1e-3 rad/s times the distance.
+        {"function_id": "widen_estimate", "argument_1": distance_m, "argument_2": 1e-3 * distance_m},
+        sequence_count=0,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scene:
+    """What lies before the camera at one frame, and the draws that are still to come.
+
+    Attributes
+    ----------
+    radiance
+        None where the camera gives no picture of the ground; `picture` is what it gives instead.
+    """
+
+    utc_ns: int
+    camera_from_mcmf: FloatArray
+    camera_from_icrf: FloatArray
+    sun_mcmf: FloatArray
+    radiance: NDArray[np.float32] | None
+    picture: Picture | None
+    rng: np.random.Generator
+
+
+def expose_frame(world: World, number: int) -> Exposure:
+    """What the camera, the ADCS and the clock deliver for one frame. Every draw depends on (seed, frame) alone."""
+    return _exposed(world, _scene(world, number))
+
+
+def _scene(world: World, number: int) -> _Scene:
+    scenario = world.scenario
+    utc_ns = int(world.frame_utc_ns[number])
+    rng = np.random.default_rng((scenario.seed, number))
+    position = world.truth.positions_mcmf(utc_ns)[0]
+    tdb_s = float(tdb_s_from_utc_ns(utc_ns))
+    sun = true_sun_direction(world, position, utc_ns, rng)
+    pointing = np.radians(scenario.attitude.pointing_error_deg) * rng.standard_normal(3)
+    camera_from_mcmf = perturbed(world.camera_from_mcmf(position), pointing)
+    camera_from_icrf = camera_from_mcmf @ world.truth.orientation.mcmf_from_icrf(tdb_s)
+    radiance, picture = _seen(world, utc_ns, position, camera_from_mcmf, sun)
+    return _Scene(utc_ns, camera_from_mcmf, camera_from_icrf, sun, radiance, picture, rng)
+
+
+def _exposed(world: World, scene: _Scene) -> Exposure:
+    scenario, rng = world.scenario, scene.rng
+    image = scene.picture
+    if scene.radiance is not None:
+        image = take_picture(scene.radiance, scenario.sensor, rng)
+    assert image is not None
+    attitude = scenario.attitude
+    bias = np.radians(attitude.knowledge_bias_deg) * np.random.default_rng(
+        (scenario.seed, 2**32)
+    ).standard_normal(3)
+    noise = np.radians(attitude.knowledge_noise_deg) * rng.standard_normal(3)
+    known = perturbed(scene.camera_from_icrf, bias + noise)
+    return Exposure(
+        scene.utc_ns,
+        image,
+        attitude_message(known, known @ scene.camera_from_icrf.T @ scene.camera_from_mcmf @ scene.sun_mcmf),
+        clock_ticks(world, scene.utc_ns),
+        scene.camera_from_mcmf,
+    )
+
+
+def _seen(
+    world: World, utc_ns: int, position_mcmf_m: FloatArray, camera_from_mcmf: FloatArray, sun_mcmf: FloatArray
+) -> tuple[NDArray[np.float32] | None, Picture | None]:
+    """The light on the sensor, none of it in deep night; in an outage no light but a picture without pixels."""
+    section, camera = world.scenario.disturbances, world.true_camera
+    elapsed_s = (utc_ns - int(world.frame_utc_ns[0])) / _NS
+    if section.outage_at_s <= elapsed_s < section.outage_at_s + section.outage_duration_s:
+        return None, np.empty((0, 0, 3), dtype=np.uint8)
+    if world.scenario.camera.images == "reduced":
+        return None, np.full((_REDUCED_PX, _REDUCED_PX, 3), 128, dtype=np.uint8)
+    if position_mcmf_m @ sun_mcmf < -np.sin(_NIGHT_RAD) * np.linalg.norm(position_mcmf_m):
+        return np.zeros((camera.height_px, camera.width_px), dtype=np.float32), None
+    law = Photometry(world.scenario.light.photometry)
+    return render(world.terrain, camera, position_mcmf_m, camera_from_mcmf, sun_mcmf, law).radiance, None
+
+
+def true_sun_direction(
+    world: World, position_mcmf_m: FloatArray, utc_ns: int, rng: np.random.Generator
+) -> FloatArray:
+    """Direction to the Sun in MCMF, unit (3,): drawn near the spacecraft as in the paper, or from the ephemeris."""
+    light = world.scenario.light
+    if light.mode == "paper":
+        elevation = np.radians(rng.uniform(light.elevation_min_deg, light.elevation_max_deg))
+        azimuth = np.radians(rng.uniform(light.azimuth_min_deg, light.azimuth_max_deg))
+        latitude, longitude, _ = spherical_from_mcmf(position_mcmf_m)
+        return sun_direction_mcmf(elevation, azimuth, float(latitude), float(longitude))
+    tdb_s = float(tdb_s_from_utc_ns(utc_ns))
+    from_moon = sun_position_icrf_m(tdb_s) - world.truth.states(utc_ns)[0][0]
+    return world.truth.orientation.mcmf_from_icrf(tdb_s) @ (from_moon / np.linalg.norm(from_moon))
+
+
+def clock_ticks(world: World, utc_ns: int) -> int:
+    """The on-board clock's reading: ideal ticks, an offset, and a drift since the first frame."""
+    clock = world.scenario.clock
+    elapsed_s = (utc_ns - int(world.frame_utc_ns[0])) / _NS
+    error_s = clock.offset_s + clock.drift_ppm * 1e-6 * elapsed_s
+    return int(ticks_from_utc_ns(utc_ns)) + round(error_s * TICKS_PER_SECOND)
+
+
+def _fly_to_windows(
+    scenario: Scenario, model: ForceModel, terrain: TiledTerrain
+) -> tuple[Truth, tuple[TrueBurn, ...], list[tuple[int, int]]]:
+    """Propagate in chunks until the wanted windows are found; truth, burns on the way, windows."""
+    window = scenario.window
+    not_before = parse_utc(window.start) if window.start else scenario.epoch_utc_ns
+    if scenario.orbit.oem:
+        ephemeris = load_oem(Path(scenario.orbit.oem))
+        truth = _truth_of_ephemeris(ephemeris, model.orientation)
+        return truth, (), _windows(scenario, truth, terrain, max(not_before, truth.start_utc_ns))
+    reach_days = min(_SEARCH_CHUNK_DAYS, window.search_days)
+    if window.search == "none":
+        reach_days = (
+            (not_before - scenario.epoch_utc_ns) / _NS / 86_400.0 + window.duration_s / 86_400.0 + 0.01
+        )
+    while True:
+        truth, burns = _propagate(scenario, model, reach_days)
+        found = _windows(scenario, truth, terrain, not_before)
+        if len(found) >= (1 if window.search == "none" else window.passes):
+            return truth, burns, found
+        if reach_days >= window.search_days:
+            raise ScenarioError(
+                f"scenario {scenario.name}: window.search expected {window.passes} {window.direction} window(s) over "
+                f"{terrain.name} within {window.search_days} days, found {len(found)}"
+            )
+        reach_days = min(2.0 * reach_days, window.search_days)
+
+
+def _windows(
+    scenario: Scenario, truth: Truth, terrain: TiledTerrain, not_before_utc_ns: int
+) -> list[tuple[int, int]]:
+    window = scenario.window
+    if window.search == "none":
+        return [
+            (not_before_utc_ns, min(not_before_utc_ns + round(window.duration_s * _NS), truth.stop_utc_ns))
+        ]
+    west_deg, width_deg = window.longitude_min_deg, window.longitude_max_deg - window.longitude_min_deg
+
+    def observable(latitude_rad: FloatArray, longitude_rad: FloatArray) -> NDArray[np.bool_]:
+        return terrain.covers(latitude_rad, longitude_rad) & (
+            (np.degrees(longitude_rad) - west_deg) % 360.0 <= width_deg
+        )
+
+    return find_windows(
+        truth,
+        observable,
+        not_before_utc_ns=not_before_utc_ns,
+        latitude_limit_rad=np.radians(window.latitude_limit_deg),
+        direction=window.direction,
+        half_fov_rad=np.radians(scenario.camera.fov_deg) / 2.0,
+        count=window.passes,
+    )
+
+
+def _propagate(scenario: Scenario, model: ForceModel, days: float) -> tuple[Truth, tuple[TrueBurn, ...]]:
+    duration_s = days * 86_400.0
+    orbit = propagate_scenario(scenario, model, duration_s)
+    stop_utc_ns = scenario.epoch_utc_ns + round(duration_s * _NS)
+    share, seed = scenario.maneuvers.execution_error_fraction, (scenario.seed, 2**36)
+    burns = tuple(executed(burn.utc_ns, burn.delta_v_icrf_m_s, share, seed) for burn in orbit.maneuvers)
+    return (
+        Truth(
+            orbit.trajectory.state,
+            scenario.epoch_utc_ns,
+            stop_utc_ns,
+            model.orientation,
+            tuple(burn.utc_ns for burn in burns),
+        ),
+        burns,
+    )
+
+
+def _truth_of_ephemeris(ephemeris: Ephemeris, orientation: Orientation) -> Truth:
+    def state(tdb_s: FloatArray) -> FloatArray:
+        position, velocity = ephemeris.at(utc_ns_from_tdb_s(tdb_s))
+        return np.concatenate([position, velocity], axis=1)
+
+    return Truth(state, ephemeris.start_utc_ns, ephemeris.stop_utc_ns, orientation)
+
+
+def sample_truth(truth: Truth, frame_utc_ns: IntArray) -> Ephemeris:
+    """The true trajectory over the frames and a margin: a state each ten seconds, a segment between jumps."""
+    start = max(int(frame_utc_ns[0]) - _EPHEMERIS_MARGIN_NS, truth.start_utc_ns)
+    stop = min(int(frame_utc_ns[-1]) + _EPHEMERIS_MARGIN_NS, truth.stop_utc_ns)
+    grid = np.append(np.arange(start, stop, _EPHEMERIS_STEP_NS, dtype=np.int64), stop)
+    edges = [start, *(utc_ns for utc_ns in sorted(truth.breaks_utc_ns) if start < utc_ns < stop), stop]
+    segments = []
+    for first, last in itertools.pairwise(edges):
+        times = np.unique(np.concatenate([[first], grid[(grid > first) & (grid < last)], [last]]))
+        # The state at a jump is that after it; a segment that ends there takes the one before.
+        asked = times.copy()
+        asked[-1] -= _BEFORE_JUMP_NS if last != stop else 0
+        position, velocity = truth.states(asked)
+        position += velocity * ((times - asked) / _NS)[:, None]
+        segments.append(
+            EphemerisSegment(
+                times,
+                position,
+                velocity,
+                object_name="SELENITA",
+                object_id="SELENITA",
+                degree=min(7, 2 * times.size - 1),
+            )
+        )
+    return Ephemeris(tuple(segments))
+
+
+def with_reference_error(ephemeris: Ephemeris, section: ReferenceSection, seed: int) -> Ephemeris:
+    """Return the ephemeris with simulated orbit determination errors.
+
+    The errors follow the Clohessy-Wiltshire solution of equal period about a circular orbit: with the angle u since the
+    start, x = a cos u + b sin u, y = c - 2 a sin u + 2 b cos u, z = d cos u + e sin u (radial, transverse, normal), all
+    coefficients drawn once. Velocities are the derivatives of the displaced positions.
+
+    References
+    ----------
+    Clohessy, Wiltshire (1960), Terminal guidance system for satellite rendezvous, equations 9.
+    """
+    if not any(section.sigma_rtn_m):
+        return ephemeris
+    draw = np.random.default_rng((seed, 2**33)).standard_normal(8)
+    offset = section.position_error_m * draw[:3]
+    a, b = section.radial_m * draw[3:5]
+    c = np.sqrt(section.transverse_m**2 - 4.0 * section.radial_m**2) * draw[5]
+    d, e = section.normal_m * draw[6:8]
+    first = ephemeris.segments[0]
+    radius = float(np.linalg.norm(first.position_m[0]))
+    rate = float(np.linalg.norm(np.cross(first.position_m[0], first.velocity_m_s[0]))) / radius**2
+
+    def displaced(segment: EphemerisSegment) -> EphemerisSegment:
+        u = rate * (segment.utc_ns - ephemeris.start_utc_ns) / _NS
+        cosine, sine = np.cos(u), np.sin(u)
+        x, y = a * cosine + b * sine, c - 2.0 * a * sine + 2.0 * b * cosine
+        z = d * cosine + e * sine
+        error = np.stack([x, y, z], axis=1) + offset
+        # The axes rotate with the orbit: derivative in these axes plus the rotation of the displacement about the
+        # normal.
+        slope = rate * np.stack(
+            [-a * sine + b * cosine, -2.0 * a * cosine - 2.0 * b * sine, -d * sine + e * cosine], axis=1
+        )
+        slope += rate * np.stack([-error[:, 1], error[:, 0], np.zeros_like(u)], axis=1)
+        rtn_from_icrf = rtn_from_inertial(segment.position_m, segment.velocity_m_s)
+        return replace(
+            segment,
+            position_m=segment.position_m + np.einsum("nji,nj->ni", rtn_from_icrf, error),
+            velocity_m_s=segment.velocity_m_s + np.einsum("nji,nj->ni", rtn_from_icrf, slope),
+        )
+
+    return Ephemeris(tuple(displaced(segment) for segment in ephemeris.segments))
+
+
+def catalogue_near_track(world: World) -> CraterCatalogue:
+    """The craters of 3 to 30 km that any frame could see, with the heights of their rims."""
+    positions = world.truth.positions_mcmf(world.frame_utc_ns)
+    latitude, longitude, altitude = spherical_from_mcmf(positions)
+    half_diagonal = np.sqrt(2.0) * np.tan(np.radians(world.scenario.camera.fov_deg) / 2.0)
+    near = [
+        world.terrain.catalogue.near(
+            float(latitude[i]),
+            float(longitude[i]),
+            float(min(half_diagonal * altitude[i], 0.1 * MOON_RADIUS_M)) + _CATALOGUE_MARGIN_M,
+        )
+        for i in range(latitude.size)
+    ]
+    chosen = np.unique(np.concatenate(near))
+    diameter_m = world.terrain.catalogue.diameter_m[chosen]
+    navigation = world.scenario.navigation
+    useful = (diameter_m >= 1e3 * navigation.catalogue_min_diameter_km) & (
+        diameter_m <= 1e3 * navigation.catalogue_max_diameter_km
+    )
+    if world.scenario.camera.images == "reduced" and "anchored" not in navigation.estimators:
+        # Nobody asks for the heights of rims: measuring them means making the ground of the whole track.
+        return world.terrain.catalogue.select(chosen[useful])
+    return world.terrain.measured(chosen[useful])

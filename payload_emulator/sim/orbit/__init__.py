@@ -1,0 +1,1 @@
+"""The true orbit and attitude, and what disturbs them."""

@@ -1,0 +1,1 @@
+"""Renderers and camera: illumination, photometry, lens, sensor, labels."""

@@ -1,0 +1,111 @@
+"""How far labels lie from the rims that rays find: the measure of whether labels sit where craters are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lunar.camera import PinholeCamera, project_mcmf
+from lunar.constants import MOON_RADIUS_M
+from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
+from payload_emulator.sim.render.labels import label_frame
+from payload_emulator.sim.render.raymarch import cast
+from payload_emulator.sim.terrain.tiles import Terrain
+
+Floats = npt.NDArray[np.float64]
+
+AZIMUTHS = 48
+ROUNDS = 8
+FOUND_M = 10.0
+"""A ray has found a rim point when it meets the ground this close to it: a tenth of a pixel at the least altitude."""
+
+LEAST_FOUND = 0.9
+"""Share of a rim that must be in sight: the mean over a part of it would say little of the centre."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RimErrors:
+    """Of the craters of one picture, arrays (n): those whole in the picture with their rims in sight.
+
+    Attributes
+    ----------
+    index
+        Row in the terrain's catalogue.
+    offset_u_px, offset_v_px
+        Middle of the rim that rays find, less the label's place.
+    scatter_px
+        Rms of the rim's single points about the label's ellipse, its middle set right: rims are uneven.
+    """
+
+    index: npt.NDArray[np.int64]
+    offset_u_px: Floats
+    offset_v_px: Floats
+    scatter_px: Floats
+
+
+def rim_errors(
+    terrain: Terrain,
+    camera: PinholeCamera,
+    position_mcmf_m: npt.ArrayLike,
+    camera_from_mcmf: npt.ArrayLike,
+    minimum_diameter_m: float = 5_000.0,
+) -> RimErrors:
+    """Labels of a picture against rims found by casting rays onto the terrain.
+
+    The rim at an azimuth is the ground that lies a radius from the centre there, whatever its height.  A ray is turned
+    until it meets just that ground; where nearer ground is in the way it never does.
+    """
+    position = np.asarray(position_mcmf_m, dtype=np.float64)
+    rotation = np.asarray(camera_from_mcmf, dtype=np.float64)
+    labels = label_frame(terrain, camera, position, rotation, minimum_diameter_m)
+    craters = terrain.measured(labels.index)
+    chosen = np.flatnonzero(
+        labels.inside & (labels.visible_fraction == 1.0) & np.isfinite(craters.rim_height_m)
+    )
+    index, craters = labels.index[chosen], craters.select(chosen)
+    if not index.size:
+        empty = np.empty(0)
+        return RimErrors(index, empty, empty, empty)
+    latitude, longitude = _circle(craters.latitude_rad, craters.longitude_rad, craters.diameter_m)
+    azimuth = _azimuths()
+    level = np.broadcast_to(craters.rim_height_m[:, None], latitude.shape)
+    tilted = level + terrain.rim_tilts_m(index) @ np.stack([np.cos(azimuth), np.sin(azimuth)])
+    centre = project_mcmf(camera, rotation, position, craters.position_mcmf_m)
+    expected = project_mcmf(camera, rotation, position, mcmf_from_spherical(latitude, longitude, tilted))
+    circle = project_mcmf(camera, rotation, position, mcmf_from_spherical(latitude, longitude, level))
+    # What a rim of one height would show as its middle is the projected centre: perspective moves both alike.
+    middle = centre + (expected - circle).mean(axis=1)
+    place = np.stack([labels.u_px[chosen], labels.v_px[chosen]], axis=-1)
+    uv = expected
+    for _ in range(ROUNDS):
+        hit = cast(terrain, camera, position, rotation, uv.reshape(-1, 2)).reshape(*latitude.shape, 3)
+        height = spherical_from_mcmf(hit)[2]
+        rim = mcmf_from_spherical(latitude, longitude, height)
+        miss = np.linalg.norm(hit - rim, axis=-1)
+        uv = np.where((miss > FOUND_M)[..., None], project_mcmf(camera, rotation, position, rim), uv)
+    found = miss <= FOUND_M
+    difference = np.where(found[..., None], uv - expected, 0.0)
+    count = found.sum(axis=1)
+    good = count >= LEAST_FOUND * AZIMUTHS
+    mean = difference[good].sum(axis=1) / count[good][:, None]
+    offset = middle[good] + mean - place[good]
+    about = np.where(found[good][..., None], difference[good] - mean[:, None], 0.0)
+    scatter = np.sqrt((about**2).sum(axis=(1, 2)) / count[good])
+    return RimErrors(index[good], offset[:, 0], offset[:, 1], scatter)
+
+
+def _circle(latitude: Floats, longitude: Floats, diameter_m: Floats) -> tuple[Floats, Floats]:
+    """Places (n, 48) on the rims."""
+    radius = (0.5 * diameter_m / MOON_RADIUS_M)[:, None]
+    azimuth = _azimuths()
+    sine0, cosine0 = np.sin(latitude)[:, None], np.cos(latitude)[:, None]
+    sine = sine0 * np.cos(radius) + cosine0 * np.sin(radius) * np.cos(azimuth)
+    east = np.sin(azimuth) * np.sin(radius) * cosine0
+    return np.arcsin(sine), longitude[:, None] + np.arctan2(east, np.cos(radius) - sine0 * sine)
+
+
+def _azimuths() -> Floats:
+    return np.asarray(np.arange(AZIMUTHS) * (2.0 * math.pi / AZIMUTHS))

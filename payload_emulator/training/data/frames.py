@@ -1,0 +1,263 @@
+"""One frame of a data set: picture, labels of what is in it, metadata."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lunar.camera import PinholeCamera, ground_point_sphere, nadir_camera_from_mcmf
+from lunar.constants import MOON_RADIUS_M
+from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
+from lunar.timescales import format_utc
+from payload_emulator.errors import DatasetError
+from payload_emulator.session.recipe import Source
+from payload_emulator.training.data.shots import Pose, draw_photometry, draw_sensor, draw_sun
+
+Floats = NDArray[np.float64]
+
+_LABEL_MINIMUM_M = 2_000.0
+_LABEL_MINIMUM_PX = 5.0
+_STAMPED_MINIMUM_PX = 9.0
+_BLOCK_DEG = 8.0
+_TRIES_OF_LIGHT = 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shot:
+    """A finished frame: gray image (H, W) of 8 or 16 bits, frame values, crater columns, pose, direction of the Sun."""
+
+    image: NDArray[Any]
+    row: dict[str, float]
+    craters: dict[str, NDArray[Any]]
+    pose: Pose
+    sun_mcmf: Floats
+
+
+def find_renderer(name: str, blender_python: str = sys.executable) -> Callable[..., Any]:
+    """The renderer of a name, called as `sim.renderer.render`; `blender_python` is the interpreter that has Blender."""
+    if name == "fast":
+        from payload_emulator.sim.render.renderer import render
+
+        return render
+    if name == "raymarch":
+        from payload_emulator.sim.render import raymarch
+
+        return raymarch.render
+    if name == "cycles":
+        from payload_emulator.sim.render import cycles
+
+        return partial(cycles.render, python=blender_python)
+    raise DatasetError(f"renderer: expected one of fast, raymarch, cycles, found {name!r}")
+
+
+def take_frame(
+    terrain: Any,
+    camera: PinholeCamera,
+    source: Source,
+    pose_of: Callable[[np.random.Generator], Pose],
+    number: int,
+    bits: int,
+    render: Callable[..., Any],
+    rng: np.random.Generator,
+) -> Shot:
+    """A frame whose picture is usable; pose, light, surface and sensor are drawn again where it is not."""
+    from payload_emulator.flight.vision.preprocess import ImageQuality, prepare_image
+    from payload_emulator.sim.render.light import sun_direction_mcmf
+
+    for _ in range(_TRIES_OF_LIGHT):
+        pose = pose_of(rng)
+        elevation, azimuth = draw_sun(source.light, rng)
+        sun = sun_direction_mcmf(elevation, azimuth, pose.latitude_rad, pose.longitude_rad)
+        rendering = render(
+            terrain,
+            camera,
+            pose.position_mcmf_m,
+            pose.camera_from_mcmf,
+            sun,
+            draw_photometry(source.vary, rng),
+        )
+        image, coarse = _exposed(rendering.radiance, draw_sensor(source.vary, rng), bits, rng)
+        if prepare_image(coarse).quality is ImageQuality.OK:
+            break
+    position, rotation = pose.position_mcmf_m, pose.camera_from_mcmf
+    craters = _label(terrain, camera, position, rotation, rendering)
+    small = stamped_craters(terrain, camera, position, rotation, coarse)
+    craters = {key: np.concatenate([craters[key], small[key]]) for key in craters}
+    latitude_deg, longitude_deg = math.degrees(pose.latitude_rad), math.degrees(pose.longitude_rad) % 360.0
+    row = {
+        "number": number,
+        "latitude_deg": latitude_deg,
+        "longitude_deg": longitude_deg,
+        "altitude_m": pose.altitude_m,
+        "ground_m": pose.ground_m,
+        "sun_elevation_deg": math.degrees(elevation),
+        "sun_azimuth_deg": math.degrees(azimuth),
+        "block": int((latitude_deg + 90.0) // _BLOCK_DEG) * 100 + int(longitude_deg // _BLOCK_DEG),
+    }
+    return Shot(image, row, craters, pose, sun)
+
+
+def describe(
+    camera: PinholeCamera,
+    shot: Shot,
+    source: Source,
+    split: str,
+    terrain: Any,
+    utc_ns: int | None = None,
+) -> dict[str, Any]:
+    """Metadata of a frame for its JSON file; angles in degrees."""
+    pose, row = shot.pose, shot.row
+    position, rotation = pose.position_mcmf_m, pose.camera_from_mcmf
+    corners = ground_point_sphere(camera, rotation, position, camera.corners_px())
+    latitude, longitude, _ = spherical_from_mcmf(corners)
+    relative = rotation @ np.asarray(nadir_camera_from_mcmf(position)).T
+    document: dict[str, Any] = {
+        "frame": int(row["number"]),
+        "source": source.name,
+        "split": split,
+        "terrain": terrain.name,
+        "data": list(terrain.data_names),
+        "latitude_deg": row["latitude_deg"],
+        "longitude_deg": row["longitude_deg"],
+        "altitude_km": row["altitude_m"] / 1000.0,
+        "mean_ground_m": row["ground_m"],
+        "tilt_deg": math.degrees(math.acos(min(1.0, float(relative[2, 2])))),
+        "azimuth_deg": math.degrees(math.atan2(float(relative[1, 0]), float(relative[0, 0]))),
+        "sun_elevation_deg": row["sun_elevation_deg"],
+        "sun_azimuth_deg": row["sun_azimuth_deg"],
+        "sun_camera": [float(value) for value in rotation @ shot.sun_mcmf],
+        "sun_mcmf": [float(value) for value in shot.sun_mcmf],
+        "corners_deg": [
+            {"latitude": float(a), "longitude": float(o) % 360.0}
+            for a, o in zip(np.degrees(latitude), np.degrees(longitude), strict=True)
+        ],
+        "position_mcmf_m": [float(value) for value in position],
+        "camera_from_mcmf": [[float(value) for value in line] for line in rotation],
+    }
+    return document if utc_ns is None else document | {"epoch": format_utc(utc_ns)}
+
+
+def _exposed(
+    radiance: NDArray[np.float32], sensor: Any, bits: int, rng: np.random.Generator
+) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+    """Mean of the colour channels (H, W) in the depth wanted, and in 8 bits."""
+    from payload_emulator.flight.vision.preprocess import gray_levels
+    from payload_emulator.sim.render.sensor import expose, expose_deep
+
+    if bits == 8:
+        image = gray_levels(expose(radiance, sensor, rng))
+        return image, image
+    red, green, blue = np.moveaxis(expose_deep(radiance, replace(sensor, bits=bits), rng), -1, 0)
+    total = red.astype(np.uint32) + green + blue  # a sum along an axis of three is ten times slower
+    deep = ((total + 1) // 3).astype(np.uint16)
+    return deep, (deep >> 8).astype(np.uint8)
+
+
+def _label(
+    terrain: Any, camera: PinholeCamera, position: Floats, rotation: Floats, rendering: Any
+) -> dict[str, NDArray[Any]]:
+    """Catalogued craters in view with what scoring and training need to know of each."""
+    from payload_emulator.sim.render.labels import label_frame
+
+    labels = label_frame(terrain, camera, position, rotation, _LABEL_MINIMUM_M, rendering.lit)
+    measured = terrain.measured(labels.index)
+    points = (measured.position_mcmf_m - position) @ rotation.T
+    diameter_px = camera.focal_px * measured.diameter_m / points[:, 2]
+    chosen = np.flatnonzero((diameter_px >= _LABEL_MINIMUM_PX) & measured.complete)
+    near = measured.select(chosen)
+    u, v = labels.u_px[chosen], labels.v_px[chosen]
+    distance = np.linalg.norm(points[chosen], axis=1)
+    row = np.clip(np.rint(v).astype(int), 0, camera.height_px - 1)
+    column = np.clip(np.rint(u).astype(int), 0, camera.width_px - 1)
+    seen = rendering.range_m[row, column]
+    hidden = np.isnan(seen) | (seen < 0.9 * distance)
+    return {
+        "id": near.ids.astype(np.int64),
+        "u_px": u.astype(np.float32),
+        "v_px": v.astype(np.float32),
+        "diameter_px": diameter_px[chosen].astype(np.float32),
+        "diameter_m": near.diameter_m.astype(np.float32),
+        "depth_ratio": (near.depth_m / near.diameter_m).astype(np.float32),
+        "lit": np.nan_to_num(labels.lit_fraction[chosen]).astype(np.float32),
+        "hidden": hidden.astype(np.uint8),
+        "latitude_deg": np.degrees(near.latitude_rad),
+        "longitude_deg": np.degrees(near.longitude_rad) % 360.0,
+        "major_px": labels.major_px[chosen].astype(np.float32),
+        "minor_px": labels.minor_px[chosen].astype(np.float32),
+        "angle_rad": labels.angle_rad[chosen].astype(np.float32),
+        "visible": labels.visible_fraction[chosen].astype(np.float32),
+    }
+
+
+def stamped_craters(
+    terrain: Any, camera: PinholeCamera, position: Floats, rotation: Floats, image: NDArray[np.uint8]
+) -> dict[str, NDArray[Any]]:
+    """Craters below the catalogue's limit that the terrain draws from its seed, where they are large in the image.
+
+    Their ids are negative: they teach what a crater looks like at any scale (from 12 km one of 1.5 km is 18 px wide),
+    and are no part of scoring. No shadow picture is kept for them, so "lit" is judged on the image.
+    """
+    latitude, longitude, altitude_m = (float(value) for value in spherical_from_mcmf(position))
+    reach = (altitude_m + 4_000.0) * math.tan(camera.fov_rad / 2.0) * 1.1 / MOON_RADIUS_M
+    wide = reach / max(math.cos(latitude), 0.2)
+    shapes = terrain.small_craters(
+        np.array([latitude - reach, latitude + reach]), np.array([longitude - wide, longitude + wide])
+    )
+    diameter_m = 2.0 * shapes.radius_rad * MOON_RADIUS_M
+    flat = mcmf_from_spherical(shapes.latitude_rad, shapes.longitude_rad, 0.0) - position
+    rough = np.asarray(flat) @ rotation.T
+    uv = camera.project(rough)
+    with np.errstate(invalid="ignore"):
+        large = camera.focal_px * diameter_m / rough[:, 2] >= 0.75 * _STAMPED_MINIMUM_PX
+        chosen = np.flatnonzero(large & camera.contains(uv, -40.0))
+    place_latitude, place_longitude = shapes.latitude_rad[chosen], shapes.longitude_rad[chosen]
+    azimuth = np.arange(8) * (math.pi / 4.0)
+    arc = shapes.radius_rad[chosen][:, None]
+    rim_latitude = place_latitude[:, None] + arc * np.cos(azimuth)
+    rim_longitude = place_longitude[:, None] + arc * np.sin(azimuth) / np.cos(place_latitude)[:, None]
+    level = terrain.level_for(altitude_m / camera.focal_px)
+    height = terrain.height_m(rim_latitude, rim_longitude, level).mean(axis=1) if chosen.size else np.zeros(0)
+    points = (
+        np.asarray(mcmf_from_spherical(place_latitude, place_longitude, height)) - position
+    ) @ rotation.T
+    uv = camera.project(points)
+    diameter_px = camera.focal_px * diameter_m[chosen] / points[:, 2]
+    keep = np.flatnonzero((diameter_px >= _STAMPED_MINIMUM_PX) & camera.contains(uv))
+    chosen, uv, diameter_px = chosen[keep], uv[keep], diameter_px[keep]
+    return {
+        "id": -1 - np.arange(chosen.size, dtype=np.int64),
+        "u_px": uv[:, 0].astype(np.float32),
+        "v_px": uv[:, 1].astype(np.float32),
+        "diameter_px": diameter_px.astype(np.float32),
+        "diameter_m": diameter_m[chosen].astype(np.float32),
+        "depth_ratio": (shapes.depth_m[chosen] / diameter_m[chosen]).astype(np.float32),
+        "lit": _bright_share(image, uv, diameter_px).astype(np.float32),
+        "hidden": np.zeros(chosen.size, np.uint8),
+        "latitude_deg": np.degrees(shapes.latitude_rad[chosen]),
+        "longitude_deg": np.degrees(shapes.longitude_rad[chosen]) % 360.0,
+        "major_px": diameter_px.astype(np.float32),
+        "minor_px": diameter_px.astype(np.float32),
+        "angle_rad": np.zeros(chosen.size, np.float32),
+        "visible": np.ones(chosen.size, np.float32),
+    }
+
+
+def _bright_share(image: NDArray[np.uint8], uv: Floats, diameter_px: Floats) -> Floats:
+    """Share of 16 points around each centre that are brighter than a third of the frame's median bright pixel."""
+    bright = image[image > 8]
+    level = float(np.median(bright)) / 3.0 if bright.size else 255.0
+    radius = np.repeat([0.6, 1.25], 8)
+    angle = np.tile(np.arange(8) * (math.pi / 4.0), 2)
+    u = uv[:, :1] + 0.5 * diameter_px[:, None] * radius * np.cos(angle)
+    v = uv[:, 1:] + 0.5 * diameter_px[:, None] * radius * np.sin(angle)
+    rows = np.clip(np.rint(v).astype(int), 0, image.shape[0] - 1)
+    columns = np.clip(np.rint(u).astype(int), 0, image.shape[1] - 1)
+    share: Floats = (image[rows, columns] > level).mean(axis=1) if uv.shape[0] else np.zeros(0)
+    return share

@@ -1,0 +1,103 @@
+"""Whether a data set on disk is whole: every file there, unchanged and readable."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from payload_emulator.errors import DatasetError
+from payload_emulator.training.data.dataset import ShardLabels, load_shard, read_gray
+from payload_emulator.training.data.finishing import index_digest
+
+
+def check(folder: Path) -> list[str]:
+    """What is wrong with a data set: missing or damaged files, one line each; empty when it is whole.
+
+    Files are compared with the hashes taken when they were written; data sets made before those of images and metadata
+    were kept are checked for readable files.
+
+    Raises
+    ------
+    DatasetError
+        There is no data set, or an unfinished one.
+    """
+    try:
+        index: dict[str, Any] = json.loads((folder / "dataset.json").read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        found = "an unfinished one" if (folder / "recipe.json").is_file() else "none"
+        raise DatasetError(f"{folder}: expected a data set (dataset.json), found {found}") from None
+    except (OSError, ValueError) as error:
+        return [
+            f"{folder / 'dataset.json'}: expected a JSON object, found: {error}; build again to make it anew"
+        ]
+    return list(_problems(folder, index))
+
+
+def _problems(folder: Path, index: dict[str, Any]) -> Iterator[str]:
+    if "sha256" in index and index["sha256"] != index_digest(index):
+        yield f"{folder / 'dataset.json'}: expected content of SHA-256 {index['sha256']}, found other; build again"
+    for name, expected in sorted(index.get("files", {}).items()):
+        yield from _against(folder / name, expected, "build again to make it anew")
+    frames = 0
+    for name, expected in sorted(index["shards"].items()):
+        path = folder / "shards" / f"{name}.npz"
+        damage = list(_against(path, expected, "delete it and build again to make its frames anew"))
+        yield from damage
+        if damage and not path.is_file():
+            continue
+        try:
+            labels = load_shard(path)
+        except DatasetError as error:
+            if not damage:
+                yield str(error)
+            continue
+        frames += labels.first.size - 1
+        yield from _frames(folder, index, name, labels)
+    if frames != index["frames"] and not any(
+        not (folder / "shards" / f"{name}.npz").is_file() for name in index["shards"]
+    ):
+        yield f"{folder}: expected {index['frames']} frames, found the labels of {frames}"
+
+
+def _frames(folder: Path, index: dict[str, Any], shard: str, labels: ShardLabels) -> Iterator[str]:
+    cure = f"delete shards/{shard}.npz and build again to make it anew"
+    size = int(index["camera"]["height_px"]), int(index["camera"]["width_px"])
+    for k, number in enumerate(labels.frames["number"].astype(int)):
+        image = folder / "images" / f"{number:06d}.png"
+        metadata = folder / "metadata" / f"{number:06d}.json"
+        if labels.image_sha256:
+            yield from _against(image, labels.image_sha256[k], cure)
+        else:
+            yield from _picture(image, size)
+        if labels.metadata_sha256:
+            yield from _against(metadata, labels.metadata_sha256[k], cure)
+        elif not metadata.is_file():
+            yield f"{metadata}: expected frame metadata, found no file"
+
+
+def _against(path: Path, expected: str, cure: str) -> Iterator[str]:
+    try:
+        found = hashlib.sha256(path.read_bytes()).hexdigest()
+    except FileNotFoundError:
+        yield f"{path}: expected a file of SHA-256 {expected}, found none; {cure}"
+        return
+    except OSError as error:
+        yield f"{path}: {error.strerror}"
+        return
+    if found != expected:
+        yield f"{path}: expected SHA-256 {expected}, found {found}; {cure}"
+
+
+def _picture(path: Path, size: tuple[int, int]) -> Iterator[str]:
+    try:
+        image = read_gray(path)
+    except DatasetError as error:
+        yield str(error)
+        return
+    if image.shape != size:
+        yield (
+            f"{path}: expected {size[1]} x {size[0]} pixels, found {image.shape[1]} x {image.shape[0]} pixels"
+        )

@@ -1,0 +1,1 @@
+"""Scores of detectors: matching, metrics, intervals, reports."""

@@ -1,0 +1,205 @@
+"""Where detections lie beside the craters: signed errors by Sun and by place in the image, and beside measured rims.
+
+Errors are detection minus crater in pixels, u right and v down. Beside the image's axes they are given toward the Sun
+in the image and across it (to the right of who looks toward the Sun): shadows would draw a detector along the first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from payload_emulator.training.data.dataset import Dataset, Frame, frame_truth
+from payload_emulator.training.data.refits import RefittedRims, refitted_frame
+from payload_emulator.training.data.truth import FrameTruth
+from payload_emulator.training.evaluate.scoring import FrameDetections, Tally, tally
+
+Floats = NDArray[np.float64]
+
+FEWEST_PAIRS = 20
+"""A mean error of fewer craters says nothing to a quarter of a pixel: one of them may be two pixels off."""
+
+_BIAS_CELLS = 4  # per side of the bias map: finer cells hold too few craters for a tenth of a pixel
+_ROUNDS = 400
+
+
+def right(tallied: Tally, threshold: float) -> NDArray[np.bool_]:
+    """Which detections are right at a threshold."""
+    chosen: NDArray[np.bool_] = (tallied.score >= threshold) & (tallied.outcome == 1)
+    return chosen
+
+
+def middle(truths: Sequence[FrameTruth]) -> tuple[float, float]:
+    """The middle of the image, u and v."""
+    return 0.5 * (truths[0].width_px - 1), 0.5 * (truths[0].height_px - 1)
+
+
+def bias_by_octant(tallied: Tally, threshold: float, truths: Sequence[FrameTruth]) -> list[dict[str, Any]]:
+    """Mean signed error of right detections by octant of the Sun's azimuth in the image, clockwise from its top.
+
+    `interval_95` of each component comes from resampling frames, whose craters share a pose and its errors.
+    """
+    found = right(tallied, threshold)
+    azimuth = np.array([truth.sun_azimuth_image_rad for truth in truths])
+    return [
+        {
+            "octant": octant,
+            "sun_azimuth_image_deg": [45 * octant, 45 * (octant + 1)],
+            **_bias(tallied, found & (tallied.detection_octant == octant), azimuth),
+        }
+        for octant in range(8)
+    ]
+
+
+def bias_overall(
+    tallied: Tally, threshold: float, truths: Sequence[FrameTruth], by_octant: Sequence[dict[str, Any]]
+) -> dict[str, Any]:
+    """Mean signed error whatever the Sun, and the longest of the octants' with its number and its noise.
+
+    `worst_octant_noise_px` is how long the mean of as many unbiased pairs would be, rms: a length cannot be negative,
+    so it is never zero. Octants of fewer than `FEWEST_PAIRS` pairs are passed over.
+    """
+    azimuth = np.array([truth.sun_azimuth_image_rad for truth in truths])
+    every = _bias(tallied, right(tallied, threshold), azimuth)
+    told = [row for row in by_octant if row["pairs"] >= FEWEST_PAIRS]
+    worst = max(told, key=lambda row: float(row["length_px"]), default=None)
+    return {
+        **every,
+        "worst_octant": None if worst is None else worst["octant"],
+        "worst_octant_px": float("nan") if worst is None else worst["length_px"],
+        "worst_octant_noise_px": float("nan") if worst is None else worst["noise_px"],
+    }
+
+
+def _bias(tallied: Tally, chosen: NDArray[np.bool_], sun_azimuth_rad: Floats) -> dict[str, Any]:
+    """Mean errors of chosen detections along the axes of the image and of the Sun, each with a 95 % interval."""
+    names = ("du_px", "dv_px", "toward_sun_px", "across_sun_px")
+    count = int(chosen.sum())
+    nan = float("nan")
+    if not count:
+        empty: dict[str, Any] = dict.fromkeys(names, nan)
+        return {
+            "pairs": 0,
+            **empty,
+            "length_px": nan,
+            "noise_px": nan,
+            "standard_error_px": nan,
+            "median_length_px": nan,
+            "interval_95": {name: [nan, nan] for name in names},
+        }
+    frame = tallied.detection_frame[chosen].astype(int)
+    sine, cosine = np.sin(sun_azimuth_rad[frame]), np.cos(sun_azimuth_rad[frame])
+    u, v = tallied.error_u[chosen], tallied.error_v[chosen]
+    errors = np.stack([u, v, u * sine - v * cosine, u * cosine + v * sine], axis=1)
+    drawn = _resampled_means(errors, frame)
+    low, high = np.percentile(drawn, (2.5, 97.5), axis=0)
+    mean = errors.mean(axis=0)
+    return {
+        "pairs": count,
+        **{name: float(value) for name, value in zip(names, mean, strict=True)},
+        "length_px": float(np.hypot(mean[0], mean[1])),
+        "noise_px": float(np.sqrt(drawn[:, 0].var() + drawn[:, 1].var())),
+        "standard_error_px": float(np.std(u) / np.sqrt(count)),
+        "median_length_px": float(np.hypot(np.median(u), np.median(v))),
+        "interval_95": {name: [float(a), float(b)] for name, a, b in zip(names, low, high, strict=True)},
+    }
+
+
+def _resampled_means(errors: Floats, frame: NDArray[np.int64]) -> Floats:
+    """Means (rounds, k) of errors (n, k) over resampled frames."""
+    _, place = np.unique(frame, return_inverse=True)
+    count = np.bincount(place).astype(float)
+    sums = np.stack([np.bincount(place, weights=column) for column in errors.T], axis=1)
+    drawn = np.random.default_rng(0).integers(0, count.size, (_ROUNDS, count.size))
+    means: Floats = sums[drawn].sum(axis=1) / count[drawn].sum(axis=1)[:, None]
+    return means
+
+
+def bias_map(tallied: Tally, threshold: float, truths: Sequence[FrameTruth]) -> list[dict[str, Any]]:
+    """Mean signed error in cells of the image, row by row from the top left."""
+    found = right(tallied, threshold)
+    width, height = truths[0].width_px, truths[0].height_px
+    column = np.clip(tallied.detection_u * _BIAS_CELLS // width, 0, _BIAS_CELLS - 1)
+    row = np.clip(tallied.detection_v * _BIAS_CELLS // height, 0, _BIAS_CELLS - 1)
+    return [
+        {
+            "u_px": (j + 0.5) * width / _BIAS_CELLS - 0.5,
+            "v_px": (i + 0.5) * height / _BIAS_CELLS - 0.5,
+            **_mean_error(tallied, found & (row == i) & (column == j)),
+        }
+        for i in range(_BIAS_CELLS)
+        for j in range(_BIAS_CELLS)
+    ]
+
+
+def _mean_error(tallied: Tally, chosen: NDArray[np.bool_]) -> dict[str, float | int]:
+    count = int(chosen.sum())
+    if not count:
+        nan = float("nan")
+        return {"pairs": 0, "du_px": nan, "dv_px": nan, "standard_error_px": nan}
+    return {
+        "pairs": count,
+        "du_px": float(np.mean(tallied.error_u[chosen])),
+        "dv_px": float(np.mean(tallied.error_v[chosen])),
+        "standard_error_px": float(np.std(tallied.error_u[chosen]) / np.sqrt(count)),
+    }
+
+
+def radial_scale(tallied: Tally, threshold: float, truths: Sequence[FrameTruth]) -> dict[str, float]:
+    """Scale of the detections about the middle of the image, percent: -0.1 makes 30 km of altitude 30 m too high."""
+    found = right(tallied, threshold)
+    u, v = middle(truths)
+    lever = np.concatenate([tallied.detection_u[found] - u, tallied.detection_v[found] - v])
+    error = np.concatenate([tallied.error_u[found], tallied.error_v[found]])
+    weight = np.tile(1.0 / np.maximum(tallied.sigma_px[found], 0.3) ** 2, 2)
+    inner = np.abs(error) < 4.0 / np.sqrt(weight)
+    lever, error, weight = lever[inner], error[inner], weight[inner]
+    moment = float((weight * lever * lever).sum())
+    if moment == 0.0:
+        return {"percent": float("nan"), "standard_error_percent": float("nan")}
+    slope = float((weight * lever * error).sum()) / moment
+    spread = float(np.sqrt((weight**2 * lever**2 * (error - slope * lever) ** 2).sum())) / moment
+    return {"percent": 100.0 * slope, "standard_error_percent": 100.0 * spread}
+
+
+def against_rims(
+    frames: Sequence[tuple[Dataset, Frame]],
+    truths: Sequence[FrameTruth],
+    found: Sequence[FrameDetections],
+    threshold: float,
+    rims: RefittedRims,
+) -> dict[str, Any]:
+    """Distances of detections of 5 to 30 km from craters with a measured rim: from the catalogue's place, from the rim.
+
+    Matching is done with each set of places in turn, as it is for the figures elsewhere. `bias` is that of the second.
+    """
+    moved, known = [], []
+    for (dataset, frame), truth in zip(frames, truths, strict=True):
+        shifted, which = refitted_frame(dataset, frame, rims)
+        place = frame_truth(dataset, shifted)
+        moved.append(replace(truth, u_px=place.u_px, v_px=place.v_px, diameter_px=place.diameter_px))
+        known.append(frame.craters["id"][which])
+    ids = np.unique(np.concatenate(known)) if known else np.zeros(0, np.int64)
+    beside = tally(moved, found)
+    fitted = beside.select(np.isin(beside.matched_id, ids), np.ones(beside.crater_id.size, bool))
+    octants = bias_by_octant(fitted, threshold, truths)
+    return {
+        "catalogue": _distances(tally(truths, found), threshold, ids),
+        "refitted": _distances(beside, threshold, ids),
+        "bias_px_by_sun_octant": octants,
+        "bias_px": bias_overall(fitted, threshold, truths, octants),
+    }
+
+
+def _distances(tallied: Tally, threshold: float, ids: NDArray[np.int64]) -> dict[str, float | int]:
+    chosen = right(tallied, threshold) & np.isin(tallied.matched_id, ids)
+    error = np.hypot(tallied.error_u[chosen], tallied.error_v[chosen])
+    return {
+        "pairs": int(error.size),
+        "mean_px": float(error.mean()) if error.size else float("nan"),
+        "median_px": float(np.median(error)) if error.size else float("nan"),
+    }

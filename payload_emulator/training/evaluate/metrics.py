@@ -1,0 +1,423 @@
+"""All figures of detections against truth: strict and ignore-aware side by side, by what they depend on."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from payload_emulator.flight.vision.detections import DEGRADED_DEPTH_RATIO, FRESH_DEPTH_RATIO
+from payload_emulator.training.data.truth import FrameTruth
+from payload_emulator.training.evaluate.localisation import (
+    bias_by_octant,
+    bias_map,
+    bias_overall,
+    middle,
+    radial_scale,
+    right,
+)
+from payload_emulator.training.evaluate.scoring import (
+    DEGRADATION_EDGES,
+    PAPER_TABLE_2,
+    FrameDetections,
+    MatchRule,
+    Tally,
+    average_precision,
+    bootstrap_f1,
+    bootstrap_recall,
+    tally,
+)
+
+Floats = NDArray[np.float64]
+
+LOWLAND_M = -1_000.0
+"""Mean ground of a frame below this is called lowland: nearly all of it is mare, and nearly all mare lies below."""
+
+_ALTITUDE_EDGES_KM = (12.0, 20.0, 30.0, 40.0, 50.0)
+_ELEVATION_EDGES_DEG = (3.0, 6.0, 9.0, 12.0, 15.0, 30.0, 60.0)
+_RADIUS_EDGES_PX = (0.0, 90.0, 150.0, 210.0, 270.0, 370.0)
+_DIAMETER_EDGES_PX = (10.0, 16.0, 24.0, 32.0, 48.0, 96.0, 400.0)
+_CLEAR_DEPTH_RATIOS = (0.06, 0.10)
+_CURVE_THRESHOLDS = tuple(round(0.10 + 0.05 * k, 2) for k in range(17))
+RADIUS_RULE = MatchRule(radii=0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Circumstances of one frame."""
+
+    altitude_km: float  # above the mean ground
+    sun_elevation_deg: float
+    ground_m: float
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class Thresholds:
+    """Scores that a model's metadata carry, all fixed on its validation split."""
+
+    on_board: float
+    balanced: float
+    navigation: float
+
+
+def score(
+    truths: Sequence[FrameTruth],
+    found: Sequence[FrameDetections],
+    thresholds: Thresholds,
+    scenes: Sequence[Scene],
+) -> dict[str, Any]:
+    """Every figure of detections against truths, as one mapping of plain values."""
+    threshold = thresholds.on_board
+    strict = tally(truths, found)
+    fair = tally(truths, found, ignore_aware=True)
+    wide = tally(truths, found, low_m=3_000.0, high_m=30_000.0)
+    wide_fair = tally(truths, found, low_m=3_000.0, high_m=30_000.0, ignore_aware=True)
+    strict_radius = tally(truths, found, rule=RADIUS_RULE)
+    fair_radius = tally(truths, found, rule=RADIUS_RULE, ignore_aware=True)
+    pair = (strict, fair)
+    octants = bias_by_octant(strict, threshold, truths)
+    return {
+        "threshold": threshold,
+        "per_class": [_class(truths, found, k, threshold) for k in range(4)][:3],
+        "class_3_to_5_km": _class(truths, found, 3, threshold),
+        "micro": _with_interval(strict, threshold),
+        "micro_half_radius": strict_radius.figures(threshold).to_dict(),
+        "ignore_aware": _with_interval(fair, threshold),
+        "ignore_aware_half_radius": fair_radius.figures(threshold).to_dict(),
+        "strict_3_to_30_km": wide.figures(threshold).to_dict(),
+        "ignore_aware_3_to_30_km": wide_fair.figures(threshold).to_dict(),
+        "average_precision_half_radius": {
+            "strict": average_precision(strict_radius),
+            "ignore_aware": average_precision(fair_radius),
+            "per_class": [
+                average_precision(tally(truths, found, classes=(k,), rule=RADIUS_RULE)) for k in range(3)
+            ],
+        },
+        "balanced": _at(pair, thresholds.balanced),
+        "navigation": _at(pair, thresholds.navigation),
+        "recall_by_degradation": _recall_by(
+            strict, strict.crater_depth_ratio, DEGRADATION_EDGES, threshold, "depth_ratio"
+        ),
+        "recall_by_third_of_degradation": _recall_by_thirds(strict, threshold),
+        "recall_of_clear_craters": [
+            {"depth_ratio": low, "strict": _recall_above(strict, low, threshold)}
+            | {"ignore_aware": _recall_above(fair, low, threshold)}
+            for low in _CLEAR_DEPTH_RATIOS
+        ],
+        "recall_by_diameter_px": _recall_by(
+            fair, fair.crater_diameter_px, _DIAMETER_EDGES_PX, threshold, "diameter_px"
+        ),
+        "degradation_state": _state(fair, threshold),
+        "by_altitude_km": _by_frame(
+            pair, threshold, np.array([s.altitude_km for s in scenes]), _ALTITUDE_EDGES_KM
+        ),
+        "by_sun_elevation_deg": _by_frame(
+            pair, threshold, np.array([s.sun_elevation_deg for s in scenes]), _ELEVATION_EDGES_DEG
+        ),
+        "by_sun_octant": _by_frame(
+            pair,
+            threshold,
+            np.degrees(np.array([t.sun_azimuth_image_rad for t in truths])) % 360.0,
+            tuple(45.0 * k for k in range(9)),
+        ),
+        "by_terrain": _by_name(
+            pair, threshold, ["lowland" if s.ground_m < LOWLAND_M else "upland" for s in scenes]
+        ),
+        "by_source": _by_name(pair, threshold, [s.source for s in scenes]),
+        "by_image_radius_px": _by_radius(pair, threshold, truths),
+        "bias_px_by_sun_octant": octants,
+        "bias_px": bias_overall(strict, threshold, truths, octants),
+        "bias_map": bias_map(strict, threshold, truths),
+        "radial_scale": radial_scale(fair, threshold, truths),
+        "sigma_calibration": {
+            **_calibration(fair, threshold),
+            "by_altitude_km": _calibration_by_altitude(fair, threshold, scenes),
+            "by_image_radius_px": _calibration_by_radius(fair, threshold, truths),
+        },
+        "score_calibration": _score_calibration(strict),
+        "repeatability": repeatability(strict, threshold),
+        "precision_recall": _curve(strict),
+        "precision_recall_per_class": [_curve(tally(truths, found, classes=(k,))) for k in range(3)],
+        "unique_craters": int(np.unique(strict.crater_id).size),
+        "blocks": int(np.unique(strict.crater_block).size),
+    }
+
+
+def repeatability(tallied: Tally, threshold: float) -> dict[str, float | int]:
+    """P(found in one frame | found in another that shows the same crater), over ordered pairs of frames.
+
+    The frames of a data set differ in Sun and pose, so this is harder than from one exposure to the next of a pass;
+    `chance` is what independent detections of the same recall would give. `next_frame` is over neighbours in the data
+    set only: from one exposure to the next where the frames follow an orbit, neighbouring ground under another Sun
+    where they are drawn.
+    """
+    with np.errstate(invalid="ignore"):
+        hit = tallied.crater_score >= threshold
+    _, place = np.unique(tallied.crater_id, return_inverse=True)
+    seen = np.bincount(place).astype(float) if place.size else np.zeros(0)
+    times = np.bincount(place, weights=hit) if place.size else np.zeros(0)
+    pairs = float((times * (seen - 1.0)).sum())
+    again = float((times * (times - 1.0)).sum())
+    several = seen > 1.0
+    return {
+        "pairs": int(pairs),
+        "value": again / pairs if pairs else float("nan"),
+        "chance": float(times[several].sum() / seen[several].sum()) if several.any() else float("nan"),
+        "next_frame": _found_next(tallied, hit, place),
+    }
+
+
+def _found_next(tallied: Tally, hit: NDArray[np.bool_], place: NDArray[np.int64]) -> dict[str, float | int]:
+    """P(found at t+1 | found at t, visible in both) over neighbouring frames."""
+    frame = tallied.crater_frame.astype(np.int64)
+    step = int(frame.max()) + 2 if frame.size else 1
+    key = place * step + frame
+    order = np.argsort(key)
+    after = np.searchsorted(key[order], key[hit] + 1)
+    there = after < key.size
+    there[there] = key[order][after[there]] == key[hit][there] + 1
+    again = hit[order][after[there]]
+    return {"pairs": int(again.size), "value": float(again.mean()) if again.size else float("nan")}
+
+
+def _class(
+    truths: Sequence[FrameTruth], found: Sequence[FrameDetections], k: int, threshold: float
+) -> dict[str, Any]:
+    strict = tally(truths, found, classes=(k,))
+    fair = tally(truths, found, classes=(k,), ignore_aware=True)
+    near = tally(truths, found, classes=(k,), rule=RADIUS_RULE).figures(threshold)
+    return {
+        **_with_interval(strict, threshold),
+        "size_class": k,
+        "ignore_aware": fair.figures(threshold).to_dict(),
+        "precision_half_radius": near.precision,
+        "recall_half_radius": near.recall,
+        "paper": PAPER_TABLE_2[k] if k < 3 else None,
+    }
+
+
+def _at(pair: tuple[Tally, Tally], threshold: float) -> dict[str, Any]:
+    return {
+        "threshold": threshold,
+        "strict": _with_interval(pair[0], threshold),
+        "ignore_aware": _with_interval(pair[1], threshold),
+    }
+
+
+def _with_interval(tallied: Tally, threshold: float) -> dict[str, Any]:
+    return {**tallied.figures(threshold).to_dict(), "f1_interval_95": list(bootstrap_f1(tallied, threshold))}
+
+
+def _group(
+    pair: tuple[Tally, Tally],
+    threshold: float,
+    masks: Sequence[tuple[NDArray[np.bool_], NDArray[np.bool_]]],
+) -> dict[str, Any]:
+    strict, fair = (part.select(*mask) for part, mask in zip(pair, masks, strict=True))
+    return {
+        "strict": strict.figures(threshold).to_dict(),
+        "ignore_aware": fair.figures(threshold).to_dict(),
+    }
+
+
+def _of_frames(part: Tally, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Masks of the detections and craters of chosen frames (f,)."""
+    return chosen[part.detection_frame.astype(int)], chosen[part.crater_frame.astype(int)]
+
+
+def _by_frame(
+    pair: tuple[Tally, Tally], threshold: float, values: Floats, edges: Sequence[float]
+) -> list[dict[str, Any]]:
+    rows = []
+    for low, high in itertools.pairwise(edges):
+        chosen = (values >= low) & (values < high)
+        if chosen.any():
+            rows.append(
+                {
+                    "low": low,
+                    "high": high,
+                    "frames": int(chosen.sum()),
+                    **_group(pair, threshold, [_of_frames(part, chosen) for part in pair]),
+                }
+            )
+    return rows
+
+
+def _by_name(pair: tuple[Tally, Tally], threshold: float, names: Sequence[str]) -> list[dict[str, Any]]:
+    rows = []
+    for name in sorted(set(names)):
+        chosen = np.array([other == name for other in names])
+        rows.append(
+            {
+                "name": name,
+                "frames": int(chosen.sum()),
+                **_group(pair, threshold, [_of_frames(part, chosen) for part in pair]),
+            }
+        )
+    return rows
+
+
+def _radii(part: Tally, truths: Sequence[FrameTruth]) -> tuple[Floats, Floats]:
+    """Distance from the middle of the image of detections and of craters, px."""
+    u, v = middle(truths)
+    return np.hypot(part.detection_u - u, part.detection_v - v), np.hypot(
+        part.crater_u - u, part.crater_v - v
+    )
+
+
+def _by_radius(
+    pair: tuple[Tally, Tally], threshold: float, truths: Sequence[FrameTruth]
+) -> list[dict[str, Any]]:
+    distances = [_radii(part, truths) for part in pair]
+    rows = []
+    for low, high in itertools.pairwise(_RADIUS_EDGES_PX):
+        masks = [((d >= low) & (d < high), (c >= low) & (c < high)) for d, c in distances]
+        rows.append({"low": low, "high": high, **_group(pair, threshold, masks)})
+    return rows
+
+
+def _recall_by(
+    tallied: Tally, values: Floats, edges: Sequence[float], threshold: float, name: str
+) -> list[dict[str, Any]]:
+    with np.errstate(invalid="ignore"):
+        found = tallied.crater_score >= threshold
+    rows = []
+    for low, high in itertools.pairwise(edges):
+        chosen = (values >= low) & (values < high) if low > edges[0] else values < high
+        count = int(chosen.sum())
+        rows.append(
+            {
+                "by": name,
+                "low": low,
+                "high": high,
+                "expected": count,
+                "recall": float(found[chosen].mean()) if count else float("nan"),
+                "recall_interval_95": list(bootstrap_recall(found[chosen], tallied.crater_block[chosen])),
+            }
+        )
+    return rows
+
+
+def _recall_above(tallied: Tally, depth_ratio: float, threshold: float) -> dict[str, Any]:
+    """Recall of the craters above a depth/diameter."""
+    row = _recall_by(tallied, -tallied.crater_depth_ratio, (-np.inf, -depth_ratio), threshold, "")[0]
+    return {key: row[key] for key in ("expected", "recall", "recall_interval_95")}
+
+
+def _recall_by_thirds(tallied: Tally, threshold: float) -> list[dict[str, Any]]:
+    """Recall of thirds of the craters by depth/diameter, the most degraded first."""
+    if tallied.crater_depth_ratio.size < 3:
+        return []
+    low, high = np.quantile(tallied.crater_depth_ratio, (1.0 / 3.0, 2.0 / 3.0))
+    top = float(tallied.crater_depth_ratio.max()) + 1e-9
+    return _recall_by(
+        tallied, tallied.crater_depth_ratio, (0.0, float(low), float(high), top), threshold, "depth_ratio"
+    )
+
+
+def _state(tallied: Tally, threshold: float) -> dict[str, Any]:
+    """How well the network tells fresh from degraded, over matched craters; rows are truth, columns said."""
+    known = (tallied.outcome == 1) & (tallied.score >= threshold) & np.isfinite(tallied.detection_depth_ratio)
+    said, true = tallied.detection_depth_ratio[known], tallied.matched_depth_ratio[known]
+    edges = (DEGRADED_DEPTH_RATIO, FRESH_DEPTH_RATIO)
+    table = np.zeros((3, 3), int)
+    np.add.at(table, (np.digitize(true, edges), np.digitize(said, edges)), 1)
+    count = int(known.sum())
+    return {
+        "states": ["degraded", "worn", "fresh"],
+        "confusion": table.tolist(),
+        "agreement": float(np.trace(table) / count) if count else float("nan"),
+        "fresh_called_degraded": float(table[2, 0] / max(table[2].sum(), 1)),
+        "depth_ratio_median_error": float(np.median(np.abs(said - true))) if count else float("nan"),
+        "craters": count,
+    }
+
+
+def _calibration(
+    tallied: Tally, threshold: float, chosen: NDArray[np.bool_] | None = None
+) -> dict[str, float]:
+    """How the errors compare with the predicted sigma: 1 and 0.683 would be perfect for a Gaussian."""
+    hit = right(tallied, threshold)
+    if chosen is not None:
+        hit &= chosen
+    sigma = tallied.sigma_px[hit]
+    scaled = np.concatenate([tallied.error_u[hit] / sigma, tallied.error_v[hit] / sigma])
+    nan = float("nan")
+    if scaled.size == 0:
+        return {
+            "pairs": 0,
+            "mean_sigma_px": nan,
+            "rms": nan,
+            "median_ratio": nan,
+            "inside_one_sigma": nan,
+            "inside_three_sigma": nan,
+        }
+    return {
+        "pairs": int(hit.sum()),
+        "mean_sigma_px": float(sigma.mean()),
+        "rms": float(np.sqrt(np.mean(scaled**2))),
+        "median_ratio": float(np.median(np.abs(scaled)) / 0.6745),
+        "inside_one_sigma": float(np.mean(np.abs(scaled) < 1.0)),
+        "inside_three_sigma": float(np.mean(np.abs(scaled) < 3.0)),
+    }
+
+
+def _calibration_by_altitude(
+    tallied: Tally, threshold: float, scenes: Sequence[Scene]
+) -> list[dict[str, float]]:
+    altitude = np.array([s.altitude_km for s in scenes])
+    rows = []
+    for low, high in itertools.pairwise(_ALTITUDE_EDGES_KM):
+        chosen, _ = _of_frames(tallied, (altitude >= low) & (altitude < high))
+        rows.append({"low": low, "high": high, **_calibration(tallied, threshold, chosen)})
+    return rows
+
+
+def _calibration_by_radius(
+    tallied: Tally, threshold: float, truths: Sequence[FrameTruth]
+) -> list[dict[str, float]]:
+    distance, _ = _radii(tallied, truths)
+    return [
+        {
+            "low": low,
+            "high": high,
+            **_calibration(tallied, threshold, (distance >= low) & (distance < high)),
+        }
+        for low, high in itertools.pairwise(_RADIUS_EDGES_PX)
+    ]
+
+
+def _score_calibration(tallied: Tally) -> list[dict[str, float]]:
+    """Share of the detections that are true, by score."""
+    rows = []
+    for low in np.arange(0.1, 1.0, 0.1):
+        chosen = (tallied.score >= low) & (tallied.score < low + 0.1) & (tallied.outcome >= 0)
+        if chosen.any():
+            rows.append(
+                {
+                    "mean_score": float(tallied.score[chosen].mean()),
+                    "fraction_true": float((tallied.outcome[chosen] == 1).mean()),
+                    "count": int(chosen.sum()),
+                }
+            )
+    return rows
+
+
+def _curve(tallied: Tally) -> list[dict[str, float]]:
+    rows = []
+    for threshold in _CURVE_THRESHOLDS:
+        figures = tallied.figures(threshold)
+        rows.append(
+            {
+                "threshold": threshold,
+                "precision": figures.precision,
+                "recall": figures.recall,
+                "f1": figures.f1,
+            }
+        )
+    return rows

@@ -1,0 +1,415 @@
+"""How well detections agree with a catalogue: one-to-one matching, strict and ignore-aware figures.
+
+Strict counts every catalogued crater whose centre lies in the frame. Ignore-aware leaves out what hardly anyone could
+see: the truth is craters of depth/diameter of at least 0.03 whose centre lies half a radius inside the frame, and a
+detection on any other catalogued crater is neither right nor wrong.
+
+Classes follow the paper: 5-10, 10-15 and 15-30 km; the class of a detection comes from its diameter in pixels and the
+range, as on board. Per class, detections of a class are matched with craters of that class; "all" matches detections
+and craters of 5-30 km whatever their class.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lunar.catalogue import CLASS_LIMITS_M, size_class
+from payload_emulator.training.data.truth import FrameTruth
+
+Floats = NDArray[np.float64]
+
+PAPER_TABLE_2 = (
+    {"precision": 0.7021, "recall": 0.3248, "loc_px": 3.50},
+    {"precision": 0.7362, "recall": 0.3586, "loc_px": 4.11},
+    {"precision": 0.8131, "recall": 0.4659, "loc_px": 4.75},
+)
+MATCH_RADIUS_PX = 10.0  # the pixel rule, as in the project's first studies; the paper does not print its own
+FAIR_DEPTH_RATIO = 0.03
+_LEAST_FOR_PRECISION = 100  # below, one false detection more moves the precision by a hundredth and over
+DEGRADATION_EDGES = (0.0, 0.03, 0.06, 0.10, 1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameDetections:
+    """Detections of one frame, arrays (n,), best first, with the diameter on the ground.
+
+    `depth_ratio` where the network tells it; `size_class` where it names the class itself, as the paper's does.
+    """
+
+    u_px: Floats
+    v_px: Floats
+    diameter_px: Floats
+    diameter_m: Floats
+    score: Floats
+    sigma_px: Floats
+    depth_ratio: Floats | None = None
+    size_class: NDArray[np.int8] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Counts and what follows from them; localisation over the matched pairs."""
+
+    expected: int
+    detected_true: int
+    false_alarms: int
+    precision: float
+    recall: float
+    f1: float
+    loc_px: float
+    loc_median_px: float
+
+    def to_dict(self) -> dict[str, float | int]:
+        return {
+            "expected": self.expected,
+            "detected_true": self.detected_true,
+            "false_alarms": self.false_alarms,
+            "precision": self.precision,
+            "recall": self.recall,
+            "f1": self.f1,
+            "loc_px": self.loc_px,
+            "loc_median_px": self.loc_median_px,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class MatchRule:
+    """`pixels`: centres within that many pixels; `radii`: within that share of the crater's radius instead."""
+
+    pixels: float = MATCH_RADIUS_PX
+    radii: float = 0.0
+
+
+def match(
+    detection_u: Floats,
+    detection_v: Floats,
+    truth_u: Floats,
+    truth_v: Floats,
+    truth_diameter: Floats,
+    rule: MatchRule,
+) -> NDArray[np.int64]:
+    """Index of the crater that each detection (best first) takes, -1 for none; nearest free crater within the rule."""
+    taken = np.zeros(truth_u.shape[0], bool)
+    found = np.full(detection_u.shape[0], -1, np.int64)
+    if truth_u.shape[0] == 0:
+        return found
+    limit = np.full(truth_u.shape[0], rule.pixels) if rule.radii == 0.0 else 0.5 * rule.radii * truth_diameter
+    for i in range(detection_u.shape[0]):
+        distance = np.hypot(truth_u - detection_u[i], truth_v - detection_v[i])
+        distance[taken | (distance > limit)] = np.inf
+        best = int(np.argmin(distance))
+        if np.isfinite(distance[best]):
+            taken[best] = True
+            found[i] = best
+    return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tally:
+    """Every detection and every wanted crater of a set of frames after matching, for one rule and one truth.
+
+    Detections: score, outcome (1 right, 0 wrong, -1 not counted); where right error_u, error_v (detection minus
+    crater) and log_diameter_ratio (detection over crater). Craters: score at which each was found (NaN: never).
+    Places in the image (u, v) and numbers of the frames say where and when; matched_depth_ratio and matched_id are the
+    crater's (NaN, -1: none), detection_depth_ratio what the network says (NaN: it does not).
+    """
+
+    score: Floats
+    outcome: NDArray[np.int8]
+    error_u: Floats
+    error_v: Floats
+    sigma_px: Floats
+    detection_block: NDArray[np.int64]
+    detection_octant: NDArray[np.int64]
+    log_diameter_ratio: Floats
+    detection_u: Floats
+    detection_v: Floats
+    detection_frame: NDArray[np.int64]
+    detection_depth_ratio: Floats
+    matched_depth_ratio: Floats
+    matched_id: NDArray[np.int64]
+    crater_score: Floats
+    crater_depth_ratio: Floats
+    crater_diameter_px: Floats
+    crater_diameter_m: Floats
+    crater_id: NDArray[np.int64]
+    crater_block: NDArray[np.int64]
+    crater_u: Floats
+    crater_v: Floats
+    crater_frame: NDArray[np.int64]
+
+    def select(self, detections: NDArray[np.bool_], craters: NDArray[np.bool_]) -> Tally:
+        """The part of a tally that masks of its detections and craters choose."""
+        return Tally(
+            **{
+                item.name: getattr(self, item.name)[
+                    craters if item.name.startswith("crater_") else detections
+                ]
+                for item in fields(self)
+            }
+        )
+
+    def figures(self, threshold: float) -> Figures:
+        """Figures of the detections with a score of at least `threshold`."""
+        with np.errstate(invalid="ignore"):
+            right = (self.score >= threshold) & (self.outcome == 1)
+            wrong = (self.score >= threshold) & (self.outcome == 0)
+            found = self.crater_score >= threshold
+        return make_figures(
+            int(self.crater_score.size),
+            int(found.sum()),
+            int(wrong.sum()),
+            np.hypot(self.error_u[right], self.error_v[right]),
+        )
+
+
+def make_figures(expected: int, found: int, false_alarms: int, errors_px: Floats) -> Figures:
+    """Figures of counts; NaN where nothing was expected or claimed."""
+    precision = found / (found + false_alarms) if found + false_alarms else float("nan")
+    recall = found / expected if expected else float("nan")
+    f1 = (
+        2.0 * found / (2 * found + false_alarms + (expected - found))
+        if expected + false_alarms
+        else float("nan")
+    )
+    return Figures(
+        expected,
+        found,
+        false_alarms,
+        precision,
+        recall,
+        f1,
+        float(errors_px.mean()) if errors_px.size else float("nan"),
+        float(np.median(errors_px)) if errors_px.size else float("nan"),
+    )
+
+
+def tally(
+    truths: Sequence[FrameTruth],
+    detections: Sequence[FrameDetections],
+    *,
+    low_m: float = CLASS_LIMITS_M[0],
+    high_m: float = CLASS_LIMITS_M[3],
+    classes: tuple[int, ...] = (),
+    ignore_aware: bool = False,
+    rule: MatchRule | None = None,
+) -> Tally:
+    """Match frame by frame. `classes` given: detections and craters of those size classes; else by diameter.
+
+    Detections are matched best first, so the outcome at every threshold is that of the detections above it.
+    """
+    rule = rule or MatchRule()
+    parts: list[tuple[NDArray[np.generic], ...]] = []
+    craters: list[tuple[NDArray[np.generic], ...]] = []
+    for number, (truth, found) in enumerate(zip(truths, detections, strict=True)):
+        in_frame = (
+            (truth.u_px >= -0.5)
+            & (truth.u_px <= truth.width_px - 0.5)
+            & (truth.v_px >= -0.5)
+            & (truth.v_px <= truth.height_px - 0.5)
+        )
+        if classes:
+            wanted = in_frame & np.isin(size_class(truth.diameter_m), classes)
+            own = size_class(found.diameter_m) if found.size_class is None else found.size_class
+            chosen = np.isin(own, classes)
+        else:
+            wanted = in_frame & (truth.diameter_m >= low_m) & (truth.diameter_m <= high_m)
+            chosen = (found.diameter_m >= low_m) & (found.diameter_m <= high_m)
+        if ignore_aware:
+            inset = 0.25 * truth.diameter_px
+            deep_inside = (
+                (truth.u_px >= inset)
+                & (truth.u_px <= truth.width_px - 1 - inset)
+                & (truth.v_px >= inset)
+                & (truth.v_px <= truth.height_px - 1 - inset)
+            )
+            wanted &= deep_inside & (truth.depth_ratio >= FAIR_DEPTH_RATIO)
+        w = np.flatnonzero(wanted)
+        d = np.flatnonzero(chosen)
+        hit = match(found.u_px[d], found.v_px[d], truth.u_px[w], truth.v_px[w], truth.diameter_px[w], rule)
+        outcome = (hit >= 0).astype(np.int8)
+        if ignore_aware:
+            other = np.flatnonzero(~wanted)
+            near = match_any(
+                found.u_px[d],
+                found.v_px[d],
+                truth.u_px[other],
+                truth.v_px[other],
+                truth.diameter_px[other],
+                rule,
+            )
+            outcome[(outcome == 0) & near] = -1
+        error_u = np.where(hit >= 0, found.u_px[d] - truth.u_px[w][hit] if w.size else np.nan, np.nan)
+        error_v = np.where(hit >= 0, found.v_px[d] - truth.v_px[w][hit] if w.size else np.nan, np.nan)
+        sizes = truth.diameter_px[w][hit] if w.size else np.ones(d.size)
+        log_ratio = np.where(hit >= 0, np.log(found.diameter_px[d] / sizes), np.nan)
+        octant = int(np.floor(np.mod(truth.sun_azimuth_image_rad, 2.0 * np.pi) / (np.pi / 4.0))) % 8
+        parts.append(
+            (
+                found.score[d],
+                outcome,
+                error_u,
+                error_v,
+                found.sigma_px[d],
+                np.full(d.size, truth.block),
+                np.full(d.size, octant),
+                log_ratio,
+                found.u_px[d],
+                found.v_px[d],
+                np.full(d.size, number),
+                np.full(d.size, np.nan) if found.depth_ratio is None else found.depth_ratio[d],
+                np.where(hit >= 0, truth.depth_ratio[w][hit] if w.size else np.nan, np.nan),
+                np.where(hit >= 0, truth.ids[w][hit] if w.size else -1, -1),
+            )
+        )
+        score = np.full(w.size, np.nan)
+        score[hit[hit >= 0]] = found.score[d][hit >= 0]
+        craters.append(
+            (
+                score,
+                truth.depth_ratio[w],
+                truth.diameter_px[w],
+                truth.diameter_m[w],
+                truth.ids[w],
+                np.full(w.size, truth.block),
+                truth.u_px[w],
+                truth.v_px[w],
+                np.full(w.size, number),
+            )
+        )
+    return Tally(*_columns(parts, 14), *_columns(craters, 9))
+
+
+def match_any(
+    detection_u: Floats,
+    detection_v: Floats,
+    truth_u: Floats,
+    truth_v: Floats,
+    truth_diameter: Floats,
+    rule: MatchRule,
+) -> NDArray[np.bool_]:
+    """Whether each detection lies on any of the craters by the rule; several may share one."""
+    if truth_u.size == 0 or detection_u.size == 0:
+        return np.zeros(detection_u.size, bool)
+    limit = np.full(truth_u.shape[0], rule.pixels) if rule.radii == 0.0 else 0.5 * rule.radii * truth_diameter
+    distance = np.hypot(detection_u[:, None] - truth_u[None, :], detection_v[:, None] - truth_v[None, :])
+    near: NDArray[np.bool_] = (distance <= limit[None, :]).any(axis=1)
+    return near
+
+
+def best_threshold(
+    tallied: Tally, candidates: Floats | None = None, beta: float = 1.0
+) -> tuple[float, Figures]:
+    """Threshold of the greatest F-beta and its figures (choose it on a validation set only).
+
+    `beta` below 1 gives precision more weight than recall.
+    """
+    candidates = np.arange(0.10, 0.91, 0.01) if candidates is None else candidates
+    every = [tallied.figures(float(threshold)) for threshold in candidates]
+    values = np.array([_f_beta(figures, beta) for figures in every])
+    best = int(np.argmax(values))
+    return float(candidates[best]), every[best]
+
+
+def _f_beta(figures: Figures, beta: float) -> float:
+    """F-beta of the counts; -1 where nothing was expected or claimed."""
+    missed = figures.expected - figures.detected_true
+    right = (1.0 + beta * beta) * figures.detected_true
+    total = right + beta * beta * missed + figures.false_alarms
+    return right / total if total else -1.0
+
+
+def threshold_for_precision(tallied: Tally, precision: float) -> float:
+    """Lowest threshold from which on the precision stays at or above the value asked for; 0.95 where none does.
+
+    Thresholds that leave fewer than `_LEAST_FOR_PRECISION` detections say nothing and are passed over.
+    """
+    chosen = 0.95
+    for threshold in np.arange(0.95, 0.095, -0.01):
+        figures = tallied.figures(float(threshold))
+        claimed = figures.detected_true + figures.false_alarms
+        if claimed >= _LEAST_FOR_PRECISION and figures.precision < precision:
+            break
+        chosen = float(threshold)
+    return chosen
+
+
+def average_precision(tallied: Tally) -> float:
+    """Area under precision over recall, with precision made to fall with recall as usual; NaN without craters."""
+    counted = tallied.outcome >= 0
+    if tallied.crater_score.size == 0:
+        return float("nan")
+    order = np.argsort(-tallied.score[counted], kind="stable")
+    right = np.cumsum(tallied.outcome[counted][order] == 1)
+    if right.size == 0:
+        return 0.0
+    precision = right / np.arange(1, right.size + 1)
+    precision = np.maximum.accumulate(precision[::-1])[::-1]
+    recall = np.concatenate([[0.0], right / tallied.crater_score.size])
+    return float(np.sum(np.diff(recall) * precision))
+
+
+def bootstrap_f1(tallied: Tally, threshold: float, seed: int = 0, rounds: int = 400) -> tuple[float, float]:
+    """95 % interval of F1 over resampled blocks of ground."""
+    blocks = np.unique(np.concatenate([tallied.crater_block, tallied.detection_block]))
+    f1 = _resampled_f1(tallied, threshold, blocks, seed, rounds)
+    return float(np.percentile(f1, 2.5)), float(np.percentile(f1, 97.5))
+
+
+def bootstrap_f1_difference(
+    tallied: Tally, reference: Tally, threshold: float, seed: int = 0, rounds: int = 400
+) -> tuple[float, float]:
+    """95 % interval of F1 less the reference's, both of the same frames, over the same resampled blocks of ground."""
+    both = (tallied, reference)
+    blocks = np.unique(np.concatenate([c for t in both for c in (t.crater_block, t.detection_block)]))
+    one, other = (_resampled_f1(t, threshold, blocks, seed, rounds) for t in both)
+    return float(np.percentile(one - other, 2.5)), float(np.percentile(one - other, 97.5))
+
+
+def _resampled_f1(
+    tallied: Tally, threshold: float, blocks: NDArray[np.int64], seed: int, rounds: int
+) -> Floats:
+    """F1 (rounds,) of blocks drawn with replacement; NaN without any."""
+    if blocks.size == 0:
+        return np.full(rounds, np.nan)
+    with np.errstate(invalid="ignore"):
+        found = tallied.crater_score >= threshold
+        wrong = (tallied.score >= threshold) & (tallied.outcome == 0)
+    counts = np.array(
+        [
+            (
+                np.count_nonzero(found & (tallied.crater_block == block)),
+                np.count_nonzero(tallied.crater_block == block),
+                np.count_nonzero(wrong & (tallied.detection_block == block)),
+            )
+            for block in blocks
+        ],
+        dtype=np.float64,
+    )
+    rng = np.random.default_rng(seed)
+    drawn = counts[rng.integers(0, len(blocks), (rounds, len(blocks)))].sum(axis=1)
+    return np.asarray(2.0 * drawn[:, 0] / np.maximum(drawn[:, 0] + drawn[:, 2] + drawn[:, 1], 1.0))
+
+
+def bootstrap_recall(
+    found: NDArray[np.bool_], block: NDArray[np.int64], seed: int = 0, rounds: int = 400
+) -> tuple[float, float]:
+    """95 % interval of the share of craters found (n,), over resampled blocks of ground (n,)."""
+    if found.size == 0:
+        return float("nan"), float("nan")
+    _, place = np.unique(block, return_inverse=True)
+    total = np.bincount(place).astype(float)
+    hits = np.bincount(place, weights=found)
+    drawn = np.random.default_rng(seed).integers(0, total.size, (rounds, total.size))
+    recall = hits[drawn].sum(axis=1) / total[drawn].sum(axis=1)
+    return float(np.percentile(recall, 2.5)), float(np.percentile(recall, 97.5))
+
+
+def _columns(parts: list[tuple[NDArray[np.generic], ...]], count: int) -> list[NDArray[np.generic]]:
+    if not parts:
+        return [np.zeros(0) for _ in range(count)]
+    return [np.concatenate(column) for column in zip(*parts, strict=True)]

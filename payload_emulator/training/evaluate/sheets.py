@@ -1,0 +1,136 @@
+"""Pictures for people: labels drawn on frames as in the paper's Fig. 5, contact sheets, renderers side by side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from payload_emulator.sim.render.renderer import Rendering
+from payload_emulator.sim.render.sensor import Picture, SensorModel, auto_exposure, take_picture
+
+Rgb = NDArray[np.uint8]
+
+CLASS_COLOURS = {0: (0, 255, 255), 1: (0, 255, 0), 2: (255, 255, 0)}
+"""Cyan, lime and yellow by size class (paper, Fig. 5)."""
+
+CAPTION_PX = 22
+GAP_PX = 4
+GROUND = 20
+INK = 230
+
+
+def eight_bits(image: Picture) -> Rgb:
+    """An 8-bit picture (H, W, 3) of one in 8 or 16 bits."""
+    return np.asarray(image if image.dtype == np.uint8 else image >> 8, dtype=np.uint8)
+
+
+def draw_labels(image: Picture, labels: Sequence[dict[str, Any]]) -> Rgb:
+    """A copy of the picture with the rims' ellipses of classes 0 to 2 on it, whose centres lie in the picture."""
+    import cv2
+
+    drawn = np.ascontiguousarray(eight_bits(image)).copy()
+    for label in labels:
+        colour = CLASS_COLOURS.get(label["class"])
+        if colour is None or not label["inside"]:
+            continue
+        axes = label["ellipse"]
+        # Sixteenths of a pixel: rims sit where they are.
+        cv2.ellipse(
+            drawn,
+            (round(16.0 * label["u_px"]), round(16.0 * label["v_px"])),
+            (round(8.0 * axes["major_px"]), round(8.0 * axes["minor_px"])),
+            axes["angle_deg"],
+            0.0,
+            360.0,
+            colour,
+            1,
+            cv2.LINE_AA,
+            4,
+        )
+    return drawn
+
+
+def contact_sheet(pictures: Sequence[Rgb], captions: Sequence[str], columns: int) -> Rgb:
+    """Pictures (H, W, 3) of one size in rows, each with a line of text under it."""
+    cells = [_captioned(picture, caption) for picture, caption in zip(pictures, captions, strict=True)]
+    high, wide = cells[0].shape[:2]
+    rows = math.ceil(len(cells) / columns)
+    sheet = np.full(
+        (rows * (high + GAP_PX) + GAP_PX, columns * (wide + GAP_PX) + GAP_PX, 3), GROUND, np.uint8
+    )
+    for number, cell in enumerate(cells):
+        top = GAP_PX + number // columns * (high + GAP_PX)
+        left = GAP_PX + number % columns * (wide + GAP_PX)
+        sheet[top : top + high, left : left + wide] = cell
+    return sheet
+
+
+def comparison_sheet(
+    renderings: Mapping[str, Sequence[Rendering]], captions: Sequence[str], sensor: SensorModel, seed: int
+) -> Rgb:
+    """A row of pictures per renderer, a column per view, then where their shadows differ from the first renderer's.
+
+    All pictures of a view are exposed with one exposure, the first renderer's, and one draw of noise.
+    """
+    names = list(renderings)
+    first = renderings[names[0]]
+    exposures = [sensor.exposure or auto_exposure(one.radiance, sensor) / sensor.gain for one in first]
+    cells, texts = [], []
+    for name in names:
+        for number, one in enumerate(renderings[name]):
+            set_sensor = replace(sensor, exposure=exposures[number])
+            rng = np.random.default_rng((seed, number))
+            cells.append(eight_bits(take_picture(one.radiance, set_sensor, rng)))
+            texts.append(f"{name}  {captions[number]}")
+    for name in names[1:]:
+        cells += [shadow_map(one, other) for one, other in zip(first, renderings[name], strict=True)]
+        texts += [f"shadow: red {name} only, blue {names[0]} only"] * len(first)
+    return contact_sheet(cells, texts, len(first))
+
+
+def shadow_map(reference: Rendering, other: Rendering) -> Rgb:
+    """Where two renderings agree on shadow (dark) and Sun (light); red where only ``other`` is dark, blue where only
+    ``reference`` is.
+    """
+    dark, also = reference.lit < 0.5, other.lit < 0.5
+    sheet = np.full((*dark.shape, 3), 215, np.uint8)
+    sheet[dark & also] = 60
+    sheet[~dark & also] = (230, 40, 40)
+    sheet[dark & ~also] = (40, 80, 240)
+    return sheet
+
+
+def save_png(image: Picture, path: Path) -> None:
+    """Write a picture (H, W, 3) in 8 or 16 bits: the whole file or none of it."""
+    import cv2
+
+    done, octets = cv2.imencode(".png", image[..., ::-1])
+    assert done
+    save_octets(octets.tobytes(), path)
+
+
+def save_octets(octets: bytes, path: Path) -> None:
+    """Write a whole file or none of it."""
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        partial.write_bytes(octets)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _captioned(picture: Rgb, caption: str) -> Rgb:
+    import cv2
+
+    strip = np.full((CAPTION_PX, picture.shape[1], 3), GROUND, np.uint8)
+    scale = 0.42 if picture.shape[1] >= 360 else 0.32
+    cv2.putText(
+        strip, caption, (4, CAPTION_PX - 7), cv2.FONT_HERSHEY_SIMPLEX, scale, (INK,) * 3, 1, cv2.LINE_AA
+    )
+    return np.concatenate([picture, strip])

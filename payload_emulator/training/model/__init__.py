@@ -1,0 +1,1 @@
+"""The network: architecture, loss, training, calibration, quantisation, export."""

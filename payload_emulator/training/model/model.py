@@ -1,0 +1,273 @@
+"""The crater network: MobileNetV3 backbone, depthwise feature pyramid, CenterNet heads at stride 4.
+
+Input (B, 1, H, W), H and W multiples of 32, as `flight.vision.preprocess` makes it. Outputs at (H/4, W/4):
+heatmap logits (B, 1 or 4, h, w): any crater, then the three classes of the paper; geometry (B, 4 or 5, h, w):
+offset to the centre in cells (right, down), ln(diameter / 16 px), ln(one-sigma centre error / 1 px), and if asked
+for ten times the depth/diameter, by which a crater is fresh or degraded.
+
+References
+----------
+A. Howard et al., "Searching for MobileNetV3", 2019, tables 1 and 2. X. Zhou et al., "Objects as Points", 2019.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import asdict, dataclass
+
+import torch
+from torch import Tensor, nn
+
+from payload_emulator.errors import ModelError
+
+# kernel, expanded channels, output channels, squeeze-excite, hard-swish (else ReLU), stride
+_SMALL = (
+    (3, 16, 16, True, False, 2),
+    (3, 72, 24, False, False, 2),
+    (3, 88, 24, False, False, 1),
+    (5, 96, 40, True, True, 2),
+    (5, 240, 40, True, True, 1),
+    (5, 240, 40, True, True, 1),
+    (5, 120, 48, True, True, 1),
+    (5, 144, 48, True, True, 1),
+    (5, 288, 96, True, True, 2),
+    (5, 576, 96, True, True, 1),
+    (5, 576, 96, True, True, 1),
+)
+_LARGE = (
+    (3, 16, 16, False, False, 1),
+    (3, 64, 24, False, False, 2),
+    (3, 72, 24, False, False, 1),
+    (5, 72, 40, True, False, 2),
+    (5, 120, 40, True, False, 1),
+    (5, 120, 40, True, False, 1),
+    (3, 240, 80, False, True, 2),
+    (3, 200, 80, False, True, 1),
+    (3, 184, 80, False, True, 1),
+    (3, 184, 80, False, True, 1),
+    (3, 480, 112, True, True, 1),
+    (3, 672, 112, True, True, 1),
+    (5, 672, 160, True, True, 2),
+    (5, 960, 160, True, True, 1),
+    (5, 960, 160, True, True, 1),
+)
+# Blocks, and the last of them at strides 4, 8, 16 and 32.
+_BACKBONES = {"small": (_SMALL, (0, 2, 7, 10)), "large": (_LARGE, (2, 5, 11, 14))}
+_STEM_CHANNELS = 16
+STRIDES_PX = (2, 4)
+_PRIOR_LOGIT = -4.0  # about one cell in fifty before training: keeps the first focal losses finite
+_INITIAL_LOG_SIGMA = 0.3
+_INITIAL_TENFOLD_DEPTH = 0.8  # depth/diameter 0.08, the middle of the catalogue
+
+
+@dataclass(frozen=True, slots=True)
+class ModelConfig:
+    """Shape of the network. `detail_blocks` adds blocks at stride 4, where small craters live.
+
+    backbone : "small" or "large" of MobileNetV3; stride_px : of the output maps, 4 or (for studies: flight reads
+        stride 4) 2.
+    """
+
+    pyramid_channels: int = 64
+    detail_blocks: int = 1
+    detail_channels: int = 24
+    paper_classes: bool = False
+    depth: bool = False
+    backbone: str = "small"
+    stride_px: int = 4
+
+    def __post_init__(self) -> None:
+        if self.backbone not in _BACKBONES:
+            raise ModelError(f"backbone: expected one of {', '.join(_BACKBONES)}, found {self.backbone!r}")
+        if self.stride_px not in STRIDES_PX:
+            raise ModelError(f"stride: expected 2 or 4 pixels, found {self.stride_px}")
+
+    def to_dict(self) -> dict[str, int | bool | str]:
+        return asdict(self)
+
+
+class CraterNet(nn.Module):
+    """Heatmap logits and geometry of a normalised gray image."""
+
+    def __init__(self, config: ModelConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or ModelConfig()
+        table, self._taps = _BACKBONES[self.config.backbone]
+        self.stem = _conv_norm(1, _STEM_CHANNELS, 3, stride=2, activation=nn.Hardswish())
+        blocks: list[nn.Module] = []
+        tapped: list[int] = []
+        channels = _STEM_CHANNELS
+        for index, (kernel, expanded, out, squeeze, swish, stride) in enumerate(table):
+            blocks.append(_InvertedResidual(channels, expanded, out, kernel, stride, squeeze, swish))
+            channels = out
+            if index in self._taps:
+                tapped.append(out)
+        self.blocks = nn.ModuleList(blocks)
+        detail = self.config.detail_channels
+        self.detail = nn.Sequential(
+            *(
+                _InvertedResidual(tapped[0] if i == 0 else detail, 2 * detail, detail, 3, 1, False, False)
+                for i in range(self.config.detail_blocks)
+            )
+        )
+        if self.config.detail_blocks:
+            tapped[0] = detail
+        if self.config.stride_px == 2:
+            tapped.insert(0, _STEM_CHANNELS)
+        width = self.config.pyramid_channels
+        self.lateral = nn.ModuleList(nn.Conv2d(c, width, 1) for c in tapped)
+        self.smooth = nn.ModuleList(_separable(width, width) for _ in tapped[:-1])
+        self.trunk = _separable(width, width)
+        self.head = nn.Conv2d(width, self.heat_channels + self.geometry_channels, 1)
+        _initialise(self)
+        assert self.head.bias is not None
+        self.head.bias.data[: self.heat_channels] = _PRIOR_LOGIT
+        self.head.bias.data[self.heat_channels + 3] = _INITIAL_LOG_SIGMA
+        if self.config.depth:
+            self.head.bias.data[self.heat_channels + 4] = _INITIAL_TENFOLD_DEPTH
+
+    @property
+    def heat_channels(self) -> int:
+        return 4 if self.config.paper_classes else 1
+
+    @property
+    def geometry_channels(self) -> int:
+        return 5 if self.config.depth else 4
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        out = self.maps(image)
+        return out[:, : self.heat_channels], out[:, self.heat_channels :]
+
+    def maps(self, image: Tensor) -> Tensor:
+        """Heatmap logits and geometry as one stack of maps."""
+        features: list[Tensor] = []
+        x = stem = self.stem(image)
+        for index, block in enumerate(self.blocks):
+            x = block(x)
+            if index in self._taps:
+                features.append(x)
+        features[0] = self.detail(features[0])
+        if self.config.stride_px == 2:
+            features.insert(0, stem)
+        merged = self.lateral[-1](features[-1])
+        for level in range(len(features) - 2, -1, -1):
+            merged = nn.functional.interpolate(merged, scale_factor=2.0, mode="nearest")
+            merged = self.smooth[level](self.lateral[level](features[level]) + merged)
+        out = self.head(self.trunk(merged))
+        if (
+            out.requires_grad
+        ):  # a gradient of another memory layout makes the backward pass several times slower
+            out.register_hook(lambda gradient: gradient.contiguous(memory_format=torch.channels_last))
+        return out
+
+
+class ExportedCraterNet(nn.Module):
+    """The network as flight runs it: probabilities, and geometry with the corrections of `calibrate.calibrate`.
+
+    `heat_channels` 1 leaves the paper's class heatmaps out. Corrections are part of the last layer's biases, and what
+    is left out is not computed.
+    """
+
+    def __init__(
+        self,
+        network: CraterNet,
+        geometry_shift: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0),
+        heat_channels: int = 1,
+    ) -> None:
+        super().__init__()
+        self.network = copy.deepcopy(network)
+        self.heat_channels = heat_channels
+        whole = network.head
+        assert whole.bias is not None
+        first = network.heat_channels
+        kept = [*range(heat_channels), *range(first, first + network.geometry_channels)]
+        head = nn.Conv2d(whole.in_channels, len(kept), 1)
+        assert head.bias is not None
+        with torch.no_grad():
+            head.weight.copy_(whole.weight[kept])
+            head.bias.copy_(whole.bias[kept])
+            head.bias[heat_channels : heat_channels + 4] += torch.tensor(geometry_shift)
+        self.network.head = head
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        out = self.network.maps(image)
+        return torch.sigmoid(out[:, : self.heat_channels]), out[:, self.heat_channels :]
+
+
+def count_parameters(network: nn.Module) -> int:
+    """Number of trained values."""
+    return sum(p.numel() for p in network.parameters())
+
+
+class _SqueezeExcite(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        reduced = max(8, (channels // 4 + 4) // 8 * 8)
+        self.reduce = nn.Conv2d(channels, reduced, 1)
+        self.expand = nn.Conv2d(reduced, channels, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        pooled = x.mean((2, 3), keepdim=True)
+        gate = nn.functional.hardsigmoid(self.expand(nn.functional.relu(self.reduce(pooled))))
+        return x * gate
+
+
+class _InvertedResidual(nn.Module):
+    def __init__(
+        self, channels: int, expanded: int, out: int, kernel: int, stride: int, squeeze: bool, swish: bool
+    ) -> None:
+        super().__init__()
+        self.residual = stride == 1 and channels == out
+        layers: list[nn.Module] = []
+        if expanded != channels:
+            layers.append(_conv_norm(channels, expanded, 1, activation=_activation(swish)))
+        layers.append(
+            _conv_norm(
+                expanded, expanded, kernel, stride=stride, groups=expanded, activation=_activation(swish)
+            )
+        )
+        if squeeze:
+            layers.append(_SqueezeExcite(expanded))
+        layers.append(_conv_norm(expanded, out, 1, activation=None))
+        self.body = nn.Sequential(*layers)
+
+    def forward(self, x: Tensor) -> Tensor:
+        y: Tensor = self.body(x)
+        return x + y if self.residual else y
+
+
+def _activation(swish: bool) -> nn.Module:
+    return nn.Hardswish() if swish else nn.ReLU()
+
+
+def _conv_norm(
+    channels: int,
+    out: int,
+    kernel: int,
+    stride: int = 1,
+    groups: int = 1,
+    activation: nn.Module | None = None,
+) -> nn.Sequential:
+    layers: list[nn.Module] = [
+        nn.Conv2d(channels, out, kernel, stride, kernel // 2, groups=groups, bias=False),
+        nn.BatchNorm2d(out, momentum=0.02),
+    ]
+    if activation is not None:
+        layers.append(activation)
+    return nn.Sequential(*layers)
+
+
+def _separable(channels: int, out: int) -> nn.Sequential:
+    depthwise = nn.Conv2d(channels, channels, 3, padding=1, groups=channels, bias=False)
+    return nn.Sequential(depthwise, _conv_norm(channels, out, 1, activation=nn.ReLU()))
+
+
+def _initialise(network: CraterNet) -> None:
+    for module in network.modules():
+        if isinstance(module, nn.Conv2d):
+            fan_out = module.kernel_size[0] * module.kernel_size[1] * module.out_channels / module.groups
+            nn.init.normal_(module.weight, 0.0, math.sqrt(2.0 / fan_out))
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)
+    nn.init.normal_(network.head.weight, 0.0, 0.01)

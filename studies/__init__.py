@@ -1,0 +1,1 @@
+"""Experiments on navigation and detection; their results are in docs/."""

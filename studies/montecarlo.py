@@ -1,0 +1,616 @@
+"""Monte Carlo of anchored navigation with simulated detections: no images, so that thousands of frames take seconds.
+
+A case is a world (true gravity and orientation, true craters), what was uploaded (another gravity field, a catalogue
+with errors), and how the instruments err. One seed draws one run. Statistics compare the errors with the
+covariances that the filter claims: a filter whose noise is mistuned looks fine in its errors and fails here.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
+from lunar.catalogue import CraterCatalogue, size_class
+from lunar.constants import MOON_RADIUS_M
+from lunar.frames import Orientation, matrix_from_quaternion, rtn_from_inertial
+from lunar.gravity import GravityField
+from lunar.propagation import ForceModel, propagate
+from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
+from payload_emulator.flight.navigation.anchored import AnchoredNavigator, AnchoredParameters
+from payload_emulator.flight.navigation.landmark_map import FIRST_LANDMARK_ID
+from payload_emulator.flight.navigation.outcomes import Outcome
+from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, in_view, landmark_map, look
+from payload_emulator.flight.vision.detections import Detections
+from tmtc.tables import (
+    CatalogueTable,
+    GravityTable,
+    InitialState,
+    pack_catalogue_table,
+    pack_gravity_table,
+    pack_orientation_table,
+    unpack_catalogue_table,
+    unpack_gravity_table,
+    unpack_orientation_table,
+)
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_NS = 1_000_000_000
+_ORIENTATION_STEP_NS = 7_200 * _NS
+_PUSH_S = 60.0
+_ORIENTATION_MARGIN_NS = 5 * _ORIENTATION_STEP_NS
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedDetector:
+    """Detector model given by its confusion table.
+
+    Attributes
+    ----------
+    recall
+        By size class 0, 1, 2 and 3 (3 to 5 km).
+    precision
+        Share of detections that are craters; the others are distributed uniformly, with the diameters of true ones.
+    sigma_px
+        Error of centres, per axis; `claimed_sigma_px` is the value that the detector reports (None: the true one).
+    persistence
+        Share of the variance that is common to all frames of a crater.
+    bias_px, bias_sigma_px, bias_correlation_s
+        Shift of all detections, right and down: a given value plus a first-order Gauss-Markov process with this
+        correlation time (infinite: constant for a run).
+    scale, scale_sigma
+        Scale error of all detections about the image centre: a given value plus a random value for each run.
+    log_diameter_sigma
+        Error of the logarithm of the diameter.
+    """
+
+    recall: tuple[float, float, float, float] = (0.6, 0.6, 0.7, 0.6)
+    precision: float = 0.85
+    sigma_px: float = 1.5
+    claimed_sigma_px: float | None = None
+    persistence: float = 0.0
+    bias_px: tuple[float, float] = (0.0, 0.0)
+    bias_sigma_px: float = 0.0
+    bias_correlation_s: float = float("inf")
+    scale: float = 0.0
+    scale_sigma: float = 0.0
+    log_diameter_sigma: float = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class CatalogueErrors:
+    """Errors of the uploaded catalogue, one sigma, drawn once per run.
+
+    `offset_enu_m` is shared by all craters, with `offset_sigma_m` drawn on top; `wrong_share` is the share of entries
+    where there is no crater at all.
+    """
+
+    centre_of_diameter: float = 0.03
+    centre_floor_m: float = 0.0
+    height_m: float = 100.0
+    offset_enu_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    offset_sigma_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    wrong_share: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Kidnap:
+    """At a frame the spacecraft is found elsewhere: turned about the Moon's centre by a distance on the ground."""
+
+    frame: int
+    distance_m: float
+    told: bool
+
+
+@dataclass(frozen=True, eq=False)
+class NavigationCase:
+    """Inputs of one run, given a seed; all of them can be pickled.
+
+    Attributes
+    ----------
+    position_icrf_m, velocity_icrf_m_s
+        True state at `epoch_utc_ns`.
+    frame_utc_ns, imaging
+        Times of the frames, and whether there is an image (n,).
+    gravity, gravity_degree, orientation
+        Of the truth.
+    filter_gravity, filter_orientation
+        As uploaded.
+    craters
+        True craters with rim heights.
+    start_position_m, start_velocity_m_s
+        Size (3-D, one sigma) of the error of the state that starts the filter.
+    attitude_noise_rad, attitude_bias_rad, attitude_correlation_s
+        Errors of the ADCS message, per axis, 1 sigma; the bias is a first-order Gauss-Markov process with this
+        correlation time (infinite: constant for a run).
+    on_board
+        Mask of the craters in the uploaded catalogue; None for all.
+    lasting_m_s2, lasting_correlation_s
+        Slowly varying acceleration of the truth, such as solar radiation pressure: first-order Gauss-Markov process,
+        radial, transverse, normal, 1 sigma.
+    any_node, node_longitudes_deg
+        Each run rotates the orbit about the Moon's axis by a random angle, such that the longitude of the ascending
+        node at the epoch lies between two values, if they are given.
+    """
+
+    epoch_utc_ns: int
+    position_icrf_m: Float
+    velocity_icrf_m_s: Float
+    frame_utc_ns: Index
+    imaging: NDArray[np.bool_]
+    gravity: GravityField
+    gravity_degree: int
+    orientation: Orientation
+    filter_gravity: GravityField
+    filter_orientation: Orientation
+    craters: CraterCatalogue
+    camera: PinholeCamera = field(default_factory=PinholeCamera)
+    detector: SimulatedDetector = field(default_factory=SimulatedDetector)
+    catalogue_errors: CatalogueErrors = field(default_factory=CatalogueErrors)
+    start_position_m: float = 1_000.0
+    start_velocity_m_s: float = 1.0
+    attitude_noise_rad: float = float(np.radians(0.01))
+    attitude_bias_rad: float = float(np.radians(0.01))
+    attitude_correlation_s: float = float("inf")
+    kidnap: Kidnap | None = None
+    on_board: NDArray[np.bool_] | None = None
+    lasting_m_s2: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lasting_correlation_s: float = 900.0
+    any_node: bool = False
+    node_longitudes_deg: tuple[float, float] | None = None
+    parameters: AnchoredParameters = field(default_factory=AnchoredParameters)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NavigationRun:
+    """Errors and claims of one run, a row per frame.
+
+    Attributes
+    ----------
+    error_rtn_m, sigma_rtn_m
+        Estimate minus truth, and one sigma, radial, transverse, normal.
+    velocity_error_m_s
+        Length of the velocity error.
+    nees
+        Of position and velocity: 6 degrees of freedom.
+    nis, degrees
+        Of each fix; NaN and 0 without one.
+    innovation
+        Mean innovation of each fix, right and down, over its standard deviation; NaN without one.
+    matched, wrong
+        Craters of the fix, and how many of them were taken for another.
+    findable
+        Detections in the frame of craters that are in the catalogue.
+    """
+
+    frame_utc_ns: Index
+    imaging: NDArray[np.bool_]
+    outcome: Index
+    error_rtn_m: Float
+    sigma_rtn_m: Float
+    velocity_error_m_s: Float
+    nees: Float
+    nis: Float
+    degrees: Index
+    innovation: Float
+    matched: Index
+    wrong: Index
+    findable: Index
+    altitude_m: Float
+
+    @property
+    def error_m(self) -> Float:
+        """Length of the position error."""
+        return np.asarray(np.linalg.norm(self.error_rtn_m, axis=1), dtype=np.float64)
+
+    @property
+    def fixed(self) -> NDArray[np.bool_]:
+        return np.asarray(self.outcome == Outcome.fixed, dtype=np.bool_)
+
+
+@dataclass(frozen=True, slots=True)
+class Consistency:
+    """Whether errors and claims of some runs agree; imaging frames after the settling time.
+
+    Attributes
+    ----------
+    anees
+        Average normalised estimation error squared of position and velocity: 6 for a filter that knows its errors.
+    nis_per_degree
+        Average normalised innovation squared per degree of freedom: 1.
+    contained_95
+        Share of frames inside 1.96 sigma in radial, transverse, normal: 0.95.
+    innovation_correlation
+        Correlation of the mean innovations of neighbouring frames: 0 for white innovations.
+    median_m, p95_m, largest_m
+        Position error, 3-D.
+    fixed_share, wrong_share
+        Frames fixed, of those with at least four findable craters; craters taken for others, of those matched.
+    """
+
+    anees: float
+    nis_per_degree: float
+    contained_95: tuple[float, float, float]
+    innovation_correlation: float
+    median_m: float
+    p95_m: float
+    largest_m: float
+    fixed_share: float
+    wrong_share: float
+
+
+def fly(case: NavigationCase, seed: int) -> NavigationRun:
+    """Return one run of a case: the same seed, the same run."""
+    rng, given_px = np.random.default_rng(seed), np.array(case.detector.bias_px)
+    case = _with_drawn_biases(case, np.random.default_rng((seed, 1)))
+    if case.any_node:
+        case = _with_drawn_node(case, np.random.default_rng((seed, 2)))
+    true_map = landmark_map(catalogue_table(case.craters))
+    table = _with_errors(catalogue_table(case.craters), case.catalogue_errors, rng)
+    if case.on_board is not None:
+        table = table.select(case.on_board)
+    states, rotations = _truth(case, rng, np.random.default_rng((seed, 4)))
+    ticks = np.asarray(ticks_from_utc_ns(case.frame_utc_ns), dtype=np.int64)
+    navigator = _navigator(case, table, states[0], int(ticks[0]), rng)
+    bias_rad = case.attitude_bias_rad * rng.standard_normal(3)
+    lasting = rng.standard_normal((len(true_map), 2))
+    detector, slow = case.detector, np.random.default_rng((seed, 3))
+    elapsed_s = np.diff(case.frame_utc_ns) / _NS
+    tilts_rad = _wandering(bias_rad, case.attitude_bias_rad, case.attitude_correlation_s, elapsed_s, slow)
+    drawn_px = np.array(detector.bias_px) - given_px
+    shifts_px = given_px + _wandering(
+        drawn_px, detector.bias_sigma_px, detector.bias_correlation_s, elapsed_s, slow
+    )
+    rows = []
+    for k in range(ticks.size):
+        camera_from_icrf = nadir_camera_from_mcmf(rotations[k] @ states[k, :3]) @ rotations[k]
+        found, truth = _detect(
+            case, true_map, states[k, :3], camera_from_icrf, rotations[k], lasting, shifts_px[k], rng
+        )
+        told = _turned(camera_from_icrf, tilts_rad[k] + case.attitude_noise_rad * rng.standard_normal(3))
+        if case.kidnap is not None and case.kidnap.told and k == case.kidnap.frame:
+            navigator.widen(case.kidnap.distance_m, 1e-3 * case.kidnap.distance_m)
+        shown = bool(case.imaging[k])
+        report = navigator.step(int(ticks[k]), found if shown else None, told)
+        rows.append(_row(navigator, report.outcome, report.nis, states[k], truth if shown else truth[:0]))
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    return NavigationRun(case.frame_utc_ns, case.imaging, *columns)
+
+
+def fly_many(case: NavigationCase, seeds: Sequence[int], workers: int | None = None) -> list[NavigationRun]:
+    """Return the runs of some seeds, in their order, on several processes where more than one is asked for."""
+    workers = min(len(seeds), workers or os.cpu_count() or 1)
+    if workers <= 1:
+        return [fly(case, seed) for seed in seeds]
+    with ProcessPoolExecutor(workers) as pool:
+        return list(pool.map(fly, [case] * len(seeds), seeds))
+
+
+def consistency(runs: Iterable[NavigationRun], settle_frames: int = 20) -> Consistency:
+    """Return how errors and claims of some runs agree, over imaging frames after the first few."""
+    used = [(run, run.imaging & (np.arange(run.imaging.size) >= settle_frames)) for run in runs]
+
+    def joined(name: str) -> Float:
+        return np.concatenate([np.asarray(getattr(run, name), dtype=np.float64)[mask] for run, mask in used])
+
+    error, sigma, length = joined("error_rtn_m"), joined("sigma_rtn_m"), joined("error_m")
+    fixed, matched, findable = joined("fixed") > 0.0, joined("matched"), joined("findable")
+    inside = np.mean(np.abs(error) < 1.96 * sigma, axis=0)
+    return Consistency(
+        anees=float(np.mean(joined("nees"))),
+        nis_per_degree=float(np.nansum(joined("nis")) / max(np.sum(joined("degrees")), 1.0)),
+        contained_95=(float(inside[0]), float(inside[1]), float(inside[2])),
+        innovation_correlation=_neighbour_correlation([run.innovation for run, _ in used]),
+        median_m=float(np.median(length)),
+        p95_m=float(np.percentile(length, 95.0)),
+        largest_m=float(np.max(length)),
+        fixed_share=float(np.mean(fixed[findable >= 4.0])),
+        wrong_share=float(np.sum(joined("wrong")) / max(np.sum(matched), 1.0)),
+    )
+
+
+def anees_bounds(runs: int, degrees: int = 6, sigmas: float = 1.96) -> tuple[float, float]:
+    """Return the 95 % bounds of the average over independent runs of a chi-square of so many degrees (normal limit)."""
+    width = sigmas * np.sqrt(2.0 * degrees / runs)
+    return degrees - float(width), degrees + float(width)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether the claims of a filter hold over independent runs, and where they do not."""
+
+    consistent: bool
+    anees_bounds: tuple[float, float]
+    reasons: tuple[str, ...]
+
+
+def verdict(result: Consistency, runs: int) -> Verdict:
+    """Return whether ANEES lies in its bounds, NIS in 0.9 to 1.1, innovations are white and sigmas contain errors.
+
+    Errors last over many frames, so that a run counts as one independent draw: the share inside 1.96 sigma of one
+    axis is then known to 0.22 over the root of the runs (1 sigma), and three of those are allowed.
+    """
+    low, high = anees_bounds(runs)
+    slack = 3.0 * np.sqrt(0.95 * 0.05 / runs)
+    worst = max(abs(share - 0.95) for share in result.contained_95)
+    checks = (
+        (low <= result.anees <= high, f"ANEES {result.anees:.2f} outside {low:.2f} to {high:.2f}"),
+        (
+            0.9 <= result.nis_per_degree <= 1.1,
+            f"NIS per degree {result.nis_per_degree:.3f} outside 0.9 to 1.1",
+        ),
+        (
+            abs(result.innovation_correlation) <= 0.1,
+            f"innovations correlated by {result.innovation_correlation:.3f}, over 0.1",
+        ),
+        (worst <= slack, f"share inside 1.96 sigma {worst:.3f} from 0.95, over {slack:.3f}"),
+    )
+    reasons = tuple(text for good, text in checks if not good)
+    return Verdict(not reasons, (low, high), reasons)
+
+
+def catalogue_table(craters: CraterCatalogue) -> CatalogueTable:
+    """Return craters as a table without uncertainty; those without a rim height stand on the sphere."""
+    return CatalogueTable(
+        np.arange(len(craters), dtype=np.int64),
+        craters.latitude_rad,
+        craters.longitude_rad,
+        craters.diameter_m,
+        np.nan_to_num(craters.rim_height_m),
+        np.zeros((len(craters), 3)),
+    )
+
+
+def _with_drawn_biases(case: NavigationCase, rng: np.random.Generator) -> NavigationCase:
+    """The case with the errors that last for a run drawn into its given ones."""
+    detector, errors = case.detector, case.catalogue_errors
+    bias = np.array(detector.bias_px) + detector.bias_sigma_px * rng.standard_normal(2)
+    offset = np.array(errors.offset_enu_m) + np.array(errors.offset_sigma_m) * rng.standard_normal(3)
+    scale = detector.scale + detector.scale_sigma * float(rng.standard_normal())
+    return replace(
+        case,
+        detector=replace(detector, bias_px=(float(bias[0]), float(bias[1])), scale=scale),
+        catalogue_errors=replace(errors, offset_enu_m=(float(offset[0]), float(offset[1]), float(offset[2]))),
+    )
+
+
+def _wandering(
+    first: Float, sigma: float | Float, correlation_s: float, elapsed_s: Float, rng: np.random.Generator
+) -> Float:
+    """Return a stationary first-order Gauss-Markov process (n + 1, k) from its first value over n steps."""
+    decay = np.exp(-elapsed_s / correlation_s)
+    fresh = sigma * np.sqrt(1.0 - decay**2)[:, None] * rng.standard_normal((elapsed_s.size, first.size))
+    values = np.empty((elapsed_s.size + 1, first.size))
+    values[0] = first
+    for k in range(elapsed_s.size):
+        values[k + 1] = decay[k] * values[k] + fresh[k]
+    return values
+
+
+def _with_drawn_node(case: NavigationCase, rng: np.random.Generator) -> NavigationCase:
+    """The case with its orbit turned about the Moon's axis."""
+    rotation = case.orientation.mcmf_from_icrf(float(tdb_s_from_utc_ns(case.epoch_utc_ns)))
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    if case.node_longitudes_deg is not None:
+        normal = rotation @ np.cross(case.position_icrf_m, case.velocity_icrf_m_s)
+        low, high = case.node_longitudes_deg
+        # The direction of the ascending node is axis x normal.
+        now = float(np.arctan2(normal[0], -normal[1]))
+        angle = float(np.radians(low + (high - low) * angle / (2.0 * np.pi))) - now
+    turn = _rotation(angle * rotation[2])
+    return replace(
+        case,
+        position_icrf_m=turn @ case.position_icrf_m,
+        velocity_icrf_m_s=turn @ case.velocity_icrf_m_s,
+    )
+
+
+def _with_errors(table: CatalogueTable, errors: CatalogueErrors, rng: np.random.Generator) -> CatalogueTable:
+    centre_m = np.maximum(errors.centre_of_diameter * table.diameter_m, errors.centre_floor_m)
+    sigma_m = np.stack([centre_m, centre_m, np.full(len(table), errors.height_m)], axis=1)
+    shift_m = sigma_m * rng.standard_normal(sigma_m.shape) + np.array(errors.offset_enu_m)
+    wrong = rng.uniform(size=len(table)) < errors.wrong_share
+    turned = np.where(wrong, rng.uniform(0.0, 2.0 * np.pi, len(table)), 0.0)
+    moved = CatalogueTable(
+        table.ids,
+        table.latitude_rad + shift_m[:, 1] / MOON_RADIUS_M,
+        table.longitude_rad + turned + shift_m[:, 0] / (MOON_RADIUS_M * np.cos(table.latitude_rad)),
+        table.diameter_m,
+        table.rim_height_m + shift_m[:, 2],
+        sigma_m,
+    )
+    return unpack_catalogue_table(pack_catalogue_table(moved))
+
+
+def _truth(case: NavigationCase, rng: np.random.Generator, slow: np.random.Generator) -> tuple[Float, Float]:
+    """Return true states (n, 6) and rotations mcmf_from_icrf (n, 3, 3) at the frames."""
+    model = ForceModel(case.gravity, case.orientation, case.gravity_degree)
+    tdb_s = np.asarray(tdb_s_from_utc_ns(case.frame_utc_ns), dtype=np.float64)
+    epoch_s = float(tdb_s_from_utc_ns(case.epoch_utc_ns))
+    last_s = float(tdb_s[-1]) - epoch_s + 1.0
+    if any(case.lasting_m_s2):
+        states = _pushed(case, model, epoch_s, tdb_s, slow)
+    else:
+        flown = propagate(epoch_s, case.position_icrf_m, case.velocity_icrf_m_s, last_s, model)
+        states = flown.state(tdb_s)
+    if case.kidnap is not None:
+        k = case.kidnap.frame
+        heading = rng.uniform(0.0, 2.0 * np.pi)
+        _, along, normal = rtn_from_inertial(states[k, :3], states[k, 3:])
+        axis = np.cos(heading) * normal + np.sin(heading) * along
+        turn = _rotation(axis * case.kidnap.distance_m / float(np.linalg.norm(states[k, :3])))
+        moved = propagate(
+            float(tdb_s[k]),
+            turn @ states[k, :3],
+            turn @ states[k, 3:],
+            float(tdb_s[-1] - tdb_s[k]) + 1.0,
+            model,
+        )
+        states = np.concatenate([states[:k], moved.state(tdb_s[k:])])
+    return states, case.orientation.mcmf_from_icrf(tdb_s)
+
+
+def _pushed(
+    case: NavigationCase, model: ForceModel, epoch_s: float, tdb_s: Float, rng: np.random.Generator
+) -> Float:
+    """Return true states at times (n,) with a slowly varying acceleration, applied as one impulse per minute.
+
+    An impulse at the beginning of a minute in place of 2e-6 m/s^2 throughout moves the orbit by 4 mm.
+    """
+    starts = np.arange(epoch_s, float(tdb_s[-1]) + 1.0, _PUSH_S)
+    sigma = np.array(case.lasting_m_s2)
+    lasting = _wandering(
+        sigma * rng.standard_normal(3), sigma, case.lasting_correlation_s, np.diff(starts), rng
+    )
+    state = np.concatenate([case.position_icrf_m, case.velocity_icrf_m_s])
+    states = np.empty((tdb_s.size, 6))
+    for start, push in zip(starts, lasting, strict=True):
+        velocity = state[3:] + rtn_from_inertial(state[:3], state[3:]).T @ (push * _PUSH_S)
+        arc = propagate(float(start), state[:3], velocity, _PUSH_S + 1.0, model)
+        within = (tdb_s >= start) & (tdb_s < start + _PUSH_S)
+        states[within] = arc.state(tdb_s[within])
+        state = arc.state(float(start) + _PUSH_S)
+    return states
+
+
+def _navigator(
+    case: NavigationCase, table: CatalogueTable, state: Float, ticks: int, rng: np.random.Generator
+) -> AnchoredNavigator:
+    times = np.arange(
+        int(case.frame_utc_ns[0]) - _ORIENTATION_MARGIN_NS,
+        int(case.frame_utc_ns[-1]) + _ORIENTATION_MARGIN_NS,
+        _ORIENTATION_STEP_NS,
+    )
+    tdb_s = np.asarray(tdb_s_from_utc_ns(times), dtype=np.float64)
+    rotations = case.filter_orientation.mcmf_from_icrf(tdb_s)
+    pa_from_mcmf = case.filter_orientation.pa_from_icrf(tdb_s[0]) @ rotations[0].T
+    gravity = case.filter_gravity
+    start = InitialState(
+        ticks,
+        state[:3] + case.start_position_m / np.sqrt(3.0) * rng.standard_normal(3),
+        state[3:] + case.start_velocity_m_s / np.sqrt(3.0) * rng.standard_normal(3),
+        max(case.start_position_m / np.sqrt(3.0), 1.0),
+        max(case.start_velocity_m_s / np.sqrt(3.0), 1e-3),
+    )
+    return AnchoredNavigator(
+        table,
+        unpack_gravity_table(
+            pack_gravity_table(
+                GravityTable(gravity.name, gravity.gm_m3_s2, gravity.radius_m, gravity.c_bar, gravity.s_bar)
+            )
+        ),
+        unpack_orientation_table(
+            pack_orientation_table(np.asarray(ticks_from_utc_ns(times)), rotations, pa_from_mcmf)
+        ),
+        start,
+        case.camera,
+        case.parameters,
+    )
+
+
+def _detect(
+    case: NavigationCase,
+    craters: LandmarkMap,
+    position_icrf_m: Float,
+    camera_from_icrf: Float,
+    mcmf_from_icrf: Float,
+    lasting: Float,
+    bias_px: Float,
+    rng: np.random.Generator,
+) -> tuple[Detections, Index]:
+    """Return the detections of a frame and the crater that each is of, -1 for none."""
+    detector, camera = case.detector, case.camera
+    pose = Pose(
+        position_icrf_m,
+        camera_from_icrf,
+        mcmf_from_icrf,
+        np.zeros(3),
+        np.zeros(2),
+        np.zeros(3),
+        detector.scale,
+    )
+    index = in_view(craters, pose, camera, 0.0).index
+    recall = np.array([*detector.recall, 0.0])[size_class(craters.diameter_m[index])]
+    index = index[rng.uniform(size=index.size) < recall]
+    seen = look(craters, index, pose, camera)
+    fresh, kept = np.sqrt(1.0 - detector.persistence), np.sqrt(detector.persistence)
+    error = detector.sigma_px * (fresh * rng.standard_normal((index.size, 2)) + kept * lasting[index])
+    uv = seen.uv_px + error + bias_px
+    diameter = seen.diameter_px * np.exp(detector.log_diameter_sigma * rng.standard_normal(index.size))
+    false = int(rng.poisson(max(index.size, 1) * (1.0 / detector.precision - 1.0)))
+    corner = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
+    uv = np.concatenate([uv, rng.uniform(size=(false, 2)) * corner])
+    sizes = rng.choice(diameter, false) if index.size else rng.uniform(15.0, 60.0, false)
+    diameter = np.concatenate([diameter, sizes])
+    truth = np.concatenate([index, np.full(false, -1, dtype=np.int64)])
+    order = rng.permutation(truth.size)
+    order = order[np.all((uv[order] >= -0.5) & (uv[order] <= corner + 0.5), axis=1)]
+    sigma = detector.sigma_px if detector.claimed_sigma_px is None else detector.claimed_sigma_px
+    found = Detections(
+        uv[order, 0], uv[order, 1], diameter[order], np.ones(order.size), np.full(order.size, sigma)
+    )
+    return found, craters.ids[truth[order]] * (truth[order] >= 0) - (truth[order] < 0)
+
+
+def _row(
+    navigator: AnchoredNavigator, outcome: Outcome, nis: float, state: Float, truth: Index
+) -> tuple[object, ...]:
+    mean, covariance = navigator.state.mean, navigator.state.covariance
+    error = mean[:6] - state
+    rtn = rtn_from_inertial(state[:3], state[3:])
+    sigma = np.sqrt(np.diag(rtn @ covariance[:3, :3] @ rtn.T))
+    nees = float(error @ np.linalg.solve(covariance[:6, :6], error))
+    matched = wrong = 0
+    innovation = np.full(2, np.nan)
+    fix = navigator.last_fix
+    if fix is not None:
+        matched = int(fix.index.size)
+        # Landmarks of the navigator's own map have identities that no true crater has.
+        used = navigator.landmarks.ids[fix.index]
+        other = truth[fix.identification.detection] != used
+        wrong = int(np.count_nonzero(other & (used < FIRST_LANDMARK_ID)))
+        innovation = fix.update.mean_innovation
+    findable = int(np.count_nonzero(truth >= 0))
+    return (
+        int(outcome),
+        rtn @ error[:3],
+        sigma,
+        float(np.linalg.norm(error[3:])),
+        nees,
+        nis,
+        2 * matched,
+        innovation,
+        matched,
+        wrong,
+        findable,
+        float(np.linalg.norm(state[:3])) - MOON_RADIUS_M,
+    )
+
+
+def _neighbour_correlation(series: Iterable[Float]) -> float:
+    """Return the correlation of values with those of the next frame, over all series and both axes."""
+    pairs = [np.stack([values[:-1].reshape(-1), values[1:].reshape(-1)]) for values in series]
+    joined = np.concatenate(pairs, axis=1)
+    joined = joined[:, np.all(np.isfinite(joined), axis=0)]
+    if joined.shape[1] < 3:
+        return float("nan")
+    return float(np.mean(joined[0] * joined[1]) / np.mean(joined[0] ** 2))
+
+
+def _rotation(vector_rad: Float) -> Float:
+    angle = float(np.linalg.norm(vector_rad))
+    if angle == 0.0:
+        return np.eye(3)
+    quaternion = np.concatenate([[np.cos(0.5 * angle)], np.sin(0.5 * angle) / angle * vector_rad])
+    return matrix_from_quaternion(quaternion)
+
+
+def _turned(camera_from_icrf: Float, error_rad: Float) -> Float:
+    return np.asarray(_rotation(error_rad) @ camera_from_icrf, dtype=np.float64)
