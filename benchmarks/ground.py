@@ -21,9 +21,9 @@ import numpy as np
 
 from benchmarks._ground_service import answers_under_load, memory_of_a_stream
 from benchmarks.campaigns._deployment import PostgresServer
-from ground_service.services.ground import open_ground
-from ground_service.services.ingest import ingest_file
-from ground_service.services.passes import define_pass, state_series
+from ground_service.ground import open_ground
+from ground_service.ingest.service import ingest_file
+from ground_service.passes.service import define_pass, state_series
 from ground_service.store import repository
 from ground_service.store.database import prepare_database
 from ground_service.store.packets import store_samples

@@ -29,12 +29,13 @@ from sqlalchemy import text
 
 from benchmarks.campaigns._deployment import PostgresServer
 from benchmarks.ground import mixed_downlink
-from ground_service.link.edges import CLOSER, OPENER, UNKNOWN, Edge
-from ground_service.link.stream import DownlinkReader, Link
-from ground_service.services.ground import Ground, open_ground
-from ground_service.services.ingest import ingest_file
-from ground_service.services.joining import Joiner, raw_domain
-from ground_service.store import edges, repository
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest import edge_store as edges
+from ground_service.ingest.edges import CLOSER, OPENER, UNKNOWN, Edge
+from ground_service.ingest.joining import Joiner, raw_domain
+from ground_service.ingest.service import ingest_file
+from ground_service.ingest.stream import DownlinkReader, Link
+from ground_service.store import repository
 from ground_service.store.database import prepare_database
 
 SPACECRAFT = 76

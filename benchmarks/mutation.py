@@ -57,14 +57,13 @@ class Group:
     tests: tuple[str, ...]
 
 
-_PROCESSING = "ground_service/processing"
 _FLIGHT = "payload_emulator/flight"
 _GROUND_TESTS = "tests/ground_service"
 _FLIGHT_TESTS = "tests/payload_emulator/flight"
 
 GROUPS = {
     "accounting": Group(
-        (f"{_PROCESSING}/sequence.py", f"{_PROCESSING}/downlink_accounting.py", "tmtc/sequence.py"),
+        ("ground_service/ingest/core.py", "ground_service/passes/downlink_accounting.py", "tmtc/sequence.py"),
         (
             f"{_GROUND_TESTS}/processing/test_sequence.py",
             f"{_GROUND_TESTS}/processing/test_downlink_accounting.py",
@@ -72,13 +71,22 @@ GROUPS = {
         ),
     ),
     "verdicts": Group(
-        tuple(f"{_PROCESSING}/{name}.py" for name in ("verdict", "reference_error", "viewing")),
+        (
+            "ground_service/evaluation/verdict.py",
+            "ground_service/evaluation/reference_error.py",
+            "ground_service/evaluation/viewing.py",
+        ),
         tuple(f"{_GROUND_TESTS}/processing/test_{name}.py" for name in ("verdict", "viewing")),
     ),
     "evaluation": Group(
-        tuple(
-            f"{_PROCESSING}/{name}.py"
-            for name in ("pass_evaluation", "alignment", "drift", "recall", "baseline", "fixes", "trajectory")
+        (
+            "ground_service/evaluation/core.py",
+            "ground_service/evaluation/alignment.py",
+            "ground_service/evaluation/drift.py",
+            "ground_service/evaluation/recall.py",
+            "ground_service/evaluation/baselines.py",
+            "ground_service/evaluation/fixes.py",
+            "ground_service/evaluation/trajectory.py",
         ),
         (
             *(
@@ -98,9 +106,11 @@ GROUPS = {
             f"{_GROUND_TESTS}/services/test_golden_reports.py",
         ),
     ),
-    "smoother": Group((f"{_PROCESSING}/smoother.py",), (f"{_GROUND_TESTS}/processing/test_smoother.py",)),
+    "smoother": Group(
+        ("ground_service/evaluation/smoother.py",), (f"{_GROUND_TESTS}/processing/test_smoother.py",)
+    ),
     "gates": Group(
-        (f"{_PROCESSING}/regression_gates.py", f"{_PROCESSING}/regression_statistics.py"),
+        ("ground_service/regression/core.py", "ground_service/regression/statistics.py"),
         (
             f"{_GROUND_TESTS}/processing/test_regression_gates.py",
             f"{_GROUND_TESTS}/processing/test_regression_statistics.py",
@@ -131,7 +141,7 @@ GROUPS = {
         ),
     ),
     "authorisation": Group(
-        ("ground_service/services/users.py", "ground_service/api/security.py"),
+        ("ground_service/access/service.py", "ground_service/http/security.py"),
         (
             f"{_GROUND_TESTS}/services/test_users.py",
             f"{_GROUND_TESTS}/api/test_access.py",
@@ -140,8 +150,8 @@ GROUPS = {
     ),
     "commanding": Group(
         (
-            "ground_service/services/commanding.py",
-            f"{_PROCESSING}/verification.py",
+            "ground_service/commanding/service.py",
+            "ground_service/commanding/core.py",
             f"{_FLIGHT}/onboard/commanding.py",
         ),
         (

@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from ground_service.services.ground import open_ground
-from ground_service.services.passes import define_pass
+from ground_service.ground import open_ground
+from ground_service.passes.service import define_pass
 from ground_service.store import repository
 from ground_service.store.rollups import HOUSEKEEPING_VALUES, add_to_rollups
 from lunar.timescales import parse_utc, ticks_from_utc_ns

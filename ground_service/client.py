@@ -92,7 +92,7 @@ class Client:
 
     def import_archive(self, folder: Path) -> int:
         """Upload a pass archive and wait until it is imported; the id of its pass."""
-        from ground_service.services.archive_zip import zip_folder
+        from ground_service.passes.archive_zip import zip_folder
 
         if not (folder / "manifest.json").is_file():
             raise InvalidInput(str(folder), "", "a pass archive with manifest.json", "no manifest.json")

@@ -27,6 +27,8 @@ from __future__ import annotations
 
 import errno
 import re
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://[^\s'\"]*")
@@ -221,3 +223,20 @@ def public_text(error: BaseException) -> str:
     shown = _PATH.sub(r"\1", _URL.sub("(address)", text))
     line = " ".join("".join(c if c.isprintable() else " " for c in shown).split())
     return line if len(line) <= PUBLIC_LIMIT else line[: PUBLIC_LIMIT - 1] + "…"
+
+
+@dataclass(frozen=True, slots=True)
+class PlanConflict:
+    """Something that stands in the way of a window."""
+
+    kind: str
+    window_id: int | None
+    detail: str
+
+
+class PlanConflicts(Conflict):
+    """A window contradicts others or the resources; `conflicts` says how."""
+
+    def __init__(self, what: str, conflicts: Sequence[PlanConflict]) -> None:
+        super().__init__(f"{what}: " + "; ".join(conflict.detail for conflict in conflicts))
+        self.conflicts = tuple(conflicts)

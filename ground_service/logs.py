@@ -42,7 +42,7 @@ def logging_config(style: str) -> dict[str, Any]:
         },
         "root": {"handlers": ["stderr"], "level": "INFO"},
         "loggers": {
-            # Requests are counted and logged by `ground_service.api.metrics`, with their times.
+            # Requests are counted and logged by `ground_service.worker.metrics`, with their times.
             "uvicorn.access": {"level": "WARNING"},
         },
     }

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ground_service.errors import InvalidInput
-from ground_service.services.ground import Ground
-from ground_service.services.views import (
+from ground_service.ground import Ground
+from ground_service.http.views import (
     correlation_view,
     ephemeris_view,
     pass_view,
@@ -36,13 +36,13 @@ class LocalOperations:
         self.ground.close()
 
     def list_passes(self, limit: int = 100) -> View:
-        from ground_service.services.passes import list_passes
+        from ground_service.passes.service import list_passes
 
         page = list_passes(self.ground, limit=limit)
         return {"items": [pass_view(row) for row in page.rows], "total": page.total}
 
     def pass_summary(self, pass_id: int) -> View:
-        from ground_service.services.reports import pass_summary
+        from ground_service.evaluation.service import pass_summary
 
         return pass_summary(self.ground, pass_id)
 
@@ -55,7 +55,7 @@ class LocalOperations:
         stream: str | None = None,
         offset: int = 0,
     ) -> View:
-        from ground_service.services.ingest import Place, ingest_file
+        from ground_service.ingest.service import Place, ingest_file
 
         place = None if stream is None else Place(stream, offset)
         return asdict(
@@ -63,12 +63,12 @@ class LocalOperations:
         )
 
     def import_archive(self, folder: Path) -> int:
-        from ground_service.services.archive_import import import_archive
+        from ground_service.passes.archive_import import import_archive
 
         return import_archive(self.ground, folder)
 
     def make_report(self, pass_id: int, out: Path | None = None) -> View:
-        from ground_service.services.reports import make_report
+        from ground_service.evaluation.service import make_report
 
         made = make_report(self.ground, pass_id, out=out, pdf=True)
         return {
@@ -80,7 +80,7 @@ class LocalOperations:
         }
 
     def add_ephemeris(self, path: Path, name: str | None = None, precedence: int = 0) -> View:
-        from ground_service.services.ephemerides import add_ephemeris
+        from ground_service.ephemerides.service import add_ephemeris
 
         if not path.is_file():
             raise InvalidInput(str(path), "", "an ephemeris file", "nothing there")
@@ -109,35 +109,35 @@ class LocalOperations:
         return get_mission(self.ground, revision).model_dump(mode="json")
 
     def enter_command(self, name: str, arguments: Mapping[str, Any], **where: Any) -> View:
-        from ground_service.services.commanding import enter_command
+        from ground_service.commanding.service import enter_command
 
         return self.get_command(enter_command(self.ground, name, arguments, actor=self._actor, **where))
 
     def list_commands(self, limit: int = 100) -> View:
-        from ground_service.services.commanding import list_commands
+        from ground_service.commanding.service import list_commands
 
         views, total = list_commands(self.ground, limit=limit)
         return {"items": [telecommand_view(view) for view in views], "total": total}
 
     def get_command(self, command_id: int) -> View:
-        from ground_service.services.commanding import get_command
+        from ground_service.commanding.service import get_command
 
         return telecommand_view(get_command(self.ground, command_id))
 
     def release_command(self, command_id: int) -> View:
-        from ground_service.services.commanding import release_command
+        from ground_service.commanding.service import release_command
 
         release_command(self.ground, command_id, actor=self._actor)
         return self.get_command(command_id)
 
     def reject_command(self, command_id: int, reason: str) -> View:
-        from ground_service.services.commanding import reject_command
+        from ground_service.commanding.service import reject_command
 
         reject_command(self.ground, command_id, actor=self._actor, reason=reason)
         return self.get_command(command_id)
 
     def take_uplink(self, spacecraft_id: int, instance: str, form: str) -> tuple[bytes, list[int]]:
-        from ground_service.services.commanding import take_uplink
+        from ground_service.commanding.service import take_uplink
 
         return take_uplink(
             self.ground,
@@ -148,12 +148,12 @@ class LocalOperations:
         )
 
     def uplink_state(self, spacecraft_id: int, instance: str = "flight") -> View:
-        from ground_service.services.uplink_state import uplink_state
+        from ground_service.commanding.receiver import uplink_state
 
         return uplink_state(self.ground, spacecraft_id, instance)
 
     def correlate(self, spacecraft_id: int, instance: str, points: list[View]) -> View:
-        from ground_service.services.timekeeping import correlate_spacecraft, time_points
+        from ground_service.timekeeping.service import correlate_spacecraft, time_points
 
         rows = correlate_spacecraft(
             self.ground, spacecraft_id, instance, time_points(points), actor=self._actor
@@ -161,19 +161,19 @@ class LocalOperations:
         return {"items": [correlation_view(row) for row in rows], "total": len(rows)}
 
     def correlations(self, spacecraft_id: int, instance: str) -> View:
-        from ground_service.services.timekeeping import spacecraft_correlations
+        from ground_service.timekeeping.service import spacecraft_correlations
 
         rows = spacecraft_correlations(self.ground, spacecraft_id, instance)
         return {"items": [correlation_view(row) for row in rows], "total": len(rows)}
 
     def correlate_again(self, spacecraft_id: int, instance: str) -> View:
-        from ground_service.services.timekeeping import correlate_again
+        from ground_service.timekeeping.service import correlate_again
 
         rows = correlate_again(self.ground, spacecraft_id, instance, actor=self._actor)
         return {"items": [correlation_view(row) for row in rows], "total": len(rows)}
 
     def enter_receptions(self, spacecraft_id: int, instance: str, receptions: list[View]) -> View:
-        from ground_service.services.recorrelation import enter_receptions, received_reports
+        from ground_service.timekeeping.recorrelation import enter_receptions, received_reports
 
         rows = enter_receptions(
             self.ground, spacecraft_id, instance, received_reports(receptions), actor=self._actor
@@ -181,37 +181,37 @@ class LocalOperations:
         return {"items": [correlation_view(row) for row in rows], "total": len(rows)}
 
     def time_reports(self, spacecraft_id: int, instance: str) -> View:
-        from ground_service.services.timekeeping import spacecraft_time_reports
+        from ground_service.timekeeping.service import spacecraft_time_reports
 
         rows = spacecraft_time_reports(self.ground, spacecraft_id, instance)
         return {"items": [time_report_view(row) for row in rows], "total": len(rows)}
 
     def search_windows(self, request: Mapping[str, Any]) -> View:
-        from ground_service.services.plan_requests import search
+        from ground_service.planning.requests import search
 
         return search_view(*search(self.ground, self._read("WindowSearch", request)))
 
     def add_window(self, request: Mapping[str, Any]) -> View:
-        from ground_service.services.plan_requests import window_entry
-        from ground_service.services.planning import add_window
+        from ground_service.planning.requests import window_entry
+        from ground_service.planning.service import add_window
 
         entry = window_entry(self._read("WindowIn", request))
         return window_view(add_window(self.ground, entry, actor=self._actor))
 
     def list_windows(self, limit: int = 100) -> View:
-        from ground_service.services.planning import list_windows
+        from ground_service.planning.service import list_windows
 
         rows, total = list_windows(self.ground, limit=limit)
         return {"items": [window_view(row) for row in rows], "total": total}
 
     def get_window(self, window_id: int) -> View:
-        from ground_service.services.planning import get_window
+        from ground_service.planning.service import get_window
 
         return window_view(get_window(self.ground, window_id))
 
     def change_window(self, window_id: int, request: Mapping[str, Any]) -> View:
-        from ground_service.services.plan_requests import window_changes
-        from ground_service.services.planning import change_window
+        from ground_service.planning.requests import window_changes
+        from ground_service.planning.service import change_window
 
         given = self._read("WindowChange", request)
         row = change_window(
@@ -225,24 +225,24 @@ class LocalOperations:
         return window_view(row)
 
     def delete_window(self, window_id: int) -> None:
-        from ground_service.services.planning import delete_window
+        from ground_service.planning.service import delete_window
 
         delete_window(self.ground, window_id, actor=self._actor)
 
     def uplink_window(self, window_id: int) -> View:
-        from ground_service.services.planning import uplink_window
+        from ground_service.planning.service import uplink_window
 
         views = [self.get_command(key) for key in uplink_window(self.ground, window_id, actor=self._actor)]
         return {"items": views, "total": len(views)}
 
     def export_plan(self) -> View:
-        from ground_service.services.plan_exchange import export_plan
+        from ground_service.planning.exchange import export_plan
 
         return export_plan(self.ground)
 
     def import_plan(self, plan: Mapping[str, Any]) -> View:
-        from ground_service.services.plan_exchange import import_plan
-        from ground_service.services.plan_requests import plan_entries
+        from ground_service.planning.exchange import import_plan
+        from ground_service.planning.requests import plan_entries
 
         entries = plan_entries(self._read("Plan", plan))
         return {"windows": import_plan(self.ground, entries, actor=self._actor)}
@@ -250,8 +250,8 @@ class LocalOperations:
     def list_audit(
         self, *, limit: int = 100, since: str | None = None, until: str | None = None, **equal: str | None
     ) -> View:
-        from ground_service.services.audit_log import list_entries
-        from ground_service.services.plan_schemas import time_of
+        from ground_service.access.audit_log import list_entries
+        from ground_service.http.times import time_of
 
         entries, total = list_entries(
             self.ground,
@@ -263,7 +263,7 @@ class LocalOperations:
         return {"items": [entry.model_dump() for entry in entries], "total": total}
 
     def audit_head(self) -> View:
-        from ground_service.services.audit_log import audit_head
+        from ground_service.access.audit_log import audit_head
 
         return audit_head(self.ground).model_dump()
 
@@ -271,7 +271,7 @@ class LocalOperations:
         """A request checked like one that comes over the wire."""
         from pydantic import ValidationError
 
-        from ground_service.services import plan_schemas
+        from ground_service.planning import model as plan_schemas
 
         try:
             return getattr(plan_schemas, name).model_validate(dict(request))

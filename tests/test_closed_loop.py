@@ -134,9 +134,9 @@ def test_the_manifest_hashes_what_lies_in_the_archive(demo) -> None:
 
 
 def test_importing_the_archive_again_changes_nothing(demo) -> None:
-    from ground_service.services.archive_import import import_archive
-    from ground_service.services.ground import open_ground
-    from ground_service.services.reports import pass_summary
+    from ground_service.evaluation.service import pass_summary
+    from ground_service.ground import open_ground
+    from ground_service.passes.archive_import import import_archive
 
     figures, out = demo
     with open_ground(out / "ground") as ground:

@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.ground import mixed_downlink
-from ground_service.services.ground import Ground, open_ground
-from ground_service.services.ingest import Place, ingest_file
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest.service import Place, ingest_file
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
 from tmtc.downlink import decode

@@ -43,15 +43,15 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from benchmarks.campaigns._deployment import PostgresServer
 from benchmarks.ground import START, mixed_downlink
-from ground_service.services.commanding import enter_command, release_command
-from ground_service.services.ground import Ground, open_ground
-from ground_service.services.ingest import ingest_file
-from ground_service.services.integrity import Verification, verify
-from ground_service.services.passes import define_pass
-from ground_service.services.planning import WindowEntry, add_window
-from ground_service.services.users import add_user
+from ground_service.access.service import add_user
+from ground_service.commanding.service import enter_command, release_command
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest.service import ingest_file
+from ground_service.passes.service import define_pass
+from ground_service.planning.service import WindowEntry, add_window
 from ground_service.store.audit import GUARD_NAMES
 from ground_service.store.models import Base
+from ground_service.worker.integrity import Verification, verify
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 from tmtc.packets import PacketSequencer

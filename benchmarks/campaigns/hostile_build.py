@@ -256,8 +256,8 @@ def write_archive(folder: Path) -> None:
 RUN = """
 import json, sys
 from pathlib import Path
-from ground_service.services.build_runs import run_build
-from ground_service.services.builds import load_build
+from ground_service.regression.build_runs import run_build
+from ground_service.regression.builds import load_build
 archive, out, runner, home, *builds = sys.argv[1:]
 for build in builds:
     place = Path(out) / Path(build).parent.name

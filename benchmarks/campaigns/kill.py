@@ -40,19 +40,19 @@ from benchmarks.campaigns._clients import PATIENCE_S, Client, Piece, Session, br
 from benchmarks.campaigns._deployment import Deployment, Laptop
 from benchmarks.campaigns._ledger import FAULTS, AuditLine, Ledger, judge
 from benchmarks.ground import START, STEP_NS, mixed_downlink
-from ground_service.services.ground import Ground, open_ground
-from ground_service.services.ingest import ingest_file
-from ground_service.services.integrity import verify
-from ground_service.services.users import add_user
+from ground_service.access.service import add_user
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest.service import ingest_file
 from ground_service.store import audit, repository
 from ground_service.store.canonical import archive_hash
+from ground_service.worker.integrity import verify
 from lunar.timescales import format_utc
 
 SPACECRAFT = 76
 CLIENTS = 4
 APIS = 2
 ROUND_S = 10.0
-FRONT = "ground_service.api.front"
+FRONT = "ground_service.http.front"
 TARGETS = ("api", "front", "worker", "database", "broker")
 ENDS = ("done", "failed")
 COUNTS = ("uploads", "attempts", "telecommands", "handed_out", "lost", "doubled", *FAULTS, "seconds")

@@ -43,11 +43,11 @@ from benchmarks.campaigns._deployment import (
     service_environment,
     wait_until,
 )
+from ground_service.access.audit_log import list_entries
+from ground_service.access.service import add_user
 from ground_service.client import Client
-from ground_service.services.audit_log import list_entries
-from ground_service.services.ground import Ground, open_ground
-from ground_service.services.integrity import verify
-from ground_service.services.users import add_user
+from ground_service.ground import Ground, open_ground
+from ground_service.worker.integrity import verify
 from linna.cli import run
 from lunar.timescales import format_utc, parse_utc
 from payload_emulator.session.flying import SPACECRAFT_ID

@@ -33,8 +33,8 @@ from sqlalchemy import select
 
 from benchmarks.campaigns._deployment import service_environment
 from benchmarks.ground import mixed_downlink
-from ground_service.services.ground import open_ground
-from ground_service.services.ingest import ingest_file
+from ground_service.ground import open_ground
+from ground_service.ingest.service import ingest_file
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
 
@@ -174,8 +174,8 @@ int mkdir(const char *path, mode_t mode) {
 CHILD = """
 import os, sys
 from pathlib import Path
-from ground_service.services.ground import open_ground
-from ground_service.services.ingest import ingest_file
+from ground_service.ground import open_ground
+from ground_service.ingest.service import ingest_file
 home, pieces = Path(sys.argv[1]), Path(sys.argv[2])
 with open_ground(home) as ground:
     for path in sorted(pieces.iterdir()):

@@ -42,8 +42,8 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from benchmarks.campaigns._deployment import Laptop, PostgresServer, wait_until
-from ground_service.services.ground import open_ground
-from ground_service.services.users import add_user
+from ground_service.access.service import add_user
+from ground_service.ground import open_ground
 from ground_service.store.database import prepare_database
 from tmtc.dictionary import DICTIONARY
 

@@ -7,8 +7,11 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Path, Query, Response
 from pydantic import Field
 
-from ground_service.api import schemas
-from ground_service.api.common import (
+from ground_service.access import audit_log
+from ground_service.access import service as users
+from ground_service.errors import InvalidInput
+from ground_service.http import schemas
+from ground_service.http.common import (
     API_PREFIX,
     PROBLEMS,
     Admin,
@@ -19,10 +22,9 @@ from ground_service.api.common import (
     RowId,
     page_of,
 )
-from ground_service.api.requests import StrictRoute
-from ground_service.errors import InvalidInput
-from ground_service.services import audit_log, users
-from ground_service.services.plan_schemas import Given, time_of
+from ground_service.http.model import Given
+from ground_service.http.requests import StrictRoute
+from ground_service.http.times import time_of
 
 access = APIRouter(route_class=StrictRoute, prefix=API_PREFIX, responses=PROBLEMS)
 

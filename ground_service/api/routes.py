@@ -7,8 +7,14 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Path, Query, Request, Response
 from starlette.responses import JSONResponse
 
-from ground_service.api import schemas
-from ground_service.api.common import (
+from ground_service.access.idempotency import once
+from ground_service.clock import utc_now_ns
+from ground_service.ephemerides import service as ephemeris_service
+from ground_service.errors import InvalidInput, NotFound
+from ground_service.evaluation.report_overview import report_overview
+from ground_service.evaluation.service import pass_summary
+from ground_service.http import schemas
+from ground_service.http.common import (
     API_PREFIX,
     PROBLEMS,
     GroundOf,
@@ -27,21 +33,10 @@ from ground_service.api.common import (
     idempotent_id,
     page_of,
 )
-from ground_service.api.requests import StrictRoute
-from ground_service.api.uploads import UploadOf
-from ground_service.clock import utc_now_ns
-from ground_service.errors import InvalidInput, NotFound
-from ground_service.services import ephemerides as ephemeris_service
-from ground_service.services import passes as pass_service
-from ground_service.services.answers import once
-from ground_service.services.ingest import FLOWN, Place
-from ground_service.services.jobs import enter_ingest
-from ground_service.services.plan_schemas import time_of
-from ground_service.services.report_overview import report_overview
-from ground_service.services.reports import pass_summary
-from ground_service.services.series import STATE_VALUES
-from ground_service.services.upkeep import spacecraft_trends, trend_view
-from ground_service.services.views import (
+from ground_service.http.requests import StrictRoute
+from ground_service.http.times import time_of
+from ground_service.http.uploads import UploadOf
+from ground_service.http.views import (
     ephemeris_view,
     ingest_view,
     job_view,
@@ -50,7 +45,12 @@ from ground_service.services.views import (
     series_view,
     time_text,
 )
+from ground_service.ingest.service import FLOWN, Place
+from ground_service.passes import service as pass_service
+from ground_service.passes.series import STATE_VALUES
 from ground_service.store import repository
+from ground_service.worker.jobs import enter_ingest
+from ground_service.worker.upkeep import spacecraft_trends, trend_view
 
 UPLOAD_PATHS = tuple(f"{API_PREFIX}/{name}" for name in ("telemetry", "ephemerides", "archives"))
 

@@ -6,9 +6,18 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Path
 
-from ground_service.api.common import API_PREFIX, PROBLEMS, GroundOf, Limit, Offset, Operator, Viewer, page_of
-from ground_service.api.requests import StrictRoute
-from ground_service.api.schemas import PageOf
+from ground_service.http.common import (
+    API_PREFIX,
+    PROBLEMS,
+    GroundOf,
+    Limit,
+    Offset,
+    Operator,
+    Viewer,
+    page_of,
+)
+from ground_service.http.requests import StrictRoute
+from ground_service.http.schemas import PageOf
 from ground_service.missions import service
 from ground_service.missions.model import MissionDetail, MissionRevision
 

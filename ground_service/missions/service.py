@@ -7,8 +7,10 @@ from typing import Any
 
 from sqlalchemy import Connection
 
+from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Forbidden, InvalidInput
+from ground_service.ground import Ground
 from ground_service.missions import store
 from ground_service.missions.declared import mission_of_manifest
 from ground_service.missions.model import (
@@ -20,8 +22,6 @@ from ground_service.missions.model import (
     format_mission,
     parse_mission,
 )
-from ground_service.services.ground import Ground
-from ground_service.services.users import audit
 
 
 def read_mission(octets: bytes, source: str = "mission.toml") -> tuple[Mission, str]:

@@ -56,7 +56,7 @@ class Run:
     mode
         `namespaces`, or `user` in a container that is used only as a runner.
     limits
-        As in the build file; see `ground_service.services.builds.Limits`.
+        As in the build file; see `ground_service.regression.builds.Limits`.
     outputs
         Names of the files that are copied from the output folder.
     deliver, printed

@@ -32,7 +32,7 @@ _IN_RANGE = select(_PACKETS.c.digest).where(
 
 
 class Batch(Protocol):
-    """What is stored: see `ground_service.link.packets.PacketBatch`."""
+    """What is stored: see `ground_service.ingest.packets.PacketBatch`."""
 
     @property
     def apid(self) -> IntArray: ...

@@ -6,7 +6,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from ground_service.errors import InvalidInput
-from ground_service.services.surface import albedo_picture
+from ground_service.evaluation.surface import albedo_picture
 
 
 @lru_cache(maxsize=2)

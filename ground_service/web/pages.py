@@ -14,9 +14,9 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
+from ground_service.commanding.approval import DEFAULT_POLICY
 from ground_service.errors import NotFound
-from ground_service.processing.approval import DEFAULT_POLICY
-from ground_service.services.passes import PARAMETERS, STATE_VALUES
+from ground_service.passes.service import PARAMETERS, STATE_VALUES
 from ground_service.web.basemap import basemap_jpeg
 from tmtc.dictionary import DICTIONARY
 from tmtc.schema import Field, PacketDefinition

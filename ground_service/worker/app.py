@@ -1,4 +1,4 @@
-"""The Celery application: the jobs of `ground_service.services.jobs`, done by workers over a broker.
+"""The Celery application: the jobs of `ground_service.worker.jobs`, done by workers over a broker.
 
 Tasks are acknowledged when they are done and given to another worker when theirs dies; since every job may be done
 twice without harm, that loses and doubles nothing.
@@ -17,11 +17,11 @@ from kombu.exceptions import OperationalError
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import PASSING, SettingsError
+from ground_service.ground import Ground, ground_from_settings
 from ground_service.logs import logging_config
-from ground_service.services.ground import Ground, ground_from_settings
-from ground_service.services.jobs import enter_job, run_job
-from ground_service.services.upkeep import nightly_job_id
 from ground_service.settings import Settings
+from ground_service.worker.jobs import enter_job, run_job
+from ground_service.worker.upkeep import nightly_job_id
 
 RUN_JOB = "ground_service.run_job"
 NIGHTLY = "ground_service.nightly"

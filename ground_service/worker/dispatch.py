@@ -10,9 +10,9 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
 
 from ground_service.errors import PASSING
-from ground_service.services.ground import Ground
-from ground_service.services.jobs import enter_job, run_job, unfinished_jobs
+from ground_service.ground import Ground
 from ground_service.settings import Settings
+from ground_service.worker.jobs import enter_job, run_job, unfinished_jobs
 
 log = logging.getLogger(__name__)
 

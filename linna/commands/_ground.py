@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ground_service.services.ground import Ground
+    from ground_service.ground import Ground
     from ground_service.settings import Settings
 
 
@@ -68,7 +68,7 @@ def settings_of(arguments: argparse.Namespace, **given: object) -> Settings:
 
 def open_service(arguments: argparse.Namespace) -> Ground:
     """The local service, its database brought up to date where that is this program's to do."""
-    from ground_service.services.ground import open_ground
+    from ground_service.ground import open_ground
     from linna.data import data_folder
 
     settings = settings_of(arguments)

@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def receptions(arguments: argparse.Namespace) -> int:
-    from ground_service.services.recorrelation import read_receptions
+    from ground_service.timekeeping.recorrelation import read_receptions
     from lunar.timescales import format_utc
 
     given = [

@@ -148,7 +148,7 @@ def run_status(arguments: argparse.Namespace) -> int:
 
 def run_backup(arguments: argparse.Namespace) -> int:
     from ground_service.clock import utc_now_ns
-    from ground_service.services.backup import backup
+    from ground_service.worker.backup import backup
 
     with open_service(arguments) as ground:
         manifest = backup(ground, arguments.out, now_utc_ns=utc_now_ns())
@@ -164,7 +164,7 @@ def run_backup(arguments: argparse.Namespace) -> int:
 
 
 def run_restore(arguments: argparse.Namespace) -> int:
-    from ground_service.services.backup import restore
+    from ground_service.worker.backup import restore
 
     with open_service(arguments) as ground:
         manifest = restore(arguments.folder, ground)
@@ -176,9 +176,9 @@ def run_restore(arguments: argparse.Namespace) -> int:
 
 def run_export(arguments: argparse.Namespace) -> int:
     from ground_service.clock import utc_now_ns
-    from ground_service.services.exchange import export_database
     from ground_service.store.database import open_database
     from ground_service.store.files import FileArchive
+    from ground_service.worker.exchange import export_database
 
     settings = settings_of(arguments)
     database = open_database(settings.resolved_database_url())
@@ -200,7 +200,7 @@ def run_export(arguments: argparse.Namespace) -> int:
 
 
 def run_import(arguments: argparse.Namespace) -> int:
-    from ground_service.services.exchange import import_database
+    from ground_service.worker.exchange import import_database
 
     with open_service(arguments) as ground:
         result = import_database(ground, arguments.file, say=log)
@@ -213,7 +213,7 @@ def run_import(arguments: argparse.Namespace) -> int:
 
 
 def run_tidy(arguments: argparse.Namespace) -> int:
-    from ground_service.services.upkeep import tidy
+    from ground_service.worker.upkeep import tidy
 
     days = arguments.days if arguments.days is not None else settings_of(arguments).retention_days
     with open_service(arguments) as ground:
@@ -225,7 +225,7 @@ def run_tidy(arguments: argparse.Namespace) -> int:
 
 
 def run_redecode(arguments: argparse.Namespace) -> int:
-    from ground_service.services.redecode import redecode_all
+    from ground_service.ingest.redecode import redecode_all
 
     with open_service(arguments) as ground:
         rows = redecode_all(ground)

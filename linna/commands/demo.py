@@ -25,9 +25,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from ground_service.services.archive_import import import_archive
-    from ground_service.services.ground import open_ground
-    from ground_service.services.reports import make_report
+    from ground_service.evaluation.service import make_report
+    from ground_service.ground import open_ground
+    from ground_service.passes.archive_import import import_archive
     from linna.data import data_folder
     from payload_emulator.session.emulator import emulate
     from payload_emulator.session.scenario import load_scenario

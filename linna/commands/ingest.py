@@ -107,7 +107,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _follow(arguments: argparse.Namespace, ingest: Any, report: Any) -> None:
-    from ground_service.services.live_ingest import Spool, follow_tcp
+    from ground_service.ingest.live import Spool, follow_tcp
     from linna.errors import UsageError
 
     host, _, port = arguments.tcp.rpartition(":")
@@ -125,7 +125,7 @@ def _watch(arguments: argparse.Namespace, ingest: Any, report: Any) -> None:
     import hashlib
     import time
 
-    from ground_service.services.live_ingest import SETTLED_S, WatchedFolder
+    from ground_service.ingest.live import SETTLED_S, WatchedFolder
 
     folder = arguments.watch.resolve()
     name = hashlib.sha256(str(folder).encode()).hexdigest()[:16]

@@ -98,15 +98,15 @@ def _finish(parser: argparse.ArgumentParser, handler: Callable[[argparse.Namespa
 
 def _run(arguments: argparse.Namespace) -> int:
     from ground_service.clock import utc_now_ns
-    from ground_service.services.builds import build_of
-    from ground_service.services.regression_documents import (
+    from ground_service.regression.builds import build_of
+    from ground_service.regression.documents import (
         regression_html,
         regression_json,
         regression_junit,
         regression_text,
     )
-    from ground_service.services.regression_policy import load_policy
-    from ground_service.services.regressions import keep_regression, run_regression
+    from ground_service.regression.policy import load_policy
+    from ground_service.regression.service import keep_regression, run_regression
 
     policy = load_policy(arguments.policy)
     with open_service(arguments) as ground:
@@ -130,8 +130,8 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _sandbox(arguments: argparse.Namespace) -> int:
+    from ground_service.regression.runner import alive
     from ground_service.sandbox.host import REMEDY, protection
-    from ground_service.services.runner import alive
     from ground_service.settings import load_settings
 
     exchange = load_settings().runner_exchange
@@ -158,10 +158,10 @@ def _sandbox(arguments: argparse.Namespace) -> int:
 
 
 def _baseline(arguments: argparse.Namespace) -> int:
-    from ground_service.services.builds import build_of
-    from ground_service.services.regression_baseline import baseline_figures, baseline_text
-    from ground_service.services.regression_policy import load_policy
-    from ground_service.services.regressions import run_regression
+    from ground_service.regression.baseline import baseline_figures, baseline_text
+    from ground_service.regression.builds import build_of
+    from ground_service.regression.policy import load_policy
+    from ground_service.regression.service import run_regression
 
     with open_service(arguments) as ground:
         build = build_of(ground, arguments.build)
@@ -203,9 +203,9 @@ def _suite(arguments: argparse.Namespace) -> int:
 
 
 def _bisect(arguments: argparse.Namespace) -> int:
-    from ground_service.services.builds import build_of
-    from ground_service.services.regression_policy import load_policy
-    from ground_service.services.regression_search import bisect
+    from ground_service.regression.builds import build_of
+    from ground_service.regression.policy import load_policy
+    from ground_service.regression.search import bisect
 
     with open_service(arguments) as ground:
         found = bisect(
@@ -240,10 +240,10 @@ def _bisect(arguments: argparse.Namespace) -> int:
 def _search(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from ground_service.services.builds import build_of
-    from ground_service.services.regression_policy import load_policy
-    from ground_service.services.regression_search import differences
-    from ground_service.services.regressions import run_regression
+    from ground_service.regression.builds import build_of
+    from ground_service.regression.policy import load_policy
+    from ground_service.regression.search import differences
+    from ground_service.regression.service import run_regression
 
     with open_service(arguments) as ground:
         outcome = run_regression(
@@ -270,7 +270,7 @@ def _search(arguments: argparse.Namespace) -> int:
 
 
 def _archive(arguments: argparse.Namespace) -> int:
-    from ground_service.services import regression_archives as archives
+    from ground_service.regression import archives as archives
     from linna.errors import UsageError
 
     if arguments.action in ("add", "pin", "unpin", "pack") and not arguments.target:
@@ -304,7 +304,7 @@ def _archive(arguments: argparse.Namespace) -> int:
 
 
 def _build(arguments: argparse.Namespace) -> int:
-    from ground_service.services.builds import build_of, registered_builds
+    from ground_service.regression.builds import build_of, registered_builds
     from linna.errors import UsageError
 
     with open_service(arguments) as ground:

@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"replay: expected {lacking}, or --check-build BUILD, found neither")
     if arguments.archive.is_dir():
         return _fly(arguments, arguments.archive)
-    from ground_service.services.regression_archives import opened_archive
+    from ground_service.regression.archives import opened_archive
 
     with opened_archive(arguments.archive) as archive:
         return _fly(arguments, archive)
@@ -100,8 +100,8 @@ def _complete(arguments: argparse.Namespace, archive: Path) -> int:
 
 
 def _run_command(arguments: argparse.Namespace, archive: Path) -> int:
-    from ground_service.services.build_runs import run_build
-    from ground_service.services.builds import load_build
+    from ground_service.regression.build_runs import run_build
+    from ground_service.regression.builds import load_build
     from ground_service.settings import load_settings
 
     runner = load_settings().runner_exchange

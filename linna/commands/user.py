@@ -63,7 +63,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def add(arguments: argparse.Namespace) -> int:
-    from ground_service.services.users import add_user
+    from ground_service.access.service import add_user
 
     with open_service(arguments) as ground:
         token = add_user(
@@ -74,7 +74,7 @@ def add(arguments: argparse.Namespace) -> int:
 
 
 def renew(arguments: argparse.Namespace) -> int:
-    from ground_service.services.users import add_token, renew_token
+    from ground_service.access.service import add_token, renew_token
 
     make = add_token if arguments.keep else renew_token
     with open_service(arguments) as ground:
@@ -86,7 +86,7 @@ def renew(arguments: argparse.Namespace) -> int:
 def ensure(arguments: argparse.Namespace) -> int:
     import os
 
-    from ground_service.services.users import ensure_user
+    from ground_service.access.service import ensure_user
     from linna.errors import UsageError
 
     token = os.environ.get(arguments.token_variable, "")
@@ -100,7 +100,7 @@ def ensure(arguments: argparse.Namespace) -> int:
 
 
 def change(arguments: argparse.Namespace) -> int:
-    from ground_service.services.users import change_user
+    from ground_service.access.service import change_user
 
     with open_service(arguments) as ground:
         user = change_user(
@@ -111,7 +111,7 @@ def change(arguments: argparse.Namespace) -> int:
 
 
 def list_all(arguments: argparse.Namespace) -> int:
-    from ground_service.services.users import list_users
+    from ground_service.access.service import list_users
 
     with open_service(arguments) as ground:
         users = list_users(ground)
@@ -124,7 +124,7 @@ def list_all(arguments: argparse.Namespace) -> int:
 
 
 def list_tokens(arguments: argparse.Namespace) -> int:
-    from ground_service.services.users import list_tokens as read_tokens
+    from ground_service.access.service import list_tokens as read_tokens
 
     with open_service(arguments) as ground:
         tokens = read_tokens(ground, arguments.name)
@@ -143,7 +143,7 @@ def list_tokens(arguments: argparse.Namespace) -> int:
 
 
 def revoke(arguments: argparse.Namespace) -> int:
-    from ground_service.services.users import revoke_token
+    from ground_service.access.service import revoke_token
 
     with open_service(arguments) as ground:
         token = revoke_token(ground, arguments.token_id, actor=local_actor())

@@ -28,8 +28,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from ground_service.services.audit_log import parse_head
-    from ground_service.services.integrity import verify
+    from ground_service.access.audit_log import parse_head
+    from ground_service.worker.integrity import verify
 
     head = parse_head(arguments.head) if arguments.head is not None else None
     began = time.monotonic()

@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 from sqlalchemy import create_engine, text
 
-from ground_service.services.ground import Ground, open_ground
+from ground_service.ground import Ground, open_ground
 from ground_service.store.database import prepare_database
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue, make_catalogue, save_catalogue, size_class

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 import uvicorn
 
-from ground_service.api.app import create_app
-from ground_service.api.server import bind
-from ground_service.services.archive_import import import_archive
-from ground_service.services.ground import open_ground
-from ground_service.services.users import add_user
+from ground_service.access.service import add_user
+from ground_service.app import create_app
+from ground_service.ground import open_ground
+from ground_service.passes.archive_import import import_archive
+from ground_service.server import bind
 from ground_service.settings import Settings
 from linna.cli import run
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks.campaigns.damage import ALONE, CHANGES, SOURCES, Harm, SqliteCopies, harms, outside
-from ground_service.services.integrity import verify
 from ground_service.store.models import Base
+from ground_service.worker.integrity import verify
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from ground_service.api.app import create_app
-from ground_service.services.users import add_user
+from ground_service.access.service import add_user
+from ground_service.app import create_app
 from ground_service.settings import Settings
 
 with warnings.catch_warnings():

@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from ground_service.api.app import create_app
-from ground_service.services.archive_import import import_archive
-from ground_service.services.users import add_user
+from ground_service.access.service import add_user
+from ground_service.app import create_app
+from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from lunar.timescales import parse_utc
 from tmtc.downlink import DownlinkEncoder
@@ -418,12 +418,12 @@ def test_figures_are_kept_by_route(client: TestClient) -> None:
 def test_requests_are_logged_with_an_id_that_the_answer_carries(
     client: TestClient, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with caplog.at_level("INFO", "ground_service.api.metrics"):
+    with caplog.at_level("INFO", "ground_service.worker.metrics"):
         named = client.get(f"{V1}/passes/999", headers={"X-Request-ID": "abc-1"})
         made_up = client.get(f"{V1}/passes", headers={"X-Request-ID": "two\tlines"})
         client.get("/healthz")
     assert named.headers["X-Request-ID"] == "abc-1"
-    told = [vars(record) for record in caplog.records if record.name == "ground_service.api.metrics"]
+    told = [vars(record) for record in caplog.records if record.name == "ground_service.worker.metrics"]
     assert [(one["status"], one["route"], one["caller"]) for one in told] == [
         (404, "/api/v1/passes/{pass_id}", "local"),
         (200, "/api/v1/passes", "local"),
@@ -442,8 +442,8 @@ def test_json_that_no_reader_takes_is_refused_in_one_line(client: TestClient) ->
 def test_a_night_that_was_slept_through_is_made_up_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from ground_service.api import app as application
-    from ground_service.services.upkeep import nightly_job_id
+    from ground_service import app as application
+    from ground_service.worker.upkeep import nightly_job_id
 
     noon = parse_utc("2029-08-07T12:00:00Z")
     monkeypatch.setattr(application, "CATCH_UP_S", -1.0)
@@ -488,9 +488,9 @@ def test_a_telecommand_that_is_sent_again_under_its_key_is_queued_once(
 
 
 def test_a_key_whose_work_was_cut_off_is_refused_and_says_why(tmp_path: Path) -> None:
+    from ground_service.access.idempotency import once
     from ground_service.errors import Conflict, DatabaseUnavailable
-    from ground_service.services.answers import once
-    from ground_service.services.ground import open_ground
+    from ground_service.ground import open_ground
 
     def ask(ground: Any, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         return once(ground, actor="ann", operation="window", key="k", request={"a": 1}, work=work)
@@ -520,7 +520,7 @@ def test_passes_and_windows_sent_again_under_their_key_are_entered_once(client: 
 
 
 def test_figures_of_work_that_is_over_go_away(tmp_path: Path) -> None:
-    from ground_service.services.jobs import enter_job, run_job
+    from ground_service.worker.jobs import enter_job, run_job
 
     with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as opened:
         ground = opened.app.state.ground
@@ -533,8 +533,8 @@ def test_figures_of_work_that_is_over_go_away(tmp_path: Path) -> None:
 
 
 def test_jobs_left_unfinished_are_taken_up_again(synthetic_pass: Any, tmp_path: Path) -> None:
-    from ground_service.services.ground import open_ground
-    from ground_service.services.jobs import enter_job
+    from ground_service.ground import open_ground
+    from ground_service.worker.jobs import enter_job
 
     with open_ground(tmp_path) as ground:
         import_archive(ground, synthetic_pass.folder)

@@ -11,8 +11,8 @@ import pytest
 import uvicorn
 from uvicorn.server import ServerState
 
-from ground_service.api.connections import ConnectionLimits, Door
-from ground_service.api.proxies import TrustedProxies
+from ground_service.http.connections import ConnectionLimits, Door
+from ground_service.http.proxies import TrustedProxies
 
 QUICK = ConnectionLimits(
     head_s=0.4, reserve_head_s=0.4, body_s=0.5, body_octets=64, unread_s=0.5, discard_s=0.5, stop_s=0.4

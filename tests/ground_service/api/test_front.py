@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 import ground_service
-from ground_service.api import front
-from ground_service.api.front import HEARTBEAT, STALE_S
+from ground_service.http import front
+from ground_service.http.front import HEARTBEAT, STALE_S
 
 PATIENCE_S = 60.0
 HEALTH = b"GET /healthz HTTP/1.1\r\nHost: a\r\n\r\n"

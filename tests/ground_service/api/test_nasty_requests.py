@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from ground_service.api.app import create_app
-from ground_service.services.archive_import import import_archive
-from ground_service.services.commanding import enter_command
-from ground_service.services.planning import WindowEntry, add_window
+from ground_service.app import create_app
+from ground_service.commanding.service import enter_command
+from ground_service.passes.archive_import import import_archive
+from ground_service.planning.service import WindowEntry, add_window
 from ground_service.settings import Settings
 
 with warnings.catch_warnings():

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from starlette.websockets import WebSocketDisconnect
 
-from ground_service.api.app import create_app
+from ground_service.app import create_app
 from ground_service.settings import Settings
 
 with warnings.catch_warnings():

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from ground_service.api.app import create_app
+from ground_service.app import create_app
 from ground_service.settings import Settings
 from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
 from tmtc.dictionary import DICTIONARY

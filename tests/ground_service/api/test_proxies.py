@@ -2,8 +2,8 @@
 
 import pytest
 
-from ground_service.api.proxies import TrustedProxies, address_key
 from ground_service.errors import SettingsError
+from ground_service.http.proxies import TrustedProxies, address_key
 from ground_service.settings import load_settings
 
 PROXIES = TrustedProxies(["10.0.0.0/8", "192.0.2.9", "2001:db8::/32"])

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from ground_service.api.app import create_app
-from ground_service.services.regression_archives import pack_archive
-from ground_service.services.users import add_user
+from ground_service.access.service import add_user
+from ground_service.app import create_app
+from ground_service.regression.archives import pack_archive
 from ground_service.settings import Settings
 
 with warnings.catch_warnings():

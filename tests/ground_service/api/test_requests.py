@@ -11,13 +11,13 @@ import pytest
 from fastapi.routing import APIRoute
 from pydantic import BaseModel
 
-from ground_service.api.app import create_app
-from ground_service.api.regression_routes import RegressionRequest
-from ground_service.api.requests import parse_json
-from ground_service.api.schemas import ReceptionIn, TimePointIn
+from ground_service.app import create_app
 from ground_service.errors import DatabaseUnavailable, FileDamaged, StorageFull, StorageReadOnly
-from ground_service.services.ground import open_ground
-from ground_service.services.plan_schemas import WindowIn
+from ground_service.ground import open_ground
+from ground_service.http.requests import parse_json
+from ground_service.http.schemas import ReceptionIn, TimePointIn
+from ground_service.planning.model import WindowIn
+from ground_service.regression.routes import RegressionRequest
 from ground_service.settings import Settings
 
 with warnings.catch_warnings():

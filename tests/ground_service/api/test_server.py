@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from ground_service.api.server import bind, serve
 from ground_service.errors import ServerError
+from ground_service.server import bind, serve
 from ground_service.settings import Settings
 
 
@@ -40,7 +40,7 @@ def test_the_listener_names_its_protocol_so_that_answers_are_not_held_back_by_na
 
 def test_the_service_starts_without_libraries_that_only_computations_need() -> None:
     code = (
-        "import sys, ground_service.api.server; "
+        "import sys, ground_service.server; "
         "print([m for m in sys.modules if m in ('scipy', 'matplotlib', 'cv2', 'numba', 'torch', 'celery')])"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 from starlette.websockets import WebSocketDisconnect
 
-from ground_service.api import sockets
-from ground_service.api.app import create_app
-from ground_service.services import users
-from ground_service.services.feed import publish
+from ground_service.access import service as users
+from ground_service.app import create_app
+from ground_service.feed import publish
 from ground_service.settings import Settings
+from ground_service.web import sockets
 
 with warnings.catch_warnings():
     # It recommends another HTTP library than the installed one; both serve it.
@@ -77,7 +77,7 @@ def test_a_socket_ends_with_the_right_to_hold_it(
         await session.accept()
         await asyncio.sleep(60.0)
 
-    monkeypatch.setattr("ground_service.api.payload_console._watched", hold)
+    monkeypatch.setattr("ground_service.web.payload_console._watched", hold)
     ground = ground_of(client)
     token, other = users.add_user(ground, "vera", "viewer"), users.add_user(ground, "otto", "admin")
     with (
@@ -119,7 +119,7 @@ def test_an_operator_who_becomes_a_viewer_may_no_longer_steer(
                 roles.append(session.caller.role)
                 await session.socket.send_text(session.caller.role)
 
-    monkeypatch.setattr("ground_service.api.payload_console._watched", watch_role)
+    monkeypatch.setattr("ground_service.web.payload_console._watched", watch_role)
     ground = ground_of(client)
     token = users.add_user(ground, "olga", "operator")
     with client.websocket_connect("/api/v1/payload", headers=bearer(token)) as socket:

@@ -1,6 +1,6 @@
 """Decoded columns as the store takes them."""
 
-from ground_service.link.packets import batch_of_cut
+from ground_service.ingest.packets import batch_of_cut
 from tmtc.cuc import NO_TICKS
 from tmtc.dictionary import DICTIONARY
 from tmtc.stream import cut_packets

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground_service.link.stream import DownlinkReader
+from ground_service.ingest.stream import DownlinkReader
 from tmtc.downlink import DownlinkEncoder, LinkSettings, decode, encode_cadus
 from tmtc.frames import Clcw, pack_clcw
 

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from ground_service.api.app import create_app
+from ground_service.app import create_app
+from ground_service.commanding.service import enter_command, release_command
 from ground_service.errors import Conflict, Forbidden, InvalidInput, NotFound
+from ground_service.ground import open_ground
 from ground_service.missions.declared import mission_of_manifest
 from ground_service.missions.model import (
     Evidence,
@@ -27,10 +29,8 @@ from ground_service.missions.service import (
     read_mission,
 )
 from ground_service.missions.store import approval_in_force, newest_of_spacecraft
-from ground_service.services.archive_import import import_archive
-from ground_service.services.commanding import enter_command, release_command
-from ground_service.services.ground import open_ground
-from ground_service.services.passes import define_pass, get_pass
+from ground_service.passes.archive_import import import_archive
+from ground_service.passes.service import define_pass, get_pass
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.database import prepare_database

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ground_service.processing.approval import DEFAULT_POLICY
+from ground_service.commanding.approval import DEFAULT_POLICY
 from tmtc.effects import EFFECTS, CommandEffect, Effect
 
 

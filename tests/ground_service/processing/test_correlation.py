@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ground_service.errors import EvaluationError
-from ground_service.processing.correlation import (
+from ground_service.timekeeping.core import (
     IDEAL_CLOCK,
     TimeCorrelation,
     fit_correlation,

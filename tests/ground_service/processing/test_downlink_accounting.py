@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ground_service.processing.downlink_accounting import account_raw, read_raw
+from ground_service.passes.downlink_accounting import account_raw, read_raw
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import LinkSettings, encode_cadus
 

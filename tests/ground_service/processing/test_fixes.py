@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from ground_service.processing.fixes import (
+from ground_service.evaluation.fixes import (
     IdentificationSamples,
     Pairs,
     join_pairs,
     snapshot_positions,
     wrong_fixes,
 )
-from ground_service.processing.samples import DetectionSamples
+from ground_service.passes.samples import DetectionSamples
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import make_catalogue
 from lunar.frames import mcmf_from_spherical

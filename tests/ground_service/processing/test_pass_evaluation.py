@@ -16,25 +16,25 @@ import pytest
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from ground_service.processing.baseline import StartState
-from ground_service.processing.fixes import IdentificationSamples
-from ground_service.processing.landmarks import MappedCraters
-from ground_service.processing.pass_evaluation import (
+from ground_service.evaluation.baselines import StartState
+from ground_service.evaluation.core import (
     PassInputs,
     _imaging_arcs,
     _joined,
     evaluate_pass,
     summary_of,
 )
-from ground_service.processing.samples import (
+from ground_service.evaluation.fixes import IdentificationSamples
+from ground_service.evaluation.landmarks import MappedCraters
+from ground_service.evaluation.smoother import FilterStates
+from ground_service.evaluation.verdict import Limits
+from ground_service.evaluation.viewing import Viewing
+from ground_service.passes.samples import (
     DetectionSamples,
     NavigationSamples,
     OutcomeSamples,
     no_detections,
 )
-from ground_service.processing.smoother import FilterStates
-from ground_service.processing.verdict import Limits
-from ground_service.processing.viewing import Viewing
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, make_catalogue
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
@@ -446,7 +446,7 @@ def test_why_there_is_no_baseline(report: PassReport, monkeypatch: pytest.Monkey
     def fail(*_: object, **__: object) -> np.ndarray:
         raise LunarError("it hit the ground")
 
-    monkeypatch.setattr("ground_service.processing.pass_evaluation.propagated_positions", fail)
+    monkeypatch.setattr("ground_service.evaluation.core.propagated_positions", fail)
     crashed = evaluate_pass(inputs(start_state=START))
     assert crashed.remarks == ("no propagate-only baseline: it hit the ground",)
     assert "gravity of the baseline" not in crashed.provenance

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground_service.processing.pass_extras import dark_limit, with_terrain
+from ground_service.evaluation.extras import dark_limit, with_terrain
 from reports.values import NavigationSeries, TerrainMap
 
 

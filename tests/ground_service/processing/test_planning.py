@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground_service.processing.planning import (
+from ground_service.planning.core import (
     Commitment,
     Constraints,
     Contact,
@@ -16,7 +16,7 @@ from ground_service.processing.planning import (
     frames_between,
     storage_peak,
 )
-from ground_service.processing.window_states import (
+from ground_service.planning.window_states import (
     PlannedSpan,
     WindowFacts,
     span_conflicts,

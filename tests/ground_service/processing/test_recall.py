@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ground_service.processing.recall import (
+from ground_service.evaluation.recall import (
     ExpectedCraters,
     Matches,
     expected_craters,
     match_detections,
     score_detections,
 )
-from ground_service.processing.samples import DetectionSamples
+from ground_service.passes.samples import DetectionSamples
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, make_catalogue
 from lunar.frames import mcmf_from_spherical

@@ -10,8 +10,7 @@ import pytest
 from scipy import stats
 
 from benchmarks.gate_error_rates import degraded, outcomes, simulated, suite
-from ground_service.processing.regression_figures import Percentile, Ratio
-from ground_service.processing.regression_gates import (
+from ground_service.regression.core import (
     Gate,
     GatePolicy,
     GateRule,
@@ -21,7 +20,8 @@ from ground_service.processing.regression_gates import (
     rule_of,
     verdict_of,
 )
-from ground_service.processing.regression_samples import EstimatorFrames, PassFrames
+from ground_service.regression.metrics import Percentile, Ratio
+from ground_service.regression.model import EstimatorFrames, PassFrames
 
 POLICY = GatePolicy(
     version="test",

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ground_service.processing.sequence import COUNT_MODULUS, account_sequence
+from ground_service.ingest.core import COUNT_MODULUS, account_sequence
 from tmtc.cuc import TICKS_PER_SECOND
 
 SECOND = TICKS_PER_SECOND

@@ -5,9 +5,9 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from ground_service.evaluation.reference_error import error_budget, reference_covariance_m2
+from ground_service.evaluation.verdict import Evaluated, Limits, requirements, verdict_of, without_mission
 from ground_service.missions.model import Requirements
-from ground_service.processing.reference_error import error_budget, reference_covariance_m2
-from ground_service.processing.verdict import Evaluated, Limits, requirements, verdict_of, without_mission
 from reports.values import (
     ClassScore,
     DetectorScore,

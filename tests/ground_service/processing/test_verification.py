@@ -6,7 +6,7 @@ from itertools import combinations
 
 import pytest
 
-from ground_service.processing.verification import (
+from ground_service.commanding.core import (
     FAILURES,
     STAGES,
     SentCommand,

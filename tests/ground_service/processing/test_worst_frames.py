@@ -5,8 +5,8 @@ from typing import Any, cast
 
 import numpy as np
 
-from ground_service.processing.pass_evaluation import WORST_FRAMES, _choose_frames
-from ground_service.processing.recall import ExpectedCraters, Matches
+from ground_service.evaluation.core import WORST_FRAMES, _choose_frames
+from ground_service.evaluation.recall import ExpectedCraters, Matches
 
 FRAMES, CRATERS = 40, 5
 

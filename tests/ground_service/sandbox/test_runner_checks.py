@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from ground_service.regression import runner
 from ground_service.sandbox import launcher
 from ground_service.sandbox.host import SandboxRefused
 from ground_service.sandbox.runner_checks import build_remains
-from ground_service.services import runner
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="only root can run processes as other users")
 

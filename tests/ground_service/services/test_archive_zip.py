@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from ground_service.errors import InvalidInput
-from ground_service.services import archive_zip
-from ground_service.services.archive_zip import import_zip, unpacked, zip_folder
-from ground_service.services.ground import Ground
+from ground_service.ground import Ground
+from ground_service.passes import archive_zip
+from ground_service.passes.archive_zip import import_zip, unpacked, zip_folder
 
 
 def zipped(path: Path, entries: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> Path:
@@ -22,7 +22,7 @@ def zipped(path: Path, entries: dict[str, bytes], method: int = zipfile.ZIP_DEFL
 
 
 def test_a_zipped_archive_is_the_same_pass_as_its_folder(ground: Ground, synthetic_pass: Any) -> None:
-    from ground_service.services.archive_import import import_archive
+    from ground_service.passes.archive_import import import_archive
 
     packed = zip_folder(synthetic_pass.folder)
     try:

@@ -10,16 +10,16 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
+from ground_service.access.service import add_user, authenticate
 from ground_service.errors import Conflict, FileDamaged, InvalidInput, NotFound
-from ground_service.services.archive_import import import_archive
-from ground_service.services.backup import backup, restore
-from ground_service.services.ground import Ground, open_ground
-from ground_service.services.integrity import verify
-from ground_service.services.planning import WindowEntry, add_window, change_window
-from ground_service.services.reports import pass_summary
-from ground_service.services.users import add_user, authenticate
+from ground_service.evaluation.service import pass_summary
+from ground_service.ground import Ground, open_ground
+from ground_service.passes.archive_import import import_archive
+from ground_service.planning.service import WindowEntry, add_window, change_window
 from ground_service.store.database import prepare_database
 from ground_service.store.models import Base
+from ground_service.worker.backup import backup, restore
+from ground_service.worker.integrity import verify
 
 NS = 1_000_000_000
 START = 2_000_000_000 * NS

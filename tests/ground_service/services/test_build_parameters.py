@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from ground_service.errors import BuildNotChecked, InvalidInput
+from ground_service.ground import Ground, open_ground
+from ground_service.regression import builds
+from ground_service.regression.builds import build_of, registered_builds
 from ground_service.sandbox.host import SandboxRefused
-from ground_service.services import builds
-from ground_service.services.builds import build_of, registered_builds
-from ground_service.services.ground import Ground, open_ground
 from linna.cli import run as run_command
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from ground_service.errors import InvalidInput
-from ground_service.services.build_runs import BuildRun, run_build
-from ground_service.services.builds import load_build
+from ground_service.regression.build_runs import BuildRun, run_build
+from ground_service.regression.builds import load_build
 
 LIMITS = "\n[limits]\nwall_s = 20\ncpu_s = 10\nmemory_mib = 300\nfile_mib = 4\nfolder_mib = 12\n"
 

@@ -9,10 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sqlalchemy import select, update
 
-from ground_service.errors import Conflict, InvalidInput, NotFound
-from ground_service.processing.verification import SentCommand, VerificationReport, fate_of
-from ground_service.services import commanding
-from ground_service.services.commanding import (
+from ground_service.commanding import service as commanding
+from ground_service.commanding.core import SentCommand, VerificationReport, fate_of
+from ground_service.commanding.service import (
     enter_command,
     get_command,
     list_commands,
@@ -21,10 +20,11 @@ from ground_service.services.commanding import (
     release_command,
     take_uplink,
 )
-from ground_service.services.feed import read_feed
-from ground_service.services.ground import Ground
-from ground_service.services.ingest import ingest_file
-from ground_service.services.planning import (
+from ground_service.errors import Conflict, InvalidInput, NotFound
+from ground_service.feed import read_feed
+from ground_service.ground import Ground
+from ground_service.ingest.service import ingest_file
+from ground_service.planning.service import (
     WindowEntry,
     add_window,
     change_window,
@@ -232,7 +232,7 @@ def test_a_time_out_is_put_on_record_once_and_stays_there(
     due = get_command(ground, silent).row["sent_utc_ns"] + 600 * 10**9
 
     def noted(now: int) -> list[int]:
-        monkeypatch.setattr("ground_service.services.command_state.utc_now_ns", lambda: now)
+        monkeypatch.setattr("ground_service.commanding.command_state.utc_now_ns", lambda: now)
         return note_timeouts(ground, 0, now)
 
     assert noted(due - 1) == []
@@ -372,8 +372,8 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """A clock that stands at `NOW` until it is set."""
 
     def put(now: int) -> None:
-        for module in ("commanding", "command_state"):
-            monkeypatch.setattr(f"ground_service.services.{module}.utc_now_ns", lambda: now)
+        for module in ("service", "command_state"):
+            monkeypatch.setattr(f"ground_service.commanding.{module}.utc_now_ns", lambda: now)
 
     put(NOW)
     return put

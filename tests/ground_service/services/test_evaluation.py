@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from ground_service.errors import InvalidInput, NotFound
-from ground_service.services import reports
-from ground_service.services.archive_import import import_archive
-from ground_service.services.ground import Ground, open_ground
-from ground_service.services.press import Press
-from ground_service.services.reports import evaluate, make_report, pass_summary
+from ground_service.evaluation import service as reports
+from ground_service.evaluation.pdf_process import Press
+from ground_service.evaluation.service import evaluate, make_report, pass_summary
+from ground_service.ground import Ground, open_ground
+from ground_service.passes.archive_import import import_archive
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
 from reports.render import render_pdf

@@ -10,22 +10,22 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
+from ground_service.access.audit_log import list_entries
+from ground_service.access.service import add_user, authenticate, token_sha256, token_valid
+from ground_service.commanding.service import get_command, release_command
 from ground_service.errors import Conflict, DatabaseTooNew, DatabaseTooOld, FileDamaged, InvalidInput
-from ground_service.link.packets import batch_of_cut
-from ground_service.services.archive_import import import_archive
-from ground_service.services.audit_log import list_entries
-from ground_service.services.commanding import get_command, release_command
-from ground_service.services.exchange import export_database, import_database
-from ground_service.services.ground import Ground, open_ground
-from ground_service.services.ingest import ingest_file
-from ground_service.services.integrity import verify
-from ground_service.services.planning import WindowEntry, add_window, change_window
-from ground_service.services.users import add_user, authenticate, token_sha256, token_valid
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest.packets import batch_of_cut
+from ground_service.ingest.service import ingest_file
+from ground_service.passes.archive_import import import_archive
+from ground_service.planning.service import WindowEntry, add_window, change_window
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
 from ground_service.store.database import open_database, prepare_database
 from ground_service.store.files import FileArchive
 from ground_service.store.models import Base
+from ground_service.worker.exchange import export_database, import_database
+from ground_service.worker.integrity import verify
 from tmtc.downlink import decode
 
 NS = 1_000_000_000

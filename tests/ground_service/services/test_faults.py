@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from sqlalchemy import func, select
 
-from ground_service.services.ground import Ground, open_ground
-from ground_service.services.ingest import ingest_file
-from ground_service.services.redecode import redecode
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest.redecode import redecode
+from ground_service.ingest.service import ingest_file
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
 from tmtc.dictionary import DICTIONARY
@@ -26,10 +26,10 @@ KILLS = 4
 INGEST = """
 import sys
 from pathlib import Path
-from ground_service.link import stream
+from ground_service.ingest import stream
 from ground_service.store import files
-from ground_service.services.ground import open_ground
-from ground_service.services.ingest import ingest_file
+from ground_service.ground import open_ground
+from ground_service.ingest.service import ingest_file
 files.BLOCK_OCTETS = 4_000
 stream.DownlinkReader.__init__.__defaults__ = (None, stream.DICTIONARY, 4_000)
 with open_ground(Path(sys.argv[1])) as ground:

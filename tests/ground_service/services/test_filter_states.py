@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 from sqlalchemy import select
 
-from ground_service.link.packets import batch_of_cut
-from ground_service.processing.pass_evaluation import evaluate_pass
-from ground_service.services.archive_import import import_archive
-from ground_service.services.ground import Ground, open_ground
-from ground_service.services.ingest import ingest_file
-from ground_service.services.pass_data import filter_states, load_pass_inputs, pass_span
-from ground_service.services.passes import define_pass
-from ground_service.services.redecode import catch_up
+from ground_service.evaluation.core import evaluate_pass
+from ground_service.evaluation.store import filter_states, load_pass_inputs
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest.packets import batch_of_cut
+from ground_service.ingest.redecode import catch_up
+from ground_service.ingest.service import ingest_file
+from ground_service.passes.archive_import import import_archive
+from ground_service.passes.service import define_pass
+from ground_service.passes.span import pass_span
 from ground_service.store import repository
 from ground_service.store.packets import store_batch
 from tmtc.dictionary import DICTIONARY, dictionary_version

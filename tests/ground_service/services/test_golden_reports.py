@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground_service.processing.pass_evaluation import summary_of
-from ground_service.services.archive_import import import_archive, instance_of, read_manifest
-from ground_service.services.ground import Ground
-from ground_service.services.ingest import ingest_file
-from ground_service.services.passes import completeness, define_pass
-from ground_service.services.reports import evaluate
+from ground_service.evaluation.core import summary_of
+from ground_service.evaluation.service import evaluate
+from ground_service.ground import Ground
+from ground_service.ingest.service import ingest_file
+from ground_service.passes.archive_import import import_archive, instance_of, read_manifest
+from ground_service.passes.service import completeness, define_pass
 from lunar.lens import BrownCamera
 from reports.render import render_html, to_json
 from reports.values import PassReport, Requirement

@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 from sqlalchemy import event, func, select
 
 from ground_service.errors import DatabaseBusy, InvalidInput
-from ground_service.link.edges import MIDDLE
-from ground_service.services.ground import Ground, open_ground
-from ground_service.services.ingest import Place, ingest_file
-from ground_service.store import edges, repository
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest import edge_store as edges
+from ground_service.ingest.edges import MIDDLE
+from ground_service.ingest.service import Place, ingest_file
+from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
 from ground_service.store.database import prepare_database
 from tmtc.crc import append_crc

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from ground_service.services.ground import Ground
-from ground_service.services.ingest import Place, ingest_file
-from ground_service.services.integrity import verify
+from ground_service.ground import Ground
+from ground_service.ingest.service import Place, ingest_file
+from ground_service.worker.integrity import verify
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 

@@ -16,11 +16,11 @@ from ground_service.errors import (
     StorageFull,
     public_text,
 )
-from ground_service.services import jobs
-from ground_service.services.ground import Ground
-from ground_service.services.jobs import add_job, enter_ingest, enter_job, run_job
+from ground_service.ground import Ground
 from ground_service.store import repository
 from ground_service.store.states import JOB, move
+from ground_service.worker import jobs
+from ground_service.worker.jobs import add_job, enter_ingest, enter_job, run_job
 
 Row = dict[str, Any]
 

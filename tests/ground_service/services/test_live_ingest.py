@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from ground_service.errors import InvalidInput, StorageFull
-from ground_service.services import live_ingest
-from ground_service.services.ground import Ground
-from ground_service.services.ingest import ingest_file
-from ground_service.services.live_ingest import Spool, WatchedFolder, follow_tcp
+from ground_service.ground import Ground
+from ground_service.ingest import live as live_ingest
+from ground_service.ingest.live import Spool, WatchedFolder, follow_tcp
+from ground_service.ingest.service import ingest_file
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
 
@@ -26,7 +26,7 @@ def hash_of(ground: Ground) -> str:
 
 @pytest.fixture
 def expected(synthetic_pass: Any, tmp_path: Path) -> str:
-    from ground_service.services.ground import open_ground
+    from ground_service.ground import open_ground
 
     with open_ground(tmp_path / "whole") as ground:
         ingest_file(ground, synthetic_pass.folder / "downlink.cadu")

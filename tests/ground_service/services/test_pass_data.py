@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ground_service.ephemerides.attitudes import HEADER, load_attitudes
 from ground_service.errors import EvaluationError, InvalidInput
+from ground_service.evaluation.core import evaluate_pass
+from ground_service.evaluation.service import evaluate
+from ground_service.evaluation.store import camera_of, load_pass_inputs, orientation_of
+from ground_service.evaluation.verdict import Limits
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest.service import ingest_file
 from ground_service.missions import frames as declared
 from ground_service.missions.frames import declared_frames
 from ground_service.missions.model import Camera, Frames, Mission
 from ground_service.missions.service import add_mission
-from ground_service.processing.pass_evaluation import evaluate_pass
-from ground_service.processing.verdict import Limits
-from ground_service.services.archive_import import import_archive
-from ground_service.services.attitudes import HEADER, load_attitudes
-from ground_service.services.ground import Ground, open_ground
-from ground_service.services.ingest import ingest_file
-from ground_service.services.pass_data import camera_of, load_pass_inputs, orientation_of
-from ground_service.services.passes import define_pass
-from ground_service.services.reports import evaluate
+from ground_service.passes.archive_import import import_archive
+from ground_service.passes.service import define_pass
 from lunar.camera import PinholeCamera
 from lunar.datafolder import DataFolder
 from lunar.frames import IauOrientation

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ground_service.ephemerides.service import add_ephemeris
 from ground_service.errors import InvalidInput
-from ground_service.services import recorrelation
-from ground_service.services.ephemerides import add_ephemeris
-from ground_service.services.ground import Ground, open_ground
-from ground_service.services.ingest import ingest_file
-from ground_service.services.passes import define_pass, events
-from ground_service.services.recorrelation import (
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest.service import ingest_file
+from ground_service.passes.service import define_pass, events
+from ground_service.timekeeping import recorrelation
+from ground_service.timekeeping.recorrelation import (
     ReceivedReport,
     enter_receptions,
     in_force,
@@ -23,7 +23,7 @@ from ground_service.services.recorrelation import (
     recorrelate,
     residuals,
 )
-from ground_service.services.timekeeping import TimePoint, correlate, correlate_again, correlations_on_record
+from ground_service.timekeeping.service import TimePoint, correlate, correlate_again, correlations_on_record
 from linna.cli import run
 from lunar.constants import MOON_RADIUS_M, SPEED_OF_LIGHT_M_S
 from lunar.ephemeris import ephemeris_from_states
@@ -160,7 +160,7 @@ def test_the_order_of_telemetry_and_receptions_does_not_matter(
 
 
 def test_a_clock_that_is_set_begins_a_new_line_and_one_bad_report_does_not() -> None:
-    from ground_service.processing.correlation import clock_runs, fit_correlation
+    from ground_service.timekeeping.core import clock_runs, fit_correlation
 
     sent = START + np.arange(20, dtype=np.int64) * 60 * NS
     ticks = np.asarray(ticks_from_utc_ns(sent), dtype=np.int64)
@@ -175,7 +175,7 @@ def test_a_clock_that_is_set_begins_a_new_line_and_one_bad_report_does_not() -> 
 
 
 def test_a_drift_within_the_resolution_of_the_clock_is_none() -> None:
-    from ground_service.processing.correlation import fit_correlation
+    from ground_service.timekeeping.core import fit_correlation
 
     sent = START + np.arange(4, dtype=np.int64) * NS
     ticks = np.asarray(ticks_from_utc_ns(sent), dtype=np.int64) + np.array([0, 0, 1, 1])

@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
-from ground_service.api.app import create_app
-from ground_service.link.packets import batch_of_cut
-from ground_service.services import redecode as redecoding
-from ground_service.services.ground import Ground, open_ground
-from ground_service.services.ingest import ingest_file
-from ground_service.services.passes import define_pass, events, parameter_series, state_series
-from ground_service.services.redecode import catch_up, redecode, vehicles_behind
+from ground_service.app import create_app
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest import redecode as redecoding
+from ground_service.ingest.packets import batch_of_cut
+from ground_service.ingest.redecode import catch_up, redecode, vehicles_behind
+from ground_service.ingest.service import ingest_file
+from ground_service.passes.service import define_pass, events, parameter_series, state_series
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash

@@ -15,10 +15,8 @@ import numpy as np
 import pytest
 
 from ground_service.errors import InvalidInput
-from ground_service.processing.regression_gates import GatePolicy
-from ground_service.services.builds import Build, build_of
-from ground_service.services.ground import Ground, open_ground
-from ground_service.services.regression_archives import (
+from ground_service.ground import Ground, open_ground
+from ground_service.regression.archives import (
     check_archive,
     check_out,
     keep_archive,
@@ -27,15 +25,17 @@ from ground_service.services.regression_archives import (
     pack_archive,
     pin_archive,
 )
-from ground_service.services.regression_documents import (
+from ground_service.regression.builds import Build, build_of
+from ground_service.regression.core import GatePolicy
+from ground_service.regression.documents import (
     regression_html,
     regression_json,
     regression_junit,
     regression_text,
 )
-from ground_service.services.regression_policy import load_policy
-from ground_service.services.regression_search import differences
-from ground_service.services.regressions import (
+from ground_service.regression.policy import load_policy
+from ground_service.regression.search import differences
+from ground_service.regression.service import (
     RegressionOutcome,
     find_replay,
     keep_regression,
@@ -443,7 +443,7 @@ def test_a_bad_policy_is_told_by_its_key(text: str, told: str, tmp_path: Path) -
 def test_a_waiver_needs_a_reason_and_a_day(tmp_path: Path) -> None:
     shipped = load_policy()
     assert isinstance(shipped.policy, GatePolicy) and shipped.policy.waivers == ()
-    from ground_service.services.regression_policy import SHIPPED
+    from ground_service.regression.policy import SHIPPED
 
     for waiver in ('reason = ""\nuntil = 2029-01-01', 'reason = "why"\nuntil = "soon"', "until = 2029-01-01"):
         (tmp_path / "policy.toml").write_text(f'{SHIPPED.read_text()}\n[[waiver]]\ngate = "x"\n{waiver}\n')
@@ -524,7 +524,7 @@ def test_a_regression_without_a_gate_is_never_a_pass(judge, home, policy, passes
 
 
 def waived_outcome(judge, tmp_path: Path, home: Ground, make_build, passes, packets) -> RegressionOutcome:
-    from ground_service.services.regression_policy import SHIPPED
+    from ground_service.regression.policy import SHIPPED
 
     (tmp_path / "policy.toml").write_text(
         f"{SHIPPED.read_text()}\n[[waiver]]\ngate = 'latency.*'\nreason = 'new <network> & agreed'\n"

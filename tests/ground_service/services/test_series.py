@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from sqlalchemy import delete
 
-from ground_service.services import series
-from ground_service.services.ground import Ground
-from ground_service.services.pass_data import PassSpan
-from ground_service.services.passes import trend_series
+from ground_service.evaluation.store import PassSpan
+from ground_service.ground import Ground
+from ground_service.passes import series
+from ground_service.passes.service import trend_series
 from ground_service.store import repository
 from ground_service.store.models import Rollup
 from ground_service.store.packets import store_samples
@@ -130,7 +130,7 @@ def test_silences_are_marked(ground: Ground) -> None:
 
 
 def test_late_data_and_split_batches_give_the_same_roll_ups(ground: Ground, tmp_path: Any) -> None:
-    from ground_service.services.ground import open_ground
+    from ground_service.ground import open_ground
 
     columns = states()
     stored(ground, columns, [np.arange(COUNT)])
@@ -165,7 +165,7 @@ def test_every_value_of_a_kind_is_rolled_up() -> None:
 
 
 def test_trends_of_a_spacecraft_need_no_pass(ground: Ground, synthetic_pass: Any) -> None:
-    from ground_service.services.ingest import ingest_file
+    from ground_service.ingest.service import ingest_file
 
     ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
     found = trend_series(ground, 76, "flight", "temperature_c", 10)

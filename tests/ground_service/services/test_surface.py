@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from ground_service.errors import InvalidInput
-from ground_service.processing.pass_extras import dark_limit
-from ground_service.services.surface import surface_map
+from ground_service.evaluation.extras import dark_limit
+from ground_service.evaluation.surface import surface_map
 from lunar.datafolder import find_data
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from ground_service.errors import InvalidInput, NotFound
-from ground_service.services.ground import Ground
-from ground_service.services.ingest import ingest_file
-from ground_service.services.passes import define_pass, parameter_series
-from ground_service.services.timekeeping import TimePoint, correlate, correlations_on_record
+from ground_service.ground import Ground
+from ground_service.ingest.service import ingest_file
+from ground_service.passes.service import define_pass, parameter_series
+from ground_service.timekeeping.service import TimePoint, correlate, correlations_on_record
 from lunar.timescales import ticks_from_utc_ns
 
 NS = 1_000_000_000

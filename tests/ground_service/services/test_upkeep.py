@@ -6,15 +6,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground_service.processing.downsampling import downsample
-from ground_service.processing.trends import trend_of
-from ground_service.services.feed import publish, read_feed
-from ground_service.services.ground import Ground
-from ground_service.services.ingest import ingest_file
-from ground_service.services.jobs import enter_job, run_job
-from ground_service.services.upkeep import nightly_job_id, spacecraft_trends, tidy
-from ground_service.services.users import audit
+from ground_service.access.service import audit
+from ground_service.feed import publish, read_feed
+from ground_service.ground import Ground
+from ground_service.ingest.service import ingest_file
+from ground_service.passes.core import downsample
+from ground_service.passes.trends import trend_of
 from ground_service.store import repository
+from ground_service.worker.jobs import enter_job, run_job
+from ground_service.worker.upkeep import nightly_job_id, spacecraft_trends, tidy
 from tmtc.dictionary import DICTIONARY
 
 DAY_NS = 86_400_000_000_000
@@ -54,7 +54,7 @@ def test_what_is_old_goes_and_the_record_stays(ground: Ground, monkeypatch: pyte
         for _ in range(3):
             publish(connection, "note", {})
         with monkeypatch.context() as long_ago:
-            long_ago.setattr("ground_service.services.users.utc_now_ns", lambda: 0)
+            long_ago.setattr("ground_service.access.service.utc_now_ns", lambda: 0)
             audit(connection, "ann", "look", "", {})
         connection.execute(repository.FEED.update().values(utc_ns=0))
     with ground.database.writing() as connection:
@@ -74,8 +74,8 @@ def test_what_is_old_goes_and_the_record_stays(ground: Ground, monkeypatch: pyte
 def test_answers_are_kept_until_telemetry_is_new(
     ground: Ground, synthetic_pass: Any, monkeypatch: Any, tmp_path: Any
 ) -> None:
-    from ground_service.services import upkeep
-    from ground_service.services.ingest import ingest_file
+    from ground_service.ingest.service import ingest_file
+    from ground_service.worker import upkeep
     from tmtc.downlink import encode_cadus
 
     half = len(synthetic_pass.packets) // 2

@@ -7,10 +7,8 @@ from pathlib import Path
 import pytest
 from sqlalchemy import update
 
-from ground_service.errors import Conflict, InvalidInput, NotAuthorised, NotFound
-from ground_service.services.audit_log import list_entries
-from ground_service.services.ground import Ground, open_ground
-from ground_service.services.users import (
+from ground_service.access.audit_log import list_entries
+from ground_service.access.service import (
     _note_use,
     add_token,
     add_user,
@@ -26,6 +24,8 @@ from ground_service.services.users import (
     token_sha256,
     token_valid,
 )
+from ground_service.errors import Conflict, InvalidInput, NotAuthorised, NotFound
+from ground_service.ground import Ground, open_ground
 from ground_service.store import repository
 
 SECRET = "a-token-of-a-deployment-0123456789"
@@ -84,7 +84,7 @@ def test_the_last_use_is_kept_to_the_hour(ground: Ground, monkeypatch: pytest.Mo
     assert list_tokens(ground)[0].used is None
     hour = 3_600_000_000_000
     now = 500_000 * hour + 5
-    monkeypatch.setattr("ground_service.services.users.utc_now_ns", lambda: now)
+    monkeypatch.setattr("ground_service.access.service.utc_now_ns", lambda: now)
     authenticate(ground, token)
     first = list_tokens(ground)[0].used
     now += hour // 2
@@ -196,7 +196,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """A clock that stands at `NOW` until it is set."""
 
     def put(now: int) -> None:
-        monkeypatch.setattr("ground_service.services.users.utc_now_ns", lambda: now)
+        monkeypatch.setattr("ground_service.access.service.utc_now_ns", lambda: now)
 
     put(NOW)
     return put

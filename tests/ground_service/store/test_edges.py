@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 from sqlalchemy import event, text
 
-from ground_service.link.edges import CLOSER, MIDDLE, OPENER, UNKNOWN, Edge
-from ground_service.store import edges
+from ground_service.ingest import edge_store as edges
+from ground_service.ingest.edges import CLOSER, MIDDLE, OPENER, UNKNOWN, Edge
 from ground_service.store.database import Database
 
 COUNT = 4_000

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from sqlalchemy import text
 
-from ground_service.services.ground import Ground, open_ground
+from ground_service.ground import Ground, open_ground
 from ground_service.store.files import FileArchive, make_durable_folder, replace_durably
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from ground_service.errors import DatabaseBusy, InvalidInput, public_text
-from ground_service.services.ground import Ground, open_ground
+from ground_service.ground import Ground, open_ground
 from ground_service.store import repository
 from ground_service.store.database import database_error, prepare_database
 

@@ -10,15 +10,15 @@ import pytest
 from sqlalchemy import create_engine, make_url, text
 from sqlalchemy.exc import DBAPIError
 
+from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
-from ground_service.services.ground import ground_from_settings
-from ground_service.services.ingest import ingest_file
-from ground_service.services.upkeep import tidy
-from ground_service.services.users import audit
+from ground_service.ground import ground_from_settings
+from ground_service.ingest.service import ingest_file
 from ground_service.settings import load_settings
 from ground_service.store import repository
 from ground_service.store.database import open_database
 from ground_service.store.roles import PowerfulRole, check_role
+from ground_service.worker.upkeep import tidy
 from linna import cli
 
 SERVICE = "linna_service"

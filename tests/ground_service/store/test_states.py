@@ -11,7 +11,7 @@ import pytest
 
 import ground_service
 from ground_service.errors import NotFound, StateConflict
-from ground_service.services.ground import Ground
+from ground_service.ground import Ground
 from ground_service.store import repository
 from ground_service.store.counters import hold, next_telecommand
 from ground_service.store.states import JOB, TELECOMMAND, change_if, move, move_all

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from ground_service.services.archive_import import import_archive
-from ground_service.services.ground import open_ground
+from ground_service.ground import open_ground
+from ground_service.passes.archive_import import import_archive
 
 CHROMIUM = "/usr/bin/chromium"
 START_S = 180.0

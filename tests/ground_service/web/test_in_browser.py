@@ -6,7 +6,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import expect
 
-from ground_service.services.regression_archives import pack_archive
+from ground_service.regression.archives import pack_archive
 from lunar.ephemeris import ephemeris_from_states
 from lunar.oem import format_oem
 from lunar.timescales import parse_utc

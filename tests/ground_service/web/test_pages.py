@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ground_service.errors import InvalidInput
-from ground_service.services.surface import WIDTH_PX
+from ground_service.evaluation.surface import WIDTH_PX
 from ground_service.web.basemap import basemap_jpeg
 from ground_service.web.pages import PAGES, POLICY
 

@@ -3,8 +3,8 @@
 import pytest
 from playwright.sync_api import expect
 
-from ground_service.services.ground import open_ground
-from ground_service.services.users import add_user
+from ground_service.access.service import add_user
+from ground_service.ground import open_ground
 
 
 @pytest.fixture(scope="module")

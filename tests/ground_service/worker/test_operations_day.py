@@ -20,10 +20,10 @@ import numpy as np
 import pytest
 import uvicorn
 
-from ground_service.api.app import create_app
-from ground_service.api.server import bind
-from ground_service.services.ground import ground_from_settings
-from ground_service.services.users import add_user
+from ground_service.access.service import add_user
+from ground_service.app import create_app
+from ground_service.ground import ground_from_settings
+from ground_service.server import bind
 from ground_service.settings import Settings
 from ground_service.store.database import prepare_database
 from linna.cli import run

@@ -9,10 +9,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from ground_service.services.builds import build_of
-from ground_service.services.ground import open_ground
-from ground_service.services.regression_archives import keep_archive
-from ground_service.services.regression_jobs import missing_replays, prepared
+from ground_service.ground import open_ground
+from ground_service.regression.archives import keep_archive
+from ground_service.regression.builds import build_of
+from ground_service.regression.jobs import missing_replays, prepared
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.worker.dispatch import dispatcher_for

@@ -1,0 +1,1 @@
+"""Users, tokens, roles, idempotency keys and the audit log."""

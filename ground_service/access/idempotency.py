@@ -1,0 +1,82 @@
+"""Idempotency keys: stored responses, so that a repeated request has no effect and gets the same response.
+
+A key is stored before the work starts. If a crash leaves it without a response, it is unknown whether the work was
+done: the key is then refused, and the caller must check the state.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from typing import Any
+
+from sqlalchemy import delete
+
+from ground_service.clock import utc_now_ns
+from ground_service.errors import Conflict, GroundError, StoreError
+from ground_service.ground import Ground
+from ground_service.store import repository
+from ground_service.store.states import change_if
+
+Work = Callable[[], dict[str, Any]]
+
+
+def once(
+    ground: Ground, *, actor: str, operation: str, key: str | None, request: dict[str, Any], work: Work
+) -> dict[str, Any]:
+    """What `work` gives, or what it gave when this actor asked for the same under the same key.
+
+    Work that ends with an error leaves the key free: it may be asked for again. Without a key the work is simply done.
+
+    Raises
+    ------
+    Conflict
+        If the key stands for another request, or for one that was begun and whose end is not known.
+    """
+    if key is None:
+        return work()
+    identity = _digest([actor, operation, key])
+    asked = _digest(request)
+    known = _take(ground, identity, asked)
+    if known is not None:
+        return known
+    try:
+        answer = work()
+    except StoreError:
+        raise  # it may have been done all the same
+    except GroundError:
+        _forget(ground, identity)
+        raise
+    table = repository.ANSWERS
+    with ground.database.writing() as connection:
+        change_if(connection, table, identity, {"answer": None}, answer=answer)
+    return answer
+
+
+def _take(ground: Ground, identity: str, asked: str) -> dict[str, Any] | None:
+    """The answer that is known already; None when the key is now this caller's to use."""
+    table = repository.ANSWERS
+    with ground.database.writing() as connection:
+        if repository.add_new(connection, table, key=identity, request=asked, created_utc_ns=utc_now_ns()):
+            return None
+        known = repository.get(connection, table, identity, "answer")
+    if known["request"] != asked:
+        raise Conflict("Idempotency-Key: expected the request that it was first sent with, found another")
+    if known["answer"] is None:
+        raise Conflict(
+            "Idempotency-Key: the request was begun and its end is not known; look whether it was done, "
+            "and use another key if it was not"
+        )
+    answer: dict[str, Any] = known["answer"]
+    return answer
+
+
+def _forget(ground: Ground, identity: str) -> None:
+    table = repository.ANSWERS
+    with ground.database.writing() as connection:
+        connection.execute(delete(table).where(table.c.key == identity, table.c.answer.is_(None)))
+
+
+def _digest(value: object) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,1 @@
+"""Telecommands: entry, approval, release, hand-out, verification, receiver state."""

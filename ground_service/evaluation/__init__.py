@@ -1,0 +1,1 @@
+"""Evaluation of a pass: alignment, drift, recall, smoothing, consistency, verdict, report."""

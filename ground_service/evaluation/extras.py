@@ -1,0 +1,138 @@
+"""Additional contents of a pass report: Sun geometry, wrong fixes, and positions from single frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ground_service.evaluation.alignment import ReferenceStates, error_of_places_rtn_m
+from ground_service.evaluation.drift import navigation_statistics
+from ground_service.evaluation.fixes import Pairs, snapshot_positions, wrong_fixes
+from ground_service.evaluation.viewing import Viewing
+from ground_service.passes.samples import NavigationSamples
+from lunar.arrays import FloatArray
+from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
+from lunar.third_bodies import sun_position_icrf_m
+from lunar.timescales import tdb_s_from_utc_ns
+from lunar.visibility import sun_elevation_azimuth
+from reports.values import NavigationSeries, TerrainMap
+
+SNAPSHOT = "snapshot"
+FILTER = "anchored"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SunAngles:
+    """Elevation and azimuth (from north, clockwise) of the Sun at the sub-satellite points (n,), degrees."""
+
+    elevation_deg: FloatArray
+    azimuth_deg: FloatArray
+
+
+def sun_angles(track: ReferenceStates) -> SunAngles:
+    """The Sun along the reference; NaN where that does not cover."""
+    sun = np.asarray(sun_position_icrf_m(np.asarray(tdb_s_from_utc_ns(track.utc_ns))))
+    elevation, azimuth = sun_elevation_azimuth(
+        track.latitude_rad, track.longitude_rad, np.einsum("nij,nj->ni", track.mcmf_from_icrf, sun)
+    )
+    return SunAngles(np.degrees(elevation), np.degrees(azimuth))
+
+
+def with_sun(series: NavigationSeries, track: ReferenceStates, sun: SunAngles) -> NavigationSeries:
+    """The series with the Sun's elevation at its samples, which are all times of the track that `sun` is of."""
+    rows = np.searchsorted(track.utc_ns, series.utc_ns)
+    return replace(series, sun_elevation_deg=sun.elevation_deg[rows])
+
+
+def with_terrain(series: NavigationSeries, track: ReferenceStates, surface: TerrainMap) -> NavigationSeries:
+    """The series with the kind of ground under its samples, "" where the reference does not cover.
+
+    Mare is what is darker than the grey value that best parts the whole map in two (Otsu 1979, by area).
+    """
+    rows = np.searchsorted(track.utc_ns, series.utc_ns)
+    latitude, longitude = track.latitude_deg[rows], track.longitude_deg[rows]
+    known = np.isfinite(latitude) & np.isfinite(longitude)
+    height, width = surface.image.shape
+    down = (surface.north_deg - latitude[known]) / (surface.north_deg - surface.south_deg) * height
+    right = (longitude[known] - surface.west_deg) % 360.0 / (surface.east_deg - surface.west_deg) * width
+    grey = surface.image[
+        np.clip(down.astype(np.int64), 0, height - 1), np.clip(right.astype(np.int64), 0, width - 1)
+    ]
+    kinds = np.full(len(rows), "", dtype="<U8")
+    kinds[known] = np.where(grey < dark_limit(surface), "mare", "highland")
+    return replace(series, terrain=tuple(kinds.tolist()))
+
+
+def dark_limit(surface: TerrainMap) -> float:
+    """The grey value that parts a map in two with the least spread on either side, each pixel weighed by its area.
+
+    References
+    ----------
+    Otsu (1979), A threshold selection method from gray-level histograms, IEEE Trans. SMC 9, equation 18.
+    """
+    rows = surface.image.shape[0]
+    step = (surface.north_deg - surface.south_deg) / rows
+    area = np.cos(np.radians(surface.north_deg - (np.arange(rows) + 0.5) * step))
+    share = np.zeros(256)
+    for row, weight in zip(surface.image, area, strict=True):
+        share += weight * np.bincount(row, minlength=256)
+    share /= share.sum()
+    dark = np.cumsum(share)
+    below = np.cumsum(share * np.arange(256))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        between = (below[-1] * dark - below) ** 2 / (dark * (1.0 - dark))
+    return float(np.nanargmax(np.where(np.isfinite(between), between, -1.0)) + 1)
+
+
+def with_wrong_fixes(
+    series: NavigationSeries, pairs: Pairs, viewing: Viewing, track: ReferenceStates
+) -> NavigationSeries:
+    """The filter's series with the number of its wrong fixes; any other as it is."""
+    if series.name != FILTER or len(pairs.frame) == 0:
+        return series
+    rotations = viewing.camera_from_mcmf(track.utc_ns, track.position_mcmf_m, track.mcmf_from_icrf)
+    return replace(
+        series,
+        wrong_fixes=wrong_fixes(pairs, viewing.camera, track.utc_ns, track.position_mcmf_m, rotations),
+    )
+
+
+def snapshot_series(
+    pairs: Pairs,
+    samples: NavigationSamples,
+    viewing: Viewing,
+    track: ReferenceStates,
+    path_m: FloatArray,
+) -> NavigationSeries | None:
+    """Positions of single frames as a baseline, at the epochs of the filter's states; None without any."""
+    if len(pairs.frame) == 0 or len(samples.utc_ns) == 0:
+        return None
+    believed = mcmf_from_spherical(
+        np.radians(samples.latitude_deg), np.radians(samples.longitude_deg), samples.altitude_m
+    )
+    every = track.at_rows(np.searchsorted(track.utc_ns, samples.utc_ns))
+    known = viewing.known(samples.utc_ns)
+    rotations = viewing.camera_from_mcmf(samples.utc_ns, every.position_mcmf_m, every.mcmf_from_icrf)
+    rotations[~known] = np.nan
+    position = snapshot_positions(pairs, viewing.camera, samples.utc_ns, believed, viewing.pointed, rotations)
+    solved = np.flatnonzero(np.isfinite(position[:, 0]))
+    if len(solved) == 0:
+        return None
+    latitude, longitude, altitude = spherical_from_mcmf(position[solved])
+    rows = np.searchsorted(track.utc_ns, samples.utc_ns[solved])
+    here = track.at_rows(rows)
+    latitude_deg, longitude_deg = np.degrees(latitude), np.degrees(longitude) % 360.0
+    error = error_of_places_rtn_m(here, latitude_deg, longitude_deg, altitude)
+    return NavigationSeries(
+        name=SNAPSHOT,
+        kind="baseline",
+        utc_ns=samples.utc_ns[solved],
+        latitude_deg=latitude_deg,
+        longitude_deg=longitude_deg,
+        altitude_m=altitude,
+        error_rtn_m=error,
+        # Frames know nothing of one another: each is a fix of its own, and there is no drift to speak of.
+        statistics=navigation_statistics(error, path_m[rows], np.ones(len(solved), dtype=np.bool_)),
+        description="each frame separately, from the filter's identifications and the attitude, without dynamics",
+    )

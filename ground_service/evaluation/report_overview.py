@@ -1,0 +1,64 @@
+"""What a page shows of a report: its verdict, its figures, and its error series made short."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from ground_service.errors import NotFound
+from ground_service.ground import Ground
+from ground_service.passes.core import downsample
+from ground_service.store import repository
+from ground_service.store.files import FileArchive
+
+_TEXTS = ("title", "verdict", "verdict_level", "evidence_level", "created_utc", "headline", "not_available")
+
+
+def report_overview(ground: Ground, report_id: str, max_points: int) -> dict[str, Any]:
+    """The head of a report and, per navigation solution, its 3-D error in at most `max_points` stretches.
+
+    Columns of one series have one length: seconds of UTC at the middle of each stretch, least, greatest and mean
+    error in metres, and whether a silence lies before the stretch.
+
+    Raises
+    ------
+    NotFound
+        If there is no such report, or it has no JSON document.
+    """
+    with ground.database.reading() as connection:
+        row = repository.get(connection, repository.REPORTS, report_id, "report")
+    if row["json_sha256"] is None:
+        raise NotFound(f"report {report_id} as", "json")
+    return {"report_id": report_id, **_overview(ground.files, row["json_sha256"], max_points)}
+
+
+@lru_cache(maxsize=64)
+def _overview(files: FileArchive, sha256: str, max_points: int) -> dict[str, Any]:
+    """The document of a hash never changes, so neither does what was made of it."""
+    document = json.loads(files.get(sha256))
+    return {
+        **{name: document.get(name) for name in _TEXTS},
+        # Reports of earlier versions have no table.
+        "requirements": document.get("requirements") or [],
+        "navigation": [_series(one, max_points) for one in document["navigation"]],
+    }
+
+
+def _series(one: Mapping[str, Any], max_points: int) -> dict[str, Any]:
+    error = np.array(one["error_rtn_m"], dtype=np.float64).reshape(-1, 3)
+    times = np.array(one["utc_ns"], dtype=np.int64)
+    buckets = downsample(times, np.sqrt(np.sum(error**2, axis=1)), max_points)
+    middle = (buckets.start_utc_ns // 2 + buckets.stop_utc_ns // 2) / 1e9
+    return {
+        "name": one["name"],
+        "kind": one["kind"],
+        "time_s": np.round(middle, 3).tolist(),
+        "min_m": np.round(buckets.low, 3).tolist(),
+        "max_m": np.round(buckets.high, 3).tolist(),
+        "mean_m": np.round(buckets.mean, 3).tolist(),
+        "after_gap": buckets.after_gap.tolist(),
+    }

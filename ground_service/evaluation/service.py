@@ -1,0 +1,162 @@
+"""Reports of passes: evaluated from the archive as it is now, rendered, and kept."""
+
+from __future__ import annotations
+
+import json
+import math
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ground_service.clock import utc_now_ns
+from ground_service.errors import storage_error
+from ground_service.evaluation.core import PassInputs, evaluate_pass, summary_of
+from ground_service.evaluation.pdf_process import Press, worthwhile
+from ground_service.evaluation.store import load_pass_inputs
+from ground_service.evaluation.surface import surface_map
+from ground_service.ground import Ground
+from ground_service.planning.progress import advance_windows
+from ground_service.store import repository
+from ground_service.store.files import make_durable_folder, replace_durably
+from lunar.timescales import format_utc
+from reports.document import evidence_number
+from reports.values import PassReport
+
+REAL_TERRAIN_LEVEL = 3
+"""Lowest evidence level with real terrain."""
+
+
+@dataclass(frozen=True, slots=True)
+class MadeReport:
+    """A report that was made, its files and its figures."""
+
+    report_id: str
+    pass_id: int
+    html: Path
+    json: Path
+    pdf: Path | None
+    summary: dict[str, Any]
+
+
+def evaluate(ground: Ground, pass_id: int, *, created_utc: str = "") -> PassReport:
+    """The report of a pass as a value; the same archive gives the same value."""
+    return _evaluated(ground, load_pass_inputs(ground, pass_id, created_utc=created_utc))
+
+
+def _evaluated(ground: Ground, inputs: PassInputs) -> PassReport:
+    # The face of the real Moon belongs under tracks over the real Moon only.
+    level = evidence_number(inputs.evidence_level)
+    if ground.data.albedo is not None and level is not None and level >= REAL_TERRAIN_LEVEL:
+        inputs = replace(inputs, surface=surface_map(ground.data.albedo))
+    return evaluate_pass(inputs)
+
+
+def pass_summary(ground: Ground, pass_id: int) -> dict[str, Any]:
+    """The figures of a pass that a script asks for; see `summary_of`."""
+    return _summary(evaluate(ground, pass_id), pass_id)
+
+
+def make_report(
+    ground: Ground,
+    pass_id: int,
+    *,
+    report_id: str | None = None,
+    out: Path | None = None,
+    pdf: bool = False,
+) -> MadeReport:
+    """Evaluate a pass, render its report as HTML and JSON, and as PDF where wanted, and keep them.
+
+    Parameters
+    ----------
+    report_id
+        Name of the report; the same name again gives the report that was made under it.
+    out
+        Folder for the documents; ``reports/pass-<id>`` under the service's home when None.
+    """
+    identity = report_id or uuid.uuid4().hex
+    now = utc_now_ns()
+    inputs = load_pass_inputs(ground, pass_id, created_utc=format_utc(now))
+    if pdf and worthwhile(len(inputs.detections)):
+        with Press() as press:
+            report = _evaluated(ground, inputs)
+            documents = _documents(report, pdf=True, press=press)
+    else:
+        report = _evaluated(ground, inputs)
+        documents = _documents(report, pdf=pdf)
+    stored = {kind: ground.files.put_octets(octets) for kind, octets in documents.items()}
+    summary = _summary(report, pass_id)
+    with ground.database.writing() as connection:
+        for kind, file in stored.items():
+            repository.register_file(connection, file, "report", f"report of pass {pass_id} ({kind})", now)
+        repository.add_new(
+            connection,
+            repository.REPORTS,
+            id=identity,
+            pass_id=pass_id,
+            html_sha256=stored["html"].sha256,
+            json_sha256=stored["json"].sha256,
+            pdf_sha256=stored["pdf"].sha256 if pdf else None,
+            summary=summary,
+            created_utc_ns=now,
+        )
+        vehicle = int(repository.get(connection, repository.PASSES, pass_id, "pass")["vehicle_id"])
+    advance_windows(ground, vehicle)
+    folder = out if out is not None else ground.home / "reports" / f"pass-{pass_id}"
+    for kind, octets in documents.items():
+        _write_whole(folder / f"report.{kind}", octets)
+    return MadeReport(
+        identity,
+        pass_id,
+        folder / "report.html",
+        folder / "report.json",
+        folder / "report.pdf" if pdf else None,
+        summary,
+    )
+
+
+def _documents(report: PassReport, *, pdf: bool, press: Press | None = None) -> dict[str, bytes]:
+    """The octets of a report by kind, its PDF from a press where there is one."""
+    from reports.render import render_html, render_pdf, to_json
+
+    if press is not None:
+        press.begin(report)
+    documents = {"html": render_html(report).encode(), "json": to_json(report).encode()}
+    if pdf:
+        # Should the press have failed, so will this, and say why.
+        documents["pdf"] = (press.finish() if press is not None else None) or render_pdf(report)
+    return documents
+
+
+def _summary(report: PassReport, pass_id: int) -> dict[str, Any]:
+    return {**plain(summary_of(report)), "pass_id": pass_id}
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON knows it: NaN and infinities as None, numbers of numpy as Python's."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
+    """Write a JSON document whole or not at all."""
+    _write_whole(path, json.dumps(plain(value), indent=2).encode())
+
+
+def _write_whole(path: Path, octets: bytes) -> None:
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+    try:
+        make_durable_folder(path.parent)
+        temporary.write_bytes(octets)
+        replace_durably(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise storage_error(error, path.parent) from None

@@ -1,0 +1,90 @@
+"""Smoothed orbit of a pass as a series of the report, in addition to its filter."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ground_service.evaluation.alignment import (
+    ReferenceStates,
+    error_of_places_rtn_m,
+    places_of_positions,
+)
+from ground_service.evaluation.consistency import nees
+from ground_service.evaluation.drift import drift_by_length, navigation_statistics
+from ground_service.evaluation.smoother import CommandedBurn, FilterStates, SmootherModel, smooth
+from ground_service.passes.samples import NavigationSamples
+from lunar.arrays import FloatArray
+from lunar.frames import Orientation, mcmf_from_spherical
+from lunar.gravity import GravityField
+from lunar.gravity_omission import omission_psd_m2_s3
+from lunar.propagation import ForceModel
+from reports.values import NavigationSeries
+
+SMOOTHED = "smoothed"
+SMOOTHER_DEGREE = 100
+
+
+def smoother_model(
+    gravity: GravityField, orientation: Orientation, burns: tuple[CommandedBurn, ...]
+) -> SmootherModel:
+    """What the ground knows of the motion, with a field to the degree that it holds."""
+    degree = min(SMOOTHER_DEGREE, gravity.degree)
+    return SmootherModel(
+        ForceModel(gravity, orientation, degree), white_psd_m2_s3=omission_psd_m2_s3(degree), burns=burns
+    )
+
+
+def smoothed_series(
+    filtered: FilterStates,
+    reported: NavigationSamples,
+    track: ReferenceStates,
+    path_m: FloatArray,
+    model: SmootherModel,
+    reference_covariance_m2: FloatArray,
+) -> NavigationSeries | None:
+    """Return the errors of the smoothed orbit relative to the reference; None without complete states.
+
+    The payload uses its own rotation model of the Moon. Therefore, its reported selenographic positions are used, and
+    the smoother's correction, a difference of two inertial states, is added.
+
+    Parameters
+    ----------
+    reported
+        Positions reported by the same filter.
+    track
+        Reference at the times of `filtered`; `path_m` (n,) is the ground path to each.
+    reference_covariance_m2
+        Covariance of the reference (3, 3), R/T/N, which the NEES adds to that of the estimate.
+    """
+    rows = np.searchsorted(reported.utc_ns, filtered.utc_ns)
+    rows = np.minimum(rows, max(len(reported.utc_ns) - 1, 0))
+    if len(filtered) < 2 or not np.array_equal(reported.utc_ns[rows], filtered.utc_ns):
+        return None
+    smoothed = smooth(filtered, model)
+    correction = smoothed.state[:, :3] - filtered.state[:, :3]
+    place = mcmf_from_spherical(
+        np.radians(reported.latitude_deg[rows]),
+        np.radians(reported.longitude_deg[rows]),
+        reported.altitude_m[rows],
+    )
+    position = np.einsum("nji,nj->ni", track.mcmf_from_icrf, place) + correction
+    latitude, longitude, altitude = places_of_positions(track, position)
+    error = error_of_places_rtn_m(track, latitude, longitude, altitude)
+    never = np.zeros(len(filtered), dtype=np.bool_)
+    return NavigationSeries(
+        name=SMOOTHED,
+        kind=SMOOTHED,
+        utc_ns=filtered.utc_ns,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        altitude_m=altitude,
+        error_rtn_m=error,
+        sigma_rtn_m=smoothed.sigma_rtn_m,
+        statistics=navigation_statistics(error, path_m, never),
+        description=(
+            f"the filter smoothed on the ground with {model.forces.gravity.name} to degree "
+            f"{model.forces.degree}, Earth and Sun"
+        ),
+        nees=nees(error, smoothed.position_covariance_rtn_m2 + reference_covariance_m2),
+        drift_by_length=drift_by_length(error, path_m, never),
+    )

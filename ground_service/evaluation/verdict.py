@@ -1,0 +1,385 @@
+"""Verdict of a pass: the requirements with limit, value and status, and a summary sentence.
+
+Limits are those of the mission description. A requirement without a limit is shown without judgement. A value that is
+not known never counts as met. The accuracy is that of the declared estimator, also if another one is better.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ground_service.evaluation.consistency import share_inside
+from reports.text import count_text, significant_text
+from reports.values import (
+    DetectorScore,
+    FrameAccounting,
+    HousekeepingParameter,
+    NavigationSeries,
+    PacketAccounting,
+    Requirement,
+)
+
+NEES_DEGREES = 3
+NO_MISSION = "mission"
+"""Key of the row that says that a pass has no mission description."""
+LARGEST_SENTENCE = 5
+"""Largest number of failed requirements named in the sentence; the table has all."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Limits of a mission description, None where not stated; see `ground_service.missions.model.Requirements`."""
+
+    estimator: str | None = None
+    median_error_m: float | None = None
+    p95_error_m: float | None = None
+    better_than: tuple[str, ...] | None = None
+    consistency_inside_percent: float | None = None
+    packets_percent: float | None = None
+    frames_percent: float | None = None
+    images_percent: float | None = None
+    recall: float | None = None
+    precision: float | None = None
+    anchor_reads: float | None = None
+    resets: float | None = None
+    cpu_percent: float | None = None
+    memory_mib: float | None = None
+    storage_percent: float | None = None
+    temperature_max_c: float | None = None
+    temperature_min_c: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluated:
+    """Results of a pass that requirements refer to."""
+
+    navigation: tuple[NavigationSeries, ...] = ()
+    detector: DetectorScore | None = None
+    frames: FrameAccounting | None = None
+    packets: PacketAccounting | None = None
+    housekeeping: tuple[HousekeepingParameter, ...] = ()
+    cpu_percent: float | None = None
+
+
+def requirements(limits: Limits, found: Evaluated) -> tuple[Requirement, ...]:
+    """Return the verdict table of a pass."""
+    return (
+        *_accuracy(limits, found),
+        *_comparisons(limits, found),
+        *_consistency(limits, found),
+        *_completeness(limits, found),
+        *_detector(limits, found),
+        *_independence(limits, found),
+        *_resources(limits, found),
+    )
+
+
+def without_mission(table: Sequence[Requirement], remedy: str) -> tuple[Requirement, ...]:
+    """Return the verdict table of a pass without a mission description: no limit is known, so that all is unknown."""
+    missing = Requirement(NO_MISSION, "mission description", "", None, None, True, "unknown", remedy)
+    return missing, *(
+        replace(one, status="unknown", note=one.note or "no limit") if one.status == "not judged" else one
+        for one in table
+    )
+
+
+def verdict_of(table: Sequence[Requirement]) -> tuple[str, str]:
+    """Return the sentence on a verdict table, failures first, and its level: "good", "caution" or "bad"."""
+    judged = [one for one in table if one.status != "not judged"]
+    failed = [one for one in judged if one.status == "not met"]
+    unknown = [one for one in judged if one.status == "unknown"]
+    met = len(judged) - len(failed) - len(unknown)
+    if not judged:
+        return "No requirement has a limit in the mission description: nothing is judged.", "caution"
+    if judged[0].key == NO_MISSION:
+        return f"Nothing can be judged: {judged[0].note}", "caution"
+    parts = []
+    if failed:
+        named = "; ".join(_said(one) for one in failed[:LARGEST_SENTENCE])
+        more = "" if len(failed) <= LARGEST_SENTENCE else f"; and {len(failed) - LARGEST_SENTENCE} more"
+        parts.append(f"{_of(len(failed), len(judged))} not met: {named}{more}.")
+    if unknown:
+        names = ", ".join(one.name for one in unknown)
+        parts.append(f"{count_text(len(unknown))} unknown: {names}.")
+    parts.append(f"{_of(met, len(judged))} met.")
+    return " ".join(parts), "bad" if failed else "caution" if unknown else "good"
+
+
+def _of(count: int, total: int) -> str:
+    noun = "requirement" if total == 1 else "requirements"
+    return f"{count_text(count)} of {count_text(total)} {noun}"
+
+
+def _said(one: Requirement) -> str:
+    unit = f" {one.unit}" if one.unit else ""
+    bound = "at most" if one.at_most else "at least"
+    return f"{one.name} {significant_text(one.value)}{unit} ({bound} {significant_text(one.limit)})"
+
+
+def _row(
+    key: str,
+    name: str,
+    unit: str,
+    value: float | None,
+    limit: float | None,
+    *,
+    at_most: bool,
+    strict: bool = False,
+    known: bool = True,
+    judged: bool,
+    note: str = "",
+) -> Requirement:
+    """Return a judged requirement: `strict` excludes equality; with `known` False the value never counts as met."""
+    if value is not None and not math.isfinite(value):
+        value = None
+    if limit is not None and not math.isfinite(limit):
+        limit = None
+    if not judged:
+        status = "not judged"
+    elif value is None or limit is None:
+        status = "unknown"
+    else:
+        margin = limit - value if at_most else value - limit
+        good = margin > 0.0 if strict else margin >= 0.0
+        status = "not met" if not good else "met" if known else "unknown"
+    return Requirement(key, name, unit, value, limit, at_most, status, note)
+
+
+def _limited(
+    key: str,
+    name: str,
+    unit: str,
+    value: float | None,
+    limit: float | None,
+    *,
+    at_most: bool,
+    known: bool = True,
+    note: str = "",
+) -> Requirement:
+    """Return a requirement that is judged if the mission states its limit."""
+    judged = limit is not None
+    return _row(key, name, unit, value, limit, at_most=at_most, known=known, judged=judged, note=note)
+
+
+def _declared(limits: Limits, found: Evaluated) -> NavigationSeries | None:
+    return next(
+        (one for one in found.navigation if one.kind == "estimate" and one.name == limits.estimator), None
+    )
+
+
+def _median(series: NavigationSeries | None) -> float | None:
+    """Return the median error; None for a single frame, where the error is that of the start position."""
+    if series is None or len(series.utc_ns) < 2:
+        return None
+    return series.statistics.median_3d_m
+
+
+def _accuracy(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+    series = _declared(limits, found)
+    if limits.estimator is None:
+        note = "the mission description declares no estimator"
+    elif series is None:
+        note = f"{limits.estimator} reported nothing"
+    elif len(series.utc_ns) < 2:
+        note = "only one frame was navigated, too few for a judgement"
+    else:
+        note = f"{limits.estimator}, {count_text(len(series.utc_ns))} samples"
+    median = _median(series)
+    p95 = None if median is None or series is None else series.statistics.p95_3d_m
+    yield _limited(
+        "accuracy.median", "median 3-D error", "m", median, limits.median_error_m, at_most=True, note=note
+    )
+    yield _limited(
+        "accuracy.p95",
+        "95th percentile of the 3-D error",
+        "m",
+        p95,
+        limits.p95_error_m,
+        at_most=True,
+        note=note,
+    )
+
+
+def _comparisons(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+    """Yield the comparisons of the declared estimator with every computed or required baseline."""
+    wanted = limits.better_than or ()
+    others = {one.name: one for one in found.navigation if one.kind in ("baseline", "smoothed")}
+    own = _median(_declared(limits, found))
+    for name in dict.fromkeys((*wanted, *others)):
+        baseline = _median(others.get(name))
+        yield _row(
+            f"better_than.{name}",
+            f"better than {name}",
+            "m",
+            own,
+            baseline,
+            at_most=True,
+            strict=True,
+            judged=name in wanted,
+            note="median 3-D error" if name in others else "this baseline was not computed",
+        )
+
+
+def _consistency(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+    series = _declared(limits, found)
+    nees = nis = float("nan")
+    if series is not None and series.nees is not None:
+        nees = 100.0 * share_inside(series.nees, NEES_DEGREES)
+    if series is not None and series.nis is not None and series.nis_dof is not None:
+        nis = 100.0 * share_inside(series.nis, series.nis_dof)
+    for key, value, note in (
+        ("nees", nees, "position error against the covariance of estimate and reference"),
+        ("nis", nis, "image innovations"),
+    ):
+        yield _limited(
+            f"consistency.{key}",
+            f"{key.upper()} inside 95 % bounds",
+            "%",
+            value,
+            limits.consistency_inside_percent,
+            at_most=False,
+            note=note,
+        )
+
+
+def _completeness(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+    packets, frames = found.packets, found.frames
+    share = edges = None
+    note = ""
+    if packets is not None:
+        edges = packets.lost_at_edges
+        share = 100.0 * packets.packets / packets.expected if packets.expected else None
+        note = f"{count_text(packets.packets)} of {count_text(packets.expected)} packets"
+        if edges is None:
+            note += "; without a plan, packets missing at the edges are unknown"
+    yield _limited(
+        "completeness.packets",
+        "packets received of those expected",
+        "%",
+        share,
+        limits.packets_percent,
+        at_most=False,
+        known=edges is not None,
+        note=note,
+    )
+    expected = None if frames is None else frames.expected
+    counts = (
+        (
+            "frames",
+            "frames reported of those expected",
+            limits.frames_percent,
+            frames.acquired if frames else None,
+        ),
+        (
+            "images",
+            "frames with a usable image of those expected",
+            limits.images_percent,
+            frames.processed if frames else None,
+        ),
+    )
+    for key, name, limit, count in counts:
+        value = 100.0 * count / expected if expected and count is not None else None
+        yield _limited(
+            f"completeness.{key}",
+            name,
+            "%",
+            value,
+            limit,
+            at_most=False,
+            note="no plan of the frames"
+            if value is None
+            else f"{count_text(count)} of {count_text(expected)} frames",
+        )
+
+
+def _detector(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+    micro = None if found.detector is None else found.detector.micro
+    note = "" if micro is None else f"{count_text(micro.expected)} craters of {micro.label} expected"
+    recall, precision = (None, None) if micro is None else (micro.recall, micro.precision)
+    yield _limited("detector.recall", "detector recall", "", recall, limits.recall, at_most=False, note=note)
+    yield _limited(
+        "detector.precision", "detector precision", "", precision, limits.precision, at_most=False, note=note
+    )
+
+
+def _independence(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+    series = _declared(limits, found)
+    reads = None if series is None else series.anchor_reads_after_start
+    resets = _resets(series)
+    yield _limited(
+        "anchor_reads", "anchor reads after the start", "", reads, limits.anchor_reads, at_most=True
+    )
+    yield _limited("resets", "resets after the start", "", resets, limits.resets, at_most=True)
+    for other in found.navigation:
+        if other.kind == "estimate" and other is not series:
+            yield _row(
+                f"resets.{other.name}",
+                f"resets of {other.name} after the start",
+                "",
+                _resets(other),
+                None,
+                at_most=True,
+                judged=False,
+            )
+
+
+def _resets(series: NavigationSeries | None) -> float | None:
+    """Return the number of resets of an estimator after its first sample; None if it reported no outcomes."""
+    if series is None or not series.reset_trigger:
+        return None
+    return float(sum(trigger != "none" for trigger in series.reset_trigger[1:]))
+
+
+def _resources(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+    values = {one.name: one.values[np.isfinite(one.values)] for one in found.housekeeping}
+
+    def greatest(name: str, scale: float = 1.0) -> float | None:
+        known = values.get(name)
+        return None if known is None or not len(known) else float(known.max()) * scale
+
+    coldest = values.get("temperature_c")
+    yield _limited(
+        "resources.cpu",
+        "CPU load",
+        "%",
+        found.cpu_percent,
+        limits.cpu_percent,
+        at_most=True,
+        note="processor time of a step over the cadence, largest mean between two reports",
+    )
+    yield _limited(
+        "resources.memory",
+        "memory in use",
+        "MiB",
+        greatest("memory_used_kib", 1.0 / 1024.0),
+        limits.memory_mib,
+        at_most=True,
+    )
+    yield _limited(
+        "resources.storage",
+        "packet store in use",
+        "%",
+        greatest("storage_used_permille", 0.1),
+        limits.storage_percent,
+        at_most=True,
+    )
+    yield _limited(
+        "resources.temperature_max",
+        "highest temperature",
+        "°C",
+        greatest("temperature_c"),
+        limits.temperature_max_c,
+        at_most=True,
+    )
+    yield _limited(
+        "resources.temperature_min",
+        "lowest temperature",
+        "°C",
+        float(coldest.min()) if coldest is not None and len(coldest) else None,
+        limits.temperature_min_c,
+        at_most=False,
+    )

@@ -1,0 +1,136 @@
+"""Resources of the ground service: database, file archive and available public data products."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import stat
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ground_service.errors import Stopping, storage_error
+from ground_service.store.database import Database, prepare_database
+from ground_service.store.files import UNPACKING, FileArchive, make_durable_folder, remove_leftovers
+from ground_service.store.roles import check_role
+from lunar.datafolder import DataFolder, default_orientation, find_data
+
+if TYPE_CHECKING:
+    from ground_service.settings import Settings
+    from lunar.frames import Orientation
+
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """An opened ground service: pass it to the services of the capabilities.
+
+    `stopping` is set before it is closed; long work then ends between two transactions.
+    """
+
+    database: Database
+    files: FileArchive
+    home: Path
+    data: DataFolder
+    runner: Path | None = None
+    stopping: threading.Event = field(default_factory=threading.Event, compare=False, repr=False)
+
+    def check_stopping(self) -> None:
+        """Called by long work where it can be broken off.
+
+        Raises
+        ------
+        Stopping
+            If the service is being stopped.
+        """
+        if self.stopping.is_set():
+            raise Stopping
+
+    @property
+    def orientation(self) -> Orientation:
+        """Lunar orientation of the available data."""
+        return _orientation(self.data)
+
+    def __enter__(self) -> Ground:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give the database connections back."""
+        self.database.engine.dispose()
+
+
+def open_ground(
+    home: Path,
+    data: DataFolder | None = None,
+    *,
+    database_url: str | None = None,
+    runner: Path | None = None,
+) -> Ground:
+    """Return the ground service under `home`; its SQLite database is created or upgraded.
+
+    Parameters
+    ----------
+    home
+        Folder of the database, the raw files and the reports; created if missing.
+    data
+        Public data products; None: the built-in models.
+    database_url
+        Database URL; None: ``home/linna.db``.
+    runner
+        Exchange folder of the runner that executes payload builds; None: a local sandbox.
+    """
+    home = home.expanduser().absolute()
+    try:
+        make_durable_folder(home)
+        keep_private(home, 0o700)
+    except OSError as error:
+        raise storage_error(error, home) from None
+    database = prepare_database(database_url or f"sqlite:///{home / 'linna.db'}")
+    keep_private(home / "linna.db", 0o600)
+    files = FileArchive(home / "files")
+    files.remove_leftovers()
+    remove_leftovers(home, UNPACKING)
+    return Ground(database, files, home, data if data is not None else DataFolder(), runner)
+
+
+def keep_private(path: Path, mode: int) -> None:
+    """Remove permissions of group and others that are not in `mode`; log a warning if that is not permitted."""
+    try:
+        found = stat.S_IMODE(path.stat().st_mode)
+        if found & ~mode & 0o077:
+            path.chmod(found & mode)
+    except FileNotFoundError:
+        return
+    except OSError:
+        log.warning("%s: expected mode %o or less, found %o; run 'chmod %o'", path, mode, found, mode)
+
+
+def ground_from_settings(settings: Settings) -> Ground:
+    """Return the ground service for the settings of the deployment.
+
+    Raises
+    ------
+    PowerfulRole
+        Its database role can change the schema or the audit log, and the settings do not permit that.
+    """
+    data = find_data(settings.data) if settings.data is not None else DataFolder()
+    url = settings.resolved_database_url()
+    ground = open_ground(settings.home, data, database_url=url, runner=settings.runner_exchange)
+    try:
+        if not settings.allow_database_owner:
+            check_role(ground.database)
+    except BaseException:
+        ground.close()
+        raise
+    return ground
+
+
+@functools.lru_cache(maxsize=4)
+def _orientation(data: DataFolder) -> Orientation:
+    return default_orientation(data)

@@ -1,0 +1,1 @@
+"""What every endpoint shares: connections, limits, origins, uploads, problem details, schemas, time formats."""

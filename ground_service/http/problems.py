@@ -1,0 +1,184 @@
+"""Errors as RFC 9457 problem details: one handler turns every error of the packages into a status and a document."""
+
+from __future__ import annotations
+
+import logging
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from ground_service.errors import (
+    BuildNotChecked,
+    Conflict,
+    EvaluationError,
+    FileDamaged,
+    Forbidden,
+    GroundError,
+    InvalidInput,
+    NotAuthorised,
+    NotFound,
+    PlanConflicts,
+    StateConflict,
+    StorageFull,
+    StorageReadOnly,
+    StoreError,
+    public_text,
+)
+from lunar.errors import LunarError
+from reports.errors import ReportError
+from tmtc.errors import TmtcError
+
+log = logging.getLogger(__name__)
+
+MEDIA_TYPE = "application/problem+json"
+
+STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
+    (NotFound, 404, "not found"),
+    (Conflict, 409, "conflict"),
+    (InvalidInput, 422, "invalid input"),
+    (EvaluationError, 422, "cannot be evaluated"),
+    (BuildNotChecked, 503, "build not checked"),
+    (NotAuthorised, 401, "not authorised"),
+    (StorageFull, 507, "no space left"),
+    (StorageReadOnly, 503, "read-only"),
+    (StoreError, 503, "store unavailable"),
+    (TmtcError, 422, "invalid telemetry"),
+    (LunarError, 422, "invalid input"),
+    (ReportError, 500, "report failed"),
+    (GroundError, 400, "bad request"),
+)
+
+RETRY_AFTER_S = 1
+
+TOLD: tuple[tuple[type[Exception], str], ...] = (
+    (StorageFull, "no space left; the data were not stored"),
+    (StorageReadOnly, "the archive or the database cannot be written"),
+    (FileDamaged, "the content of a stored file has changed"),
+    (StoreError, "database unavailable"),
+    (BuildNotChecked, "the parameters of the build cannot be checked here, so it was not registered"),
+    (Exception, "internal error; see the log of the service"),
+)
+"""Public text of internal errors, without paths and addresses."""
+
+
+class TooLarge(GroundError):
+    """More octets than the service takes."""
+
+
+class Busy(GroundError):
+    """Too many simultaneous requests; the same request may succeed later."""
+
+
+class BrokenOff(GroundError):
+    """Incomplete request body."""
+
+
+class UnsupportedEncoding(GroundError):
+    """Unsupported content encoding of a request body."""
+
+
+class PreconditionFailed(GroundError):
+    """What is stored is no longer what the caller saw."""
+
+
+def problem(
+    status: int, title: str, detail: str, request: Request | None = None, **extra: Any
+) -> JSONResponse:
+    """A problem document."""
+    body: dict[str, Any] = {
+        "type": "about:blank",
+        "title": title,
+        "status": status,
+        "detail": detail,
+        **extra,
+    }
+    if request is not None:
+        body["instance"] = request.url.path
+    headers = {"WWW-Authenticate": "Bearer"} if status == 401 else None
+    return JSONResponse(body, status_code=status, media_type=MEDIA_TYPE, headers=headers)
+
+
+def busy(detail: str, request: Request | None = None) -> JSONResponse:
+    """Return a problem document with Retry-After."""
+    response = problem(503, "busy", detail, request)
+    response.headers["Retry-After"] = str(RETRY_AFTER_S)
+    return response
+
+
+def _allowed(app: FastAPI, request: Request) -> list[str]:
+    """Return the methods of all operations at the path of a request."""
+    methods: set[str] = set()
+    for route in app.state.operations:
+        if route.path_regex.match(request.scope["path"]):
+            methods |= set(route.methods or ())
+    return sorted(methods)
+
+
+def install(app: FastAPI) -> None:
+    """Make the application answer every error with a problem document."""
+
+    async def known(request: Request, error: Exception) -> JSONResponse:
+        if isinstance(error, Forbidden):
+            return problem(403, "forbidden", str(error), request)
+        if isinstance(error, TooLarge):
+            return problem(413, "too large", str(error), request)
+        if isinstance(error, Busy):
+            return busy(str(error), request)
+        if isinstance(error, BrokenOff):
+            return problem(400, "broken off", str(error), request)
+        if isinstance(error, UnsupportedEncoding):
+            return problem(415, "unsupported encoding", str(error), request)
+        if isinstance(error, PreconditionFailed):
+            return problem(412, "precondition failed", str(error), request)
+        told = public_text(error)  # the log contains the complete text
+        if isinstance(error, PlanConflicts):
+            found = [
+                {"where": f"window {one.window_id}" if one.window_id else one.kind, "detail": one.detail}
+                for one in error.conflicts
+            ]
+            return problem(409, "conflict", told, request, errors=found)
+        if isinstance(error, StateConflict):
+            return problem(409, "conflict", told, request, state=error.found)
+        status, title = next((s, t) for kind, s, t in STATUSES if isinstance(error, kind))
+        if status < 500:
+            return problem(status, title, told, request)
+        # The message may contain paths or addresses: it is logged with the id of the request.
+        request_id = getattr(request.state, "request_id", None)
+        log.error("%s %s: %s", request.method, request.url.path, error, extra={"request_id": request_id})
+        detail = next(text for kind, text in TOLD if isinstance(error, kind))
+        return problem(status, title, detail, request, request_id=request_id)
+
+    async def http(request: Request, error: Exception) -> JSONResponse:
+        assert isinstance(error, HTTPException)
+        if error.status_code == 400:  # what the framework says of a body that its JSON reader gives up on
+            detail = "body: expected JSON of ordinary depth with numbers of ordinary length, found none"
+            return problem(400, "invalid request", detail, request)
+        title = HTTPStatus(error.status_code).phrase.lower()
+        answer = problem(error.status_code, title, str(error.detail), request)
+        if error.status_code == 405:
+            answer.headers["Allow"] = ", ".join(_allowed(app, request))
+        return answer
+
+    async def invalid(request: Request, error: Exception) -> JSONResponse:
+        assert isinstance(error, RequestValidationError)
+        found = [
+            {"where": ".".join(str(part) for part in item["loc"]), "expected": item["msg"]}
+            for item in error.errors()
+        ]
+        detail = "; ".join(f"{item['where']}: {item['expected']}" for item in found[:5])
+        return problem(422, "invalid request", detail, request, errors=found)
+
+    async def unexpected(request: Request, error: Exception) -> JSONResponse:
+        told = {"request_id": getattr(request.state, "request_id", None)}
+        log.exception("%s %s", request.method, request.url.path, exc_info=error, extra=told)
+        return problem(500, "internal error", "internal error; see the log of the service", request)
+
+    for kind in (GroundError, TmtcError, LunarError, ReportError):
+        app.add_exception_handler(kind, known)
+    app.add_exception_handler(HTTPException, http)
+    app.add_exception_handler(RequestValidationError, invalid)
+    app.add_exception_handler(Exception, unexpected)

@@ -1,0 +1,1 @@
+"""From octets of a downlink to stored packets: frames, packets, joining of pieces, accounting."""

@@ -1,0 +1,459 @@
+"""Ingest of a downlink file: the raw file is archived, its packets are stored once each, everything is accounted for.
+
+The archive that results depends only on the octets that were ingested, not on their order, on how they were split into
+files or on how often they came. An ingest that was cut off can simply be run again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection
+
+from ground_service.clock import utc_now_ns
+from ground_service.errors import PASSING, GroundError, InvalidInput
+from ground_service.ground import Ground
+from ground_service.ingest import edge_store as edges
+from ground_service.ingest.frames import ChannelEdge, is_checked
+from ground_service.ingest.joining import Joiner
+from ground_service.ingest.packets import PacketBatch
+from ground_service.ingest.redecode import catch_up
+from ground_service.ingest.stream import (
+    BARE,
+    CADU_MAX_OCTETS,
+    PROBE_OCTETS,
+    DownlinkReader,
+    Link,
+    fragment_edges,
+)
+from ground_service.planning.progress import advance_windows
+from ground_service.store import repository
+from ground_service.store.files import StoredFile, read_blocks
+from ground_service.store.packets import store_batch
+from ground_service.timekeeping.recorrelation import recorrelate
+from tmtc.cuc import NO_TICKS
+from tmtc.dictionary import DICTIONARY
+from tmtc.errors import TmtcError
+from tmtc.link import LinkSettings
+from tmtc.packets import PACKET_MAX_LENGTH
+
+FLOWN = "flight"
+"""Instance of a spacecraft that telemetry belongs to when nothing else is said."""
+
+Progress = Callable[[float], None]
+
+
+DEFAULT_LINKS = (Link(LinkSettings()), Link(LinkSettings(checksum=False)))
+"""Links that are tried for an unknown spacecraft if a piece is too small to determine its link."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Position of a file in a stream of octets, as stated by its sender."""
+
+    stream: str
+    offset: int
+
+
+@dataclass(frozen=True, slots=True)
+class IngestResult:
+    """Content of an ingested file, and the new part of it.
+
+    `packets_joined` is the number of packets completed with earlier files, `frames_joined` that of frames.
+    `octets_pending` cannot be used yet: they wait for the octets before or after them. `first_ticks` and
+    `last_ticks` are the earliest and the latest on-board time of the complete packets in the file, None without any.
+    `vehicle_ids` are the vehicles whose packets it contains. `uplink` contains a `tmtc.clcw.UplinkSeen` for each
+    spacecraft and telecommand channel reported in the frames.
+    """
+
+    ingest_id: int
+    vehicle_id: int | None
+    octets: int
+    packets: int
+    packets_new: int
+    packets_joined: int
+    packets_repeated: int
+    samples: int
+    crc_errors: int
+    octets_skipped: int
+    octets_pending: int
+    frames: int
+    frames_bad: int
+    frames_joined: int
+    symbols_corrected: int
+    unknown: int
+    first_ticks: int | None = None
+    last_ticks: int | None = None
+    vehicle_ids: tuple[int, ...] = ()
+    uplink: tuple[dict[str, Any], ...] = ()
+
+
+def ingest_file(
+    ground: Ground,
+    path: Path,
+    *,
+    spacecraft_id: int | None = None,
+    instance: str = FLOWN,
+    name: str | None = None,
+    place: Place | None = None,
+) -> IngestResult:
+    """Archive a downlink file and store its content.
+
+    Parameters
+    ----------
+    spacecraft_id
+        Spacecraft of the file; frames of other spacecraft are ignored. None: the ids are those of the frames. Required
+        for bare packets, which have no id.
+    instance
+        Instance of the spacecraft to which the telemetry belongs.
+    place
+        Position of the file in its stream; None: joined by order of arrival and by content.
+
+    Raises
+    ------
+    InvalidInput
+        If the file is unreadable or contains no part of a downlink.
+    """
+    if not path.is_file():
+        raise InvalidInput(str(path), "", "a downlink file", "a folder" if path.is_dir() else "nothing there")
+    stored = ground.files.put_file(path)
+    return ingest_stored(
+        ground, stored, spacecraft_id=spacecraft_id, instance=instance, name=name or path.name, place=place
+    )
+
+
+def ingest_stored(
+    ground: Ground,
+    stored: StoredFile,
+    *,
+    spacecraft_id: int | None = None,
+    instance: str = FLOWN,
+    name: str,
+    place: Place | None = None,
+) -> IngestResult:
+    """Store what is in an archived downlink file; see `ingest_file`."""
+    with ground.database.writing() as connection:
+        ingest_id = add_ingest(
+            connection,
+            stored,
+            name,
+            spacecraft_id=spacecraft_id,
+            instance=instance,
+            place=place,
+            state="running",
+        )
+    return _run(ground, ingest_id, again=False)
+
+
+def add_ingest(
+    connection: Connection,
+    stored: StoredFile,
+    name: str,
+    *,
+    spacecraft_id: int | None = None,
+    instance: str = FLOWN,
+    place: Place | None = None,
+    state: str = "queued",
+) -> int:
+    """Add an ingest of an archived file, within the caller's transaction; return its id."""
+    now = utc_now_ns()
+    repository.register_file(connection, stored, "downlink", name, now)
+    ingest_id = int(
+        repository.add(
+            connection,
+            repository.INGESTS,
+            vehicle_id=None,
+            file_sha256=stored.sha256,
+            state=state,
+            dictionary_version=DICTIONARY.version,
+            received_utc_ns=now,
+            accounting={},
+        )
+    )
+    edges.add_piece(
+        connection,
+        edges.Piece(
+            ingest_id=ingest_id,
+            scope=instance,
+            spacecraft_id=spacecraft_id,
+            file_sha256=stored.sha256,
+            octets=stored.octets,
+            stream=place.stream if place is not None else "",
+            position=place.offset if place is not None else ingest_id,
+            links_tried=None,
+        ),
+    )
+    return ingest_id
+
+
+def run_ingest(
+    ground: Ground,
+    ingest_id: int,
+    *,
+    progress: Progress | None = None,
+) -> IngestResult:
+    """Run an ingest that was added with `add_ingest`; a repetition changes nothing.
+
+    `progress` is called with the stored share of the file, several times for a long file.
+    """
+    with ground.database.writing() as connection:
+        record = repository.get(connection, repository.INGESTS, ingest_id, "ingest")
+        repository.change(connection, repository.INGESTS, ingest_id, state="running")
+    again = record["state"] != "queued"
+    return _run(ground, ingest_id, again=again, progress=progress)
+
+
+def _run(
+    ground: Ground,
+    ingest_id: int,
+    *,
+    again: bool,
+    progress: Progress | None = None,
+) -> IngestResult:
+    try:
+        result = _read_piece(ground, ingest_id, again, progress)
+    except PASSING:
+        raise
+    except (GroundError, TmtcError) as error:
+        with ground.database.writing() as connection:
+            repository.change(
+                connection,
+                repository.INGESTS,
+                ingest_id,
+                state="failed",
+                error=str(error),
+                finished_utc_ns=utc_now_ns(),
+            )
+        raise
+    with ground.database.writing() as connection:
+        repository.change(
+            connection,
+            repository.INGESTS,
+            ingest_id,
+            state="done",
+            error=None,
+            vehicle_id=result.vehicle_id,
+            finished_utc_ns=utc_now_ns(),
+            accounting=asdict(result),
+        )
+    return result
+
+
+def _read_piece(
+    ground: Ground,
+    ingest_id: int,
+    again: bool,
+    progress: Progress | None,
+) -> IngestResult:
+    """Store the content of a piece and the units joined with others, and read pieces that wait for its link."""
+    with ground.database.reading() as connection:
+        piece = edges.piece_of(connection, ingest_id)
+    reading = _Reading(ground, piece, progress)
+    learned = reading.read()
+    for other in learned:
+        late = _Reading(ground, other, None, vehicles=reading.vehicles)
+        late.read()
+        with ground.database.writing() as connection:
+            repository.change(
+                connection, repository.INGESTS, other.ingest_id, accounting=asdict(late.result())
+            )
+    for vehicle in reading.vehicles.values():
+        catch_up(ground, vehicle)
+        new = reading.new + reading.joiner.joined.packets
+        if (new or learned or again) and not recorrelate(ground, vehicle):
+            advance_windows(ground, vehicle)
+    return reading.result()
+
+
+@dataclass(frozen=True, slots=True)
+class _Batch:
+    """Packets of a downlink, and the fragments in its channels."""
+
+    packets: PacketBatch
+    channel_edges: list[ChannelEdge]
+
+
+class _Reading:
+    """Reading of one piece."""
+
+    def __init__(
+        self,
+        ground: Ground,
+        piece: edges.Piece,
+        progress: Progress | None,
+        vehicles: dict[int, int] | None = None,
+    ) -> None:
+        self.ground = ground
+        self.piece = piece
+        self.spacecraft_id = piece.spacecraft_id
+        self.progress = progress
+        self.vehicles: dict[int, int] = {} if vehicles is None else vehicles
+        self.joiner = Joiner(ground, piece, self.vehicles)
+        self.new = self.samples = self.unknown = 0
+        self.ticks: list[int] = []
+        self.reader = DownlinkReader(piece.spacecraft_id)
+
+    def read(self) -> list[edges.Piece]:
+        """Read and join the piece; return the pieces that can be read now because its link is known."""
+        while True:
+            with self.ground.database.reading() as connection:
+                known = edges.known_links(connection, self.piece.scope)
+            candidates = [*known, *(link for link in DEFAULT_LINKS if link not in known)]
+            self.reader = DownlinkReader(self.spacecraft_id, known=candidates)
+            last = self._store_batches()
+            link = self.reader.link
+            if link is not None:
+                with self.ground.database.writing() as connection:
+                    self._store(connection, last)
+                    self.joiner.keep_channel_edges(connection, self.reader.take_channel_edges())
+                    self.joiner.keep_edges(connection, link, self.reader.edges)
+                    self._learn(connection, link, known, None)
+                self.joiner.join()
+                return self._readable_now()
+            link = self._link_by_place(known) if self.piece.octets <= CADU_MAX_OCTETS else None
+            if link is None:
+                self._refuse_noise()
+            with self.ground.database.writing() as connection:
+                self._keep_fragment(connection, link, known)
+                edges.note_read(connection, self.piece.ingest_id, len(known))
+            self.joiner.join()
+            if link is not None and (self.joiner.joined.frames or self.joiner.joined.packets):
+                with self.ground.database.writing() as connection:
+                    self._learn(connection, link, known, len(known) + 1)
+                return self._readable_now()
+            with self.ground.database.reading() as connection:
+                if len(edges.known_links(connection, self.piece.scope)) == len(known):
+                    return []
+
+    def _learn(self, connection: Connection, link: Link, known: list[Link], links_tried: int | None) -> None:
+        edges.note_read(connection, self.piece.ingest_id, links_tried)
+        if link not in known:
+            edges.learn_link(connection, self.piece.scope, link)
+
+    def _readable_now(self) -> list[edges.Piece]:
+        with self.ground.database.reading() as connection:
+            links = len(edges.known_links(connection, self.piece.scope))
+            return [
+                edges.piece_of(connection, one)
+                for one in edges.pieces_to_read_again(connection, self.piece.scope, links)
+                if one != self.piece.ingest_id
+            ]
+
+    def _store_batches(self) -> _Batch | None:
+        """Store all batches of the file except the last one, which is returned."""
+        ground, total = self.ground, max(self.piece.octets, 1)
+        path = ground.files.path(self.piece.file_sha256)
+        last: _Batch | None = None
+        for batch in self.reader.batches(read_blocks(path)):
+            ground.check_stopping()
+            if batch.spacecraft_id is None:
+                raise InvalidInput("downlink of bare packets", "", "the id of their spacecraft", "none given")
+            if last is not None:
+                with self.ground.database.writing() as connection:
+                    self._store(connection, last)
+            last = _Batch(batch, self.reader.take_channel_edges())
+            if self.progress is not None:
+                self.progress(self.reader.accounting.octets / total)
+        return last
+
+    def _store(self, connection: Connection, found: _Batch | None) -> None:
+        if found is None or (not len(found.packets) and self.reader.link == BARE):
+            return
+        assert found.packets.spacecraft_id is not None
+        vehicle = self.joiner.vehicle(connection, found.packets.spacecraft_id)
+        self.joiner.keep_channel_edges(connection, found.channel_edges)
+        stored = store_batch(connection, vehicle, found.packets)
+        self.new += stored.new
+        self.samples += stored.samples
+        self.unknown += found.packets.unknown
+        timed = found.packets.ticks[found.packets.ticks != NO_TICKS]
+        if timed.size:
+            self.ticks = [min([*self.ticks, int(timed.min())]), max([*self.ticks, int(timed.max())])]
+
+    def _link_by_place(self, known: list[Link]) -> Link | None:
+        """Return the link of a piece that is too small to determine it, from the adjacent octets."""
+        if known:
+            return None
+        with self.ground.database.reading() as connection:
+            before = edges.octets_before(connection, self.piece, PROBE_OCTETS // 4)
+            behind = edges.octets_behind(connection, self.piece, PROBE_OCTETS // 4)
+        if not before and not behind:
+            return None
+        parts = [*before, edges.Part(self.piece.file_sha256, 0, self.piece.octets), *behind]
+        octets = b"".join(self.ground.files.read(one.file_sha256, one.start, one.stop) for one in parts)
+        probe = DownlinkReader(self.spacecraft_id, known=DEFAULT_LINKS)
+        try:
+            for _ in probe.batches([octets]):
+                pass
+        except TmtcError:
+            return None
+        link = probe.link  # octets that are adjacent only by order of arrival must not determine a link
+        certain = link is None or link.settings is None or is_checked(link.settings)
+        return link if certain else None
+
+    def _keep_fragment(self, connection: Connection, link: Link | None, known: list[Link]) -> None:
+        """Store a piece without a complete unit as fragments, for each possible link."""
+        links = [link] if link is not None else known or list(DEFAULT_LINKS[:1])
+        if not known and self.spacecraft_id is not None and BARE not in links:
+            links = [*links, BARE]
+        octets = b""
+        if self.piece.octets <= PACKET_MAX_LENGTH:
+            octets = self.ground.files.read(self.piece.file_sha256, 0, self.piece.octets)
+        for one in links:
+            self.joiner.keep_edges(connection, one, fragment_edges(octets, one.settings) if octets else [])
+
+    def _refuse_noise(self) -> None:
+        """Refuse a piece that cannot be a fragment of a unit.
+
+        Raises
+        ------
+        InvalidInput
+            If the piece is longer than any CADU or packet but contains none.
+        """
+        limit = 2 * CADU_MAX_OCTETS if self.spacecraft_id is None else PACKET_MAX_LENGTH
+        if self.piece.octets > limit:
+            raise InvalidInput(
+                _name(self.ground, self.piece.file_sha256),
+                "",
+                "a stream of CADUs or of space packets",
+                f"{self.piece.octets} octets without a valid packet",
+            )
+
+    def result(self) -> IngestResult:
+        """Return the result of the reading."""
+        found, joined = self.reader.accounting, self.joiner.joined
+        with self.ground.database.reading() as connection:
+            pending = edges.octets_pending(connection, self.piece.file_sha256)
+        return IngestResult(
+            ingest_id=self.piece.ingest_id,
+            vehicle_id=next(iter(self.vehicles.values()), None),
+            octets=found.octets,
+            packets=found.packets,
+            packets_new=self.new + joined.packets,
+            packets_joined=joined.packets,
+            packets_repeated=found.packets - self.new,
+            samples=self.samples + joined.samples,
+            crc_errors=found.crc_errors,
+            octets_skipped=found.octets_skipped,
+            octets_pending=pending,
+            frames=found.frames,
+            frames_bad=found.frames_bad,
+            frames_joined=joined.frames,
+            symbols_corrected=found.symbols_corrected,
+            unknown=self.unknown,
+            first_ticks=self.ticks[0] if self.ticks else None,
+            last_ticks=self.ticks[-1] if self.ticks else None,
+            vehicle_ids=tuple(sorted(self.vehicles.values())),
+            uplink=tuple(
+                {"spacecraft_id": spacecraft_id, **asdict(seen)}
+                for (spacecraft_id, _), seen in sorted(found.uplink.items())
+            ),
+        )
+
+
+def _name(ground: Ground, sha256: str) -> str:
+    with ground.database.reading() as connection:
+        return str(repository.get(connection, repository.FILES, sha256, "file")["name"])

@@ -1,0 +1,1 @@
+"""Passes and their telemetry: definition, import of archives, series, trends, packet accounting."""

@@ -1,0 +1,292 @@
+"""Import of a pass archive: manifest, reference ephemeris, catalogue, images and downlink become a pass."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from ground_service.clock import utc_now_ns
+from ground_service.ephemerides.attitudes import load_attitudes
+from ground_service.errors import InvalidInput, storage_error
+from ground_service.ground import Ground
+from ground_service.ingest.service import ingest_stored
+from ground_service.missions.declared import mission_of_manifest
+from ground_service.missions.model import Mission
+from ground_service.missions.service import enter, read_mission
+from ground_service.missions.store import ARCHIVE_ACTOR
+from ground_service.store import repository
+from ground_service.store.counters import hold
+from ground_service.store.files import StoredFile
+from ground_service.text import require_line
+from ground_service.timekeeping.recorrelation import enter_receptions, read_receptions
+from lunar.catalogue import load_catalogue
+from lunar.ephemeris import load_ephemeris
+from lunar.errors import LunarError
+from lunar.timescales import parse_utc
+
+SCHEMA_VERSION = 1
+RECEPTIONS_FILE = "receptions.csv"
+MISSION_FILE = "mission.toml"
+ATTITUDE_FILE = "attitude.csv"
+MANIFEST_LIMIT_OCTETS = 16 << 20
+
+FRAMES_KEPT = 200
+"""Images kept with a pass, spread evenly: galleries need a few, and a day of them would fill the archive."""
+
+_REQUIRED: dict[str, type | tuple[type, ...]] = {
+    "schema_version": int,
+    "pass_name": str,
+    "spacecraft_id": int,
+    "start_utc": str,
+    "stop_utc": str,
+    "files": dict,
+}
+
+
+def import_archive(ground: Ground, folder: Path, progress: Callable[[str], None] | None = None) -> int:
+    """Import a pass archive; the id of its pass. Importing the same archive again changes nothing.
+
+    Every file is checked against the hash that the manifest gives before anything is stored. The telemetry goes
+    into an instance of the spacecraft that belongs to this archive alone, so that runs of an emulator do not mix.
+
+    Raises
+    ------
+    InvalidInput
+        If the archive is not complete or not what its manifest says.
+    """
+    folder = Path(folder)
+    manifest, digest = read_manifest(folder)
+    say = progress or (lambda _text: None)
+    say("checking the archive")
+    names = checked_files(folder, manifest)
+    start_utc_ns, stop_utc_ns = _interval(folder, manifest)
+    mission, text = _mission(folder, manifest)
+    for name, load in (("reference.oem", load_ephemeris), ("catalogue.csv", load_catalogue)):
+        if name in names:
+            _refuse_unreadable(folder / name, load)
+    if ATTITUDE_FILE in names:
+        load_attitudes(folder / ATTITUDE_FILE, str(folder / ATTITUDE_FILE))
+    stored = {name: ground.files.put_file(folder / name) for name in names if not name.startswith("frames/")}
+    images = {number: ground.files.put_file(folder / name) for number, name in _chosen_frames(names)}
+    pass_id = _register(
+        ground, folder, manifest, digest, start_utc_ns, stop_utc_ns, stored, images, (mission, text)
+    )
+    if RECEPTIONS_FILE in stored:
+        enter_receptions(
+            ground,
+            int(manifest["spacecraft_id"]),
+            instance_of(manifest, digest),
+            read_receptions(folder / RECEPTIONS_FILE),
+            actor="archive",
+        )
+    if "downlink.cadu" in stored:
+        say("ingesting the downlink")
+        ingest_stored(
+            ground,
+            stored["downlink.cadu"],
+            spacecraft_id=manifest["spacecraft_id"],
+            instance=instance_of(manifest, digest),
+            name="downlink.cadu",
+        )
+    return pass_id
+
+
+def read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
+    """The manifest of a pass archive, checked for what must be in it, and the SHA-256 that names the archive."""
+    path = folder / "manifest.json"
+    if not folder.is_dir():
+        raise InvalidInput(
+            str(folder), "", "a pass archive folder", "a file" if folder.exists() else "nothing there"
+        )
+    try:
+        octets = path.read_bytes()
+    except FileNotFoundError:
+        raise InvalidInput(str(folder), "", "a pass archive with manifest.json", "no manifest.json") from None
+    except OSError as error:
+        raise storage_error(error, path) from None
+    if len(octets) > MANIFEST_LIMIT_OCTETS:
+        raise InvalidInput(str(path), "", f"at most {MANIFEST_LIMIT_OCTETS} octets", str(len(octets)))
+    try:
+        manifest = json.loads(octets)
+    except (ValueError, RecursionError) as error:
+        place = f"line {error.lineno}" if isinstance(error, json.JSONDecodeError) else ""
+        raise InvalidInput(str(path), place, "JSON", "something else") from None
+    if not isinstance(manifest, dict):
+        raise InvalidInput(str(path), "", "a JSON object", type(manifest).__name__)
+    for key, kind in _REQUIRED.items():
+        if not isinstance(manifest.get(key), kind) or isinstance(manifest.get(key), bool):
+            expected = kind.__name__ if isinstance(kind, type) else "a value"
+            raise InvalidInput(str(path), key, expected, repr(manifest.get(key))[:80])
+    if manifest["schema_version"] > SCHEMA_VERSION:
+        raise InvalidInput(
+            str(path),
+            "schema_version",
+            f"{SCHEMA_VERSION} or less",
+            f"{manifest['schema_version']} of a newer version",
+        )
+    require_line(manifest["pass_name"], str(path), "pass_name")
+    if not 0 <= manifest["spacecraft_id"] <= repository.SPACECRAFT_ID_MAX:
+        found = str(manifest["spacecraft_id"])[:40]
+        raise InvalidInput(str(path), "spacecraft_id", f"0 to {repository.SPACECRAFT_ID_MAX}", found)
+    return manifest, hashlib.sha256(octets).hexdigest()
+
+
+def instance_of(manifest: Mapping[str, Any], digest: str) -> str:
+    """The instance of the spacecraft that the telemetry of an archive belongs to."""
+    name = "".join(c if c.isalnum() or c in "-_." else "-" for c in str(manifest["pass_name"]))[:60]
+    return f"{name}@{digest[:16]}"
+
+
+def checked_files(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
+    """Names of the files of the archive, each found to have the size and hash that the manifest gives."""
+    root = folder.resolve()
+    names = []
+    for name, entry in sorted(manifest["files"].items()):
+        path = folder / name
+        if not isinstance(entry, dict) or not isinstance(entry.get("sha256"), str):
+            raise InvalidInput(
+                str(folder / "manifest.json"), f"files.{name}", "an object with sha256", repr(entry)[:80]
+            )
+        if Path(name).is_absolute() or not path.resolve().is_relative_to(root):
+            raise InvalidInput(
+                str(folder / "manifest.json"), f"files.{name}", "a path inside the archive", name
+            )
+        if not path.is_file():
+            raise InvalidInput(str(folder), name, "a file of the archive", "nothing there")
+        found = _sha256(path)
+        if found != entry["sha256"]:
+            raise InvalidInput(
+                str(path),
+                "",
+                f"SHA-256 {entry['sha256'][:16]}… of the manifest",
+                f"{found[:16]}… (damaged or cut short)",
+            )
+        names.append(name)
+    return names
+
+
+def _sha256(path: Path) -> str:
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise storage_error(error, path) from None
+
+
+def _interval(folder: Path, manifest: Mapping[str, Any]) -> tuple[int, int]:
+    path = str(folder / "manifest.json")
+    try:
+        start, stop = parse_utc(manifest["start_utc"]), parse_utc(manifest["stop_utc"])
+    except LunarError as error:
+        raise InvalidInput(path, "start_utc, stop_utc", "UTC epochs", str(error)) from None
+    if stop < start:
+        raise InvalidInput(path, "stop_utc", f"an epoch after {manifest['start_utc']}", manifest["stop_utc"])
+    return start, stop
+
+
+def archived_mission(folder: Path, manifest: Mapping[str, Any]) -> Mission:
+    """Return the mission description of an archive, otherwise that of its manifest."""
+    return _mission(folder, manifest)[0]
+
+
+def _mission(folder: Path, manifest: Mapping[str, Any]) -> tuple[Mission, str | None]:
+    if MISSION_FILE not in manifest["files"]:
+        return mission_of_manifest(manifest), None
+    path = folder / MISSION_FILE
+    mission, text = read_mission(path.read_bytes(), str(path))
+    stated = mission.spacecraft.id
+    if stated is not None and stated != manifest["spacecraft_id"]:
+        expected = f"{manifest['spacecraft_id']} as in manifest.json"
+        raise InvalidInput(str(path), "spacecraft.id", expected, str(stated))
+    return mission, text
+
+
+def _refuse_unreadable(path: Path, load: Callable[[Path], object]) -> None:
+    try:
+        load(path)
+    except LunarError as error:
+        raise InvalidInput(str(path), "", "a readable file", str(error)) from None
+
+
+def _chosen_frames(names: list[str]) -> list[tuple[int, str]]:
+    """Frame numbers and names of the images to keep."""
+    frames = []
+    for name in names:
+        stem = Path(name).stem
+        if name.startswith("frames/") and stem.isdigit():
+            frames.append((int(stem), name))
+    frames.sort()
+    if len(frames) <= FRAMES_KEPT:
+        return frames
+    step = (len(frames) - 1) / (FRAMES_KEPT - 1)
+    return [frames[round(k * step)] for k in range(FRAMES_KEPT)]
+
+
+def _register(
+    ground: Ground,
+    folder: Path,
+    manifest: dict[str, Any],
+    digest: str,
+    start_utc_ns: int,
+    stop_utc_ns: int,
+    stored: Mapping[str, StoredFile],
+    images: Mapping[int, StoredFile],
+    mission: tuple[Mission, str | None],
+) -> int:
+    now = utc_now_ns()
+    reference = load_ephemeris(folder / "reference.oem") if "reference.oem" in stored else None
+    with ground.database.writing() as connection:
+        hold(connection, f"archive {digest}")
+        existing = repository.find(connection, repository.PASSES, archive_digest=digest)
+        if existing is not None:
+            return int(existing["id"])
+        for name, file in stored.items():
+            repository.register_file(connection, file, Path(name).stem, name, now)
+        for number, file in images.items():
+            repository.register_file(connection, file, "frame", f"frame {number}", now)
+        ephemeris_id = None
+        if reference is not None:
+            ephemeris_id = repository.add(
+                connection,
+                repository.EPHEMERIDES,
+                file_sha256=stored["reference.oem"].sha256,
+                name=f"reference of {manifest['pass_name']}",
+                object_name=reference.segments[0].object_name,
+                frame=reference.segments[0].frame,
+                start_utc_ns=reference.start_utc_ns,
+                stop_utc_ns=reference.stop_utc_ns,
+                states=sum(len(segment.utc_ns) for segment in reference.segments),
+                precedence=0,
+                created_utc_ns=now,
+            )
+        pass_id = int(
+            repository.add(
+                connection,
+                repository.PASSES,
+                vehicle_id=repository.vehicle_id(
+                    connection, manifest["spacecraft_id"], instance_of(manifest, digest)
+                ),
+                name=manifest["pass_name"],
+                start_utc_ns=start_utc_ns,
+                stop_utc_ns=stop_utc_ns,
+                archive_digest=digest,
+                manifest={key: value for key, value in manifest.items() if key != "files"},
+                ephemeris_id=ephemeris_id,
+                catalogue_sha256=stored["catalogue.csv"].sha256 if "catalogue.csv" in stored else None,
+                attitude_sha256=stored[ATTITUDE_FILE].sha256 if ATTITUDE_FILE in stored else None,
+                mission_id=enter(connection, *mission, actor=ARCHIVE_ACTOR),
+                created_utc_ns=now,
+            )
+        )
+        for number, file in images.items():
+            repository.add(
+                connection,
+                repository.PASS_FRAMES,
+                pass_id=pass_id,
+                frame_number=number,
+                file_sha256=file.sha256,
+            )
+        return pass_id

@@ -1,0 +1,240 @@
+"""Accounting of octets, frames and packets of raw downlink files by on-board time.
+
+Frames carry no time. A frame is assigned the time of the last packet that begins in it. A frame in which no packet
+begins (damaged, idle, or the middle of a long packet) is assigned the time of the previous frame, or of the next one at
+the start of a file. Therefore, every frame is assigned to the same pass as its neighbours. Files without a readable
+packet belong to no pass.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ground_service.ingest.packets import packet_ticks
+from lunar.arrays import BoolArray, IntArray
+from tmtc.cuc import NO_TICKS
+from tmtc.downlink import FRAME_FOREIGN, FRAME_GOOD, DownlinkDecode, decode
+from tmtc.stream import Octets
+
+DIGEST_OCTETS = 16
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawFile:
+    """Content of one raw file by on-board time; `NO_TICKS` if the time is unknown.
+
+    Attributes
+    ----------
+    frame_ticks, frame_bad, frame_corrected, frame_octets
+        For every frame (f,): time, whether it was unusable, corrected symbols, octets from its marker to the next.
+    packet_ticks, packet_apid, packet_good
+        For every packet (p,), including damaged ones; the APID of a damaged packet may be wrong.
+    packet_digest
+        Hash of every packet, empty for damaged ones.
+    skipped_ticks, skipped_octets
+        For every interval (s,) of octets that belongs to no frame or no packet.
+    has_frames
+        False for a file of bare packets.
+    """
+
+    frame_ticks: IntArray
+    frame_bad: BoolArray
+    frame_corrected: IntArray
+    frame_octets: IntArray
+    packet_ticks: IntArray
+    packet_apid: IntArray
+    packet_good: BoolArray
+    packet_digest: tuple[bytes, ...]
+    skipped_ticks: IntArray
+    skipped_octets: IntArray
+    has_frames: bool
+
+    @property
+    def span(self) -> tuple[int, int] | None:
+        """First and last on-board time in the file; None if unknown."""
+        times = self.packet_ticks[self.packet_ticks != NO_TICKS]
+        return (int(times.min()), int(times.max())) if times.size else None
+
+
+@dataclass(frozen=True, slots=True)
+class RawAccount:
+    """Sums over raw files within an interval of on-board time; `duplicates` and `crc_errors` are by APID.
+
+    `frames` and `octets` are None if only bare packets were received.
+    """
+
+    frames: int | None
+    frames_bad: int
+    symbols_corrected: int
+    octets: int
+    octets_skipped: int
+    duplicates: dict[int, int]
+    crc_errors: dict[int, int]
+
+
+def read_raw(octets: Octets, spacecraft_id: int | None) -> RawFile:
+    """Return the content of a raw file for one spacecraft.
+
+    Raises
+    ------
+    LinkFormatError
+        If the file has frames with an unknown coding.
+    """
+    found = decode(octets, spacecraft_id=spacecraft_id)
+    starts, good = found.cut.offsets, found.cut.crc_ok
+    ticks = np.full(len(found.cut), NO_TICKS, dtype=np.int64)
+    rows = np.flatnonzero(good)
+    ticks[rows] = packet_ticks(found.buffer, found.cut, rows, found.headers.secondary_header[rows])
+    order = np.argsort(starts, kind="stable")
+    ticks[order] = _filled(ticks[order])
+    skipped = _unused(found)
+    skipped_ticks = ticks[order][_before(starts[order], skipped[:, 0])] if len(order) else _none(len(skipped))
+    frames = _frames(found, starts[order], ticks[order], good[order])
+    octets_skipped = skipped[:, 1] - skipped[:, 0]
+    if found.frames is not None:
+        # The parts of a reassembled packet are outside packets in the zones, but are used.
+        joined = order[_frame_of(found, starts[order]) < 0]
+        skipped_ticks = np.concatenate([skipped_ticks, ticks[joined]])
+        octets_skipped = np.concatenate([octets_skipped, -found.cut.lengths[joined]])
+        loose = frames[3] - _cadu_length(found)
+        skipped_ticks = np.concatenate([skipped_ticks, frames[0]])
+        octets_skipped = np.concatenate([octets_skipped, np.maximum(loose, 0)])
+    return RawFile(
+        *frames,
+        packet_ticks=ticks,
+        packet_apid=found.headers.apid.astype(np.int64),
+        packet_good=good,
+        packet_digest=_digests(found),
+        skipped_ticks=skipped_ticks,
+        skipped_octets=octets_skipped,
+        has_frames=found.frames is not None,
+    )
+
+
+def account_raw(files: Sequence[RawFile], start_ticks: int, stop_ticks: int) -> RawAccount:
+    """Return the sums over raw files from `start_ticks` to `stop_ticks`, both included."""
+
+    def inside(ticks: IntArray) -> BoolArray:
+        return np.asarray((ticks >= start_ticks) & (ticks <= stop_ticks), dtype=np.bool_)
+
+    frames = frames_bad = corrected = octets = skipped = 0
+    seen: dict[int, int] = {}
+    distinct: dict[int, set[bytes]] = {}
+    crc_errors: dict[int, int] = {}
+    for file in files:
+        here = inside(file.frame_ticks)
+        frames += int(np.count_nonzero(here))
+        frames_bad += int(np.count_nonzero(here & file.frame_bad))
+        corrected += int(file.frame_corrected[here].sum())
+        octets += int(file.frame_octets[here].sum())
+        skipped += int(file.skipped_octets[inside(file.skipped_ticks)].sum())
+        for row in np.flatnonzero(inside(file.packet_ticks)).tolist():
+            apid = int(file.packet_apid[row])
+            if file.packet_good[row]:
+                seen[apid] = seen.get(apid, 0) + 1
+                distinct.setdefault(apid, set()).add(file.packet_digest[row])
+            else:
+                crc_errors[apid] = crc_errors.get(apid, 0) + 1
+    return RawAccount(
+        frames=frames if any(file.has_frames for file in files) else None,
+        frames_bad=frames_bad,
+        symbols_corrected=corrected,
+        octets=octets,
+        octets_skipped=skipped,
+        duplicates={apid: count - len(distinct[apid]) for apid, count in seen.items()},
+        crc_errors=crc_errors,
+    )
+
+
+def _frames(
+    found: DownlinkDecode, starts: IntArray, ticks: IntArray, good: BoolArray
+) -> tuple[IntArray, BoolArray, IntArray, IntArray]:
+    """Return time, unusable flag, corrected symbols and octets of every frame, except those of other spacecraft."""
+    table = found.frames
+    if table is None:
+        none = np.zeros(0, dtype=np.int64)
+        return none, none.astype(np.bool_), none, none
+    own = np.flatnonzero(table.verdict != FRAME_FOREIGN)
+    frame_ticks = np.full(len(table), NO_TICKS, dtype=np.int64)
+    frame = _frame_of(found, starts)
+    known = np.flatnonzero(good & (ticks != NO_TICKS) & (frame >= 0))
+    # The assignment keeps the last packet that begins in each frame.
+    frame_ticks[frame[known]] = ticks[known]
+    # Octets between two markers belong to the frame of the first one, octets before the first marker to the first
+    # frame.
+    edges = np.concatenate([table.offset, [_stream_octets(found)]])
+    edges[0] = 0
+    corrected = np.where(table.corrected > 0, table.corrected, 0).sum(axis=1).astype(np.int64)
+    return (
+        _filled(frame_ticks)[own],
+        np.asarray(table.verdict != FRAME_GOOD, dtype=np.bool_)[own],
+        corrected[own],
+        np.diff(edges)[own],
+    )
+
+
+def _frame_of(found: DownlinkDecode, places: IntArray) -> IntArray:
+    """Return the row of the frame whose packet zone contains each position of the buffer; -1 if none does."""
+    table = found.frames
+    assert table is not None
+    used = np.flatnonzero(table.buffer_offset >= 0)
+    used = used[np.argsort(table.buffer_offset[used], kind="stable")]
+    if not used.size:
+        return np.full(len(places), -1, dtype=np.int64)
+    rows = used[_before(table.buffer_offset[used], places)]
+    inside = (places >= table.buffer_offset[rows]) & (
+        places < table.buffer_offset[rows] + table.buffer_octets[rows]
+    )
+    return np.where(inside, rows, -1)
+
+
+def _unused(found: DownlinkDecode) -> IntArray:
+    """Return the ranges (s, 2) of the buffer outside packets: skipped octets, and packets whose start was lost."""
+    cut = found.cut
+    taken = np.concatenate(
+        [np.stack([cut.offsets, cut.offsets + cut.lengths], axis=1), cut.idle.reshape(-1, 2)]
+    ).astype(np.int64)
+    taken = taken[np.argsort(taken[:, 0], kind="stable")]
+    starts = np.concatenate([[0], taken[:, 1]])
+    stops = np.concatenate([taken[:, 0], [len(found.buffer)]])
+    return np.stack([starts, stops], axis=1)[stops > starts]
+
+
+def _before(edges: IntArray, places: IntArray) -> IntArray:
+    """Return the row of the last edge (ascending) at or before each position; the first row if there is none."""
+    return np.maximum(np.searchsorted(edges, places, side="right") - 1, 0)
+
+
+def _filled(ticks: IntArray) -> IntArray:
+    """Return times (n,) with unknown times replaced by the previous one, at the start by the first known one."""
+    known = np.flatnonzero(ticks != NO_TICKS)
+    if not known.size:
+        return ticks
+    last = np.searchsorted(known, np.arange(len(ticks)), side="right") - 1
+    return np.asarray(ticks[known[np.maximum(last, 0)]], dtype=np.int64)
+
+
+def _none(count: int) -> IntArray:
+    return np.full(count, NO_TICKS, dtype=np.int64)
+
+
+def _cadu_length(found: DownlinkDecode) -> int:
+    assert found.settings is not None
+    return found.settings.cadu_length
+
+
+def _stream_octets(found: DownlinkDecode) -> int:
+    return sum(found.octets.values())
+
+
+def _digests(found: DownlinkDecode) -> tuple[bytes, ...]:
+    view = found.buffer.data
+    rows = zip(found.cut.offsets.tolist(), found.cut.lengths.tolist(), found.cut.crc_ok.tolist(), strict=True)
+    return tuple(
+        hashlib.blake2b(view[start : start + length], digest_size=DIGEST_OCTETS).digest() if good else b""
+        for start, length, good in rows
+    )

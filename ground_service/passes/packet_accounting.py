@@ -1,0 +1,229 @@
+"""Accounting of the packets, frames and octets of one pass: received, missing, damaged and duplicate.
+
+Missing packets follow from sequence counts and from the planned frames. Frames and octets are those of the raw files
+with on-board times in the pass (`processing.downlink_accounting`); other passes of the spacecraft have no influence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection, select
+
+from ground_service.ingest.core import Gap, account_sequence
+from ground_service.passes.downlink_accounting import RawAccount, RawFile, account_raw, read_raw
+from ground_service.passes.span import PassSpan
+from ground_service.store import repository
+from ground_service.store.files import FileArchive
+from reports.values import ApidAccounting, CompletenessSeries, PacketAccounting
+from tmtc.cuc import TICKS_PER_SECOND
+from tmtc.dictionary import APID_DETECTIONS, DICTIONARY
+
+IntArray = NDArray[np.int64]
+
+_EVENT_CODES = {name: code for code, name in DICTIONARY.labels("event_info", "event_id").items()}
+STARTED, STOPPED = _EVENT_CODES["observation_started"], _EVENT_CODES["observation_stopped"]
+
+COMPLETENESS_BINS = 60
+GAP_POINTS = 256
+
+RAW_LIMIT_OCTETS = 128 << 20
+"""Largest size of raw files that are read again for a report; above it, the dependent values are not computed."""
+
+
+def packet_accounting(
+    files: FileArchive, connection: Connection, record: Mapping[str, Any], span: PassSpan
+) -> PacketAccounting:
+    """Return the packet and octet accounting of a pass."""
+    headers = repository.packet_headers(connection, span.vehicle, span.start_ticks, span.stop_ticks)
+    raw = _raw_account(files, connection, span)
+    names = _apid_names()
+    by_apid: dict[int, ApidAccounting] = {}
+    lost = np.zeros((0, 2), dtype=np.float64)
+    accounts = {}
+    for apid in np.unique(headers["apid"]).tolist():
+        here = headers["apid"] == apid
+        accounts[apid] = account_sequence(headers["ticks"][here], headers["sequence_count"][here])
+        lost = np.concatenate([lost, *(_spread(gap) for gap in accounts[apid].gaps)])
+    images = _images(connection, record, span)
+    in_gaps = accounts[APID_DETECTIONS].lost if APID_DETECTIONS in accounts else 0
+    edges = _frames_at_edges(record["manifest"].get("frames_expected"), images, in_gaps)
+    damaged = {} if raw is None else raw.crc_errors
+    for apid in sorted({*accounts, *(apid for apid in damaged if apid in names)}):
+        account = accounts.get(apid)
+        packets = 0 if account is None else len(account.order)
+        missing = 0 if account is None else account.lost
+        by_apid[apid] = ApidAccounting(
+            name=names.get(apid, "unknown"),
+            packets=packets,
+            lost=missing,
+            duplicates=None if raw is None else raw.duplicates.get(apid, 0),
+            conflicts=0 if account is None else account.conflicts,
+            crc_errors=None if raw is None else damaged.get(apid, 0),
+            lost_at_edges=_packets_at_edges(apid, edges, packets + missing, images.count + in_gaps),
+        )
+    return PacketAccounting(
+        packets=len(headers["apid"]),
+        lost=sum(apid.lost for apid in by_apid.values()),
+        duplicates=None if raw is None else sum(raw.duplicates.values()),
+        conflicts=sum(apid.conflicts for apid in by_apid.values()),
+        crc_errors=None if raw is None else sum(damaged.values()),
+        octets_skipped=None if raw is None else raw.octets_skipped,
+        frames=None if raw is None else raw.frames,
+        frames_bad=None if raw is None else raw.frames_bad,
+        symbols_corrected=None if raw is None else raw.symbols_corrected,
+        lost_at_edges=None if edges is None else sum(apid.lost_at_edges or 0 for apid in by_apid.values()),
+        octets=None if raw is None else raw.octets,
+        by_apid=by_apid,
+        completeness=_completeness(record, span, headers["ticks"], lost),
+    )
+
+
+def _raw_account(files: FileArchive, connection: Connection, span: PassSpan) -> RawAccount | None:
+    """Return sums over the raw files of the vehicle; None without files, or if one is too large."""
+    vehicle = repository.get(connection, repository.VEHICLES, span.vehicle, "vehicle")
+    found = []
+    for sha256, octets in _raw_files(connection, span):
+        if octets > RAW_LIMIT_OCTETS:
+            return None
+        found.append(_raw_file(files, sha256, int(vehicle["ccsds_id"])))
+    return account_raw(found, span.start_ticks, span.stop_ticks) if found else None
+
+
+def _raw_files(connection: Connection, span: PassSpan) -> list[tuple[str, int]]:
+    """Return hashes and sizes of the ingested files that may contain data of the pass, ordered by hash."""
+    ingests, stored = repository.INGESTS, repository.FILES
+    query = (
+        select(ingests.c.file_sha256, stored.c.octets, ingests.c.accounting)
+        .join(stored, stored.c.sha256 == ingests.c.file_sha256)
+        .where(
+            (ingests.c.vehicle_id == span.vehicle)
+            | ingests.c.accounting["vehicle_ids"][1].as_integer().is_not(None),
+            ingests.c.state == "done",
+        )
+        .order_by(ingests.c.file_sha256)
+    )
+    chosen: dict[str, int] = {}
+    for sha256, octets, accounting in connection.execute(query):
+        if span.vehicle not in accounting.get("vehicle_ids", (span.vehicle,)):
+            continue
+        first, last = accounting.get("first_ticks"), accounting.get("last_ticks")
+        if first is None or last is None or (first <= span.stop_ticks and last >= span.start_ticks):
+            chosen[sha256] = int(octets)
+    return list(chosen.items())
+
+
+@lru_cache(maxsize=32)
+def _raw_file(files: FileArchive, sha256: str, spacecraft_id: int) -> RawFile:
+    """Return the content of a raw file; cached, because the file of a hash never changes."""
+    return read_raw(files.get(sha256), spacecraft_id)
+
+
+@dataclass(frozen=True, slots=True)
+class _Images:
+    """Reported images: number, first and last frame number; and the frame counter of the payload.
+
+    `first_made` and `after_last_made` are the frame counter at the start and at the end of the observation, None if
+    the event with the counter was not received.
+    """
+
+    count: int
+    first: int
+    last: int
+    first_made: int | None
+    after_last_made: int | None
+
+
+def _images(connection: Connection, record: Mapping[str, Any], span: PassSpan) -> _Images:
+    def columns(kind: str, *names: str, after_ticks: int = 0) -> dict[str, list[Any]]:
+        stop = span.stop_ticks + after_ticks
+        return repository.samples(
+            connection, kind, span.vehicle, span.start_ticks, stop, span.dictionary_version, names
+        )
+
+    images = columns("detections", "ticks", "frame_number")
+    # An observation ends at the first frame time at or after its planned end: up to one cadence after the span.
+    events = columns("events", "event_id", "frame_number", after_ticks=_cadence_ticks(record))
+    counters: dict[int, list[int]] = {STARTED: [], STOPPED: []}
+    for event, number in zip(events["event_id"], events["frame_number"], strict=True):
+        if event in counters:
+            counters[event].append(number)
+    return _Images(
+        len(set(images["ticks"])),
+        min(images["frame_number"], default=0),
+        max(images["frame_number"], default=-1),
+        min(counters[STARTED], default=None),
+        max(counters[STOPPED], default=None),
+    )
+
+
+def _cadence_ticks(record: Mapping[str, Any]) -> int:
+    cadence_s = record["manifest"].get("cadence_s")
+    return 0 if cadence_s is None else round(cadence_s * TICKS_PER_SECOND)
+
+
+def _frames_at_edges(planned: object, images: _Images, in_gaps: int) -> int | None:
+    """Return the number of frames missing before the first or after the last received frame; None if unknown.
+
+    It follows from the frame counter at start and end of the observation; without both, from the plan.
+    """
+    start, stop = images.first_made, images.after_last_made
+    if (
+        images.count
+        and start is not None
+        and stop is not None
+        and start <= images.first
+        and images.last < stop
+    ):
+        return images.first - start + stop - 1 - images.last
+    if not isinstance(planned, int) or isinstance(planned, bool):
+        return None
+    return max(planned - images.count - in_gaps, 0)
+
+
+def _packets_at_edges(apid: int, frames: int | None, packets: int, of_frames: int) -> int | None:
+    """Return the expected packets of an application process for the frames at the edges; None if unknown."""
+    if frames is None or apid not in _IMAGE_APIDS:
+        return None
+    if frames == 0:
+        return 0
+    return frames * round(packets / of_frames) if of_frames else None
+
+
+_IMAGE_APIDS = frozenset(
+    definition.apid
+    for definition in DICTIONARY.telemetry
+    if any(field.name == "image_ticks" for field in definition.fields)
+)
+"""Application processes whose packets are generated for images."""
+
+
+def _apid_names() -> dict[int, str]:
+    names: dict[int, str] = {}
+    for definition in DICTIONARY.telemetry:
+        names.setdefault(definition.apid, definition.name.split("_info")[0].replace("_", " "))
+    return names
+
+
+def _completeness(
+    record: Mapping[str, Any], span: PassSpan, ticks: IntArray, lost: NDArray[np.float64]
+) -> CompletenessSeries | None:
+    if len(ticks) == 0:
+        return None
+    edges = np.linspace(record["start_utc_ns"], record["stop_utc_ns"], COMPLETENESS_BINS + 1).astype(np.int64)
+    received = np.histogram(np.clip(span.utc_ns(list(ticks)), edges[0], edges[-1]), edges)[0]
+    when = np.clip(span.utc_ns(lost[:, 0].astype(np.int64).tolist()), edges[0], edges[-1])
+    missing = np.histogram(when, edges, weights=lost[:, 1])[0]
+    return CompletenessSeries(edges, received + np.rint(missing).astype(np.int64), received.astype(np.int64))
+
+
+def _spread(gap: Gap) -> NDArray[np.float64]:
+    """Return the on-board times (k, 2) over which the packets of a gap are distributed, and their numbers."""
+    points = min(gap.missing, GAP_POINTS)
+    ticks = np.linspace(gap.before_ticks, gap.after_ticks, points + 2)[1:-1]
+    return np.column_stack([ticks, np.full(points, gap.missing / points)])

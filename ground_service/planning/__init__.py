@@ -1,0 +1,1 @@
+"""Observation windows: search, prediction, conflicts, approval, uplink, progress."""

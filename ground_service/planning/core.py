@@ -1,0 +1,397 @@
+"""Candidate observation windows: where constraints on the orbit, the light, the ground and the resources all hold.
+
+Everything is computed along one reference ephemeris. The crater count is that of a nadir camera over the catalogue;
+the battery is a simple balance of generation and load, full where the search begins; stored data leave in the order
+they came whenever a station sees the spacecraft.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from ground_service.evaluation.recall import expected_craters
+from ground_service.missions.stations import STATIONS
+from lunar.arrays import BoolArray, FloatArray, IntArray
+from lunar.camera import PinholeCamera
+from lunar.catalogue import CraterCatalogue
+from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.ephemeris import Ephemeris
+from lunar.frames import Orientation, spherical_from_mcmf
+from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
+from lunar.timescales import tdb_s_from_utc_ns
+from lunar.visibility import GroundStation, find_windows, link, sun_elevation_azimuth, sunlit_fraction
+from tmtc.dictionary import DICTIONARY
+
+Range = tuple[float, float]
+TerrainAt = Callable[[FloatArray, FloatArray], BoolArray]
+"""Latitudes and longitudes (n,) in rad to whether the ground there is mare (n,)."""
+
+NS = NANOSECONDS_PER_SECOND
+LIGHT_MARGIN_NS = 3 * NS
+"""A contact is evaluated at reception, so the ephemeris has to reach back by the light time (1.3 s)."""
+
+CONTACT_STEP_S = 120.0
+CONTACT_HORIZON_S = 86_400.0
+"""Data that are not down a day after their window are taken to stay on board."""
+
+EDGE_TOLERANCE_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Constraints:
+    """What a window has to fulfil all along; None where anything will do. Angles in rad, lengths in m."""
+
+    altitude_m: Range | None = None
+    sun_elevation_rad: Range | None = None
+    latitude_rad: Range | None = None
+    craters_per_frame: float | None = None
+    crater_diameter_m: Range = (5e3, 30e3)
+    mare: bool | None = None
+    sunlit: bool = False
+    minimum_duration_s: float = 300.0
+    maximum_duration_s: float = 2400.0
+    minimum_battery: float | None = None
+    needs_contact: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Resources:
+    """What the spacecraft and the ground have to offer; the defaults are those of a 6U CubeSat."""
+
+    storage_octets: int = 64 << 20
+    downlink_bit_s: float = 16_000.0
+    battery_wh: float = 75.0
+    generation_w: float = 30.0
+    idle_w: float = 12.0
+    observing_w: float = 8.0
+    estimators: int = 3
+    detections_per_frame: float = 25.0
+    stations: tuple[GroundStation, ...] = STATIONS
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """A span in which a station sees the spacecraft."""
+
+    station: str
+    start_utc_ns: int
+    stop_utc_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Commitment:
+    """A window that is planned already: its span and the data it will make."""
+
+    start_utc_ns: int
+    stop_utc_ns: int
+    octets: int
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A window that fulfils the constraints, and what it would be like; None where it was not asked or not known."""
+
+    start_utc_ns: int
+    stop_utc_ns: int
+    frames: int
+    altitude_m: Range
+    sun_elevation_rad: Range
+    latitude_rad: Range
+    sunlit_share: float
+    craters_per_frame: Range | None
+    mare_share: float | None
+    data_octets: int
+    energy_wh: float
+    battery_minimum: float
+    storage_peak_octets: int
+    downlinked_by_utc_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class SearchResult:
+    """Candidates in order of time, the contacts that were counted with, and why spans were left out."""
+
+    candidates: tuple[Candidate, ...]
+    contacts: tuple[Contact, ...]
+    refused: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Geometry:
+    position_mcmf_m: FloatArray
+    latitude_rad: FloatArray
+    longitude_rad: FloatArray
+    altitude_m: FloatArray
+    sun_elevation_rad: FloatArray
+    sunlit: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Planner:
+    """Window search in one ephemeris; `mare` and `catalogue` are None if not available."""
+
+    ephemeris: Ephemeris
+    orientation: Orientation
+    resources: Resources
+    camera: PinholeCamera
+    catalogue: CraterCatalogue | None = None
+    mare: TerrainAt | None = None
+
+    def search(
+        self,
+        constraints: Constraints,
+        start_utc_ns: int,
+        stop_utc_ns: int,
+        cadence_s: float,
+        *,
+        step_s: float = 30.0,
+        commitments: Sequence[Commitment] = (),
+    ) -> SearchResult:
+        """Windows between two times, longer ones cut at the maximum duration, in order of time.
+
+        Raises
+        ------
+        EphemerisCoverageError
+            If the ephemeris does not cover the span.
+        """
+        spans = find_windows(
+            lambda epochs: self._holds(epochs, constraints),
+            start_utc_ns,
+            stop_utc_ns,
+            step_s,
+            EDGE_TOLERANCE_S,
+        )
+        contacts = self.contacts(start_utc_ns, stop_utc_ns)
+        battery = self._battery(start_utc_ns, stop_utc_ns, step_s)
+        refused: dict[str, int] = {}
+        candidates = []
+        for begin, end in spans:
+            for first, last in _cut(begin, end, constraints.maximum_duration_s):
+                if last - first < constraints.minimum_duration_s * NS:
+                    refused["too short"] = refused.get("too short", 0) + 1
+                    continue
+                candidate = self._candidate(
+                    constraints, first, last, cadence_s, contacts, battery, commitments
+                )
+                reason = self._refusal(candidate, constraints)
+                if reason:
+                    refused[reason] = refused.get(reason, 0) + 1
+                else:
+                    candidates.append(candidate)
+        return SearchResult(tuple(candidates), contacts, refused)
+
+    def predict(
+        self,
+        start_utc_ns: int,
+        stop_utc_ns: int,
+        cadence_s: float,
+        *,
+        since_utc_ns: int,
+        until_utc_ns: int,
+        commitments: Sequence[Commitment] = (),
+    ) -> Candidate:
+        """What a given window would be like: the battery is full at `since`, contacts are counted up to `until`."""
+        horizon = min(until_utc_ns, stop_utc_ns + round(CONTACT_HORIZON_S) * NS)
+        contacts = self.contacts(start_utc_ns, horizon)
+        battery = self._battery(since_utc_ns, stop_utc_ns, 30.0)
+        return self._candidate(
+            Constraints(), start_utc_ns, stop_utc_ns, cadence_s, contacts, battery, commitments
+        )
+
+    def contacts(self, start_utc_ns: int, stop_utc_ns: int) -> tuple[Contact, ...]:
+        """When a station sees the spacecraft, in order of time."""
+        begin = max(start_utc_ns, self.ephemeris.start_utc_ns + LIGHT_MARGIN_NS)
+        if stop_utc_ns <= begin:
+            return ()
+        found = []
+        for station in self.resources.stations:
+
+            def visible(epochs: IntArray, station: GroundStation = station) -> BoolArray:
+                return link(self.ephemeris, epochs, station).visible
+
+            for a, b in find_windows(visible, begin, stop_utc_ns, CONTACT_STEP_S, EDGE_TOLERANCE_S):
+                found.append(Contact(station.name, a, b))
+        return tuple(sorted(found, key=lambda contact: (contact.start_utc_ns, contact.station)))
+
+    def _geometry(self, utc_ns: IntArray) -> _Geometry:
+        position, _ = self.ephemeris.at(utc_ns)
+        tdb_s = np.asarray(tdb_s_from_utc_ns(utc_ns))
+        rotation = self.orientation.mcmf_from_icrf(tdb_s)
+        sun = np.asarray(sun_position_icrf_m(tdb_s))
+        place = np.einsum("nij,nj->ni", rotation, position)
+        latitude, longitude, altitude = spherical_from_mcmf(place)
+        elevation, _ = sun_elevation_azimuth(latitude, longitude, np.einsum("nij,nj->ni", rotation, sun))
+        lit = sunlit_fraction(position, sun, np.asarray(earth_position_icrf_m(tdb_s)))
+        return _Geometry(place, latitude, longitude, altitude, elevation, lit)
+
+    def _holds(self, utc_ns: IntArray, constraints: Constraints) -> BoolArray:
+        """Whether the constraints hold at epochs (n,); the dear one, the craters, only where the others do."""
+        at = self._geometry(utc_ns)
+        held = np.ones(len(utc_ns), dtype=np.bool_)
+        for value, limits in (
+            (at.altitude_m, constraints.altitude_m),
+            (at.sun_elevation_rad, constraints.sun_elevation_rad),
+            (at.latitude_rad, constraints.latitude_rad),
+        ):
+            if limits is not None:
+                held &= (value >= limits[0]) & (value <= limits[1])
+        if constraints.sunlit:
+            held &= at.sunlit >= 1.0
+        if constraints.mare is not None and self.mare is not None:
+            held &= self.mare(at.latitude_rad, at.longitude_rad) == constraints.mare
+        if constraints.craters_per_frame is not None and held.any():
+            rows = np.flatnonzero(held)
+            counts = self._craters(at.position_mcmf_m[rows], constraints)
+            if counts is not None:
+                held[rows] = counts >= constraints.craters_per_frame
+        return held
+
+    def _craters(self, position_mcmf_m: FloatArray, constraints: Constraints) -> IntArray | None:
+        """Catalogued craters of the wanted sizes that a nadir camera sees from each position (n,)."""
+        if self.catalogue is None:
+            return None
+        low, high = constraints.crater_diameter_m
+        expected = expected_craters(self.catalogue, self.camera, position_mcmf_m)
+        diameter = self.catalogue.diameter_m[expected.index]
+        wanted = np.concatenate(([0], np.cumsum((diameter >= low) & (diameter <= high))))
+        return np.asarray(np.diff(wanted[expected.offsets]), dtype=np.int64)
+
+    def _battery(self, start_utc_ns: int, stop_utc_ns: int, step_s: float) -> tuple[IntArray, FloatArray]:
+        """Epochs (n,) and the charge (n,) in Wh of a battery that was full at the start, without observations."""
+        epochs = np.arange(start_utc_ns, stop_utc_ns + 1, round(step_s * NS), dtype=np.int64)
+        gain = (self._geometry(epochs).sunlit * self.resources.generation_w - self.resources.idle_w) * (
+            step_s / 3600.0
+        )
+        charge = np.empty(len(epochs))
+        now = self.resources.battery_wh
+        for i, change in enumerate(gain.tolist()):
+            charge[i] = now
+            now = min(max(now + change, 0.0), self.resources.battery_wh)
+        return epochs, charge
+
+    def _candidate(
+        self,
+        constraints: Constraints,
+        start: int,
+        stop: int,
+        cadence_s: float,
+        contacts: Sequence[Contact],
+        battery: tuple[IntArray, FloatArray],
+        commitments: Sequence[Commitment],
+    ) -> Candidate:
+        frames = frames_between(start, stop, cadence_s)
+        epochs = np.linspace(start, stop, min(max(frames, 2), 200)).astype(np.int64)
+        at = self._geometry(epochs)
+        craters = self._craters(at.position_mcmf_m, constraints) if constraints.craters_per_frame else None
+        per_frame = float(craters.mean()) if craters is not None else self.resources.detections_per_frame
+        octets = data_octets(frames, per_frame, self.resources.estimators)
+        extra_w = self.resources.observing_w
+        charge = np.interp(epochs, *battery) - extra_w * (epochs - start) / NS / 3600.0
+        mine = Commitment(start, stop, octets)
+        peak, by = storage_peak([*commitments, mine], contacts, self.resources.downlink_bit_s, mine)
+        return Candidate(
+            start_utc_ns=start,
+            stop_utc_ns=stop,
+            frames=frames,
+            altitude_m=_range(at.altitude_m),
+            sun_elevation_rad=_range(at.sun_elevation_rad),
+            latitude_rad=_range(at.latitude_rad),
+            sunlit_share=float(np.mean(at.sunlit)),
+            craters_per_frame=_range(craters) if craters is not None else None,
+            mare_share=float(np.mean(self.mare(at.latitude_rad, at.longitude_rad))) if self.mare else None,
+            data_octets=octets,
+            energy_wh=extra_w * (stop - start) / NS / 3600.0,
+            battery_minimum=max(float(charge.min()), 0.0) / self.resources.battery_wh,
+            storage_peak_octets=peak,
+            downlinked_by_utc_ns=by,
+        )
+
+    def _refusal(self, candidate: Candidate, constraints: Constraints) -> str | None:
+        if (
+            constraints.minimum_battery is not None
+            and candidate.battery_minimum < constraints.minimum_battery
+        ):
+            return "battery too low"
+        if candidate.storage_peak_octets > self.resources.storage_octets:
+            return "storage too small"
+        if constraints.needs_contact and candidate.downlinked_by_utc_ns is None:
+            return "no contact to downlink its data"
+        return None
+
+
+def frames_between(start_utc_ns: int, stop_utc_ns: int, cadence_s: float) -> int:
+    """Return the number of frames of an observation: one at its start, then one per cadence, none at its stop."""
+    return max(-((start_utc_ns - stop_utc_ns) // round(cadence_s * NS)), 1)
+
+
+def data_octets(frames: int, detections_per_frame: float, estimators: int) -> int:
+    """Octets of telemetry that an observation makes, by the lengths of the dictionary's packets."""
+    detections = DICTIONARY.packet("detections")
+    each = detections.base_length + detections.item_length * detections_per_frame
+    for name in ("navigation_state", "frame_outcome"):
+        each += estimators * DICTIONARY.packet(name).base_length
+    return round(frames * (each + DICTIONARY.packet("housekeeping").base_length))
+
+
+def storage_peak(
+    commitments: Sequence[Commitment], contacts: Sequence[Contact], downlink_bit_s: float, mine: Commitment
+) -> tuple[int, int | None]:
+    """Most octets ever stored on board, and when those of `mine` are down (None: not within the contacts).
+
+    Data are there from the end of their window on; what came first leaves first, while any station sees the spacecraft.
+    """
+    visible = _union(contacts)
+    queue = sorted(commitments, key=lambda one: (one.stop_utc_ns, one.start_utc_ns))
+    rate = downlink_bit_s / 8.0 / NS
+    finished: list[tuple[int | None, Commitment]] = []
+    free_at = 0
+    for one in queue:
+        left = float(one.octets)
+        end: int | None = None
+        for begin, stop in visible:
+            begin = max(begin, one.stop_utc_ns, free_at)
+            if begin >= stop:
+                continue
+            needed = math.ceil(left / rate) if rate > 0.0 else stop - begin + 1
+            if begin + needed <= stop:
+                end = begin + needed
+                break
+            left -= (stop - begin) * rate
+        finished.append((end, one))
+        free_at = end if end is not None else 2**62
+    peak = 0
+    for _, one in finished:
+        held = sum(
+            other.octets
+            for end, other in finished
+            if other.stop_utc_ns <= one.stop_utc_ns and (end is None or end > one.stop_utc_ns)
+        )
+        peak = max(peak, held)
+    return peak, next(end for end, one in finished if one is mine)
+
+
+def _union(contacts: Sequence[Contact]) -> list[tuple[int, int]]:
+    """Spans in which at least one station sees the spacecraft."""
+    spans: list[tuple[int, int]] = []
+    for contact in sorted(contacts, key=lambda one: one.start_utc_ns):
+        if spans and contact.start_utc_ns <= spans[-1][1]:
+            spans[-1] = (spans[-1][0], max(spans[-1][1], contact.stop_utc_ns))
+        else:
+            spans.append((contact.start_utc_ns, contact.stop_utc_ns))
+    return spans
+
+
+def _cut(start: int, stop: int, maximum_s: float) -> list[tuple[int, int]]:
+    """The span in pieces of equal length, none longer than the maximum."""
+    pieces = max(math.ceil((stop - start) / (maximum_s * NS)), 1)
+    edges = np.linspace(start, stop, pieces + 1).astype(np.int64).tolist()
+    return list(pairwise(edges))
+
+
+def _range(values: FloatArray | IntArray) -> Range:
+    return float(np.min(values)), float(np.max(values))

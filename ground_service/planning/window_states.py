@@ -1,0 +1,112 @@
+"""Where a planned window has come, from what people decided and what telemetry says; and what stands in its way.
+
+draft → approved → uplinked → executing → executed → downlinked → processed, or failed
+
+The state is a function of facts, not of the order in which they became known: late telemetry mends a state that was
+concluded without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ground_service.errors import PlanConflict
+
+STATES = ("draft", "approved", "uplinked", "executing", "executed", "downlinked", "processed", "failed")
+DECISIONS = ("draft", "approved", "failed")
+COMMITTED = ("approved", "uplinked", "executing", "executed", "downlinked")
+"""States in which a window claims its time and its storage."""
+
+
+@dataclass(frozen=True, slots=True)
+class WindowFacts:
+    """What is known about a window.
+
+    Attributes
+    ----------
+    decision
+        What people decided last: draft, approved or failed.
+    predecessor_failed
+        Whether the window that has to come before it failed.
+    command_states
+        States of the telecommands that carry it up and of those they carry, with the failure where one failed.
+    frames
+        Frames of it that came down.
+    started, stopped
+        Whether an event report or a verification report shows the start, and the end, of the observation.
+    heard_after
+        Whether telemetry from after its end has come down.
+    lost
+        Packets missing from its span; None where none came at all.
+    reported
+        Whether a report of its pass was made.
+    """
+
+    decision: str
+    predecessor_failed: bool = False
+    command_states: tuple[str, ...] = ()
+    frames: int = 0
+    started: bool = False
+    stopped: bool = False
+    heard_after: bool = False
+    lost: int | None = None
+    reported: bool = False
+
+
+def state_of(facts: WindowFacts) -> tuple[str, str | None]:
+    """The state of a window, and the reason where it failed."""
+    if facts.decision != "approved":
+        return facts.decision, None
+    begun = facts.started or facts.frames > 0
+    over = begun and (facts.stopped or facts.heard_after)
+    if over and facts.lost == 0 and facts.heard_after:
+        return ("processed" if facts.reported else "downlinked"), None
+    if over:
+        return "executed", None
+    if begun:
+        return "executing", None
+    if "failed" in facts.command_states:
+        return "failed", "a telecommand of it failed"
+    if facts.predecessor_failed:
+        return "failed", "its predecessor failed"
+    sent = bool(facts.command_states) and not {"queued", "released", "carried"} & set(facts.command_states)
+    if sent and facts.heard_after:
+        return "failed", "telemetry from after its end shows no observation"
+    return ("uplinked" if sent else "approved"), None
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedSpan:
+    """A window as conflicts see it."""
+
+    id: int
+    start_utc_ns: int
+    stop_utc_ns: int
+    state: str
+
+
+def span_conflicts(
+    window: PlannedSpan, predecessor: PlannedSpan | None, others: Sequence[PlannedSpan]
+) -> list[PlanConflict]:
+    """Overlaps with committed windows, and a predecessor that does not come before."""
+    found = [
+        PlanConflict("overlap", other.id, f"window {other.id} ({other.state}) covers part of the same time")
+        for other in others
+        if other.id != window.id
+        and other.state in COMMITTED
+        and other.start_utc_ns < window.stop_utc_ns
+        and window.start_utc_ns < other.stop_utc_ns
+    ]
+    if predecessor is not None:
+        if predecessor.stop_utc_ns > window.start_utc_ns or predecessor.id == window.id:
+            found.append(
+                PlanConflict(
+                    "predecessor",
+                    predecessor.id,
+                    f"window {predecessor.id} does not end before this one starts",
+                )
+            )
+        if predecessor.state == "failed":
+            found.append(PlanConflict("predecessor", predecessor.id, f"window {predecessor.id} failed"))
+    return found

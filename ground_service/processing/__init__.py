@@ -1,1 +1,0 @@
-"""Pure evaluation: arrays in, arrays and report values out. Opens nothing and reads no clock."""

@@ -1,0 +1,1 @@
+"""Regression of payload builds against archived passes: archives, builds, gates, verdicts."""

@@ -1,0 +1,181 @@
+"""One run of a build over one archived pass: an external program with resource limits, and its outcome."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from ground_service.errors import InvalidInput
+from ground_service.regression.archives import write_flight_view
+from ground_service.regression.builds import Build
+from ground_service.regression.runner import (
+    DOWNLINKS,
+    PERFORMANCE,
+    RunRequest,
+    run_by_runner,
+    run_in_sandbox,
+)
+from ground_service.sandbox.host import SandboxRefused, check_private, tail
+
+PERFORMANCE_LIMIT_OCTETS = 64 << 20
+PRINTED_SHOWN = 2000
+PRINTED = "printed.txt"
+
+OK = "ok"
+OUTCOMES = {
+    OK: "ended well",
+    "crashed": "crashed",
+    "timeout": "hung: stopped at its time limit",
+    "cpu": "stopped at its CPU time limit",
+    "memory": "ran out of the memory it is allowed",
+    "disk": "wrote more than it is allowed",
+    "nothing": "ended without a downlink",
+    "garbage": "wrote a downlink that is no telemetry",
+    "refused": "was not run",
+}
+_OUT_OF_MEMORY = ("MemoryError", "bad_alloc", "Cannot allocate memory", "std::length_error", "out of memory")
+_OUT_OF_DISK = ("File too large", "No space left on device", "file size limit")
+
+
+@dataclass(frozen=True, slots=True)
+class BuildRun:
+    """Outcome of a run.
+
+    Attributes
+    ----------
+    outcome
+        A key of `OUTCOMES`.
+    detail
+        Explanation of the outcome for users.
+    isolation
+        Sandbox in which the program ran; "" if it was not run.
+    """
+
+    build: str
+    outcome: str
+    detail: str
+    downlink: Path | None
+    performance: Mapping[str, Any] | None
+    wall_s: float
+    cpu_s: float
+    peak_rss_mib: float
+    isolation: str
+
+    def summary(self) -> dict[str, Any]:
+        """The run as figures for a script, and as a line for a person."""
+        figures = {
+            key: value for key, value in asdict(self).items() if key not in ("downlink", "performance")
+        }
+        told = f"{self.build} {OUTCOMES[self.outcome]}" + (f": {self.detail}" if self.detail else "")
+        return {
+            **figures,
+            "downlink": str(self.downlink) if self.downlink else None,
+            "text": f"{told} ({self.cpu_s:.1f} s of CPU, {self.peak_rss_mib:.0f} MiB)",
+        }
+
+
+def run_build(
+    build: Build, archive: Path, out: Path, *, runner: Path | None = None, private: Sequence[Path] = ()
+) -> BuildRun:
+    """Run a build over an archived pass and write its downlink into `out`.
+
+    The program has access only to copies of the payload inputs and of its own files: no reference, truth, ground
+    catalogue, network or other part of this machine. It is not run if it cannot be isolated.
+
+    Parameters
+    ----------
+    runner
+        Exchange folder of the runner that executes the run; None runs it in a local sandbox.
+    private
+        Folders that a build must not be able to read, such as the archive of the service.
+    """
+    if out.exists() and any(out.iterdir()):
+        raise InvalidInput(str(out), "", "a new or empty folder", "something in it")
+    work = out / ".run"
+    work.mkdir(parents=True)
+    try:
+        write_flight_view(archive, work / "archive")
+        build.stage(work / "build")
+        written = work / "out"
+        written.mkdir()
+        request = RunRequest(build.words, asdict(build.limits))
+        try:
+            if runner is not None:
+                report = run_by_runner(runner, request, work, written, out / PRINTED)
+            else:
+                check_private(private)
+                report = run_in_sandbox(request, work, written, out / PRINTED)
+        except SandboxRefused as error:
+            return BuildRun(build.title, "refused", str(error), None, None, 0.0, 0.0, 0.0, "")
+        return _judged(build, report, written, out)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _judged(build: Build, report: Mapping[str, Any], written: Path, out: Path) -> BuildRun:
+    printed = tail(out / PRINTED, PRINTED_SHOWN)
+    outcome, detail = _outcome(report, printed)
+    downlink: Path | None = None
+    performance = None
+    for name in DOWNLINKS:
+        found = written / name
+        if found.is_file() and not found.is_symlink():
+            downlink = out / name
+            shutil.move(found, downlink)
+            break
+    measured = written / PERFORMANCE
+    if (
+        measured.is_file()
+        and not measured.is_symlink()
+        and measured.stat().st_size <= PERFORMANCE_LIMIT_OCTETS
+    ):
+        shutil.move(measured, out / PERFORMANCE)
+        performance = read_performance(out / PERFORMANCE)
+    if outcome == OK and downlink is None:
+        outcome, detail = "nothing", f"expected {' or '.join(DOWNLINKS)} in its output folder"
+    return BuildRun(
+        build.title,
+        outcome,
+        detail,
+        downlink if outcome == OK else None,
+        performance,
+        float(report["wall_s"]),
+        float(report["cpu_s"]),
+        float(report["peak_rss_mib"]),
+        str(report["isolation"]),
+    )
+
+
+def _outcome(report: Mapping[str, Any], printed: str) -> tuple[str, str]:
+    cause, status, killed = report["cause"], report["exit_status"], report["signal"]
+    last = printed.strip().splitlines()[-1][:200] if printed.strip() else ""
+    if killed is None and status is not None and status > 128:
+        killed = status - 128
+    if cause:
+        return str(cause), ""
+    if status != 0 and report.get("full"):
+        return "disk", last
+    if killed == 24:  # SIGXCPU
+        return "cpu", ""
+    if killed == 25 or (status != 0 and any(sign in printed for sign in _OUT_OF_DISK)):  # SIGXFSZ
+        return "disk", last
+    if status != 0 and any(sign in printed for sign in _OUT_OF_MEMORY):
+        return "memory", last
+    if status == 0 and killed is None:
+        return OK, ""
+    how = f"signal {killed}" if killed is not None else f"exit status {status}"
+    return "crashed", f"{how}: {last}" if last else how
+
+
+def read_performance(path: Path) -> dict[str, Any] | None:
+    """The costs that a build reports of itself, None where they are not in the form of the contract."""
+    try:
+        given = json.loads(path.read_text())
+        stages = {str(name): [float(value) for value in values] for name, values in given["stages"].items()}
+        return {"stages": stages, "yardstick": [float(value) for value in given.get("yardstick", [])]}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None

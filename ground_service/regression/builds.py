@@ -1,0 +1,447 @@
+"""Payload builds: what a build file says, and builds as they are registered.
+
+A build is a program (any command that keeps the contract in docs/build-contract.md), or a network and a parameter file
+on the installed flight code. Its identity is the hash of everything that decides what it does: command and files, or
+network, parameters and the flight code itself.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+import shutil
+import tempfile
+import tomllib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from ground_service.clock import utc_now_ns
+from ground_service.errors import BuildNotChecked, InvalidInput, NotFound, storage_error
+from ground_service.ground import Ground
+from ground_service.regression.runner import RunRequest, run_by_runner, run_in_sandbox
+from ground_service.sandbox.host import SandboxRefused, check_private, tail
+from ground_service.store import repository
+from ground_service.store.files import make_durable_folder, replace_durably
+from ground_service.text import require_line
+
+SCHEMA_VERSION = 1
+CURRENT = "current"
+BUILD_FILE = "build.toml"
+BUILD_FILE_LIMIT_OCTETS = 1 << 20
+FLIGHT_COMMAND = (
+    "{python}", "-m", "linna", "replay", "{archive}", "--build", "{build}", "--out", "{out}", "--recorded-only",
+)  # fmt: skip
+CHECK_COMMAND = ("{python}", "-m", "linna", "replay", "--check-build", "{folder}/" + BUILD_FILE, "--json")
+CHECK_FAILED = 2
+CHECK_LIMIT_OCTETS = 1 << 14
+_KEYS = (
+    "schema_version", "name", "version", "description", "command", "files", "model", "parameters", "camera",
+    "limits", "provenance",
+)  # fmt: skip
+# Packages of the flight code of this installation, in addition to the shipped network.
+_FLIGHT_CODE = (
+    "payload_emulator/flight",
+    "payload_emulator/session/replay.py",
+    "payload_emulator/session/recording.py",
+    "payload_emulator/session/parameter_file.py",
+    "lunar",
+    "tmtc",
+)
+_SHIPPED_MODEL = "payload_emulator/flight/models/craters.onnx"
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Resource limits of a run of a build: seconds, MiB, open files, processes and threads.
+
+    `cpu_s` and `memory_mib` count all processes of the run together, and `folder_mib` everything that it writes.
+    """
+
+    wall_s: int = 900
+    cpu_s: int = 900
+    memory_mib: int = 6144
+    file_mib: int = 256
+    folder_mib: int = 512
+    open_files: int = 256
+    processes: int = 128
+
+
+CHECK_LIMITS = Limits(wall_s=120, cpu_s=60, memory_mib=2048, file_mib=1, folder_mib=16, processes=32)
+"""Limits of the parameter check, which imports the flight code and reads a text file."""
+
+
+@dataclass(frozen=True, slots=True)
+class Build:
+    """Payload build under test.
+
+    Attributes
+    ----------
+    file
+        The build file; other file names in it are relative to its folder.
+    command
+        Program and arguments with the places {archive}, {out} and {build}; empty for a build on the flight code.
+    files
+        SHA-256 of every file that belongs to the build, by name.
+    parameters
+        Name of the parameter file of a build on the flight code; "" without one.
+    camera
+        Camera for which the build is made; None if it is not specific to a camera.
+    digest
+        Identity of the build.
+    """
+
+    name: str
+    version: str
+    digest: str
+    file: Path
+    command: tuple[str, ...] = ()
+    files: tuple[tuple[str, str], ...] = ()
+    description: str = ""
+    camera: tuple[tuple[str, float], ...] = ()
+    limits: Limits = field(default_factory=Limits)
+    provenance: tuple[tuple[str, str], ...] = ()
+    flight_code: str = ""
+    parameters: str = ""
+
+    @property
+    def title(self) -> str:
+        """Name, version and the beginning of the identity."""
+        return " ".join(part for part in (self.name, self.version, f"({self.digest[:12]})") if part)
+
+    @property
+    def folder(self) -> Path:
+        return self.file.parent
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """Return the command line, with the placeholders {python}, {archive}, {out} and {folder}."""
+        place = "{folder}" if self.command else ("{folder}/" + BUILD_FILE if self.folder_needed else CURRENT)
+        words = [word.replace("{build}", place) for word in self.command or FLIGHT_COMMAND]
+        if words[0] in dict(self.files):
+            words[0] = "{folder}/" + words[0]
+        return tuple(words)
+
+    @property
+    def folder_needed(self) -> bool:
+        """Whether the build has its own files; the flight code of this installation has none."""
+        return str(self.file) != CURRENT
+
+    def stage(self, folder: Path) -> None:
+        """Copy the build file and the files it names into a new folder, the only one that a run can access."""
+        folder.mkdir(parents=True)
+        if not self.folder_needed:
+            return
+        for name, source in (
+            (BUILD_FILE, self.file),
+            *((name, self.folder / name) for name, _ in self.files),
+        ):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(source, folder / name)
+
+
+def load_build(given: str | Path) -> Build:
+    """The build that a file describes; "current" is this flight code with its own network.
+
+    Raises
+    ------
+    InvalidInput
+        The file is missing, is no build, or names files that are not there.
+    """
+    if str(given) == CURRENT:
+        return _current()
+    path = Path(given)
+    if path.is_dir():
+        path = path / BUILD_FILE
+    table = _read(path)
+    source = str(path)
+    for key in table:
+        if key not in _KEYS:
+            raise InvalidInput(source, key, f"one of {', '.join(_KEYS)}", "an unknown key")
+    if table.get("schema_version", SCHEMA_VERSION) != SCHEMA_VERSION:
+        raise InvalidInput(source, "schema_version", str(SCHEMA_VERSION), repr(table["schema_version"]))
+    name = _text(table, "name", source, required=True)
+    command = _texts(table, "command", source)
+    own = {key: _text(table, key, source) for key in ("model", "parameters")}
+    if command and any(own.values()):
+        raise InvalidInput(source, "command", "a command, or a model and parameters", "both")
+    names = (*_texts(table, "files", source), *(value for value in own.values() if value))
+    files = tuple((item, _file_hash(path, item)) for item in sorted(set(names)))
+    camera = _numbers(table, "camera", source, ("width_px", "height_px", "fov_deg"))
+    code = "" if command else flight_code_hash()
+    if command:
+        if not any("{archive}" in word for word in command) or not any("{out}" in word for word in command):
+            raise InvalidInput(source, "command", "the places {archive} and {out} in it", " ".join(command))
+        content: dict[str, Any] = {"command": command, "files": files}
+    else:
+        model = dict(files).get(own["model"]) or _hash_of(_root() / _SHIPPED_MODEL)
+        content = {"model": model, "parameters": dict(files).get(own["parameters"], ""), "flight_code": code}
+    provenance = table.get("provenance", {})
+    if not isinstance(provenance, dict):
+        raise InvalidInput(source, "provenance", "a table", repr(provenance)[:80])
+    return Build(
+        name=name,
+        version=_text(table, "version", source),
+        digest=_digest({**content, "camera": camera}),
+        file=path,
+        command=command,
+        files=files,
+        description=_text(table, "description", source),
+        camera=tuple(sorted(camera.items())),
+        limits=_limits(table, source),
+        provenance=tuple((str(key), str(value)) for key, value in sorted(provenance.items())),
+        flight_code=code,
+        parameters=own["parameters"],
+    )
+
+
+def register_build(ground: Ground, build: Build, *, actor: str = "local") -> Build:
+    """Store a build: its files by content, its identity and origin; return the stored build.
+
+    Raises
+    ------
+    InvalidInput
+        Its parameters are not valid for the flight code.
+    BuildNotChecked
+        Its parameters cannot be checked here.
+    """
+    folder = ground.home / "regression" / "builds" / build.digest
+    if not folder.exists():
+        check_parameters(build, runner=ground.runner, private=(ground.home,))
+    try:
+        if not folder.exists():
+            make_durable_folder(folder.parent)
+            # a unique name: another process may register the same build at the same time
+            partial = Path(tempfile.mkdtemp(prefix=f".{build.digest[:16]}.", dir=folder.parent))
+            text = build.file.read_bytes() if build.file.is_file() else _current_text().encode()
+            (partial / BUILD_FILE).write_bytes(text)
+            for name, _ in build.files:
+                (partial / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy(build.folder / name, partial / name)
+            partial.chmod(0o755)
+            try:
+                replace_durably(partial, folder)
+            except OSError:
+                shutil.rmtree(partial, ignore_errors=True)
+                if not folder.exists():  # otherwise the other process was first, with the same files
+                    raise
+    except OSError as error:
+        raise storage_error(error, folder) from None
+    with ground.database.writing() as connection:
+        repository.add_new(
+            connection,
+            repository.BUILDS,
+            digest=build.digest,
+            name=build.name,
+            version=build.version,
+            description=build.description,
+            kind="command" if build.command else "flight",
+            files=dict(build.files),
+            flight_code=build.flight_code or None,
+            provenance=dict(build.provenance),
+            registered_by=actor,
+            created_utc_ns=utc_now_ns(),
+        )
+    return load_build(folder)
+
+
+def check_parameters(build: Build, *, runner: Path | None = None, private: Sequence[Path] = ()) -> None:
+    """Check the parameter file of a build with the flight code; other builds are not checked.
+
+    The flight code runs in the sandbox like a build, with a copy of the files of the build.
+
+    Raises
+    ------
+    InvalidInput
+        A parameter is unknown or has an invalid value.
+    BuildNotChecked
+        The check cannot be isolated here, or did not finish.
+    """
+    if not build.parameters:
+        return
+    with tempfile.TemporaryDirectory(prefix="build-check-") as name:
+        work = Path(name)
+        (work / "archive").mkdir()
+        (work / "out").mkdir()
+        build.stage(work / "build")
+        request = RunRequest(CHECK_COMMAND, asdict(CHECK_LIMITS))
+        printed = work / "printed.txt"
+        try:
+            if runner is not None:
+                report = run_by_runner(runner, request, work, work / "out", printed)
+            else:
+                check_private(private)
+                report = run_in_sandbox(request, work, work / "out", printed)
+        except SandboxRefused as error:
+            raise BuildNotChecked(build.title, str(error)) from None
+        told = tail(printed, CHECK_LIMIT_OCTETS).strip()
+    if report["exit_status"] == 0 and not report["cause"]:
+        return
+    fault = _fault_of(told) if report["exit_status"] == CHECK_FAILED else None
+    if fault is None:
+        last = told.splitlines()[-1][:200] if told else "nothing printed"
+        status = report["cause"] or f"status {report['exit_status']}, signal {report['signal']}"
+        raise BuildNotChecked(build.title, f"the check of the parameters ended with {status}: {last}")
+    raise fault
+
+
+def _fault_of(told: str) -> InvalidInput | None:
+    """Return the fault that the check printed as JSON; None if it printed none."""
+    try:
+        fault = json.loads(told[told.index('{"fault"') :])["fault"]
+        return InvalidInput(*(str(fault[name]) for name in ("file", "key", "expected", "found")))
+    except (ValueError, KeyError, TypeError):
+        return None
+
+
+def registered_build(ground: Ground, digest: str) -> Build:
+    """A build that was registered, found by its identity or the unmistakable beginning of it.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    InvalidInput
+        If its files are no longer those that were registered.
+    """
+    with ground.database.reading() as connection:
+        page = repository.page(
+            connection, repository.BUILDS, limit=2, conditions=[repository.BUILDS.c.digest.startswith(digest)]
+        )
+    if page.total != 1 or len(digest) < 8:
+        raise NotFound("build", digest)
+    whole = page.rows[0]["digest"]
+    build = load_build(ground.home / "regression" / "builds" / whole)
+    if build.digest != whole:
+        raise InvalidInput(
+            f"build {whole[:12]}",
+            "",
+            "the files and flight code it was registered with",
+            f"{build.digest[:12]}",
+        )
+    return build
+
+
+def build_of(ground: Ground, given: str) -> Build:
+    """A build by file, by "current", or by the identity it was registered under; registered in any case."""
+    if given == CURRENT or Path(given).exists() or Path(given).suffix == ".toml":
+        return register_build(ground, load_build(given))
+    return registered_build(ground, given)
+
+
+def registered_builds(ground: Ground) -> list[dict[str, Any]]:
+    """Builds that are registered, the newest first."""
+    with ground.database.reading() as connection:
+        return repository.page(connection, repository.BUILDS, limit=1000).rows
+
+
+def flight_code_hash() -> str:
+    """Return the SHA-256 of the sources of the installed flight code, which is never imported here."""
+    digest = hashlib.sha256()
+    root = _root()
+    for place in _FLIGHT_CODE:
+        where = root / place
+        for path in [where] if where.is_file() else sorted(where.rglob("*.py")):
+            digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+def _root() -> Path:
+    """Folder that holds the packages of this checkout or installation."""
+    spec = importlib.util.find_spec("ground_service")
+    assert spec is not None and spec.submodule_search_locations
+    return Path(next(iter(spec.submodule_search_locations))).parent
+
+
+def _current() -> Build:
+    code = flight_code_hash()
+    model = _hash_of(_root() / _SHIPPED_MODEL)
+    return Build(
+        name="current",
+        version="",
+        digest=_digest({"model": model, "parameters": "", "flight_code": code, "camera": {}}),
+        file=Path(CURRENT),
+        description="the installed flight code with its own network and the parameters used in flight",
+        flight_code=code,
+    )
+
+
+def _current_text() -> str:
+    return 'schema_version = 1\nname = "current"\n'
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        octets = path.read_bytes()
+    except FileNotFoundError:
+        raise InvalidInput(str(path), "", "a build file (TOML) or 'current'", "nothing there") from None
+    except OSError as error:
+        raise storage_error(error, path) from None
+    if len(octets) > BUILD_FILE_LIMIT_OCTETS:
+        raise InvalidInput(str(path), "", f"at most {BUILD_FILE_LIMIT_OCTETS} octets", str(len(octets)))
+    try:
+        return tomllib.loads(octets.decode("utf-8"))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InvalidInput(str(path), "", "a build file (TOML)", str(error)) from None
+
+
+def _limits(table: dict[str, Any], source: str) -> Limits:
+    names = tuple(item.name for item in fields(Limits))
+    given = _numbers(table, "limits", source, names)
+    for name, value in given.items():
+        if value <= 0 or value != int(value):
+            raise InvalidInput(source, f"limits.{name}", "a whole number above 0", repr(value))
+    return Limits(**{name: int(value) for name, value in given.items()})
+
+
+def _numbers(table: dict[str, Any], key: str, source: str, names: tuple[str, ...]) -> dict[str, float]:
+    given = table.get(key, {})
+    if not isinstance(given, dict):
+        raise InvalidInput(source, key, "a table", repr(given)[:80])
+    for name, value in given.items():
+        if name not in names:
+            raise InvalidInput(source, f"{key}.{name}", f"one of {', '.join(names)}", "an unknown key")
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise InvalidInput(source, f"{key}.{name}", "a number", repr(value)[:80])
+    return {name: float(value) for name, value in given.items()}
+
+
+def _text(table: dict[str, Any], key: str, source: str, *, required: bool = False) -> str:
+    value = table.get(key, None if required else "")
+    if not isinstance(value, str) or (required and not value):
+        raise InvalidInput(source, key, "a text", repr(value)[:80])
+    if value and key in ("name", "version"):
+        return require_line(value, source, key)
+    if "\0" in value or "\x1b" in value:
+        raise InvalidInput(source, key, "a text without control characters", ascii(value)[:80])
+    return value
+
+
+def _texts(table: dict[str, Any], key: str, source: str) -> tuple[str, ...]:
+    value = table.get(key, [])
+    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+        raise InvalidInput(source, key, "a list of texts", repr(value)[:80])
+    return tuple(value)
+
+
+def _file_hash(build_file: Path, name: str) -> str:
+    path = build_file.parent / name
+    inside = not Path(name).is_absolute() and path.resolve().is_relative_to(build_file.parent.resolve())
+    if not inside:
+        raise InvalidInput(str(build_file), name, "a file beside the build file", "one elsewhere")
+    if not path.is_file():
+        raise InvalidInput(str(build_file), name, "a file beside the build file", "nothing there")
+    return _hash_of(path)
+
+
+def _hash_of(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise storage_error(error, path) from None
+
+
+def _digest(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

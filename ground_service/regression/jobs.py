@@ -1,0 +1,100 @@
+"""Regressions as jobs: a replay for every archive and build, distributed over the workers, and then the verdict.
+
+The verdict's own job does what replays are still missing, so nothing hangs on another worker: a replay that two workers
+do at the same time is kept once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from ground_service.errors import InvalidInput
+from ground_service.ground import Ground
+from ground_service.regression.archives import kept_archives
+from ground_service.regression.builds import CURRENT, Build, load_build, register_build, registered_build
+from ground_service.regression.policy import load_policy
+from ground_service.regression.service import (
+    do_replay,
+    find_replay,
+    is_done,
+    keep_regression,
+    run_regression,
+)
+from ground_service.store import repository
+from ground_service.store.states import change_if
+
+
+def prepared(ground: Ground, candidate: str, baseline: str, archives: Sequence[str]) -> dict[str, Any]:
+    """Arguments of the job of a regression: identities of builds and archives that are there.
+
+    Parameters
+    ----------
+    candidate, baseline
+        Identities of registered builds, or "current".
+    archives
+        Identities of kept archives; all that are kept when empty.
+
+    Raises
+    ------
+    NotFound, InvalidInput
+        A build or an archive is not known, or none is kept.
+    """
+    kept = {row["digest"] for row in kept_archives(ground)}
+    for digest in archives:
+        if digest not in kept:
+            raise InvalidInput("archives", "", "identities of archives that are kept", digest[:64])
+    chosen = list(archives) or sorted(kept)
+    if not chosen:
+        raise InvalidInput("archives", "", "at least one archive that is kept", "none")
+    return {
+        "candidate": named_build(ground, candidate).digest,
+        "baseline": named_build(ground, baseline).digest,
+        "archives": chosen,
+    }
+
+
+def named_build(ground: Ground, name: str) -> Build:
+    """Return a registered build by its identity, or the installed flight code."""
+    if name == CURRENT:
+        return register_build(ground, load_build(CURRENT))
+    return registered_build(ground, name)
+
+
+def missing_replays(ground: Ground, arguments: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Arguments of the jobs of the replays that a regression needs and that were not done yet."""
+    builds = [registered_build(ground, arguments[side]) for side in ("baseline", "candidate")]
+    return [
+        {"archive": digest, "build": build.digest}
+        for digest in arguments["archives"]
+        for build in dict.fromkeys(builds)
+        if not is_done(find_replay(ground, digest, build))
+    ]
+
+
+def replay_job(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[str, Any]:
+    """One build over one archive."""
+    replay = do_replay(ground, str(arguments["archive"]), registered_build(ground, str(arguments["build"])))
+    return {"outcome": replay.outcome, "detail": replay.detail, "cpu_s": replay.cpu_s}
+
+
+def regression_job(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
+    """A verdict; its id is that of the job."""
+
+    def progress(items: Any, total: int) -> Iterator[Any]:
+        for number, item in enumerate(items, start=1):
+            yield item
+            share = 0.95 * number / total
+            with ground.database.writing() as connection:
+                change_if(connection, repository.JOBS, job_id, {"state": "running"}, progress=share)
+
+    outcome = run_regression(
+        ground,
+        list(arguments["archives"]),
+        registered_build(ground, str(arguments["candidate"])),
+        registered_build(ground, str(arguments["baseline"])),
+        load_policy(),
+        progress=progress,
+    )
+    keep_regression(ground, outcome, regression_id=job_id)
+    return {"regression_id": job_id, "verdict": outcome.verdict}

@@ -1,0 +1,326 @@
+"""A replay's downlink read with the dictionary of its archive, as frame samples for the gates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ground_service.ephemerides.attitudes import load_attitudes, no_attitudes
+from ground_service.errors import InvalidInput
+from ground_service.evaluation.store import camera_of, orientation_of
+from ground_service.evaluation.viewing import Viewing
+from ground_service.missions.model import Camera, Evidence
+from ground_service.passes.archive_import import ATTITUDE_FILE, archived_mission
+from ground_service.passes.samples import DetectionSamples, NavigationSamples
+from ground_service.regression.archives import PassArchive, frame_inputs
+from ground_service.regression.model import PassFrames, pass_frames
+from lunar.arrays import IntArray
+from lunar.camera import PinholeCamera
+from lunar.catalogue import CraterCatalogue, load_catalogue
+from lunar.datafolder import DataFolder
+from lunar.ephemeris import Ephemeris, load_ephemeris
+from lunar.frames import Orientation
+from lunar.timescales import utc_ns_from_ticks
+from tmtc.definitions import parse_dictionary
+from tmtc.downlink import DownlinkDecode, decode
+from tmtc.errors import TmtcError
+from tmtc.schema import Dictionary, Table
+
+FRAME_TIMES = "frame_times.csv"
+LATENCY_LEVEL = 0.25
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PassContext:
+    """What the ground knows of an archived pass, whichever build flies it: read once, used for every build."""
+
+    name: str
+    manifest: Mapping[str, Any]
+    frame_ticks: IntArray
+    frame_utc_ns: IntArray
+    frame_names: tuple[str, ...]
+    dictionary: Dictionary
+    reference: Ephemeris
+    catalogue: CraterCatalogue
+    camera: PinholeCamera
+    orientation: Orientation
+    viewing: Viewing
+    evidence: Evidence
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReadDownlink:
+    """A downlink as samples whose frame numbers are rows of the archive's frames."""
+
+    detections: DetectionSamples
+    frames: PassFrames
+
+
+def pass_context(archive: PassArchive, data: DataFolder) -> PassContext:
+    """Return the context of an archived pass, in its declared lunar orientation.
+
+    Raises
+    ------
+    EvaluationError
+        The archive does not declare its lunar orientation, or it is not available on this machine.
+    """
+    folder = archive.folder
+    mission = archived_mission(folder, archive.manifest)
+    rows = frame_inputs(folder)
+    ticks = np.array([row["ticks"] for row in rows], dtype=np.int64)
+    text = (folder / "payload/dictionary.json").read_text(encoding="utf-8")
+    utc_ns = _frame_times(folder, [row["frame"] for row in rows], ticks)
+    camera = camera_of(mission.camera)
+    return PassContext(
+        name=archive.name,
+        manifest=archive.manifest,
+        frame_ticks=ticks,
+        frame_utc_ns=utc_ns,
+        frame_names=tuple(row["image"] or "" for row in rows),
+        dictionary=parse_dictionary(text, str(folder / "payload/dictionary.json")),
+        reference=load_ephemeris(folder / "reference.oem"),
+        catalogue=load_catalogue(folder / "catalogue.csv"),
+        camera=camera,
+        orientation=orientation_of(mission, data),
+        viewing=_viewing(folder, mission.camera, camera, ticks, utc_ns),
+        evidence=mission.evidence,
+    )
+
+
+def _viewing(
+    folder: Path, declared: Camera, camera: PinholeCamera, ticks: IntArray, utc_ns: IntArray
+) -> Viewing:
+    """Return the pointing of the camera for the frames of an archive."""
+    path = folder / ATTITUDE_FILE
+    table = load_attitudes(path, str(path)) if path.is_file() else no_attitudes()
+    order = np.argsort(ticks, kind="stable")
+    rows = np.searchsorted(ticks[order], table.image_ticks)
+    known = rows < len(ticks)
+    known[known] = ticks[order][rows[known]] == table.image_ticks[known]
+    frames = order[rows[known]]
+    in_time = np.argsort(utc_ns[frames], kind="stable")
+    return Viewing(
+        camera,
+        math.radians(declared.tilt_deg or 0.0),
+        math.radians(declared.yaw_deg or 0.0),
+        utc_ns[frames][in_time],
+        table.q_wxyz[known][in_time],
+    )
+
+
+def read_downlink(
+    context: PassContext, octets: bytes, performance: Mapping[str, Any] | None, memory_mib: float
+) -> ReadDownlink:
+    """What came down, by frame of the archive.
+
+    Raises
+    ------
+    InvalidInput
+        If there is no packet of the dictionary among the octets.
+    """
+    try:
+        decoded = decode(octets, dictionary=context.dictionary)
+    except TmtcError as error:
+        raise InvalidInput("downlink", "", "telemetry of the dictionary of its archive", str(error)) from None
+    tables = decoded.tables(context.dictionary)
+    if not any(len(table) for table in tables.values()):
+        raise InvalidInput(
+            "downlink",
+            "",
+            f"packets of dictionary version {context.dictionary.version}",
+            f"none among {len(octets)} octets",
+        )
+    detections = _detections(tables.get("detections"), context)
+    outcomes = _outcomes(tables.get("frame_outcome"), context)
+    good = decoded.cut.crc_ok
+    ticks = _packet_ticks(tables, len(decoded.cut))
+    frames = pass_frames(
+        context.frame_ticks,
+        context.frame_utc_ns,
+        detections,
+        _navigation(tables.get("navigation_state"), context),
+        outcomes,
+        ticks[good],
+        decoded.cut.lengths[good],
+        context.reference,
+        context.catalogue,
+        context.camera,
+        context.orientation,
+        context.viewing,
+    )
+    latency, latency_ms = _latency(performance, len(context.frame_ticks))
+    return ReadDownlink(
+        detections,
+        replace(
+            frames,
+            latency=latency,
+            latency_ms=latency_ms,
+            undecodable=decoded.unknown
+            + decoded.crc_errors
+            + _meaningless(decoded, tables, context.dictionary),
+            memory_mib=memory_mib,
+        ),
+    )
+
+
+def _frame_times(folder: Path, numbers: list[int], ticks: IntArray) -> IntArray:
+    """UTC of every frame: as the archive correlates it, else by an ideal clock."""
+    path = folder / FRAME_TIMES
+    if not path.is_file():
+        return np.asarray(utc_ns_from_ticks(ticks), dtype=np.int64)
+    try:
+        rows = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()[1:]]
+        times = {int(number): int(utc) for number, utc in rows}
+        return np.array([times[number] for number in numbers], dtype=np.int64)
+    except (ValueError, KeyError) as error:
+        raise InvalidInput(str(path), "", "the UTC of every frame in ns", str(error)) from None
+
+
+def _rows(table: Table, context: PassContext) -> tuple[IntArray, NDArray[np.bool_]]:
+    """Row of the archive's frame that each packet speaks of, by on-board time, and which of them speak of one."""
+    ticks = np.asarray(table.columns["image_ticks"], dtype=np.int64)
+    order = np.argsort(context.frame_ticks, kind="stable")
+    if len(order) == 0:
+        return ticks, np.zeros(len(ticks), dtype=np.bool_)
+    at = np.minimum(np.searchsorted(context.frame_ticks[order], ticks), len(order) - 1)
+    row = order[at]
+    return row, context.frame_ticks[row] == ticks
+
+
+def _firsts(*keys: IntArray) -> IntArray:
+    """Indices of the first of all rows with equal keys, in order."""
+    if len(keys[0]) == 0:
+        return np.zeros(0, dtype=np.int64)
+    _, index = np.unique(np.column_stack(keys), axis=0, return_index=True)
+    return np.asarray(np.sort(index), dtype=np.int64)
+
+
+def _detections(table: Table | None, context: PassContext) -> DetectionSamples:
+    if table is None or len(table) == 0:
+        none, whole = np.zeros(0), np.zeros(0, dtype=np.int64)
+        return DetectionSamples(
+            whole,
+            whole,
+            np.zeros(0, dtype=np.bool_),
+            (),
+            np.zeros(1, dtype=np.int64),
+            none,
+            none,
+            none,
+            none,
+            whole,
+        )
+    row, known = _rows(table, context)
+    packets = np.flatnonzero(known)
+    packets = packets[_firsts(row[packets])]
+    packets = packets[np.argsort(row[packets], kind="stable")]
+    owners = table.item_owner
+    items = np.concatenate([np.flatnonzero(owners == packet) for packet in packets] or [owners[:0]])
+    counts = np.bincount(owners, minlength=len(table))[packets]
+    return DetectionSamples(
+        frame_number=row[packets],
+        utc_ns=context.frame_utc_ns[row[packets]],
+        usable=np.asarray(table.columns["image_quality"][packets] == 0, dtype=np.bool_),
+        quality=(),
+        offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
+        u_px=table.items["u_px"][items],
+        v_px=table.items["v_px"][items],
+        diameter_px=table.items["diameter_px"][items],
+        score=table.items["score"][items],
+        size_class=table.items["size_class"][items].astype(np.int64),
+    )
+
+
+def _navigation(table: Table | None, context: PassContext) -> dict[str, NavigationSamples]:
+    if table is None or len(table) == 0:
+        return {}
+    row, known = _rows(table, context)
+    names = context.dictionary.labels("navigation_state", "estimator")
+    estimator = np.asarray(table.columns["estimator"], dtype=np.int64)
+    samples = {}
+    for code, name in names.items():
+        chosen = np.flatnonzero(known & (estimator == code))
+        chosen = chosen[_firsts(row[chosen])]
+        if len(chosen) == 0:
+            continue
+        columns = {key: values[chosen] for key, values in table.columns.items()}
+        samples[name] = NavigationSamples(
+            name,
+            row[chosen],
+            context.frame_utc_ns[row[chosen]],
+            columns["latitude_deg"],
+            columns["longitude_deg"],
+            columns["altitude_m"],
+            columns["sigma_rtn_m"],
+            columns["nis"],
+            columns["matched"],
+            (),
+        )
+    return samples
+
+
+def _outcomes(table: Table | None, context: PassContext) -> dict[str, dict[int, str]]:
+    if table is None:
+        return {}
+    row, known = _rows(table, context)
+    estimators = context.dictionary.labels("frame_outcome", "estimator")
+    outcomes = context.dictionary.labels("frame_outcome", "outcome")
+    found: dict[str, dict[int, str]] = {}
+    for i in np.flatnonzero(known).tolist():
+        estimator = estimators.get(int(table.columns["estimator"][i]), "")
+        outcome = outcomes.get(int(table.columns["outcome"][i]), "")
+        found.setdefault(estimator, {}).setdefault(int(row[i]), outcome)
+    return found
+
+
+def _packet_ticks(tables: Mapping[str, Table], packets: int) -> IntArray:
+    """On-board time of every packet of the stream; those that could not be decoded take that of the one before."""
+    ticks = np.full(packets, -1, dtype=np.int64)
+    for table in tables.values():
+        ticks[table.packet_index] = table.ticks
+    known = ticks >= 0
+    if not known.any():
+        return np.zeros(packets, dtype=np.int64)
+    last = np.maximum.accumulate(np.where(known, np.arange(packets), -1))
+    return np.where(last >= 0, ticks[np.maximum(last, 0)], ticks[known][0])
+
+
+def _meaningless(decoded: DownlinkDecode, tables: Mapping[str, Table], dictionary: Dictionary) -> int:
+    """Packets that have the length and checksum of their kind but hold codes or places that mean nothing."""
+    bad = np.zeros(len(decoded.cut), dtype=np.bool_)
+    for name, table in tables.items():
+        if len(table) == 0:
+            continue
+        wrong = np.zeros(len(table), dtype=np.bool_)
+        for item in dictionary.packet(name).fields:
+            if item.labels and item.name in table.columns:
+                wrong |= ~np.isin(table.raw[item.name], [code for code, _ in item.labels])
+        if name == "navigation_state":
+            wrong |= ~(np.abs(np.nan_to_num(table.columns["latitude_deg"])) <= 90.0)
+        bad[table.packet_index[wrong]] = True
+    return int(np.count_nonzero(bad))
+
+
+def _latency(
+    performance: Mapping[str, Any] | None, frames: int
+) -> tuple[dict[str, NDArray[np.float64]], dict[str, NDArray[np.float64]]]:
+    """CPU time of each stage in yardsticks and in milliseconds, of the stages reported for every frame."""
+    if performance is None:
+        return {}, {}
+    measured = {
+        # A stage that took no time did not run: a frame without an image says nothing about the network.
+        name: np.where(np.array(values) > 0.0, np.array(values, dtype=np.float64), np.nan)
+        for name, values in performance["stages"].items()
+        if len(values) == frames and all(math.isfinite(value) for value in values)
+    }
+    yardstick = [value for value in performance["yardstick"] if value > 0.0]
+    if not yardstick:
+        return {}, measured
+    unit = float(np.quantile(yardstick, LATENCY_LEVEL))
+    return {name: values / unit for name, values in measured.items()}, measured

@@ -1,0 +1,442 @@
+"""A candidate build against a baseline over archived passes: replays, gates, verdict.
+
+A replay is done once for an archive and a build and kept under the identity of both, so that a run that was interrupted
+goes on where it stopped and a baseline is not flown again. What goes wrong with one pass is said of that pass; the rest
+goes on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import os
+import platform
+import tempfile
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sqlalchemy import true, update
+
+from ground_service.clock import utc_now_ns
+from ground_service.errors import GroundError, InvalidInput
+from ground_service.ground import Ground
+from ground_service.regression.archives import PassArchive, check_out, keep_archive, store_of
+from ground_service.regression.build_runs import OK, OUTCOMES, PERFORMANCE, read_performance, run_build
+from ground_service.regression.builds import Build
+from ground_service.regression.core import FAIL, INCONCLUSIVE, PASS, Gate, judge, verdict_of
+from ground_service.regression.metrics import outcome_shares, same_telemetry
+from ground_service.regression.model import PassFrames
+from ground_service.regression.policy import PolicyFile
+from ground_service.regression.replay_samples import PassContext, ReadDownlink, pass_context, read_downlink
+from ground_service.store import repository
+from lunar.errors import LunarError
+from lunar.timescales import format_utc
+
+EXIT_STATUS = {PASS: 0, FAIL: 1, INCONCLUSIVE: 3}
+Progress = Callable[[Sequence[Any], int], Iterator[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class KeptReplay:
+    """Completed replay: its outcome, and the location of its downlink."""
+
+    outcome: str
+    detail: str
+    downlink_sha256: str | None
+    performance_sha256: str | None
+    wall_s: float
+    cpu_s: float
+    peak_rss_mib: float
+    isolation: str
+    machine: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PassVerdict:
+    """One pass of a regression.
+
+    Attributes
+    ----------
+    state
+        "judged", "candidate failed", "baseline failed" or "unusable" (the archive).
+    detail
+        What went wrong, empty for a pass that was judged.
+    """
+
+    name: str
+    digest: str
+    state: str
+    detail: str = ""
+    baseline: KeptReplay | None = None
+    candidate: KeptReplay | None = None
+    context: PassContext | None = None
+    baseline_read: ReadDownlink | None = None
+    candidate_read: ReadDownlink | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RegressionOutcome:
+    """The verdict on a candidate build."""
+
+    baseline: Build
+    candidate: Build
+    policy: PolicyFile
+    gates: tuple[Gate, ...]
+    passes: tuple[PassVerdict, ...]
+    remarks: tuple[str, ...] = field(default=())
+
+    @property
+    def verdict(self) -> str:
+        """Pass, fail or inconclusive.
+
+        "fail": a gate failed, or the candidate failed on a pass. "inconclusive": there is no gate, a gate is
+        inconclusive, or a pass could not be judged because of its archive or its baseline.
+        """
+        of_gates = verdict_of(self.gates)
+        if of_gates == FAIL or any(one.state == "candidate failed" for one in self.passes):
+            return FAIL
+        return of_gates if all(one.state == "judged" for one in self.passes) else INCONCLUSIVE
+
+    @property
+    def exit_status(self) -> int:
+        """0 pass, 1 fail, 3 inconclusive."""
+        return EXIT_STATUS[self.verdict]
+
+    @property
+    def frames_judged(self) -> int:
+        """Number of frames processed by both builds."""
+        return sum(
+            len(one.baseline_read.frames)
+            for one in self.passes
+            if one.state == "judged" and one.baseline_read
+        )
+
+    @property
+    def frames_needed(self) -> int | None:
+        """Number of frames needed to decide every gate over the suite; None if no gate states a number."""
+        return max(
+            (
+                gate.frames_needed
+                for gate in self.gates
+                if gate.frames_needed is not None and not gate.pass_name and not gate.waived
+            ),
+            default=None,
+        )
+
+
+def run_regression(
+    ground: Ground,
+    archives: Sequence[Path | str],
+    candidate: Build,
+    baseline: Build,
+    policy: PolicyFile,
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> RegressionOutcome:
+    """Fly archives with both builds, where that was not done before, and judge.
+
+    Parameters
+    ----------
+    archives
+        Folders and zips, or identities of archives that are kept.
+    workers
+        Replays at a time; every replay is a process of its own. Default: one for each core.
+    progress
+        Wraps the iteration over replays (items, total), for a progress bar.
+    """
+    if not archives:
+        raise InvalidInput("archives", "", "at least one pass archive", "none")
+    kept = [_kept(ground, given) for given in archives]
+    usable = list(dict.fromkeys(one.digest for one in kept if isinstance(one, PassArchive)))
+    shards = [(digest, build) for digest in usable for build in dict.fromkeys((baseline, candidate))]
+    shards = [shard for shard in shards if not is_done(find_replay(ground, *shard))]
+    fly_shards(ground, shards, workers=workers, progress=progress)
+    return judge_regression(ground, kept, candidate, baseline, policy)
+
+
+def fly_shards(
+    ground: Ground,
+    shards: Sequence[tuple[str, Build]],
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> None:
+    """Do replays, several at a time: every one is a process, the threads here only wait for them."""
+    if not shards:
+        return
+    with ThreadPoolExecutor(max_workers=workers or os.cpu_count() or 1, thread_name_prefix="replay") as pool:
+        futures = [pool.submit(do_replay, ground, digest, build) for digest, build in shards]
+        try:
+            done = as_completed(futures)
+            for future in progress(done, len(futures)) if progress else done:  # type: ignore[arg-type]
+                future.result()
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            raise
+
+
+def do_replay(ground: Ground, digest: str, build: Build) -> KeptReplay:
+    """One build over one kept archive: done now, or what was kept of an earlier time."""
+    known = find_replay(ground, digest, build)
+    if known is not None and is_done(known):
+        return known
+    with tempfile.TemporaryDirectory(prefix="replay-", dir=_scratch(ground)) as folder:
+        archive = check_out(ground, digest, Path(folder) / "archive")
+        refusal = _other_camera(build, archive)
+        if refusal:
+            return _keep(
+                ground, digest, build, KeptReplay("refused", refusal, None, None, 0, 0, 0, "", _machine())
+            )
+        run = run_build(
+            build, archive.folder, Path(folder) / "out", runner=ground.runner, private=(ground.home,)
+        )
+        outcome, detail = run.outcome, run.detail
+        stored: dict[str, str | None] = {"downlink": None, "performance": None}
+        if run.downlink is not None:
+            octets = run.downlink.read_bytes()
+            try:
+                context = pass_context(archive, ground.data)
+            except (GroundError, LunarError):
+                pass  # a fault of the archive or of ground data, not of the build; the verdict reports it
+            else:
+                try:
+                    read_downlink(context, octets, None, 0.0)
+                except InvalidInput as error:
+                    outcome, detail = "garbage", str(error)
+            stored["downlink"] = store_of(ground).put_octets(octets).sha256
+        if run.performance is not None:
+            stored["performance"] = store_of(ground).put_file(Path(folder) / "out" / PERFORMANCE).sha256
+        return _keep(
+            ground,
+            digest,
+            build,
+            KeptReplay(
+                outcome,
+                detail,
+                stored["downlink"],
+                stored["performance"],
+                run.wall_s,
+                run.cpu_s,
+                run.peak_rss_mib,
+                run.isolation,
+                _machine(),
+            ),
+        )
+
+
+def find_replay(ground: Ground, digest: str, build: Build) -> KeptReplay | None:
+    """What was kept of a replay; None where it was not done, or something of it is lost."""
+    with ground.database.reading() as connection:
+        row = repository.find(connection, repository.REPLAYS, id=replay_id(digest, build))
+    if row is None:
+        return None
+    files = store_of(ground)
+    if any(
+        row[key] and not files.path(row[key]).exists() for key in ("downlink_sha256", "performance_sha256")
+    ):
+        return None
+    return KeptReplay(**{item.name: row[item.name] for item in dataclasses.fields(KeptReplay)})
+
+
+def is_done(replay: KeptReplay | None) -> bool:
+    """Whether a replay need not be done again: what failed once may have failed for want of time or space."""
+    return replay is not None and replay.outcome == OK
+
+
+def replay_id(digest: str, build: Build) -> str:
+    """Identity of a replay: hash of the identities of archive and build."""
+    return hashlib.sha256(f"{digest} {build.digest}".encode()).hexdigest()
+
+
+def judge_regression(
+    ground: Ground,
+    kept: Sequence[PassArchive | PassVerdict],
+    candidate: Build,
+    baseline: Build,
+    policy: PolicyFile,
+) -> RegressionOutcome:
+    """The gates over replays that were done."""
+    passes = tuple(
+        one if isinstance(one, PassVerdict) else _pass_verdict(ground, one, candidate, baseline)
+        for one in kept
+    )
+    judged = [one for one in passes if one.baseline_read is not None and one.candidate_read is not None]
+    remarks = []
+    names = _unique_names(judged)
+    before, after = {}, {}
+    elsewhere = 0
+    for name, one in zip(names, judged, strict=True):
+        assert one.baseline_read and one.candidate_read and one.baseline and one.candidate
+        old, new = one.baseline_read.frames, one.candidate_read.frames
+        if one.baseline.machine != one.candidate.machine:
+            elsewhere += 1
+            old, new = (dataclasses.replace(frames, latency={}) for frames in (old, new))
+        before[name], after[name] = old, new
+    if elsewhere:
+        remarks.append(
+            f"{elsewhere} passes were flown on different machines by the two builds: their latencies are not compared"
+        )
+    gates = judge(before, after, policy.policy, today=format_utc(utc_now_ns())[:10])
+    if before and all(same_telemetry(before[name], after[name]) for name in before):
+        remarks.append("Both builds sent identical telemetry in every frame: it is compared exactly")
+    waived = [gate for gate in gates if gate.waived]
+    remarks += [f"waived: {gate.name} {gate.pass_name}: {gate.waived}".replace(" :", ":") for gate in waived]
+    isolations = sorted(
+        {
+            replay.isolation
+            for one in passes
+            for replay in (one.baseline, one.candidate)
+            if replay and replay.isolation
+        }
+    )
+    remarks += [f"builds were isolated by: {name}" for name in isolations]
+    return RegressionOutcome(baseline, candidate, policy, tuple(gates), passes, tuple(remarks))
+
+
+def keep_regression(ground: Ground, outcome: RegressionOutcome, *, regression_id: str | None = None) -> str:
+    """Keep a verdict with the service; its id."""
+    from ground_service.regression.documents import regression_html, regression_json
+
+    identity = regression_id or uuid.uuid4().hex
+    html = ground.files.put_octets(regression_html(ground, outcome, identity).encode())
+    now = utc_now_ns()
+    with ground.database.writing() as connection:
+        repository.register_file(connection, html, "report", f"regression {identity}", now)
+        repository.add_new(  # a stored verdict is not replaced
+            connection,
+            repository.REGRESSIONS,
+            id=identity,
+            baseline_digest=outcome.baseline.digest,
+            candidate_digest=outcome.candidate.digest,
+            verdict=outcome.verdict,
+            result=regression_json(outcome),
+            html_sha256=html.sha256,
+            created_utc_ns=now,
+        )
+    return identity
+
+
+def pass_figures(frames: PassFrames) -> dict[str, Any]:
+    """Return the additional values of a pass in a verdict: outcomes, costs in milliseconds, memory."""
+    return {
+        "outcome_shares": outcome_shares(frames),
+        "stages_ms": {
+            name: float(np.nanmedian(values))
+            for name, values in frames.latency_ms.items()
+            if np.isfinite(values).any()
+        },
+        "memory_mib": frames.memory_mib,
+        "undecodable": frames.undecodable,
+    }
+
+
+def _kept(ground: Ground, given: Path | str) -> PassArchive | PassVerdict:
+    """An archive as it is kept, or the verdict on one that cannot be used."""
+    path = Path(given)
+    try:
+        if path.exists():
+            return keep_archive(ground, path)
+        with ground.database.reading() as connection:
+            row = repository.find(connection, repository.REGRESSION_ARCHIVES, digest=str(given))
+        if row is None:
+            raise InvalidInput(
+                str(given), "", "a pass archive, or the identity of one that is kept", "neither"
+            )
+        return PassArchive(path, row["digest"], {"pass_name": row["name"]}, row["frames"])
+    except (GroundError, LunarError) as error:
+        return PassVerdict(path.name, "", "unusable", str(error))
+
+
+def _pass_verdict(ground: Ground, archive: PassArchive, candidate: Build, baseline: Build) -> PassVerdict:
+    replays = [find_replay(ground, archive.digest, build) for build in (baseline, candidate)]
+    old, new = replays
+    if old is None or new is None:
+        return PassVerdict(archive.name, archive.digest, "unusable", "it was not flown", old, new)
+    for replay, build, state in ((new, candidate, "candidate failed"), (old, baseline, "baseline failed")):
+        if replay.outcome != OK:
+            told = f"{build.name} {OUTCOMES[replay.outcome]}" + (
+                f": {replay.detail}" if replay.detail else ""
+            )
+            return PassVerdict(archive.name, archive.digest, state, told, old, new)
+    try:
+        with tempfile.TemporaryDirectory(prefix="judge-", dir=_scratch(ground)) as folder:
+            context = pass_context(check_out(ground, archive.digest, Path(folder) / "a"), ground.data)
+        read = [_read(ground, context, replay) for replay in (old, new)]
+    except (GroundError, LunarError) as error:
+        return PassVerdict(archive.name, archive.digest, "unusable", str(error), old, new)
+    return PassVerdict(archive.name, archive.digest, "judged", "", old, new, context, read[0], read[1])
+
+
+def _read(ground: Ground, context: PassContext, replay: KeptReplay) -> ReadDownlink:
+    files = store_of(ground)
+    assert replay.downlink_sha256 is not None
+    performance = (
+        read_performance(files.path(replay.performance_sha256)) if replay.performance_sha256 else None
+    )
+    return read_downlink(context, files.get(replay.downlink_sha256), performance, replay.peak_rss_mib)
+
+
+def _keep(ground: Ground, digest: str, build: Build, replay: KeptReplay) -> KeptReplay:
+    """Store a replay; a successful replay is never replaced by a concurrent one of another worker."""
+    values = {item.name: getattr(replay, item.name) for item in dataclasses.fields(replay)}
+    identity = replay_id(digest, build)
+    table = repository.REPLAYS
+    with ground.database.writing() as connection:
+        added = repository.add_new(
+            connection,
+            table,
+            id=identity,
+            archive_digest=digest,
+            build_digest=build.digest,
+            created_utc_ns=utc_now_ns(),
+            **values,
+        )
+        if not added:
+            condition = table.c.outcome != OK if replay.outcome != OK else true()
+            connection.execute(update(table).where(table.c.id == identity, condition).values(**values))
+    return replay
+
+
+def _other_camera(build: Build, archive: PassArchive) -> str:
+    """Why a build made for one camera cannot fly this archive; empty where it can."""
+    given: Mapping[str, Any] = archive.manifest.get("camera") or {}
+    for key, value in build.camera:
+        if key in given and abs(float(given[key]) - value) > 1e-6:
+            return f"made for another camera: expected {key} {value:g}, found {float(given[key]):g}"
+    return ""
+
+
+def _unique_names(passes: Sequence[PassVerdict]) -> list[str]:
+    names = [one.name for one in passes]
+    return [
+        name if names.count(name) == 1 else f"{name} {one.digest[:8]}"
+        for name, one in zip(names, passes, strict=True)
+    ]
+
+
+def _scratch(ground: Ground) -> Path:
+    folder = ground.home / "regression" / "scratch"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+@functools.cache
+def _machine() -> str:
+    """What a latency was measured on."""
+    model = platform.processor() or platform.machine()
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as stream:
+            model = next(
+                (line.split(":", 1)[1].strip() for line in stream if line.startswith("model name")), model
+            )
+    except OSError:
+        pass
+    return f"{platform.node()}, {model}"

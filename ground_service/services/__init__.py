@@ -1,1 +1,0 @@
-"""What the service does, one module per service: it joins store, link and processing."""

@@ -1,0 +1,1 @@
+"""On-board time: time reports, receptions, correlation."""

@@ -1,0 +1,236 @@
+"""Open WebSockets: their callers and limits, periodic authorisation, and the feed.
+
+The feed is read once for all sockets of a process. Callers are verified again every `VERIFY_S`: a socket is closed if
+its token was revoked or has expired, or if its user was disabled.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+from collections import Counter
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from fastapi import WebSocket, WebSocketDisconnect
+from starlette.concurrency import run_in_threadpool
+
+from ground_service.access.service import LOCAL_CALLER, Caller, authenticate, has_users
+from ground_service.errors import GroundError, NotAuthorised
+from ground_service.feed import last_number, read_feed
+from ground_service.ground import Ground
+from ground_service.http.problems import problem
+from ground_service.http.proxies import address_key
+from ground_service.http.security import VERIFIED_CALLER
+from ground_service.http.views import time_text
+
+log = logging.getLogger(__name__)
+
+VERIFY_S = 2.0
+POLL_S = 0.5
+CLOSE_S = 2.0
+BATCH = 200
+QUEUED_LIMIT = 1000
+"""Largest number of queued messages of a socket; a socket with more is closed, and its client can reconnect."""
+
+REPLAYS_AT_ONCE = 2
+POLICY_VIOLATION = 1008
+TRY_AGAIN_LATER = 1013
+
+
+@dataclass(eq=False, slots=True)
+class Session:
+    """Socket and its caller, as last verified; `ended` holds the close code."""
+
+    socket: WebSocket
+    caller: Caller
+    token: str | None
+    ended: asyncio.Future[int]
+    messages: asyncio.Queue[tuple[int, str]] = field(default_factory=lambda: asyncio.Queue(QUEUED_LIMIT))
+
+    async def accept(self) -> None:
+        """Accept the socket; a client that sent its token as a sub-protocol receives the sub-protocol name back."""
+        protocol = "bearer" if "sec-websocket-protocol" in self.socket.headers else None
+        await self.socket.accept(subprotocol=protocol)
+
+    def end(self, code: int) -> None:
+        """Request that the socket is closed."""
+        if not self.ended.done():
+            self.ended.set_result(code)
+
+    def offer(self, number: int, text: str) -> None:
+        """Queue a message of the feed."""
+        try:
+            self.messages.put_nowait((number, text))
+        except asyncio.QueueFull:
+            self.end(TRY_AGAIN_LATER)
+
+
+class Sockets:
+    """WebSockets of one process."""
+
+    def __init__(self, ground: Ground, *, open_without_users: bool, per_user: int, total: int) -> None:
+        self._ground = ground
+        self._open_without_users = open_without_users
+        self._per_user, self._total = per_user, total
+        self._sessions: set[Session] = set()
+        self._holders: Counter[str] = Counter()
+        self._readers: set[Session] = set()
+        self._number = 0
+        self._replays = asyncio.Semaphore(REPLAYS_AT_ONCE)
+
+    @asynccontextmanager
+    async def admitted(self, socket: WebSocket) -> AsyncIterator[Session | None]:
+        """Yield the session of a socket whose caller is authorised, to be accepted; None if it was refused."""
+        token = token_of(socket)
+        caller = await run_in_threadpool(self._verified, token)
+        if caller is None or not caller.may("viewer"):
+            await socket.close(POLICY_VIOLATION)
+            yield None
+            return
+        if token is not None:
+            setattr(socket.state, VERIFIED_CALLER, caller.name)
+        client = socket.client.host if socket.client is not None else ""
+        holder = f"user {caller.name}" if token is not None else f"address {address_key(client)}"
+        if self._holders[holder] >= self._per_user or len(self._sessions) >= self._total:
+            limit = f"{self._per_user} of one user and {self._total} in all"
+            refusal = problem(429, "too many sockets", f"WebSockets: expected at most {limit}")
+            with contextlib.suppress(RuntimeError):  # a server without denial responses has closed the socket
+                await socket.send_denial_response(refusal)
+            yield None
+            return
+        session = Session(socket, caller, token, asyncio.get_running_loop().create_future())
+        self._sessions.add(session)
+        self._holders[holder] += 1
+        try:
+            yield session
+        finally:
+            self._sessions.discard(session)
+            self._readers.discard(session)
+            self._holders[holder] -= 1
+            if self._holders[holder] <= 0:
+                del self._holders[holder]
+            session.end(POLICY_VIOLATION)
+
+    async def follow(self, session: Session, after: int | None) -> None:
+        """Open a socket and send it the feed until cancelled: first messages after a number, then new messages.
+
+        Without a number, only messages after the opening of the socket are sent.
+        """
+        newest = await run_in_threadpool(last_number, self._ground)
+        if not self._readers:
+            self._number = newest
+        self._readers.add(session)
+        await session.accept()
+        number = newest if after is None else after
+        known = self._number  # later messages are queued for the session
+        at = number
+        while at < known:
+            async with self._replays:
+                items = await run_in_threadpool(read_feed, self._ground, at, BATCH)
+            for item in items:
+                if item["id"] <= known:
+                    await session.socket.send_text(text_of(item))
+            at = items[-1]["id"] if items else known
+        number = max(number, known)
+        while True:
+            at, text = await session.messages.get()
+            if at > number:
+                await session.socket.send_text(text)
+
+    async def run(self) -> None:
+        """Read the feed for all sockets and verify their callers until cancelled."""
+        await asyncio.gather(self._read(), self._verify())
+
+    async def _read(self) -> None:
+        while True:
+            await asyncio.sleep(POLL_S)
+            if not self._readers:
+                continue
+            try:
+                items = await run_in_threadpool(read_feed, self._ground, self._number, BATCH)
+            except GroundError as error:
+                log.warning("the feed cannot be read: %s", error)
+                continue
+            for item in items:
+                text = text_of(item)
+                for session in self._readers:
+                    session.offer(item["id"], text)
+                self._number = item["id"]
+
+    async def _verify(self) -> None:
+        while True:
+            await asyncio.sleep(VERIFY_S)
+            for token in {session.token for session in self._sessions}:
+                holders = [session for session in self._sessions if session.token == token]
+                try:
+                    caller = await run_in_threadpool(self._verified, token)
+                except GroundError as error:
+                    log.warning("callers of open sockets cannot be verified: %s", error)
+                    for session in holders:
+                        session.end(TRY_AGAIN_LATER)
+                    continue
+                for session in holders:
+                    if caller is None or not caller.may("viewer"):
+                        session.end(POLICY_VIOLATION)
+                    else:
+                        session.caller = caller
+
+    def _verified(self, token: str | None) -> Caller | None:
+        """Return the caller of a token; the local user if there are no users."""
+        if token is None:
+            return LOCAL_CALLER if self._open_without_users and not has_users(self._ground) else None
+        try:
+            return authenticate(self._ground, token)
+        except NotAuthorised:
+            return None
+
+
+async def until_over(session: Session, *work: Any) -> None:
+    """Run tasks concurrently until the first one ends, the client disconnects, or the session is ended."""
+    tasks = [asyncio.ensure_future(one) for one in work]
+    try:
+        await asyncio.wait([*tasks, session.ended], return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
+    for task in tasks:
+        error = None if task.cancelled() else task.exception()
+        if error is not None and not isinstance(error, WebSocketDisconnect | RuntimeError):
+            raise error
+    if session.ended.done():
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError, TimeoutError):
+            async with asyncio.timeout(CLOSE_S):
+                await session.socket.close(session.ended.result())
+
+
+async def until_gone(socket: WebSocket) -> None:
+    """Discard the messages of the client until it disconnects."""
+    with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+        while (await socket.receive())["type"] != "websocket.disconnect":
+            pass
+
+
+def token_of(socket: WebSocket) -> str | None:
+    """Return the token of the Authorization header or of the sub-protocol ``bearer``; None without one."""
+    protocols = [value.strip() for value in socket.headers.get("sec-websocket-protocol", "").split(",")]
+    scheme, _, token = socket.headers.get("authorization", "").partition(" ")
+    if scheme.lower() == "bearer":
+        return token.strip()
+    return protocols[1] if len(protocols) == 2 and protocols[0] == "bearer" else None
+
+
+def text_of(item: dict[str, Any]) -> str:
+    """Return a message of the feed as text."""
+    message = {
+        "sequence": item["id"],
+        "time": time_text(item["utc_ns"]),
+        "kind": item["kind"],
+        "payload": item["payload"],
+    }
+    return json.dumps(message, separators=(",", ":"), ensure_ascii=False)

@@ -1,0 +1,212 @@
+"""Backup and restore of the service as a folder, during operation, with SQLite and PostgreSQL.
+
+The folder contains a SQLite database of the same schema, the files of the archive, and a manifest with the SHA-256 of
+every table and of the list of files and the head of the audit chain. A restore verifies everything before it writes,
+and requires an empty service.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import asdict
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, Table, select
+
+from ground_service.errors import Conflict, FileDamaged, InvalidInput, NotFound, storage_error
+from ground_service.ground import Ground
+from ground_service.store import audit, row_digests, rows
+from ground_service.store.database import Database, prepare_database, schema_revisions
+from ground_service.store.files import (
+    FileArchive,
+    StoredFile,
+    make_durable_folder,
+    read_blocks,
+    replace_durably,
+)
+from ground_service.store.models import Base
+from lunar.timescales import format_utc
+
+SCHEMA_VERSION = 2
+MANIFEST = "backup.json"
+DATABASE = "linna.db"
+FILES = "files"
+DAMAGE_LISTED = 20
+
+
+def backup(ground: Ground, out: Path, *, now_utc_ns: int) -> dict[str, Any]:
+    """Write a backup into a new folder; return its manifest.
+
+    `damaged` in the manifest lists rows of the service that do not match their digests; the backup contains them
+    unchanged.
+
+    Raises
+    ------
+    Conflict
+        If the folder exists already.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise Conflict(f"{out}: expected a folder that is new or empty, found something in it")
+    partial = out.with_name(f".{out.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        make_durable_folder(out.parent)
+        partial.mkdir()
+        copy = prepare_database(f"sqlite:///{partial / DATABASE}")
+        try:
+            with ground.database.snapshot() as connection:
+                damaged = [
+                    f"{one.table} {one.key}: {one.reason}"
+                    for one in islice(_strays(connection), DAMAGE_LISTED)
+                ]
+                _copy_rows(connection, copy)
+            with copy.reading() as connection:
+                tables = rows.table_digests(connection)
+                head = audit.read_head(connection)
+                names = _file_names(connection)
+        finally:
+            copy.engine.dispose()
+        octets = 0
+        for sha256 in names:
+            octets += _copy_file(ground.files.path(sha256), FileArchive(partial / FILES), sha256)
+        manifest = {
+            "schema_version": SCHEMA_VERSION,
+            "made_utc": format_utc(now_utc_ns),
+            "revision": schema_revisions(ground.database)[0],
+            "rows": {name: table.rows for name, table in tables.items()},
+            "tables": {name: table.sha256 for name, table in tables.items()},
+            "files": len(names),
+            "files_sha256": _list_sha256(names),
+            "octets": octets,
+            "audit_head": asdict(head) if head is not None else None,
+            "damaged": damaged,
+        }
+        (partial / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
+        if out.exists():
+            out.rmdir()
+        replace_durably(partial, out)
+    except OSError as error:
+        raise storage_error(error, out) from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return manifest
+
+
+def restore(folder: Path, ground: Ground) -> dict[str, Any]:
+    """Restore a verified backup into an empty service; return its manifest.
+
+    Raises
+    ------
+    InvalidInput
+        If the folder is not a backup, or a row in it was changed.
+    FileDamaged, NotFound
+        If a file in it was changed or is missing.
+    Conflict
+        If the service is not empty.
+    """
+    manifest = _manifest(folder)
+    with ground.database.reading() as connection:
+        filled = rows.first_filled_table(connection)
+    if filled is not None:
+        raise Conflict(f"{ground.database.label}: expected an empty service, found rows in {filled}")
+    source = prepare_database(f"sqlite:///{folder / DATABASE}", upgrade=False)
+    try:
+        with source.snapshot() as connection:
+            _check_rows(folder, connection, manifest)
+            names = _file_names(connection)
+            for sha256 in names:
+                _check_file(FileArchive(folder / FILES), sha256)
+            for sha256 in names:
+                _copy_file(FileArchive(folder / FILES).path(sha256), ground.files, sha256)
+            _copy_rows(connection, ground.database)
+    except OSError as error:
+        raise storage_error(error, ground.home) from None
+    finally:
+        source.engine.dispose()
+    return manifest
+
+
+def _manifest(folder: Path) -> dict[str, Any]:
+    path = folder / MANIFEST
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InvalidInput(str(folder), "", f"a backup with {MANIFEST}", "none") from None
+    except (OSError, ValueError) as error:
+        raise InvalidInput(str(path), "", "a JSON object", str(error)[:80]) from None
+    if not isinstance(manifest, dict) or manifest.get("schema_version") != SCHEMA_VERSION:
+        raise InvalidInput(str(path), "schema_version", str(SCHEMA_VERSION), "another")
+    for key in ("rows", "tables", "files_sha256", "audit_head"):
+        if key not in manifest:
+            raise InvalidInput(str(path), key, "an entry", "none")
+    return manifest
+
+
+def _check_rows(folder: Path, connection: Connection, manifest: dict[str, Any]) -> None:
+    """Compare every table, the list of files and the audit chain of a backup with its manifest."""
+    for name, table in rows.table_digests(connection).items():
+        if manifest["rows"].get(name) != table.rows:
+            raise InvalidInput(
+                str(folder / DATABASE), name, f"{manifest['rows'].get(name)} rows", str(table.rows)
+            )
+        if manifest["tables"].get(name) != table.sha256:
+            raise InvalidInput(str(folder / DATABASE), name, "the rows that were saved", "changed rows")
+    if _list_sha256(_file_names(connection)) != manifest["files_sha256"]:
+        raise InvalidInput(str(folder / DATABASE), "files", "the files that were saved", "a changed list")
+    head = audit.read_head(connection)
+    if head is None or asdict(head) != manifest["audit_head"]:
+        raise InvalidInput(str(folder / MANIFEST), "audit_head", "the head of the audit chain", "another")
+    broken = next(audit.broken_entries(connection), None)
+    if broken is not None:
+        raise InvalidInput(
+            str(folder / DATABASE), f"audit {broken.number}", "a complete chain", broken.reason
+        )
+
+
+def _strays(connection: Connection) -> Iterator[row_digests.StrayRow]:
+    for table in row_digests.guarded_tables():
+        yield from row_digests.stray_rows(connection, table)
+
+
+def _file_names(connection: Connection) -> list[str]:
+    table: Table = Base.metadata.tables["files"]
+    return sorted(connection.execute(select(table.c.sha256)).scalars())
+
+
+def _list_sha256(names: list[str]) -> str:
+    return hashlib.sha256("\n".join(names).encode()).hexdigest()
+
+
+def _copy_rows(connection: Connection, target: Database) -> None:
+    """Copy every row that a connection sees into another, empty database, in one transaction."""
+    with target.writing() as writing:
+        for table in rows.copied_tables():
+            rows.insert_rows(writing, table, rows.row_blocks(connection, table))
+        rows.advance_sequences(writing)
+
+
+def _check_file(files: FileArchive, sha256: str) -> None:
+    path = files.path(sha256)
+    if not path.is_file():
+        raise NotFound("file", f"{sha256} in {files.root}")
+    digest = hashlib.sha256()
+    for block in read_blocks(path):
+        digest.update(block)
+    if digest.hexdigest() != sha256:
+        raise FileDamaged(path, sha256, digest.hexdigest())
+
+
+def _copy_file(source: Path, files: FileArchive, sha256: str) -> int:
+    """Copy a file into an archive and verify its hash; return its number of octets."""
+    if not source.is_file():
+        raise NotFound("file", f"{sha256} in {source.parent.parent}")
+    stored: StoredFile = files.put_file(source)
+    if stored.sha256 != sha256:
+        stored.path.unlink(missing_ok=True)
+        raise FileDamaged(source, sha256, stored.sha256)
+    return stored.octets

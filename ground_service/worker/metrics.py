@@ -1,0 +1,112 @@
+"""Figures for Prometheus: what was asked of the service, how long it took, and how its work stands."""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+import uuid
+
+from prometheus_client import (
+    CONTENT_TYPE_LATEST,
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    Histogram,
+    generate_latest,
+)
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from ground_service.ground import Ground
+from ground_service.worker.backlog import work_counts
+
+BUCKETS = (0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 30.0)
+
+
+class Metrics:
+    """The figures of one application."""
+
+    def __init__(self) -> None:
+        self._registry = CollectorRegistry()
+        self.requests = Counter(
+            "linna_http_requests", "Requests answered", ("method", "route", "status"), registry=self._registry
+        )
+        self.seconds = Histogram(
+            "linna_http_request_seconds",
+            "Time from request to answer",
+            ("method", "route"),
+            buckets=BUCKETS,
+            registry=self._registry,
+        )
+        self._jobs = Gauge("linna_jobs", "Jobs by state", ("kind", "state"), registry=self._registry)
+        self._ingests = Gauge("linna_ingests", "Ingests by state", ("state",), registry=self._registry)
+        self._passes = Gauge("linna_passes", "Passes", registry=self._registry)
+
+    def answer(self, ground: Ground) -> Response:
+        """All figures, those of the work read from the database now."""
+        counts = work_counts(ground)
+        # A state that nothing is in any more has no row, and must not keep its last count.
+        self._jobs.clear()
+        self._ingests.clear()
+        for (kind, state), count in counts.jobs.items():
+            self._jobs.labels(kind, state).set(count)
+        for state, count in counts.ingests.items():
+            self._ingests.labels(state).set(count)
+        self._passes.set(counts.passes)
+        return Response(generate_latest(self._registry), media_type=CONTENT_TYPE_LATEST)
+
+
+log = logging.getLogger(__name__)
+
+_UNLOGGED = ("/healthz", "/readyz", "/metrics")
+_REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+
+
+class Watch:
+    """Counts, times and logs every request; counts by its route, never by its path, so that there are few series.
+
+    Each has an id, the caller's own or a new one: it is in the answer (X-Request-ID) and in the log.
+    """
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+        self._app = app
+        self._metrics = metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        started = time.perf_counter()
+        status = 500
+        given = Headers(scope=scope).get("x-request-id", "")
+        request_id = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex[:16]
+        scope.setdefault("state", {})["request_id"] = request_id
+
+        async def noted(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                MutableHeaders(scope=message)["X-Request-ID"] = request_id
+            await send(message)
+
+        try:
+            await self._app(scope, receive, noted)
+        finally:
+            route = getattr(scope.get("route"), "path", "none")
+            took_s = time.perf_counter() - started
+            self._metrics.requests.labels(scope["method"], route, status).inc()
+            self._metrics.seconds.labels(scope["method"], route).observe(took_s)
+            if scope["path"] not in _UNLOGGED:
+                told = {
+                    "request_id": request_id,
+                    "method": scope["method"],
+                    "path": scope["path"],
+                    "route": route,
+                    "status": status,
+                    "ms": round(1e3 * took_s, 1),
+                    "caller": scope["state"].get("caller"),
+                    "address": (scope.get("client") or (None,))[0],
+                }
+                log.info("%s %s %d", scope["method"], scope["path"], status, extra=told)

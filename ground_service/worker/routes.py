@@ -1,0 +1,33 @@
+"""What a deployment watches the service with."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request, Response
+
+from ground_service.http import schemas
+from ground_service.http.common import GroundOf
+from ground_service.store import repository
+
+operations = APIRouter(include_in_schema=False)
+
+
+@operations.get("/healthz")
+async def healthz() -> schemas.Health:
+    """Report that the process is alive; `front` answers this if it is the first request of a connection."""
+    return schemas.Health(status="ok")
+
+
+@operations.get("/readyz")
+def readyz(ground: GroundOf) -> schemas.Health:
+    """The service can be used: its database answers and takes what is written, and so does the archive of files."""
+    with ground.database.reading() as connection:
+        repository.page(connection, repository.JOBS, limit=1)
+    ground.database.require_writable()
+    ground.files.require_writable()
+    return schemas.Health(status="ok")
+
+
+@operations.get("/metrics")
+def metrics(request: Request, ground: GroundOf) -> Response:
+    """Figures for Prometheus."""
+    return request.app.state.metrics.answer(ground)
