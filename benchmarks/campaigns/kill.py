@@ -237,9 +237,11 @@ def work_meanwhile(
         round_ = 0
         while harassment.is_alive() and not over.is_set():
             patient = time.monotonic() + ROUND_S
-            first = ledger.jobs[round_ * pieces // 2]
+            first = round_ * pieces // 2
             while harassment.is_alive() and time.monotonic() < patient:
-                if sessions[0].get(f"/jobs/{first}")["state"] in ENDS:
+                # A piece taken by a client counts as accepted only once its job is known.
+                known = ledger.jobs[first : first + 1]
+                if known and sessions[0].get(f"/jobs/{known[0]}")["state"] in ENDS:
                     break
                 over.wait(0.5)
             round_ += 1

@@ -165,5 +165,5 @@ def test_nothing_writes_a_state_but_the_store() -> None:
     assert found == []
 
 
-_ELSEWHERE = (Path(ground_service.__file__).parent / "services" / "ingest.py",)
+_ELSEWHERE = (Path(ground_service.__file__).parent / "ingest" / "service.py",)
 """An ingest is done by its job alone."""

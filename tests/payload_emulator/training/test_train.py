@@ -168,7 +168,8 @@ def test_a_run_killed_and_resumed_reaches_the_figures_of_one_left_alone(blob_dat
     parameters = replace(SHORT, steps=5, batch=2, crop_px=96, replicas=1, validate_every_minutes=0.0)
     code = (
         "import sys, time; from dataclasses import replace; from pathlib import Path\n"
-        "from payload_emulator.training.model import train as t; from payload_emulator.training.data.dataset import Dataset\n"
+        "from payload_emulator.training.model import train as t\n"
+        "from payload_emulator.training.data.dataset import Dataset\n"
         "from payload_emulator.training.data.feeder import TrainParameters\n"
         "save = t._save\n"
         "def slow(path, *rest):\n"
