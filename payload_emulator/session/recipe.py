@@ -27,6 +27,8 @@ PAPER_SHARES = (0.80, 0.15, 0.05)
 TERRAINS = ("procedural", "real", "catalogue")
 LIGHTS = ("wide", "low", "paper")
 DEPTHS = (8, 16)
+COLOURS = ("gray", "rgb")
+FOOTPRINTS = ("inside", "centre")
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +59,9 @@ class Source:
         `step_s` where the sub-satellite latitude is within `latitude_limit_deg` (the paper, section V-B.4) and the
         footprint is on the terrain. `altitude_km` does not apply.
     sharpen : real terrain gets seeded craters and roughness below what its rasters resolve.
+    footprint : "inside" keeps whole footprints in the boxes and clear of those to avoid; "centre" only the point below
+        the camera, for footprints wider than a box. Such frames are scored on the ground of their boxes alone.
+    label_minimum_px : apparent diameter from which catalogued craters are listed.
     """
 
     name: str
@@ -75,11 +80,18 @@ class Source:
     days: float = 1.0
     latitude_limit_deg: float = 60.0
     sharpen: bool = True
+    footprint: str = "inside"
+    label_minimum_px: float = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """A data set up to its number of frames. `bits` is the depth of the images, 8 or 16."""
+    """A data set up to its number of frames.
+
+    bits : depth of the images, 8 or 16.
+    colour : "gray", the mean of the camera's channels, or "rgb", the channels as the camera gives them (the paper,
+        section IV-A).
+    """
 
     name: str
     seed: int
@@ -90,10 +102,11 @@ class Recipe:
     frames_per_shard: int = 20
     bits: int = 8
     renderer: str = "fast"
+    colour: str = "gray"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values; what came later than the first data sets is left out where it is not used."""
-        document = _without_defaults(asdict(self), {"bits": 8, "renderer": "fast"})
+        document = _without_defaults(asdict(self), {"bits": 8, "renderer": "fast", "colour": "gray"})
         document["sources"] = [_source_dict(source) for source in document["sources"]]
         return document
 
@@ -105,7 +118,7 @@ class Recipe:
 
 def _source_dict(source: dict[str, Any]) -> dict[str, Any]:
     """A source's values; of an ephemeris only the name, as its folder says nothing about the frames."""
-    source = _without_defaults(source, {"sharpen": True})
+    source = _without_defaults(source, {"sharpen": True, "footprint": "inside", "label_minimum_px": 5.0})
     if source["ephemeris"]:
         return source | {"ephemeris": Path(source["ephemeris"]).name}
     return {
@@ -162,6 +175,8 @@ def load_recipe(path: Path) -> Recipe:
             raise DatasetError(f"{path}: dataset.{key}: expected a value, found none")
     if settings.get("bits", 8) not in DEPTHS:
         raise DatasetError(f"{path}: dataset.bits: expected 8 or 16, found {settings['bits']!r}")
+    if settings.get("colour", "gray") not in COLOURS:
+        raise DatasetError(f"{path}: dataset.colour: expected gray or rgb, found {settings['colour']!r}")
     return Recipe(sources=tuple(_source(path, n, item) for n, item in enumerate(sources)), **settings)
 
 
@@ -173,7 +188,12 @@ def _source(path: Path, number: int, table: Mapping[str, Any]) -> Source:
         if key not in values:
             raise DatasetError(f"{path}: {where}: {key}: expected a value, found none")
     splits = (*SPLITS, PAPER_SPLIT) if values.get("ephemeris") else SPLITS
-    for key, allowed in (("split", splits), ("terrain", TERRAINS), ("light", LIGHTS)):
+    for key, allowed in (
+        ("split", splits),
+        ("terrain", TERRAINS),
+        ("light", LIGHTS),
+        ("footprint", FOOTPRINTS),
+    ):
         if key in values and values[key] not in allowed:
             raise DatasetError(
                 f"{path}: {where}: {key}: expected one of {', '.join(allowed)}, found {values[key]!r}"
@@ -183,6 +203,11 @@ def _source(path: Path, number: int, table: Mapping[str, Any]) -> Source:
             f"{path}: {where}: sharpen: expected true or false on real terrain, found {values['sharpen']!r} "
             f"on {values['terrain']} terrain"
         )
+    if "label_minimum_px" in values:
+        least = values["label_minimum_px"]
+        if isinstance(least, bool) or not isinstance(least, (int, float)) or not 1.0 <= least <= 50.0:
+            raise DatasetError(f"{path}: {where}: label_minimum_px: expected 1 to 50, found {least!r}")
+        values["label_minimum_px"] = float(least)
     for key in ("boxes", "avoid"):
         if key in values:
             values[key] = tuple(_box(path, f"{where}: {key}", item) for item in values[key])

@@ -23,7 +23,7 @@ from payload_emulator.training.data.shots import Pose, draw_photometry, draw_sen
 Floats = NDArray[np.float64]
 
 _LABEL_MINIMUM_M = 2_000.0
-_LABEL_MINIMUM_PX = 5.0
+_HIGHEST_GROUND_M = 11_000.0  # above the map sphere
 _STAMPED_MINIMUM_PX = 9.0
 _BLOCK_DEG = 8.0
 _TRIES_OF_LIGHT = 20
@@ -87,7 +87,7 @@ def take_frame(
         if prepare_image(coarse).quality is ImageQuality.OK:
             break
     position, rotation = pose.position_mcmf_m, pose.camera_from_mcmf
-    craters = _label(terrain, camera, position, rotation, rendering)
+    craters = _label(terrain, camera, pose, rendering, source.label_minimum_px)
     small = stamped_craters(terrain, camera, position, rotation, coarse)
     craters = {key: np.concatenate([craters[key], small[key]]) for key in craters}
     latitude_deg, longitude_deg = math.degrees(pose.latitude_rad), math.degrees(pose.longitude_rad) % 360.0
@@ -161,16 +161,19 @@ def _exposed(
 
 
 def _label(
-    terrain: Any, camera: PinholeCamera, position: Floats, rotation: Floats, rendering: Any
+    terrain: Any, camera: PinholeCamera, pose: Pose, rendering: Any, least_px: float
 ) -> dict[str, NDArray[Any]]:
     """Catalogued craters in view with what scoring and training need to know of each."""
     from payload_emulator.sim.render.labels import label_frame
 
-    labels = label_frame(terrain, camera, position, rotation, _LABEL_MINIMUM_M, rendering.lit)
+    position, rotation = pose.position_mcmf_m, pose.camera_from_mcmf
+    # No crater of fewer metres has `least_px` even on the highest ground straight below; tilt is a few degrees at most.
+    resolved_m = 0.95 * least_px * (pose.altitude_m - _HIGHEST_GROUND_M) / camera.focal_px
+    labels = label_frame(terrain, camera, position, rotation, max(_LABEL_MINIMUM_M, resolved_m), rendering.lit)
     measured = terrain.measured(labels.index)
     points = (measured.position_mcmf_m - position) @ rotation.T
     diameter_px = camera.focal_px * measured.diameter_m / points[:, 2]
-    chosen = np.flatnonzero((diameter_px >= _LABEL_MINIMUM_PX) & measured.complete)
+    chosen = np.flatnonzero((diameter_px >= least_px) & measured.complete)
     near = measured.select(chosen)
     u, v = labels.u_px[chosen], labels.v_px[chosen]
     distance = np.linalg.norm(points[chosen], axis=1)

@@ -69,11 +69,11 @@ def draw_pose(
         turn = draw_pointing(source.vary, rng)
         position = np.asarray(mcmf_from_spherical(latitude, longitude, altitude_m))
         rotation = turn @ nadir_camera_from_mcmf(position)
-        ground = ground_point_sphere(camera, rotation, position, edge)
-        if not np.isfinite(ground).all():
-            continue
+        ground = footprint_edge(camera, rotation, position, edge)
         edge_latitude, edge_longitude, _ = spherical_from_mcmf(ground)
-        if not allowed(source, box, np.degrees(edge_latitude), np.degrees(edge_longitude)):
+        if source.footprint == "inside" and not allowed(
+            source, box, np.degrees(edge_latitude), np.degrees(edge_longitude)
+        ):
             continue
         if not np.all(terrain.covers(edge_latitude, edge_longitude)):
             continue
@@ -106,7 +106,7 @@ def pose_at(
     """
     latitude, longitude, altitude_m = (float(value) for value in spherical_from_mcmf(position_mcmf_m))
     rotation = draw_pointing(source.vary, rng) @ nadir_camera_from_mcmf(position_mcmf_m)
-    ground = ground_point_sphere(camera, rotation, position_mcmf_m, edge_pixels(camera))
+    ground = footprint_edge(camera, rotation, position_mcmf_m, edge_pixels(camera))
     heights = _heights_in_view(terrain, ground)
     under = float(heights[-1])
     if altitude_m <= under:
@@ -129,6 +129,24 @@ def _heights_in_view(terrain: Any, edge_mcmf_m: Floats) -> Floats:
     inner = np.concatenate([0.5 * (edge_mcmf_m + middle), middle[None]])
     latitude, longitude, _ = spherical_from_mcmf(inner)
     return np.asarray(terrain.height_m(latitude, longitude, MEASURE_LEVEL))
+
+
+def footprint_edge(camera: PinholeCamera, camera_from_mcmf: Floats, position_mcmf_m: Floats, uv: Floats) -> Floats:
+    """Points (n, 3) of the map sphere that pixels (n, 2) see, MCMF m; where a pixel sees the sky, the horizon below it.
+
+    At 150 km a camera of 120 degrees sees the sky in its corners (67.8 degrees off nadir, horizon at 67.0).
+    """
+    ground = ground_point_sphere(camera, camera_from_mcmf, position_mcmf_m, uv)
+    sky = ~np.isfinite(ground).all(axis=-1)
+    if sky.any():
+        distance = float(np.linalg.norm(position_mcmf_m))
+        up = position_mcmf_m / distance
+        rays = camera.rays(uv)[sky] @ camera_from_mcmf
+        level = rays - (rays @ up)[:, None] * up
+        level /= np.linalg.norm(level, axis=1)[:, None]
+        cosine = MOON_RADIUS_M / distance
+        ground[sky] = MOON_RADIUS_M * (cosine * up + math.sqrt(1.0 - cosine**2) * level)
+    return ground
 
 
 def _about(box: Box, latitude_deg: float, longitude_deg: float) -> Box:
