@@ -132,6 +132,15 @@ class Catalogue(Section):
     registration_east_m: float | None = None
 
 
+class Detector(Section):
+    """Crater network on board: name, hash of its file, threshold in force, largest number of detections of a frame."""
+
+    network: str | None = None
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = None
+    score_threshold: Share | None = None
+    max_detections: Annotated[int, Field(ge=1)] | None = None
+
+
 class Reference(Section):
     """Source of the reference ephemeris, and its 1-sigma error in radial, transverse and normal."""
 
@@ -270,6 +279,7 @@ class Mission(Section):
     frames: Frames = Frames()
     camera: Camera = Camera()
     catalogue: Catalogue = Catalogue()
+    detector: Detector = Detector()
     reference: Reference = Reference()
     evidence: Evidence = Evidence()
     requirements: Requirements = Requirements()

@@ -121,6 +121,8 @@ def world_at(scenario: Scenario, data: DataFolder, epochs_utc_ns: Sequence[int])
         start=format_utc(last, 9),
         duration_s=scenario.camera.frame_interval_s,
         latitude_limit_deg=90.0,
+        latitude_min_deg=-90.0,
+        latitude_max_deg=90.0,
     )
     world = build_world(replace(scenario, window=window), data)
     require_above_ground(world.truth, np.array(sorted(epochs_utc_ns), dtype=np.int64), world.terrain.height_m)

@@ -24,7 +24,7 @@ from lunar.frames import IauOrientation, Orientation
 from lunar.gravity import GravityField, builtin_gravity, load_gravity
 from lunar.timescales import format_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
 from payload_emulator.errors import ModelError
-from payload_emulator.flight.models import load_shipped_model
+from payload_emulator.flight.models import NETWORKS, load_shipped_model
 from payload_emulator.flight.navigation.anchored import AnchoredParameters
 from payload_emulator.flight.navigation.filter import CommonErrors
 from payload_emulator.flight.navigation.odometry import OdometryParameters
@@ -109,7 +109,6 @@ def load_payload(
     data: DataFolder,
     first_frame_utc_ns: int,
     burns: Sequence[TrueBurn] = (),
-    model: Path | None = None,
 ) -> LoadedPayload:
     """Flight software with its tables, for a window that starts at `first_frame_utc_ns`.
 
@@ -118,11 +117,11 @@ def load_payload(
     ModelError
         The detector model is missing or no network of this project.
     """
-    model_octets = _model_octets(model)
+    model_octets = network_octets(scenario.detector.network)
     navigation = scenario.navigation
     field = filter_field(navigation.filter_gravity, navigation.filter_degree, data)
     chosen = BuildParameters(
-        DetectorParameters(width_px=camera.width_px, height_px=camera.height_px),
+        detector_parameters(scenario),
         FlightParameters(
             camera=camera,
             modes=tuple(Mode[name] for name in navigation.estimators),
@@ -301,10 +300,30 @@ def _anchor_table(reference: Ephemeris, orientation: Orientation) -> bytes:
     )
 
 
-def _model_octets(model: Path | None) -> bytes:
+def detector_parameters(scenario: Scenario) -> DetectorParameters:
+    """Return the parameters of the detector that a scenario states."""
+    section, camera = scenario.detector, scenario.camera
+    return DetectorParameters(
+        score_threshold=None if section.score_threshold < 0.0 else section.score_threshold,
+        max_detections=section.max_detections,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+    )
+
+
+def network_octets(name: str) -> bytes:
+    """Return the octets of the network that a scenario names: a shipped one, or an ONNX file.
+
+    Raises
+    ------
+    ModelError
+        The name is neither.
+    """
+    if name in NETWORKS:
+        return load_shipped_model(name)
     try:
-        return load_shipped_model() if model is None else model.read_bytes()
-    except FileNotFoundError:
+        return Path(name).read_bytes()
+    except OSError as error:
         raise ModelError(
-            f"detector model {model or 'shipped with flight'}: expected an ONNX file, found none"
+            f"detector.network: expected {', '.join(NETWORKS)} or an ONNX file, found {name!r} ({error.strerror})"
         ) from None

@@ -18,8 +18,10 @@ from lunar.arrays import BoolArray, FloatArray
 from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder
 from lunar.frames import IauOrientation, spherical_from_mcmf
+from payload_emulator.flight.models import NETWORKS
+from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.session.flying import PLAYBACK_CHANNEL, SPACECRAFT_ID
-from payload_emulator.session.loading import filter_field
+from payload_emulator.session.loading import detector_parameters, filter_field, network_octets
 from payload_emulator.session.recipe import Box, Source, load_recipe
 from payload_emulator.session.recording import StepInput
 from payload_emulator.session.scenario import SHIPPED, RequirementsSection, Scenario
@@ -105,6 +107,7 @@ def mission_text(world: World, data: DataFolder) -> str:
             "registration_north_m": world.terrain.registration_north_m,
             "registration_east_m": world.terrain.registration_east_m,
         },
+        "detector": _detector(scenario),
         "reference": _reference(scenario),
         "evidence": _evidence(world),
         "requirements": _requirements(scenario),
@@ -209,6 +212,18 @@ def _evidence(world: World) -> dict[str, Value]:
         share = unseen_share(world)
         return {"world": "real-terrain", "seed": world.scenario.seed, "unseen_share": share}
     return {"world": "procedural", "seed": world.scenario.seed}
+
+
+def _detector(scenario: Scenario) -> dict[str, Value]:
+    """Network on board with the threshold in force."""
+    section = scenario.detector
+    onnx = OnnxDetector(network_octets(section.network), detector_parameters(scenario))
+    return {
+        "network": section.network if section.network in NETWORKS else Path(section.network).name,
+        "sha256": onnx.sha256,
+        "score_threshold": onnx.score_threshold,
+        "max_detections": section.max_detections,
+    }
 
 
 def _reference(scenario: Scenario) -> dict[str, Value]:

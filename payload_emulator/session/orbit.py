@@ -12,7 +12,7 @@ from lunar.datafolder import DataFolder, default_gravity, default_orientation
 from lunar.elements import Elements, icrf_state_from_elements, state_from_elements
 from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.errors import ImpactError
-from lunar.frames import IauOrientation, Orientation
+from lunar.frames import IauOrientation, Orientation, mci_from_icrf
 from lunar.gravity import GravityField, builtin_gravity, load_gravity
 from lunar.maneuvers import Maneuver, ManeuverRule, propagate_with_maneuvers
 from lunar.propagation import ForceModel, SolarPressure, Trajectory, propagate
@@ -69,8 +69,14 @@ def force_model(scenario: Scenario, data: DataFolder) -> ForceModel:
 
 
 def initial_state_icrf(scenario: Scenario, gm_m3_s2: float) -> FloatArray:
-    """Position (m) and velocity (m/s), shape (6,), Moon-centred ICRF axes, of a scenario's elements at its epoch."""
+    """Position (m) and velocity (m/s), shape (6,), Moon-centred ICRF axes, of a scenario's orbit at its epoch."""
     orbit = scenario.orbit
+    if orbit.position_km:
+        state = 1e3 * np.array([*orbit.position_km, *orbit.velocity_km_s])
+        if orbit.frame == "ICRF":
+            return state
+        icrf_from_mci = np.asarray(mci_from_icrf(tdb_s_from_utc_ns(scenario.epoch_utc_ns))).T
+        return np.concatenate([icrf_from_mci @ state[:3], icrf_from_mci @ state[3:]])
     elements = Elements(
         orbit.semi_major_axis_km * 1e3,
         orbit.eccentricity,
@@ -96,7 +102,7 @@ def propagate_scenario(scenario: Scenario, model: ForceModel, duration_s: float)
     """
     if scenario.orbit.oem:
         raise ScenarioError(
-            f"scenario {scenario.name}: expected orbital elements to propagate, "
+            f"scenario {scenario.name}: expected orbital elements or a state to propagate, "
             f"found the ephemeris {scenario.orbit.oem}"
         )
     epoch_tdb_s = tdb_s_from_utc_ns(scenario.epoch_utc_ns)

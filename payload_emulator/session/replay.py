@@ -8,13 +8,14 @@ can be told from a slow build.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import time
 import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 from lunar.arrays import FloatArray
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import ModelError, ParameterError, RecordError
-from payload_emulator.flight.models import load_shipped_model
+from payload_emulator.flight.models import DEFAULT_NETWORK, NETWORKS, load_shipped_model
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.flight.payload import Payload
 from payload_emulator.flight.ports import UNLIMITED, BareBoard, ResetCause
@@ -57,7 +58,10 @@ YARDSTICK_EVERY = 3
 
 @dataclass(frozen=True, slots=True)
 class FlightBuild:
-    """A build on the current flight code: a network (None: the shipped one) and changes to the flown parameters."""
+    """A build on the current flight code: a network and changes to the flown parameters.
+
+    Without a network, the shipped one that the pass was flown with is used, or the default network if that is unknown.
+    """
 
     name: str = "current"
     version: str = ""
@@ -154,7 +158,7 @@ def replay_archive(
         )
     images = rendered_images(archive, record, data) if lacking and data else stored_images(archive, record)
     started = time.monotonic()
-    flown = replay(record, images, build, progress=progress)
+    flown = replay(record, images, _with_network(build, manifest), progress=progress)
     wall_s = time.monotonic() - started
     out.mkdir(parents=True, exist_ok=True)
     octets = encode_cadus(
@@ -244,6 +248,15 @@ def replay(
         {name: stages[:, i] for i, name in enumerate(STAGES)},
         np.array(yardstick_ms),
     )
+
+
+def _with_network(build: FlightBuild, manifest: dict[str, Any]) -> FlightBuild:
+    if build.model is not None:
+        return build
+    flown = str(dict(manifest.get("build") or {}).get("model_sha256", ""))
+    shipped = {name: load_shipped_model(name) for name in NETWORKS}
+    same = [octets for octets in shipped.values() if hashlib.sha256(octets).hexdigest() == flown]
+    return replace(build, model=same[0] if same else shipped[DEFAULT_NETWORK])
 
 
 def parameters_of(build: FlightBuild, flown: BuildParameters) -> BuildParameters:

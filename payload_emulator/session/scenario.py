@@ -9,7 +9,7 @@ import dataclasses
 import difflib
 import math
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import UnionType
@@ -27,7 +27,11 @@ SHIPPED = Path(__file__).resolve().parents[2] / "scenarios"
 
 @dataclass(frozen=True, slots=True)
 class OrbitSection:
-    """Where the spacecraft is at the epoch: Keplerian elements (osculating), or an OEM file that flies the truth."""
+    """Where the spacecraft is at the epoch: osculating Keplerian elements, a Cartesian state, or an OEM file.
+
+    `position_km` and `velocity_km_s` (three numbers each, axes of `frame`) replace the elements. An OEM file gives the
+    whole trajectory.
+    """
 
     epoch: str = "2029-08-07T00:00:00Z"
     frame: Literal["MCI", "ICRF"] = "MCI"
@@ -37,6 +41,8 @@ class OrbitSection:
     raan_deg: float = 3.164
     argument_of_perilune_deg: float = 333.604
     true_anomaly_deg: float = 8.882
+    position_km: tuple[float, ...] = ()
+    velocity_km_s: tuple[float, ...] = ()
     oem: str = ""
 
 
@@ -78,8 +84,8 @@ class WindowSection:
     `search`: "terrain" takes the first window of the wanted direction that lies entirely over the available terrain,
     no earlier than `start` (the orbit's epoch when empty), between the two longitudes (east-positive; the second may
     exceed 360); "none" observes from `start` for `duration_s`.
-    Frames are taken where the sub-satellite latitude is within `latitude_limit_deg`, on one of so many arcs as
-    `arc_interval` says (1: on every one).
+    Frames are taken where the sub-satellite latitude is within `latitude_limit_deg` of the equator and between
+    `latitude_min_deg` and `latitude_max_deg`, on one of so many arcs as `arc_interval` says (1: on every one).
     """
 
     search: Literal["terrain", "none"] = "terrain"
@@ -88,10 +94,18 @@ class WindowSection:
     passes: int = 1
     direction: Literal["ascending", "descending", "any"] = "ascending"
     latitude_limit_deg: float = 60.0
+    latitude_min_deg: float = -90.0
+    latitude_max_deg: float = 90.0
     arc_interval: int = 1
     longitude_min_deg: float = 0.0
     longitude_max_deg: float = 360.0
     search_days: float = 30.0
+
+    @property
+    def latitude_band_deg(self) -> tuple[float, float]:
+        """Lowest and highest sub-satellite latitude of frames."""
+        limit = self.latitude_limit_deg
+        return max(self.latitude_min_deg, -limit), min(self.latitude_max_deg, limit)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,9 +151,26 @@ class TerrainSection:
     """`auto`: the real terrain where its rasters are available, else the procedural Moon.
 
     `catalogue`: the craters of the data folder's catalogue, at their places and sizes, on a procedural base.
+    `registration_north_east_m` shifts height rasters on the ground, in metres to the north and to the east; empty: the
+    shift that belongs to the rasters (-59 m to the north for GLD100). A procedural Moon has no registration.
     """
 
     source: Literal["auto", "raster", "procedural", "catalogue"] = "auto"
+    registration_north_east_m: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorSection:
+    """Crater network on board and its use.
+
+    `network` is the name of a shipped network (`linna detector info --help` lists them) or an ONNX file. A negative
+    `score_threshold` takes the threshold stored in the network. `max_detections` limits the detections of a frame, the
+    best first; the detections packet holds up to 255.
+    """
+
+    network: str = "craters"
+    score_threshold: float = -1.0
+    max_detections: int = 120
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,6 +308,7 @@ class Scenario:
     sensor: SensorModel = field(default_factory=SensorModel)
     light: LightSection = field(default_factory=LightSection)
     terrain: TerrainSection = field(default_factory=TerrainSection)
+    detector: DetectorSection = field(default_factory=DetectorSection)
     navigation: NavigationSection = field(default_factory=NavigationSection)
     attitude: AttitudeSection = field(default_factory=AttitudeSection)
     disturbances: DisturbancesSection = field(default_factory=DisturbancesSection)
@@ -394,9 +426,10 @@ def _convert(hint: Any, value: Any, source: str, place: str) -> Any:
             raise ScenarioError(f"{source}: {place} must be one of {expected}, found {value!r}")
         return value
     if origin is tuple:
-        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-            raise ScenarioError(f"{source}: {place} must be a list of texts, found {value!r}")
-        return tuple(value)
+        kind = get_args(hint)[0]
+        if not isinstance(value, list):
+            raise ScenarioError(f"{source}: {place} must be a list, found {value!r}")
+        return tuple(_convert(kind, item, source, f"{place}[{k}]") for k, item in enumerate(value))
     if origin in (Union, UnionType):
         raise TypeError(f"scenario field {place} has a union type, which the parser does not read")
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
@@ -410,6 +443,44 @@ def _convert(hint: Any, value: Any, source: str, place: str) -> Any:
 
 _NAMES = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
 ESTIMATORS = ("paper", "spherical", "anchored")
+
+LARGEST_REGISTRATION_M = 5_000.0
+"""More than any offset between published lunar height models."""
+
+_MOON_RADIUS_KM = 1737.4
+
+
+def _check_cartesian(orbit: OrbitSection, require: Callable[[bool, str, str, object], None]) -> None:
+    """Refuse a Cartesian state that is incomplete, contradicts other keys or lies in the Moon."""
+    for key in ("position_km", "velocity_km_s"):
+        values = getattr(orbit, key)
+        require(len(values) == 3, f"orbit.{key}", "three numbers", values)
+    default = OrbitSection()
+    for key in _ELEMENT_KEYS:
+        require(
+            getattr(orbit, key) == getattr(default, key),
+            f"orbit.{key}",
+            "absent where orbit.position_km is given",
+            getattr(orbit, key),
+        )
+    require(not orbit.oem, "orbit.oem", "absent where orbit.position_km is given", orbit.oem)
+    require(
+        math.hypot(*orbit.position_km) > _MOON_RADIUS_KM,
+        "orbit.position_km",
+        f"a place above the ground (radius over {_MOON_RADIUS_KM} km)",
+        list(orbit.position_km),
+    )
+    require(any(orbit.velocity_km_s), "orbit.velocity_km_s", "a velocity", list(orbit.velocity_km_s))
+
+
+_ELEMENT_KEYS = (
+    "semi_major_axis_km",
+    "eccentricity",
+    "inclination_deg",
+    "raan_deg",
+    "argument_of_perilune_deg",
+    "true_anomaly_deg",
+)
 
 
 def _check(scenario: Scenario, source: str) -> None:
@@ -426,7 +497,9 @@ def _check(scenario: Scenario, source: str) -> None:
                 parse_utc(text)
         except (LunarError, ValueError):
             require(False, key, "a UTC time such as 2029-08-07T00:00:00Z", text)
-    if not orbit.oem:
+    if orbit.position_km or orbit.velocity_km_s:
+        _check_cartesian(orbit, require)
+    elif not orbit.oem:
         require(
             0.0 <= orbit.eccentricity < 1.0, "orbit.eccentricity", "from 0 to below 1", orbit.eccentricity
         )
@@ -470,6 +543,40 @@ def _check(scenario: Scenario, source: str) -> None:
         "over 0 and up to 90",
         window.latitude_limit_deg,
     )
+    lowest_deg, highest_deg = window.latitude_band_deg
+    require(
+        lowest_deg < highest_deg,
+        "window.latitude_min_deg and latitude_max_deg",
+        "a band of latitudes within window.latitude_limit_deg, lower limit first",
+        (window.latitude_min_deg, window.latitude_max_deg),
+    )
+    shift = scenario.terrain.registration_north_east_m
+    require(
+        not shift or (len(shift) == 2 and max(map(abs, shift)) <= LARGEST_REGISTRATION_M),
+        "terrain.registration_north_east_m",
+        f"empty or two numbers of at most {LARGEST_REGISTRATION_M:g} m",
+        shift,
+    )
+    require(
+        not shift or scenario.terrain.source in ("auto", "raster"),
+        "terrain.registration_north_east_m",
+        f"empty where terrain.source is {scenario.terrain.source!r}",
+        shift,
+    )
+    detector = scenario.detector
+    require(
+        detector.score_threshold < 0.0 or 0.0 < detector.score_threshold < 1.0,
+        "detector.score_threshold",
+        "between 0 and 1, or negative for that of the network",
+        detector.score_threshold,
+    )
+    require(
+        1 <= detector.max_detections <= 255,
+        "detector.max_detections",
+        "from 1 to 255",
+        detector.max_detections,
+    )
+    require(detector.network != "", "detector.network", "a shipped network or an ONNX file", detector.network)
     require(
         0.0 < window.longitude_max_deg - window.longitude_min_deg <= 360.0,
         "window.longitude_max_deg",

@@ -23,15 +23,22 @@ from lunar.lens import BrownCamera, pointed_camera_from_mcmf
 from lunar.oem import load_oem
 from lunar.propagation import ForceModel
 from lunar.third_bodies import sun_position_icrf_m
-from lunar.timescales import parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns, utc_ns_from_tdb_s
+from lunar.timescales import (
+    format_utc,
+    parse_utc,
+    tdb_s_from_utc_ns,
+    ticks_from_utc_ns,
+    utc_ns_from_tdb_s,
+)
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.orbit import force_model, propagate_scenario
-from payload_emulator.session.scenario import ReferenceSection, Scenario
+from payload_emulator.session.scenario import ReferenceSection, Scenario, WindowSection
 from payload_emulator.sim.orbit.disturbances import TrueBurn, changed, executed, turned_state
 from payload_emulator.sim.orbit.truth import (
+    Crossing,
     Truth,
     attitude_message,
-    find_windows,
+    find_crossings,
     frame_times,
     perturbed,
     require_above_ground,
@@ -119,19 +126,24 @@ def build_world(scenario: Scenario, data: DataFolder) -> World:
     ScenarioError
         No window over the terrain within the days searched, or a trajectory below the ground.
     """
-    terrain = open_terrain(scenario.terrain.source, data, scenario.seed)
+    terrain = open_terrain(
+        scenario.terrain.source,
+        data,
+        scenario.seed,
+        registration_north_east_m=scenario.terrain.registration_north_east_m,
+    )
     model = force_model(scenario, data)
     gravity = model.gravity
     truth, burns, windows = _fly_to_windows(scenario, model, terrain)
     interval_ns = round(scenario.camera.frame_interval_s * _NS)
-    limit_rad = np.radians(scenario.window.latitude_limit_deg)
-    frames = [frame_times(truth, start, stop, interval_ns, limit_rad) for start, stop in windows]
+    band_rad = _band_rad(scenario)
+    frames = [frame_times(truth, start, stop, interval_ns, band_rad) for start, stop in windows]
     frame_utc_ns = np.concatenate(frames) if frames else np.zeros(0, dtype=np.int64)
     frame_utc_ns = _one_arc_of(scenario.window.arc_interval, frame_utc_ns, interval_ns)
     if frame_utc_ns.size == 0:
         raise ScenarioError(
-            f"scenario {scenario.name}: the observation window holds no frame within "
-            f"{scenario.window.latitude_limit_deg} deg of latitude"
+            f"scenario {scenario.name}: the observation window holds no frame between latitudes "
+            f"{_degrees(scenario.window.latitude_band_deg)}"
         )
     truth, burns = _disturbed(scenario, truth, burns, int(frame_utc_ns[0]), model)
     require_above_ground(truth, frame_utc_ns, terrain.height_m, _HIGHEST_GROUND_M)
@@ -328,15 +340,42 @@ def _fly_to_windows(
         )
     while True:
         truth, burns = _propagate(scenario, model, reach_days)
-        found = _windows(scenario, truth, terrain, not_before)
-        if len(found) >= (1 if window.search == "none" else window.passes):
-            return truth, burns, found
+        if window.search == "none":
+            return truth, burns, _windows(scenario, truth, terrain, not_before)
+        crossings = _crossings(scenario, truth, terrain, not_before)
+        found = [(one.start_utc_ns, one.stop_utc_ns) for one in crossings if one.observable]
+        if len(found) >= window.passes:
+            return truth, burns, found[: window.passes]
         if reach_days >= window.search_days:
             raise ScenarioError(
                 f"scenario {scenario.name}: window.search expected {window.passes} {window.direction} window(s) over "
-                f"{terrain.name} within {window.search_days} days, found {len(found)}"
+                f"{terrain.name} within {window.search_days} days, found {len(found)}; {_what_lacks(crossings, window)}"
             )
         reach_days = min(2.0 * reach_days, window.search_days)
+
+
+def _what_lacks(crossings: list[Crossing], window: WindowSection) -> str:
+    """Which latitudes lack terrain on the crossing that lacks the least of it."""
+    band = f"latitudes {_degrees(window.latitude_band_deg)}"
+    near = [one for one in crossings if one.in_reach and one.missing_rad.size]
+    if not near:
+        reach = _degrees((window.longitude_min_deg, window.longitude_max_deg))
+        return f"no further crossing of {band} keeps its swath within longitudes {reach}"
+    best = min(near, key=lambda one: float((one.missing_rad[:, 1] - one.missing_rad[:, 0]).sum()))
+    missing = ", ".join(_degrees(tuple(np.degrees(row))) for row in best.missing_rad)
+    return (
+        f"the best other crossing of {band}, at longitude {np.degrees(best.longitude_rad) % 360.0:.1f} deg on "
+        f"{format_utc(best.start_utc_ns, 0)}, lacks terrain at latitudes {missing}"
+    )
+
+
+def _degrees(limits: tuple[float, ...]) -> str:
+    return f"{limits[0]:.1f} to {limits[1]:.1f} deg"
+
+
+def _band_rad(scenario: Scenario) -> tuple[float, float]:
+    low_deg, high_deg = scenario.window.latitude_band_deg
+    return float(np.radians(low_deg)), float(np.radians(high_deg))
 
 
 def _windows(
@@ -344,24 +383,29 @@ def _windows(
 ) -> list[tuple[int, int]]:
     window = scenario.window
     if window.search == "none":
-        return [
-            (not_before_utc_ns, min(not_before_utc_ns + round(window.duration_s * _NS), truth.stop_utc_ns))
-        ]
+        stop_utc_ns = not_before_utc_ns + round(window.duration_s * _NS)
+        return [(not_before_utc_ns, min(stop_utc_ns, truth.stop_utc_ns))]
+    crossings = _crossings(scenario, truth, terrain, not_before_utc_ns)
+    return [(one.start_utc_ns, one.stop_utc_ns) for one in crossings if one.observable][: window.passes]
+
+
+def _crossings(
+    scenario: Scenario, truth: Truth, terrain: TiledTerrain, not_before_utc_ns: int
+) -> list[Crossing]:
+    window = scenario.window
     west_deg, width_deg = window.longitude_min_deg, window.longitude_max_deg - window.longitude_min_deg
 
-    def observable(latitude_rad: FloatArray, longitude_rad: FloatArray) -> NDArray[np.bool_]:
-        return terrain.covers(latitude_rad, longitude_rad) & (
-            (np.degrees(longitude_rad) - west_deg) % 360.0 <= width_deg
-        )
+    def in_reach(longitude_rad: FloatArray) -> NDArray[np.bool_]:
+        return np.asarray((np.degrees(longitude_rad) - west_deg) % 360.0 <= width_deg)
 
-    return find_windows(
+    return find_crossings(
         truth,
-        observable,
+        terrain.covers,
+        in_reach,
         not_before_utc_ns=not_before_utc_ns,
-        latitude_limit_rad=np.radians(window.latitude_limit_deg),
+        latitude_band_rad=_band_rad(scenario),
         direction=window.direction,
         half_fov_rad=np.radians(scenario.camera.fov_deg) / 2.0,
-        count=window.passes,
     )
 
 

@@ -1,5 +1,7 @@
 """Mission description written by the emulator, and terrain used in training."""
 
+import hashlib
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,8 +10,10 @@ import pytest
 from ground_service.missions.model import parse_mission
 from lunar.datafolder import DataFolder
 from lunar.frames import mcmf_from_spherical
+from payload_emulator.errors import ModelError
+from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.session.mission import mission_text, seen_in_training, unseen_share
-from payload_emulator.session.scenario import parse_scenario
+from payload_emulator.session.scenario import DetectorSection, parse_scenario
 from payload_emulator.session.world import build_world
 
 SCENARIO = """
@@ -46,6 +50,30 @@ def test_the_ground_reads_what_the_emulator_writes(world) -> None:
     assert (mission.camera.tilt_deg, mission.camera.k1, mission.camera.fov_deg) == (20.0, -0.05, 120.0)
     assert mission.evidence.level == "2" and mission.evidence.seed == 7
     assert mission.link.frame_length == 1115 and mission.link.interleave == 5
+
+
+def test_the_network_and_the_threshold_in_force_are_stated(world) -> None:
+    own = parse_mission(mission_text(world, DataFolder())).detector
+    assert (own.network, own.max_detections) == ("craters", 120)
+    assert own.sha256 == hashlib.sha256(load_shipped_model()).hexdigest()
+    assert own.score_threshold == 0.44  # in the metadata of the shipped network
+    detector = DetectorSection(score_threshold=0.61, max_detections=80)
+    changed = replace(world, scenario=replace(world.scenario, detector=detector))
+    stated = parse_mission(mission_text(changed, DataFolder())).detector
+    assert (stated.score_threshold, stated.max_detections) == (0.61, 80)
+    lost = replace(world, scenario=replace(world.scenario, detector=DetectorSection(network="lost.onnx")))
+    with pytest.raises(ModelError, match=r"expected craters.* or an ONNX file, found 'lost.onnx'"):
+        mission_text(lost, DataFolder())
+
+
+def test_the_registration_of_the_terrain_is_stated(world) -> None:
+    text = mission_text(world, DataFolder())
+    assert parse_mission(text).catalogue.registration_north_m is None
+    shifted = SimpleNamespace(
+        catalogue=world.terrain.catalogue, is_real=False, registration_north_m=-46.0, registration_east_m=13.0
+    )
+    stated = parse_mission(mission_text(replace(world, terrain=shifted), DataFolder())).catalogue
+    assert (stated.registration_north_m, stated.registration_east_m) == (-46.0, 13.0)
 
 
 def test_limits_of_the_scenario_are_stated_and_negative_ones_are_not(world) -> None:

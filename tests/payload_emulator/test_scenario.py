@@ -53,6 +53,51 @@ def test_an_empty_scenario_is_the_papers_orbit() -> None:
         ('name = "x"\n[orbit]\nsemi_major_axis_km = 1700.0', "an orbit above the ground"),
         ('name = "x"\n[orbit]\nepoch = "tomorrow"', "orbit.epoch must be a UTC time"),
         ('name = "x"\n[orbit]\nraan_deg = nan', "orbit.raan_deg must be finite"),
+        (
+            'name = "x"\n[orbit]\nposition_km = [1800.0, 0.0]\nvelocity_km_s = [0.0, 1.6, 0.0]',
+            "orbit.position_km must be three numbers, found (1800.0, 0.0)",
+        ),
+        (
+            'name = "x"\n[orbit]\nposition_km = [1800.0, 0.0, 0.0]',
+            "orbit.velocity_km_s must be three numbers, found ()",
+        ),
+        (
+            'name = "x"\n[orbit]\nposition_km = [1700.0, 0.0, 0.0]\nvelocity_km_s = [0.0, 1.6, 0.0]',
+            "orbit.position_km must be a place above the ground",
+        ),
+        (
+            'name = "x"\n[orbit]\nposition_km = [1800.0, 0.0, 0.0]\nvelocity_km_s = [0.0, 1.6, 0.0]\nraan_deg = 4.0',
+            "orbit.raan_deg must be absent where orbit.position_km is given, found 4.0",
+        ),
+        (
+            'name = "x"\n[orbit]\nposition_km = ["far", 0.0, 0.0]',
+            "orbit.position_km[0] must be a number, found 'far'",
+        ),
+        (
+            'name = "x"\n[window]\nlatitude_min_deg = 30.0\nlatitude_max_deg = 20.0',
+            "window.latitude_min_deg and latitude_max_deg must be a band of latitudes",
+        ),
+        (
+            'name = "x"\n[window]\nlatitude_min_deg = 70.0',
+            "window.latitude_min_deg and latitude_max_deg must be a band of latitudes",
+        ),
+        (
+            'name = "x"\n[detector]\nscore_threshold = 1.5',
+            "detector.score_threshold must be between 0 and 1, or negative for that of the network, found 1.5",
+        ),
+        (
+            'name = "x"\n[detector]\nmax_detections = 256',
+            "detector.max_detections must be from 1 to 255, found 256",
+        ),
+        (
+            'name = "x"\n[terrain]\nregistration_north_east_m = [10.0]',
+            "terrain.registration_north_east_m must be empty or two numbers of at most 5000 m, found (10.0,)",
+        ),
+        (
+            'name = "x"\n[terrain]\nsource = "procedural"\nregistration_north_east_m = [10.0, 0.0]',
+            "terrain.registration_north_east_m must be empty where terrain.source is 'procedural'",
+        ),
+        ('name = "x"\n[camera]\ntilt_deg = 75.0', "camera.tilt_deg must be from -60 to 60, found 75.0"),
         ('name = "x"\n[light]\nmode = "moonlight"', "light.mode must be one of 'paper', 'real'"),
         (
             'name = "x"\n[navigation]\nestimators = ["oracle"]',

@@ -88,53 +88,93 @@ class Truth:
 
 
 def frame_times(
-    truth: Truth, start_utc_ns: int, stop_utc_ns: int, interval_ns: int, latitude_limit_rad: float
+    truth: Truth,
+    start_utc_ns: int,
+    stop_utc_ns: int,
+    interval_ns: int,
+    latitude_band_rad: tuple[float, float],
 ) -> IntArray:
     """UTC instants of the frames between two instants: one each interval, where the sub-satellite latitude allows."""
     times = np.arange(start_utc_ns, stop_utc_ns, interval_ns, dtype=np.int64)
     if times.size == 0:
         return times
     latitude, _, _ = spherical_from_mcmf(truth.positions_mcmf(times))
-    return times[np.abs(latitude) <= latitude_limit_rad]
+    return times[(latitude >= latitude_band_rad[0]) & (latitude <= latitude_band_rad[1])]
 
 
-def find_windows(
+@dataclass(frozen=True, slots=True, eq=False)
+class Crossing:
+    """One crossing of a latitude band.
+
+    Attributes
+    ----------
+    start_utc_ns, stop_utc_ns
+        Span of the crossing with a search step before and after it.
+    longitude_rad
+        Longitude in the middle of the crossing.
+    in_reach
+        Whether the whole swath lies between the wanted longitudes.
+    missing_rad
+        Ranges of latitude, south to north, (n, 2), at which part of the swath has no terrain.
+    """
+
+    start_utc_ns: int
+    stop_utc_ns: int
+    longitude_rad: float
+    in_reach: bool
+    missing_rad: FloatArray
+
+    @property
+    def observable(self) -> bool:
+        """Whether the whole swath lies on terrain and between the wanted longitudes."""
+        return self.in_reach and not self.missing_rad.size
+
+
+def find_crossings(
     truth: Truth,
     covers: Callable[[FloatArray, FloatArray], NDArray[np.bool_]],
+    in_reach: Callable[[FloatArray], NDArray[np.bool_]],
     *,
     not_before_utc_ns: int,
-    latitude_limit_rad: float,
+    latitude_band_rad: tuple[float, float],
     direction: str,
     half_fov_rad: float,
-    count: int,
-) -> list[tuple[int, int]]:
-    """Observation windows whose whole swath lies over known terrain: (first, last) UTC instants, earliest first.
+) -> list[Crossing]:
+    """Crossings of a latitude band northwards ("ascending"), southwards ("descending") or either ("any"), in order.
 
-    A window is one crossing of the latitude band northwards ("ascending"), southwards ("descending") or either ("any").
     The swath is the footprint's half-width either side of the track, as wide in longitude as the latitude makes it.
+    `covers` tells of latitudes and longitudes (n,) whether there is terrain, `in_reach` of longitudes (n,) whether they
+    are wanted. Crossings cut by the ends of the trajectory are left out.
     """
     times = np.arange(not_before_utc_ns, truth.stop_utc_ns, _SEARCH_STEP_NS, dtype=np.int64)
     latitude, longitude, altitude = spherical_from_mcmf(truth.positions_mcmf(times))
-    inside = np.abs(latitude) <= latitude_limit_rad
+    inside = (latitude >= latitude_band_rad[0]) & (latitude <= latitude_band_rad[1])
     northward = np.gradient(latitude) > 0.0
     wanted = inside & {"ascending": northward, "descending": ~northward, "any": inside}[direction]
     half_width_rad = altitude * np.tan(half_fov_rad) / MOON_RADIUS_M
     margin_rad = half_width_rad / np.cos(np.minimum(np.abs(latitude), _POLAR_NORTH_LIMIT_RAD))
-    good = np.zeros(times.size, dtype=bool)
     place = np.flatnonzero(wanted)
-    good[place] = (
-        covers(latitude[place], longitude[place])
-        & covers(latitude[place], longitude[place] - margin_rad[place])
-        & covers(latitude[place], longitude[place] + margin_rad[place])
-    )
-    windows: list[tuple[int, int]] = []
+    swath = longitude[place] + np.array([[0.0], [-1.0], [1.0]]) * margin_rad[place]
+    there, reached = np.zeros(times.size, dtype=bool), np.zeros(times.size, dtype=bool)
+    there[place] = covers(np.broadcast_to(latitude[place], swath.shape), swath).all(axis=0)
+    reached[place] = in_reach(swath).all(axis=0)
+    crossings = []
     for first, last in _runs(wanted):
-        cut_short = first == 0 or last == times.size - 1
-        if not cut_short and bool(np.all(good[first : last + 1])):
-            windows.append((int(times[first]) - _SEARCH_STEP_NS, int(times[last]) + _SEARCH_STEP_NS))
-            if len(windows) == count:
-                break
-    return windows
+        if first == 0 or last == times.size - 1:
+            continue
+        here = slice(first, last + 1)
+        gaps = [latitude[first + a : first + b + 1] for a, b in _runs(~there[here])]
+        missing = np.array(sorted((float(gap.min()), float(gap.max())) for gap in gaps)).reshape(-1, 2)
+        crossings.append(
+            Crossing(
+                int(times[first]) - _SEARCH_STEP_NS,
+                int(times[last]) + _SEARCH_STEP_NS,
+                float(longitude[(first + last) // 2]),
+                bool(reached[here].all()),
+                missing,
+            )
+        )
+    return crossings
 
 
 def perturbed(camera_from_source: FloatArray, error_rad: FloatArray) -> FloatArray:

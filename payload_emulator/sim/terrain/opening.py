@@ -16,11 +16,19 @@ SLDEM_RESOLUTION_M = 150.0
 """SLDEM2015 resolves about 60 m at the equator (Barker et al. 2016); at 256 pixels per degree its pixels limit it."""
 
 
-def open_terrain(kind: str, data: DataFolder, seed: int, **options: object) -> TiledTerrain:
+def open_terrain(
+    kind: str,
+    data: DataFolder,
+    seed: int,
+    *,
+    registration_north_east_m: tuple[float, ...] = (),
+    **options: object,
+) -> TiledTerrain:
     """The terrain of a kind.
 
     ``raster``: real heights and catalogue of the data folder; ``procedural``: a seeded Moon; ``auto``: the first where
     the data allow it, else the second; ``catalogue``: the craters of the data folder's catalogue on a procedural base.
+    `registration_north_east_m` shifts height rasters instead of the shift that belongs to them.
     Of the height models SLDEM2015 is preferred to GLD100, of the albedos georeferenced mosaics to pictures.
 
     Raises
@@ -63,6 +71,9 @@ def open_terrain(kind: str, data: DataFolder, seed: int, **options: object) -> T
             "smoothing_pixels": 0.0,
             "effective_resolution_m": SLDEM_RESOLUTION_M,
         }
+    if registration_north_east_m:
+        north_m, east_m = registration_north_east_m
+        chosen |= {"registration_north_m": north_m, "registration_east_m": east_m}
     albedo = data.albedo_tiles or ((data.albedo,) if data.albedo else ())
     return RasterTerrain(
         tiles,

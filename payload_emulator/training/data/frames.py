@@ -169,7 +169,9 @@ def _label(
     position, rotation = pose.position_mcmf_m, pose.camera_from_mcmf
     # No crater of fewer metres has `least_px` even on the highest ground straight below; tilt is a few degrees at most.
     resolved_m = 0.95 * least_px * (pose.altitude_m - _HIGHEST_GROUND_M) / camera.focal_px
-    labels = label_frame(terrain, camera, position, rotation, max(_LABEL_MINIMUM_M, resolved_m), rendering.lit)
+    labels = label_frame(
+        terrain, camera, position, rotation, max(_LABEL_MINIMUM_M, resolved_m), rendering.lit
+    )
     measured = terrain.measured(labels.index)
     points = (measured.position_mcmf_m - position) @ rotation.T
     diameter_px = camera.focal_px * measured.diameter_m / points[:, 2]

@@ -131,7 +131,9 @@ def _heights_in_view(terrain: Any, edge_mcmf_m: Floats) -> Floats:
     return np.asarray(terrain.height_m(latitude, longitude, MEASURE_LEVEL))
 
 
-def footprint_edge(camera: PinholeCamera, camera_from_mcmf: Floats, position_mcmf_m: Floats, uv: Floats) -> Floats:
+def footprint_edge(
+    camera: PinholeCamera, camera_from_mcmf: Floats, position_mcmf_m: Floats, uv: Floats
+) -> Floats:
     """Points (n, 3) of the map sphere that pixels (n, 2) see, MCMF m; where a pixel sees the sky, the horizon below it.
 
     At 150 km a camera of 120 degrees sees the sky in its corners (67.8 degrees off nadir, horizon at 67.0).

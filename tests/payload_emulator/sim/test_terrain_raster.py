@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from lunar.catalogue import load_catalogue, make_catalogue
+from lunar.catalogue import load_catalogue, make_catalogue, save_catalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder, find_data
 from payload_emulator.errors import TerrainError
@@ -55,6 +55,17 @@ def test_registration_moves_the_raster_over_the_ground(tmp_path):
     assert float(moved.height_m(*place) - still.height_m(*place)) == pytest.approx(
         100.0 * shift_deg, abs=0.01
     )
+
+
+def test_a_scenario_may_give_the_registration_of_height_rasters(tmp_path):
+    path = write_raster(tmp_path / "a.tif", 10.0, 20.0, 8.0, slope)
+    catalogue = tmp_path / "craters.csv"
+    save_catalogue(make_catalogue([np.radians(15.0)], [np.radians(14.0)], [8e3], source="x"), catalogue)
+    data = DataFolder(dem_tiles=(path,), catalogue_lu=catalogue)
+    own = open_terrain("raster", data, 1)
+    given = open_terrain("raster", data, 1, registration_north_east_m=(-46.0, 13.0))
+    assert (own.registration_north_m, own.registration_east_m) == (-59.0, 0.0)
+    assert (given.registration_north_m, given.registration_east_m) == (-46.0, 13.0)
 
 
 def test_files_join_without_a_seam_and_across_the_prime_meridian(tmp_path):

@@ -15,7 +15,7 @@ from payload_emulator.sim.orbit.truth import (
     Truth,
     attitude_message,
     counted_reads,
-    find_windows,
+    find_crossings,
     frame_times,
     perturbed,
     require_above_ground,
@@ -25,6 +25,23 @@ PERIOD_S = 6600.0
 RADIUS_M = MOON_RADIUS_M + 30_000.0
 START_NS = 1_880_000_000 * 10**9
 NS = 10**9
+BAND_RAD = (np.radians(-60.0), np.radians(60.0))
+
+
+def everywhere(latitude, longitude=None):
+    return np.ones(latitude.shape, dtype=bool)
+
+
+def crossings(truth, covers, in_reach=everywhere, direction="ascending", band_rad=BAND_RAD):
+    return find_crossings(
+        truth,
+        covers,
+        in_reach,
+        not_before_utc_ns=START_NS,
+        latitude_band_rad=band_rad,
+        direction=direction,
+        half_fov_rad=np.radians(60.0),
+    )
 
 
 class StillMoon:
@@ -56,7 +73,7 @@ def polar_truth() -> Truth:
 
 
 def test_frames_are_taken_at_the_cadence_within_the_latitude_limit(polar_truth: Truth) -> None:
-    times = frame_times(polar_truth, START_NS, START_NS + int(PERIOD_S) * NS, 15 * NS, np.radians(60.0))
+    times = frame_times(polar_truth, START_NS, START_NS + int(PERIOD_S) * NS, 15 * NS, BAND_RAD)
     latitude, _, _ = spherical_from_mcmf(polar_truth.positions_mcmf(times))
     assert np.abs(latitude).max() <= np.radians(60.0)
     assert np.all(np.diff(times) % (15 * NS) == 0)
@@ -66,16 +83,9 @@ def test_frames_are_taken_at_the_cadence_within_the_latitude_limit(polar_truth: 
 
 @pytest.mark.parametrize(("direction", "longitude_deg"), [("ascending", 0.0), ("descending", 180.0)])
 def test_a_window_runs_across_the_band_in_the_wanted_direction(polar_truth, direction, longitude_deg) -> None:
-    windows = find_windows(
-        polar_truth,
-        lambda latitude, longitude: np.ones(latitude.shape, dtype=bool),
-        not_before_utc_ns=START_NS,
-        latitude_limit_rad=np.radians(60.0),
-        direction=direction,
-        half_fov_rad=np.radians(60.0),
-        count=1,
-    )
-    ((first, last),) = windows
+    found = crossings(polar_truth, everywhere, direction=direction)[0]
+    assert found.observable
+    first, last = found.start_utc_ns, found.stop_utc_ns
     assert (last - first) / NS == pytest.approx(
         PERIOD_S / 3.0, abs=61.0
     )  # a search step and a margin at each end, s
@@ -91,19 +101,35 @@ def test_a_window_whose_swath_leaves_the_terrain_is_not_taken(polar_truth: Truth
     def wide(latitude, longitude):
         return np.abs(np.degrees(longitude)) < 4.0
 
-    def windows_over(covers):
-        return find_windows(
-            polar_truth,
-            covers,
-            not_before_utc_ns=START_NS,
-            latitude_limit_rad=np.radians(60.0),
-            direction="ascending",
-            half_fov_rad=np.radians(60.0),
-            count=1,
-        )
+    assert not any(one.observable for one in crossings(polar_truth, narrow))
+    assert crossings(polar_truth, wide)[0].observable
 
-    assert windows_over(narrow) == []
-    assert len(windows_over(wide)) == 1
+
+def test_a_crossing_tells_the_latitudes_without_terrain(polar_truth: Truth) -> None:
+    def north_of_ten_degrees_without_a_hole(latitude, longitude):
+        degrees = np.degrees(latitude)
+        return (degrees > 10.0) & ~((degrees > 30.0) & (degrees < 40.0))
+
+    found = crossings(polar_truth, north_of_ten_degrees_without_a_hole)[0]
+    assert not found.observable and found.in_reach
+    # A search step of 20 s moves the ground point by 1.1 degrees.
+    np.testing.assert_allclose(np.degrees(found.missing_rad), [[-60.0, 10.0], [30.0, 40.0]], atol=1.2)
+
+
+def test_a_crossing_outside_the_wanted_longitudes_is_not_observable(polar_truth: Truth) -> None:
+    found = crossings(polar_truth, everywhere, lambda longitude: np.degrees(longitude) > 1.0)[0]
+    assert not found.in_reach and not found.observable and found.missing_rad.size == 0
+
+
+def test_the_band_may_lie_on_one_side_of_the_equator(polar_truth: Truth) -> None:
+    band_rad = (np.radians(20.0), np.radians(50.0))
+    times = frame_times(polar_truth, START_NS, START_NS + int(PERIOD_S) * NS, 15 * NS, band_rad)
+    latitude, _, _ = spherical_from_mcmf(polar_truth.positions_mcmf(times))
+    assert latitude.min() >= band_rad[0] and latitude.max() <= band_rad[1]
+    assert np.degrees(latitude.max() - latitude.min()) > 28.0
+    found = crossings(polar_truth, everywhere, band_rad=band_rad)[0]
+    # 30 degrees of 360, with a search step and a margin at each end.
+    assert (found.stop_utc_ns - found.start_utc_ns) / NS == pytest.approx(PERIOD_S / 12.0, abs=61.0)
 
 
 def test_the_attitude_message_carries_attitude_and_sun() -> None:

@@ -1,0 +1,62 @@
+"""Observation windows of a world: the band of latitudes, and the message where terrain lacks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lunar.datafolder import DataFolder
+from lunar.frames import spherical_from_mcmf
+from payload_emulator.errors import ScenarioError
+from payload_emulator.session import world as world_module
+from payload_emulator.session.scenario import parse_scenario
+from payload_emulator.session.world import build_world
+
+SCENARIO = parse_scenario("""
+name = "band"
+[dynamics]
+gravity = "builtin"
+orientation = "iau"
+[maneuvers]
+enabled = false
+[window]
+search_days = 0.5
+latitude_min_deg = -20.0
+latitude_max_deg = 50.0
+[terrain]
+source = "procedural"
+""")
+
+
+def test_frames_keep_to_the_band_of_the_window() -> None:
+    world = build_world(SCENARIO, DataFolder())
+    latitude, _, _ = spherical_from_mcmf(world.truth.positions_mcmf(world.frame_utc_ns))
+    # A frame each 15 s moves the ground point by 0.8 degrees.
+    assert np.degrees([latitude.min(), latitude.max()]) == pytest.approx([-20.0, 50.0], abs=0.9)
+    assert np.degrees(latitude.min()) >= -20.0 and np.degrees(latitude.max()) <= 50.0
+
+
+def test_a_search_without_a_window_names_the_latitudes_that_lack_terrain(monkeypatch) -> None:
+    opened = world_module.open_terrain
+
+    class Patchy:
+        def __init__(self, terrain):
+            self._terrain = terrain
+
+        def __getattr__(self, name):
+            return getattr(self._terrain, name)
+
+        def covers(self, latitude_rad, longitude_rad):
+            return np.broadcast_to(np.degrees(latitude_rad) < 30.0, np.shape(longitude_rad))
+
+    monkeypatch.setattr(world_module, "open_terrain", lambda *a, **k: Patchy(opened(*a, **k)))
+    with pytest.raises(ScenarioError, match=r"lacks terrain at latitudes (29|30|31)\.\d to (49|50)\.\d deg"):
+        build_world(SCENARIO, DataFolder())
+    south = replace(SCENARIO, window=replace(SCENARIO.window, latitude_max_deg=28.0))
+    assert build_world(south, DataFolder()).frame_utc_ns.size > 20
+
+
+def test_a_search_in_longitudes_that_no_track_crosses_says_so() -> None:
+    narrow = replace(SCENARIO.window, longitude_min_deg=10.0, longitude_max_deg=11.0)
+    with pytest.raises(ScenarioError, match=r"keeps its swath within longitudes 10\.0 to 11\.0 deg"):
+        build_world(replace(SCENARIO, window=narrow), DataFolder())
