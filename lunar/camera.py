@@ -11,9 +11,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lunar.arrays import FloatArray
+from lunar.arrays import BoolArray, FloatArray
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import enu_from_mcmf, spherical_from_mcmf
 
@@ -54,7 +54,7 @@ class PinholeCamera:
         directions = np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
         return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
 
-    def contains(self, uv: ArrayLike, margin_px: float = 0.0) -> NDArray[np.bool_]:
+    def contains(self, uv: ArrayLike, margin_px: float = 0.0) -> BoolArray:
         """Return whether pixels ``(..., 2)`` lie in the image, ``margin_px`` inside its edges."""
         u, v = np.moveaxis(np.asarray(uv, dtype=np.float64), -1, 0)
         low = -0.5 + margin_px
@@ -111,7 +111,7 @@ def project_mcmf(
     return camera.project(np.einsum("...ij,...j->...i", rotation, line_of_sight))
 
 
-def above_horizon(position_mcmf_m: ArrayLike, points_mcmf_m: ArrayLike) -> NDArray[np.bool_]:
+def above_horizon(position_mcmf_m: ArrayLike, points_mcmf_m: ArrayLike) -> BoolArray:
     """Return whether the ground leaves points ``(..., 3)`` in sight of a position ``(..., 3)``."""
     position = np.asarray(position_mcmf_m, dtype=np.float64)
     points = np.asarray(points_mcmf_m, dtype=np.float64)

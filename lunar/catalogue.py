@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lunar.arrays import FloatArray, IntArray
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.constants import MOON_RADIUS_M
 from lunar.errors import DataFileError, LunarError
 from lunar.frames import mcmf_from_spherical
@@ -89,7 +89,7 @@ class CraterCatalogue:
     rim_height_m: FloatArray
     depth_m: FloatArray
     source: str
-    complete: NDArray[np.bool_]
+    complete: BoolArray
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -223,7 +223,7 @@ def paper_density_catalogue(seed: int, uniform: bool = False) -> CraterCatalogue
     mare_unit = mcmf_from_spherical(mare[:, 0], mare[:, 1]) / MOON_RADIUS_M
     mare_cos = np.cos([500.0 * diameter_km / MOON_RADIUS_M for _, _, diameter_km in MARIA])
 
-    def accepted(latitude_rad: FloatArray, longitude_rad: FloatArray) -> NDArray[np.bool_]:
+    def accepted(latitude_rad: FloatArray, longitude_rad: FloatArray) -> BoolArray:
         chance = rng.random(len(latitude_rad))
         unit = mcmf_from_spherical(latitude_rad, longitude_rad) / MOON_RADIUS_M
         in_mare = np.any(unit @ mare_unit.T > mare_cos, axis=1)
@@ -284,7 +284,7 @@ def _class_diameters_m(rng: np.random.Generator, counts: Sequence[int]) -> Float
 
 
 def _random_places(
-    rng: np.random.Generator, n: int, accepted: Callable[[FloatArray, FloatArray], NDArray[np.bool_]]
+    rng: np.random.Generator, n: int, accepted: Callable[[FloatArray, FloatArray], BoolArray]
 ) -> tuple[FloatArray, FloatArray]:
     """Return n latitudes and longitudes, uniform over the part of the sphere that is accepted."""
     latitude_rad, longitude_rad = np.empty(0), np.empty(0)
@@ -429,7 +429,7 @@ def _numbers(path: Path, columns: dict[str, list[str]], name: str, missing: bool
         raise
 
 
-def _flags(texts: list[str]) -> NDArray[np.bool_]:
+def _flags(texts: list[str]) -> BoolArray:
     return np.array([text.strip().lower() in ("1", "true") for text in texts], dtype=np.bool_)
 
 

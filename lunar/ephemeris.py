@@ -23,9 +23,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lunar.arrays import FloatArray, IntArray
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.errors import DataFileError, EphemerisCoverageError, EphemerisError
 from lunar.timescales import NS, format_utc, tai_ns_from_utc_ns
 
@@ -124,7 +124,7 @@ class EphemerisSegment:
         return int(steps[0]) if len(steps) and np.all(steps == steps[0]) else 0
 
     @cached_property
-    def _gaps(self) -> NDArray[np.bool_]:
+    def _gaps(self) -> BoolArray:
         """Return which steps (n - 1,) are gaps."""
         steps = np.diff(self._tai_ns)
         return (
@@ -170,7 +170,7 @@ class Ephemeris:
         kept = [s.utc_ns[(s.utc_ns >= s.start_utc_ns) & (s.utc_ns <= s.stop_utc_ns)] for s in self.segments]
         return np.unique(np.concatenate(kept))
 
-    def covers(self, utc_ns: ArrayLike) -> NDArray[np.bool_]:
+    def covers(self, utc_ns: ArrayLike) -> BoolArray:
         """Return whether a state is known at epochs ``(...)``."""
         epochs = np.asarray(utc_ns, dtype=np.int64)
         flat = epochs.reshape(-1)
@@ -300,7 +300,7 @@ def _steps_of(segment: EphemerisSegment, epochs_tai_ns: IntArray) -> IntArray:
     return np.asarray(np.clip(index, 0, max(len(nodes) - 2, 0)))
 
 
-def _in_gap(segment: EphemerisSegment, flat: IntArray) -> NDArray[np.bool_]:
+def _in_gap(segment: EphemerisSegment, flat: IntArray) -> BoolArray:
     if not np.any(segment._gaps):
         return np.zeros(len(flat), dtype=np.bool_)
     epochs = tai_ns_from_utc_ns(flat)

@@ -21,9 +21,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lunar.arrays import FloatArray
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import ground_arc_m
 from lunar.catalogue import BAND_RAD, CLASS_LIMITS_M, CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
@@ -123,9 +123,7 @@ def study_field_of_view(
     )
 
 
-def _covered(
-    tangents: FloatArray, rows: NDArray[np.int64], altitude_m: FloatArray, complete: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def _covered(tangents: FloatArray, rows: IntArray, altitude_m: FloatArray, complete: BoolArray) -> BoolArray:
     known = rows[:, 0] >= 0
     # The nearest crater lies within the square of its tangent, so at most sqrt(2) farther than that along the
     # ground.
@@ -141,5 +139,5 @@ def _share_within(required_deg: FloatArray, fields_deg: FloatArray) -> FloatArra
     return np.asarray(counts / max(len(required_deg), 1), dtype=np.float64)
 
 
-def _smallest(fields_deg: FloatArray, good: NDArray[np.bool_]) -> float:
+def _smallest(fields_deg: FloatArray, good: BoolArray) -> float:
     return float(fields_deg[np.argmax(good)]) if np.any(good) else math.nan

@@ -14,12 +14,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray
 from lunar.constants import MOON_RADIUS_M
 from lunar.gravity import GravityField, acceleration
 
-Float = NDArray[np.float64]
 Densities = tuple[float, float, float]
 
 FAR_SIDE_COSINE = float(np.cos(np.radians(105.0)))
@@ -181,12 +180,12 @@ class Omission:
     """
 
     revolutions: int
-    psd_m2_s3: Float
-    near_psd_m2_s3: Float
-    far_psd_m2_s3: Float
-    rms_m_s2: Float
-    near_rms_m_s2: Float
-    far_rms_m_s2: Float
+    psd_m2_s3: FloatArray
+    near_psd_m2_s3: FloatArray
+    far_psd_m2_s3: FloatArray
+    rms_m_s2: FloatArray
+    near_rms_m_s2: FloatArray
+    far_rms_m_s2: FloatArray
 
 
 def measured_omission(
@@ -225,7 +224,7 @@ def measured_omission(
 
 def _revolution(
     inclination_rad: float, node_rad: float, perilune_rad: float, period_s: float
-) -> tuple[Float, Float]:
+) -> tuple[FloatArray, FloatArray]:
     """Return positions (n, 3) in Moon-fixed axes over a revolution, and the axes R, T, N there (n, 3, 3)."""
     # Even steps of the argument of latitude: at this eccentricity within 1 % of even steps of time.
     angle = np.arange(_SAMPLES) / _SAMPLES * 2.0 * np.pi
@@ -241,5 +240,5 @@ def _revolution(
     return radius[:, None] * radial, rtn
 
 
-def _rms(rows: Float) -> Float:
+def _rms(rows: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.mean(rows**2, axis=0)), dtype=np.float64)

@@ -17,11 +17,10 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.errors import LensError
 from lunar.frames import axis_rotation
-
-Floats = npt.NDArray[np.float64]
 
 NEWTON_STEPS = 12
 SETTLED = 1.0e-10
@@ -53,7 +52,7 @@ class BrownCamera(PinholeCamera):
                 f"(k1 {self.k1:g}, k2 {self.k2:g}, k3 {self.k3:g}, p1 {self.p1:g}, p2 {self.p2:g})"
             )
 
-    def project(self, points_camera_m: npt.ArrayLike) -> Floats:
+    def project(self, points_camera_m: npt.ArrayLike) -> FloatArray:
         """Return the pixel coordinates ``(..., 2)`` of points ``(..., 3)``; NaN where there are none."""
         points = np.asarray(points_camera_m, dtype=np.float64)
         depth = np.where(points[..., 2] > 0.0, points[..., 2], np.nan)
@@ -63,13 +62,13 @@ class BrownCamera(PinholeCamera):
         place[~(square < _largest_square(self.k1, self.k2, self.k3))] = np.nan
         return np.asarray(self.focal_px * place + np.array(self.centre_px))
 
-    def rays(self, uv: npt.ArrayLike) -> Floats:
+    def rays(self, uv: npt.ArrayLike) -> FloatArray:
         """Return unit directions ``(..., 3)`` in camera axes of pixels ``(..., 2)``; NaN if there is none."""
         plane = self.undistorted(uv)
         directions = np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
         return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
 
-    def undistorted(self, uv: npt.ArrayLike) -> Floats:
+    def undistorted(self, uv: npt.ArrayLike) -> FloatArray:
         """Return undistorted image-plane coordinates ``(..., 2)`` of pixels ``(..., 2)``, in focal lengths."""
         wanted = (np.asarray(uv, dtype=np.float64) - np.array(self.centre_px)) / self.focal_px
         goal_x, goal_y = wanted[..., 0], wanted[..., 1]
@@ -92,7 +91,7 @@ class BrownCamera(PinholeCamera):
             good &= x * x + y * y < _largest_square(self.k1, self.k2, self.k3)
         return np.where(good[..., None], np.stack([x, y], axis=-1), np.nan)
 
-    def _distorted(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    def _distorted(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         square = x * x + y * y
         radial = 1.0 + square * (self.k1 + square * (self.k2 + square * self.k3))
         return (
@@ -103,7 +102,7 @@ class BrownCamera(PinholeCamera):
 
 def pointed_camera_from_mcmf(
     position_mcmf_m: npt.ArrayLike, tilt_rad: float = 0.0, yaw_rad: float = 0.0
-) -> Floats:
+) -> FloatArray:
     """Return the rotation (..., 3, 3) to a camera at positions (..., 3), turned from nadir with image up to the north.
 
     ``yaw`` turns the camera clockwise seen from above (image up to that azimuth), then ``tilt`` leans its boresight

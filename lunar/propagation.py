@@ -23,10 +23,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lunar import constants
-from lunar.arrays import FloatArray
+from lunar.arrays import FloatArray, IntArray
 from lunar.errors import EphemerisCoverageError, ImpactError, OrbitError
 from lunar.gravity import GravityField, packed, packed_gradient
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
@@ -480,7 +480,7 @@ def _table(model: ForceModel, first: int, last: int) -> FloatArray:
     return joined
 
 
-def _series(model: ForceModel, segments: NDArray[np.int64]) -> FloatArray:
+def _series(model: ForceModel, segments: IntArray) -> FloatArray:
     """Return coefficients (segments, powers of -1..1, columns) of orientation, Earth and Sun.
 
     Fitted at the Chebyshev nodes; eight terms leave less than a float64 of seconds does.

@@ -15,9 +15,9 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lunar.arrays import FloatArray
+from lunar.arrays import BoolArray, FloatArray
 from lunar.constants import ASTRONOMICAL_UNIT_M, SECONDS_PER_DAY
 
 _J2000_JD = 2_451_545.0
@@ -82,7 +82,7 @@ def _missing_terms(tdb_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
 
 
 @cache
-def _terms() -> tuple[FloatArray, NDArray[np.bool_], NDArray[np.bool_], FloatArray]:
+def _terms() -> tuple[FloatArray, BoolArray, BoolArray, FloatArray]:
     """Return multipliers (n, 9), which are cosines or constants, which are secular, and weights (n, 3)."""
     from lunar._moon_terms import TERMS
 

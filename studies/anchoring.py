@@ -11,14 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, IntArray
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
 from studies.montecarlo import NavigationCase, fly
 
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Mask = BoolArray
 
 CHOICES = ("random", "largest", "spread")
 # A run whose error has grown beyond this has lost its anchor: the size of a footprint.
@@ -93,7 +92,7 @@ def study_sizes(
     return scores
 
 
-def _spread_order(craters: CraterCatalogue) -> NDArray[np.int64]:
+def _spread_order(craters: CraterCatalogue) -> IntArray:
     """Return craters in an order of which every beginning is spread: the largest of each cell, coarse cells first."""
     rank = np.full(len(craters), np.inf)
     sine, longitude = np.sin(craters.latitude_rad), np.mod(craters.longitude_rad, 2.0 * np.pi)

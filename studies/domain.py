@@ -118,7 +118,7 @@ def _figures(
     truths: Sequence[FrameTruth],
     found: Sequence[FrameDetections],
     reference: Sequence[FrameDetections],
-    mask: np.typing.NDArray[np.bool_],
+    mask: np.typing.BoolArray,
     threshold: float,
 ) -> dict[str, Any]:
     chosen = [int(k) for k in np.flatnonzero(mask)]

@@ -14,8 +14,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
@@ -35,9 +35,6 @@ from payload_emulator.flight.navigation.lost_in_space import (
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, in_view, landmark_map
 from payload_emulator.flight.vision.detections import Detections
 from tmtc.tables import CatalogueTable
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # An estimate this far from the truth is another place, not an inaccurate one: ten times the error of a good fix.
 WRONG_PLACE_M = 3_000.0
@@ -73,9 +70,9 @@ class StudyFrame:
     """A frame: true pose (MCMF stands in for ICRF), attitude as told, detections and the crater of each (-1: none)."""
 
     pose: Pose
-    told_camera_from_mcmf: Float
+    told_camera_from_mcmf: FloatArray
     found: Detections
-    crater: Index
+    crater: IntArray
     altitude_m: float
 
     @property
@@ -154,8 +151,8 @@ def study_world(craters: CraterCatalogue, seed: int, name: str) -> StudyWorld:
 
 def draw_frame(
     world: StudyWorld,
-    position_mcmf_m: Float,
-    attitude_error_rad: Float,
+    position_mcmf_m: FloatArray,
+    attitude_error_rad: FloatArray,
     model: DetectionModel,
     camera: PinholeCamera,
     rng: np.random.Generator,
@@ -326,7 +323,7 @@ def _frames(
         yield frame
 
 
-def _place(world: StudyWorld, rng: np.random.Generator, altitudes_m: tuple[float, float]) -> Float:
+def _place(world: StudyWorld, rng: np.random.Generator, altitudes_m: tuple[float, float]) -> FloatArray:
     """Return a place below 62 degrees of latitude, uniform over the part of the sphere that the map covers."""
     position = world.true.position_mcmf_m
     while True:
@@ -415,7 +412,7 @@ def _tracked(
     errors: kalman.CommonErrors,
     parameters: IdentificationParameters,
     camera: PinholeCamera,
-) -> tuple[Index, Index] | None:
+) -> tuple[IntArray, IntArray] | None:
     """Return believed pairs of detections and craters (indices into the map), None without any."""
     pose = kalman.pose_of(prior.mean, frame.told_camera_from_mcmf, np.eye(3))
     altitude_m = max(float(np.linalg.norm(prior.mean[:3])) - MOON_RADIUS_M, 1_000.0)
@@ -445,8 +442,8 @@ def _contradicts_truth(
     frame: StudyFrame,
     prior: kalman.FilterState,
     board: LandmarkMap,
-    detection: Index,
-    crater: Index,
+    detection: IntArray,
+    crater: IntArray,
     errors: kalman.CommonErrors,
     camera: PinholeCamera,
 ) -> bool:

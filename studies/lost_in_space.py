@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera, project_mcmf
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import RecordError
@@ -40,8 +40,6 @@ from payload_emulator.session.loading import onboard_catalogue
 from payload_emulator.session.scenario import DisturbancesSection, Scenario
 from payload_emulator.session.world import World, expose_frame
 
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 Progress = Callable[[Iterable[Any], int], Iterator[Any]]
 
 WRONG_PLACE_M = 2_000.0
@@ -73,9 +71,9 @@ class SeenFrames:
         All detections, frame after frame.
     """
 
-    number: Index
-    camera_from_mcmf: Float
-    owner: Index
+    number: IntArray
+    camera_from_mcmf: FloatArray
+    owner: IntArray
     found: Detections
 
     def of(self, row: int) -> Detections:
@@ -116,7 +114,7 @@ class Share:
         return self.correct / self.searches if self.searches else math.nan
 
 
-def frames_in_sets(world: World, sets: int) -> Index:
+def frames_in_sets(world: World, sets: int) -> IntArray:
     """Return frames in sets of consecutive ones that a scenario's cadence links, spread evenly over the scenario."""
     utc_ns, size = world.frame_utc_ns, FRAMES_COMBINED
     interval_ns = round(world.scenario.camera.frame_interval_s * _NS)
@@ -140,7 +138,7 @@ def pointed(scenario: Scenario, attitude_deg: float) -> Scenario:
 
 
 def see_frames(
-    world: World, detector: OnnxDetector, numbers: Index, progress: Progress | None = None
+    world: World, detector: OnnxDetector, numbers: IntArray, progress: Progress | None = None
 ) -> SeenFrames:
     """Return what the detector finds in the given frames; the next is rendered while it works on this one."""
     attitudes, owners, found = [], [], []
@@ -204,7 +202,7 @@ def load_seen(path: Path, key: str) -> SeenFrames:
         raise RecordError(f"{path}: expected saved detections, found {error}") from None
 
 
-def search_map(world: World, numbers: Index, smallest_m: float) -> tuple[LandmarkMap, LandmarkMap]:
+def search_map(world: World, numbers: IntArray, smallest_m: float) -> tuple[LandmarkMap, LandmarkMap]:
     """Return the true craters, and the map on board with a catalogue's errors: the same craters.
 
     All craters of the terrain's catalogue from `smallest_m` on take part, wherever they lie. The rims of those that
@@ -318,18 +316,18 @@ def by_altitude(rows: Sequence[LostRow], least_catalogued: int) -> list[tuple[fl
     ]
 
 
-def _sigma_px(found: Detections) -> Float:
+def _sigma_px(found: Detections) -> FloatArray:
     sigma = np.where(np.isfinite(found.sigma_px), found.sigma_px, _SIGMA_PX)
     return np.maximum(sigma, _SIGMA_FLOOR_PX)
 
 
 def _known(
     found: Detections,
-    craters_mcmf_m: Float,
-    diameter_m: Float,
+    craters_mcmf_m: FloatArray,
+    diameter_m: FloatArray,
     camera: PinholeCamera,
-    camera_from_mcmf: Float,
-    position_mcmf_m: Float,
+    camera_from_mcmf: FloatArray,
+    position_mcmf_m: FloatArray,
 ) -> int:
     """Return how many detections are craters of the map."""
     if not len(found) or not diameter_m.size:
@@ -345,7 +343,7 @@ def _known(
 
 
 def _joined(parts: Sequence[Detections]) -> Detections:
-    def column(name: str) -> Float:
+    def column(name: str) -> FloatArray:
         return np.concatenate([np.empty(0), *(getattr(part, name) for part in parts)])
 
     return Detections(*(column(name) for name in ("u_px", "v_px", "diameter_px", "score", "sigma_px")))

@@ -13,8 +13,8 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue, size_class
 from lunar.constants import MOON_RADIUS_M
@@ -38,9 +38,6 @@ from tmtc.tables import (
     unpack_gravity_table,
     unpack_orientation_table,
 )
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _NS = 1_000_000_000
 _ORIENTATION_STEP_NS = 7_200 * _NS
@@ -141,10 +138,10 @@ class NavigationCase:
     """
 
     epoch_utc_ns: int
-    position_icrf_m: Float
-    velocity_icrf_m_s: Float
-    frame_utc_ns: Index
-    imaging: NDArray[np.bool_]
+    position_icrf_m: FloatArray
+    velocity_icrf_m_s: FloatArray
+    frame_utc_ns: IntArray
+    imaging: BoolArray
     gravity: GravityField
     gravity_degree: int
     orientation: Orientation
@@ -160,7 +157,7 @@ class NavigationCase:
     attitude_bias_rad: float = float(np.radians(0.01))
     attitude_correlation_s: float = float("inf")
     kidnap: Kidnap | None = None
-    on_board: NDArray[np.bool_] | None = None
+    on_board: BoolArray | None = None
     lasting_m_s2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     lasting_correlation_s: float = 900.0
     any_node: bool = False
@@ -190,28 +187,28 @@ class NavigationRun:
         Detections in the frame of craters that are in the catalogue.
     """
 
-    frame_utc_ns: Index
-    imaging: NDArray[np.bool_]
-    outcome: Index
-    error_rtn_m: Float
-    sigma_rtn_m: Float
-    velocity_error_m_s: Float
-    nees: Float
-    nis: Float
-    degrees: Index
-    innovation: Float
-    matched: Index
-    wrong: Index
-    findable: Index
-    altitude_m: Float
+    frame_utc_ns: IntArray
+    imaging: BoolArray
+    outcome: IntArray
+    error_rtn_m: FloatArray
+    sigma_rtn_m: FloatArray
+    velocity_error_m_s: FloatArray
+    nees: FloatArray
+    nis: FloatArray
+    degrees: IntArray
+    innovation: FloatArray
+    matched: IntArray
+    wrong: IntArray
+    findable: IntArray
+    altitude_m: FloatArray
 
     @property
-    def error_m(self) -> Float:
+    def error_m(self) -> FloatArray:
         """Length of the position error."""
         return np.asarray(np.linalg.norm(self.error_rtn_m, axis=1), dtype=np.float64)
 
     @property
-    def fixed(self) -> NDArray[np.bool_]:
+    def fixed(self) -> BoolArray:
         return np.asarray(self.outcome == Outcome.fixed, dtype=np.bool_)
 
 
@@ -297,7 +294,7 @@ def consistency(runs: Iterable[NavigationRun], settle_frames: int = 20) -> Consi
     """Return how errors and claims of some runs agree, over imaging frames after the first few."""
     used = [(run, run.imaging & (np.arange(run.imaging.size) >= settle_frames)) for run in runs]
 
-    def joined(name: str) -> Float:
+    def joined(name: str) -> FloatArray:
         return np.concatenate([np.asarray(getattr(run, name), dtype=np.float64)[mask] for run, mask in used])
 
     error, sigma, length = joined("error_rtn_m"), joined("sigma_rtn_m"), joined("error_m")
@@ -382,8 +379,12 @@ def _with_drawn_biases(case: NavigationCase, rng: np.random.Generator) -> Naviga
 
 
 def _wandering(
-    first: Float, sigma: float | Float, correlation_s: float, elapsed_s: Float, rng: np.random.Generator
-) -> Float:
+    first: FloatArray,
+    sigma: float | FloatArray,
+    correlation_s: float,
+    elapsed_s: FloatArray,
+    rng: np.random.Generator,
+) -> FloatArray:
     """Return a stationary first-order Gauss-Markov process (n + 1, k) from its first value over n steps."""
     decay = np.exp(-elapsed_s / correlation_s)
     fresh = sigma * np.sqrt(1.0 - decay**2)[:, None] * rng.standard_normal((elapsed_s.size, first.size))
@@ -429,7 +430,9 @@ def _with_errors(table: CatalogueTable, errors: CatalogueErrors, rng: np.random.
     return unpack_catalogue_table(pack_catalogue_table(moved))
 
 
-def _truth(case: NavigationCase, rng: np.random.Generator, slow: np.random.Generator) -> tuple[Float, Float]:
+def _truth(
+    case: NavigationCase, rng: np.random.Generator, slow: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
     """Return true states (n, 6) and rotations mcmf_from_icrf (n, 3, 3) at the frames."""
     model = ForceModel(case.gravity, case.orientation, case.gravity_degree)
     tdb_s = np.asarray(tdb_s_from_utc_ns(case.frame_utc_ns), dtype=np.float64)
@@ -458,8 +461,8 @@ def _truth(case: NavigationCase, rng: np.random.Generator, slow: np.random.Gener
 
 
 def _pushed(
-    case: NavigationCase, model: ForceModel, epoch_s: float, tdb_s: Float, rng: np.random.Generator
-) -> Float:
+    case: NavigationCase, model: ForceModel, epoch_s: float, tdb_s: FloatArray, rng: np.random.Generator
+) -> FloatArray:
     """Return true states at times (n,) with a slowly varying acceleration, applied as one impulse per minute.
 
     An impulse at the beginning of a minute in place of 2e-6 m/s^2 throughout moves the orbit by 4 mm.
@@ -481,7 +484,7 @@ def _pushed(
 
 
 def _navigator(
-    case: NavigationCase, table: CatalogueTable, state: Float, ticks: int, rng: np.random.Generator
+    case: NavigationCase, table: CatalogueTable, state: FloatArray, ticks: int, rng: np.random.Generator
 ) -> AnchoredNavigator:
     times = np.arange(
         int(case.frame_utc_ns[0]) - _ORIENTATION_MARGIN_NS,
@@ -518,13 +521,13 @@ def _navigator(
 def _detect(
     case: NavigationCase,
     craters: LandmarkMap,
-    position_icrf_m: Float,
-    camera_from_icrf: Float,
-    mcmf_from_icrf: Float,
-    lasting: Float,
-    bias_px: Float,
+    position_icrf_m: FloatArray,
+    camera_from_icrf: FloatArray,
+    mcmf_from_icrf: FloatArray,
+    lasting: FloatArray,
+    bias_px: FloatArray,
     rng: np.random.Generator,
-) -> tuple[Detections, Index]:
+) -> tuple[Detections, IntArray]:
     """Return the detections of a frame and the crater that each is of, -1 for none."""
     detector, camera = case.detector, case.camera
     pose = Pose(
@@ -560,7 +563,7 @@ def _detect(
 
 
 def _row(
-    navigator: AnchoredNavigator, outcome: Outcome, nis: float, state: Float, truth: Index
+    navigator: AnchoredNavigator, outcome: Outcome, nis: float, state: FloatArray, truth: IntArray
 ) -> tuple[object, ...]:
     mean, covariance = navigator.state.mean, navigator.state.covariance
     error = mean[:6] - state
@@ -594,7 +597,7 @@ def _row(
     )
 
 
-def _neighbour_correlation(series: Iterable[Float]) -> float:
+def _neighbour_correlation(series: Iterable[FloatArray]) -> float:
     """Return the correlation of values with those of the next frame, over all series and both axes."""
     pairs = [np.stack([values[:-1].reshape(-1), values[1:].reshape(-1)]) for values in series]
     joined = np.concatenate(pairs, axis=1)
@@ -604,7 +607,7 @@ def _neighbour_correlation(series: Iterable[Float]) -> float:
     return float(np.mean(joined[0] * joined[1]) / np.mean(joined[0] ** 2))
 
 
-def _rotation(vector_rad: Float) -> Float:
+def _rotation(vector_rad: FloatArray) -> FloatArray:
     angle = float(np.linalg.norm(vector_rad))
     if angle == 0.0:
         return np.eye(3)
@@ -612,5 +615,5 @@ def _rotation(vector_rad: Float) -> Float:
     return matrix_from_quaternion(quaternion)
 
 
-def _turned(camera_from_icrf: Float, error_rad: Float) -> Float:
+def _turned(camera_from_icrf: FloatArray, error_rad: FloatArray) -> FloatArray:
     return np.asarray(_rotation(error_rad) @ camera_from_icrf, dtype=np.float64)

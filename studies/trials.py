@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray
 from lunar.catalogue import size_class
 from payload_emulator.errors import DatasetError
 from payload_emulator.flight.vision.detections import Detections
@@ -40,7 +41,7 @@ class Trial:
     """A way of looking at one prepared frame: gives detections in the frame's own pixels."""
 
     name: str
-    look: Callable[[OnnxDetector, Image, NDArray[np.float64]], Detections]
+    look: Callable[[OnnxDetector, Image, FloatArray], Detections]
 
 
 def run_trials(
@@ -160,18 +161,18 @@ def _read(detector: OnnxDetector, tile: Image) -> Detections:
     return decode(heatmap[0, 0], geometry[0], SCORE_FLOOR)
 
 
-def _as_flown(detector: OnnxDetector, gray: Image, sun: NDArray[np.float64]) -> Detections:
+def _as_flown(detector: OnnxDetector, gray: Image, sun: FloatArray) -> Detections:
     turns = sun_up_turns(sun)
     found = _read(detector, np.rot90(gray, turns))
     u_px, v_px = turn_back(found.u_px, found.v_px, turns, *gray.shape)
     return replace(found, u_px=u_px, v_px=v_px)
 
 
-def _not_turned(detector: OnnxDetector, gray: Image, sun: NDArray[np.float64]) -> Detections:
+def _not_turned(detector: OnnxDetector, gray: Image, sun: FloatArray) -> Detections:
     return _read(detector, gray)
 
 
-def _exactly_sun_up(detector: OnnxDetector, gray: Image, sun: NDArray[np.float64]) -> Detections:
+def _exactly_sun_up(detector: OnnxDetector, gray: Image, sun: FloatArray) -> Detections:
     """Turned by the exact angle; what falls out of the square is lost, the corners are mirrored ground."""
     import cv2
 
@@ -187,14 +188,14 @@ def _exactly_sun_up(detector: OnnxDetector, gray: Image, sun: NDArray[np.float64
     return replace(found, u_px=u_px, v_px=v_px).select(inside)
 
 
-def _sharpened(detector: OnnxDetector, gray: Image, sun: NDArray[np.float64]) -> Detections:
+def _sharpened(detector: OnnxDetector, gray: Image, sun: FloatArray) -> Detections:
     import cv2
 
     smooth = cv2.GaussianBlur(gray, (0, 0), 1.2)
     return _as_flown(detector, np.clip(gray + np.float32(0.6) * (gray - smooth), -4.0, 4.0), sun)
 
 
-def _with_mirror(detector: OnnxDetector, gray: Image, sun: NDArray[np.float64]) -> Detections:
+def _with_mirror(detector: OnnxDetector, gray: Image, sun: FloatArray) -> Detections:
     """Maps of the frame and of its mirror image averaged: twice the time."""
     turns = sun_up_turns(sun)
     tile = np.ascontiguousarray(np.rot90(gray, turns))
@@ -209,7 +210,7 @@ def _with_mirror(detector: OnnxDetector, gray: Image, sun: NDArray[np.float64]) 
     return replace(found, u_px=u_px, v_px=v_px)
 
 
-def _enlarged(detector: OnnxDetector, gray: Image, sun: NDArray[np.float64]) -> Detections:
+def _enlarged(detector: OnnxDetector, gray: Image, sun: FloatArray) -> Detections:
     """One and a half times as large, in four overlapping tiles: four times the time."""
     import cv2
 

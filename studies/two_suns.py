@@ -16,15 +16,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, FloatArray
 from payload_emulator.errors import DatasetError
 from payload_emulator.training.data.dataset import Dataset, Frame, diameter_on_ground_m, ground_points
 from payload_emulator.training.data.truth import FrameTruth
 from payload_emulator.training.evaluate.evaluate import Scored
 from payload_emulator.training.evaluate.scoring import FrameDetections, best_threshold, tally
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,14 +166,14 @@ def fuse(
     return FrameDetections(*(column[order] for column in columns))
 
 
-def _ground_grid(dataset: Dataset, frame: Frame, side: int = 7) -> Floats:
+def _ground_grid(dataset: Dataset, frame: Frame, side: int = 7) -> FloatArray:
     u, v = np.meshgrid(
         np.linspace(0, dataset.width_px - 1, side), np.linspace(0, dataset.height_px - 1, side)
     )
     return ground_points(dataset, frame, u.ravel(), v.ravel())
 
 
-def _in_view(dataset: Dataset, frame: Frame, points: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def _in_view(dataset: Dataset, frame: Frame, points: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Pixels (n, 2) of points (n, 3) in a frame, and which lie in its picture."""
     camera = dataset.camera
     uv = np.asarray(camera.project((points - frame.position_mcmf_m) @ frame.camera_from_mcmf.T))

@@ -13,14 +13,10 @@ register before the packet, E after it, and n its octets, the packet's own check
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
 from tmtc._compile import njit
-
-Array = npt.NDArray[Any]
+from tmtc.arrays import RecordArray
 
 GOOD = 0
 POLYNOMIAL = 0x1021
@@ -30,7 +26,7 @@ _CUC_P_FIELD = 0x2E
 _PACKET_MAX = 65_542
 
 
-def crc_tables() -> Array:
+def crc_tables() -> RecordArray:
     """(8, 256) int32: the register's change by an octet that is followed by 0..7 zero octets."""
     tables = np.zeros((8, 256), dtype=np.int32)
     for octet in range(256):
@@ -44,7 +40,7 @@ def crc_tables() -> Array:
     return tables
 
 
-def powers_of_octets() -> Array:
+def powers_of_octets() -> RecordArray:
     """(65543,) int32: x**(8n) modulo the generator polynomial."""
     tables = crc_tables()[0].tolist()
     power, powers = 1, []
@@ -55,7 +51,7 @@ def powers_of_octets() -> Array:
 
 
 @njit
-def _crc(buffer: Array, start: int, stop: int, tables: Array) -> int:
+def _crc(buffer: RecordArray, start: int, stop: int, tables: RecordArray) -> int:
     crc = 0xFFFF
     i = start
     while i + 8 <= stop:
@@ -77,7 +73,7 @@ def _crc(buffer: Array, start: int, stop: int, tables: Array) -> int:
 
 
 @njit
-def length_at(buffer: Array, p: int, stop: int, packet_type: int, longest: int) -> int:
+def length_at(buffer: RecordArray, p: int, stop: int, packet_type: int, longest: int) -> int:
     """Octets of the packet whose header stands at `p`, or 0 where no such header can stand."""
     if stop - p < 7 or (buffer[p] >> 4) != packet_type:
         return 0
@@ -88,13 +84,20 @@ def length_at(buffer: Array, p: int, stop: int, packet_type: int, longest: int) 
 
 
 @njit
-def is_idle(buffer: Array, p: int) -> bool:
+def is_idle(buffer: RecordArray, p: int) -> bool:
     return (buffer[p] & 0x0F) == 0x07 and buffer[p + 1] == 0xFF
 
 
 @njit
 def walk(
-    buffer: Array, p: int, stop: int, packet_type: int, longest: int, tables: Array, rows: Array, count: int
+    buffer: RecordArray,
+    p: int,
+    stop: int,
+    packet_type: int,
+    longest: int,
+    tables: RecordArray,
+    rows: RecordArray,
+    count: int,
 ) -> tuple[int, int]:
     """(position, number of rows) after the undamaged packets from `p` on have been written as rows kind,
     start, stop.
@@ -115,7 +118,7 @@ def walk(
 
 
 @njit
-def is_pus(buffer: Array, p: int, length: int, packet_type: int) -> bool:
+def is_pus(buffer: RecordArray, p: int, length: int, packet_type: int) -> bool:
     """Whether a PUS-C secondary header stands where it should."""
     if not buffer[p] & 0x08:
         return False
@@ -136,7 +139,13 @@ def _multiply(a: int, b: int) -> int:
 
 @njit
 def _prefix_holds(
-    buffer: Array, p: int, length: int, prefix: Array, known: Array, tables: Array, powers: Array
+    buffer: RecordArray,
+    p: int,
+    length: int,
+    prefix: RecordArray,
+    known: RecordArray,
+    tables: RecordArray,
+    powers: RecordArray,
 ) -> bool:
     """Whether the packet at `p` ends with its checksum; `prefix` is filled over [known[0], known[1]]."""
     e = p + length
@@ -157,8 +166,8 @@ def _prefix_holds(
 
 @njit
 def _stands(
-    buffer: Array, p: int, stop: int, packet_type: int, longest: int,
-    prefix: Array, known: Array, tables: Array, powers: Array,
+    buffer: RecordArray, p: int, stop: int, packet_type: int, longest: int,
+    prefix: RecordArray, known: RecordArray, tables: RecordArray, powers: RecordArray,
 ) -> bool:  # fmt: skip
     """Whether a whole packet with a right checksum, or the header of an idle packet, stands at `p`."""
     length = length_at(buffer, p, stop, packet_type, longest)
@@ -169,8 +178,8 @@ def _stands(
 
 @njit
 def chain_start(
-    buffer: Array, first: int, end: int, packet_type: int, longest: int,
-    prefix: Array, known: Array, tables: Array, powers: Array,
+    buffer: RecordArray, first: int, end: int, packet_type: int, longest: int,
+    prefix: RecordArray, known: RecordArray, tables: RecordArray, powers: RecordArray,
 ) -> int:  # fmt: skip
     """Least position in [first, end) from which right packets lead exactly to `end`, or -1."""
     leads = np.zeros(end - first + 1, dtype=np.uint8)
@@ -190,8 +199,8 @@ def chain_start(
 
 @njit
 def search(
-    buffer: Array, first: int, limit: int, stop: int, packet_type: int, longest: int,
-    prefix: Array, known: Array, tables: Array, powers: Array,
+    buffer: RecordArray, first: int, limit: int, stop: int, packet_type: int, longest: int,
+    prefix: RecordArray, known: RecordArray, tables: RecordArray, powers: RecordArray,
 ) -> int:  # fmt: skip
     """First position in [first, limit) at which a packet is believed to begin, or `limit`.
 
@@ -218,7 +227,7 @@ _AHEAD = 256
 
 
 @njit
-def header_at(buffer: Array, p: int, stop: int, packet_type: int, longest: int) -> int:
+def header_at(buffer: RecordArray, p: int, stop: int, packet_type: int, longest: int) -> int:
     """Octets that the header at `p` claims, whether or not they are there; 0 where no header can stand."""
     if stop - p < 7 or (buffer[p] >> 4) != packet_type:
         return 0
@@ -228,7 +237,14 @@ def header_at(buffer: Array, p: int, stop: int, packet_type: int, longest: int) 
 
 @njit
 def walk_unchecked(
-    buffer: Array, p: int, stop: int, packet_type: int, longest: int, last: Array, rows: Array, count: int
+    buffer: RecordArray,
+    p: int,
+    stop: int,
+    packet_type: int,
+    longest: int,
+    last: RecordArray,
+    rows: RecordArray,
+    count: int,
 ) -> tuple[int, int]:
     """Like `walk` for packets without error control: goes on as long as headers follow each other.
 
@@ -252,7 +268,7 @@ def walk_unchecked(
 
 @njit
 def proves(
-    buffer: Array, q: int, stop: int, packet_type: int, longest: int, last: Array, is_begin: bool
+    buffer: RecordArray, q: int, stop: int, packet_type: int, longest: int, last: RecordArray, is_begin: bool
 ) -> bool:
     """Whether packets without error control begin at `q`.
 
@@ -284,7 +300,7 @@ def proves(
 
 @njit
 def search_unchecked(
-    buffer: Array, first: int, stop: int, packet_type: int, longest: int, last: Array
+    buffer: RecordArray, first: int, stop: int, packet_type: int, longest: int, last: RecordArray
 ) -> int:
     """First position in [first, stop) at which packets without error control begin, or `stop`."""
     for q in range(first, stop):

@@ -6,20 +6,17 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from tmtc._compile import njit
-
-Array = npt.NDArray[Any]
+from tmtc.arrays import RecordArray
 
 _HIGH, _LOW = 0x1ACF, 0xFC1D
 
 
 @functools.cache
-def tables() -> Array:
+def tables() -> RecordArray:
     """Return (2, 65536) uint8: the number of bits in which each 16-bit word differs from each half of the marker."""
     words = np.arange(1 << 16, dtype=np.uint16)
     return np.stack([np.bitwise_count(words ^ np.uint16(half)) for half in (_HIGH, _LOW)])
@@ -27,7 +24,7 @@ def tables() -> Array:
 
 @njit
 def find_markers(
-    octets: Array, first: int, stop: int, tolerance: int, distance: Array, found: Array
+    octets: RecordArray, first: int, stop: int, tolerance: int, distance: RecordArray, found: RecordArray
 ) -> tuple[int, int]:
     """Find start bits in [first, stop) of markers with at most `tolerance` wrong bits; return (count, next bit).
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tmtc.arrays import IntArray
 from tmtc.errors import MalformedPacket, TruncatedPacket, ValueRefused
 
 P_FIELD = 0x2E
@@ -67,7 +68,7 @@ def unpack_cuc(octets: bytes | memoryview) -> int:
     return int.from_bytes(octets[1:CUC_LENGTH], "big")
 
 
-def onboard_ticks(values: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+def onboard_ticks(values: npt.NDArray[Any]) -> IntArray:
     """Return on-board times (n,) given as u64 in signed integers; `NO_TICKS` for those beyond 48 bits."""
     ticks = values.astype(np.int64)
     ticks[values >= TICKS_LIMIT] = NO_TICKS

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tmtc import cadu, reed_solomon
-from tmtc.arrays import IntArray, OctetArray
+from tmtc.arrays import BoolArray, IntArray, OctetArray
 from tmtc.clcw import UplinkSeen, uplink_seen
 from tmtc.crc import CRC_LENGTH, crc16
 from tmtc.dictionary import DICTIONARY
@@ -551,9 +551,9 @@ def proof_of(stream: OctetArray, settings: LinkSettings) -> cadu.Verify | None:
     if not settings.proves_frames:
         return None
 
-    def proves(sync: cadu.CaduSync) -> npt.NDArray[np.bool_]:
+    def proves(sync: cadu.CaduSync) -> BoolArray:
         frames, corrected = _read_frames(stream, sync, settings)
-        repaired: npt.NDArray[np.bool_] = np.all(corrected >= 0, axis=1)
+        repaired: BoolArray = np.all(corrected >= 0, axis=1)
         return repaired & frame_checksums_hold(frames) if settings.checksum else repaired
 
     return proves
@@ -720,7 +720,7 @@ def _continuation(
     return []
 
 
-def _frames_lost(zones: OctetArray, count: IntArray, idle: npt.NDArray[np.bool_]) -> int:
+def _frames_lost(zones: OctetArray, count: IntArray, idle: BoolArray) -> int:
     """Frames of one virtual channel that are missing by their counts of 8 bits.
 
     What came before, octet for octet, is sent again and not counted; a count up to `_LATE_FRAMES` behind the one before

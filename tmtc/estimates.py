@@ -6,13 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from tmtc.arrays import FloatArray, IntArray
 from tmtc.cuc import onboard_ticks
 from tmtc.schema import Table
-
-Float = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
 
 ESTIMATE_PACKETS = ("filter_state", "filter_estimate")
 """Packets that carry an estimate: in version 2, and from version 3 on."""
@@ -29,7 +26,7 @@ class FilterEstimates:
     Attributes
     ----------
     packet_index
-        Index of each packet in its stream, shape (n,).
+        IntArray of each packet in its stream, shape (n,).
     image_ticks, frame_number
         Of the image, shape (n,).
     packet_ticks
@@ -43,13 +40,13 @@ class FilterEstimates:
         Degrees of freedom of the normalised innovation squared, 0 without a fix, -1 if unknown (version 2).
     """
 
-    packet_index: Index
-    image_ticks: Index
-    frame_number: Index
-    packet_ticks: Index
-    state: Float
-    covariance: Float
-    innovation_degrees: Index
+    packet_index: IntArray
+    image_ticks: IntArray
+    frame_number: IntArray
+    packet_ticks: IntArray
+    state: FloatArray
+    covariance: FloatArray
+    innovation_degrees: IntArray
 
     def __len__(self) -> int:
         return len(self.image_ticks)
@@ -67,7 +64,7 @@ def filter_estimates(tables: Mapping[str, Table]) -> FilterEstimates:
     return FilterEstimates(*columns)
 
 
-def full_covariance(triangle: Float, *, upper: bool) -> Float:
+def full_covariance(triangle: FloatArray, *, upper: bool) -> FloatArray:
     """Return symmetric matrices (n, 9, 9) from triangles by rows (n, 45)."""
     rows, columns = np.triu_indices(STATES) if upper else np.tril_indices(STATES)
     covariance = np.zeros((len(triangle), STATES, STATES))

@@ -14,9 +14,8 @@ import struct
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from tmtc.arrays import IntArray, OctetArray
+from tmtc.arrays import BoolArray, IntArray, OctetArray
 from tmtc.crc import CRC_LENGTH, crc16
 from tmtc.errors import FrameError, TruncatedPacket, ValueRefused
 
@@ -54,9 +53,9 @@ class TmFrameHeaders:
     master_count: IntArray
     channel_count: IntArray
     first_header_pointer: IntArray
-    ocf: npt.NDArray[np.bool_]
-    secondary_header: npt.NDArray[np.bool_]
-    synchronised: npt.NDArray[np.bool_]
+    ocf: BoolArray
+    secondary_header: BoolArray
+    synchronised: BoolArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +128,7 @@ def frame_headers(frames: OctetArray) -> TmFrameHeaders:
     )
 
 
-def frame_checksums_hold(frames: OctetArray) -> npt.NDArray[np.bool_]:
+def frame_checksums_hold(frames: OctetArray) -> BoolArray:
     """Whether the last two octets of each frame (n, length) are the checksum of those before."""
     if frames.shape[1] <= CRC_LENGTH:
         return np.zeros(frames.shape[0], dtype=np.bool_)

@@ -15,10 +15,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from tmtc import cadu, reed_solomon
-from tmtc.arrays import OctetArray
+from tmtc.arrays import BoolArray, IntArray, OctetArray
 from tmtc.errors import LinkFormatError
 from tmtc.frames import FRAME_HEADER_LENGTH, FRAME_MAX_LENGTH, frame_checksums_hold
 from tmtc.link import FRAME_MIN_LENGTH, LinkSettings
@@ -163,8 +162,8 @@ def _lengths(octets: int, distances: dict[int, int]) -> Iterator[list[int]]:
 
 def _examine(
     stream: OctetArray,
-    starts: npt.NDArray[np.int64],
-    inverted: npt.NDArray[np.bool_],
+    starts: IntArray,
+    inverted: BoolArray,
     length: int,
     count_packets: CountPackets,
     proved: bool,
@@ -220,7 +219,7 @@ def _weigh(
     code = candidate.code
     settings, frames = candidate, blocks
     clean = repaired = None
-    good: npt.NDArray[np.bool_] = np.ones(blocks.shape[0], dtype=np.bool_)
+    good: BoolArray = np.ones(blocks.shape[0], dtype=np.bool_)
     if code is not None:
         decoded = reed_solomon.decode(blocks, code)
         clean = float((decoded.corrected == 0).mean())
@@ -258,9 +257,9 @@ def _weigh(
     )
 
 
-def _regular(frames: OctetArray) -> npt.NDArray[np.bool_]:
+def _regular(frames: OctetArray) -> BoolArray:
     """Return whether each frame (n, length) has version 0, no data field flags and segment length id 11."""
-    regular: npt.NDArray[np.bool_] = (frames[:, 0] >> 6 == 0) & (frames[:, 4] >> 3 == 0b00011)
+    regular: BoolArray = (frames[:, 0] >> 6 == 0) & (frames[:, 4] >> 3 == 0b00011)
     return regular
 
 

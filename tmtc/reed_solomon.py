@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tmtc.arrays import OctetArray
+from tmtc.arrays import BoolArray, IntArray, OctetArray
 from tmtc.errors import LinkFormatError
 
 CODEWORD = 255
@@ -130,7 +130,7 @@ def decode(blocks: OctetArray, code: ReedSolomon) -> RsDecode:
     return RsDecode(frames, corrected)
 
 
-def clean(blocks: OctetArray, code: ReedSolomon) -> npt.NDArray[np.bool_]:
+def clean(blocks: OctetArray, code: ReedSolomon) -> BoolArray:
     """Whether each codeword of codeblocks (n, block_length) is free of errors, shape (n, interleave)."""
     words = blocks.reshape(blocks.shape[0], CODEWORD - code.virtual_fill, code.interleave)
     result = np.empty((blocks.shape[0], code.interleave), dtype=np.bool_)
@@ -294,7 +294,7 @@ def _parity_table(errors: int, dual_basis: bool) -> npt.NDArray[np.uint64]:
 
 
 @functools.cache
-def _field_tables() -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _field_tables() -> tuple[IntArray, IntArray]:
     exponent = np.zeros(255, dtype=np.int64)
     logarithm = np.zeros(256, dtype=np.int64)
     value = 1

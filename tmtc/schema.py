@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from tmtc.arrays import IntArray
+from tmtc.arrays import BoolArray, IntArray, OctetArray, RecordArray
 from tmtc.crc import CRC_LENGTH, append_crc, check_crc
 from tmtc.errors import MalformedPacket, TruncatedPacket, UnknownPacket, ValueRefused
 from tmtc.packets import (
@@ -46,7 +46,6 @@ from tmtc.pus import (
 if TYPE_CHECKING:
     from tmtc.stream import Octets, PacketCut
 
-Array = npt.NDArray[Any]
 
 _STRUCT_CODES = {
     "u8": "B", "i8": "b", "u16": "H", "i16": "h", "u32": "I", "i32": "i", "u64": "Q", "i64": "q",
@@ -230,10 +229,10 @@ class Table:
     ticks: IntArray
     sequence_count: IntArray
     message_counter: IntArray
-    columns: dict[str, Array]
-    raw: dict[str, Array]
-    items: dict[str, Array]
-    items_raw: dict[str, Array]
+    columns: dict[str, RecordArray]
+    raw: dict[str, RecordArray]
+    items: dict[str, RecordArray]
+    items_raw: dict[str, RecordArray]
     item_owner: IntArray
 
     def __len__(self) -> int:
@@ -433,20 +432,20 @@ class Dictionary:
         return self._compiled[definition.name]
 
 
-def as_octets(buffer: Octets) -> npt.NDArray[np.uint8]:
+def as_octets(buffer: Octets) -> OctetArray:
     """`buffer` as a one-dimensional array of octets, without a copy."""
     if isinstance(buffer, np.ndarray):
         return np.ascontiguousarray(buffer, dtype=np.uint8).reshape(-1)
     return np.frombuffer(buffer, dtype=np.uint8)
 
 
-def gather(octets: npt.NDArray[np.uint8], starts: IntArray, dtype: np.dtype[Any]) -> Array:
+def gather(octets: OctetArray, starts: IntArray, dtype: np.dtype[Any]) -> RecordArray:
     """Records of `dtype` beginning at `starts` (n,), copied out of `octets`."""
     if not starts.size:
         return np.empty(0, dtype=dtype)
     length = dtype.itemsize
     opaque = np.dtype((np.void, length))
-    windows: Array = np.ndarray((octets.size - length + 1,), dtype=opaque, buffer=octets, strides=(1,))
+    windows: RecordArray = np.ndarray((octets.size - length + 1,), dtype=opaque, buffer=octets, strides=(1,))
     return windows[starts].view(dtype)
 
 
@@ -564,9 +563,7 @@ class _Compiled:
             raw[group.name], values[group.name] = _columns(group.fields, records)
         return values, raw
 
-    def lengths_hold(
-        self, octets: npt.NDArray[np.uint8], offsets: IntArray, lengths: IntArray
-    ) -> npt.NDArray[np.bool_]:
+    def lengths_hold(self, octets: OctetArray, offsets: IntArray, lengths: IntArray) -> BoolArray:
         """Whether each packet is as long as its definition and count say."""
         definition = self.definition
         if definition.group is None:
@@ -576,15 +573,15 @@ class _Compiled:
         right[right] = lengths[right] == definition.base_length + counts * definition.item_length
         return right
 
-    def table(self, octets: npt.NDArray[np.uint8], offsets: IntArray, rows: IntArray) -> Table:
+    def table(self, octets: OctetArray, offsets: IntArray, rows: IntArray) -> Table:
         """The packets at `offsets[rows]` as columns; their lengths are known to hold."""
         definition, group = self.definition, self.definition.group
         starts = offsets[rows]
         records = gather(octets, starts, self.tm_dtype)
         header = records["header"]
         raw, columns = _columns(definition.fields, records)
-        items: dict[str, Array] = {}
-        items_raw: dict[str, Array] = {}
+        items: dict[str, RecordArray] = {}
+        items_raw: dict[str, RecordArray] = {}
         owner = np.empty(0, dtype=np.int64)
         if group:
             assert self.item_dtype is not None
@@ -646,7 +643,9 @@ def _record_dtype(fields: tuple[Field, ...]) -> np.dtype[Any]:
     return np.dtype(_dtype_fields(fields))
 
 
-def _columns(fields: tuple[Field, ...], records: Array) -> tuple[dict[str, Array], dict[str, Array]]:
+def _columns(
+    fields: tuple[Field, ...], records: RecordArray
+) -> tuple[dict[str, RecordArray], dict[str, RecordArray]]:
     """(raw, engineering) columns of big-endian `records`."""
     raw, engineering = {}, {}
     for f in fields:
@@ -656,7 +655,7 @@ def _columns(fields: tuple[Field, ...], records: Array) -> tuple[dict[str, Array
     return raw, engineering
 
 
-def _decode_column(f: Field, raw: Array) -> Array:
+def _decode_column(f: Field, raw: RecordArray) -> RecordArray:
     if f.is_float:
         return raw.astype(np.float64) if not f.is_calibrated else raw.astype(np.float64) * f.scale + f.offset
     if not f.is_calibrated:
@@ -708,7 +707,7 @@ def _encode(packet: str, f: Field, value: object) -> int | float:
     return float(encoded) if f.is_float else int(encoded)
 
 
-def _encode_column(packet: str, f: Field, value: object) -> Array:
+def _encode_column(packet: str, f: Field, value: object) -> RecordArray:
     """Raw numbers (n,) of engineering values."""
     given = _as_array(f, value)
     if given.size == 0:
@@ -728,7 +727,7 @@ def _encode_column(packet: str, f: Field, value: object) -> Array:
     if f.is_float:
         with np.errstate(over="ignore"):
             scaled = (given.astype(np.float64) - f.offset) / f.scale if f.is_calibrated else given
-            raw: Array = scaled.astype(f.dtype)
+            raw: RecordArray = scaled.astype(f.dtype)
         _refuse(packet, f, given, np.isinf(raw) & ~np.isinf(given))
         return raw
     least, greatest = f.raw_limits
@@ -755,7 +754,7 @@ def _encode_column(packet: str, f: Field, value: object) -> Array:
     return codes.astype(f.dtype)
 
 
-def _as_array(f: Field, value: object) -> Array:
+def _as_array(f: Field, value: object) -> RecordArray:
     given = np.asarray(value)
     if f.type == "u64" and given.dtype.kind == "f" and not isinstance(value, np.ndarray):
         # numpy makes floats of a list that holds integers below and above 2^63
@@ -781,6 +780,6 @@ def _refuse_no_number(packet: str, name: str, value: object) -> None:
         raise ValueRefused(packet, name, value, "a finite number")
 
 
-def _refuse(packet: str, f: Field, given: Array, wrong: Array) -> None:
+def _refuse(packet: str, f: Field, given: RecordArray, wrong: RecordArray) -> None:
     if np.any(wrong):
         raise ValueRefused(packet, f.name, given[wrong].flat[0].item(), _expectation(f))

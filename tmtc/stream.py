@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tmtc.arrays import IntArray
+from tmtc.arrays import BoolArray, IntArray, OctetArray
 from tmtc.crc import crc16
 from tmtc.errors import ValueRefused
 from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, TYPE_TELEMETRY
 from tmtc.schema import as_octets
 
-Octets = bytes | bytearray | memoryview | npt.NDArray[np.uint8]
+Octets = bytes | bytearray | memoryview | OctetArray
 
 _GOOD, _BAD, _SKIPPED, _IDLE = 0, 1, 2, 3
 
@@ -41,7 +41,7 @@ class PacketCut:
 
     offsets: IntArray
     lengths: IntArray
-    crc_ok: npt.NDArray[np.bool_]
+    crc_ok: BoolArray
     skipped: IntArray
     idle: IntArray
     consumed: int
@@ -81,7 +81,7 @@ class PrimaryHeaders:
     apid: IntArray
     sequence_count: IntArray
     sequence_flags: IntArray
-    secondary_header: npt.NDArray[np.bool_]
+    secondary_header: BoolArray
 
 
 def cut_packets(
@@ -152,7 +152,7 @@ def primary_headers(buffer: Octets, cut: PacketCut) -> PrimaryHeaders:
 class _Cutter:
     """One pass over a buffer: compiled walks over undamaged packets, a decision wherever one ends."""
 
-    def __init__(self, octets: npt.NDArray[np.uint8], packet_type: int, longest: int) -> None:
+    def __init__(self, octets: OctetArray, packet_type: int, longest: int) -> None:
         from tmtc import _cutting  # numba is imported only where it is used
 
         self.kernels: Any = _cutting
@@ -252,7 +252,7 @@ class _Cutter:
 class _UncheckedCutter:
     """One pass over packets without error control: walk over headers, search where they end."""
 
-    def __init__(self, octets: npt.NDArray[np.uint8], packet_type: int, longest: int) -> None:
+    def __init__(self, octets: OctetArray, packet_type: int, longest: int) -> None:
         from tmtc import _cutting
 
         self.kernels: Any = _cutting

@@ -20,11 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tmtc.arrays import BoolArray, FloatArray, IntArray
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.errors import TableError
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 MAGIC = b"LINNATBL"
 VERSION = 1
@@ -78,8 +76,8 @@ class AnchorTable:
         Positions, shape (n, 3).
     """
 
-    ticks: Index
-    position_mcmf_m: Float
+    ticks: IntArray
+    position_mcmf_m: FloatArray
 
     def at(self, ticks: int) -> AnchorSample | None:
         """Return the place at an on-board time, None outside the table or in a gap of it."""
@@ -123,17 +121,17 @@ class CatalogueTable:
         Standard deviations east, north, up of the centre at rim height, shape (n, 3).
     """
 
-    ids: Index
-    latitude_rad: Float
-    longitude_rad: Float
-    diameter_m: Float
-    rim_height_m: Float
-    sigma_m: Float
+    ids: IntArray
+    latitude_rad: FloatArray
+    longitude_rad: FloatArray
+    diameter_m: FloatArray
+    rim_height_m: FloatArray
+    sigma_m: FloatArray
 
     def __len__(self) -> int:
         return int(self.ids.shape[0])
 
-    def select(self, which: NDArray[np.bool_] | Index) -> CatalogueTable:
+    def select(self, which: BoolArray | IntArray) -> CatalogueTable:
         return CatalogueTable(
             self.ids[which],
             self.latitude_rad[which],
@@ -151,8 +149,8 @@ class GravityTable:
     name: str
     gm_m3_s2: float
     radius_m: float
-    c_bar: Float
-    s_bar: Float
+    c_bar: FloatArray
+    s_bar: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,11 +167,11 @@ class OrientationTable:
         The constant rotation from mean-Earth axes to principal axes, shape (3, 3).
     """
 
-    ticks: Index
-    mcmf_from_icrf: Float
-    pa_from_mcmf: Float
+    ticks: IntArray
+    mcmf_from_icrf: FloatArray
+    pa_from_mcmf: FloatArray
 
-    def at(self, ticks: int) -> Float | None:
+    def at(self, ticks: int) -> FloatArray | None:
         """Return mcmf_from_icrf at an on-board time, shape (3, 3); None outside the table."""
         matrix = _interpolate(self.ticks, self.mcmf_from_icrf.reshape(-1, 9), ticks)
         if matrix is None:
@@ -197,8 +195,8 @@ class InitialState:
     """
 
     ticks: int
-    position_icrf_m: Float
-    velocity_icrf_m_s: Float
+    position_icrf_m: FloatArray
+    velocity_icrf_m_s: FloatArray
     sigma_position_m: float
     sigma_velocity_m_s: float
 
@@ -217,9 +215,9 @@ class BurnTable:
         Standard deviation per axis of what is carried out against the plan, shape (n,).
     """
 
-    ticks: Index
-    delta_v_icrf_m_s: Float
-    sigma_m_s: Float
+    ticks: IntArray
+    delta_v_icrf_m_s: FloatArray
+    sigma_m_s: FloatArray
 
     def __len__(self) -> int:
         return int(self.ticks.shape[0])
@@ -463,14 +461,14 @@ def _count(content: bytes, each: int, kind: bytes, extra: int = 0) -> int:
     return count
 
 
-def _increasing(ticks: ArrayLike | Sequence[int], what: str) -> Index:
+def _increasing(ticks: ArrayLike | Sequence[int], what: str) -> IntArray:
     times = np.asarray(ticks).astype(np.int64).reshape(-1)
     if times.size < 2 or np.any(np.diff(times) <= 0):
         raise TableError(f"{what}: needs at least two times, strictly increasing")
     return times
 
 
-def _finite(values: NDArray[np.floating], what: str) -> Float:
+def _finite(values: NDArray[np.floating], what: str) -> FloatArray:
     numbers = np.asarray(values, dtype=np.float64)
     if not np.all(np.isfinite(numbers)):
         first = int(np.argmax(~np.isfinite(numbers)))
@@ -478,7 +476,7 @@ def _finite(values: NDArray[np.floating], what: str) -> Float:
     return numbers
 
 
-def _interpolate(ticks: Index, values: Float, at_ticks: int) -> Float | None:
+def _interpolate(ticks: IntArray, values: FloatArray, at_ticks: int) -> FloatArray | None:
     """Return rows interpolated by Lagrange's formula on the nearest nodes; None outside or in a gap.
 
     A gap is a step more than twice the smallest: the table is evenly spaced wherever it covers.
@@ -512,5 +510,5 @@ def _interpolate(ticks: Index, values: Float, at_ticks: int) -> Float | None:
     return np.asarray(weights @ values[low:high], dtype=np.float64)
 
 
-def _sine_latitude(position: Float) -> float:
+def _sine_latitude(position: FloatArray) -> float:
     return float(position[2] / np.linalg.norm(position))

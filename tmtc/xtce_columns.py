@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Any, Union
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[Any]
-IntArray = npt.NDArray[np.int64]
+from tmtc.arrays import BoolArray, IntArray, RecordArray
+
+IntArray = IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,8 +20,8 @@ class ValueColumn:
     Python objects in object arrays. A code without a name stays an integer.
     """
 
-    raw: Array
-    values: Array
+    raw: RecordArray
+    values: RecordArray
 
     def __len__(self) -> int:
         return len(self.raw)
@@ -85,7 +85,7 @@ class RecordColumn:
 class OptionalColumn:
     """A column that not every packet has: `present` (n,), and the values of the packets that have it."""
 
-    present: npt.NDArray[np.bool_]
+    present: BoolArray
     column: Column
 
     def __len__(self) -> int:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tmtc.arrays import BoolArray, IntArray, OctetArray, RecordArray
 from tmtc.errors import DefinitionError
 from tmtc.schema import as_octets, gather
 from tmtc.stream import Octets, PacketCut
@@ -55,10 +56,9 @@ from tmtc.xtce_definition import (
     StringEncoding,
 )
 
-Array = npt.NDArray[Any]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
-OctetArray = npt.NDArray[np.uint8]
+IntArray = IntArray
+BoolArray = BoolArray
+OctetArray = OctetArray
 
 DECODED, NO_CONTAINER, AMBIGUOUS, TOO_SHORT, MALFORMED, DAMAGED = 0, 1, 2, 3, 4, 5
 VERDICTS = ("decoded", "no_container", "ambiguous", "too_short", "malformed", "damaged")
@@ -736,10 +736,10 @@ def _read_octets(
     return found, behind[readable], None if good.all() else good
 
 
-def _slices(run: _Run, starts: IntArray, sizes: IntArray) -> Array:
+def _slices(run: _Run, starts: IntArray, sizes: IntArray) -> RecordArray:
     """So many octets (n,) of the buffer from `starts` (n,) on, as objects."""
     if len(sizes) and 0 < sizes[0] <= 4096 and (sizes == sizes[0]).all():
-        found: Array = gather(run.octets, starts, np.dtype((np.void, int(sizes[0])))).astype(object)
+        found: RecordArray = gather(run.octets, starts, np.dtype((np.void, int(sizes[0])))).astype(object)
         return found
     data = run.data
     first = starts - run.base
@@ -748,8 +748,8 @@ def _slices(run: _Run, starts: IntArray, sizes: IntArray) -> Array:
 
 
 def _aligned_texts(
-    run: _Run, at: IntArray, bits: IntArray, raw: Array, encoding: StringEncoding
-) -> Array | None:
+    run: _Run, at: IntArray, bits: IntArray, raw: RecordArray, encoding: StringEncoding
+) -> RecordArray | None:
     """Texts (n,) in buffers `raw` of whole octets; None where one is no text or the layout is not a plain one."""
     starts, sizes = at >> 3, bits >> 3
     if encoding.tag_bits:
@@ -774,8 +774,8 @@ def _aligned_texts(
 
 
 def _decoded_texts(
-    run: _Run, starts: IntArray, sizes: IntArray, charset: str, whole: Array | None
-) -> Array | None:
+    run: _Run, starts: IntArray, sizes: IntArray, charset: str, whole: RecordArray | None
+) -> RecordArray | None:
     """Texts (n,) of so many octets each; None where one of them is no text.
 
     Short ones are widened to four octets a character and made strings by numpy, which takes zeros at the end for none.
@@ -825,7 +825,7 @@ def _pieces(octets: OctetArray, at: IntArray, bits: IntArray, *, left: bool) -> 
     return pieces
 
 
-def _objects(values: Sequence[Any]) -> Array:
+def _objects(values: Sequence[Any]) -> RecordArray:
     array = np.empty(len(values), dtype=object)
     array[:] = values
     return array
@@ -894,7 +894,7 @@ def _read_open_text(run: _Run, rows: _Rows, encoding: StringEncoding) -> _Found:
 # numbers
 
 
-def _raw_fields(run: _Run, at: IntArray, fields: Sequence[tuple[Any, int]], bits: int) -> list[Array]:
+def _raw_fields(run: _Run, at: IntArray, fields: Sequence[tuple[Any, int]], bits: int) -> list[RecordArray]:
     """Raw columns (n,) of numbers at offsets from `at`, all inside `bits` bits that are there."""
     if not len(at):
         return [np.empty(0, dtype=_raw_dtype(encoding)) for encoding, _ in fields]
@@ -902,7 +902,7 @@ def _raw_fields(run: _Run, at: IntArray, fields: Sequence[tuple[Any, int]], bits
     least, greatest = int(phase.min()), int(phase.max())
     if least == greatest:
         return _record_fields(run.octets, at >> 3, least, fields, bits)
-    columns: list[Array] = [np.empty(len(at), dtype=_raw_dtype(encoding)) for encoding, _ in fields]
+    columns: list[RecordArray] = [np.empty(len(at), dtype=_raw_dtype(encoding)) for encoding, _ in fields]
     for one in range(least, greatest + 1):
         mine = np.flatnonzero(phase == one)
         if len(mine):
@@ -920,10 +920,10 @@ def _raw_dtype(encoding: IntegerEncoding | FloatEncoding) -> type:
 
 def _record_fields(
     octets: OctetArray, starts: IntArray, phase: int, fields: Sequence[tuple[Any, int]], bits: int
-) -> list[Array]:
+) -> list[RecordArray]:
     span = (phase + bits + 7) >> 3
     records = gather(octets, starts, np.dtype((np.void, span))).view(np.uint8).reshape(-1, span)
-    columns: list[Array] = []
+    columns: list[RecordArray] = []
     for encoding, offset in fields:
         if isinstance(encoding, IntegerEncoding):
             columns.append(_integers(records, phase + offset, encoding))
@@ -962,13 +962,13 @@ def _unsigned(records: OctetArray, bit: int, bits: int) -> npt.NDArray[np.uint64
     return value
 
 
-def _window(records: OctetArray, begin: int, size: int, kind: str = "u", order: str = ">") -> Array:
+def _window(records: OctetArray, begin: int, size: int, kind: str = "u", order: str = ">") -> RecordArray:
     """Numbers of whole octets at one place of each record, without a copy."""
     n, span = records.shape
     return np.ndarray((n,), dtype=f"{order}{kind}{size}", buffer=records, offset=begin, strides=(span,))
 
 
-def _integers(records: OctetArray, bit: int, encoding: IntegerEncoding) -> Array:
+def _integers(records: OctetArray, bit: int, encoding: IntegerEncoding) -> RecordArray:
     bits, form = encoding.bits, encoding.form
     order = "<" if encoding.little else ">"
     if not bit & 7 and bits in (8, 16, 32, 64) and form in ("unsigned", "twosComplement"):
@@ -994,7 +994,7 @@ def _integers(records: OctetArray, bit: int, encoding: IntegerEncoding) -> Array
     return np.where(sign, -number, number)
 
 
-def _floats(records: OctetArray, bit: int, encoding: FloatEncoding) -> Array:
+def _floats(records: OctetArray, bit: int, encoding: FloatEncoding) -> RecordArray:
     bits = encoding.bits
     order = "<" if encoding.little else ">"
     if encoding.form == "IEEE754":
@@ -1023,8 +1023,8 @@ def _floats(records: OctetArray, bit: int, encoding: FloatEncoding) -> Array:
 
 
 def _calibrated(
-    data_type: ScalarType, raw: Array, rows: _Rows, name: str | None
-) -> tuple[Array, BoolArray | None]:
+    data_type: ScalarType, raw: RecordArray, rows: _Rows, name: str | None
+) -> tuple[RecordArray, BoolArray | None]:
     """Values of raw numbers, and which of them a calibrator covers (None: all)."""
     if data_type.is_boolean:
         return raw != 0, None
@@ -1038,22 +1038,22 @@ def _calibrated(
     return _in_context(calibration, raw, rows, name)
 
 
-def _named(data_type: ScalarType, raw: Array) -> Array:
+def _named(data_type: ScalarType, raw: RecordArray) -> RecordArray:
     """Names of codes; a code without a name stays an integer."""
     firsts = np.array([first for first, _, _ in data_type.labels], dtype=raw.dtype)
     lasts = np.array([last for _, last, _ in data_type.labels], dtype=raw.dtype)
     names = _objects([label for _, _, label in data_type.labels])
     place = np.searchsorted(firsts, raw, side="right") - 1
     known = (place >= 0) & (raw <= lasts[np.maximum(place, 0)])
-    values: Array = names[np.maximum(place, 0)]
+    values: RecordArray = names[np.maximum(place, 0)]
     if not known.all():
         values[~known] = raw[~known].tolist()
     return values
 
 
 def _in_context(
-    calibration: Calibration, raw: Array, rows: _Rows, name: str | None
-) -> tuple[Array, BoolArray | None]:
+    calibration: Calibration, raw: RecordArray, rows: _Rows, name: str | None
+) -> tuple[RecordArray, BoolArray | None]:
     """Values by the first calibrator whose condition holds; a condition may ask for the raw value itself."""
     values = raw.astype(np.float64)
     covered = np.ones(len(raw), dtype=np.bool_)
@@ -1073,7 +1073,7 @@ def _in_context(
     return values, None if covered.all() else covered
 
 
-def _applied(calibrator: Calibrator, raw: Array) -> tuple[Array, BoolArray | None]:
+def _applied(calibrator: Calibrator, raw: RecordArray) -> tuple[RecordArray, BoolArray | None]:
     """Calibrated values (n,), and which lie where the calibrator says something (None: all)."""
     x = raw.astype(np.float64)
     if isinstance(calibrator, Polynomial):
@@ -1085,7 +1085,7 @@ def _applied(calibrator: Calibrator, raw: Array) -> tuple[Array, BoolArray | Non
     return _splined(calibrator, x)
 
 
-def _splined(spline: Spline, x: Array) -> tuple[Array, BoolArray | None]:
+def _splined(spline: Spline, x: RecordArray) -> tuple[RecordArray, BoolArray | None]:
     raws = np.array([point[0] for point in spline.points])
     calibrated = np.array([point[1] for point in spline.points])
     place = np.clip(np.searchsorted(raws, x, side="right") - 1, 0, len(raws) - 1)
@@ -1104,7 +1104,7 @@ def _splined(spline: Spline, x: Array) -> tuple[Array, BoolArray | None]:
 # conditions
 
 
-def _resolved(reference: Reference, rows: _Rows) -> tuple[Array, BoolArray]:
+def _resolved(reference: Reference, rows: _Rows) -> tuple[RecordArray, BoolArray]:
     """Values (n,) of an earlier parameter, and which packets have it; zeros where there is none."""
     column = rows.column(reference.parameter)
     present = np.ones(len(rows), dtype=np.bool_)
@@ -1144,7 +1144,7 @@ def _holds(condition: Condition, rows: _Rows) -> BoolArray:
     return present & _compare(left, condition.operator, right)
 
 
-def _compare(left: Array, operator: str, right: Any) -> BoolArray:
+def _compare(left: RecordArray, operator: str, right: Any) -> BoolArray:
     result: Any
     if operator == "==":
         result = left == right

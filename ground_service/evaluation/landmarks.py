@@ -9,16 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ground_service.evaluation.fixes import IdentificationSamples
+from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
 from reports.values import PayloadMap
 from tmtc.schema import Table
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 LOG_DIAMETER_GATE = 0.4
 """Largest difference of the logarithms of mapped and catalogued diameter."""
@@ -37,13 +34,13 @@ class MappedCraters:
     `passes` is on how many passes each had been mapped by then.
     """
 
-    landmark_id: Index
-    latitude_deg: Float
-    longitude_deg: Float
-    height_m: Float
-    diameter_m: Float
-    sigma_m: Float
-    passes: Index
+    landmark_id: IntArray
+    latitude_deg: FloatArray
+    longitude_deg: FloatArray
+    height_m: FloatArray
+    diameter_m: FloatArray
+    sigma_m: FloatArray
+    passes: IntArray
 
     def __len__(self) -> int:
         return len(self.landmark_id)
@@ -65,8 +62,8 @@ class MapComparison:
         Mean of the squares of east and north over the claimed sigma: 1 where the claims hold.
     """
 
-    crater: Index
-    offset_m: Float
+    crater: IntArray
+    offset_m: FloatArray
     median_horizontal_m: float
     median_offset_m: tuple[float, float, float]
     normalised_square: float
@@ -80,7 +77,7 @@ def mapped_craters(reports: Table | None) -> MappedCraters:
     """Return all reports of landmarks in the order in which they came; none without packets."""
     items = {} if reports is None else reports.items
 
-    def column(name: str) -> Float:
+    def column(name: str) -> FloatArray:
         return np.asarray(items.get(name, np.empty(0)), dtype=np.float64)
 
     return MappedCraters(

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray
 from payload_emulator.flight.onboard.commanding import Command, Refusal, failure, parse_commands
 from payload_emulator.flight.onboard.fdir import Monitors, Reaction
 from payload_emulator.flight.onboard.housekeeping import StageTimer
@@ -36,7 +37,6 @@ from tmtc.pus import ACK_ACCEPTANCE, ACK_COMPLETION, ACK_START
 
 __all__ = ["FlightParameters", "FlightTables", "Payload", "PayloadMode"]
 
-Float = NDArray[np.float64]
 
 _PARAMETERS, _NO_TABLES = FlightParameters(), FlightTables()
 # Octets of packets in a transfer frame, for time reports.
@@ -122,7 +122,7 @@ class Payload:
         self._sent_octets = 0
 
     def step(
-        self, image: NDArray[Any], attitude: Float, clock_ticks: int, telecommand_octets: bytes
+        self, image: NDArray[Any], attitude: FloatArray, clock_ticks: int, telecommand_octets: bytes
     ) -> list[bytes]:
         """Return the space packets that go down after one frame, or one turn without a frame.
 
@@ -334,7 +334,7 @@ class Payload:
 
     # Frames
 
-    def _look(self, image: NDArray[Any], attitude: Float) -> None:
+    def _look(self, image: NDArray[Any], attitude: FloatArray) -> None:
         """Work on a frame, if it is time for one; end the observation when its time is over."""
         machine = self._machine
         ticks, window = machine.telemetry.ticks, machine.observation

@@ -11,10 +11,10 @@ from enum import IntEnum
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Memory = NDArray[np.uint8]
+from lunar.arrays import FloatArray, OctetArray
+
+Memory = OctetArray
 
 UNLIMITED = 1 << 62
 SENSORS = ("bus_voltage_v", "bus_current_a", "temperature_c", "camera_temperature_c")
@@ -64,7 +64,7 @@ class Board(Protocol):
     store: Memory
     settings: Memory
 
-    def sensors(self) -> Float:
+    def sensors(self) -> FloatArray:
         """Readings in the order of `SENSORS` (EPS, thermistors), NaN where one is dead."""
         ...
 
@@ -112,10 +112,10 @@ class BareBoard:
     reset_cause: int = ResetCause.power_on
     store: Memory = field(default_factory=lambda: np.zeros(STORE_OCTETS, dtype=np.uint8))
     settings: Memory = field(default_factory=lambda: np.zeros(SETTINGS_OCTETS, dtype=np.uint8))
-    readings: Float = field(default_factory=lambda: np.array([12.0, 0.5, 20.0, 20.0]))
+    readings: FloatArray = field(default_factory=lambda: np.array([12.0, 0.5, 20.0, 20.0]))
     tables: dict[int, bytes] = field(default_factory=dict)
 
-    def sensors(self) -> Float:
+    def sensors(self) -> FloatArray:
         return self.readings
 
     def switch(self, loads: int) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar.arrays import IntArray
+from lunar.arrays import FloatArray, IntArray
 from lunar.camera import project_mcmf
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
@@ -108,7 +108,7 @@ class CatalogueDetector:
         )
 
     def examine(
-        self, image: NDArray[Any], sun_in_camera: NDArray[np.float64] | None = None
+        self, image: NDArray[Any], sun_in_camera: FloatArray | None = None
     ) -> tuple[ImageQuality, Detections]:
         found, self._next = self._next, no_detections()
         if not image.size:
@@ -122,7 +122,7 @@ class CatalogueDetector:
 
 def craters_in_view(
     world: World, exposure: Exposure, smallest_px: float, craters: CraterCatalogue | None = None
-) -> tuple[IntArray, NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[IntArray, FloatArray, FloatArray]:
     """Return the craters in an image: index, place (n, 2) and diameter (n,) in pixels.
 
     Parameters

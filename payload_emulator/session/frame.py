@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lunar.arrays import FloatArray
+from lunar.arrays import FloatArray, IntArray
 from lunar.camera import ground_point_sphere
 from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
@@ -267,7 +266,7 @@ def metadata_of(world: World, view: View) -> dict[str, Any]:
     }
 
 
-def _label_rows(labels: Labels, ids: NDArray[np.int64]) -> list[dict[str, Any]]:
+def _label_rows(labels: Labels, ids: IntArray) -> list[dict[str, Any]]:
     return [
         {
             "id": int(ids[labels.index[n]]),

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar.arrays import FloatArray
+from lunar.arrays import FloatArray, IntArray
 from payload_emulator.errors import RecordError
 from payload_emulator.flight.payload import FlightTables
 from payload_emulator.session.parameter_file import BuildParameters, format_parameters, parse_parameters
@@ -120,7 +120,7 @@ def save_record(
             (folder / TABLES / f"{item.name}.bin").write_bytes(octets)
 
 
-def save_frame_times(folder: Path, utc_ns: NDArray[np.int64]) -> None:
+def save_frame_times(folder: Path, utc_ns: IntArray) -> None:
     """Write the UTC (n,) of every frame, which is the ground's to know: a payload is given its own clock only."""
     rows = [f"{number},{utc}\n" for number, utc in enumerate(utc_ns.tolist())]
     (folder / FRAME_TIMES).write_text("frame_number,utc_ns\n" + "".join(rows))

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import project_mcmf
 from lunar.catalogue import CraterCatalogue
 from lunar.frames import rtn_from_inertial, spherical_from_mcmf
@@ -34,9 +34,6 @@ from tmtc.tables import (
     unpack_initial_state,
     unpack_orientation_table,
 )
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _NS = 1_000_000_000
 _PACKETS = (*ESTIMATE_PACKETS, "identifications", "navigation_state", "frame_outcome", "detections")
@@ -71,14 +68,14 @@ class FlownErrors:
         Length of the error right before the first image after a gap; NaN elsewhere.
     """
 
-    frame: Index
-    state_error_rtn: Float
-    nees: Float
-    only_error_m: Float
-    coast_end_m: Float
+    frame: IntArray
+    state_error_rtn: FloatArray
+    nees: FloatArray
+    only_error_m: FloatArray
+    coast_end_m: FloatArray
 
     @property
-    def position_m(self) -> Float:
+    def position_m(self) -> FloatArray:
         return np.asarray(np.linalg.norm(self.state_error_rtn[:, :3], axis=1), dtype=np.float64)
 
 
@@ -86,7 +83,7 @@ def score_navigation(
     world: World,
     loaded: LoadedPayload,
     catalogue: CraterCatalogue,
-    camera_from_mcmf: Float,
+    camera_from_mcmf: FloatArray,
     octets: bytes,
 ) -> dict[str, Any]:
     """The section `navigation` of a summary; nothing where the anchored estimator did not run.
@@ -150,7 +147,7 @@ def score_navigation(
     }
 
 
-def _first_of_each(image_ticks: Index, frame_ticks: Index) -> tuple[Index, Index]:
+def _first_of_each(image_ticks: IntArray, frame_ticks: IntArray) -> tuple[IntArray, IntArray]:
     """Return the rows (n,) of frames of the session, each frame once (frames that were played back occur twice)."""
     ticks = image_ticks.astype(np.int64)
     at = np.minimum(np.searchsorted(frame_ticks, ticks), frame_ticks.size - 1)
@@ -159,7 +156,7 @@ def _first_of_each(image_ticks: Index, frame_ticks: Index) -> tuple[Index, Index
     return rows[first], frames.astype(np.int64)
 
 
-def _outcomes(tables: dict[str, Table], frame_ticks: Index) -> tuple[Index, Float, Index]:
+def _outcomes(tables: dict[str, Table], frame_ticks: IntArray) -> tuple[IntArray, FloatArray, IntArray]:
     """Outcome of each frame (-1: none), and NIS and matched craters of its fix."""
     outcome = np.full(frame_ticks.size, -1, dtype=np.int64)
     nis, matched = np.full(frame_ticks.size, np.nan), np.zeros(frame_ticks.size, dtype=np.int64)
@@ -178,8 +175,8 @@ def _errors(
     world: World,
     loaded: LoadedPayload,
     estimates: FilterEstimates,
-    frame_ticks: Index,
-    imaging: NDArray[np.bool_],
+    frame_ticks: IntArray,
+    imaging: BoolArray,
 ) -> FlownErrors:
     which, frame = _first_of_each(estimates.image_ticks, frame_ticks)
     own, covariance = estimates.state[which], estimates.covariance[which]
@@ -213,28 +210,28 @@ def _errors(
     return FlownErrors(frame, error, nees, only_error, coast_end)
 
 
-def _turns(rotation: Float, orientation: OrientationTable, ticks: Index) -> Float:
+def _turns(rotation: FloatArray, orientation: OrientationTable, ticks: IntArray) -> FloatArray:
     """Rotations (n, 3, 3) from the payload's inertial axes to the true ones, by way of the Moon both look at."""
     own = [orientation.at(int(tick)) for tick in ticks]
     known = np.array([np.full((3, 3), np.nan) if matrix is None else matrix for matrix in own])
     return np.asarray(np.einsum("nji,njk->nik", rotation, known), dtype=np.float64)
 
 
-def _halves(states: Float) -> Float:
+def _halves(states: FloatArray) -> FloatArray:
     """Position and velocity of states (n, 6) as (n, 2, 3)."""
     return states.reshape(-1, 2, 3)
 
 
-def _turned(states: Float, turn: Float) -> Float:
+def _turned(states: FloatArray, turn: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("nij,nkj->nki", turn, _halves(states)).reshape(-1, 6), dtype=np.float64)
 
 
-def _split(states: Float, truth: Float, turn: Float, rtn: Float) -> Float:
+def _split(states: FloatArray, truth: FloatArray, turn: FloatArray, rtn: FloatArray) -> FloatArray:
     """Errors (n, 6) of the payload's states along the axes of the true orbit."""
     return _turned(_turned(states, turn) - truth, rtn)
 
 
-def _nees(error: Float, block: Float) -> Float:
+def _nees(error: FloatArray, block: FloatArray) -> FloatArray:
     """Return the normalised errors squared (n,) of position and velocity (n, 6) under covariances (n, 6, 6)."""
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", block), 1e-30))
     whitened = error / scale
@@ -243,10 +240,10 @@ def _nees(error: Float, block: Float) -> Float:
     return np.asarray(np.einsum("ni,ni->n", whitened, solved), dtype=np.float64)
 
 
-def _propagated(loaded: LoadedPayload, model: OrbitModel, burns: BurnTable, ticks: Index) -> Float:
+def _propagated(loaded: LoadedPayload, model: OrbitModel, burns: BurnTable, ticks: IntArray) -> FloatArray:
     """States (n, 6) of the start state flown on without any image, NaN where the orbit model ends."""
     start = unpack_initial_state(loaded.tables.initial_state)
-    state: Float | None = np.concatenate([start.position_icrf_m, start.velocity_icrf_m_s, np.zeros(3)])
+    state: FloatArray | None = np.concatenate([start.position_icrf_m, start.velocity_icrf_m_s, np.zeros(3)])
     at, states = start.ticks, np.full((ticks.size, 6), np.nan)
     for row, tick in enumerate(ticks.tolist()):
         state = None if state is None else flown(model, state, at, tick, burns)
@@ -259,10 +256,10 @@ def _propagated(loaded: LoadedPayload, model: OrbitModel, burns: BurnTable, tick
 def _judged_pairs(
     world: World,
     catalogue: CraterCatalogue,
-    camera_from_mcmf: Float,
+    camera_from_mcmf: FloatArray,
     tables: dict[str, Table],
-    frame_ticks: Index,
-) -> tuple[Index, Index]:
+    frame_ticks: IntArray,
+) -> tuple[IntArray, IntArray]:
     """Right and wrong pairs of each frame's fix, shape (n, 2), and detections that are catalogued craters (n,).
 
     Landmarks that the payload mapped itself are in no catalogue and are not judged.
@@ -306,26 +303,26 @@ def _judged_pairs(
     return judged, findable
 
 
-def _rows_of(owner: Index, value: int) -> slice:
+def _rows_of(owner: IntArray, value: int) -> slice:
     low, high = np.searchsorted(owner, [value, value + 1])
     return slice(int(low), int(high))
 
 
 def _seen(
     world: World,
-    camera_from_mcmf: Float,
-    position: Float,
-    rim: Float,
+    camera_from_mcmf: FloatArray,
+    position: FloatArray,
+    rim: FloatArray,
     catalogue: CraterCatalogue,
-    which: Index,
-) -> tuple[Float, Float]:
+    which: IntArray,
+) -> tuple[FloatArray, FloatArray]:
     uv = project_mcmf(world.camera, camera_from_mcmf, position, rim[which])
     depth = (rim[which] - position) @ camera_from_mcmf[2]
     with np.errstate(divide="ignore", invalid="ignore"):
         return uv, catalogue.diameter_m[which] * world.camera.focal_px / np.where(depth > 0.0, depth, np.nan)
 
 
-def _arcs(utc_ns: Index, imaging: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _arcs(utc_ns: IntArray, imaging: BoolArray) -> list[tuple[int, int]]:
     """First and last frame of each stretch of images without a long gap."""
     at = np.flatnonzero(imaging)
     if not at.size:
@@ -334,7 +331,7 @@ def _arcs(utc_ns: Index, imaging: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(part[0]), int(part[-1])) for part in np.split(at, cuts)]
 
 
-def _arc_row(world: World, errors: FlownErrors, outcomes: Index, arc: tuple[int, int]) -> dict[str, Any]:
+def _arc_row(world: World, errors: FlownErrors, outcomes: IntArray, arc: tuple[int, int]) -> dict[str, Any]:
     first, last = arc
     mine = (errors.frame >= first) & (errors.frame <= last)
     middle = world.frame_utc_ns[(first + last) // 2]
@@ -356,7 +353,7 @@ def _arc_row(world: World, errors: FlownErrors, outcomes: Index, arc: tuple[int,
     }
 
 
-def frames_to_recover(error_m: Float) -> int | None:
+def frames_to_recover(error_m: FloatArray) -> int | None:
     """Return which frame with an image is the first to be back (1: the first of all), None where none is.
 
     Parameters
@@ -371,7 +368,7 @@ def frames_to_recover(error_m: Float) -> int | None:
     return None
 
 
-def _recovery(world: World, errors: FlownErrors, imaging: NDArray[np.bool_]) -> dict[str, Any] | None:
+def _recovery(world: World, errors: FlownErrors, imaging: BoolArray) -> dict[str, Any] | None:
     """How many frames with an image it took to be back after a kidnap or an outage; None without either."""
     section = world.scenario.disturbances
     if section.kidnap_distance_km > 0.0:
@@ -387,7 +384,7 @@ def _recovery(world: World, errors: FlownErrors, imaging: NDArray[np.bool_]) -> 
     return {"after": event, "frames_with_image": int(np.sum(since)), "frames_until_below_500_m": frames}
 
 
-def _statistics(values: Float) -> dict[str, Any]:
+def _statistics(values: FloatArray) -> dict[str, Any]:
     return {
         "count": int(values.size),
         "median_m": _percentile(values, 50.0),
@@ -396,12 +393,12 @@ def _statistics(values: Float) -> dict[str, Any]:
     }
 
 
-def _percentile(values: Float, percent: float) -> float | None:
+def _percentile(values: FloatArray, percent: float) -> float | None:
     values = values[np.isfinite(values)]
     return round(float(np.percentile(values, percent)), 3) if values.size else None
 
 
-def _means(values: Float) -> list[float | None]:
+def _means(values: FloatArray) -> list[float | None]:
     if not len(values):
         return [None] * values.shape[1]
     return [round(float(value), 3) for value in values.mean(axis=0)]

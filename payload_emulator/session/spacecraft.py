@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar.arrays import FloatArray
+from lunar.arrays import FloatArray, OctetArray
 from payload_emulator.flight.onboard.loads import MODEL_NUMBER, TABLE_NUMBERS
 from payload_emulator.flight.onboard.machine import PARAMETERS_NUMBER
 from payload_emulator.flight.payload import Payload
@@ -234,7 +234,7 @@ class Spacecraft:
         elif fault.kind == "camera_dead":
             self._camera_dead = True
 
-    def _flip_used(self, memory: NDArray[np.uint8], bits: int) -> None:
+    def _flip_used(self, memory: OctetArray, bits: int) -> None:
         """Flip bits where something is written, so that a nearly empty store is hit too."""
         used = np.flatnonzero(memory)
         for at in self._rng.choice(used, min(bits, used.size), replace=False).tolist() if used.size else ():

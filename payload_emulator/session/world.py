@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar.arrays import FloatArray, IntArray
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
@@ -395,7 +395,7 @@ def _crossings(
     window = scenario.window
     west_deg, width_deg = window.longitude_min_deg, window.longitude_max_deg - window.longitude_min_deg
 
-    def in_reach(longitude_rad: FloatArray) -> NDArray[np.bool_]:
+    def in_reach(longitude_rad: FloatArray) -> BoolArray:
         return np.asarray((np.degrees(longitude_rad) - west_deg) % 360.0 <= width_deg)
 
     return find_crossings(

@@ -10,17 +10,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lunar._compile import njit
 from lunar._gravity_kernel import acceleration as field_acceleration
 from lunar._gravity_kernel import acceleration_gradient
-
-Float = NDArray[np.float64]
+from lunar.arrays import FloatArray
 
 
 @njit(error_model="numpy")
-def _rotation(start: Float, turn: Float, fraction: float, out: Float) -> None:
+def _rotation(start: FloatArray, turn: FloatArray, fraction: float, out: FloatArray) -> None:
     """Rotation to principal axes at a fraction of the arc: exp(fraction [turn]) start, to third order."""
     a, b, c = turn[0] * fraction, turn[1] * fraction, turn[2] * fraction
     square = a * a + b * b + c * c
@@ -37,7 +35,7 @@ def _rotation(start: Float, turn: Float, fraction: float, out: Float) -> None:
 
 
 @njit(error_model="numpy")
-def _tide(x: float, y: float, z: float, body: Float, gm: float) -> tuple[float, float, float]:
+def _tide(x: float, y: float, z: float, body: FloatArray, gm: float) -> tuple[float, float, float]:
     """Acceleration by a distant body relative to that of the Moon's centre (third-body term)."""
     dx, dy, dz = body[0] - x, body[1] - y, body[2] - z
     near = gm / (dx * dx + dy * dy + dz * dz) ** 1.5
@@ -47,7 +45,7 @@ def _tide(x: float, y: float, z: float, body: Float, gm: float) -> tuple[float, 
 
 @njit(error_model="numpy")
 def _field(
-    packed: Float, scratch: Float, rotation: Float, x: float, y: float, z: float
+    packed: FloatArray, scratch: FloatArray, rotation: FloatArray, x: float, y: float, z: float
 ) -> tuple[float, float, float]:
     """Gravity of the Moon in inertial axes."""
     bx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
@@ -62,7 +60,7 @@ def _field(
 
 
 @njit(error_model="numpy")
-def _axes(state: Float, out: Float) -> None:
+def _axes(state: FloatArray, out: FloatArray) -> None:
     """Columns radial, transverse, normal of the orbit, in inertial axes."""
     r = math.sqrt(state[0] ** 2 + state[1] ** 2 + state[2] ** 2)
     hx = state[1] * state[5] - state[2] * state[4]
@@ -78,19 +76,19 @@ def _axes(state: Float, out: Float) -> None:
 
 @njit(error_model="numpy")
 def _rates(
-    state: Float,
-    transition: Float,
+    state: FloatArray,
+    transition: FloatArray,
     decay: float,
-    rotation: Float,
-    field: Float,
-    scratch: Float,
-    coarse: Float,
-    bodies: Float,
-    gms: Float,
-    axes: Float,
-    gradient: Float,
-    rate: Float,
-    transition_rate: Float,
+    rotation: FloatArray,
+    field: FloatArray,
+    scratch: FloatArray,
+    coarse: FloatArray,
+    bodies: FloatArray,
+    gms: FloatArray,
+    axes: FloatArray,
+    gradient: FloatArray,
+    rate: FloatArray,
+    transition_rate: FloatArray,
 ) -> None:
     """Time derivatives of state (6) and transition matrix (6, 9); `decay` is that of the empirical acceleration."""
     x, y, z = state[0], state[1], state[2]
@@ -123,7 +121,7 @@ def _rates(
 
 
 @njit(error_model="numpy")
-def _advance(step_matrix: Float, matrix: Float, both_sides: bool, work: Float) -> None:
+def _advance(step_matrix: FloatArray, matrix: FloatArray, both_sides: bool, work: FloatArray) -> None:
     """Replace a matrix (9, 9) by step_matrix times it, and by that times the transpose where both sides are asked."""
     for i in range(9):
         for j in range(9):
@@ -143,20 +141,20 @@ def _advance(step_matrix: Float, matrix: Float, both_sides: bool, work: Float) -
 
 @njit(error_model="numpy")
 def propagate_arc(
-    start: Float,
+    start: FloatArray,
     duration_s: float,
     steps: int,
-    start_rotation: Float,
-    turn: Float,
-    field: Float,
-    scratch: Float,
-    coarse: Float,
-    bodies: Float,
-    gms: Float,
+    start_rotation: FloatArray,
+    turn: FloatArray,
+    field: FloatArray,
+    scratch: FloatArray,
+    coarse: FloatArray,
+    bodies: FloatArray,
+    gms: FloatArray,
     correlation_s: float,
-    white_psd: Float,
-    markov_sigma: Float,
-) -> tuple[Float, Float, Float]:
+    white_psd: FloatArray,
+    markov_sigma: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return state (9,), transition (9, 9) and process noise (9, 9) at the end of an arc, by fourth-order Runge-Kutta.
 
     Parameters

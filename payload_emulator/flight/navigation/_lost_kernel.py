@@ -11,9 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lunar._compile import njit
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
+from lunar.arrays import FloatArray, IntArray
 
 _LISTED = 20_000
 
@@ -22,23 +20,23 @@ _LISTED = 20_000
 def vote(
     distance_m: float,
     radius_m: float,
-    off_nadir: Float,
-    azimuth: Float,
-    log_size: Float,
+    off_nadir: FloatArray,
+    azimuth: FloatArray,
+    log_size: FloatArray,
     gate: float,
-    bin_start: Index,
-    bin_height: Float,
-    log_diameter: Float,
-    latitude_rad: Float,
-    tangent: Float,
-    longitude: Float,
-    extent: Float,
+    bin_start: IntArray,
+    bin_height: FloatArray,
+    log_diameter: FloatArray,
+    latitude_rad: FloatArray,
+    tangent: FloatArray,
+    longitude: FloatArray,
+    extent: FloatArray,
     cell: float,
     rows: int,
     columns: int,
     work: NDArray[np.uint16],
     weight_limit: float,
-    listed: Float,
+    listed: FloatArray,
     kept: int,
 ) -> int:
     """Vote for places below a camera at one distance from the Moon's centre; return how many places are listed.
@@ -159,7 +157,7 @@ def vote(
 
 @njit
 def _insert(
-    listed: Float, total: int, kept: int, value: float, row: float, column: float, distance_m: float
+    listed: FloatArray, total: int, kept: int, value: float, row: float, column: float, distance_m: float
 ) -> int:
     """Keep a list of the best places, rows 1 to `kept`, best first; neighbours on the same level count once."""
     if total == kept and value <= listed[total, 0]:
@@ -182,7 +180,7 @@ def _insert(
 
 
 @njit
-def _solved(normal: Float, right: Float) -> Float:
+def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
     """Solution of symmetric positive definite equations by Cholesky's factors; NaN where they are not definite.
 
     Numba's own linear algebra would ask for SciPy, which does not fly.
@@ -214,24 +212,24 @@ def _solved(normal: Float, right: Float) -> Float:
 
 @njit
 def fit_place(
-    start: Float,
-    camera_from_enu: Float,
+    start: FloatArray,
+    camera_from_enu: FloatArray,
     focal_px: float,
-    centre_px: Float,
-    half_px: Float,
-    uv: Float,
-    size_px: Float,
-    variance_px2: Float,
-    latitude: Float,
-    position: Float,
-    diameter: Float,
-    sigma_m: Float,
+    centre_px: FloatArray,
+    half_px: FloatArray,
+    uv: FloatArray,
+    size_px: FloatArray,
+    variance_px2: FloatArray,
+    latitude: FloatArray,
+    position: FloatArray,
+    diameter: FloatArray,
+    sigma_m: FloatArray,
     attitude_sigma: float,
     first_tolerance_px: float,
     gate: float,
     log_gate: float,
     radius_m: float,
-) -> tuple[Float, Float, Float, Index, Float]:
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray, FloatArray]:
     """Return place, attitude, their covariance, the crater of each detection (-1: none) and what chance would give.
 
     Least squares on the pairs of detections and craters that are each other's nearest, over place (east, north, up)

@@ -11,17 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.flight.navigation.identification import minimum_members
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, in_view
 from payload_emulator.flight.vision.detections import Detections
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
-
 
 # The ground falls away from a plane: towards the edges of the image depth exceeds altitude by up to a tenth.
 _SAG = 0.05
@@ -66,8 +62,8 @@ class AcquisitionParameters:
 class Acquisition:
     """Pairs of detections and craters (indices into both), and the pose that explains them."""
 
-    detection: Index
-    index: Index
+    detection: IntArray
+    index: IntArray
     pose: Pose
     candidates: int
     needed: int
@@ -79,7 +75,7 @@ def acquire(
     pose: Pose,
     camera: PinholeCamera,
     sigma_m: float,
-    sigma_px: Float,
+    sigma_px: FloatArray,
     attitude_sigma_rad: float,
     parameters: AcquisitionParameters,
 ) -> Acquisition | None:
@@ -140,14 +136,14 @@ class _Votes:
         Edge of a cell of the vote.
     """
 
-    crater: Float
-    sight: Float
-    detection: Index
-    log_depth: Float
-    centre: Float
-    east: Float
-    north: Float
-    altitudes_m: Float
+    crater: FloatArray
+    sight: FloatArray
+    detection: IntArray
+    log_depth: FloatArray
+    centre: FloatArray
+    east: FloatArray
+    north: FloatArray
+    altitudes_m: FloatArray
     altitude_m: float
     cell_m: float
     reach_m: float
@@ -208,7 +204,7 @@ class _Votes:
             reach_m=reach,
         )
 
-    def places(self, parameters: AcquisitionParameters) -> list[Float]:
+    def places(self, parameters: AcquisitionParameters) -> list[FloatArray]:
         """Return the best camera positions (MCMF) of the vote, best first."""
         along = np.einsum("ij,ij->i", self.crater, self.sight)
         beyond = along**2 - np.einsum("ij,ij->i", self.crater, self.crater)
@@ -239,12 +235,12 @@ class _Votes:
 
 
 def _fit(
-    place_mcmf_m: Float,
+    place_mcmf_m: FloatArray,
     found: Detections,
     landmarks: LandmarkMap,
     pose: Pose,
     camera: PinholeCamera,
-    sigma_px: Float,
+    sigma_px: FloatArray,
     attitude_sigma_rad: float,
     parameters: AcquisitionParameters,
 ) -> Acquisition | None:

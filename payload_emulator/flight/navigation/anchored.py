@@ -11,8 +11,8 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import rtn_from_inertial
@@ -71,9 +71,6 @@ from tmtc.tables import (
     OrientationTable,
     no_burns,
 )
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _NAN = float("nan")
 _NO_CRATERS = np.empty(0, dtype=np.int64)
@@ -238,7 +235,7 @@ class Fix:
     """Identified craters of a frame with the update they gave."""
 
     identification: Identification
-    index: Index
+    index: IntArray
     update: Update
     reacquired: bool
 
@@ -294,7 +291,9 @@ class AnchoredNavigator:
         self._markov_sigma_m_s2 = noise.markov_sigma_m_s2
         self._places: PlaceIndex | None = None
 
-    def step(self, ticks: int, found: Detections | None, camera_from_icrf: Float | None) -> AnchoredReport:
+    def step(
+        self, ticks: int, found: Detections | None, camera_from_icrf: FloatArray | None
+    ) -> AnchoredReport:
         """Return the outcome of one frame.
 
         Parameters
@@ -349,7 +348,7 @@ class AnchoredNavigator:
         return self._report(Outcome.fixed, mcmf_from_icrf, candidates, expected, fix)
 
     def _tied(
-        self, prior: FilterState, found: Detections, camera_from_icrf: Float, mcmf_from_icrf: Float
+        self, prior: FilterState, found: Detections, camera_from_icrf: FloatArray, mcmf_from_icrf: FloatArray
     ) -> FilterState:
         """Return the prediction after the move since the frame before was measured."""
         before, self._before, self.ties = self._before, None, 0
@@ -367,7 +366,7 @@ class AnchoredNavigator:
         )
         return tied if _usable(tied, self.parameters.limits) else without_clone(prior)
 
-    def _remember(self, found: Detections, camera_from_icrf: Float, mcmf_from_icrf: Float) -> None:
+    def _remember(self, found: Detections, camera_from_icrf: FloatArray, mcmf_from_icrf: FloatArray) -> None:
         """Keep the detections that no catalogue explains, and the position that they were seen from."""
         free = np.ones(len(found), dtype=bool)
         if self.last_fix is not None:
@@ -385,7 +384,7 @@ class AnchoredNavigator:
         """Whether the estimate is too uncertain to be of use."""
         return self.state.position_sigma_m > self.parameters.divergence_limit_m
 
-    def _map(self, found: Detections, camera_from_icrf: Float, mcmf_from_icrf: Float) -> None:
+    def _map(self, found: Detections, camera_from_icrf: FloatArray, mcmf_from_icrf: FloatArray) -> None:
         """Give the map what the catalogue does not explain."""
         mean, fix = self.state.mean, self.last_fix
         pose = kalman.pose_of(mean, camera_from_icrf, mcmf_from_icrf)
@@ -602,7 +601,7 @@ class AnchoredNavigator:
         elif usable >= limits.judged_craters:
             self._disagreements += 1
 
-    def _crater_sigma_m(self, index: Index, variance_px2: Float) -> Float:
+    def _crater_sigma_m(self, index: IntArray, variance_px2: FloatArray) -> FloatArray:
         """Return the uncertainty of where each crater is detected, east, north, up.
 
         That is the catalogue's, and the part of the detector's error that stays with the crater.
@@ -616,14 +615,14 @@ class AnchoredNavigator:
         sigma_m[:, :2] = np.hypot(sigma_m[:, :2], (lasting_px * altitude_m / self._camera.focal_px)[:, None])
         return sigma_m
 
-    def _detection_variance(self, found: Detections) -> Float:
+    def _detection_variance(self, found: Detections) -> FloatArray:
         """Return the variance of each detection, per axis."""
         parameters = self.parameters
         sigma = np.where(np.isfinite(found.sigma_px), found.sigma_px, parameters.detection_sigma_px)
         sigma = np.maximum(sigma * parameters.detection_sigma_scale, parameters.detection_sigma_floor_px)
         return np.asarray(sigma**2, dtype=np.float64)
 
-    def _fresh(self, variance_px2: Float) -> Float:
+    def _fresh(self, variance_px2: FloatArray) -> FloatArray:
         """Return the part of each detection's variance that is new in every frame."""
         fresh = variance_px2 * (1.0 - self.parameters.detection_persistence)
         return np.maximum(fresh, self.parameters.limits.smallest_variance_px2)
@@ -631,7 +630,7 @@ class AnchoredNavigator:
     def _report(
         self,
         outcome: Outcome,
-        mcmf_from_icrf: Float | None,
+        mcmf_from_icrf: FloatArray | None,
         candidates: int,
         expected: int,
         fix: Fix | None = None,

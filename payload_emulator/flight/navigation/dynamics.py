@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray
 from lunar.constants import GM_EARTH_M3_S2, GM_SUN_M3_S2, MOON_RADIUS_M
 from lunar.gravity import GravityField, packed, packed_gradient
 from lunar.gravity_omission import FAR_SIDE_COSINE, REFERENCE_ALTITUDE_M, field_noise
@@ -18,8 +18,6 @@ from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns, utc_ns_from_ticks
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.tables import BurnTable, GravityTable, OrientationTable
-
-Float = NDArray[np.float64]
 
 # Arc over which the Moon's rotation rate and the third bodies are held: the Earth moves 60 km of 384,000 in it,
 # 4e-9 m/s^2 in its tide.
@@ -82,9 +80,9 @@ def process_noise(degree: int, field: str = "") -> ProcessNoise:
 class Prediction:
     """State (9,) at the end of an arc, transition (9, 9) over it and process noise (9, 9) of it."""
 
-    state: Float
-    transition: Float
-    noise: Float
+    state: FloatArray
+    transition: FloatArray
+    noise: FloatArray
 
 
 class OrbitModel:
@@ -114,11 +112,11 @@ class OrbitModel:
         self._coarse = packed_gradient(field, min(_GRADIENT_DEGREE, used))
         self._scratch = np.zeros(scratch_size(used))
 
-    def mcmf_from_icrf(self, ticks: int) -> Float | None:
+    def mcmf_from_icrf(self, ticks: int) -> FloatArray | None:
         """Return the rotation to mean-Earth axes, None outside the orientation table."""
         return self._orientation.at(ticks)
 
-    def propagate(self, state: Float, from_ticks: int, to_ticks: int) -> Prediction | None:
+    def propagate(self, state: FloatArray, from_ticks: int, to_ticks: int) -> Prediction | None:
         """Return the state (9,) carried from one on-board time to another; None outside the orientation table."""
         from payload_emulator.flight.navigation._dynamics_kernel import propagate_arc
 
@@ -153,7 +151,9 @@ class OrbitModel:
             noise = transition @ noise @ transition.T + added
         return Prediction(state, total, noise)
 
-    def _white_psd(self, position_mcmf_m: Float, velocity_mcmf_m_s: Float) -> tuple[float, float, float]:
+    def _white_psd(
+        self, position_mcmf_m: FloatArray, velocity_mcmf_m_s: FloatArray
+    ) -> tuple[float, float, float]:
         """Return the spectral density of white acceleration at a place, for an inertial velocity."""
         noise, radius_m = self._noise, float(np.linalg.norm(position_mcmf_m))
         psd, height_m = noise.white_psd_m2_s3, noise.scale_height_m
@@ -174,7 +174,9 @@ class OrbitModel:
         return factor * psd[0], factor * psd[1], factor * psd[2]
 
 
-def flown(model: OrbitModel, state: Float, from_ticks: int, to_ticks: int, burns: BurnTable) -> Float | None:
+def flown(
+    model: OrbitModel, state: FloatArray, from_ticks: int, to_ticks: int, burns: BurnTable
+) -> FloatArray | None:
     """Return the state (9,) carried forwards over the planned burns on the way; None outside the orientation table."""
     low, high = np.searchsorted(burns.ticks, [from_ticks, to_ticks], side="right")
     stops = [*burns.ticks[low:high].tolist(), to_ticks]
@@ -191,12 +193,12 @@ def flown(model: OrbitModel, state: Float, from_ticks: int, to_ticks: int, burns
 _THIRD_BODY_GMS = np.array([GM_EARTH_M3_S2, GM_SUN_M3_S2])
 
 
-def _third_bodies(ticks: int) -> Float:
+def _third_bodies(ticks: int) -> FloatArray:
     tdb_s = float(tdb_s_from_utc_ns(utc_ns_from_ticks(ticks)))
     return np.stack([earth_position_icrf_m(tdb_s), sun_position_icrf_m(tdb_s)])
 
 
-def _turn(start: Float, stop: Float) -> Float:
+def _turn(start: FloatArray, stop: FloatArray) -> FloatArray:
     """Return the rotation vector that carries the axes of `start` to those of `stop`, in the axes of `start`.
 
     The turn over a minute is 1.6e-4 rad: the antisymmetric part is the vector to 1e-12 rad.

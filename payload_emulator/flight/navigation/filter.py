@@ -14,15 +14,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from payload_emulator.flight.navigation.dynamics import OrbitModel
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, Sighting, look
 from tmtc.cuc import TICKS_PER_SECOND
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 SIZE = 18
 POSITION, VELOCITY, ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -77,9 +74,9 @@ class FilterState:
     """
 
     ticks: int
-    mean: Float
-    covariance: Float
-    craters: Index
+    mean: FloatArray
+    covariance: FloatArray
+    craters: IntArray
 
     @property
     def position_sigma_m(self) -> float:
@@ -90,7 +87,7 @@ class FilterState:
     def finite(self) -> bool:
         return bool(np.all(np.isfinite(self.mean)) and np.all(np.isfinite(self.covariance)))
 
-    def slots(self, index: Index) -> Index:
+    def slots(self, index: IntArray) -> IntArray:
         """Return the place of the first of the three states of each given crater, -1 where it has none."""
         if not self.craters.size:
             return np.full(index.size, -1, dtype=np.int64)
@@ -99,13 +96,13 @@ class FilterState:
         found = self.craters[order[at]] == index
         return np.where(found, SIZE + 3 * order[at], -1)
 
-    def shifts(self, index: Index) -> Float:
+    def shifts(self, index: IntArray) -> FloatArray:
         """Return how far each given crater lies from its catalogued place, shape (n, 3), zero where not estimated."""
         slots = self.slots(index)
         values = self.mean[np.maximum(slots, 0)[:, None] + np.arange(3)]
         return np.where(slots[:, None] >= 0, values, 0.0)
 
-    def with_craters(self, index: Index, sigma_m: Float) -> FilterState:
+    def with_craters(self, index: IntArray, sigma_m: FloatArray) -> FilterState:
         """Return the state with the given craters among its states; new ones at their catalogued places."""
         new = self.slots(index) < 0
         count, size = int(np.count_nonzero(new)), self.mean.size
@@ -118,7 +115,7 @@ class FilterState:
         mean = np.concatenate([self.mean, np.zeros(3 * count)])
         return FilterState(self.ticks, mean, covariance, np.concatenate([self.craters, index[new]]))
 
-    def only_craters(self, keep: Index) -> FilterState:
+    def only_craters(self, keep: IntArray) -> FilterState:
         """Return the state without the craters that are not among the given ones."""
         kept = np.isin(self.craters, keep)
         if kept.all():
@@ -149,16 +146,16 @@ class Update:
 
     state: FilterState
     nis: float
-    mean_innovation: Float
-    residual_px: Float
-    attitude_rad: Float
+    mean_innovation: FloatArray
+    residual_px: FloatArray
+    attitude_rad: FloatArray
     attitude_sigma_rad: float
 
 
 def initial_filter_state(
     ticks: int,
-    position_icrf_m: Float,
-    velocity_icrf_m_s: Float,
+    position_icrf_m: FloatArray,
+    velocity_icrf_m_s: FloatArray,
     sigma_position_m: float,
     sigma_velocity_m_s: float,
     markov_sigma_m_s2: tuple[float, float, float],
@@ -193,7 +190,7 @@ def predict(state: FilterState, ticks: int, model: OrbitModel, errors: CommonErr
     return FilterState(ticks, mean, 0.5 * (covariance + covariance.T), state.craters)
 
 
-def burn(state: FilterState, delta_v_icrf_m_s: Float, sigma_m_s: float) -> FilterState:
+def burn(state: FilterState, delta_v_icrf_m_s: FloatArray, sigma_m_s: float) -> FilterState:
     """Return the state after an impulsive burn (3,) that was carried out to a standard deviation per axis."""
     mean, covariance = state.mean.copy(), state.covariance.copy()
     mean[VELOCITY] += delta_v_icrf_m_s
@@ -211,7 +208,7 @@ def widened(state: FilterState, sigma_position_m: float, sigma_velocity_m_s: flo
 
 def transition_to(
     state: FilterState, ticks: int, model: OrbitModel, errors: CommonErrors
-) -> tuple[Float | None, Float, Float]:
+) -> tuple[FloatArray | None, FloatArray, FloatArray]:
     """Return transition (18, 18; None outside the orientation table), propagated mean and process noise (18, 18)."""
     orbit = model.propagate(state.mean[ORBIT], state.ticks, ticks)
     transition, noise, mean = np.eye(SIZE), np.zeros((SIZE, SIZE)), state.mean.copy()
@@ -231,7 +228,7 @@ def transition_to(
     return transition, mean, noise
 
 
-def pose_of(mean: Float, camera_from_icrf: Float, mcmf_from_icrf: Float) -> Pose:
+def pose_of(mean: FloatArray, camera_from_icrf: FloatArray, mcmf_from_icrf: FloatArray) -> Pose:
     """Return the camera pose that a filter state stands for."""
     return Pose(
         mean[POSITION],
@@ -244,7 +241,7 @@ def pose_of(mean: Float, camera_from_icrf: Float, mcmf_from_icrf: Float) -> Pose
     )
 
 
-def design_matrix(sighting: Sighting, state: FilterState) -> Float:
+def design_matrix(sighting: Sighting, state: FilterState) -> FloatArray:
     """Return the derivatives of all predicted pixels by all states, shape (n, 2, 18 + 3 m)."""
     matrix = np.zeros((len(sighting), 2, state.mean.size))
     matrix[:, :, POSITION] = sighting.by_position
@@ -264,12 +261,12 @@ def design_matrix(sighting: Sighting, state: FilterState) -> Float:
 
 def update(
     prior: FilterState,
-    camera_from_icrf: Float,
-    mcmf_from_icrf: Float,
+    camera_from_icrf: FloatArray,
+    mcmf_from_icrf: FloatArray,
     landmarks: LandmarkMap,
-    index: Index,
-    uv_px: Float,
-    variance_px2: Float,
+    index: IntArray,
+    uv_px: FloatArray,
+    variance_px2: FloatArray,
     camera: PinholeCamera,
     errors: CommonErrors,
     iterations: int = 3,
@@ -288,7 +285,7 @@ def update(
     count = 2 * index.size
     prior = prior.with_craters(_TURN, np.full((1, 3), errors.attitude_noise_rad))
     turn = int(prior.slots(_TURN)[0])
-    noise: Float = np.diag(np.repeat(variance_px2, 2))
+    noise: FloatArray = np.diag(np.repeat(variance_px2, 2))
     mean = prior.mean
     for step in range(iterations):
         current = FilterState(prior.ticks, mean, prior.covariance, prior.craters)
@@ -309,7 +306,7 @@ def update(
             nis = float(innovation @ np.linalg.solve(spread, innovation))
             spread_of_sum = spread.reshape(index.size, 2, index.size, 2).sum(axis=(0, 2))
             mean_innovation = innovation.reshape(-1, 2).sum(axis=0) / np.sqrt(np.diag(spread_of_sum))
-        gain: Float = np.asarray(np.linalg.solve(spread, crossed).T, dtype=np.float64)
+        gain: FloatArray = np.asarray(np.linalg.solve(spread, crossed).T, dtype=np.float64)
         previous, mean = mean, prior.mean + gain @ innovation
         turned = float(np.linalg.norm(mean[turn : turn + 3] - previous[turn : turn + 3]))
         moved = float(np.linalg.norm(mean[POSITION] - previous[POSITION]))
@@ -334,7 +331,9 @@ def update(
     )
 
 
-def corrected_covariance(covariance: Float, design: Float, gain: Float, noise: Float) -> Float:
+def corrected_covariance(
+    covariance: FloatArray, design: FloatArray, gain: FloatArray, noise: FloatArray
+) -> FloatArray:
     """Return the covariance after a measurement in Joseph form, (1 - K H) P (1 - K H)' + K R K', symmetric.
 
     The form is valid for any gain, not only the optimal one, so rounding of the gain does not invalidate it.
@@ -354,6 +353,8 @@ def corrected_covariance(covariance: Float, design: Float, gain: Float, noise: F
     return np.asarray(0.5 * (joined + joined.T), dtype=np.float64)
 
 
-def _pose_with_turn(state: FilterState, turn: int, camera_from_icrf: Float, mcmf_from_icrf: Float) -> Pose:
+def _pose_with_turn(
+    state: FilterState, turn: int, camera_from_icrf: FloatArray, mcmf_from_icrf: FloatArray
+) -> Pose:
     pose = pose_of(state.mean, camera_from_icrf, mcmf_from_icrf)
     return replace(pose, attitude_rad=pose.attitude_rad + state.mean[turn : turn + 3])

@@ -15,13 +15,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from payload_emulator.flight.navigation.sighting import Sighting
 from payload_emulator.flight.vision.detections import Detections
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # Chi-square of 2 degrees of freedom at 0.999: a true pair is lost once in a thousand.
 GATE = 13.8
@@ -69,15 +66,15 @@ class Identification:
         Members that a set had to have to be believed.
     """
 
-    detection: Index
-    sighted: Index
+    detection: IntArray
+    sighted: IntArray
     candidates: int
     needed: int
 
     def __len__(self) -> int:
         return int(self.detection.shape[0])
 
-    def select(self, which: Index) -> Identification:
+    def select(self, which: IntArray) -> Identification:
         """Return some of the pairs, believed as all of them were."""
         return Identification(self.detection[which], self.sighted[which], self.candidates, self.needed)
 
@@ -89,12 +86,12 @@ class Identification:
 def identify(
     found: Detections,
     sighting: Sighting,
-    prior_px2: Float,
-    crater_noise_px2: Float,
-    detection_variance_px2: Float,
+    prior_px2: FloatArray,
+    crater_noise_px2: FloatArray,
+    detection_variance_px2: FloatArray,
     image_area_px2: float,
     parameters: IdentificationParameters,
-    place_px2: Float | None = None,
+    place_px2: FloatArray | None = None,
 ) -> Identification:
     """Return the pairs of detections and craters that agree on one correction of the prediction.
 
@@ -164,13 +161,13 @@ def minimum_members(loose_chance: float, tight_chance: float, limit: float) -> i
 def _candidates(
     found: Detections,
     sighting: Sighting,
-    prior_px2: Float,
-    crater_noise_px2: Float,
-    detection_variance_px2: Float,
+    prior_px2: FloatArray,
+    crater_noise_px2: FloatArray,
+    detection_variance_px2: FloatArray,
     image_area_px2: float,
     parameters: IdentificationParameters,
-    place_px2: Float,
-) -> tuple[Index, Index, Float, Float, Float, float]:
+    place_px2: FloatArray,
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, float]:
     """Return detection, crater, offset (k, 2), spread (k, 2, 2) of gated pairs, the chance of each, and of all harm.
 
     Chances cover every pair that the diameters allow, gated or not: the area of its gate over that of the image is the
@@ -196,14 +193,14 @@ def _candidates(
 
 
 def _consensus(
-    detection: Index,
-    sighted: Index,
-    offset: Float,
-    spread: Float,
-    prior_px2: Float,
-    chance: Float,
+    detection: IntArray,
+    sighted: IntArray,
+    offset: FloatArray,
+    spread: FloatArray,
+    prior_px2: FloatArray,
+    chance: FloatArray,
     limit: int,
-) -> tuple[Index, float]:
+) -> tuple[IntArray, float]:
     """Return the pairs that the best hypothesis explains, and the expected number of chance pairs that agree."""
     count = detection.size
     tried = np.arange(count) if count <= limit else np.linspace(0, count - 1, limit).astype(np.int64)
@@ -239,13 +236,13 @@ def _consensus(
 
 
 def _consistent(
-    chosen: Index,
-    sighted: Index,
-    offset: Float,
-    prior_px2: Float,
-    crater_noise_px2: Float,
-    variance_px2: Float,
-) -> Index:
+    chosen: IntArray,
+    sighted: IntArray,
+    offset: FloatArray,
+    prior_px2: FloatArray,
+    crater_noise_px2: FloatArray,
+    variance_px2: FloatArray,
+) -> IntArray:
     """Return the pairs left after those are removed, worst first, that all the others together contradict."""
     while chosen.size > 1:
         craters = sighted[chosen]
@@ -265,13 +262,13 @@ def _consistent(
     return chosen
 
 
-def _determinant(matrix: Float) -> Float:
+def _determinant(matrix: FloatArray) -> FloatArray:
     """Return determinants of (..., 2, 2); zero where rounding makes them negative."""
     value = matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0]
     return np.asarray(np.maximum(value, 0.0), dtype=np.float64)
 
 
-def _distance(offset: Float, spread: Float, determinant: Float) -> Float:
+def _distance(offset: FloatArray, spread: FloatArray, determinant: FloatArray) -> FloatArray:
     """Return squared Mahalanobis distances of offsets (..., 2) under covariances (..., 2, 2)."""
     a, b = offset[..., 0], offset[..., 1]
     return np.asarray(

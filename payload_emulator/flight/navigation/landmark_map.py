@@ -19,8 +19,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import enu_from_mcmf
@@ -28,9 +28,6 @@ from payload_emulator.flight.navigation.sighting import LandmarkMap, Sighting, l
 from payload_emulator.flight.vision.detections import Detections
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.tables import CatalogueTable
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 FIRST_LANDMARK_ID = 3_000_000_000
 """Identities of landmarks begin here; catalogues stay below."""
@@ -88,8 +85,8 @@ class Landmark:
     """
 
     identity: int
-    position_mcmf_m: Float
-    covariance_m2: Float
+    position_mcmf_m: FloatArray
+    covariance_m2: FloatArray
     diameter_m: float
     sightings: int
     passes: int
@@ -111,9 +108,9 @@ class View:
     """
 
     ticks: int
-    camera_from_mcmf: Float
-    position_mcmf_m: Float
-    covariance_m2: Float
+    camera_from_mcmf: FloatArray
+    position_mcmf_m: FloatArray
+    covariance_m2: FloatArray
     attitude_sigma_rad: float
 
 
@@ -122,11 +119,11 @@ class _Track:
     """Sightings of what may be one crater: views, pixels (n, 2), variances (n,), and the place they give."""
 
     views: tuple[View, ...]
-    uv_px: Float
-    variance_px2: Float
+    uv_px: FloatArray
+    variance_px2: FloatArray
     diameter_m: float
-    position_mcmf_m: Float
-    own_covariance_m2: Float
+    position_mcmf_m: FloatArray
+    own_covariance_m2: FloatArray
     surface_m: float
 
 
@@ -146,7 +143,7 @@ class LandmarkMapper:
         return len(self.landmarks)
 
     def observe(
-        self, view: View, found: Detections, variance_px2: Float, free: NDArray[np.bool_], surface_m: float
+        self, view: View, found: Detections, variance_px2: FloatArray, free: BoolArray, surface_m: float
     ) -> tuple[Landmark, ...]:
         """Take a frame; return landmarks that it completed or that closed tracks improved.
 
@@ -197,14 +194,16 @@ class LandmarkMapper:
             )
         )
 
-    def _ground_diameter(self, view: View, uv: Float, diameter_px: Float, surface_m: float) -> Float:
+    def _ground_diameter(
+        self, view: View, uv: FloatArray, diameter_px: FloatArray, surface_m: float
+    ) -> FloatArray:
         """Return diameters on the ground of detections, NaN off it."""
         points = self._on_sphere(view, uv, surface_m)
         depth = (points - view.position_mcmf_m) @ view.camera_from_mcmf[2]
         with np.errstate(invalid="ignore"):
             return np.asarray(np.nan_to_num(diameter_px * depth / self._camera.focal_px, nan=-1.0))
 
-    def _on_sphere(self, view: View, uv: Float, height_m: float) -> Float:
+    def _on_sphere(self, view: View, uv: FloatArray, height_m: float) -> FloatArray:
         """Return where lines of sight meet a sphere (n, 3), NaN where they do not."""
         sight = self._camera.rays(uv) @ view.camera_from_mcmf
         along = -(sight @ view.position_mcmf_m)
@@ -214,7 +213,13 @@ class LandmarkMapper:
         return np.asarray(view.position_mcmf_m + reach[:, None] * sight)
 
     def _begin(
-        self, view: View, uv: Float, variance_px2: Float, size_m: Float, rows: Index, surface_m: float
+        self,
+        view: View,
+        uv: FloatArray,
+        variance_px2: FloatArray,
+        size_m: FloatArray,
+        rows: IntArray,
+        surface_m: float,
     ) -> None:
         """Begin tracks with detections, on the ground around; where memory is full the poorest tracks give way."""
         places = self._on_sphere(view, uv[rows], surface_m)
@@ -239,8 +244,8 @@ class LandmarkMapper:
             self._drop_poorest_track()
 
     def _join(
-        self, view: View, uv: Float, variance_px2: Float, size_m: Float, usable: NDArray[np.bool_]
-    ) -> NDArray[np.bool_]:
+        self, view: View, uv: FloatArray, variance_px2: FloatArray, size_m: FloatArray, usable: BoolArray
+    ) -> BoolArray:
         """Add detections to the tracks they continue, each other's nearest only; return which were added."""
         joined = np.zeros(usable.size, dtype=np.bool_)
         rows = np.flatnonzero(usable)
@@ -270,7 +275,9 @@ class LandmarkMapper:
             )
         return joined
 
-    def _longer(self, track: _Track, view: View, uv: Float, variance_px2: float, diameter_m: float) -> _Track:
+    def _longer(
+        self, track: _Track, view: View, uv: FloatArray, variance_px2: float, diameter_m: float
+    ) -> _Track:
         kept = self.parameters.sightings_kept
         count = len(track.views)
         longer = replace(
@@ -306,7 +313,7 @@ class LandmarkMapper:
         own = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         return replace(track, position_mcmf_m=place, own_covariance_m2=own)
 
-    def _projected(self, view: View, places: Float) -> tuple[Float, Float]:
+    def _projected(self, view: View, places: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return pixels (n, 2) of places and their derivatives (n, 2, 3); NaN behind the camera."""
         seen = (places - view.position_mcmf_m) @ view.camera_from_mcmf.T
         depth = np.where(seen[:, 2] > 0.0, seen[:, 2], np.nan)
@@ -404,7 +411,7 @@ class LandmarkMapper:
 def intersected(first: Landmark, second: Landmark) -> Landmark:
     """Return two mappings of one crater as one, by the covariance intersection of least trace."""
     inverse_1, inverse_2 = np.linalg.inv(first.covariance_m2), np.linalg.inv(second.covariance_m2)
-    best: tuple[float, Float, Float] | None = None
+    best: tuple[float, FloatArray, FloatArray] | None = None
     for weight in np.linspace(0.0, 1.0, 21):
         covariance = np.linalg.inv(weight * inverse_1 + (1.0 - weight) * inverse_2)
         if best is None or float(np.trace(covariance)) < best[0]:
@@ -431,14 +438,14 @@ def intersected(first: Landmark, second: Landmark) -> Landmark:
 class MapRows:
     """Landmarks as columns of one length; heights above the sphere of the maps, sigma east, north, up (n, 3)."""
 
-    identity: Index
-    latitude_rad: Float
-    longitude_rad: Float
-    height_m: Float
-    diameter_m: Float
-    sigma_m: Float
-    sightings: Index
-    passes: Index
+    identity: IntArray
+    latitude_rad: FloatArray
+    longitude_rad: FloatArray
+    height_m: FloatArray
+    diameter_m: FloatArray
+    sigma_m: FloatArray
+    sightings: IntArray
+    passes: IntArray
 
 
 def map_rows(landmarks: Sequence[Landmark]) -> MapRows:
@@ -461,9 +468,7 @@ def map_rows(landmarks: Sequence[Landmark]) -> MapRows:
     )
 
 
-def unclaimed(
-    found: Detections, sighting: Sighting, used: Index, reach_px: float = 12.0
-) -> NDArray[np.bool_]:
+def unclaimed(found: Detections, sighting: Sighting, used: IntArray, reach_px: float = 12.0) -> BoolArray:
     """Return which detections belong to no crater of the catalogue: not used, and none of their size near by."""
     free = np.ones(len(found), dtype=np.bool_)
     free[used] = False

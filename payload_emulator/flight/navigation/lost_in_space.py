@@ -19,17 +19,14 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from payload_emulator.flight.navigation.sighting import LandmarkMap
 from payload_emulator.flight.vision.detections import Detections
 
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
-
-NADIR_NORTH_UP: Float = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
+NADIR_NORTH_UP: FloatArray = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 """camera_from_enu of a camera that looks straight down, image up to the north."""
 
 FRAMES_COMBINED = 4
@@ -103,13 +100,13 @@ class PlaceIndex:
     """
 
     landmarks: LandmarkMap
-    bin_start: Index
-    bin_height_m: Float
-    log_diameter: Float
-    latitude_rad: Float
-    tangent: Float
-    longitude_rad: Float
-    extent: Float
+    bin_start: IntArray
+    bin_height_m: FloatArray
+    log_diameter: FloatArray
+    latitude_rad: FloatArray
+    tangent: FloatArray
+    longitude_rad: FloatArray
+    extent: FloatArray
 
     @property
     def octets(self) -> int:
@@ -142,11 +139,11 @@ class Place:
         Natural logarithm of the expected number of places as good as this that chance makes up per search.
     """
 
-    position_mcmf_m: Float
-    attitude_rad: Float
-    sigma_m: Float
-    detection: Index
-    index: Index
+    position_mcmf_m: FloatArray
+    attitude_rad: FloatArray
+    sigma_m: FloatArray
+    detection: IntArray
+    index: IntArray
     chance: float
     log_false: float
 
@@ -159,7 +156,7 @@ class LostFrame:
     """One frame of a search over several: detections, one sigma of each centre, and the time since the first."""
 
     found: Detections
-    sigma_px: Float
+    sigma_px: FloatArray
     elapsed_s: float
 
 
@@ -193,11 +190,11 @@ def place_index(landmarks: LandmarkMap) -> PlaceIndex:
 
 def candidate_places(
     found: Detections,
-    sigma_px: Float,
+    sigma_px: FloatArray,
     index: PlaceIndex,
     camera: PinholeCamera,
     parameters: LostParameters = LostParameters(),
-    camera_from_enu: Float = NADIR_NORTH_UP,
+    camera_from_enu: FloatArray = NADIR_NORTH_UP,
 ) -> list[Place]:
     """Return places that explain at least three detections, the least likely by chance first.
 
@@ -234,11 +231,11 @@ def candidate_places(
 
 def find_place(
     found: Detections,
-    sigma_px: Float,
+    sigma_px: FloatArray,
     index: PlaceIndex,
     camera: PinholeCamera,
     parameters: LostParameters = LostParameters(),
-    camera_from_enu: Float = NADIR_NORTH_UP,
+    camera_from_enu: FloatArray = NADIR_NORTH_UP,
 ) -> Place | None:
     """Return the place of a single frame, None where none is safe."""
     return believed_place(
@@ -259,7 +256,7 @@ def find_place_in_frames(
     index: PlaceIndex,
     camera: PinholeCamera,
     parameters: LostParameters = LostParameters(),
-    camera_from_enu: Float = NADIR_NORTH_UP,
+    camera_from_enu: FloatArray = NADIR_NORTH_UP,
 ) -> tuple[Place, ...] | None:
     """Return the places of frames seconds to a minute apart, one per frame that takes part; None where none is safe.
 
@@ -309,13 +306,13 @@ def place_of_frames(
 
 
 def _voted(
-    uv: Float,
-    diameter_px: Float,
+    uv: FloatArray,
+    diameter_px: FloatArray,
     index: PlaceIndex,
     camera: PinholeCamera,
     parameters: LostParameters,
-    camera_from_enu: Float,
-) -> Float:
+    camera_from_enu: FloatArray,
+) -> FloatArray:
     """Return the best places of the vote (MCMF), shape (n, 3), best first."""
     from payload_emulator.flight.navigation._lost_kernel import vote
 
@@ -331,7 +328,7 @@ def _voted(
     low, high = parameters.minimum_altitude_m, parameters.maximum_altitude_m
     steps = math.ceil(math.log(high / low) / math.log1p(parameters.altitude_step)) + 1
     listed = np.zeros((parameters.places + 1, 4))
-    result: list[tuple[float, Float]] = []
+    result: list[tuple[float, FloatArray]] = []
     # The widest parallel of the map: the equator where it holds it.
     widest = math.cos(max(south, -north, 0.0))
     smallest = math.sqrt((north - south) * width * widest / parameters.cells)
@@ -376,14 +373,14 @@ def _voted(
 
 
 def _fitted(
-    start: Float,
-    uv: Float,
-    diameter_px: Float,
-    sigma_px: Float,
+    start: FloatArray,
+    uv: FloatArray,
+    diameter_px: FloatArray,
+    sigma_px: FloatArray,
     index: PlaceIndex,
     camera: PinholeCamera,
     parameters: LostParameters,
-    camera_from_enu: Float,
+    camera_from_enu: FloatArray,
 ) -> Place | None:
     """Return a place fitted to the detections it explains, None where they are fewer than three."""
     from payload_emulator.flight.navigation._lost_kernel import fit_place
@@ -525,7 +522,7 @@ def _same_place_m(place: Place, camera: PinholeCamera, parameters: LostParameter
     return 2.0 * parameters.block_px * altitude_m / camera.focal_px
 
 
-def _renumbered(place: Place, usable: Index) -> Place:
+def _renumbered(place: Place, usable: IntArray) -> Place:
     return Place(
         place.position_mcmf_m,
         place.attitude_rad,
@@ -537,7 +534,7 @@ def _renumbered(place: Place, usable: Index) -> Place:
     )
 
 
-def _span(longitude: Float) -> tuple[float, float]:
+def _span(longitude: FloatArray) -> tuple[float, float]:
     """Return the west end and the width of the smallest interval that holds all longitudes."""
     if not longitude.size:
         return 0.0, 0.0
@@ -548,6 +545,6 @@ def _span(longitude: Float) -> tuple[float, float]:
     return west, 2.0 * math.pi - float(gaps[widest])
 
 
-def _mcmf(latitude: float, longitude: float, radius_m: float) -> Float:
+def _mcmf(latitude: float, longitude: float, radius_m: float) -> FloatArray:
     flat = radius_m * math.cos(latitude)
     return np.array([flat * math.cos(longitude), flat * math.sin(longitude), radius_m * math.sin(latitude)])

@@ -13,10 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
+from lunar.arrays import FloatArray, IntArray
 
 # A cluster count compares every candidate with every other; this many rows are compared at a time (memory
 # bound).
@@ -43,9 +41,9 @@ class MatcherParameters:
 class GroundFeatures:
     """Craters of one frame: metres east and north of the sub-satellite point, and size class."""
 
-    east_m: Float
-    north_m: Float
-    size_class: Index
+    east_m: FloatArray
+    north_m: FloatArray
+    size_class: IntArray
 
     def __len__(self) -> int:
         return int(self.east_m.shape[0])
@@ -66,8 +64,8 @@ class Match:
         True where the pairs come from the densest cluster, False for the singleton fall-back.
     """
 
-    earlier: Index
-    later: Index
+    earlier: IntArray
+    later: IntArray
     candidate_pairs: int
     from_cluster: bool
 
@@ -116,7 +114,7 @@ def _candidate_pairs(
     scale: float,
     direction: int,
     parameters: MatcherParameters,
-) -> tuple[Float, Float, Index, Index]:
+) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
     """Return shift east, shift north and both indices of every same-class pair inside the bounds."""
     east = earlier.east_m[:, None] - later.east_m[None, :]
     north = earlier.north_m[:, None] - later.north_m[None, :]
@@ -132,7 +130,7 @@ def _candidate_pairs(
     return east[rows, columns], north[rows, columns], rows.astype(np.int64), columns.astype(np.int64)
 
 
-def _densest(east: Float, north: Float, tolerance_m: float) -> int:
+def _densest(east: FloatArray, north: FloatArray, tolerance_m: float) -> int:
     """Return the candidate with most candidates within the tolerance, the tightest of several such."""
     count = np.empty(east.size, dtype=np.int64)
     spread = np.empty(east.size)
@@ -146,8 +144,8 @@ def _densest(east: Float, north: Float, tolerance_m: float) -> int:
 
 
 def _assign_one_to_one(
-    rows: Index, columns: Index, distance: Float, tolerance_m: float
-) -> tuple[Index, Index]:
+    rows: IntArray, columns: IntArray, distance: FloatArray, tolerance_m: float
+) -> tuple[IntArray, IntArray]:
     """Return the pairs nearer than the tolerance, nearest first, no crater used twice."""
     first: list[int] = []
     second: list[int] = []
@@ -164,14 +162,14 @@ def _assign_one_to_one(
 def _singletons(
     earlier: GroundFeatures,
     later: GroundFeatures,
-    rows: Index,
-    columns: Index,
-    east: Float,
-    north: Float,
+    rows: IntArray,
+    columns: IntArray,
+    east: FloatArray,
+    north: FloatArray,
     scale: float,
     direction: int,
     parameters: MatcherParameters,
-) -> tuple[Index, Index]:
+) -> tuple[IntArray, IntArray]:
     """Return at most one pair: of a class with exactly one detection in each frame, inside the motion bounds.
 
     Several classes may offer such a pair. They disagree with each other (a pair of them would have formed a

@@ -27,8 +27,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import size_class
 from lunar.constants import MOON_RADIUS_M
@@ -37,8 +37,6 @@ from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrig
 from payload_emulator.flight.vision.detections import Detections
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.tables import AnchorTable
-
-Float = NDArray[np.float64]
 
 PAPER_CLASSES = 3
 _NAN = float("nan")
@@ -73,8 +71,8 @@ class OdometryParameters:
 class FrameFeatures:
     """What the next frame needs of this one: pixels, ground places and the altitude they were scaled with."""
 
-    u_px: Float
-    v_px: Float
+    u_px: FloatArray
+    v_px: FloatArray
     ground: GroundFeatures
     altitude_m: float
 
@@ -204,7 +202,9 @@ def frame_features(
     )
 
 
-def depth_on_sphere(u_px: Float, v_px: Float, altitude_m: float, camera: PinholeCamera) -> Float:
+def depth_on_sphere(
+    u_px: FloatArray, v_px: FloatArray, altitude_m: float, camera: PinholeCamera
+) -> FloatArray:
     """Return the depth along the boresight of the ground behind pixels, nadir camera, NaN beyond the limb."""
     x, y = _tangents(u_px, v_px, camera)
     return _depth(x * x + y * y, altitude_m)
@@ -374,12 +374,14 @@ def _moved(state: OdometryState, motion: Motion) -> OdometryState:
     )
 
 
-def _tangents(u_px: Float, v_px: Float, camera: PinholeCamera) -> tuple[Float, Float]:
+def _tangents(u_px: FloatArray, v_px: FloatArray, camera: PinholeCamera) -> tuple[FloatArray, FloatArray]:
     cx, cy = camera.centre_px
     return (u_px - cx) / camera.focal_px, (v_px - cy) / camera.focal_px
 
 
-def _sphere_places(x: Float, y: Float, altitude_m: float) -> tuple[Float, Float, Float]:
+def _sphere_places(
+    x: FloatArray, y: FloatArray, altitude_m: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return arcs east and north of the sub-satellite point, and depth along the boresight, on the sphere."""
     radius = MOON_RADIUS_M + altitude_m
     depth = _depth(x * x + y * y, altitude_m)
@@ -390,7 +392,7 @@ def _sphere_places(x: Float, y: Float, altitude_m: float) -> tuple[Float, Float,
     return x * stretch, -y * stretch, depth
 
 
-def _depth(tangent_squared: Float, altitude_m: float) -> Float:
+def _depth(tangent_squared: FloatArray, altitude_m: float) -> FloatArray:
     """Return the depth at which rays from a nadir camera meet the sphere, NaN on a miss.
 
     With d the depth and t the tangent of the angle off nadir: (r - d)^2 + (t d)^2 = R^2, the nearer root.
@@ -402,7 +404,7 @@ def _depth(tangent_squared: Float, altitude_m: float) -> Float:
     return np.asarray(constant / (radius + root), dtype=np.float64)
 
 
-def _on_sphere(ray_enu: Float, latitude_rad: float, altitude_m: float) -> Float:
+def _on_sphere(ray_enu: FloatArray, latitude_rad: float, altitude_m: float) -> FloatArray:
     """Return where rays (n, 3) of unit depth meet the sphere; axes: x at the own meridian, z north pole."""
     depth = _depth(ray_enu[:, 0] ** 2 + ray_enu[:, 1] ** 2, altitude_m)
     enu = ray_enu * depth[:, None]
@@ -411,7 +413,7 @@ def _on_sphere(ray_enu: Float, latitude_rad: float, altitude_m: float) -> Float:
     return np.stack([up * cosine - enu[:, 1] * sine, enu[:, 0], up * sine + enu[:, 1] * cosine], axis=1)
 
 
-def _see(points: Float, unknowns: Float) -> Float:
+def _see(points: FloatArray, unknowns: FloatArray) -> FloatArray:
     """Return tangents (right, down) of points seen by a nadir camera at (latitude, longitude, altitude)."""
     latitude, longitude, altitude = unknowns
     sl, cl = np.sin(longitude), np.cos(longitude)
@@ -423,7 +425,7 @@ def _see(points: Float, unknowns: Float) -> Float:
     return np.stack([east / depth, -north / depth], axis=1)
 
 
-def _size_class(diameter_m: Float) -> NDArray[np.int64]:
+def _size_class(diameter_m: FloatArray) -> IntArray:
     """Return the paper's classes 0, 1, 2; -1 outside 5 to 30 km (also 3 to 5 km) and for NaN."""
     classes = size_class(diameter_m).astype(np.int64)
     return np.where(classes < PAPER_CLASSES, classes, -1)

@@ -14,8 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.flight.navigation.filter import (
@@ -27,9 +27,6 @@ from payload_emulator.flight.navigation.filter import (
 )
 from payload_emulator.flight.navigation.sighting import turned_by
 from payload_emulator.flight.vision.detections import Detections
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 CLONE = -1
 """Stands among the craters of a filter state for the position of the frame before."""
@@ -62,9 +59,9 @@ class Remembered:
     """Detections of the frame before with the attitude and the Moon's orientation of then."""
 
     found: Detections
-    variance_px2: Float
-    camera_from_icrf: Float
-    mcmf_from_icrf: Float
+    variance_px2: FloatArray
+    camera_from_icrf: FloatArray
+    mcmf_from_icrf: FloatArray
 
 
 def with_clone(state: FilterState) -> FilterState:
@@ -142,7 +139,7 @@ def _predicted(
     camera: PinholeCamera,
     radius_m: float,
     height_sigma_m: float,
-) -> tuple[Float, Float, Float, Float, Float]:
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return pixels (n, 2), derivatives by both positions (n, 2, 3), noise (n, 2, 2), derivatives by attitude."""
     turn = turned_by(-state.mean[ATTITUDE])
     bias = state.mean[PIXEL]
@@ -185,13 +182,13 @@ def _predicted(
 
 def _pairs(
     state: FilterState,
-    design: Float,
-    predicted: Float,
-    noise: Float,
+    design: FloatArray,
+    predicted: FloatArray,
+    noise: FloatArray,
     before: Remembered,
     now: Remembered,
     parameters: RelativeParameters,
-) -> tuple[Index, Index]:
+) -> tuple[IntArray, IntArray]:
     """Return detections of the frame before and of now that are each other's nearest and inside their gates."""
     uv = np.stack([now.found.u_px, now.found.v_px], axis=1)
     own = np.einsum("nai,ij,nbj->nab", design, state.covariance, design) + noise

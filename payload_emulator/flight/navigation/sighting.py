@@ -14,14 +14,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from tmtc.tables import CatalogueTable
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # A crater is in sight if its centre is above the limb by this much: on the very limb a degree is many pixels.
 _LIMB_MARGIN_RAD = np.radians(5.0)
@@ -39,17 +36,17 @@ class LandmarkMap:
         Local axes at each crater, shape (n, 3, 3).
     """
 
-    ids: Index
-    latitude_rad: Float
-    position_mcmf_m: Float
-    enu_from_mcmf: Float
-    diameter_m: Float
-    sigma_m: Float
+    ids: IntArray
+    latitude_rad: FloatArray
+    position_mcmf_m: FloatArray
+    enu_from_mcmf: FloatArray
+    diameter_m: FloatArray
+    sigma_m: FloatArray
 
     def __len__(self) -> int:
         return int(self.ids.shape[0])
 
-    def near(self, direction_mcmf: Float, angle_rad: float) -> Index:
+    def near(self, direction_mcmf: FloatArray, angle_rad: float) -> IntArray:
         """Return the craters whose centre lies within an angle of a direction from the Moon's centre."""
         latitude = float(np.arcsin(np.clip(direction_mcmf[2], -1.0, 1.0)))
         low, high = np.searchsorted(self.latitude_rad, [latitude - angle_rad, latitude + angle_rad])
@@ -99,12 +96,12 @@ class Pose:
         Relative stretch of the image about its centre.
     """
 
-    position_icrf_m: Float
-    camera_from_icrf: Float
-    mcmf_from_icrf: Float
-    attitude_rad: Float
-    pixel_bias_px: Float
-    catalogue_offset_m: Float
+    position_icrf_m: FloatArray
+    camera_from_icrf: FloatArray
+    mcmf_from_icrf: FloatArray
+    attitude_rad: FloatArray
+    pixel_bias_px: FloatArray
+    catalogue_offset_m: FloatArray
     scale: float = 0.0
 
 
@@ -126,18 +123,18 @@ class Sighting:
         Derivatives by the scale, shape (n, 2).
     """
 
-    index: Index
-    uv_px: Float
-    diameter_px: Float
-    by_position: Float
-    by_attitude: Float
-    by_offset: Float
-    by_scale: Float
+    index: IntArray
+    uv_px: FloatArray
+    diameter_px: FloatArray
+    by_position: FloatArray
+    by_attitude: FloatArray
+    by_offset: FloatArray
+    by_scale: FloatArray
 
     def __len__(self) -> int:
         return int(self.index.shape[0])
 
-    def select(self, which: NDArray[np.bool_] | Index) -> Sighting:
+    def select(self, which: BoolArray | IntArray) -> Sighting:
         return Sighting(
             self.index[which],
             self.uv_px[which],
@@ -165,7 +162,7 @@ def in_view(landmarks: LandmarkMap, pose: Pose, camera: PinholeCamera, margin_px
     return sighting.select(inside_image(sighting, camera, margin_px))
 
 
-def inside_image(sighting: Sighting, camera: PinholeCamera, margin_px: float = 0.0) -> NDArray[np.bool_]:
+def inside_image(sighting: Sighting, camera: PinholeCamera, margin_px: float = 0.0) -> BoolArray:
     """Return which craters lie in the image, or up to a margin outside it; False for NaN."""
     u, v = sighting.uv_px[:, 0] - camera.centre_px[0], sighting.uv_px[:, 1] - camera.centre_px[1]
     with np.errstate(invalid="ignore"):
@@ -194,10 +191,10 @@ def _reach_rad(radius_m: float, pose: Pose, camera: PinholeCamera, margin_px: fl
 
 def look(
     landmarks: LandmarkMap,
-    index: Index,
+    index: IntArray,
     pose: Pose,
     camera: PinholeCamera,
-    shift_enu_m: Float | None = None,
+    shift_enu_m: FloatArray | None = None,
 ) -> Sighting:
     """Return the given craters as a pose sees them; NaN behind the camera.
 
@@ -236,12 +233,12 @@ def look(
     )
 
 
-def cross_matrix(vector: Float) -> Float:
+def cross_matrix(vector: FloatArray) -> FloatArray:
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def turned_by(vector_rad: Float) -> Float:
+def turned_by(vector_rad: FloatArray) -> FloatArray:
     """Return the rotation matrix of a rotation vector (3,), by Rodrigues' formula."""
     angle = float(np.linalg.norm(vector_rad))
     if not angle > 0.0:

@@ -5,16 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import IntEnum
 
-import numpy as np
-from numpy.typing import NDArray
-
+from lunar.arrays import FloatArray
 from payload_emulator.flight.onboard.parameters import ParameterStore
 from payload_emulator.flight.ports import SENSORS
 from payload_emulator.flight.telemetry.packets import Telemetry
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from tmtc.cuc import TICKS_PER_SECOND
-
-Float = NDArray[np.float64]
 
 _VOLTAGE, _TEMPERATURE = SENSORS.index("bus_voltage_v"), SENSORS.index("temperature_c")
 # A limit counts as left only when it is left by this much, so that noise makes no stream of events.
@@ -43,7 +39,7 @@ class Monitors:
     _cycles: int = 0
     _detector_failures: int = 0
 
-    def sensors(self, readings: Float) -> Reaction:
+    def sensors(self, readings: FloatArray) -> Reaction:
         """Voltage and temperature of the board against their limits; a dead sensor breaks none."""
         voltage, temperature = float(readings[_VOLTAGE]), float(readings[_TEMPERATURE])
         limit = self.parameters

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import size_class
 from lunar.frames import matrix_from_quaternion
 from payload_emulator.flight.navigation import filter as kalman
@@ -35,7 +36,6 @@ from tmtc.tables import (
     unpack_orientation_table,
 )
 
-Float = NDArray[np.float64]
 Table = TypeVar("Table")
 
 _NAN = float("nan")
@@ -110,7 +110,7 @@ class Observer:
             self._navigator.widen(position_m, velocity_m_s)
 
     def frame(
-        self, image: NDArray[Any], attitude: Float, score_floor: float, timeout_s: float, quiet: bool
+        self, image: NDArray[Any], attitude: FloatArray, score_floor: float, timeout_s: float, quiet: bool
     ) -> None:
         """Detect craters in one frame, run every estimator on them, report both.
 
@@ -192,7 +192,7 @@ class Observer:
         return table
 
     def _detect(
-        self, image: NDArray[Any], sun: Float | None, timeout_s: float
+        self, image: NDArray[Any], sun: FloatArray | None, timeout_s: float
     ) -> tuple[ImageQuality, Detections]:
         """Run the detector; what fails or comes too late is an event and no detection."""
         started_ns = self._timer.enter(Stage.detector)
@@ -229,7 +229,7 @@ class Observer:
                 burns,
             )
 
-    def _anchored_frame(self, found: Detections | None, camera_from_icrf: Float | None) -> float:
+    def _anchored_frame(self, found: Detections | None, camera_from_icrf: FloatArray | None) -> float:
         """Run the anchored estimator on one frame, report it, and return its altitude."""
         mode, detections = Mode.anchored, 0 if found is None else len(found)
         navigator = self._navigator
@@ -430,7 +430,7 @@ class Observer:
         return size_class(found.diameter_px * depth / camera.focal_px)
 
 
-def _rotation(attitude: Float) -> Float | None:
+def _rotation(attitude: FloatArray) -> FloatArray | None:
     """Return camera_from_icrf of an ADCS message, None where it holds no rotation."""
     if attitude.size != 7 or not np.all(np.isfinite(attitude[:4])):
         return None
@@ -441,6 +441,6 @@ def _rotation(attitude: Float) -> Float | None:
     return matrix_from_quaternion(attitude[:4] / length)
 
 
-def _reported(found: Detections) -> NDArray[np.int64]:
+def _reported(found: Detections) -> IntArray:
     """Return the detections that fit into a packet, the strongest, in their order."""
     return np.sort(np.argsort(-found.score, kind="stable")[:255])

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import OctetArray
+
 _THUMBNAIL = struct.Struct(">IQHH")
 _LANDMARK = np.dtype([("crater_id", ">u4"), ("frames", ">u2")])
 
@@ -35,7 +37,7 @@ def thumbnail_octets(image: NDArray[Any], factor: int, frame_number: int, ticks:
     return _THUMBNAIL.pack(frame_number & 0xFFFFFFFF, ticks, rows, columns) + zlib.compress(octets, 9)
 
 
-def unpack_thumbnail(octets: bytes) -> tuple[int, int, NDArray[np.uint8]]:
+def unpack_thumbnail(octets: bytes) -> tuple[int, int, OctetArray]:
     """(frame number, on-board time, gray levels (rows, columns)) of a thumbnail."""
     frame_number, ticks, rows, columns = _THUMBNAIL.unpack_from(octets)
     levels = np.frombuffer(zlib.decompress(octets[_THUMBNAIL.size :]), dtype=np.uint8)

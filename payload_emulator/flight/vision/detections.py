@@ -11,9 +11,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray
 from payload_emulator.flight.vision.preprocess import ImageQuality
-
-Float = NDArray[np.float64]
 
 FRESH_DEPTH_RATIO = 0.10
 DEGRADED_DEPTH_RATIO = 0.06
@@ -40,12 +39,12 @@ class Detections:
         Depth over diameter as it looks: about 0.2 fresh, under `DEGRADED_DEPTH_RATIO` worn down.
     """
 
-    u_px: Float
-    v_px: Float
-    diameter_px: Float
-    score: Float
-    sigma_px: Float
-    depth_ratio: Float | None = None
+    u_px: FloatArray
+    v_px: FloatArray
+    diameter_px: FloatArray
+    score: FloatArray
+    sigma_px: FloatArray
+    depth_ratio: FloatArray | None = None
 
     def __len__(self) -> int:
         return int(self.u_px.shape[0])
@@ -81,7 +80,7 @@ class Detector(Protocol):
     """Anything that finds craters in a camera frame."""
 
     def examine(
-        self, image: NDArray[Any], sun_in_camera: Float | None = None
+        self, image: NDArray[Any], sun_in_camera: FloatArray | None = None
     ) -> tuple[ImageQuality, Detections]:
         """Return the verdict on an image (H, W) or (H, W, 3) and its craters; none unless the verdict is OK.
 

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray
 from payload_emulator.errors import ModelError
 from payload_emulator.flight.vision.detections import Detections, no_detections
 from payload_emulator.flight.vision.preprocess import ImageQuality, prepare_image, sun_up_turns, turn_back
@@ -97,9 +98,7 @@ class OnnxDetector:
         """First 32 bits of the SHA-256, as housekeeping carries it."""
         return int(self.sha256[:8], 16)
 
-    def detect(
-        self, image: NDArray[np.generic], sun_in_camera: NDArray[np.float64] | None = None
-    ) -> Detections:
+    def detect(self, image: NDArray[np.generic], sun_in_camera: FloatArray | None = None) -> Detections:
         """Craters in a frame of the size in `parameters`; none in a frame that cannot be searched (see `examine`).
 
         Parameters
@@ -110,7 +109,7 @@ class OnnxDetector:
         return self.examine(image, sun_in_camera)[1]
 
     def examine(
-        self, image: NDArray[np.generic], sun_in_camera: NDArray[np.float64] | None = None
+        self, image: NDArray[np.generic], sun_in_camera: FloatArray | None = None
     ) -> tuple[ImageQuality, Detections]:
         """Verdict on a frame, and its craters where the verdict is OK; never raises for what a camera may deliver."""
         image = np.asarray(image)
@@ -119,7 +118,7 @@ class OnnxDetector:
         return self.examine_any_size(image, sun_in_camera)
 
     def examine_any_size(
-        self, image: NDArray[np.generic], sun_in_camera: NDArray[np.float64] | None = None
+        self, image: NDArray[np.generic], sun_in_camera: FloatArray | None = None
     ) -> tuple[ImageQuality, Detections]:
         """As `examine`, any size: smaller images are padded, larger ones searched in overlapping tiles."""
         prepared = prepare_image(image)
@@ -201,8 +200,8 @@ def decode(
     total = weight.sum(axis=(1, 2))
     total = np.where(total > 0.0, total, 1.0)
 
-    def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        averaged: NDArray[np.float64] = (values * weight).sum(axis=(1, 2)) / total
+    def mean(values: FloatArray) -> FloatArray:
+        averaged: FloatArray = (values * weight).sum(axis=(1, 2)) / total
         return averaged
 
     centre_of_cell = (stride_px - 1) / 2.0

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, OctetArray
+
 # Fractions of full scale. A frame on the night side holds read noise and an offset of at most a few counts of 255.
 _DARK_LEVEL = 0.04
 _DARK_SHARE = (
@@ -70,13 +72,13 @@ def normalise(square_root_gray: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.clip(scaled, -_CLIP, _CLIP, out=scaled)
 
 
-def gray_levels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def gray_levels(image: OctetArray) -> OctetArray:
     """Mean of the colour channels of an 8-bit frame (H, W, 3), rounded: what a data set stores."""
     total = image[..., 0].astype(np.uint16) + image[..., 1] + image[..., 2]
     return ((total + 1) // 3).astype(np.uint8)
 
 
-def sun_up_turns(sun_in_camera: NDArray[np.float64] | None) -> int:
+def sun_up_turns(sun_in_camera: FloatArray | None) -> int:
     """Quarter turns (counter-clockwise, as `numpy.rot90`) that bring the Sun nearest the top of the image.
 
     `sun_in_camera` is the direction to the Sun, (3,), camera frame (x right, y down, z boresight). None or NaN: 0.
@@ -92,8 +94,8 @@ def sun_up_turns(sun_in_camera: NDArray[np.float64] | None) -> int:
 
 
 def turn_back(
-    u_px: NDArray[np.float64], v_px: NDArray[np.float64], turns: int, height_px: int, width_px: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    u_px: FloatArray, v_px: FloatArray, turns: int, height_px: int, width_px: int
+) -> tuple[FloatArray, FloatArray]:
     """Coordinates in the original frame (height, width) of points found in `numpy.rot90(frame, turns)`."""
     turns %= 4
     if turns == 1:
@@ -106,8 +108,8 @@ def turn_back(
 
 
 def turn_forward(
-    u_px: NDArray[np.float64], v_px: NDArray[np.float64], turns: int, height_px: int, width_px: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    u_px: FloatArray, v_px: FloatArray, turns: int, height_px: int, width_px: int
+) -> tuple[FloatArray, FloatArray]:
     """Coordinates in `numpy.rot90(frame, turns)` of points of the original frame (height, width)."""
     turns %= 4
     if turns == 1:

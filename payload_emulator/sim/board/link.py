@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lunar.arrays import BoolArray, IntArray
+from lunar.arrays import BoolArray, FloatArray, IntArray, OctetArray
 from lunar.constants import SPEED_OF_LIGHT_M_S
 from lunar.ephemeris import Ephemeris
 from lunar.third_bodies import earth_position_icrf_m
@@ -190,7 +189,7 @@ def transmit(dumps: Sequence[Dump], settings: LinkSettings, section: LinkSection
     counts: dict[str, int] = dict.fromkeys(
         ("frames", "frames_bad", "symbols_corrected", "packets", "frames_lost_on_link", "bit_errors"), 0
     )
-    arrived: list[NDArray[np.uint8]] = []
+    arrived: list[OctetArray] = []
     received: list[bytes] = []
     bursting = False
     for dump, frames in zip(dumps, sent, strict=True):
@@ -245,7 +244,7 @@ def save_receptions(folder: Path, dumps: Sequence[Dump]) -> None:
 
 
 def save_time_receptions(
-    folder: Path, packets: Sequence[bytes], emitted_utc_ns: IntArray, position_icrf_m: NDArray[np.float64]
+    folder: Path, packets: Sequence[bytes], emitted_utc_ns: IntArray, position_icrf_m: FloatArray
 ) -> None:
     """Write when time reports (n,), emitted at positions (n, 3) from the Moon, came to the Earth's centre."""
     light_s = _light_to_earth_s(position_icrf_m, emitted_utc_ns)
@@ -277,9 +276,7 @@ def station(name: str, minimum_elevation_deg: float = 10.0) -> GroundStation:
     )
 
 
-def contacts(
-    ephemeris: Ephemeris, utc_ns: IntArray, section: LinkSection
-) -> tuple[BoolArray, NDArray[np.float64]]:
+def contacts(ephemeris: Ephemeris, utc_ns: IntArray, section: LinkSection) -> tuple[BoolArray, FloatArray]:
     """Whether any station hears the spacecraft at emission epochs (n,), and the light time to there in s.
 
     Without stations it is always heard, by the Earth's centre. Contacts begin and end on a grid of a minute.
@@ -299,7 +296,7 @@ def contacts(
     return heard[at], light_s[at]
 
 
-def _light_to_earth_s(position_icrf_m: NDArray[np.float64], utc_ns: IntArray) -> NDArray[np.float64]:
+def _light_to_earth_s(position_icrf_m: FloatArray, utc_ns: IntArray) -> FloatArray:
     """Light time (n,) from positions (n, 3) from the Moon to the Earth's centre, s."""
     earth = np.asarray(earth_position_icrf_m(np.asarray(tdb_s_from_utc_ns(utc_ns)))).reshape(-1, 3)
     return np.asarray(np.linalg.norm(position_icrf_m - earth, axis=1) / SPEED_OF_LIGHT_M_S)
@@ -317,12 +314,12 @@ def _bursts(
 
 
 def _with_errors(
-    frames: NDArray[np.uint8],
+    frames: OctetArray,
     lost: BoolArray,
-    bit_error_rate: NDArray[np.float64],
+    bit_error_rate: FloatArray,
     settings: LinkSettings,
     rng: np.random.Generator,
-) -> tuple[NDArray[np.uint8], BoolArray, int, int]:
+) -> tuple[OctetArray, BoolArray, int, int]:
     """(frames that came, which of them cannot be repaired, symbols to repair in the others, wrong bits)."""
     came = frames[~lost].copy()
     bits = 8 * settings.cadu_length
@@ -345,9 +342,7 @@ def _with_errors(
     return came, bad, repaired, int(wrong.sum())
 
 
-def _out_of_order(
-    blocks: list[NDArray[np.uint8]], share: float, rng: np.random.Generator
-) -> list[NDArray[np.uint8]]:
+def _out_of_order(blocks: list[OctetArray], share: float, rng: np.random.Generator) -> list[OctetArray]:
     """The blocks, a share of them exchanged with the next one."""
     blocks = list(blocks)
     for k in range(len(blocks) - 1):

@@ -13,12 +13,11 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, OctetArray
 from tmtc.cuc import TICKS_PER_SECOND
 
-Float = NDArray[np.float64]
-Memory = NDArray[np.uint8]
+Memory = OctetArray
 
 UNLIMITED = 1 << 62
 _CAMERA, _ACCELERATOR = 1, 2
@@ -100,7 +99,7 @@ class SimulatedBoard:
     camera_c: float = 6.0
     tables: dict[int, bytearray] = field(default_factory=dict)
     memory: dict[int, Memory] = field(default_factory=dict)
-    readings: Float = field(default_factory=lambda: np.full(4, np.nan))
+    readings: FloatArray = field(default_factory=lambda: np.full(4, np.nan))
     _loads: int = 0
     _uptime: int = 0
     _counter_ns: int = 0
@@ -161,7 +160,7 @@ class SimulatedBoard:
 
     # What flight software sees
 
-    def sensors(self) -> Float:
+    def sensors(self) -> FloatArray:
         model = self.model
         open_v = model.empty_v + (model.full_v - model.empty_v) * self.charge - self.drop_v
         drawn_w = self.drawn_w

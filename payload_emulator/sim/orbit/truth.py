@@ -12,9 +12,9 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lunar.arrays import FloatArray, IntArray
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import (
     Orientation,
@@ -132,8 +132,8 @@ class Crossing:
 
 def find_crossings(
     truth: Truth,
-    covers: Callable[[FloatArray, FloatArray], NDArray[np.bool_]],
-    in_reach: Callable[[FloatArray], NDArray[np.bool_]],
+    covers: Callable[[FloatArray, FloatArray], BoolArray],
+    in_reach: Callable[[FloatArray], BoolArray],
     *,
     not_before_utc_ns: int,
     latitude_band_rad: tuple[float, float],
@@ -222,7 +222,7 @@ def require_above_ground(
         )
 
 
-def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _runs(mask: BoolArray) -> list[tuple[int, int]]:
     """First and last index of each run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [(int(first), int(stop) - 1) for first, stop in zip(edges[::2], edges[1::2], strict=True)]

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import enu_from_mcmf, mcmf_from_spherical, spherical_from_mcmf
@@ -31,7 +32,6 @@ from payload_emulator.sim.terrain.tiles import (
     TerrainPatch,
 )
 
-Floats = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 
 GRID = 65
@@ -118,13 +118,13 @@ class CyclesScene:
         quarter of the light of a Sun 6 deg up (Fresnel) onward into the picture; 1 mirrors nothing.
     """
 
-    vertices_km: Floats
-    uv: Floats
+    vertices_km: FloatArray
+    uv: FloatArray
     displacement: Image
     displacement_range_km: float
     albedo: Image
-    camera_to_world: Floats
-    sun_to_world: Floats
+    camera_to_world: FloatArray
+    sun_to_world: FloatArray
     fov_rad: float
     width_px: int
     height_px: int
@@ -211,9 +211,9 @@ def describe_scene(
 def _bounds(
     terrain: Terrain,
     camera: PinholeCamera,
-    position: Floats,
-    rotation: Floats,
-    sun: Floats,
+    position: FloatArray,
+    rotation: FloatArray,
+    sun: FloatArray,
     longitude: float,
 ) -> tuple[float, float, float, float]:
     """South, north, west and east of the cap: all ground in view and toward the Sun that can shade it."""
@@ -240,7 +240,7 @@ def _bounds(
 
 def _textures(
     terrain: Terrain, south: float, north: float, west: float, east: float, level: int
-) -> tuple[Floats, Floats]:
+) -> tuple[FloatArray, FloatArray]:
     """Heights in metres and albedo over the cap, rows from south to north, at the pixels of the terrain's level."""
     from payload_emulator.sim.terrain import kernels
 
@@ -266,10 +266,10 @@ def _textures(
 
 
 def _law_over_lambert(
-    heights: Floats,
+    heights: FloatArray,
     bounds: tuple[float, float, float, float],
-    position: Floats,
-    sun: Floats,
+    position: FloatArray,
+    sun: FloatArray,
     photometry: Photometry,
 ) -> Image:
     """What the law makes of each texel over a matt Lambert surface; slopes over two texels, as elsewhere."""
@@ -301,8 +301,8 @@ def _law_over_lambert(
 
 
 def _local_axes(
-    cos_latitude: Floats, sin_latitude: Floats, longitude: Floats
-) -> tuple[tuple[Floats, Floats, Floats], ...]:
+    cos_latitude: FloatArray, sin_latitude: FloatArray, longitude: FloatArray
+) -> tuple[tuple[FloatArray, FloatArray, FloatArray], ...]:
     """East, north and up at latitudes (n, 1) and longitudes (m,) as MCMF components that broadcast to (n, m)."""
     cos_longitude, sin_longitude = np.cos(longitude)[None, :], np.sin(longitude)[None, :]
     zero = np.zeros((1, 1))
@@ -313,7 +313,7 @@ def _local_axes(
     )
 
 
-def _albedo(patch: TerrainPatch, rows: Floats, columns: Floats) -> Floats:
+def _albedo(patch: TerrainPatch, rows: FloatArray, columns: FloatArray) -> FloatArray:
     """Albedo at patch coordinates, bilinear on the coarser albedo pixels."""
     step = TILE_PIXELS >> ALBEDO_SHIFT
     mask = (1 << ALBEDO_SHIFT) - 1
@@ -328,7 +328,7 @@ def _albedo(patch: TerrainPatch, rows: Floats, columns: Floats) -> Floats:
     return np.asarray((1.0 - fr) * top + fr * low, dtype=np.float64)
 
 
-def _camera_to_world(enu_from_camera: Floats, altitude_m: float) -> Floats:
+def _camera_to_world(enu_from_camera: FloatArray, altitude_m: float) -> FloatArray:
     """Blender's camera has y up and looks along -z: the camera frame's y and z turned about."""
     matrix = np.eye(4)
     matrix[:3, :3] = enu_from_camera @ np.diag([1.0, -1.0, -1.0])
@@ -336,7 +336,7 @@ def _camera_to_world(enu_from_camera: Floats, altitude_m: float) -> Floats:
     return matrix
 
 
-def _sun_to_world(sun_enu: Floats) -> Floats:
+def _sun_to_world(sun_enu: FloatArray) -> FloatArray:
     """A lamp shines along its -z, so its z points to the Sun; how it is rolled does not matter."""
     helper = np.array([1.0, 0.0, 0.0]) if abs(sun_enu[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     x = np.cross(helper, sun_enu)

@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf, project_mcmf
 from lunar.catalogue import CraterCatalogue, size_class
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.sim.terrain.tiles import Terrain
-
-Floats = npt.NDArray[np.float64]
 
 RIM_POINTS = 24
 HIDDEN_SHARE = 0.1
@@ -52,20 +51,20 @@ class Labels:
         Share of the rim within the picture that no nearer ground hides; NaN if no ranges were given.
     """
 
-    index: npt.NDArray[np.int64]
-    u_px: Floats
-    v_px: Floats
-    diameter_px: Floats
-    major_px: Floats
-    minor_px: Floats
-    angle_rad: Floats
+    index: IntArray
+    u_px: FloatArray
+    v_px: FloatArray
+    diameter_px: FloatArray
+    major_px: FloatArray
+    minor_px: FloatArray
+    angle_rad: FloatArray
     size_class: npt.NDArray[np.int8]
-    diameter_m: Floats
-    depth_m: Floats
-    inside: npt.NDArray[np.bool_]
-    visible_fraction: Floats
-    lit_fraction: Floats
-    sight_fraction: Floats
+    diameter_m: FloatArray
+    depth_m: FloatArray
+    inside: BoolArray
+    visible_fraction: FloatArray
+    lit_fraction: FloatArray
+    sight_fraction: FloatArray
 
     def __len__(self) -> int:
         return self.index.size
@@ -135,7 +134,7 @@ def project_craters(
     minimum_diameter_m: float = 2_500.0,
     lit: npt.NDArray[np.float32] | None = None,
     range_m: npt.NDArray[np.float32] | None = None,
-    rim_tilt_m: Floats | None = None,
+    rim_tilt_m: FloatArray | None = None,
 ) -> Labels:
     """Labels of all craters of the catalogue with any part of the rim in the picture.
 
@@ -223,7 +222,7 @@ def label_frame_as_the_paper(
 
 def project_as_the_paper(
     catalogue: CraterCatalogue, camera: PinholeCamera, position_mcmf_m: npt.ArrayLike
-) -> tuple[Floats, Floats, Floats]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Pixel coordinates u, v and diameters (n) by the paper's local equirectangular map on a smooth sphere.
 
     For a nadir camera with image up to the north: no relief, no curvature, one scale for the whole picture.  Kept to
@@ -240,7 +239,9 @@ def project_as_the_paper(
     return u, v, camera.focal_px * catalogue.diameter_m / altitude
 
 
-def _rim_points(catalogue: CraterCatalogue, tilt_m: Floats | None = None) -> tuple[Floats, Floats]:
+def _rim_points(
+    catalogue: CraterCatalogue, tilt_m: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Centres (n, 3) and rims (n, 24, 3) in MCMF at rim height, on planes tilted by (n, 2) toward north and east."""
     height = np.nan_to_num(catalogue.rim_height_m, nan=0.0)
     latitude, longitude = catalogue.latitude_rad, catalogue.longitude_rad
@@ -262,7 +263,7 @@ def _rim_points(catalogue: CraterCatalogue, tilt_m: Floats | None = None) -> tup
     return distance * up, rim[..., None] * circle
 
 
-def _axes(rim_uv: Floats, centre_uv: Floats) -> tuple[Floats, Floats, Floats]:
+def _axes(rim_uv: FloatArray, centre_uv: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Full axes and angle of the ellipses through equally spaced rim points, from their second moments."""
     offset = rim_uv - rim_uv.mean(axis=1, keepdims=True) if rim_uv.size else rim_uv
     # Points equally spaced in parameter have covariance axis^2 / 2 along each axis.
@@ -274,7 +275,7 @@ def _axes(rim_uv: Floats, centre_uv: Floats) -> tuple[Floats, Floats, Floats]:
     return major, minor, 0.5 * np.arctan2(2.0 * b, a - c)
 
 
-def _lit_fraction(rim_uv: Floats, centre_uv: Floats, lit: npt.NDArray[np.float32]) -> Floats:
+def _lit_fraction(rim_uv: FloatArray, centre_uv: FloatArray, lit: npt.NDArray[np.float32]) -> FloatArray:
     """Mean of the shadow picture over the rim's inside, sampled on rings that halve the area."""
     if not rim_uv.size:
         return np.empty(0)
@@ -290,8 +291,8 @@ def _lit_fraction(rim_uv: Floats, centre_uv: Floats, lit: npt.NDArray[np.float32
 
 
 def _sight_fraction(
-    rim_uv: Floats, within: npt.NDArray[np.bool_], distance_m: Floats, range_m: npt.NDArray[np.float32]
-) -> Floats:
+    rim_uv: FloatArray, within: BoolArray, distance_m: FloatArray, range_m: npt.NDArray[np.float32]
+) -> FloatArray:
     """Share of the rim points within the picture at which the picture shows the rim and nothing nearer."""
     if not rim_uv.size:
         return np.empty(0)

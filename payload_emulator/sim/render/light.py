@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from lunar.arrays import FloatArray
 from lunar.frames import enu_from_mcmf
-
-Floats = npt.NDArray[np.float64]
 
 SUN_ANGULAR_RADIUS_RAD = math.radians(0.2666)
 """Half the Sun's apparent diameter at 1 au (nominal solar radius 695 700 km over 149 597 871 km)."""
@@ -20,7 +18,7 @@ PAPER_AZIMUTH_RAD = (math.radians(-45.0), math.radians(45.0))
 
 def sun_direction_mcmf(
     elevation_rad: float, azimuth_rad: float, latitude_rad: float, longitude_rad: float
-) -> Floats:
+) -> FloatArray:
     """Unit vector (3,) to a Sun of this elevation and azimuth (from north, clockwise) at a place."""
     horizontal = math.cos(elevation_rad)
     enu = np.array(
@@ -29,7 +27,7 @@ def sun_direction_mcmf(
     return np.asarray(enu_from_mcmf(latitude_rad, longitude_rad).T @ enu)
 
 
-def sun_angles(sun_mcmf: Floats, latitude_rad: float, longitude_rad: float) -> tuple[float, float]:
+def sun_angles(sun_mcmf: FloatArray, latitude_rad: float, longitude_rad: float) -> tuple[float, float]:
     """Elevation and azimuth (from north, clockwise, -pi..pi) of a unit vector to the Sun at a place."""
     east, north, up = enu_from_mcmf(latitude_rad, longitude_rad) @ sun_mcmf
     return math.asin(min(1.0, max(-1.0, up))), math.atan2(east, north)

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lunar._compile import njit
+from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import spherical_from_mcmf
@@ -92,7 +93,7 @@ def cast(
     position_mcmf_m: npt.ArrayLike,
     camera_from_mcmf: npt.ArrayLike,
     uv_px: npt.ArrayLike,
-) -> npt.NDArray[np.float64]:
+) -> FloatArray:
     """Where the rays of picture points (n, 2), inside the picture or not far outside, meet the ground: (n, 3) in MCMF,
     NaN for the sky.  The same march, over the same level of detail, as that of `render`.
     """
@@ -131,10 +132,10 @@ def cast(
 
 def rays_window(
     camera: PinholeCamera,
-    position: npt.NDArray[np.float64],
-    rotation: npt.NDArray[np.float64],
-    sun: npt.NDArray[np.float64],
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], float]:
+    position: FloatArray,
+    rotation: FloatArray,
+    sun: FloatArray,
+) -> tuple[FloatArray, FloatArray, float]:
     """Places over all ground that any ray, toward the ground or on to the Sun, can pass, and their spacing."""
     edge = np.linspace(-0.5, 1.0, 9)
     u = np.linspace(-0.5, camera.width_px - 0.5, 13)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import spherical_from_mcmf
@@ -28,7 +29,6 @@ from payload_emulator.sim.terrain.tiles import (
     MEAN_ALBEDO,
     MEASURE_LEVEL,
     TILE_SHIFT,
-    Floats,
     Terrain,
     TerrainPatch,
 )
@@ -85,9 +85,9 @@ class TangentGrid:
 class View:
     """The camera and the Sun in the tangent frame."""
 
-    tangent_from_mcmf: Floats
+    tangent_from_mcmf: FloatArray
     altitude_m: float
-    tangent_from_camera: Floats
+    tangent_from_camera: FloatArray
     sun_elevation_rad: float
 
 
@@ -221,7 +221,7 @@ def tangent_view(
 
 def places_of_tangent(
     view: View, x_m: npt.NDArray[Any], y_m: npt.NDArray[Any], height_m: npt.ArrayLike
-) -> tuple[Floats, Floats]:
+) -> tuple[FloatArray, FloatArray]:
     """Latitude and longitude of ground of a given height at (x, y) of the tangent frame; NaN past the limb."""
     radius = MOON_RADIUS_M + np.asarray(height_m, dtype=np.float64)
     with np.errstate(invalid="ignore"):
@@ -232,7 +232,7 @@ def places_of_tangent(
     )
 
 
-def _below(position_mcmf_m: npt.ArrayLike) -> tuple[Floats, Floats]:
+def _below(position_mcmf_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
     latitude, longitude, _ = spherical_from_mcmf(np.asarray(position_mcmf_m, dtype=np.float64))
     return latitude, longitude
 
@@ -263,7 +263,7 @@ def _fit_grid(
     return _rectangle(hits, camera, ground, 10.0), surely
 
 
-def _border_rays(camera: PinholeCamera, view: View) -> Floats:
+def _border_rays(camera: PinholeCamera, view: View) -> FloatArray:
     """Unit directions (n, 3) in the tangent frame along the border of the picture."""
     u = np.linspace(-0.5, camera.width_px - 0.5, 33)
     v = np.linspace(-0.5, camera.height_px - 0.5, 33)
@@ -278,7 +278,7 @@ def _border_rays(camera: PinholeCamera, view: View) -> Floats:
     return np.asarray(camera.rays(edge) @ view.tangent_from_camera.T)
 
 
-def _reach(rays: Floats, altitude_m: float, height_m: npt.ArrayLike) -> Floats:
+def _reach(rays: FloatArray, altitude_m: float, height_m: npt.ArrayLike) -> FloatArray:
     """Range along rays to the sphere at a height; to the point closest to it for rays that miss."""
     radius = MOON_RADIUS_M + np.asarray(height_m, dtype=np.float64)
     above = altitude_m - np.asarray(height_m, dtype=np.float64)
@@ -287,7 +287,7 @@ def _reach(rays: Floats, altitude_m: float, height_m: npt.ArrayLike) -> Floats:
     return np.asarray(np.maximum(descent - root, 0.0))
 
 
-def _border_hits(rays: Floats, view: View, patch: TerrainPatch) -> list[Floats]:
+def _border_hits(rays: FloatArray, view: View, patch: TerrainPatch) -> list[FloatArray]:
     """Where the rays meet the ground, (n, 2) per round of a fixed-point search, the settled rounds only."""
     from payload_emulator.sim.terrain import kernels
 
@@ -303,7 +303,7 @@ def _border_hits(rays: Floats, view: View, patch: TerrainPatch) -> list[Floats]:
     return hits
 
 
-def _rectangle(hits: Floats, camera: PinholeCamera, ground_m: float, spare_texels: float) -> TangentGrid:
+def _rectangle(hits: FloatArray, camera: PinholeCamera, ground_m: float, spare_texels: float) -> TangentGrid:
     texel = max(TEXEL_PER_PIXEL * ground_m / camera.focal_px, SMALLEST_TEXEL_M)
     spare = spare_texels * texel
     (x_low, y_low), (x_high, y_high) = hits.min(axis=0) - spare, hits.max(axis=0) + spare
@@ -321,7 +321,7 @@ def _whole_nodes(length: float) -> int:
     return math.ceil(length / NODE_STEP) * NODE_STEP + 1
 
 
-def _outline(view: View, *grids: TangentGrid) -> tuple[Floats, Floats, float]:
+def _outline(view: View, *grids: TangentGrid) -> tuple[FloatArray, FloatArray, float]:
     """Places on a lattice over the rectangles, borders included, and its spacing, for finding the tiles they need."""
     latitudes, longitudes, spacing = [], [], 0.0
     for grid in grids:

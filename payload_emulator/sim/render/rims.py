@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera, project_mcmf
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.sim.render.labels import label_frame
 from payload_emulator.sim.render.raymarch import cast
 from payload_emulator.sim.terrain.tiles import Terrain
-
-Floats = npt.NDArray[np.float64]
 
 AZIMUTHS = 48
 ROUNDS = 8
@@ -40,10 +39,10 @@ class RimErrors:
         Rms of the rim's single points about the label's ellipse, its middle set right: rims are uneven.
     """
 
-    index: npt.NDArray[np.int64]
-    offset_u_px: Floats
-    offset_v_px: Floats
-    scatter_px: Floats
+    index: IntArray
+    offset_u_px: FloatArray
+    offset_v_px: FloatArray
+    scatter_px: FloatArray
 
 
 def rim_errors(
@@ -97,7 +96,9 @@ def rim_errors(
     return RimErrors(index[good], offset[:, 0], offset[:, 1], scatter)
 
 
-def _circle(latitude: Floats, longitude: Floats, diameter_m: Floats) -> tuple[Floats, Floats]:
+def _circle(
+    latitude: FloatArray, longitude: FloatArray, diameter_m: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Places (n, 48) on the rims."""
     radius = (0.5 * diameter_m / MOON_RADIUS_M)[:, None]
     azimuth = _azimuths()
@@ -107,5 +108,5 @@ def _circle(latitude: Floats, longitude: Floats, diameter_m: Floats) -> tuple[Fl
     return np.arcsin(sine), longitude[:, None] + np.arctan2(east, np.cos(radius) - sine0 * sine)
 
 
-def _azimuths() -> Floats:
+def _azimuths() -> FloatArray:
     return np.asarray(np.arange(AZIMUTHS) * (2.0 * math.pi / AZIMUTHS))

@@ -9,10 +9,11 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from lunar.arrays import OctetArray
 from payload_emulator.errors import PayloadError
 
 Image = npt.NDArray[np.float32]
-Picture = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+Picture = OctetArray | npt.NDArray[np.uint16]
 
 COLOUR = (1.06, 1.0, 0.90)
 """Red, green and blue response to sunlit regolith after white balance on the Sun: the Moon is slightly red."""
@@ -103,7 +104,7 @@ class SensorModel:
                 raise PayloadError(f"sensor: expected {name} from {low:g} to {high:g}, found {value:g}")
 
 
-def expose(radiance: Image, sensor: SensorModel, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
+def expose(radiance: Image, sensor: SensorModel, rng: np.random.Generator) -> OctetArray:
     """RGB picture (H, W, 3) of a radiance (H, W), 8 bit; see `expose_deep` for more."""
     if sensor.bits != 8:
         raise PayloadError(f"sensor: expected 8 bits for an 8-bit picture, found {sensor.bits}")

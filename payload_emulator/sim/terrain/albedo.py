@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from lunar.arrays import FloatArray
 from payload_emulator.errors import TerrainError
 from payload_emulator.sim.terrain.rasters import RasterLayer, open_layers
-from payload_emulator.sim.terrain.tiles import Floats
 
 LEAST, GREATEST = 0.3, 2.0
 """Bounds of relative albedo: craters' rays and the darkest plains stay within."""
@@ -27,7 +27,7 @@ class AlbedoMap:
     def __init__(self, path: Path) -> None:
         self._values = load_albedo_map(path)
 
-    def relative(self, latitude_rad: Floats, longitude_rad: Floats) -> Floats:
+    def relative(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> FloatArray:
         """Albedo over its mean on a grid of places, (rows, columns)."""
         return _sample_map(self._values, latitude_rad, longitude_rad)
 
@@ -42,7 +42,7 @@ class AlbedoTiles:
         self._layers: list[RasterLayer] = open_layers(paths, heights=False)
         self._mean = _median(self._layers)
 
-    def relative(self, latitude_rad: Floats, longitude_rad: Floats) -> Floats:
+    def relative(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> FloatArray:
         """Albedo over its mean on a grid of places, (rows, columns)."""
         out = np.full((latitude_rad.size, longitude_rad.size), np.nan)
         for layer in reversed(self._layers):
@@ -95,7 +95,7 @@ def _median(layers: Sequence[RasterLayer]) -> float:
     return float(np.median(found))
 
 
-def _averaged(layer: RasterLayer, latitude: Floats, longitude: Floats) -> Floats:
+def _averaged(layer: RasterLayer, latitude: FloatArray, longitude: FloatArray) -> FloatArray:
     """Means of a layer over cells of the grid's step about each place, (rows, columns); NaN without data."""
     rows = (90.0 - np.degrees(latitude)) * layer.pixels_per_degree - layer.north_offset
     columns = np.degrees(longitude) * layer.pixels_per_degree - layer.west_offset
@@ -143,7 +143,7 @@ def load_albedo_map(path: Path) -> npt.NDArray[np.float32]:
     return np.asarray(np.clip(scaled, 0.3, 2.0), dtype=np.float32)
 
 
-def _sample_map(values: npt.NDArray[np.float32], latitude: Floats, longitude: Floats) -> Floats:
+def _sample_map(values: npt.NDArray[np.float32], latitude: FloatArray, longitude: FloatArray) -> FloatArray:
     """Bilinear values (rows, columns) of a whole-Moon map that starts at the north pole and 180 degrees west."""
     height, width = values.shape
     row = np.clip((0.5 - latitude / math.pi) * height - 0.5, 0.0, height - 1.001)

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from lunar.arrays import FloatArray, IntArray
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.sim.terrain.kernels import PROFILE_REACH
-
-Floats = npt.NDArray[np.float64]
 
 AGE_STEPS = 10
 SHAPES = 4
@@ -49,17 +48,17 @@ SMALL_DEPTH_QUANTILES = ((0.0, 0.02), (0.3, 0.05), (0.6, 0.08), (0.85, 0.12), (0
 class CraterShapes:
     """Craters ready to stamp, arrays of one length; angles in radians."""
 
-    latitude_rad: Floats
-    longitude_rad: Floats
-    radius_rad: Floats
-    depth_m: Floats
-    profile_row: npt.NDArray[np.int64]
-    wobble: Floats
+    latitude_rad: FloatArray
+    longitude_rad: FloatArray
+    radius_rad: FloatArray
+    depth_m: FloatArray
+    profile_row: IntArray
+    wobble: FloatArray
 
     def __len__(self) -> int:
         return self.latitude_rad.size
 
-    def select(self, indices: npt.NDArray[np.int64]) -> CraterShapes:
+    def select(self, indices: IntArray) -> CraterShapes:
         """The craters of these indices, in that order."""
         return CraterShapes(
             self.latitude_rad[indices],
@@ -93,17 +92,17 @@ def crater_profiles() -> npt.NDArray[np.float32]:
     return np.asarray(rows, dtype=np.float32)
 
 
-def fresh_depth_ratio(diameter_m: Floats) -> Floats:
+def fresh_depth_ratio(diameter_m: FloatArray) -> FloatArray:
     """Depth over diameter of fresh craters: 0.2 up to about 15 km, then falling as complex craters do."""
     kilometres = np.maximum(diameter_m / 1000.0, 1.0e-3)
     return np.minimum(0.2, 1.044 * kilometres ** (0.301 - 1.0))
 
 
 def shape_craters(
-    latitude_rad: Floats,
-    longitude_rad: Floats,
-    diameter_m: Floats,
-    depth_ratio: Floats,
+    latitude_rad: FloatArray,
+    longitude_rad: FloatArray,
+    diameter_m: FloatArray,
+    depth_ratio: FloatArray,
     rng: np.random.Generator,
 ) -> CraterShapes:
     """Craters of given sizes and depth ratios with seeded irregular rims."""
@@ -126,7 +125,7 @@ def shape_craters(
 
 def draw_power_law(
     rng: np.random.Generator, count: int, low_m: float, high_m: float, exponent: float
-) -> Floats:
+) -> FloatArray:
     """Diameters (count,) between two limits with cumulative numbers falling as ``D ** -exponent``."""
     share = rng.random(count)
     low, high = low_m**-exponent, high_m**-exponent
@@ -135,7 +134,7 @@ def draw_power_law(
 
 def draw_depth_ratio(
     rng: np.random.Generator, count: int, quantiles: tuple[tuple[float, float], ...]
-) -> Floats:
+) -> FloatArray:
     """Depth over diameter (count,) by a table of (share, value)."""
     table = np.array(quantiles)
     return np.asarray(np.interp(rng.random(count), table[:, 0], table[:, 1]))
@@ -151,7 +150,7 @@ class SmallCraters:
         high_m: float,
         per_km2: float,
         exponent: float,
-        density: npt.NDArray[np.float64] | None = None,
+        density: FloatArray | None = None,
     ) -> None:
         """``per_km2`` counts craters above ``low_m``; ``density`` (180, 360) scales it per cell, north first."""
         self.seed = seed
@@ -165,7 +164,7 @@ class SmallCraters:
             self._mean = self._mean * density
         self._cells: dict[tuple[int, int], CraterShapes] = {}
 
-    def around(self, latitude_rad: Floats, longitude_rad: Floats) -> CraterShapes:
+    def around(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> CraterShapes:
         """The craters of every cell that can touch a tile of these latitudes and longitudes, in a fixed order."""
         margin = PROFILE_REACH * 1.05 * 0.5 * self.high_m / MOON_RADIUS_M
         north = math.degrees(latitude_rad.max() + margin)
@@ -211,7 +210,7 @@ class SmallCraters:
         return made
 
 
-def _fresh_profile(s: Floats, shape: int) -> Floats:
+def _fresh_profile(s: FloatArray, shape: int) -> FloatArray:
     rim = 0.2
     outside = np.where(s > 1.0, np.maximum(s, 1.0) ** -3.2, 1.0)
     end = PROFILE_REACH**-3.2
@@ -230,7 +229,7 @@ def _fresh_profile(s: Floats, shape: int) -> Floats:
     return np.where(s < 1.0, inside, np.maximum(outside, 0.0))
 
 
-def _aged_profile(s: Floats, fresh: Floats, age: float) -> Floats:
+def _aged_profile(s: FloatArray, fresh: FloatArray, age: float) -> FloatArray:
     """The profile after diffusion: rounded over a length that grows with age, scaled back to unit depth."""
     width = 0.025 + 0.30 * age
     step = s[1] - s[0]

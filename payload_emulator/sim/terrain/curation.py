@@ -18,16 +18,14 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue, make_catalogue
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import TerrainError
 from tmtc.tables import MAGIC, CatalogueTable, table_hash, unpack_catalogue_table
 
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+Mask = BoolArray
 
 REASONS = ("size", "no_terrain", "shallow", "no_rim", "moved", "confusable")
 """Why a crater is dropped, in the order in which it is tested."""
@@ -50,7 +48,7 @@ class Heights(Protocol):
 
     pixels_per_degree: float
 
-    def window(self, south: float, north: float, west: float, east: float) -> tuple[Float, float, float]:
+    def window(self, south: float, north: float, west: float, east: float) -> tuple[FloatArray, float, float]:
         """Heights (rows, columns), north first, NaN where there are none; latitude and longitude of pixel (0, 0)."""
         ...
 
@@ -64,7 +62,7 @@ class Region:
     south_deg: float = -90.0
     north_deg: float = 90.0
 
-    def holds(self, latitude_rad: Float, longitude_rad: Float) -> Mask:
+    def holds(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> Mask:
         latitude = np.degrees(latitude_rad)
         inside = (latitude >= self.south_deg) & (latitude <= self.north_deg)
         east = np.mod(np.degrees(longitude_rad) - self.west_deg, 360.0)
@@ -131,11 +129,11 @@ class Curation:
     """
 
     table: CatalogueTable
-    depth_m: Float
+    depth_m: FloatArray
     dropped: dict[str, int]
     offset_m: tuple[float, float]
     offset_sigma_m: float
-    shift_m: Float
+    shift_m: FloatArray
     height_correction_m: float
 
     def catalogue(self, source: str) -> CraterCatalogue:
@@ -157,14 +155,14 @@ class Curation:
 class _Fit:
     """Measured craters, arrays of one length; NaN where the raster has nothing."""
 
-    east_m: Float
-    north_m: Float
-    radius_m: Float
-    rim_m: Float
-    depth_m: Float
-    scatter_m: Float
-    share: Float
-    sigma_rim_m: Float
+    east_m: FloatArray
+    north_m: FloatArray
+    radius_m: FloatArray
+    rim_m: FloatArray
+    depth_m: FloatArray
+    scatter_m: FloatArray
+    share: FloatArray
+    sigma_rim_m: FloatArray
 
 
 def curate(
@@ -245,7 +243,9 @@ def _measured(craters: CraterCatalogue, heights: Heights) -> _Fit:
     return _Fit(*columns)
 
 
-def _blocks(craters: CraterCatalogue, heights: Heights) -> Iterator[tuple[Index, tuple[Float, float, float]]]:
+def _blocks(
+    craters: CraterCatalogue, heights: Heights
+) -> Iterator[tuple[IntArray, tuple[FloatArray, float, float]]]:
     """Yield rows of craters that lie in one block, with the heights about them."""
     latitude = np.degrees(craters.latitude_rad)
     longitude = np.mod(np.degrees(craters.longitude_rad), 360.0)
@@ -266,7 +266,9 @@ def _blocks(craters: CraterCatalogue, heights: Heights) -> Iterator[tuple[Index,
             yield rows.astype(np.int64), window
 
 
-def _fitted(craters: CraterCatalogue, ppd: float, window: Float, top_deg: float, left_deg: float) -> Float:
+def _fitted(
+    craters: CraterCatalogue, ppd: float, window: FloatArray, top_deg: float, left_deg: float
+) -> FloatArray:
     """Return east, north, radius, rim height, depth, scatter, share of azimuths, sigma of the rim height, (8, n)."""
     count = len(craters)
     latitude, longitude = np.degrees(craters.latitude_rad), np.degrees(craters.longitude_rad)
@@ -277,7 +279,7 @@ def _fitted(craters: CraterCatalogue, ppd: float, window: Float, top_deg: float,
     azimuth = (np.arange(_AZIMUTHS) + 0.5) * (2.0 * math.pi / _AZIMUTHS)
     sine, cosine = np.sin(azimuth), np.cos(azimuth)
 
-    def sample(at: Float) -> Float:
+    def sample(at: FloatArray) -> FloatArray:
         """Heights at distances (n, k) from the centres along all azimuths, shape (n, azimuths, k)."""
         x = east[:, None, None] + at[:, None, :] * sine[None, :, None]
         y = north[:, None, None] + at[:, None, :] * cosine[None, :, None]
@@ -311,7 +313,7 @@ def _fitted(craters: CraterCatalogue, ppd: float, window: Float, top_deg: float,
     return np.stack([east, north, radius, rim, rim - floor, scatter_m, share, sigma_rim])
 
 
-def _rim_points(profile: Float) -> tuple[Float, Mask]:
+def _rim_points(profile: FloatArray) -> tuple[FloatArray, Mask]:
     """Return where along profiles (n, azimuths, k) the crest lies, over the assumed radius, and whether it does."""
     best = np.argmax(np.nan_to_num(profile, nan=-np.inf), axis=2)
     inner = np.clip(best, 1, profile.shape[2] - 2)[..., None]
@@ -326,8 +328,8 @@ def _rim_points(profile: Float) -> tuple[Float, Mask]:
 
 
 def _circle(
-    points: Float, seen: Mask, sine: Float, cosine: Float
-) -> tuple[Float, Float, Float, Float, Float]:
+    points: FloatArray, seen: Mask, sine: FloatArray, cosine: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return centre east, north, radius, scatter (all over the radius assumed) and share of azimuths used, (n,).
 
     Least squares of r = R + e sin + n cos, with points weighted down by their distance (Cauchy, scale from the median).
@@ -353,7 +355,9 @@ def _circle(
     return answer[:, 0], answer[:, 1], answer[:, 2], scatter, share
 
 
-def _common_shift(east_m: Float, north_m: Float, radius_m: Float) -> tuple[tuple[float, float], float]:
+def _common_shift(
+    east_m: FloatArray, north_m: FloatArray, radius_m: FloatArray
+) -> tuple[tuple[float, float], float]:
     """Return the median shift of small craters (whose centres are known best) and its standard error."""
     if not east_m.size:
         return (0.0, 0.0), 0.0
@@ -365,7 +369,7 @@ def _common_shift(east_m: Float, north_m: Float, radius_m: Float) -> tuple[tuple
 
 
 def _unmistakable(
-    latitude: Float, longitude: Float, diameter: Float, depth: Float, rules: CurationRules
+    latitude: FloatArray, longitude: FloatArray, diameter: FloatArray, depth: FloatArray, rules: CurationRules
 ) -> Mask:
     """Return which craters have no deeper neighbour of their size on top of them."""
     clear = np.ones(latitude.size, dtype=np.bool_)
@@ -392,7 +396,7 @@ def _low_rim_m(pixels_per_degree: float) -> float:
     return _LOW_RIM_M_PER_HALVING * max(0.0, math.log2(_FULL_RESOLUTION_PPD / pixels_per_degree))
 
 
-def _bilinear(values: Float, row: Float, column: Float) -> Float:
+def _bilinear(values: FloatArray, row: FloatArray, column: FloatArray) -> FloatArray:
     """Return values at pixel coordinates, NaN outside and next to NaN."""
     rows, columns = values.shape
     i = np.clip(np.floor(row), 0, rows - 2).astype(np.int64)
@@ -418,7 +422,7 @@ class RasterHeights:
         self.pixels_per_degree = float(self._layer.pixels_per_degree)
         self._smoothing = smoothing_pixels
 
-    def window(self, south: float, north: float, west: float, east: float) -> tuple[Float, float, float]:
+    def window(self, south: float, north: float, west: float, east: float) -> tuple[FloatArray, float, float]:
         """Heights of a window in degrees, with latitude and longitude of the centre of its first pixel."""
         layer, ppd = self._layer, self.pixels_per_degree
         top = math.floor((90.0 - north) * ppd - layer.north_offset - 0.5)
@@ -433,7 +437,7 @@ class RasterHeights:
         )
 
 
-def _smoothed(values: Float, sigma: float) -> Float:
+def _smoothed(values: FloatArray, sigma: float) -> FloatArray:
     """Return values under a small Gaussian; what touches NaN becomes NaN."""
     reach = math.ceil(3.0 * sigma)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(sigma, 1e-9)) ** 2)

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from lunar.arrays import BoolArray, FloatArray
 from lunar.catalogue import CLASS_LIMITS_M, PAPER_CLASS_COUNTS, CraterCatalogue, make_catalogue
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.sim.terrain import kernels
@@ -23,7 +24,6 @@ from payload_emulator.sim.terrain.craters import (
 )
 from payload_emulator.sim.terrain.tiles import (
     MEAN_ALBEDO,
-    Floats,
     Heights,
     TiledTerrain,
     coarse_nodes,
@@ -121,14 +121,14 @@ class ProceduralTerrain(TiledTerrain):
             if chosen.size:
                 self._bands.append((float(reach[chosen].max()), chosen, catalogue.select(chosen)))
 
-    def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> BoolArray:
         """Whether the source itself holds each place: everywhere but within six degrees of the poles."""
         latitude, _ = np.broadcast_arrays(
             np.asarray(latitude_rad, dtype=np.float64), np.asarray(longitude_rad)
         )
         return np.asarray(np.abs(latitude) < math.radians(83.0))
 
-    def make_heights(self, latitude_rad: Floats, longitude_rad: Floats) -> Heights:
+    def make_heights(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> Heights:
         """Heights on an even grid of places (rows, columns) in metres."""
         step = float(latitude_rad[0] - latitude_rad[1])
         pixel_km = step * MOON_RADIUS_M / 1000.0
@@ -165,12 +165,12 @@ class ProceduralTerrain(TiledTerrain):
         )
         return out
 
-    def make_albedo(self, latitude_rad: Floats, longitude_rad: Floats) -> Heights:
+    def make_albedo(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> Heights:
         """Normal albedo on a grid of places: dark plains, bright uplands, mottled."""
         plain = self._plain(latitude_rad, longitude_rad)
         return mottled_albedo(1.12 - 0.5 * plain, latitude_rad, longitude_rad, self._salts[40:46])
 
-    def _plain(self, latitude: Floats, longitude: Floats) -> Floats:
+    def _plain(self, latitude: FloatArray, longitude: FloatArray) -> FloatArray:
         """How much of a plain (0..1) a grid of places is, (rows, columns), cubic in a half-degree map."""
         rows = (90.0 - np.degrees(latitude)) * 2.0
         columns = np.degrees(longitude) * 2.0
@@ -193,7 +193,7 @@ class ProceduralTerrain(TiledTerrain):
         )
         return out.astype(np.float64)
 
-    def _craters_about(self, latitude: Floats, longitude: Floats) -> CraterShapes:
+    def _craters_about(self, latitude: FloatArray, longitude: FloatArray) -> CraterShapes:
         middle_latitude = 0.5 * float(latitude[0] + latitude[-1])
         middle_longitude = 0.5 * float(longitude[0] + longitude[-1])
         half = float(latitude[0] - latitude[-1]) * 0.75 * MOON_RADIUS_M
@@ -205,7 +205,11 @@ class ProceduralTerrain(TiledTerrain):
 
 
 def stamp(
-    out: Heights, latitude: Floats, longitude: Floats, shapes: CraterShapes, profiles: npt.NDArray[np.float32]
+    out: Heights,
+    latitude: FloatArray,
+    longitude: FloatArray,
+    shapes: CraterShapes,
+    profiles: npt.NDArray[np.float32],
 ) -> None:
     """Add craters to a tile of heights in place."""
     kernels.stamp_craters(
@@ -222,7 +226,9 @@ def stamp(
     )
 
 
-def mottled_albedo(base: Floats, latitude: Floats, longitude: Floats, salts: list[int]) -> Heights:
+def mottled_albedo(
+    base: FloatArray, latitude: FloatArray, longitude: FloatArray, salts: list[int]
+) -> Heights:
     """Normal albedo: a smooth map relative to the mean, with seeded mottling of 3 to 60 km."""
     angles = (np.cos(latitude), np.sin(latitude), np.cos(longitude), np.sin(longitude))
     mottle = np.zeros(base.shape, np.float32)

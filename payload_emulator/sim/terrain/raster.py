@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from lunar.arrays import BoolArray, FloatArray
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import TerrainError
@@ -27,7 +28,6 @@ from payload_emulator.sim.terrain.procedural import (
 )
 from payload_emulator.sim.terrain.rasters import RasterLayer, open_layers
 from payload_emulator.sim.terrain.tiles import (
-    Floats,
     Heights,
     TiledTerrain,
     coarse_nodes,
@@ -112,7 +112,7 @@ class RasterTerrain(TiledTerrain):
         self._reflectance = open_albedo(albedo_paths) if albedo_paths else None
         super().__init__(name, data_names or (name,), catalogue, pixels_per_degree, cache_tiles)
 
-    def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> BoolArray:
         """Whether a height raster (not a coarse one) spans each place."""
         latitude, longitude = np.broadcast_arrays(
             np.asarray(latitude_rad, dtype=np.float64), np.asarray(longitude_rad, dtype=np.float64)
@@ -122,7 +122,7 @@ class RasterTerrain(TiledTerrain):
             held |= layer.holds(latitude, longitude)
         return held
 
-    def make_heights(self, latitude_rad: Floats, longitude_rad: Floats) -> Heights:
+    def make_heights(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> Heights:
         """Heights on an even grid of places (rows, columns) in metres."""
         out = self._resampled(latitude_rad, longitude_rad)
         if not self._sharpen:
@@ -140,7 +140,7 @@ class RasterTerrain(TiledTerrain):
         )
         return out
 
-    def make_albedo(self, latitude_rad: Floats, longitude_rad: Floats) -> Heights:
+    def make_albedo(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> Heights:
         """Normal albedo on a grid of places: the map where there is one, mottled."""
         if self._reflectance is None:
             base = np.ones((latitude_rad.size, longitude_rad.size))
@@ -148,7 +148,7 @@ class RasterTerrain(TiledTerrain):
             base = self._reflectance.relative(latitude_rad, longitude_rad)
         return mottled_albedo(base, latitude_rad, longitude_rad, self._salts[10:15])
 
-    def _resampled(self, latitude: Floats, longitude: Floats) -> Heights:
+    def _resampled(self, latitude: FloatArray, longitude: FloatArray) -> Heights:
         """Heights on a grid of places from the finest layers, cubic."""
         shape = (latitude.size, longitude.size)
         result: Heights | None = None
@@ -170,7 +170,9 @@ class RasterTerrain(TiledTerrain):
             )
         return result
 
-    def _from_layer(self, layer: RasterLayer, latitude: Floats, longitude: Floats) -> tuple[Heights, Heights]:
+    def _from_layer(
+        self, layer: RasterLayer, latitude: FloatArray, longitude: FloatArray
+    ) -> tuple[Heights, Heights]:
         """Smoothed heights of one layer and how much they count: 1 inside, falling to 0 at the edge of its data."""
         ppd = layer.pixels_per_degree
         middle = 0.5 * float(latitude[0] + latitude[-1])
@@ -210,7 +212,7 @@ class RasterTerrain(TiledTerrain):
         kernels.resample_cubic(source, *_span(rows, top), *_span(columns, left), out)
         return out, weight
 
-    def _slope_gain(self, latitude: Floats, longitude: Floats) -> Heights:
+    def _slope_gain(self, latitude: FloatArray, longitude: FloatArray) -> Heights:
         """How rough the ground about each pixel is beside average ground, (rows, columns)."""
         step = float(latitude[0] - latitude[1])
         # About 1 km between nodes whatever the level, on pixels all tiles share.
@@ -242,7 +244,7 @@ def _share_below(diameter_m: float) -> float:
     return 1.0 - float((SMALL_LOW_M / diameter_m) ** SMALL_EXPONENT)
 
 
-def _span(places: Floats, origin: int) -> tuple[float, float]:
+def _span(places: FloatArray, origin: int) -> tuple[float, float]:
     return float(places[0] - origin), float(places[1] - places[0])
 
 
@@ -255,7 +257,7 @@ def _smoothed(values: Heights, sigma: float, reach: int) -> Heights:
     return smoothed
 
 
-def _density_map(catalogue: CraterCatalogue) -> Floats:
+def _density_map(catalogue: CraterCatalogue) -> FloatArray:
     """Craters of 2 to 5 km about each cell of one degree relative to the mean, (180, 360), over 7 x 7 cells."""
     density = np.ones((180, 360))
     chosen = (catalogue.diameter_m >= 2_000.0) & (catalogue.diameter_m < 5_000.0)
@@ -271,7 +273,7 @@ def _density_map(catalogue: CraterCatalogue) -> Floats:
     return np.clip(np.where(counted > 0.0, counted / expected, 1.0), 0.25, 2.0)
 
 
-def _box(values: Floats) -> Floats:
+def _box(values: FloatArray) -> FloatArray:
     """Mean over 7 x 7 cells, around the meridian."""
     padded = np.pad(np.pad(values, ((3, 3), (0, 0)), mode="edge"), ((0, 0), (3, 3)), mode="wrap")
     return np.asarray(sum(padded[i : i + 180, j : j + 360] for i in range(7) for j in range(7)) / 49.0)

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from lunar.arrays import BoolArray, FloatArray
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import TerrainError
-from payload_emulator.sim.terrain.tiles import Floats, Heights
+from payload_emulator.sim.terrain.tiles import Heights
 
 CHUNK_PIXELS = 1024
 CHUNKS_KEPT = 40
@@ -85,7 +85,7 @@ class RasterLayer:
                     )
         return out
 
-    def holds(self, latitude_rad: Floats, longitude_rad: Floats) -> npt.NDArray[np.bool_]:
+    def holds(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> BoolArray:
         """Whether a file spans each place."""
         row = (90.0 - np.degrees(latitude_rad)) * self.pixels_per_degree - self.north_offset
         column = np.degrees(longitude_rad) * self.pixels_per_degree - self.west_offset

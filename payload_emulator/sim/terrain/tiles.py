@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import TerrainError
@@ -24,7 +25,6 @@ from payload_emulator.errors import TerrainError
 if TYPE_CHECKING:
     from payload_emulator.sim.terrain.craters import CraterShapes, SmallCraters
 
-Floats = npt.NDArray[np.float64]
 Heights = npt.NDArray[np.float32]
 
 TILE_SHIFT = 9
@@ -77,7 +77,9 @@ class TerrainPatch:
     low_m: float
     high_m: float
 
-    def coordinates(self, latitude_rad: Floats, longitude_rad: Floats) -> tuple[Floats, Floats]:
+    def coordinates(
+        self, latitude_rad: FloatArray, longitude_rad: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Pixel coordinates (row, column) of places within the window; integers are pixel centres."""
         rows = (0.5 * math.pi - latitude_rad) * self.pixels_per_radian - 0.5 - self.first_row
         middle = (self.first_column + 0.5 * self.table.shape[1] * TILE_PIXELS) / self.pixels_per_radian
@@ -94,11 +96,13 @@ class Terrain(Protocol):
     catalogue: CraterCatalogue
     pixel_m: float
 
-    def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> BoolArray:
         """Whether the source itself holds each place."""
         ...
 
-    def height_m(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike, level: int = 0) -> Floats:
+    def height_m(
+        self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike, level: int = 0
+    ) -> FloatArray:
         """Height above the map sphere, bilinear on the grid of a level of detail."""
         ...
 
@@ -107,7 +111,7 @@ class Terrain(Protocol):
         ...
 
     def patch(
-        self, latitude_rad: Floats, longitude_rad: Floats, spacing_m: float = 0.0, level: int = 0
+        self, latitude_rad: FloatArray, longitude_rad: FloatArray, spacing_m: float = 0.0, level: int = 0
     ) -> TerrainPatch:
         """Tiles of a level within ``spacing_m`` of places that lie within half a turn of each other."""
         ...
@@ -116,15 +120,15 @@ class Terrain(Protocol):
         """Catalogue craters about a place, rim heights and depths measured on this terrain."""
         ...
 
-    def measured(self, indices: npt.NDArray[np.int64]) -> CraterCatalogue:
+    def measured(self, indices: IntArray) -> CraterCatalogue:
         """Catalogue craters of these indices, likewise measured."""
         ...
 
-    def rim_tilts_m(self, indices: npt.NDArray[np.int64]) -> Floats:
+    def rim_tilts_m(self, indices: IntArray) -> FloatArray:
         """How much higher than its mean the rim's best plane is in the north and in the east, (n, 2)."""
         ...
 
-    def small_craters(self, latitude_rad: Floats, longitude_rad: Floats) -> CraterShapes:
+    def small_craters(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> CraterShapes:
         """Seeded craters below the catalogue's limit that can touch a window of these latitudes and longitudes."""
         ...
 
@@ -178,28 +182,28 @@ class TiledTerrain(ABC):
         self._owner: int | None = None
 
     @abstractmethod
-    def make_heights(self, latitude_rad: Floats, longitude_rad: Floats) -> Heights:
+    def make_heights(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> Heights:
         """Heights on a grid of places (rows, columns) at even steps of latitude, north first, and longitude.
 
         What is too small for the steps is left out.  The value at a place must not depend on the rest of the grid.
         """
 
     @abstractmethod
-    def make_albedo(self, latitude_rad: Floats, longitude_rad: Floats) -> Heights:
+    def make_albedo(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> Heights:
         """Normal albedo on a grid of places (rows, columns)."""
 
     @abstractmethod
-    def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> BoolArray:
         """Whether the source itself holds each place."""
 
-    def small_craters(self, latitude_rad: Floats, longitude_rad: Floats) -> CraterShapes:
+    def small_craters(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> CraterShapes:
         """Seeded craters below the catalogue's limit that can touch a window of these latitudes and longitudes."""
         from payload_emulator.sim.terrain.craters import no_craters
 
         return no_craters() if self._small is None else self._small.around(latitude_rad, longitude_rad)
 
     def patch(
-        self, latitude_rad: Floats, longitude_rad: Floats, spacing_m: float = 0.0, level: int = 0
+        self, latitude_rad: FloatArray, longitude_rad: FloatArray, spacing_m: float = 0.0, level: int = 0
     ) -> TerrainPatch:
         """Tiles of a level within ``spacing_m`` (and two pixels) of the given places.
 
@@ -270,11 +274,13 @@ class TiledTerrain(ABC):
         sizes = [math.pi * MOON_RADIUS_M / (rows * TILE_PIXELS) for rows in self._level_rows]
         return next((level for level, size in enumerate(sizes) if size >= 0.75 * sample_m), LEVELS - 1)
 
-    def height_m(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike, level: int = 0) -> Floats:
+    def height_m(
+        self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike, level: int = 0
+    ) -> FloatArray:
         """Height above the map sphere (...) in metres, bilinear on the grid of a level; places may lie far apart."""
         return self._sample(latitude_rad, longitude_rad, level)
 
-    def _sample(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike, level: int) -> Floats:
+    def _sample(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike, level: int) -> FloatArray:
         from payload_emulator.sim.terrain import kernels
 
         latitude, longitude = np.broadcast_arrays(
@@ -302,7 +308,7 @@ class TiledTerrain(ABC):
         indices = np.asarray(self.catalogue.near(latitude_rad, longitude_rad, radius_m), dtype=np.int64)
         return self.measured(indices)
 
-    def measured(self, indices: npt.NDArray[np.int64]) -> CraterCatalogue:
+    def measured(self, indices: IntArray) -> CraterCatalogue:
         """The craters of these indices, measured: rim height is the mean on the rim circle, depth from it to the floor.
 
         The floor is the mean within 0.4 radius.  Craters whose surroundings this terrain cannot give keep NaN.
@@ -320,12 +326,12 @@ class TiledTerrain(ABC):
             complete=chosen.complete,
         )
 
-    def rim_tilts_m(self, indices: npt.NDArray[np.int64]) -> Floats:
+    def rim_tilts_m(self, indices: IntArray) -> FloatArray:
         """How much higher than its mean the rim's best plane is in the north and in the east, (n, 2); 0 if unknown."""
         self._measure(indices[~self._measured[indices]])
         return self._rim_tilt_m[indices]
 
-    def _measure(self, indices: npt.NDArray[np.int64]) -> None:
+    def _measure(self, indices: IntArray) -> None:
         if indices.size == 0:
             return
         latitude = self.catalogue.latitude_rad[indices]
@@ -393,7 +399,7 @@ class TiledTerrain(ABC):
         return slot
 
 
-def tile_angles(tile_row: int, tile_column: int, pixels_per_degree: float) -> tuple[Floats, Floats]:
+def tile_angles(tile_row: int, tile_column: int, pixels_per_degree: float) -> tuple[FloatArray, FloatArray]:
     """Latitudes and longitudes (515,) in radians of a tile's pixel centres, some of the neighbours' included."""
     index = np.arange(-APRON, TILE_PIXELS + 2)
     latitude = np.radians(90.0 - (tile_row * TILE_PIXELS + index + 0.5) / pixels_per_degree)
@@ -402,8 +408,8 @@ def tile_angles(tile_row: int, tile_column: int, pixels_per_degree: float) -> tu
 
 
 def coarse_nodes(
-    latitude: Floats, longitude: Floats, stride: int, spare: int
-) -> tuple[Floats, Floats, float, float]:
+    latitude: FloatArray, longitude: FloatArray, stride: int, spare: int
+) -> tuple[FloatArray, FloatArray, float, float]:
     """Every ``stride``-th place of the global grid about a part of it, and where the part begins among them.
 
     All tiles pick the same nodes, so what is interpolated between them agrees at tile edges.  ``spare`` nodes are
@@ -422,12 +428,14 @@ def coarse_nodes(
     return np.asarray(0.5 * math.pi - nodes[0]), np.asarray(nodes[1]), starts[0], starts[1]
 
 
-def _azimuths(count: int) -> Floats:
+def _azimuths(count: int) -> FloatArray:
     """Azimuths (count,) from north, clockwise, evenly spread."""
     return np.asarray((np.arange(count) + 0.5) * (2.0 * math.pi / count))
 
 
-def _circle(latitude: Floats, longitude: Floats, radius: Floats, azimuths: int) -> tuple[Floats, Floats]:
+def _circle(
+    latitude: FloatArray, longitude: FloatArray, radius: FloatArray, azimuths: int
+) -> tuple[FloatArray, FloatArray]:
     """Places (n, azimuths) on small circles of angular ``radius`` about centres (n, 1)."""
     azimuth = _azimuths(azimuths)
     sine = np.sin(latitude) * np.cos(radius) + np.cos(latitude) * np.sin(radius) * np.cos(azimuth)

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, FloatArray, OctetArray
 from payload_emulator.flight.vision.preprocess import normalise, sun_up_turns, turn_forward
-
-Floats = NDArray[np.float64]
 
 _NOISE_SIZE = 1400
 _TONES = 4096
@@ -37,18 +36,18 @@ class Crop:
     """Network input (S, S) and where the frame's craters fell, arrays (n,)."""
 
     image: NDArray[np.float32]
-    u_px: Floats
-    v_px: Floats
-    diameter_px: Floats
+    u_px: FloatArray
+    v_px: FloatArray
+    diameter_px: FloatArray
 
 
 def make_crop(
-    gray: NDArray[np.uint8],
-    sun_camera: Floats,
-    u_px: Floats,
-    v_px: Floats,
-    diameter_px: Floats,
-    labelled: NDArray[np.bool_],
+    gray: OctetArray,
+    sun_camera: FloatArray,
+    u_px: FloatArray,
+    v_px: FloatArray,
+    diameter_px: FloatArray,
+    labelled: BoolArray,
     size_px: int,
     parameters: AugmentParameters,
     rng: np.random.Generator,

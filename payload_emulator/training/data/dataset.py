@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, FloatArray, IntArray, OctetArray
 from lunar.camera import PinholeCamera, intersect_sphere
 from lunar.catalogue import size_class
 from lunar.constants import MOON_RADIUS_M
@@ -87,11 +88,11 @@ class ShardLabels:
     split: str
     complete: bool
     frames: dict[str, NDArray[Any]]
-    sun_camera: NDArray[np.float64]
-    camera_from_mcmf: NDArray[np.float64]
-    position_mcmf_m: NDArray[np.float64]
+    sun_camera: FloatArray
+    camera_from_mcmf: FloatArray
+    position_mcmf_m: FloatArray
     craters: dict[str, NDArray[Any]]
-    first: NDArray[np.int64]
+    first: IntArray
     frame_split: tuple[str, ...] = ()
     image_sha256: tuple[str, ...] = ()
     metadata_sha256: tuple[str, ...] = ()
@@ -106,9 +107,9 @@ class Frame:
     split: str
     complete: bool
     values: dict[str, float]
-    sun_camera: NDArray[np.float64]
-    camera_from_mcmf: NDArray[np.float64]
-    position_mcmf_m: NDArray[np.float64]
+    sun_camera: FloatArray
+    camera_from_mcmf: FloatArray
+    position_mcmf_m: FloatArray
     craters: dict[str, NDArray[Any]]
 
 
@@ -170,14 +171,14 @@ class Dataset:
             f for f in self._frames if (not split or f.split == split) and (not source or f.source == source)
         ]
 
-    def image(self, frame: Frame) -> NDArray[np.uint8]:
+    def image(self, frame: Frame) -> OctetArray:
         """Gray image (H, W) of a frame, the upper 8 bits where it has 16."""
         return read_gray(self.folder / "images" / f"{frame.number:06d}.png")
 
 
 def choose_tiers(
     craters: dict[str, NDArray[Any]], width_px: int, height_px: int, complete: bool
-) -> tuple[NDArray[np.int8], NDArray[np.float64]]:
+) -> tuple[NDArray[np.int8], FloatArray]:
     """Tier and weight of the craters of a frame, (n,) each, by what can be seen of them.
 
     `complete` (procedural terrain) says that the terrain shows craters of any size; real terrain does so only for those
@@ -228,10 +229,10 @@ def frame_truth(dataset: Dataset, frame: Frame) -> FrameTruth:
 def diameter_on_ground_m(
     dataset: Dataset,
     frame: Frame,
-    u_px: NDArray[np.float64],
-    v_px: NDArray[np.float64],
-    diameter_px: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    u_px: FloatArray,
+    v_px: FloatArray,
+    diameter_px: FloatArray,
+) -> FloatArray:
     """Diameters that a payload knowing its altitude above the mean ground gives to detections of the frame."""
     camera = dataset.camera
     rays = camera.rays(np.stack([u_px, v_px], axis=-1))
@@ -241,9 +242,7 @@ def diameter_on_ground_m(
     return np.asarray(diameter_px * reach * rays[..., 2] / camera.focal_px)
 
 
-def ground_points(
-    dataset: Dataset, frame: Frame, u_px: NDArray[np.float64], v_px: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def ground_points(dataset: Dataset, frame: Frame, u_px: FloatArray, v_px: FloatArray) -> FloatArray:
     """Points (n, 3) of the mean ground that pixels of a frame look at, MCMF m; NaN beside the Moon."""
     heading = dataset.camera.rays(np.stack([u_px, v_px], axis=-1)) @ frame.camera_from_mcmf
     reach = intersect_sphere(frame.position_mcmf_m, heading, MOON_RADIUS_M + frame.values["ground_m"])
@@ -333,7 +332,7 @@ def count_instances(frames: Iterable[Frame], width_px: int, height_px: int) -> l
     return [int(count) for count in counts]
 
 
-def read_gray(path: Path) -> NDArray[np.uint8]:
+def read_gray(path: Path) -> OctetArray:
     """A gray PNG (H, W) in 8 bits."""
     import cv2
 
@@ -377,9 +376,9 @@ def write_whole(path: Path, octets: bytes) -> str:
     return hashlib.sha256(octets).hexdigest()
 
 
-def in_picture(craters: dict[str, NDArray[Any]], width_px: int, height_px: int) -> NDArray[np.bool_]:
+def in_picture(craters: dict[str, NDArray[Any]], width_px: int, height_px: int) -> BoolArray:
     """Which craters have their centre in the picture."""
-    inside: NDArray[np.bool_] = (
+    inside: BoolArray = (
         (craters["u_px"] >= -0.5)
         & (craters["u_px"] <= width_px - 0.5)
         & (craters["v_px"] >= -0.5)

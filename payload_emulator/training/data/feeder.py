@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import IntArray, OctetArray
 from lunar.catalogue import size_class
 from payload_emulator.training.data.augment import AugmentParameters, make_crop
 from payload_emulator.training.data.dataset import Dataset, Frame, choose_tiers
@@ -61,7 +62,7 @@ class Feeder:
     def __init__(
         self,
         frames: Sequence[tuple[Dataset, Frame]],
-        images: list[NDArray[np.uint8]],
+        images: list[OctetArray],
         parameters: TrainParameters,
     ) -> None:
         self.frames = frames
@@ -129,10 +130,10 @@ class Feeder:
         }
 
 
-_orders: dict[tuple[int, int, int], NDArray[np.int64]] = {}
+_orders: dict[tuple[int, int, int], IntArray] = {}
 
 
-def _permutation(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
+def _permutation(seed: int, epoch: int, count: int) -> IntArray:
     key = (seed, epoch, count)
     if key not in _orders:
         if len(_orders) > 8:

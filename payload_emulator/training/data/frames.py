@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, OctetArray
 from lunar.camera import PinholeCamera, ground_point_sphere, nadir_camera_from_mcmf
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
@@ -19,8 +20,6 @@ from lunar.timescales import format_utc
 from payload_emulator.errors import DatasetError
 from payload_emulator.session.recipe import Source
 from payload_emulator.training.data.shots import Pose, draw_photometry, draw_sensor, draw_sun
-
-Floats = NDArray[np.float64]
 
 _LABEL_MINIMUM_M = 2_000.0
 _HIGHEST_GROUND_M = 11_000.0  # above the map sphere
@@ -37,7 +36,7 @@ class Shot:
     row: dict[str, float]
     craters: dict[str, NDArray[Any]]
     pose: Pose
-    sun_mcmf: Floats
+    sun_mcmf: FloatArray
 
 
 def find_renderer(name: str, blender_python: str = sys.executable) -> Callable[..., Any]:
@@ -146,7 +145,7 @@ def describe(
 
 def _exposed(
     radiance: NDArray[np.float32], sensor: Any, bits: int, rng: np.random.Generator
-) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+) -> tuple[NDArray[Any], OctetArray]:
     """Mean of the colour channels (H, W) in the depth wanted, and in 8 bits."""
     from payload_emulator.flight.vision.preprocess import gray_levels
     from payload_emulator.sim.render.sensor import expose, expose_deep
@@ -202,7 +201,7 @@ def _label(
 
 
 def stamped_craters(
-    terrain: Any, camera: PinholeCamera, position: Floats, rotation: Floats, image: NDArray[np.uint8]
+    terrain: Any, camera: PinholeCamera, position: FloatArray, rotation: FloatArray, image: OctetArray
 ) -> dict[str, NDArray[Any]]:
     """Craters below the catalogue's limit that the terrain draws from its seed, where they are large in the image.
 
@@ -254,7 +253,7 @@ def stamped_craters(
     }
 
 
-def _bright_share(image: NDArray[np.uint8], uv: Floats, diameter_px: Floats) -> Floats:
+def _bright_share(image: OctetArray, uv: FloatArray, diameter_px: FloatArray) -> FloatArray:
     """Share of 16 points around each centre that are brighter than a third of the frame's median bright pixel."""
     bright = image[image > 8]
     level = float(np.median(bright)) / 3.0 if bright.size else 255.0
@@ -264,5 +263,5 @@ def _bright_share(image: NDArray[np.uint8], uv: Floats, diameter_px: Floats) -> 
     v = uv[:, 1:] + 0.5 * diameter_px[:, None] * radius * np.sin(angle)
     rows = np.clip(np.rint(v).astype(int), 0, image.shape[0] - 1)
     columns = np.clip(np.rint(u).astype(int), 0, image.shape[1] - 1)
-    share: Floats = (image[rows, columns] > level).mean(axis=1) if uv.shape[0] else np.zeros(0)
+    share: FloatArray = (image[rows, columns] > level).mean(axis=1) if uv.shape[0] else np.zeros(0)
     return share

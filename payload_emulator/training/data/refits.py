@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical
 from payload_emulator.errors import DatasetError
@@ -20,18 +20,16 @@ from payload_emulator.training.data.dataset import Dataset, Frame
 from tmtc.errors import TableError
 from tmtc.tables import unpack_catalogue_table
 
-Floats = NDArray[np.float64]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefittedRims:
     """Measured circles, arrays (n,), ids ascending; heights of the rim above the sphere of the maps."""
 
-    ids: NDArray[np.int64]
-    latitude_rad: Floats
-    longitude_rad: Floats
-    diameter_m: Floats
-    rim_height_m: Floats
+    ids: IntArray
+    latitude_rad: FloatArray
+    longitude_rad: FloatArray
+    diameter_m: FloatArray
+    rim_height_m: FloatArray
 
     def __len__(self) -> int:
         return int(self.ids.size)
@@ -65,7 +63,7 @@ def load_refitted(path: Path, east_m: float = 0.0, north_m: float = 0.0) -> Refi
     )
 
 
-def refitted_frame(dataset: Dataset, frame: Frame, rims: RefittedRims) -> tuple[Frame, NDArray[np.bool_]]:
+def refitted_frame(dataset: Dataset, frame: Frame, rims: RefittedRims) -> tuple[Frame, BoolArray]:
     """The frame with its craters on the measured rims where there is one, and which those are, (n,)."""
     craters = frame.craters
     known = np.zeros(craters["id"].size, bool)
@@ -77,7 +75,7 @@ def refitted_frame(dataset: Dataset, frame: Frame, rims: RefittedRims) -> tuple[
         return frame, known
     of = place[rows]
 
-    def project(latitude_rad: Floats, longitude_rad: Floats) -> Floats:
+    def project(latitude_rad: FloatArray, longitude_rad: FloatArray) -> FloatArray:
         ground = np.asarray(mcmf_from_spherical(latitude_rad, longitude_rad, rims.rim_height_m[of]))
         return np.asarray(dataset.camera.project((ground - frame.position_mcmf_m) @ frame.camera_from_mcmf.T))
 

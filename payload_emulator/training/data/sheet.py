@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import OctetArray
 from lunar.catalogue import size_class
 from payload_emulator.errors import DatasetError
 from payload_emulator.training.data.dataset import Dataset, Frame, in_picture
@@ -25,7 +25,7 @@ _SUB_PIXEL_BITS = 4
 
 def draw_sheet(
     dataset: Dataset, split: str = "", columns: int = 4, rows: int = 2, tile_px: int = 512
-) -> NDArray[np.uint8]:
+) -> OctetArray:
     """RGB picture (H, W, 3) of frames spread evenly over a split (all where not named), every labelled rim drawn.
 
     Raises
@@ -49,7 +49,7 @@ def draw_sheet(
     return sheet
 
 
-def draw_frame(dataset: Dataset, frame: Frame, tile_px: int = 512) -> NDArray[np.uint8]:
+def draw_frame(dataset: Dataset, frame: Frame, tile_px: int = 512) -> OctetArray:
     """RGB picture (tile_px, tile_px, 3) of a frame with the rims of its labelled craters."""
     import cv2
 
@@ -90,7 +90,7 @@ def _caption(frame: Frame) -> str:
     )
 
 
-def _write(picture: NDArray[np.uint8], text: str, place: Sequence[int], width_px: int) -> None:
+def _write(picture: OctetArray, text: str, place: Sequence[int], width_px: int) -> None:
     import cv2
 
     scale = min(0.45, 0.45 * width_px / 512 * _LETTERS_TO_WIDTH / max(len(text), 1))

@@ -10,15 +10,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, FloatArray
 from lunar.camera import PinholeCamera, ground_point_sphere, nadir_camera_from_mcmf
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.errors import DatasetError
 from payload_emulator.session.recipe import Box, Source
-
-Floats = NDArray[np.float64]
 
 _ATTEMPTS = 4000
 _LOWEST_FLIGHT_M = 9_000.0  # above the ground: lower, a 5 km crater fills more than a sixth of the frame
@@ -43,8 +41,8 @@ class Pose:
     longitude_rad: float
     altitude_m: float
     ground_m: float
-    position_mcmf_m: Floats
-    camera_from_mcmf: Floats
+    position_mcmf_m: FloatArray
+    camera_from_mcmf: FloatArray
 
 
 def draw_pose(
@@ -93,7 +91,7 @@ def pose_at(
     terrain: Any,
     camera: PinholeCamera,
     source: Source,
-    position_mcmf_m: Floats,
+    position_mcmf_m: FloatArray,
     where: str,
     rng: np.random.Generator,
 ) -> Pose:
@@ -118,7 +116,7 @@ def pose_at(
     return Pose(latitude, longitude, altitude_m, float(heights.mean()), position_mcmf_m, rotation)
 
 
-def _heights_in_view(terrain: Any, edge_mcmf_m: Floats) -> Floats:
+def _heights_in_view(terrain: Any, edge_mcmf_m: FloatArray) -> FloatArray:
     """Heights (n + 1,) half-way to the points (n, 3) of a footprint's edge and in its middle.
 
     On the level on which rims are measured, which the labels need anyway.
@@ -162,7 +160,7 @@ def _about(box: Box, latitude_deg: float, longitude_deg: float) -> Box:
     )
 
 
-def allowed(source: Source, box: Box, latitude_deg: Floats, longitude_deg: Floats) -> bool:
+def allowed(source: Source, box: Box, latitude_deg: FloatArray, longitude_deg: FloatArray) -> bool:
     """Whether a footprint's edge lies in the box and clear of every box to avoid, buffer included."""
     if not inside_box(box, latitude_deg, longitude_deg, 0.0).all():
         return False
@@ -171,20 +169,20 @@ def allowed(source: Source, box: Box, latitude_deg: Floats, longitude_deg: Float
     )
 
 
-def inside_box(box: Box, latitude_deg: Floats, longitude_deg: Floats, buffer_km: float) -> NDArray[np.bool_]:
+def inside_box(box: Box, latitude_deg: FloatArray, longitude_deg: FloatArray, buffer_km: float) -> BoolArray:
     """Which places lie in a box or within `buffer_km` of it."""
     margin = math.degrees(buffer_km * 1000.0 / MOON_RADIUS_M)
     widen = margin / np.cos(np.radians(np.minimum(np.abs(latitude_deg) + margin, 85.0)))
     middle = 0.5 * (box.west_deg + box.east_deg)
     offset = np.mod(longitude_deg - middle + 180.0, 360.0) - 180.0
     across = np.abs(offset) <= 0.5 * (box.east_deg - box.west_deg) + widen
-    inside: NDArray[np.bool_] = (
+    inside: BoolArray = (
         across & (latitude_deg >= box.south_deg - margin) & (latitude_deg <= box.north_deg + margin)
     )
     return inside
 
 
-def edge_pixels(camera: PinholeCamera) -> Floats:
+def edge_pixels(camera: PinholeCamera) -> FloatArray:
     """Sixteen pixels along the edge of the image, (16, 2)."""
     right, bottom = camera.width_px - 0.5, camera.height_px - 0.5
     along_u, along_v = np.linspace(-0.5, right, 5), np.linspace(-0.5, bottom, 5)
@@ -219,7 +217,7 @@ def draw_sun(light: str, rng: np.random.Generator) -> tuple[float, float]:
     return math.radians(rng.uniform(*limits)), azimuth
 
 
-def draw_pointing(vary: bool, rng: np.random.Generator) -> Floats:
+def draw_pointing(vary: bool, rng: np.random.Generator) -> FloatArray:
     """Small rotation of the camera: yaw of 4 degrees, tilt of 0.7 degrees (one sigma, cut at three)."""
     if not vary:
         return np.eye(3)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray
 from payload_emulator.flight.vision.detector import REFERENCE_DIAMETER_PX, STRIDE_PX
 
 SIGMA_OF_RADIUS = 0.22  # heat falls to 0.6 at this share of the radius
@@ -47,13 +48,13 @@ class Targets:
 def make_targets(
     height_px: int,
     width_px: int,
-    u_px: NDArray[np.float64],
-    v_px: NDArray[np.float64],
-    diameter_px: NDArray[np.float64],
+    u_px: FloatArray,
+    v_px: FloatArray,
+    diameter_px: FloatArray,
     tier: NDArray[np.int8],
-    weight: NDArray[np.float64],
+    weight: FloatArray,
     size_class: NDArray[np.int8] | None = None,
-    depth_ratio: NDArray[np.float64] | None = None,
+    depth_ratio: FloatArray | None = None,
     stride_px: int = STRIDE_PX,
 ) -> Targets:
     """Targets of craters (n,) in an image; `size_class` given: three class heatmaps follow the common one.

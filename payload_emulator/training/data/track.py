@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera, ground_point_sphere, nadir_camera_from_mcmf
 from lunar.datafolder import DataFolder, default_orientation
 from lunar.frames import spherical_from_mcmf
@@ -31,10 +31,10 @@ class Track:
     order : indices (n,) in the order in which the frames are best made: neighbours on the ground follow each other.
     """
 
-    utc_ns: NDArray[np.int64]
-    position_mcmf_m: NDArray[np.float64]
+    utc_ns: IntArray
+    position_mcmf_m: FloatArray
     split: tuple[str, ...]
-    order: NDArray[np.int64]
+    order: IntArray
 
     @property
     def digest(self) -> str:
@@ -77,9 +77,7 @@ def lay_track(
     return Track(utc_ns[taken], position[taken], split_track(source.split, wanted, seed), order)
 
 
-def order_by_ground(
-    position_mcmf_m: NDArray[np.float64], camera: PinholeCamera, terrain: Any
-) -> NDArray[np.int64]:
+def order_by_ground(position_mcmf_m: FloatArray, camera: PinholeCamera, terrain: Any) -> IntArray:
     """Indices (n,) of places (n, 3) such that those over the same tiles of the terrain come together.
 
     By level of the terrain, which follows from the altitude, then by strips along meridians, north and south in turn.
@@ -104,9 +102,7 @@ def split_track(split: str, count: int, seed: int) -> tuple[str, ...]:
     return (*(str(name) for name in names), *("test",) * test)
 
 
-def _can_look(
-    source: Source, camera: PinholeCamera, terrain: Any, position: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def _can_look(source: Source, camera: PinholeCamera, terrain: Any, position: FloatArray) -> BoolArray:
     """Whether the nadir footprint from each place (n, 3) is on the terrain and where the source may look."""
     rotation = nadir_camera_from_mcmf(position)
     ground = ground_point_sphere(camera, rotation[:, None], position[:, None], edge_pixels(camera))
@@ -121,7 +117,7 @@ def _can_look(
     return np.asarray(good, dtype=bool)
 
 
-def _places(source: Source, data: DataFolder) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _places(source: Source, data: DataFolder) -> tuple[IntArray, FloatArray]:
     """Epochs (n,) every `step_s` and places (n, 3) in MCMF m of an ephemeris file or a scenario's orbit."""
     if source.ephemeris.endswith((".oem", ".e")):
         from lunar.ephemeris import load_ephemeris

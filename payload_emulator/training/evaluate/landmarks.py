@@ -18,12 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.errors import DatasetError
 from payload_emulator.training.data.dataset import Dataset, Frame, frame_truth, ground_points
 from payload_emulator.training.evaluate.scoring import FrameDetections, MatchRule, match_any, tally
-
-Floats = NDArray[np.float64]
 
 _COLUMNS = ("latitude_deg", "longitude_deg", "height_m", "diameter_m", "sightings", "looks", "score")
 _FIRST_ID = 10_000_000_000  # above every catalogue's numbers
@@ -48,19 +47,19 @@ class RecurrenceRule:
 class Landmarks:
     """Places on the ground, arrays (n,): how often each was seen, in how many frames it was in view, mean score."""
 
-    latitude_rad: Floats
-    longitude_rad: Floats
-    height_m: Floats
-    diameter_m: Floats
-    sightings: NDArray[np.int64]
-    looks: NDArray[np.int64]
-    score: Floats
+    latitude_rad: FloatArray
+    longitude_rad: FloatArray
+    height_m: FloatArray
+    diameter_m: FloatArray
+    sightings: IntArray
+    looks: IntArray
+    score: FloatArray
 
     def __len__(self) -> int:
         return int(self.diameter_m.size)
 
     @property
-    def position_mcmf_m(self) -> Floats:
+    def position_mcmf_m(self) -> FloatArray:
         return np.asarray(mcmf_from_spherical(self.latitude_rad, self.longitude_rad, self.height_m))
 
 
@@ -98,7 +97,7 @@ def explained_by_landmarks(
     found: Sequence[FrameDetections],
     landmarks: Landmarks,
     rule: MatchRule | None = None,
-) -> list[NDArray[np.bool_]]:
+) -> list[BoolArray]:
     """For each frame, which of its detections lie on a landmark."""
     rule = rule or MatchRule()
     masks = []
@@ -185,7 +184,7 @@ def load_landmarks(path: Path) -> Landmarks:
 
 def hide_craters(
     frames: Sequence[tuple[Dataset, Frame]], share: float, seed: int = 0
-) -> tuple[list[tuple[Dataset, Frame]], NDArray[np.int64]]:
+) -> tuple[list[tuple[Dataset, Frame]], IntArray]:
     """Frames without a share of the catalogued craters, the same ones everywhere, and the ids of those hidden."""
     every = np.unique(np.concatenate([frame.craters["id"] for _, frame in frames]))
     every = every[every >= 0]
@@ -242,7 +241,7 @@ def study(
 
 
 def _recovered(
-    frames: Sequence[tuple[Dataset, Frame]], hidden: NDArray[np.int64], landmarks: Landmarks
+    frames: Sequence[tuple[Dataset, Frame]], hidden: IntArray, landmarks: Landmarks
 ) -> dict[str, Any]:
     """How many landmarks are hidden craters (within half a diameter, size within a half), and how many were hidden."""
     rows = {
@@ -269,7 +268,7 @@ def _recovered(
     }
 
 
-def _unexplained(frame: Frame, found: FrameDetections) -> NDArray[np.bool_]:
+def _unexplained(frame: Frame, found: FrameDetections) -> BoolArray:
     """Detections on nothing that is listed for the frame, catalogued or stamped."""
     craters = frame.craters
     u, v, size = (craters[key].astype(np.float64) for key in ("u_px", "v_px", "diameter_px"))
@@ -278,9 +277,7 @@ def _unexplained(frame: Frame, found: FrameDetections) -> NDArray[np.bool_]:
     return ~on_any
 
 
-def _project(
-    dataset: Dataset, frame: Frame, landmarks: Landmarks
-) -> tuple[Floats, Floats, NDArray[np.int64]]:
+def _project(dataset: Dataset, frame: Frame, landmarks: Landmarks) -> tuple[FloatArray, FloatArray, IntArray]:
     """Places (k, 2) and diameters (k,) in pixels of the landmarks in view, and which they are."""
     camera = dataset.camera
     points = (landmarks.position_mcmf_m - frame.position_mcmf_m) @ frame.camera_from_mcmf.T
@@ -292,8 +289,8 @@ def _project(
 
 
 def _grouped(
-    point: Floats, size: Floats, score: Floats, owner: NDArray[np.int64], rule: RecurrenceRule
-) -> list[NDArray[np.int64]]:
+    point: FloatArray, size: FloatArray, score: FloatArray, owner: IntArray, rule: RecurrenceRule
+) -> list[IntArray]:
     """Indices of detections at one place, at most one per frame; the best detection left gathers its own."""
     free = np.ones(size.size, bool)
     groups = []
@@ -313,13 +310,13 @@ def _grouped(
 
 
 def _row(
-    group: NDArray[np.int64],
-    point: Floats,
-    size: Floats,
-    score: Floats,
-    owner: NDArray[np.int64],
+    group: IntArray,
+    point: FloatArray,
+    size: FloatArray,
+    score: FloatArray,
+    owner: IntArray,
     frames: Sequence[tuple[Dataset, Frame]],
-    azimuth_deg: Floats,
+    azimuth_deg: FloatArray,
     rule: RecurrenceRule,
 ) -> tuple[float, ...] | None:
     """Columns of `Landmarks` for one place, None where it is none."""

@@ -11,14 +11,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from payload_emulator.training.data.dataset import Dataset, Frame, frame_truth
 from payload_emulator.training.data.refits import RefittedRims, refitted_frame
 from payload_emulator.training.data.truth import FrameTruth
 from payload_emulator.training.evaluate.scoring import FrameDetections, Tally, tally
-
-Floats = NDArray[np.float64]
 
 FEWEST_PAIRS = 20
 """A mean error of fewer craters says nothing to a quarter of a pixel: one of them may be two pixels off."""
@@ -27,9 +25,9 @@ _BIAS_CELLS = 4  # per side of the bias map: finer cells hold too few craters fo
 _ROUNDS = 400
 
 
-def right(tallied: Tally, threshold: float) -> NDArray[np.bool_]:
+def right(tallied: Tally, threshold: float) -> BoolArray:
     """Which detections are right at a threshold."""
-    chosen: NDArray[np.bool_] = (tallied.score >= threshold) & (tallied.outcome == 1)
+    chosen: BoolArray = (tallied.score >= threshold) & (tallied.outcome == 1)
     return chosen
 
 
@@ -75,7 +73,7 @@ def bias_overall(
     }
 
 
-def _bias(tallied: Tally, chosen: NDArray[np.bool_], sun_azimuth_rad: Floats) -> dict[str, Any]:
+def _bias(tallied: Tally, chosen: BoolArray, sun_azimuth_rad: FloatArray) -> dict[str, Any]:
     """Mean errors of chosen detections along the axes of the image and of the Sun, each with a 95 % interval."""
     names = ("du_px", "dv_px", "toward_sun_px", "across_sun_px")
     count = int(chosen.sum())
@@ -109,13 +107,13 @@ def _bias(tallied: Tally, chosen: NDArray[np.bool_], sun_azimuth_rad: Floats) ->
     }
 
 
-def _resampled_means(errors: Floats, frame: NDArray[np.int64]) -> Floats:
+def _resampled_means(errors: FloatArray, frame: IntArray) -> FloatArray:
     """Means (rounds, k) of errors (n, k) over resampled frames."""
     _, place = np.unique(frame, return_inverse=True)
     count = np.bincount(place).astype(float)
     sums = np.stack([np.bincount(place, weights=column) for column in errors.T], axis=1)
     drawn = np.random.default_rng(0).integers(0, count.size, (_ROUNDS, count.size))
-    means: Floats = sums[drawn].sum(axis=1) / count[drawn].sum(axis=1)[:, None]
+    means: FloatArray = sums[drawn].sum(axis=1) / count[drawn].sum(axis=1)[:, None]
     return means
 
 
@@ -136,7 +134,7 @@ def bias_map(tallied: Tally, threshold: float, truths: Sequence[FrameTruth]) -> 
     ]
 
 
-def _mean_error(tallied: Tally, chosen: NDArray[np.bool_]) -> dict[str, float | int]:
+def _mean_error(tallied: Tally, chosen: BoolArray) -> dict[str, float | int]:
     count = int(chosen.sum())
     if not count:
         nan = float("nan")
@@ -195,7 +193,7 @@ def against_rims(
     }
 
 
-def _distances(tallied: Tally, threshold: float, ids: NDArray[np.int64]) -> dict[str, float | int]:
+def _distances(tallied: Tally, threshold: float, ids: IntArray) -> dict[str, float | int]:
     chosen = right(tallied, threshold) & np.isin(tallied.matched_id, ids)
     error = np.hypot(tallied.error_u[chosen], tallied.error_v[chosen])
     return {

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from payload_emulator.flight.vision.detections import DEGRADED_DEPTH_RATIO, FRESH_DEPTH_RATIO
 from payload_emulator.training.data.truth import FrameTruth
 from payload_emulator.training.evaluate.localisation import (
@@ -31,8 +31,6 @@ from payload_emulator.training.evaluate.scoring import (
     bootstrap_recall,
     tally,
 )
-
-Floats = NDArray[np.float64]
 
 LOWLAND_M = -1_000.0
 """Mean ground of a frame below this is called lowland: nearly all of it is mare, and nearly all mare lies below."""
@@ -172,7 +170,7 @@ def repeatability(tallied: Tally, threshold: float) -> dict[str, float | int]:
     }
 
 
-def _found_next(tallied: Tally, hit: NDArray[np.bool_], place: NDArray[np.int64]) -> dict[str, float | int]:
+def _found_next(tallied: Tally, hit: BoolArray, place: IntArray) -> dict[str, float | int]:
     """P(found at t+1 | found at t, visible in both) over neighbouring frames."""
     frame = tallied.crater_frame.astype(np.int64)
     step = int(frame.max()) + 2 if frame.size else 1
@@ -216,7 +214,7 @@ def _with_interval(tallied: Tally, threshold: float) -> dict[str, Any]:
 def _group(
     pair: tuple[Tally, Tally],
     threshold: float,
-    masks: Sequence[tuple[NDArray[np.bool_], NDArray[np.bool_]]],
+    masks: Sequence[tuple[BoolArray, BoolArray]],
 ) -> dict[str, Any]:
     strict, fair = (part.select(*mask) for part, mask in zip(pair, masks, strict=True))
     return {
@@ -225,13 +223,13 @@ def _group(
     }
 
 
-def _of_frames(part: Tally, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _of_frames(part: Tally, chosen: BoolArray) -> tuple[BoolArray, BoolArray]:
     """Masks of the detections and craters of chosen frames (f,)."""
     return chosen[part.detection_frame.astype(int)], chosen[part.crater_frame.astype(int)]
 
 
 def _by_frame(
-    pair: tuple[Tally, Tally], threshold: float, values: Floats, edges: Sequence[float]
+    pair: tuple[Tally, Tally], threshold: float, values: FloatArray, edges: Sequence[float]
 ) -> list[dict[str, Any]]:
     rows = []
     for low, high in itertools.pairwise(edges):
@@ -262,7 +260,7 @@ def _by_name(pair: tuple[Tally, Tally], threshold: float, names: Sequence[str]) 
     return rows
 
 
-def _radii(part: Tally, truths: Sequence[FrameTruth]) -> tuple[Floats, Floats]:
+def _radii(part: Tally, truths: Sequence[FrameTruth]) -> tuple[FloatArray, FloatArray]:
     """Distance from the middle of the image of detections and of craters, px."""
     u, v = middle(truths)
     return np.hypot(part.detection_u - u, part.detection_v - v), np.hypot(
@@ -282,7 +280,7 @@ def _by_radius(
 
 
 def _recall_by(
-    tallied: Tally, values: Floats, edges: Sequence[float], threshold: float, name: str
+    tallied: Tally, values: FloatArray, edges: Sequence[float], threshold: float, name: str
 ) -> list[dict[str, Any]]:
     with np.errstate(invalid="ignore"):
         found = tallied.crater_score >= threshold
@@ -338,9 +336,7 @@ def _state(tallied: Tally, threshold: float) -> dict[str, Any]:
     }
 
 
-def _calibration(
-    tallied: Tally, threshold: float, chosen: NDArray[np.bool_] | None = None
-) -> dict[str, float]:
+def _calibration(tallied: Tally, threshold: float, chosen: BoolArray | None = None) -> dict[str, float]:
     """How the errors compare with the predicted sigma: 1 and 0.683 would be perfect for a Gaussian."""
     hit = right(tallied, threshold)
     if chosen is not None:

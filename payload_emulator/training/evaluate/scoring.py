@@ -17,10 +17,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.catalogue import CLASS_LIMITS_M, size_class
 from payload_emulator.training.data.truth import FrameTruth
-
-Floats = NDArray[np.float64]
 
 PAPER_TABLE_2 = (
     {"precision": 0.7021, "recall": 0.3248, "loc_px": 3.50},
@@ -40,13 +39,13 @@ class FrameDetections:
     `depth_ratio` where the network tells it; `size_class` where it names the class itself, as the paper's does.
     """
 
-    u_px: Floats
-    v_px: Floats
-    diameter_px: Floats
-    diameter_m: Floats
-    score: Floats
-    sigma_px: Floats
-    depth_ratio: Floats | None = None
+    u_px: FloatArray
+    v_px: FloatArray
+    diameter_px: FloatArray
+    diameter_m: FloatArray
+    score: FloatArray
+    sigma_px: FloatArray
+    depth_ratio: FloatArray | None = None
     size_class: NDArray[np.int8] | None = None
 
 
@@ -85,13 +84,13 @@ class MatchRule:
 
 
 def match(
-    detection_u: Floats,
-    detection_v: Floats,
-    truth_u: Floats,
-    truth_v: Floats,
-    truth_diameter: Floats,
+    detection_u: FloatArray,
+    detection_v: FloatArray,
+    truth_u: FloatArray,
+    truth_v: FloatArray,
+    truth_diameter: FloatArray,
     rule: MatchRule,
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Index of the crater that each detection (best first) takes, -1 for none; nearest free crater within the rule."""
     taken = np.zeros(truth_u.shape[0], bool)
     found = np.full(detection_u.shape[0], -1, np.int64)
@@ -118,31 +117,31 @@ class Tally:
     crater's (NaN, -1: none), detection_depth_ratio what the network says (NaN: it does not).
     """
 
-    score: Floats
+    score: FloatArray
     outcome: NDArray[np.int8]
-    error_u: Floats
-    error_v: Floats
-    sigma_px: Floats
-    detection_block: NDArray[np.int64]
-    detection_octant: NDArray[np.int64]
-    log_diameter_ratio: Floats
-    detection_u: Floats
-    detection_v: Floats
-    detection_frame: NDArray[np.int64]
-    detection_depth_ratio: Floats
-    matched_depth_ratio: Floats
-    matched_id: NDArray[np.int64]
-    crater_score: Floats
-    crater_depth_ratio: Floats
-    crater_diameter_px: Floats
-    crater_diameter_m: Floats
-    crater_id: NDArray[np.int64]
-    crater_block: NDArray[np.int64]
-    crater_u: Floats
-    crater_v: Floats
-    crater_frame: NDArray[np.int64]
+    error_u: FloatArray
+    error_v: FloatArray
+    sigma_px: FloatArray
+    detection_block: IntArray
+    detection_octant: IntArray
+    log_diameter_ratio: FloatArray
+    detection_u: FloatArray
+    detection_v: FloatArray
+    detection_frame: IntArray
+    detection_depth_ratio: FloatArray
+    matched_depth_ratio: FloatArray
+    matched_id: IntArray
+    crater_score: FloatArray
+    crater_depth_ratio: FloatArray
+    crater_diameter_px: FloatArray
+    crater_diameter_m: FloatArray
+    crater_id: IntArray
+    crater_block: IntArray
+    crater_u: FloatArray
+    crater_v: FloatArray
+    crater_frame: IntArray
 
-    def select(self, detections: NDArray[np.bool_], craters: NDArray[np.bool_]) -> Tally:
+    def select(self, detections: BoolArray, craters: BoolArray) -> Tally:
         """The part of a tally that masks of its detections and craters choose."""
         return Tally(
             **{
@@ -167,7 +166,7 @@ class Tally:
         )
 
 
-def make_figures(expected: int, found: int, false_alarms: int, errors_px: Floats) -> Figures:
+def make_figures(expected: int, found: int, false_alarms: int, errors_px: FloatArray) -> Figures:
     """Figures of counts; NaN where nothing was expected or claimed."""
     precision = found / (found + false_alarms) if found + false_alarms else float("nan")
     recall = found / expected if expected else float("nan")
@@ -285,24 +284,24 @@ def tally(
 
 
 def match_any(
-    detection_u: Floats,
-    detection_v: Floats,
-    truth_u: Floats,
-    truth_v: Floats,
-    truth_diameter: Floats,
+    detection_u: FloatArray,
+    detection_v: FloatArray,
+    truth_u: FloatArray,
+    truth_v: FloatArray,
+    truth_diameter: FloatArray,
     rule: MatchRule,
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Whether each detection lies on any of the craters by the rule; several may share one."""
     if truth_u.size == 0 or detection_u.size == 0:
         return np.zeros(detection_u.size, bool)
     limit = np.full(truth_u.shape[0], rule.pixels) if rule.radii == 0.0 else 0.5 * rule.radii * truth_diameter
     distance = np.hypot(detection_u[:, None] - truth_u[None, :], detection_v[:, None] - truth_v[None, :])
-    near: NDArray[np.bool_] = (distance <= limit[None, :]).any(axis=1)
+    near: BoolArray = (distance <= limit[None, :]).any(axis=1)
     return near
 
 
 def best_threshold(
-    tallied: Tally, candidates: Floats | None = None, beta: float = 1.0
+    tallied: Tally, candidates: FloatArray | None = None, beta: float = 1.0
 ) -> tuple[float, Figures]:
     """Threshold of the greatest F-beta and its figures (choose it on a validation set only).
 
@@ -370,9 +369,7 @@ def bootstrap_f1_difference(
     return float(np.percentile(one - other, 2.5)), float(np.percentile(one - other, 97.5))
 
 
-def _resampled_f1(
-    tallied: Tally, threshold: float, blocks: NDArray[np.int64], seed: int, rounds: int
-) -> Floats:
+def _resampled_f1(tallied: Tally, threshold: float, blocks: IntArray, seed: int, rounds: int) -> FloatArray:
     """F1 (rounds,) of blocks drawn with replacement; NaN without any."""
     if blocks.size == 0:
         return np.full(rounds, np.nan)
@@ -396,7 +393,7 @@ def _resampled_f1(
 
 
 def bootstrap_recall(
-    found: NDArray[np.bool_], block: NDArray[np.int64], seed: int = 0, rounds: int = 400
+    found: BoolArray, block: IntArray, seed: int = 0, rounds: int = 400
 ) -> tuple[float, float]:
     """95 % interval of the share of craters found (n,), over resampled blocks of ground (n,)."""
     if found.size == 0:

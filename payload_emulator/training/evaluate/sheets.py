@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import OctetArray
 from payload_emulator.sim.render.renderer import Rendering
 from payload_emulator.sim.render.sensor import Picture, SensorModel, auto_exposure, take_picture
 
-Rgb = NDArray[np.uint8]
+Rgb = OctetArray
 
 CLASS_COLOURS = {0: (0, 255, 255), 1: (0, 255, 0), 2: (255, 255, 0)}
 """Cyan, lime and yellow by size class (paper, Fig. 5)."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
+from lunar.arrays import FloatArray
 
 CURVE_COLUMNS = (
     "step",
@@ -25,9 +24,7 @@ CURVE_COLUMNS = (
 )
 
 
-def append_curve(
-    run: Path, step: int, minutes: float, losses: NDArray[np.float64], figures: dict[str, float]
-) -> None:
+def append_curve(run: Path, step: int, minutes: float, losses: FloatArray, figures: dict[str, float]) -> None:
     """Add a line to curves.csv: losses since the last one, figures of the validation."""
     path = run / "curves.csv"
     fresh = not path.is_file()

@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray, OctetArray
 from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.training.data.dataset import Dataset, Frame
 from payload_emulator.training.data.feeder import Feeder, TrainParameters
@@ -189,7 +189,7 @@ class _Shown:
         self.last = np.full(6, np.nan)
         self.clock = time.monotonic()
 
-    def add(self, terms: NDArray[np.float64]) -> None:
+    def add(self, terms: FloatArray) -> None:
         self.sums += terms
         self.count += 1
 
@@ -212,7 +212,7 @@ class _Team:
         self.parameters = parameters
         self.pool = ThreadPoolExecutor(replicas)
 
-    def step(self, feeder: Feeder, step: int, optimiser: Any) -> NDArray[np.float64]:
+    def step(self, feeder: Feeder, step: int, optimiser: Any) -> FloatArray:
         """One optimiser step over the step's batch; the mean loss terms come back."""
         import torch
 
@@ -244,7 +244,7 @@ class _Team:
                         held.copy_(lead)
         return np.asarray(terms)
 
-    def _work(self, member: Any, feeder: Feeder, first: int, count: int) -> NDArray[np.float64]:
+    def _work(self, member: Any, feeder: Feeder, first: int, count: int) -> FloatArray:
         import torch
 
         from payload_emulator.training.model.loss import LossWeights, crater_loss
@@ -370,9 +370,7 @@ def _validate(
     }
 
 
-def _load_images(
-    frames: Sequence[tuple[Dataset, Frame]], report: Callable[[str], None]
-) -> list[NDArray[np.uint8]]:
+def _load_images(frames: Sequence[tuple[Dataset, Frame]], report: Callable[[str], None]) -> list[OctetArray]:
     began = time.monotonic()
     images = [dataset.image(frame) for dataset, frame in frames]
     report(f"{len(images)} training images loaded in {time.monotonic() - began:.1f} s")

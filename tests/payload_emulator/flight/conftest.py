@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lunar.arrays import FloatArray
 from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload, PayloadMode
 from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
@@ -17,7 +17,6 @@ from payload_emulator.session.spacecraft import new_board
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 
-Float = NDArray[np.float64]
 RADIUS_M = 1_737_400.0
 GM_M3_S2 = 4.902800066e12
 MOON_RATE_RAD_S = 2.661699e-6
@@ -31,7 +30,7 @@ CLASS_SHARES = (58_649 / 79_387, 12_830 / 79_387, 7_908 / 79_387)
 CLASS_DIAMETERS_M = (7_000.0, 12_000.0, 20_000.0)
 
 
-def paper_orbit_mcmf_m(seconds: Iterable[float] | Float) -> Float:
+def paper_orbit_mcmf_m(seconds: Iterable[float] | FloatArray) -> FloatArray:
     """Return positions (n, 3) on the Kepler orbit of the paper's Table I over a uniformly turning Moon."""
     time = np.asarray(list(seconds) if not isinstance(seconds, np.ndarray) else seconds, dtype=np.float64)
     a, e = 1_768_180.0, 0.006908
@@ -55,7 +54,7 @@ def paper_orbit_mcmf_m(seconds: Iterable[float] | Float) -> Float:
     )
 
 
-def place(position_m: Float) -> tuple[float, float, float]:
+def place(position_m: FloatArray) -> tuple[float, float, float]:
     """Return latitude, longitude, altitude."""
     radius = float(np.linalg.norm(position_m))
     latitude = float(np.arcsin(position_m[2] / radius))
@@ -70,10 +69,10 @@ def ticks_at(second: float) -> int:
 class CraterField:
     """Point craters on the smooth sphere, ordered by z."""
 
-    position_m: Float
-    diameter_m: Float
+    position_m: FloatArray
+    diameter_m: FloatArray
 
-    def perfect_detections(self, position_m: Float) -> Detections:
+    def perfect_detections(self, position_m: FloatArray) -> Detections:
         """Return every crater in view of a nadir camera, image up to the north, by true perspective."""
         latitude, longitude, altitude = place(position_m)
         reach = RADIUS_M * np.sin(np.arccos(RADIUS_M / (RADIUS_M + altitude)))
@@ -103,7 +102,7 @@ def make_crater_field(seed: int) -> CraterField:
     return CraterField(position, rng.choice(CLASS_DIAMETERS_M, size=count, p=CLASS_SHARES))
 
 
-def detections(u_px: Float, v_px: Float, diameter_px: Float) -> Detections:
+def detections(u_px: FloatArray, v_px: FloatArray, diameter_px: FloatArray) -> Detections:
     u = np.atleast_1d(np.asarray(u_px, dtype=np.float64))
     return Detections(
         u,
@@ -118,8 +117,8 @@ def detections(u_px: Float, v_px: Float, diameter_px: Float) -> Detections:
 class Toolbox:
     """What tests of flight share, since test files cannot import each other."""
 
-    orbit: Callable[..., Float] = paper_orbit_mcmf_m
-    place: Callable[[Float], tuple[float, float, float]] = place
+    orbit: Callable[..., FloatArray] = paper_orbit_mcmf_m
+    place: Callable[[FloatArray], tuple[float, float, float]] = place
     ticks_at: Callable[[float], int] = ticks_at
     crater_field: Callable[[int], CraterField] = make_crater_field
     detections: Callable[..., Detections] = detections
