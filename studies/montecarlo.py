@@ -22,7 +22,14 @@ from lunar.frames import Orientation, matrix_from_quaternion, rtn_from_inertial
 from lunar.gravity import GravityField
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
-from payload_emulator.flight.navigation.anchored import AnchoredNavigator, AnchoredParameters
+from payload_emulator.flight.navigation import anchored
+from payload_emulator.flight.navigation.anchored import (
+    AnchoredReport,
+    AnchoredSetup,
+    AnchoredState,
+    Observation,
+)
+from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
 from payload_emulator.flight.navigation.landmark_map import FIRST_LANDMARK_ID
 from payload_emulator.flight.navigation.outcomes import Outcome
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, in_view, landmark_map, look
@@ -255,7 +262,7 @@ def fly(case: NavigationCase, seed: int) -> NavigationRun:
         table = table.select(case.on_board)
     states, rotations = _truth(case, rng, np.random.default_rng((seed, 4)))
     ticks = np.asarray(ticks_from_utc_ns(case.frame_utc_ns), dtype=np.int64)
-    navigator = _navigator(case, table, states[0], int(ticks[0]), rng)
+    setup, state = _started(case, table, states[0], int(ticks[0]), rng)
     bias_rad = case.attitude_bias_rad * rng.standard_normal(3)
     lasting = rng.standard_normal((len(true_map), 2))
     detector, slow = case.detector, np.random.default_rng((seed, 3))
@@ -273,10 +280,11 @@ def fly(case: NavigationCase, seed: int) -> NavigationRun:
         )
         told = _turned(camera_from_icrf, tilts_rad[k] + case.attitude_noise_rad * rng.standard_normal(3))
         if case.kidnap is not None and case.kidnap.told and k == case.kidnap.frame:
-            navigator.widen(case.kidnap.distance_m, 1e-3 * case.kidnap.distance_m)
+            state = anchored.widened(state, case.kidnap.distance_m, 1e-3 * case.kidnap.distance_m)
         shown = bool(case.imaging[k])
-        report = navigator.step(int(ticks[k]), found if shown else None, told)
-        rows.append(_row(navigator, report.outcome, report.nis, states[k], truth if shown else truth[:0]))
+        observation = Observation(int(ticks[k]), found if shown else None, told)
+        state, report = anchored.step(state, observation, setup)
+        rows.append(_row(state, report, states[k], truth if shown else truth[:0]))
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     return NavigationRun(case.frame_utc_ns, case.imaging, *columns)
 
@@ -483,9 +491,9 @@ def _pushed(
     return states
 
 
-def _navigator(
+def _started(
     case: NavigationCase, table: CatalogueTable, state: FloatArray, ticks: int, rng: np.random.Generator
-) -> AnchoredNavigator:
+) -> tuple[AnchoredSetup, AnchoredState]:
     times = np.arange(
         int(case.frame_utc_ns[0]) - _ORIENTATION_MARGIN_NS,
         int(case.frame_utc_ns[-1]) + _ORIENTATION_MARGIN_NS,
@@ -502,7 +510,7 @@ def _navigator(
         max(case.start_position_m / np.sqrt(3.0), 1.0),
         max(case.start_velocity_m_s / np.sqrt(3.0), 1e-3),
     )
-    return AnchoredNavigator(
+    return anchored.start(
         table,
         unpack_gravity_table(
             pack_gravity_table(
@@ -563,37 +571,37 @@ def _detect(
 
 
 def _row(
-    navigator: AnchoredNavigator, outcome: Outcome, nis: float, state: FloatArray, truth: IntArray
+    state: AnchoredState, report: AnchoredReport, true_state: FloatArray, truth: IntArray
 ) -> tuple[object, ...]:
-    mean, covariance = navigator.state.mean, navigator.state.covariance
-    error = mean[:6] - state
-    rtn = rtn_from_inertial(state[:3], state[3:])
+    mean, covariance = state.estimate.mean, state.estimate.covariance
+    error = mean[:6] - true_state
+    rtn = rtn_from_inertial(true_state[:3], true_state[3:])
     sigma = np.sqrt(np.diag(rtn @ covariance[:3, :3] @ rtn.T))
     nees = float(error @ np.linalg.solve(covariance[:6, :6], error))
     matched = wrong = 0
     innovation = np.full(2, np.nan)
-    fix = navigator.last_fix
+    fix = report.fix
     if fix is not None:
         matched = int(fix.index.size)
         # Landmarks of the navigator's own map have identities that no true crater has.
-        used = navigator.landmarks.ids[fix.index]
+        used = state.landmarks.ids[fix.index]
         other = truth[fix.identification.detection] != used
         wrong = int(np.count_nonzero(other & (used < FIRST_LANDMARK_ID)))
         innovation = fix.update.mean_innovation
     findable = int(np.count_nonzero(truth >= 0))
     return (
-        int(outcome),
+        int(report.outcome),
         rtn @ error[:3],
         sigma,
         float(np.linalg.norm(error[3:])),
         nees,
-        nis,
+        report.nis,
         2 * matched,
         innovation,
         matched,
         wrong,
         findable,
-        float(np.linalg.norm(state[:3])) - MOON_RADIUS_M,
+        float(np.linalg.norm(true_state[:3])) - MOON_RADIUS_M,
     )
 
 

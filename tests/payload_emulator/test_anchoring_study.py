@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lunar.catalogue import CraterCatalogue, make_catalogue
-from payload_emulator.flight.navigation.anchored import AnchoredParameters
+from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
 from studies.anchoring import CHOICES, chosen_craters, study_sizes
 from studies.montecarlo import NavigationCase
 

@@ -16,7 +16,7 @@ Frame: MCMF (ME). Memory is bounded: tracks, sightings per track and landmarks h
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -32,9 +32,19 @@ from tmtc.tables import CatalogueTable
 FIRST_LANDMARK_ID = 3_000_000_000
 """Identities of landmarks begin here; catalogues stay below."""
 
-# Chi-square of 2 and of 3 degrees of freedom at 0.99; of a track's residuals per degree of freedom, far in the tail.
-_GATE, _GATE_3 = 9.2, 11.3
+# Chi-square of 2 and of 3 degrees of freedom at 0.99: one correct sighting, one correct mapping in a hundred is lost.
+_GATE_2, _GATE_3 = 9.2, 11.3
+# Largest mean square of a track's residuals per degree of freedom, far in the tail of its distribution.
 _RESIDUAL_LIMIT = 3.0
+# Two mappings of one crater are within this distance on each axis, or within its diameter, whatever their covariances.
+_SAME_CRATER_M = 4_000.0
+# Gauss-Newton steps of a placement, which starts from the place before the last sighting.
+_PLACEMENT_ITERATIONS = 2
+# Weights of the covariance intersection that are tried, 0 to 1 in steps of 0.05; the one of least trace is taken.
+_INTERSECTION_WEIGHTS = 21
+# A detection this close to a catalogued crater and of a diameter within a factor exp(0.5) may be of that crater.
+_CLAIMED_PX = 12.0
+_CLAIMED_LOG_DIAMETER = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +125,7 @@ class View:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Track:
+class Track:
     """Sightings of what may be one crater: views, pixels (n, 2), variances (n,), and the place they give."""
 
     views: tuple[View, ...]
@@ -127,292 +137,336 @@ class _Track:
     surface_m: float
 
 
-class LandmarkMapper:
-    """The map under construction: takes what each frame's fix left over."""
+@dataclass(frozen=True, slots=True, eq=False)
+class MapState:
+    """Map under construction: what each frame's fix left over.
 
-    def __init__(self, camera: PinholeCamera, parameters: MappingParameters = MappingParameters()) -> None:
-        self.parameters = parameters
-        self.landmarks: dict[int, Landmark] = {}
-        # Places of the landmarks in the order of the dictionary, for the search.
-        self._places = np.empty((0, 3))
-        self._camera = camera
-        self._tracks: list[_Track] = []
-        self._next = FIRST_LANDMARK_ID
+    Attributes
+    ----------
+    landmarks
+        In the order in which they were first mapped.
+    places_mcmf_m
+        Places of the landmarks, shape (n, 3), for the search.
+    tracks
+        Tracks that may still grow.
+    next_identity
+        Identity of the next new landmark.
+    """
 
-    def __len__(self) -> int:
-        return len(self.landmarks)
+    landmarks: tuple[Landmark, ...] = ()
+    places_mcmf_m: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    tracks: tuple[Track, ...] = ()
+    next_identity: int = FIRST_LANDMARK_ID
 
-    def observe(
-        self, view: View, found: Detections, variance_px2: FloatArray, free: BoolArray, surface_m: float
-    ) -> tuple[Landmark, ...]:
-        """Take a frame; return landmarks that it completed or that closed tracks improved.
 
-        Parameters
-        ----------
+def observe(
+    state: MapState,
+    view: View,
+    found: Detections,
+    variance_px2: FloatArray,
+    free: BoolArray,
+    surface_m: float,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+) -> tuple[MapState, tuple[Landmark, ...]]:
+    """Return the map after a frame, and the landmarks that closed tracks made or improved.
+
+    Parameters
+    ----------
+    free
+        Detections that belong to no crater of the catalogue, shape (n,).
+    surface_m
+        Height of the ground in view, according to the catalogue.
+    """
+    spread = float(np.sqrt(np.trace(view.covariance_m2) / 3.0))
+    usable = (
         free
-            Detections that belong to no crater of the catalogue, shape (n,).
-        surface_m
-            Height of the ground around, as the catalogue has it.
-        """
-        parameters = self.parameters
-        spread = float(np.sqrt(np.trace(view.covariance_m2) / 3.0))
-        usable = (
-            free
-            & np.isfinite(found.u_px)
-            & np.isfinite(found.v_px)
-            & (found.diameter_px > 0.0)
-            & np.isfinite(variance_px2)
+        & np.isfinite(found.u_px)
+        & np.isfinite(found.v_px)
+        & (found.diameter_px > 0.0)
+        & np.isfinite(variance_px2)
+    )
+    state, ready = _closed(state, view.ticks, camera, parameters)
+    if not (np.isfinite(spread) and spread < parameters.position_limit_m):
+        return state, ready
+    uv = np.stack([found.u_px, found.v_px], axis=1)
+    size_m = _ground_diameter(view, uv, found.diameter_px, surface_m, camera)
+    low, high = parameters.diameter_limits_m
+    usable &= (size_m >= low) & (size_m <= high)
+    tracks, joined = _joined(state.tracks, view, uv, variance_px2, size_m, usable, camera, parameters)
+    rows = np.flatnonzero(usable & ~joined)
+    begun = _begun(view, uv, variance_px2, size_m, rows, surface_m, camera, parameters)
+    return replace(state, tracks=_best_tracks((*tracks, *begun), parameters.tracks)), ready
+
+
+def close(
+    state: MapState, camera: PinholeCamera, parameters: MappingParameters
+) -> tuple[MapState, tuple[Landmark, ...]]:
+    """Return the map after the end of all tracks, as before a gap, and the landmarks that these made or improved."""
+    return _closed(state, None, camera, parameters)
+
+
+def with_catalogue(landmarks: Sequence[Landmark], catalogue: CatalogueTable) -> LandmarkMap:
+    """Return the catalogue with landmarks added, ready for use."""
+    if not landmarks:
+        return landmark_map(catalogue)
+    rows = map_rows(landmarks)
+    return landmark_map(
+        CatalogueTable(
+            np.concatenate([catalogue.ids, rows.identity]),
+            np.concatenate([catalogue.latitude_rad, rows.latitude_rad]),
+            np.concatenate([catalogue.longitude_rad, rows.longitude_rad]),
+            np.concatenate([catalogue.diameter_m, rows.diameter_m]),
+            np.concatenate([catalogue.rim_height_m, rows.height_m]),
+            np.concatenate([catalogue.sigma_m, rows.sigma_m]),
         )
-        ready = self._closed(view.ticks)
-        if not (np.isfinite(spread) and spread < parameters.position_limit_m):
-            return ready
-        uv = np.stack([found.u_px, found.v_px], axis=1)
-        size_m = self._ground_diameter(view, uv, found.diameter_px, surface_m)
-        low, high = parameters.diameter_limits_m
-        usable &= (size_m >= low) & (size_m <= high)
-        joined = self._join(view, uv, variance_px2, size_m, usable)
-        self._begin(view, uv, variance_px2, size_m, np.flatnonzero(usable & ~joined), surface_m)
-        return ready
+    )
 
-    def close(self) -> tuple[Landmark, ...]:
-        """End all tracks, as before a gap; return the landmarks that came of them."""
-        return self._closed(None)
 
-    def with_catalogue(self, catalogue: CatalogueTable) -> LandmarkMap:
-        """Return the catalogue with the landmarks added, ready for use."""
-        if not self.landmarks:
-            return landmark_map(catalogue)
-        rows = map_rows(list(self.landmarks.values()))
-        return landmark_map(
-            CatalogueTable(
-                np.concatenate([catalogue.ids, rows.identity]),
-                np.concatenate([catalogue.latitude_rad, rows.latitude_rad]),
-                np.concatenate([catalogue.longitude_rad, rows.longitude_rad]),
-                np.concatenate([catalogue.diameter_m, rows.diameter_m]),
-                np.concatenate([catalogue.rim_height_m, rows.height_m]),
-                np.concatenate([catalogue.sigma_m, rows.sigma_m]),
-            )
+def _ground_diameter(
+    view: View, uv: FloatArray, diameter_px: FloatArray, surface_m: float, camera: PinholeCamera
+) -> FloatArray:
+    """Return diameters of detections on the ground in metres, -1 for lines of sight that miss it."""
+    points = _on_sphere(view, uv, surface_m, camera)
+    depth = (points - view.position_mcmf_m) @ view.camera_from_mcmf[2]
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.nan_to_num(diameter_px * depth / camera.focal_px, nan=-1.0))
+
+
+def _on_sphere(view: View, uv: FloatArray, height_m: float, camera: PinholeCamera) -> FloatArray:
+    """Return where lines of sight meet a sphere (n, 3), NaN where they do not."""
+    sight = camera.rays(uv) @ view.camera_from_mcmf
+    along = -(sight @ view.position_mcmf_m)
+    below = view.position_mcmf_m @ view.position_mcmf_m - (MOON_RADIUS_M + height_m) ** 2
+    with np.errstate(invalid="ignore"):
+        reach = along - np.sqrt(along**2 - below)
+    return np.asarray(view.position_mcmf_m + reach[:, None] * sight)
+
+
+def _begun(
+    view: View,
+    uv: FloatArray,
+    variance_px2: FloatArray,
+    size_m: FloatArray,
+    rows: IntArray,
+    surface_m: float,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+) -> list[Track]:
+    """Return tracks that begin with detections, placed on the ground in view."""
+    places = _on_sphere(view, uv[rows], surface_m, camera)
+    rows, places = rows[np.isfinite(places[:, 0])], places[np.isfinite(places[:, 0])]
+    _, by_point = _projected(view, places, camera)
+    up = places / np.linalg.norm(places, axis=1, keepdims=True)
+    normal = up[:, :, None] * up[:, None, :] / parameters.height_sigma_m**2
+    normal = normal + np.swapaxes(by_point, 1, 2) @ by_point / variance_px2[rows, None, None]
+    own = np.linalg.inv(normal)
+    return [
+        Track((view,), uv[i : i + 1], variance_px2[i : i + 1], float(size_m[i]), places[k], own[k], surface_m)
+        for k, i in enumerate(rows)
+    ]
+
+
+def _best_tracks(tracks: tuple[Track, ...], limit: int) -> tuple[Track, ...]:
+    """Return at most so many tracks, without those of the fewest and then the oldest sightings."""
+    if len(tracks) <= limit:
+        return tracks
+    order = sorted(range(len(tracks)), key=lambda t: (len(tracks[t].views), tracks[t].views[-1].ticks))
+    dropped = set(order[: len(tracks) - limit])
+    return tuple(track for t, track in enumerate(tracks) if t not in dropped)
+
+
+def _joined(
+    tracks: tuple[Track, ...],
+    view: View,
+    uv: FloatArray,
+    variance_px2: FloatArray,
+    size_m: FloatArray,
+    usable: BoolArray,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+) -> tuple[tuple[Track, ...], BoolArray]:
+    """Return tracks with the detections that continue them, mutual nearest only, and which detections these are."""
+    joined = np.zeros(usable.size, dtype=np.bool_)
+    rows = np.flatnonzero(usable)
+    if not rows.size or not tracks:
+        return tracks, joined
+    places = np.stack([track.position_mcmf_m for track in tracks])
+    own = np.stack([track.own_covariance_m2 for track in tracks])
+    sizes = np.array([track.diameter_m for track in tracks])
+    predicted, by_point = _projected(view, places, camera)
+    # Between frames the spacecraft's own error is the same: only the track's is left.
+    spread = by_point @ own @ np.swapaxes(by_point, 1, 2)
+    offset = uv[rows][None] - predicted[:, None]
+    total = spread[:, None] + variance_px2[rows][None, :, None, None] * np.eye(2)
+    with np.errstate(invalid="ignore"):
+        distance = np.einsum("tna,tnab,tnb->tn", offset, np.linalg.inv(total), offset)
+        alike = np.abs(np.log(size_m[rows][None] / sizes[:, None])) <= parameters.log_diameter_gate
+    distance = np.where(alike & np.isfinite(distance), distance, np.inf)
+    best_track, best_row = np.argmin(distance, axis=0), np.argmin(distance, axis=1)
+    grown = list(tracks)
+    for t, track in enumerate(tracks):
+        k = int(best_row[t])
+        if best_track[k] != t or not distance[t, k] < _GATE_2:
+            continue
+        i = int(rows[k])
+        joined[i] = True
+        kept = parameters.sightings_kept
+        grown[t] = _placed(
+            _longer(track, view, uv[i], float(variance_px2[i]), float(size_m[i]), kept),
+            camera,
+            parameters.height_sigma_m,
         )
+    return tuple(grown), joined
 
-    def _ground_diameter(
-        self, view: View, uv: FloatArray, diameter_px: FloatArray, surface_m: float
-    ) -> FloatArray:
-        """Return diameters on the ground of detections, NaN off it."""
-        points = self._on_sphere(view, uv, surface_m)
-        depth = (points - view.position_mcmf_m) @ view.camera_from_mcmf[2]
-        with np.errstate(invalid="ignore"):
-            return np.asarray(np.nan_to_num(diameter_px * depth / self._camera.focal_px, nan=-1.0))
 
-    def _on_sphere(self, view: View, uv: FloatArray, height_m: float) -> FloatArray:
-        """Return where lines of sight meet a sphere (n, 3), NaN where they do not."""
-        sight = self._camera.rays(uv) @ view.camera_from_mcmf
-        along = -(sight @ view.position_mcmf_m)
-        below = view.position_mcmf_m @ view.position_mcmf_m - (MOON_RADIUS_M + height_m) ** 2
-        with np.errstate(invalid="ignore"):
-            reach = along - np.sqrt(along**2 - below)
-        return np.asarray(view.position_mcmf_m + reach[:, None] * sight)
+def _longer(
+    track: Track, view: View, uv: FloatArray, variance_px2: float, diameter_m: float, kept: int
+) -> Track:
+    """Return the track with one more sighting, of which the last so many are kept."""
+    count = len(track.views)
+    return replace(
+        track,
+        views=(*track.views, view)[-kept:],
+        uv_px=np.concatenate([track.uv_px, uv[None]])[-kept:],
+        variance_px2=np.append(track.variance_px2, variance_px2)[-kept:],
+        diameter_m=float(np.exp((count * np.log(track.diameter_m) + np.log(diameter_m)) / (count + 1))),
+    )
 
-    def _begin(
-        self,
-        view: View,
-        uv: FloatArray,
-        variance_px2: FloatArray,
-        size_m: FloatArray,
-        rows: IntArray,
-        surface_m: float,
-    ) -> None:
-        """Begin tracks with detections, on the ground around; where memory is full the poorest tracks give way."""
-        places = self._on_sphere(view, uv[rows], surface_m)
-        rows, places = rows[np.isfinite(places[:, 0])], places[np.isfinite(places[:, 0])]
-        _, by_point = self._projected(view, places)
-        up = places / np.linalg.norm(places, axis=1, keepdims=True)
-        normal = up[:, :, None] * up[:, None, :] / self.parameters.height_sigma_m**2
-        normal = normal + np.swapaxes(by_point, 1, 2) @ by_point / variance_px2[rows, None, None]
-        own = np.linalg.inv(normal)
-        for k, i in enumerate(rows):
-            track = _Track(
-                (view,),
-                uv[i : i + 1],
-                variance_px2[i : i + 1],
-                float(size_m[i]),
-                places[k],
-                own[k],
-                surface_m,
-            )
-            self._tracks.append(track)
-        for _ in range(len(self._tracks) - self.parameters.tracks):
-            self._drop_poorest_track()
 
-    def _join(
-        self, view: View, uv: FloatArray, variance_px2: FloatArray, size_m: FloatArray, usable: BoolArray
-    ) -> BoolArray:
-        """Add detections to the tracks they continue, each other's nearest only; return which were added."""
-        joined = np.zeros(usable.size, dtype=np.bool_)
-        rows = np.flatnonzero(usable)
-        if not rows.size or not self._tracks:
-            return joined
-        places = np.stack([track.position_mcmf_m for track in self._tracks])
-        own = np.stack([track.own_covariance_m2 for track in self._tracks])
-        sizes = np.array([track.diameter_m for track in self._tracks])
-        predicted, by_point = self._projected(view, places)
-        # Between frames the spacecraft's own error is the same: only the track's is left.
-        spread = by_point @ own @ np.swapaxes(by_point, 1, 2)
-        offset = uv[rows][None] - predicted[:, None]
-        total = spread[:, None] + variance_px2[rows][None, :, None, None] * np.eye(2)
-        with np.errstate(invalid="ignore"):
-            distance = np.einsum("tna,tnab,tnb->tn", offset, np.linalg.inv(total), offset)
-            alike = np.abs(np.log(size_m[rows][None] / sizes[:, None])) <= self.parameters.log_diameter_gate
-        distance = np.where(alike & np.isfinite(distance), distance, np.inf)
-        best_track, best_row = np.argmin(distance, axis=0), np.argmin(distance, axis=1)
-        for t in range(len(self._tracks)):
-            k = int(best_row[t])
-            if best_track[k] != t or not distance[t, k] < _GATE:
-                continue
-            i = int(rows[k])
-            joined[i] = True
-            self._tracks[t] = self._longer(
-                self._tracks[t], view, uv[i], float(variance_px2[i]), float(size_m[i])
-            )
-        return joined
+def _placed(track: Track, camera: PinholeCamera, height_sigma_m: float) -> Track:
+    """Return the track with its place by least squares: its sightings, and the height of the ground in view."""
+    place, f, centre = track.position_mcmf_m, camera.focal_px, np.array(camera.centre_px)
+    rotation = np.stack([view.camera_from_mcmf for view in track.views])
+    position = np.stack([view.position_mcmf_m for view in track.views])
+    weight = np.repeat(1.0 / track.variance_px2, 2)
+    normal = np.eye(3)
+    for _ in range(_PLACEMENT_ITERATIONS):
+        radius = float(np.sqrt(place @ place))
+        up = place / radius
+        seen = np.einsum("kij,kj->ki", rotation, place - position)
+        scale = f / seen[:, 2]
+        predicted = seen[:, :2] * scale[:, None] + centre
+        by_seen = np.zeros((len(track.views), 2, 3))
+        by_seen[:, 0, 0] = by_seen[:, 1, 1] = scale
+        by_seen[:, :, 2] = -seen[:, :2] * (scale / seen[:, 2])[:, None]
+        design = (by_seen @ rotation).reshape(-1, 3)
+        left = (track.uv_px - predicted).reshape(-1)
+        normal = np.outer(up, up) / height_sigma_m**2 + (design.T * weight) @ design
+        pull = (track.surface_m - (radius - MOON_RADIUS_M)) / height_sigma_m**2
+        place = place + np.linalg.solve(normal, up * pull + design.T @ (weight * left))
+    own = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    return replace(track, position_mcmf_m=place, own_covariance_m2=own)
 
-    def _longer(
-        self, track: _Track, view: View, uv: FloatArray, variance_px2: float, diameter_m: float
-    ) -> _Track:
-        kept = self.parameters.sightings_kept
-        count = len(track.views)
-        longer = replace(
-            track,
-            views=(*track.views, view)[-kept:],
-            uv_px=np.concatenate([track.uv_px, uv[None]])[-kept:],
-            variance_px2=np.append(track.variance_px2, variance_px2)[-kept:],
-            diameter_m=float(np.exp((count * np.log(track.diameter_m) + np.log(diameter_m)) / (count + 1))),
-        )
-        return self._placed(longer)
 
-    def _placed(self, track: _Track) -> _Track:
-        """Return the track with its place by least squares: its sightings, and the height of the ground around."""
-        place, f, centre = track.position_mcmf_m, self._camera.focal_px, np.array(self._camera.centre_px)
-        rotation = np.stack([view.camera_from_mcmf for view in track.views])
-        position = np.stack([view.position_mcmf_m for view in track.views])
-        weight = np.repeat(1.0 / track.variance_px2, 2)
-        normal = np.eye(3)
-        for _ in range(2):
-            radius = float(np.sqrt(place @ place))
-            up = place / radius
-            seen = np.einsum("kij,kj->ki", rotation, place - position)
-            scale = f / seen[:, 2]
-            predicted = seen[:, :2] * scale[:, None] + centre
-            by_seen = np.zeros((len(track.views), 2, 3))
-            by_seen[:, 0, 0] = by_seen[:, 1, 1] = scale
-            by_seen[:, :, 2] = -seen[:, :2] * (scale / seen[:, 2])[:, None]
-            design = (by_seen @ rotation).reshape(-1, 3)
-            left = (track.uv_px - predicted).reshape(-1)
-            normal = np.outer(up, up) / self.parameters.height_sigma_m**2 + (design.T * weight) @ design
-            pull = (track.surface_m - (radius - MOON_RADIUS_M)) / self.parameters.height_sigma_m**2
-            place = place + np.linalg.solve(normal, up * pull + design.T @ (weight * left))
-        own = np.asarray(np.linalg.inv(normal), dtype=np.float64)
-        return replace(track, position_mcmf_m=place, own_covariance_m2=own)
+def _projected(view: View, places: FloatArray, camera: PinholeCamera) -> tuple[FloatArray, FloatArray]:
+    """Return pixels (n, 2) of places and their derivatives (n, 2, 3); NaN behind the camera."""
+    seen = (places - view.position_mcmf_m) @ view.camera_from_mcmf.T
+    depth = np.where(seen[:, 2] > 0.0, seen[:, 2], np.nan)
+    f, x, y = camera.focal_px, seen[:, 0] / depth, seen[:, 1] / depth
+    by_seen = np.zeros((depth.size, 2, 3))
+    by_seen[:, 0, 0] = by_seen[:, 1, 1] = f / depth
+    by_seen[:, 0, 2], by_seen[:, 1, 2] = -f * x / depth, -f * y / depth
+    uv = f * np.stack([x, y], axis=1) + np.array(camera.centre_px)
+    return uv, by_seen @ view.camera_from_mcmf
 
-    def _projected(self, view: View, places: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return pixels (n, 2) of places and their derivatives (n, 2, 3); NaN behind the camera."""
-        seen = (places - view.position_mcmf_m) @ view.camera_from_mcmf.T
-        depth = np.where(seen[:, 2] > 0.0, seen[:, 2], np.nan)
-        f, x, y = self._camera.focal_px, seen[:, 0] / depth, seen[:, 1] / depth
-        by_seen = np.zeros((depth.size, 2, 3))
-        by_seen[:, 0, 0] = by_seen[:, 1, 1] = f / depth
-        by_seen[:, 0, 2], by_seen[:, 1, 2] = -f * x / depth, -f * y / depth
-        uv = f * np.stack([x, y], axis=1) + np.array(self._camera.centre_px)
-        return uv, by_seen @ view.camera_from_mcmf
 
-    def _closed(self, ticks: int | None) -> tuple[Landmark, ...]:
-        """Close tracks not seen for a while (all, without a time) and return the landmarks that came of them."""
-        memory = self.parameters.track_memory_s * TICKS_PER_SECOND
-        done: list[_Track] = []
-        going: list[_Track] = []
-        for track in self._tracks:
-            old = ticks is None or not 0 <= ticks - track.views[-1].ticks <= memory
-            (done if old else going).append(track)
-        self._tracks = going
-        made = [self._landmark(track) for track in done if len(track.views) >= self.parameters.sightings]
-        return tuple(landmark for landmark in made if landmark is not None)
+def _closed(
+    state: MapState, ticks: int | None, camera: PinholeCamera, parameters: MappingParameters
+) -> tuple[MapState, tuple[Landmark, ...]]:
+    """Return the map without the tracks not seen for a while (without any, for no time), and their landmarks."""
+    memory = parameters.track_memory_s * TICKS_PER_SECOND
+    done: list[Track] = []
+    going: list[Track] = []
+    for track in state.tracks:
+        old = ticks is None or not 0 <= ticks - track.views[-1].ticks <= memory
+        (done if old else going).append(track)
+    state = replace(state, tracks=tuple(going))
+    made = []
+    for track in done:
+        if len(track.views) < parameters.sightings:
+            continue
+        landmark = _landmark(track, state.next_identity, camera)
+        if landmark is not None:
+            state, landmark = _added(state, landmark, parameters)
+            made.append(landmark)
+    return state, tuple(made)
 
-    def _landmark(self, track: _Track) -> Landmark | None:
-        """Put a track into the map; None where its sightings contradict each other."""
-        misfit = 0.0
-        for view, uv, variance in zip(track.views, track.uv_px, track.variance_px2, strict=True):
-            left = uv - self._projected(view, track.position_mcmf_m[None])[0][0]
-            misfit += float(left @ left) / float(variance)
-        # Each sighting brings two numbers, a place takes three.
-        if not misfit <= _RESIDUAL_LIMIT * max(2 * len(track.views) - 3, 1):
-            return None
-        middle = track.views[len(track.views) // 2]
-        reach = float(np.linalg.norm(track.position_mcmf_m - middle.position_mcmf_m))
-        covariance = (
-            track.own_covariance_m2
-            + np.mean([view.covariance_m2 for view in track.views], axis=0)
-            + np.eye(3) * (reach * middle.attitude_sigma_rad) ** 2
-        )
-        new = Landmark(
-            self._next,
-            track.position_mcmf_m,
-            covariance,
-            track.diameter_m,
-            len(track.views),
-            1,
-            track.views[-1].ticks,
-        )
-        known = self._known(new)
-        if known is not None:
-            new = intersected(known, new)
-        else:
-            self._next += 1
-            if len(self.landmarks) >= self.parameters.landmarks:
-                poorest = min(
-                    self.landmarks.values(), key=lambda landmark: (landmark.sightings, landmark.ticks)
-                )
-                self._places = np.delete(self._places, list(self.landmarks).index(poorest.identity), axis=0)
-                del self.landmarks[poorest.identity]
-        if new.identity in self.landmarks:
-            self._places[list(self.landmarks).index(new.identity)] = new.position_mcmf_m
-        else:
-            self._places = np.concatenate([self._places, new.position_mcmf_m[None]])
-        self.landmarks[new.identity] = new
-        return new
 
-    def _known(self, new: Landmark) -> Landmark | None:
-        """Return the landmark of the map that a new one is, None for none."""
-        if not self.landmarks:
-            return None
-        away_m = np.abs(self._places - new.position_mcmf_m).max(axis=1)
-        near = np.flatnonzero(away_m < max(new.diameter_m, 4_000.0))
-        if not near.size:
-            return None
-        chosen = list(self.landmarks.values())
-        best, nearest = None, _GATE_3
-        # Two mappings of one crater lie no farther apart than this, whatever the covariances.
-        for k in near:
-            landmark = chosen[k]
-            offset = landmark.position_mcmf_m - new.position_mcmf_m
-            if abs(np.log(landmark.diameter_m / new.diameter_m)) > self.parameters.log_diameter_gate:
-                continue
-            away = float(offset @ np.linalg.solve(landmark.covariance_m2 + new.covariance_m2, offset))
-            if away < nearest:
-                best, nearest = landmark, away
-        return best
+def _landmark(track: Track, identity: int, camera: PinholeCamera) -> Landmark | None:
+    """Return the landmark that a track gives; None where its sightings contradict each other."""
+    misfit = 0.0
+    for view, uv, variance in zip(track.views, track.uv_px, track.variance_px2, strict=True):
+        left = uv - _projected(view, track.position_mcmf_m[None], camera)[0][0]
+        misfit += float(left @ left) / float(variance)
+    # Each sighting brings two numbers, a place takes three.
+    if not misfit <= _RESIDUAL_LIMIT * max(2 * len(track.views) - 3, 1):
+        return None
+    middle = track.views[len(track.views) // 2]
+    reach = float(np.linalg.norm(track.position_mcmf_m - middle.position_mcmf_m))
+    covariance = (
+        track.own_covariance_m2
+        + np.mean([view.covariance_m2 for view in track.views], axis=0)
+        + np.eye(3) * (reach * middle.attitude_sigma_rad) ** 2
+    )
+    return Landmark(
+        identity,
+        track.position_mcmf_m,
+        covariance,
+        track.diameter_m,
+        len(track.views),
+        1,
+        track.views[-1].ticks,
+    )
 
-    def _drop_poorest_track(self) -> None:
-        poorest = min(
-            range(len(self._tracks)),
-            key=lambda t: (len(self._tracks[t].views), self._tracks[t].views[-1].ticks),
-        )
-        del self._tracks[poorest]
+
+def _added(state: MapState, new: Landmark, parameters: MappingParameters) -> tuple[MapState, Landmark]:
+    """Return the map with a landmark, joined with an earlier mapping of the same crater; and what it became.
+
+    A full map loses the landmark of the fewest and then the oldest sightings.
+    """
+    landmarks, places = list(state.landmarks), state.places_mcmf_m
+    known = _known(state, new, parameters.log_diameter_gate)
+    if known is not None:
+        joined = intersected(landmarks[known], new)
+        places = places.copy()
+        landmarks[known], places[known] = joined, joined.position_mcmf_m
+        return replace(state, landmarks=tuple(landmarks), places_mcmf_m=places), joined
+    if len(landmarks) >= parameters.landmarks:
+        poorest = min(range(len(landmarks)), key=lambda k: (landmarks[k].sightings, landmarks[k].ticks))
+        del landmarks[poorest]
+        places = np.delete(places, poorest, axis=0)
+    grown = MapState(
+        (*landmarks, new),
+        np.concatenate([places, new.position_mcmf_m[None]]),
+        state.tracks,
+        state.next_identity + 1,
+    )
+    return grown, new
+
+
+def _known(state: MapState, new: Landmark, log_diameter_gate: float) -> int | None:
+    """Return the index of the landmark that a new one is another mapping of; None if there is none."""
+    if not state.landmarks:
+        return None
+    away_m = np.abs(state.places_mcmf_m - new.position_mcmf_m).max(axis=1)
+    best, nearest = None, _GATE_3
+    for k in np.flatnonzero(away_m < max(new.diameter_m, _SAME_CRATER_M)):
+        landmark = state.landmarks[k]
+        offset = landmark.position_mcmf_m - new.position_mcmf_m
+        if abs(np.log(landmark.diameter_m / new.diameter_m)) > log_diameter_gate:
+            continue
+        away = float(offset @ np.linalg.solve(landmark.covariance_m2 + new.covariance_m2, offset))
+        if away < nearest:
+            best, nearest = int(k), away
+    return best
 
 
 def intersected(first: Landmark, second: Landmark) -> Landmark:
     """Return two mappings of one crater as one, by the covariance intersection of least trace."""
     inverse_1, inverse_2 = np.linalg.inv(first.covariance_m2), np.linalg.inv(second.covariance_m2)
     best: tuple[float, FloatArray, FloatArray] | None = None
-    for weight in np.linspace(0.0, 1.0, 21):
+    for weight in np.linspace(0.0, 1.0, _INTERSECTION_WEIGHTS):
         covariance = np.linalg.inv(weight * inverse_1 + (1.0 - weight) * inverse_2)
         if best is None or float(np.trace(covariance)) < best[0]:
             information = weight * inverse_1 @ first.position_mcmf_m
@@ -468,7 +522,9 @@ def map_rows(landmarks: Sequence[Landmark]) -> MapRows:
     )
 
 
-def unclaimed(found: Detections, sighting: Sighting, used: IntArray, reach_px: float = 12.0) -> BoolArray:
+def unclaimed(
+    found: Detections, sighting: Sighting, used: IntArray, reach_px: float = _CLAIMED_PX
+) -> BoolArray:
     """Return which detections belong to no crater of the catalogue: not used, and none of their size near by."""
     free = np.ones(len(found), dtype=np.bool_)
     free[used] = False
@@ -476,6 +532,9 @@ def unclaimed(found: Detections, sighting: Sighting, used: IntArray, reach_px: f
         uv = np.stack([found.u_px, found.v_px], axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             away = np.linalg.norm(uv[:, None] - sighting.uv_px[None], axis=2)
-            alike = np.abs(np.log(found.diameter_px[:, None] / sighting.diameter_px[None])) < 0.5
+            alike = (
+                np.abs(np.log(found.diameter_px[:, None] / sighting.diameter_px[None]))
+                < _CLAIMED_LOG_DIAMETER
+            )
         free &= ~np.any((away < reach_px) & alike, axis=1)
     return free

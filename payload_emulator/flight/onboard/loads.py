@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from lunar.camera import PinholeCamera
-from payload_emulator.flight.navigation.anchored import AnchoredParameters
+from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
 from payload_emulator.flight.navigation.odometry import OdometryParameters
 from payload_emulator.flight.navigation.outcomes import Mode
 from tmtc.tables import (

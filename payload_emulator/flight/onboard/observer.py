@@ -12,9 +12,14 @@ from numpy.typing import NDArray
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import size_class
 from lunar.frames import matrix_from_quaternion
+from payload_emulator.flight.navigation import anchored, odometry
 from payload_emulator.flight.navigation import filter as kalman
-from payload_emulator.flight.navigation import odometry
-from payload_emulator.flight.navigation.anchored import AnchoredNavigator
+from payload_emulator.flight.navigation.anchored import (
+    AnchoredReport,
+    AnchoredSetup,
+    AnchoredState,
+    Observation,
+)
 from payload_emulator.flight.navigation.landmark_map import map_rows
 from payload_emulator.flight.navigation.odometry import OdometryState
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
@@ -83,7 +88,8 @@ class Observer:
         self._triggers: dict[Mode, Counter[ResetTrigger]] = {mode: Counter() for mode in parameters.modes}
         self._odometry: dict[Mode, OdometryState | None] = {}
         self._anchor: AnchorTable | None = None
-        self._navigator: AnchoredNavigator | None = None
+        self._setup: AnchoredSetup | None = None
+        self._anchored: AnchoredState | None = None
         self._in_trouble: set[str] = set()
         self._tables = FlightTables()
 
@@ -106,8 +112,8 @@ class Observer:
 
     def widen(self, position_m: float, velocity_m_s: float) -> None:
         """Trust the orbit no more than this."""
-        if self._navigator is not None:
-            self._navigator.widen(position_m, velocity_m_s)
+        if self._anchored is not None:
+            self._anchored = anchored.widened(self._anchored, position_m, velocity_m_s)
 
     def frame(
         self, image: NDArray[Any], attitude: FloatArray, score_floor: float, timeout_s: float, quiet: bool
@@ -210,7 +216,7 @@ class Observer:
         return quality, found
 
     def _start_navigator(self) -> None:
-        self._navigator = None
+        self._setup = self._anchored = None
         if Mode.anchored not in self._parameters.modes:
             return
         catalogue = self._load("catalogue", unpack_catalogue_table)
@@ -219,7 +225,7 @@ class Observer:
         state = self._load("initial_state", unpack_initial_state)
         burns = self._load("burns", unpack_burn_table)
         if catalogue and gravity and orientation and state:
-            self._navigator = AnchoredNavigator(
+            self._setup, self._anchored = anchored.start(
                 catalogue,
                 gravity,
                 orientation,
@@ -232,16 +238,15 @@ class Observer:
     def _anchored_frame(self, found: Detections | None, camera_from_icrf: FloatArray | None) -> float:
         """Run the anchored estimator on one frame, report it, and return its altitude."""
         mode, detections = Mode.anchored, 0 if found is None else len(found)
-        navigator = self._navigator
         report = None
-        if navigator is not None:
+        if self._setup is not None and self._anchored is not None:
+            observation = Observation(self._telemetry.ticks, found, camera_from_icrf)
             try:
-                report = navigator.step(self._telemetry.ticks, found, camera_from_icrf)
+                self._anchored, report = anchored.step(self._anchored, observation, self._setup)
             except np.linalg.LinAlgError:
                 self._telemetry.event("high", "estimator_error", float(mode))
-                # What no longer can be inverted is of no use: begin again from the tables.
+                # A covariance that cannot be inverted is of no use: start again from the tables.
                 self._start_navigator()
-                navigator = self._navigator
         outcome = Outcome.refused if report is None else report.outcome
         self._outcomes[mode][outcome] += 1
         self._send_outcome(
@@ -253,7 +258,7 @@ class Observer:
             (_NAN, _NAN),
             0,
         )
-        if report is None or navigator is None or not np.isfinite(report.latitude_rad):
+        if report is None or self._anchored is None or not np.isfinite(report.latitude_rad):
             return _NAN
         if report.reacquired:
             self.reacquisitions += 1
@@ -261,7 +266,7 @@ class Observer:
         self._trouble(
             "fix_refused", outcome is Outcome.refused, float(report.candidates), float(report.expected)
         )
-        self._trouble("filter_divergence", navigator.lost, max(report.sigma_rtn_m), 0.0)
+        self._trouble("filter_divergence", report.lost, max(report.sigma_rtn_m), 0.0)
         self._telemetry.send(
             "navigation_state",
             {
@@ -278,13 +283,13 @@ class Observer:
                 "matched": report.matched,
             },
         )
-        self._send_filter(navigator, found)
+        self._send_filter(self._anchored, report, found)
         return report.altitude_m
 
-    def _send_filter(self, navigator: AnchoredNavigator, found: Detections | None) -> None:
+    def _send_filter(self, state: AnchoredState, report: AnchoredReport, found: Detections | None) -> None:
         """Send what the ground needs to judge and to smooth the filter: its orbit in full, the pairs of its fix."""
         frame = {"frame_number": self._telemetry.frame_number, "image_ticks": self._telemetry.ticks}
-        mean, fix = navigator.state.mean, navigator.last_fix
+        mean, fix = state.estimate.mean, report.fix
         self._telemetry.send(
             "filter_estimate",
             {
@@ -292,7 +297,7 @@ class Observer:
                 "position_icrf_m": mean[kalman.POSITION],
                 "velocity_icrf_m_s": mean[kalman.VELOCITY],
                 "acceleration_rtn_m_s2": mean[kalman.ACCELERATION],
-                "covariance": navigator.state.covariance[kalman.ORBIT, kalman.ORBIT][_ORBIT_TRIANGLE],
+                "covariance": state.estimate.covariance[kalman.ORBIT, kalman.ORBIT][_ORBIT_TRIANGLE],
                 "innovation_degrees": 0 if fix is None else 2 * fix.index.size,
             },
         )
@@ -301,12 +306,12 @@ class Observer:
             sent = np.isin(fix.identification.detection, reported)
             pairs = {
                 "detection": np.searchsorted(reported, fix.identification.detection[sent]),
-                "crater_id": navigator.landmarks.ids[fix.index[sent]],
+                "crater_id": state.landmarks.ids[fix.index[sent]],
             }
             self.sightings.update(pairs["crater_id"].tolist())
             self._telemetry.send("identifications", {**frame, "items": pairs})
-        for first in range(0, len(navigator.new_landmarks), _LANDMARKS_A_PACKET):
-            rows = map_rows(navigator.new_landmarks[first : first + _LANDMARKS_A_PACKET])
+        for first in range(0, len(report.new_landmarks), _LANDMARKS_A_PACKET):
+            rows = map_rows(report.new_landmarks[first : first + _LANDMARKS_A_PACKET])
             items = {
                 "landmark_id": rows.identity,
                 "latitude_deg": np.degrees(rows.latitude_rad),

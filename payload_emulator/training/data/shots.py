@@ -130,8 +130,8 @@ def _heights_in_view(terrain: Any, edge_mcmf_m: FloatArray) -> FloatArray:
 
 
 def footprint_edge(
-    camera: PinholeCamera, camera_from_mcmf: Floats, position_mcmf_m: Floats, uv: Floats
-) -> Floats:
+    camera: PinholeCamera, camera_from_mcmf: FloatArray, position_mcmf_m: FloatArray, uv: FloatArray
+) -> FloatArray:
     """Points (n, 3) of the map sphere that pixels (n, 2) see, MCMF m; where a pixel sees the sky, the horizon below it.
 
     At 150 km a camera of 120 degrees sees the sky in its corners (67.8 degrees off nadir, horizon at 67.0).

@@ -13,22 +13,59 @@ from scipy.stats import chi2, norm
 from lunar.camera import nadir_camera_from_mcmf
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
-from payload_emulator.flight.navigation import anchored
+from payload_emulator.flight.navigation import anchored, association, correction, recovery
 from payload_emulator.flight.navigation.anchored import (
-    AnchoredLimits,
-    AnchoredNavigator,
-    AnchoredParameters,
-    frame_limit,
+    AnchoredReport,
+    AnchoredSetup,
+    AnchoredState,
+    Observation,
 )
+from payload_emulator.flight.navigation.anchored_parameters import AnchoredLimits, AnchoredParameters
+from payload_emulator.flight.navigation.correction import Fix, frame_limit
+from payload_emulator.flight.navigation.filter import FilterState
+from payload_emulator.flight.navigation.landmark_map import MapState
 from payload_emulator.flight.navigation.lost_in_space import Place
 from payload_emulator.flight.navigation.outcomes import Outcome
-from payload_emulator.flight.navigation.relative import RelativeParameters
+from payload_emulator.flight.navigation.prediction import is_usable
+from payload_emulator.flight.navigation.relative import RelativeParameters, without_clone
 from payload_emulator.flight.navigation.sighting import Pose, in_view, landmark_map
 from payload_emulator.flight.vision.detections import Detections
 from studies import montecarlo
 from tmtc.tables import BurnTable
 
 SECOND = 65_536
+
+
+class Navigator:
+    """Set-up and current state of the estimator under test, with the last report."""
+
+    def __init__(self, setup: AnchoredSetup, state: AnchoredState) -> None:
+        self.setup, self.state = setup, state
+        self.report: AnchoredReport | None = None
+
+    @property
+    def estimate(self) -> FilterState:
+        return self.state.estimate
+
+    @property
+    def fix(self) -> Fix:
+        assert self.report is not None and self.report.fix is not None
+        return self.report.fix
+
+    def step(self, ticks: int, found: Detections | None, camera_from_icrf: Any) -> AnchoredReport:
+        before = frozen_copy(self.state)
+        given = self.state
+        self.state, self.report = anchored.step(
+            given, Observation(ticks, found, camera_from_icrf), self.setup
+        )
+        # A step changes nothing of the state that it is given.
+        np.testing.assert_array_equal(given.estimate.mean, before[0])
+        np.testing.assert_array_equal(given.estimate.covariance, before[1])
+        return self.report
+
+
+def frozen_copy(state: AnchoredState) -> tuple[Any, Any]:
+    return state.estimate.mean.copy(), state.estimate.covariance.copy()
 
 
 class Orbit:
@@ -56,7 +93,7 @@ class Orbit:
         one = np.ones(len(seen))
         return Detections(seen.uv_px[:, 0] + shift_px, seen.uv_px[:, 1], seen.diameter_px, one, one)
 
-    def navigator(self, **changes: Any) -> AnchoredNavigator:
+    def navigator(self, **changes: Any) -> Navigator:
         case = replace(
             self.case,
             start_position_m=changes.pop("start_position_m", 300.0),
@@ -66,12 +103,12 @@ class Orbit:
         table = replace(
             montecarlo.catalogue_table(case.craters), sigma_m=np.full((len(case.craters), 3), 60.0)
         )
-        return montecarlo._navigator(
-            case, table, self.states[0], int(self.ticks[0]), np.random.default_rng(1)
+        return Navigator(
+            *montecarlo._started(case, table, self.states[0], int(self.ticks[0]), np.random.default_rng(1))
         )
 
-    def error_m(self, navigator: AnchoredNavigator, k: int) -> float:
-        return float(np.linalg.norm(navigator.state.mean[:3] - self.states[k, :3]))
+    def error_m(self, navigator: Navigator, k: int) -> float:
+        return float(np.linalg.norm(navigator.estimate.mean[:3] - self.states[k, :3]))
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +116,7 @@ def orbit(navigation_case: Any) -> Orbit:
     return Orbit(navigation_case(40))
 
 
-def fly(orbit: Orbit, navigator: AnchoredNavigator, first: int, last: int) -> list[Any]:
+def fly(orbit: Orbit, navigator: Navigator, first: int, last: int) -> list[Any]:
     return [
         navigator.step(int(orbit.ticks[k]), orbit.detections(k), orbit.attitude(k))
         for k in range(first, last)
@@ -100,7 +137,7 @@ def test_shipped_parameters_hold_the_orbit_and_report_what_the_state_says(orbit:
     assert {report.outcome for report in reports} == {Outcome.fixed}
     # Exact detections: what is left is the start, weighed with 60 m of catalogue and 15 m of its offset.
     assert orbit.error_m(navigator, 11) < 60.0
-    last, state = reports[-1], navigator.state
+    last, state = reports[-1], navigator.estimate
     place = orbit.rotations[11] @ state.mean[:3]
     radius = float(np.linalg.norm(place))
     assert last.altitude_m == pytest.approx(radius - 1_737_400.0, abs=1e-6)
@@ -113,18 +150,18 @@ def test_shipped_parameters_hold_the_orbit_and_report_what_the_state_says(orbit:
     expected = [np.sqrt(axis @ state.covariance[:3, :3] @ axis) for axis in axes]
     np.testing.assert_allclose(last.sigma_rtn_m, expected, rtol=1e-9)
     assert last.velocity_icrf_m_s == tuple(state.mean[3:6])
-    fix = navigator.last_fix
-    assert fix is not None and last.matched == fix.index.size and last.nis == fix.update.nis
+    fix = navigator.fix
+    assert last.matched == fix.index.size and last.nis == fix.update.nis
     assert last.nis < chi2.ppf(0.999, 2 * last.matched)
 
 
 def test_without_an_image_attitude_or_detections_the_orbit_is_coasted(orbit: Orbit) -> None:
     navigator = orbit.navigator()
     fly(orbit, navigator, 0, 6)
-    before = navigator.state
+    before = navigator.estimate
     none = navigator.step(int(orbit.ticks[6]), None, orbit.attitude(6))
     assert none.outcome is Outcome.no_image and np.isnan(none.nis) and none.matched == 0
-    assert navigator.state.position_sigma_m > before.position_sigma_m
+    assert navigator.estimate.position_sigma_m > before.position_sigma_m
     blind = navigator.step(int(orbit.ticks[7]), orbit.detections(7), None)
     empty = navigator.step(
         int(orbit.ticks[8]), orbit.detections(8).select(np.empty(0, dtype=np.int64)), orbit.attitude(8)
@@ -149,11 +186,11 @@ def test_craters_stay_among_the_states_for_their_memory_and_no_longer(orbit: Orb
     for gap, kept in ((15, True), (17, False)):
         navigator = orbit.navigator()
         fly(orbit, navigator, 0, 6)
-        assert navigator.state.craters.size > 5
+        assert navigator.estimate.craters.size > 5
         k = 5 + gap
         assert (gap * 15.0 <= limit_s) is kept
         navigator.step(int(orbit.ticks[k]), None, None)
-        assert (navigator.state.craters.size > 0) is kept
+        assert (navigator.estimate.craters.size > 0) is kept
 
 
 def test_only_so_many_craters_are_used_the_surest(orbit: Orbit) -> None:
@@ -162,8 +199,8 @@ def test_only_so_many_craters_are_used_the_surest(orbit: Orbit) -> None:
     found = orbit.detections(1)
     sigma = np.linspace(3.0, 0.6, len(found))
     report = navigator.step(int(orbit.ticks[1]), replace(found, sigma_px=sigma), orbit.attitude(1))
-    fix = navigator.last_fix
-    assert fix is not None and report.matched == 5
+    fix = navigator.fix
+    assert report.matched == 5
     # Exact detections are all identified: the five smallest sigmas are the last five.
     assert fix.identification.detection.tolist() == list(range(len(found) - 5, len(found)))
 
@@ -174,20 +211,28 @@ def test_detection_noise_is_split_between_frame_and_crater(orbit: Orbit) -> None
     count = len(found)
     sigma = np.full(count, 0.1)
     sigma[:2] = [np.nan, 1.0]
-    variance = navigator._detection_variance(replace(found, sigma_px=sigma))
+    parameters = navigator.setup.parameters
+    variance = association.detection_variance_px2(replace(found, sigma_px=sigma), parameters)
     # Unknown: 1.5 px; given: twice what it says; never below 0.5 px.
     np.testing.assert_allclose(variance[:3], [9.0, 4.0, 0.25])
-    np.testing.assert_allclose(navigator._fresh(variance)[:3], [6.3, 2.8, 0.175])
-    np.testing.assert_allclose(navigator._fresh(np.array([0.05])), [0.04])
+    np.testing.assert_allclose(correction.fresh_variance_px2(variance, parameters)[:3], [6.3, 2.8, 0.175])
+    np.testing.assert_allclose(correction.fresh_variance_px2(np.array([0.05]), parameters), [0.04])
     index = np.array([3, 8])
-    lasting = navigator._crater_sigma_m(index, np.array([4.0, 9.0]))
-    altitude_m = np.linalg.norm(navigator.state.mean[:3]) - 1_737_400.0
+    altitude_m, low_m = 30_000.0, 400.0
+    catalogue_m = navigator.state.landmarks.sigma_m[index]
+    lasting = correction.crater_sigma_m(
+        catalogue_m, np.array([4.0, 9.0]), altitude_m, orbit.case.camera, parameters
+    )
+    low = correction.crater_sigma_m(catalogue_m, np.array([4.0, 9.0]), low_m, orbit.case.camera, parameters)
     focal_px = 256.0 / np.tan(np.radians(60.0))
     for row, px2 in enumerate((4.0, 9.0)):
         across = np.hypot(60.0, np.sqrt(0.3 * px2) * altitude_m / focal_px)
         np.testing.assert_allclose(lasting[row], [across, across, 60.0], rtol=1e-12)
+        # Below the lowest altitude the scale of that altitude is used.
+        across = np.hypot(60.0, np.sqrt(0.3 * px2) * 1_000.0 / focal_px)
+        np.testing.assert_allclose(low[row], [across, across, 60.0], rtol=1e-12)
     # The map itself is left alone.
-    np.testing.assert_allclose(navigator.landmarks.sigma_m[index], 60.0)
+    np.testing.assert_allclose(navigator.state.landmarks.sigma_m[index], 60.0)
 
 
 def test_an_image_that_contradicts_the_prediction_is_refused_until_it_has_done_so_often(orbit: Orbit) -> None:
@@ -198,10 +243,10 @@ def test_an_image_that_contradicts_the_prediction_is_refused_until_it_has_done_s
         report = navigator.step(int(orbit.ticks[k]), orbit.detections(k, shift_px=60.0), orbit.attitude(k))
         assert report.outcome in (Outcome.refused, Outcome.coasted) or report.matched <= 2
         assert orbit.error_m(navigator, k) < error + 100.0
-    assert navigator._disagreements == 3
+    assert navigator.state.disagreements == 3
     # Frames that agree take the suspicion away.
     navigator.step(int(orbit.ticks[11]), orbit.detections(11), orbit.attitude(11))
-    assert navigator._disagreements == 0
+    assert navigator.state.disagreements == 0
 
 
 @pytest.mark.parametrize(
@@ -217,17 +262,15 @@ def test_an_image_that_contradicts_the_prediction_is_refused_until_it_has_done_s
     ],
 )
 def test_frames_are_judged_by_the_share_they_explain(
-    orbit: Orbit, matched: int | None, expected: int, detections: int, counts: int
+    matched: int | None, expected: int, detections: int, counts: int
 ) -> None:
-    navigator = orbit.navigator()
-    navigator._disagreements = 5
     fix: Any = None if matched is None else type("Fix", (), {"index": np.arange(matched)})()
-    navigator._judge(fix, expected, detections)
-    assert navigator._disagreements == (0 if counts < 0 else 5 + counts)
+    after = recovery.disagreements(5, fix, expected, detections, AnchoredParameters())
+    assert after == (0 if counts < 0 else 5 + counts)
 
 
 def test_corrections_that_are_no_corrections_are_refused(orbit: Orbit) -> None:
-    prior, limits = orbit.navigator().state, AnchoredLimits()
+    prior, limits = orbit.navigator().estimate, AnchoredLimits()
     sigma = prior.position_sigma_m
     assert sigma == pytest.approx(300.0 / np.sqrt(3.0))
 
@@ -236,50 +279,58 @@ def test_corrections_that_are_no_corrections_are_refused(orbit: Orbit) -> None:
         mean[1] += metres
         return replace(prior, mean=mean)
 
-    assert anchored._plausible(prior, moved(6.9 * sigma), limits)
-    assert not anchored._plausible(prior, moved(7.1 * sigma), limits)
+    assert correction.is_plausible(prior, moved(6.9 * sigma), limits)
+    assert not correction.is_plausible(prior, moved(7.1 * sigma), limits)
     bad = replace(prior, covariance=prior.covariance.copy())
     bad.covariance[4, 4] = -1e-9
-    assert not anchored._plausible(prior, bad, limits)
-    assert not anchored._plausible(prior, replace(prior, mean=np.full(18, np.nan)), limits)
+    assert not correction.is_plausible(prior, bad, limits)
+    assert not correction.is_plausible(prior, replace(prior, mean=np.full(18, np.nan)), limits)
     for radius, usable in ((1_727.3e3, False), (1_727.5e3, True), (2_737.3e3, True), (2_737.5e3, False)):
         mean = prior.mean.copy()
         mean[:3] *= radius / np.linalg.norm(mean[:3])
-        assert anchored._usable(replace(prior, mean=mean), limits) is usable
+        assert is_usable(replace(prior, mean=mean), limits) is usable
 
 
 def test_a_burn_on_the_way_is_flown_and_its_uncertainty_added(orbit: Orbit) -> None:
     plain, burning = orbit.navigator(), orbit.navigator()
     at = int(orbit.ticks[0]) + 20 * SECOND
     push = np.array([0.0, 2.0, 0.0])
-    burning.burns = BurnTable(np.array([at]), push[None], np.array([0.05]))
+    burning.setup = replace(burning.setup, burns=BurnTable(np.array([at]), push[None], np.array([0.05])))
     for navigator in (plain, burning):
         navigator.step(int(orbit.ticks[2]), None, None)
-    moved = burning.state.mean - plain.state.mean
+    moved = burning.estimate.mean - plain.estimate.mean
     # Ten seconds after the burn: 20 m along its axis; gravity changes that by a millionth.
     np.testing.assert_allclose(moved[:3], 10.0 * push, atol=1e-2)
     np.testing.assert_allclose(moved[3:6], push, atol=1e-3)
-    added = burning.state.covariance - plain.state.covariance
+    added = burning.estimate.covariance - plain.estimate.covariance
     np.testing.assert_allclose(np.diag(added)[3:6], 0.05**2, rtol=1e-3)
     np.testing.assert_allclose(np.diag(added)[:3], (10.0 * 0.05) ** 2, rtol=1e-3)
     # Back before the burn it is undone.
     burning.step(int(orbit.ticks[0]), None, None)
     plain.step(int(orbit.ticks[0]), None, None)
-    np.testing.assert_allclose(burning.state.mean[3:6], plain.state.mean[3:6], atol=1e-3)
+    np.testing.assert_allclose(burning.estimate.mean[3:6], plain.estimate.mean[3:6], atol=1e-3)
 
 
 def test_it_is_lost_beyond_its_limit(orbit: Orbit) -> None:
     navigator = orbit.navigator()
-    assert not navigator.lost
-    navigator.widen(4_900.0, 1.0)
-    assert not navigator.lost
-    navigator.widen(1_500.0, 1.0)
-    assert navigator.lost and navigator.state.position_sigma_m == pytest.approx(5_127.3, abs=1.0)
+    parameters = navigator.setup.parameters
+    assert not anchored.is_lost(navigator.state, parameters)
+    wide = anchored.widened(navigator.state, 4_900.0, 1.0)
+    assert not anchored.is_lost(wide, parameters)
+    wider = anchored.widened(wide, 1_500.0, 1.0)
+    assert anchored.is_lost(wider, parameters)
+    assert wider.estimate.position_sigma_m == pytest.approx(5_127.3, abs=1.0)
+    unknown = replace(wide, estimate=replace(wide.estimate, mean=np.full(18, np.nan)))
+    assert anchored.is_lost(unknown, parameters)
+    # The report of a frame says so.
+    navigator.state = wider
+    report = navigator.step(int(orbit.ticks[1]), None, None)
+    assert report.lost and not orbit.navigator().step(int(orbit.ticks[1]), None, None).lost
 
 
 def test_a_wide_prior_is_searched_by_votes_and_says_so(orbit: Orbit) -> None:
     navigator = orbit.navigator(start_position_m=9_000.0)
-    assert navigator.state.position_sigma_m > AnchoredParameters().tracking_limit_m
+    assert navigator.estimate.position_sigma_m > AnchoredParameters().tracking_limit_m
     report = navigator.step(int(orbit.ticks[0]), orbit.detections(0), orbit.attitude(0))
     assert report.outcome is Outcome.fixed and report.reacquired
     assert orbit.error_m(navigator, 0) < 300.0
@@ -306,7 +357,7 @@ def test_a_place_found_without_a_prior_turns_the_orbit_with_it(
 ) -> None:
     """The velocity turns by the shortest rotation from the believed place to the one that was found."""
     navigator = orbit.navigator()
-    prior = navigator.state
+    prior = navigator.estimate
     found = orbit.detections(0)
     axis = np.cross(prior.mean[:3], [0.3, -0.5, 0.8])
     turn = Rotation.from_rotvec(0.4 * axis / np.linalg.norm(axis))
@@ -315,16 +366,26 @@ def test_a_place_found_without_a_prior_turns_the_orbit_with_it(
         orbit.rotations[0] @ there, np.zeros(3), np.array([30.0, 80.0, 50.0]), np.array([2, 5, 7]), np.array([4, 1, 9]),
         0.1, -20.0,
     )  # fmt: skip
-    search = recorded(monkeypatch, anchored, "find_place", place)
-    updated = recorded(monkeypatch, navigator, "_updated", "the fix")
+    search = recorded(monkeypatch, recovery, "find_place", place)
+    updated = recorded(monkeypatch, recovery, "correct", "the fix")
+    setup, landmarks, index = navigator.setup, navigator.state.landmarks, object()
+
+    def found_anywhere() -> Any:
+        return recovery.search_everywhere(
+            prior, pose, found, landmarks, setup.camera, setup.parameters, setup.markov_sigma_m_s2, index
+        )
+
     pose = Pose(prior.mean[:3], orbit.attitude(0), orbit.rotations[0], np.zeros(3), np.zeros(2), np.zeros(3))
-    assert navigator._found_anywhere(prior, pose, found) == "the fix"
+    assert found_anywhere() == "the fix"
     ((given, sigma_px, places, camera, parameters),) = search
-    assert given is found and camera is orbit.case.camera and parameters is navigator.parameters.lost
+    assert given is found and camera is orbit.case.camera and parameters is setup.parameters.lost
     np.testing.assert_allclose(sigma_px, 1.0)
-    assert places is navigator._places
-    ((fresh, moved, detected, identification, sighting, more),) = updated
+    assert places is index
+    ((fresh, moved, detected, identification, sighting, *rest, altitude_m, more),) = updated
     assert more == {"reacquired": True} and detected is found
+    assert rest == [landmarks, setup.camera, setup.parameters]
+    # Detections are scaled to the ground by the altitude that was predicted.
+    assert altitude_m == pytest.approx(np.linalg.norm(prior.mean[:3]) - 1_737_400.0)
     np.testing.assert_allclose(fresh.mean[:3], there, rtol=1e-12)
     np.testing.assert_allclose(fresh.mean[3:6], turn.apply(prior.mean[3:6]), rtol=1e-9)
     assert fresh.ticks == prior.ticks and not fresh.craters.size
@@ -332,14 +393,14 @@ def test_a_place_found_without_a_prior_turns_the_orbit_with_it(
     # Three times the worst of 30, 80 and 50 m, and 200 m; a metre a second and 1e-3/s of the way.
     np.testing.assert_allclose(sigma[:3], 440.0)
     np.testing.assert_allclose(sigma[3:6], 1.0 + 1e-3 * np.linalg.norm(there - prior.mean[:3]))
-    np.testing.assert_allclose(sigma[6:9], navigator._markov_sigma_m_s2)
+    np.testing.assert_allclose(sigma[6:9], setup.markov_sigma_m_s2)
     np.testing.assert_allclose(moved.position_icrf_m, there)
     np.testing.assert_array_equal(moved.camera_from_icrf, pose.camera_from_icrf)
     assert identification.detection.tolist() == [2, 5, 7] and identification.sighted.tolist() == [0, 1, 2]
     assert (identification.candidates, identification.needed) == (len(found), 3)
     assert sighting.index.tolist() == [4, 1, 9]
-    monkeypatch.setattr(anchored, "find_place", lambda *_: None)
-    assert navigator._found_anywhere(prior, pose, found) is None
+    monkeypatch.setattr(recovery, "find_place", lambda *_: None)
+    assert found_anywhere() is None
 
 
 def test_a_widened_search_adds_its_radius_to_what_the_orbit_believes(
@@ -347,11 +408,12 @@ def test_a_widened_search_adds_its_radius_to_what_the_orbit_believes(
 ) -> None:
     """Half a width of 24 km is three sigma: 8 km, and a velocity of 1e-3/s of that."""
     navigator = orbit.navigator(search_radius_m=24_000.0)
-    prior, found = navigator.state, orbit.detections(0)
-    calls = recorded(monkeypatch, navigator, "_acquired", "the fix")
-    assert navigator._reacquire(prior, "the pose", found) == "the fix"
-    ((wide, pose, given, radius_m),) = calls
-    assert (pose, radius_m) == ("the pose", 8_000.0) and given is found
+    prior, found = navigator.estimate, orbit.detections(0)
+    calls = recorded(monkeypatch, recovery, "search_by_votes", "the fix")
+    chosen: Any = ("the map", "the camera", navigator.setup.parameters)
+    assert recovery.search_widely(prior, "the pose", found, *chosen) == "the fix"  # type: ignore[arg-type]
+    ((wide, pose, given, *rest, radius_m),) = calls
+    assert (pose, radius_m) == ("the pose", 8_000.0) and given is found and tuple(rest) == chosen
     added = np.zeros_like(prior.covariance)
     added[:3, :3], added[3:6, 3:6] = np.eye(3) * 64e6, np.eye(3) * 64.0
     np.testing.assert_allclose(wide.covariance - prior.covariance, added, rtol=1e-9, atol=1e-6)
@@ -363,9 +425,14 @@ def test_disagreeing_frames_widen_the_search_and_then_give_the_prior_up(
 ) -> None:
     """From the fourth on the search is widened; from the sixth on every third goes without a prior."""
     navigator = orbit.navigator(map_landmarks=False)
-    monkeypatch.setattr(navigator, "_fix", lambda *_: (None, 7, 10))
-    widened = recorded(monkeypatch, navigator, "_reacquire")
-    anywhere = recorded(monkeypatch, navigator, "_found_anywhere")
+    candidates = 7
+
+    def nothing(state: AnchoredState, *_: Any) -> anchored.Search:
+        return anchored.Search(state.estimate, None, candidates, 10)
+
+    monkeypatch.setattr(anchored, "search_around", nothing)
+    widened = recorded(monkeypatch, recovery, "search_widely")
+    anywhere = recorded(monkeypatch, recovery, "search_everywhere")
     counts = []
     for k in range(13):
         report = navigator.step(int(orbit.ticks[k]), orbit.detections(k), orbit.attitude(k))
@@ -374,7 +441,10 @@ def test_disagreeing_frames_widen_the_search_and_then_give_the_prior_up(
     assert counts == [
         (0, 0), (0, 0), (0, 0), (1, 0), (2, 0), (3, 1), (4, 1), (5, 1), (6, 2), (7, 2), (8, 2), (9, 3), (10, 3),
     ]  # fmt: skip
-    monkeypatch.setattr(navigator, "_fix", lambda *_: (None, 0, 10))
+    # The search index is made once.
+    assert navigator.state.places is not None
+    assert {id(given[-1]) for given in anywhere} == {id(navigator.state.places)}
+    candidates = 0
     report = navigator.step(int(orbit.ticks[13]), orbit.detections(13), orbit.attitude(13))
     assert report.outcome is Outcome.coasted
 
@@ -386,7 +456,7 @@ def test_craters_are_looked_for_as_far_outside_as_the_position_may_be_off(
     focal_px = 256.0 / np.tan(np.radians(60.0))
     for sigma_m in (300.0, 1_400.0, 3_500.0):
         navigator = orbit.navigator(tracking_limit_m=5_000.0)
-        prior = navigator.state
+        prior = navigator.estimate
         wide = np.zeros_like(prior.covariance)
         wide[:3, :3] = np.eye(3) * sigma_m**2
         prior = replace(prior, covariance=wide)
@@ -395,7 +465,9 @@ def test_craters_are_looked_for_as_far_outside_as_the_position_may_be_off(
         )
         nothing = in_view(orbit.map, pose, orbit.case.camera, 0.0).select(np.zeros(0, dtype=np.int64))
         calls = recorded(monkeypatch, anchored, "in_view", nothing)
-        assert navigator._fix(prior, pose, orbit.detections(0)) == (None, 0, 0)
+        state = replace(navigator.state, estimate=prior)
+        search = anchored.search_around(state, pose, orbit.detections(0), navigator.setup)
+        assert (search.fix, search.candidates, search.expected) == (None, 0, 0)
         monkeypatch.undo()
         altitude_m = np.linalg.norm(prior.mean[:3]) - 1_737_400.0
         assert calls[0][3] == pytest.approx(min(3.5 * sigma_m / altitude_m * focal_px, 200.0))
@@ -407,14 +479,16 @@ def test_what_identification_is_given_is_the_spread_of_prediction_and_catalogue(
     navigator = orbit.navigator()
     fly(orbit, navigator, 0, 3)
     # Some craters are among the states, others are not.
-    prior = navigator.state.only_craters(navigator.state.craters[::2])
+    prior = navigator.estimate.only_craters(navigator.estimate.craters[::2])
     pose = Pose(prior.mean[:3], orbit.attitude(2), orbit.rotations[2], np.zeros(3), np.zeros(2), np.zeros(3))
-    sighting = in_view(navigator.landmarks, pose, orbit.case.camera, 0.0)
-    calls = recorded(monkeypatch, anchored, "identify", "pairs")
+    landmarks, parameters = navigator.state.landmarks, navigator.setup.parameters
+    sighting = in_view(landmarks, pose, orbit.case.camera, 0.0)
+    calls = recorded(monkeypatch, association, "identify", "pairs")
     found = orbit.detections(2)
-    assert navigator._identify(prior, sighting, found) == "pairs"
-    ((given, seen, spread, own, variance, area_px2, parameters, place),) = calls
-    assert given is found and seen is sighting and parameters is navigator.parameters.identification
+    pairs = association.associate(prior, sighting, found, landmarks, orbit.case.camera, parameters)
+    assert pairs == "pairs"  # type: ignore[comparison-overlap]
+    ((given, seen, spread, own, variance, area_px2, rules, place),) = calls
+    assert given is found and seen is sighting and rules is parameters.identification
     assert area_px2 == 512.0 * 512.0
     np.testing.assert_allclose(variance, 1.0)
     count = len(sighting)
@@ -428,7 +502,7 @@ def test_what_identification_is_given_is_the_spread_of_prediction_and_catalogue(
         rows[here, 17] = sighting.by_scale[k]
         if slots[k] >= 0:
             rows[here, slots[k] : slots[k] + 3] = sighting.by_offset[k]
-    noise = navigator.parameters.errors.attitude_noise_rad
+    noise = parameters.errors.attitude_noise_rad
     tilt = np.concatenate([sighting.by_attitude[k] for k in range(count)]) * noise
     dense = (rows @ prior.covariance @ rows.T + tilt @ tilt.T).reshape(count, 2, count, 2)
     np.testing.assert_allclose(spread, dense, rtol=1e-9, atol=1e-9)
@@ -450,13 +524,15 @@ def test_the_map_is_shown_the_frame_as_corrected_and_what_no_crater_explains(
     found = orbit.detections(2)
     stray = Detections(*(np.append(column, 300.0) for column in (found.u_px, found.v_px)),
         np.append(found.diameter_px, 200.0), np.ones(len(found) + 1), np.ones(len(found) + 1))  # fmt: skip
-    state, fix = navigator.state, navigator.last_fix
-    assert fix is not None
-    calls = recorded(monkeypatch, navigator.mapper, "observe", ("a landmark",))
-    navigator.new_landmarks = ("the first",)
-    navigator._map(stray, orbit.attitude(2), orbit.rotations[2])
-    assert navigator.new_landmarks == ("the first", "a landmark")
-    ((view, shifted, variance, free, surface_m),) = calls
+    state, fix = navigator.estimate, navigator.fix
+    grown: Any = MapState(next_identity=7)
+    calls = recorded(monkeypatch, anchored.mapping, "observe", (grown, ("a landmark",)))
+    attitude, setup = orbit.attitude(2), navigator.setup
+    after, made = anchored.map_frame(navigator.state, fix, stray, attitude, orbit.rotations[2], setup)
+    assert made == ("a landmark",) and after.mapped is grown and after.estimate is state
+    ((mapped, view, shifted, variance, free, surface_m, camera, rules),) = calls
+    assert mapped is navigator.state.mapped and after.surface_m == surface_m
+    assert camera is setup.camera and rules is setup.parameters.mapping
     rotation = orbit.rotations[2]
     turn = Rotation.from_rotvec(-(state.mean[9:12] + fix.update.attitude_rad)).as_matrix()
     np.testing.assert_allclose(view.camera_from_mcmf, turn @ orbit.attitude(2) @ rotation.T, atol=1e-12)
@@ -471,16 +547,23 @@ def test_the_map_is_shown_the_frame_as_corrected_and_what_no_crater_explains(
     heights = np.linalg.norm(orbit.map.position_mcmf_m[fix.index], axis=1) - 1_737_400.0
     assert heights.min() - 1_000.0 < surface_m < heights.max() + 1_000.0
     # Without a fix the attitude is taken as measured, with its bias and its noise.
-    navigator.last_fix = None
-    navigator._map(stray, orbit.attitude(2), orbit.rotations[2])
-    errors = navigator.parameters.errors
-    assert calls[1][0].attitude_sigma_rad == pytest.approx(
+    anchored.map_frame(navigator.state, None, stray, attitude, orbit.rotations[2], setup)
+    errors = setup.parameters.errors
+    assert calls[1][1].attitude_sigma_rad == pytest.approx(
         np.hypot(errors.attitude_bias_rad, errors.attitude_noise_rad)
     )
     turn = Rotation.from_rotvec(-state.mean[9:12]).as_matrix()
     np.testing.assert_allclose(
-        calls[1][0].camera_from_mcmf, turn @ orbit.attitude(2) @ rotation.T, atol=1e-12
+        calls[1][1].camera_from_mcmf, turn @ orbit.attitude(2) @ rotation.T, atol=1e-12
     )
+
+
+def coasted_then_empty(orbit: Orbit, navigator: Navigator, seconds: int) -> list[AnchoredReport]:
+    start, nothing = int(orbit.ticks[2]), orbit.detections(3).select(np.zeros(0, dtype=np.int64))
+    return [
+        navigator.step(start + 100 * SECOND, None, None),
+        navigator.step(start + seconds * SECOND, nothing, None),
+    ]
 
 
 def test_a_pass_ends_when_nothing_was_seen_for_the_memory_of_craters(
@@ -490,41 +573,28 @@ def test_a_pass_ends_when_nothing_was_seen_for_the_memory_of_craters(
     for seconds, ended in ((240, 0), (241, 1), (-1, 1)):
         navigator = orbit.navigator()
         fly(orbit, navigator, 0, 3)
-        calls = recorded(monkeypatch, navigator, "_end_pass")
-        navigator.step(int(orbit.ticks[2]) + 100 * SECOND, None, None)
-        navigator.step(
-            int(orbit.ticks[2]) + seconds * SECOND,
-            orbit.detections(3).select(np.zeros(0, dtype=np.int64)),
-            None,
-        )
+        with monkeypatch.context() as patched:
+            calls = recorded(patched, anchored.mapping, "close", (navigator.state.mapped, ("new",)))
+            reports = coasted_then_empty(orbit, navigator, seconds)
+        assert [report.new_landmarks for report in reports] == [(), ("new",) * ended]
         assert len(calls) == ended, seconds
         # The search takes up where the image was, not where it was coasted to.
-        assert navigator._image_ticks == int(orbit.ticks[2]) + seconds * SECOND
+        assert navigator.state.image_ticks == int(orbit.ticks[2]) + seconds * SECOND
 
 
 def test_the_landmarks_of_a_pass_serve_from_its_end_on(orbit: Orbit, monkeypatch: pytest.MonkeyPatch) -> None:
     navigator = orbit.navigator()
-    before = navigator.landmarks
-    navigator._places = "searched before"
-    navigator._end_pass()
+    before = replace(navigator.state, places="searched before")  # type: ignore[arg-type]
+    after, made = anchored.end_pass(before, navigator.setup)
     # Nothing was mapped: the map stays.
-    assert navigator.landmarks is before and navigator._places == "searched before"
-
-    class Mapper:
-        def close(self) -> tuple[str, ...]:
-            return ("new",)
-
-        def __len__(self) -> int:
-            return 1
-
-        def with_catalogue(self, catalogue: Any) -> tuple[str, Any]:
-            return ("with", catalogue)
-
-    navigator.mapper = Mapper()
-    navigator._end_pass()
-    assert navigator.new_landmarks == ("new",)
-    assert navigator.landmarks == ("with", navigator._catalogue)
-    assert navigator._places is None
+    assert made == () and after.landmarks is before.landmarks and after.places is before.places
+    mapped: Any = MapState(landmarks=("one",))  # type: ignore[arg-type]
+    recorded(monkeypatch, anchored.mapping, "close", (mapped, ("new",)))
+    joined = recorded(monkeypatch, anchored.mapping, "with_catalogue", "both")
+    after, made = anchored.end_pass(before, navigator.setup)
+    assert made == ("new",) and after.mapped is mapped
+    assert after.landmarks == "both" and joined == [(("one",), navigator.setup.catalogue)]
+    assert after.places is None
 
 
 def test_the_move_between_frames_is_measured_on_what_no_fix_used(
@@ -532,39 +602,43 @@ def test_the_move_between_frames_is_measured_on_what_no_fix_used(
 ) -> None:
     navigator = orbit.navigator(relative=RelativeParameters(enabled=True))
     found = orbit.detections(0)
-    assert navigator.ties == 0
-    navigator.step(int(orbit.ticks[0]), found, orbit.attitude(0))
-    fix, before = navigator.last_fix, navigator._before
-    assert fix is not None and before is not None
+    assert navigator.step(int(orbit.ticks[0]), found, orbit.attitude(0)).ties == 0
+    fix, before = navigator.fix, navigator.state.previous
+    assert before is not None
     left = np.setdiff1d(np.arange(len(found)), fix.identification.detection)
     np.testing.assert_array_equal(before.found.u_px, found.u_px[left])
     np.testing.assert_allclose(before.variance_px2, np.ones(left.size))
     np.testing.assert_allclose(before.camera_from_icrf, orbit.attitude(0), atol=1e-12)
     np.testing.assert_allclose(before.mcmf_from_icrf, orbit.rotations[0], atol=1e-7)
-    prior, later = navigator.state, orbit.detections(1)
-    navigator._surface_m = 123.0
+    prior, later = navigator.estimate, orbit.detections(1)
+    setup, state = navigator.setup, replace(navigator.state, surface_m=123.0)
+
+    def tied(state: AnchoredState) -> tuple[AnchoredState, int]:
+        return anchored.tied(state, later, orbit.attitude(1), orbit.rotations[1], setup)
+
     calls = recorded(monkeypatch, anchored, "tie", (prior, 4))
-    assert navigator._tied(prior, later, orbit.attitude(1), orbit.rotations[1]) is prior
-    ((state, was, now, camera, surface_m, noise_rad, parameters),) = calls
-    assert state is prior and was is before and camera is orbit.case.camera and surface_m == 123.0
+    after, ties = tied(state)
+    assert after.estimate is prior and ties == 4
+    ((given, was, now, camera, surface_m, noise_rad, parameters),) = calls
+    assert given is prior and was is before and camera is orbit.case.camera and surface_m == 123.0
     assert now.found is later and now.camera_from_icrf is not before.camera_from_icrf
     np.testing.assert_allclose(now.variance_px2, 1.0)
-    assert noise_rad == navigator.parameters.errors.attitude_noise_rad
-    assert parameters is navigator.parameters.relative and navigator.ties == 4
-    # Each frame is compared once; without one before the clone of the position goes, too.
-    assert navigator._before is None
-    bare = navigator._tied(prior, later, orbit.attitude(1), orbit.rotations[1])
-    assert len(calls) == 1 and navigator.ties == 0
-    assert bare.mean.size == prior.mean.size - 3
+    assert noise_rad == setup.parameters.errors.attitude_noise_rad
+    assert parameters is setup.parameters.relative
+    # Each frame is compared once; without a previous one the clone of the position is dropped, too.
+    assert after.previous is None
+    bare, ties = tied(after)
+    assert len(calls) == 1 and ties == 0
+    assert bare.estimate.mean.size == prior.mean.size - 3
     # A position too uncertain to predict pixels is not tied, and a result that is none is not used.
-    navigator._before = before
     vague = replace(prior, covariance=prior.covariance + np.eye(prior.mean.size) * 1_600.0**2)
-    assert navigator._tied(vague, later, orbit.attitude(1), orbit.rotations[1]).mean.size == bare.mean.size
+    untied, ties = tied(replace(state, estimate=vague))
+    assert untied.estimate.mean.size == bare.estimate.mean.size and ties == 0
     assert len(calls) == 1
-    navigator._before = before
     monkeypatch.setattr(
         anchored, "tie", lambda *_: (replace(prior, mean=np.full(prior.mean.size, np.nan)), 1)
     )
-    np.testing.assert_array_equal(
-        navigator._tied(prior, later, orbit.attitude(1), orbit.rotations[1]).mean, bare.mean
-    )
+    np.testing.assert_array_equal(tied(state)[0].estimate.mean, bare.estimate.mean)
+    # The report of the next frame says how many were tied.
+    monkeypatch.setattr(anchored, "tie", lambda prior, *_: (without_clone(prior), 4))
+    assert navigator.step(int(orbit.ticks[1]), later, orbit.attitude(1)).ties == 4

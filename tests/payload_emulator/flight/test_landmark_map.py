@@ -12,11 +12,14 @@ from lunar.frames import mcmf_from_spherical
 from payload_emulator.flight.navigation.landmark_map import (
     FIRST_LANDMARK_ID,
     Landmark,
-    LandmarkMapper,
     MappingParameters,
+    MapState,
     View,
+    close,
     intersected,
+    observe,
     unclaimed,
+    with_catalogue,
 )
 from payload_emulator.flight.navigation.sighting import Sighting
 from payload_emulator.flight.vision.detections import Detections, no_detections
@@ -37,8 +40,30 @@ def ground(count: int, seed: int) -> np.ndarray:
     return mcmf_from_spherical(latitude, longitude, 300.0 + 400.0 * rng.standard_normal(count))
 
 
+class Mapper:
+    """A map under construction with its rules."""
+
+    def __init__(self, **changes: float) -> None:
+        self.parameters, self.state = MappingParameters(**changes), MapState()  # type: ignore[arg-type]  # integers among them
+
+    def __len__(self) -> int:
+        return len(self.state.landmarks)
+
+    def observe(
+        self, view: View, found: Detections, variance: np.ndarray, free: np.ndarray, surface_m: float
+    ) -> tuple[Landmark, ...]:
+        self.state, made = observe(
+            self.state, view, found, variance, free, surface_m, CAMERA, self.parameters
+        )
+        return made
+
+    def close(self) -> tuple[Landmark, ...]:
+        self.state, made = close(self.state, CAMERA, self.parameters)
+        return made
+
+
 def fly(
-    mapper: LandmarkMapper,
+    mapper: Mapper,
     craters: np.ndarray,
     seed: int,
     frames: int = 6,
@@ -76,7 +101,7 @@ def nearest_m(landmark: Landmark, craters: np.ndarray) -> float:
 
 def test_craters_become_landmarks_where_they_are_and_with_errors_as_claimed() -> None:
     craters = ground(25, 1)
-    mapper = LandmarkMapper(CAMERA)
+    mapper = Mapper()
     made = fly(mapper, craters, 2)
     assert len(made) == len(mapper) >= 15
     errors, nees = [], []
@@ -97,7 +122,7 @@ def test_craters_become_landmarks_where_they_are_and_with_errors_as_claimed() ->
 def test_the_spacecrafts_error_is_in_every_landmark_and_in_its_covariance() -> None:
     craters = ground(25, 1)
     wrong = np.array([0.0, 150.0, 120.0])
-    shifted = LandmarkMapper(CAMERA)
+    shifted = Mapper()
     made = fly(shifted, craters, 2, error_m=wrong)
     mean = np.mean(
         [
@@ -114,7 +139,7 @@ def test_the_spacecrafts_error_is_in_every_landmark_and_in_its_covariance() -> N
 
 
 def test_false_detections_do_not_become_landmarks() -> None:
-    mapper = LandmarkMapper(CAMERA)
+    mapper = Mapper()
     fly(mapper, np.empty((0, 3)) + RADIUS_M, 3, frames=8, false=12)
     # Ninety-six of them; chance lines up three now and then.
     assert len(mapper) <= 3
@@ -122,7 +147,7 @@ def test_false_detections_do_not_become_landmarks() -> None:
 
 def test_a_second_pass_joins_the_landmarks_of_the_first_without_counting_its_error_twice() -> None:
     craters = ground(25, 1)
-    mapper = LandmarkMapper(CAMERA)
+    mapper = Mapper()
     first = fly(mapper, craters, 2)
     count = len(mapper)
     second = fly(mapper, craters, 9, start_ticks=7_000 * SECOND, east_m=8_000.0)
@@ -151,46 +176,46 @@ def test_the_intersection_never_claims_more_than_the_better_of_two_equal_directi
 
 
 def test_memory_is_bounded() -> None:
-    mapper = LandmarkMapper(CAMERA, MappingParameters(tracks=10, landmarks=4))
+    mapper = Mapper(tracks=10, landmarks=4)
     fly(mapper, ground(40, 1), 2, frames=6)
     assert len(mapper) <= 4
-    best = min(landmark.sightings for landmark in mapper.landmarks.values())
+    best = min(landmark.sightings for landmark in mapper.state.landmarks)
     assert best >= 3
 
 
 def test_landmarks_stand_beside_the_catalogue_with_identities_of_their_own() -> None:
-    mapper = LandmarkMapper(CAMERA)
+    mapper = Mapper()
     craters = ground(25, 1)
     fly(mapper, craters, 2)
     one = np.ones(1)
     catalogue = CatalogueTable(
         np.array([7]), 0.1 * one, 0.2 * one, 6e3 * one, 50.0 * one, 80.0 * np.ones((1, 3))
     )
-    merged = mapper.with_catalogue(catalogue)
+    merged = with_catalogue(mapper.state.landmarks, catalogue)
     assert len(merged) == 1 + len(mapper)
     assert set(merged.ids[merged.ids < FIRST_LANDMARK_ID].tolist()) == {7}
     assert np.all(np.diff(merged.latitude_rad) >= 0.0)
     own = merged.position_mcmf_m[merged.ids >= FIRST_LANDMARK_ID]
     assert {tuple(np.round(place)) for place in own} == {
-        tuple(np.round(landmark.position_mcmf_m)) for landmark in mapper.landmarks.values()
+        tuple(np.round(landmark.position_mcmf_m)) for landmark in mapper.state.landmarks
     }
 
 
 def test_nothing_is_mapped_while_the_spacecraft_does_not_know_where_it_is_or_sees_nothing() -> None:
-    mapper = LandmarkMapper(CAMERA, MappingParameters(position_limit_m=50.0))
+    mapper = Mapper(position_limit_m=50.0)
     assert fly(mapper, ground(25, 1), 2) == []
     nothing = no_detections()
     place = mcmf_from_spherical(0.0, 0.0, 30e3)
     view = View(0, nadir_camera_from_mcmf(place), place, np.eye(3), 1e-4)
-    assert LandmarkMapper(CAMERA).observe(view, nothing, np.empty(0), np.empty(0, dtype=bool), 0.0) == ()
+    assert Mapper().observe(view, nothing, np.empty(0), np.empty(0, dtype=bool), 0.0) == ()
     lost = replace(view, covariance_m2=np.full((3, 3), np.nan))
     one = np.ones(1)
     found = Detections(200.0 * one, 200.0 * one, 20.0 * one, one, one)
-    assert LandmarkMapper(CAMERA).observe(lost, found, one, np.ones(1, dtype=bool), 0.0) == ()
+    assert Mapper().observe(lost, found, one, np.ones(1, dtype=bool), 0.0) == ()
 
 
 def test_detections_that_are_no_numbers_are_left_out() -> None:
-    mapper = LandmarkMapper(CAMERA)
+    mapper = Mapper()
     place = mcmf_from_spherical(0.0, 0.0, 30e3)
     view = View(0, nadir_camera_from_mcmf(place), place, np.eye(3), 1e-4)
     values = np.array([np.nan, 200.0, 300.0])

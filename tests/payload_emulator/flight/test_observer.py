@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from payload_emulator.flight.navigation.anchored import AnchoredReport
+from payload_emulator.flight.navigation import anchored
+from payload_emulator.flight.navigation.anchored import AnchoredReport, Observation
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.onboard.loads import FlightParameters, FlightTables
 from payload_emulator.flight.onboard.observer import Observer
@@ -73,19 +74,30 @@ class Navigator:
 
     def __init__(self) -> None:
         self.given: list[tuple[int, Detections | None, Any]] = []
-        self.outcome, self.lost, self.last_fix, self.new_landmarks = Outcome.coasted, False, None, ()
+        self.outcome, self.lost, self.fix, self.new_landmarks = Outcome.coasted, False, None, ()
         self.breaks = self.reacquired = False
         root = RNG.standard_normal((18, 18))
-        self.state = SimpleNamespace(mean=np.arange(18.0), covariance=root @ root.T)
-        self.landmarks = SimpleNamespace(ids=np.arange(100) + 1_000)
+        self.start = SimpleNamespace(estimate=None, landmarks=None)
+        self.state = SimpleNamespace(
+            estimate=SimpleNamespace(mean=np.arange(18.0), covariance=root @ root.T),
+            landmarks=SimpleNamespace(ids=np.arange(100) + 1_000),
+        )
+        self.widened: list[tuple[float, float]] = []
 
-    def step(self, ticks: int, found: Detections | None, camera_from_icrf: Any) -> AnchoredReport:
-        self.given.append((ticks, found, camera_from_icrf))
+    def step(self, state: Any, observation: Observation, setup: Any) -> tuple[Any, AnchoredReport]:
+        assert setup == "the tables" and state is (self.state if self.given else self.start)
+        self.given.append((observation.ticks, observation.found, observation.camera_from_icrf))
         if self.breaks:
             raise np.linalg.LinAlgError
-        return AnchoredReport(
-            self.outcome, 0.1, -0.2, 30e3, (1.0, 2.0, 3.0), (4.0, 6.0, 5.0), 7.0, 3, 9, 11, self.reacquired
-        )
+        return self.state, AnchoredReport(
+            self.outcome, 0.1, -0.2, 30e3, (1.0, 2.0, 3.0), (4.0, 6.0, 5.0), 7.0, 3, 9, 11, self.reacquired,
+            self.lost, 0, self.fix, self.new_landmarks,
+        )  # fmt: skip
+
+    def widen(self, state: Any, position_m: float, velocity_m_s: float) -> Any:
+        assert state is self.start
+        self.widened.append((position_m, velocity_m_s))
+        return self.start
 
 
 def detections(count: int) -> Detections:
@@ -99,10 +111,12 @@ def detections(count: int) -> Detections:
 
 
 @pytest.fixture
-def rig() -> SimpleNamespace:
+def rig(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     eye, telemetry, clock, navigator = Eye(), Recorder(), Clock(), Navigator()
     observer = Observer(eye, FlightParameters(modes=(Mode.anchored,)), telemetry, clock)
-    observer._navigator = navigator
+    observer._setup, observer._anchored = "the tables", navigator.start
+    monkeypatch.setattr(anchored, "step", navigator.step)
+    monkeypatch.setattr(anchored, "widened", navigator.widen)
     return SimpleNamespace(eye=eye, telemetry=telemetry, clock=clock, navigator=navigator, observer=observer)
 
 
@@ -116,12 +130,12 @@ def test_the_estimate_goes_down_with_the_upper_triangle_and_the_degrees_of_its_i
     rig: SimpleNamespace,
 ) -> None:
     rig.navigator.outcome = Outcome.fixed
-    rig.navigator.last_fix = SimpleNamespace(
+    rig.navigator.fix = SimpleNamespace(
         identification=SimpleNamespace(detection=np.array([0, 3, 5])), index=np.array([7, 2, 40])
     )
     look(rig)
     (sent,) = rig.telemetry.named("filter_estimate")
-    covariance = rig.navigator.state.covariance
+    covariance = rig.navigator.state.estimate.covariance
     assert sent["covariance"].tolist() == [covariance[i, j] for i in range(9) for j in range(i, 9)]
     assert [*sent["position_icrf_m"], *sent["velocity_icrf_m_s"], *sent["acceleration_rtn_m_s2"]] == list(
         range(9)
@@ -152,7 +166,7 @@ def test_pairs_name_the_detection_by_its_place_among_those_reported(rig: SimpleN
     score = np.linspace(0.2, 0.9, 300)
     rig.eye.found = Detections(*(np.full(300, 50.0),) * 3, score, np.full(300, 0.7))
     rig.navigator.outcome = Outcome.fixed
-    rig.navigator.last_fix = SimpleNamespace(
+    rig.navigator.fix = SimpleNamespace(
         identification=SimpleNamespace(detection=np.array([10, 45, 299])), index=np.array([1, 2, 3])
     )
     look(rig)
@@ -449,7 +463,7 @@ def test_detections_are_reported_within_the_range_of_their_fields_and_with_their
 
 
 def test_without_an_altitude_no_detection_has_a_class(rig: SimpleNamespace) -> None:
-    rig.observer._navigator = None
+    rig.observer._setup = rig.observer._anchored = None
     look(rig)
     (sent,) = rig.telemetry.named("detections")
     assert set(sent["items"]["size_class"].tolist()) == {-1}
@@ -462,17 +476,16 @@ def test_a_damaged_table_is_told_by_its_number_and_its_hash(rig: SimpleNamespace
     assert rig.telemetry.events == [
         ("high", "table_refused", float(number), float(table_hash(octets))) for number in (1, 2, 10)
     ]
-    assert observer._navigator is None
+    assert observer._setup is None and observer._anchored is None
 
 
 def test_a_widened_orbit_and_a_reset_reach_the_navigator(rig: SimpleNamespace) -> None:
-    calls: list[tuple[float, float]] = []
-    rig.navigator.widen = lambda position, velocity: calls.append((position, velocity))
+    calls = rig.navigator.widened
     rig.observer.widen(500.0, 0.5)
     assert calls == [(500.0, 0.5)]
     rig.observer._odometry[Mode.paper] = "remembered"
     rig.observer.reset()
     # There are no tables to start a new one from.
-    assert rig.observer._navigator is None and rig.observer._odometry == {}
+    assert rig.observer._setup is None and rig.observer._anchored is None and rig.observer._odometry == {}
     rig.observer.widen(500.0, 0.5)
     assert len(calls) == 1

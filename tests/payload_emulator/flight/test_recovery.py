@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from payload_emulator.flight.navigation.anchored import AnchoredParameters
+from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
 from payload_emulator.flight.navigation.lost_in_space import LostParameters
 from studies.montecarlo import CatalogueErrors, Kidnap, NavigationCase, NavigationRun, fly
 

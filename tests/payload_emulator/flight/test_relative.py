@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from payload_emulator.flight.navigation.anchored import AnchoredParameters
+from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
 from payload_emulator.flight.navigation.dynamics import ProcessNoise
 from payload_emulator.flight.navigation.filter import CommonErrors
 from payload_emulator.flight.navigation.relative import CLONE, RelativeParameters, with_clone, without_clone
