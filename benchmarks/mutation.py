@@ -122,6 +122,10 @@ GROUPS = {
             for name in (
                 "navigation/filter",
                 "navigation/anchored",
+                "navigation/prediction",
+                "navigation/association",
+                "navigation/correction",
+                "navigation/recovery",
                 "onboard/observer",
                 "navigation/acquisition",
             )

@@ -411,7 +411,7 @@ def test_a_widened_search_adds_its_radius_to_what_the_orbit_believes(
     prior, found = navigator.estimate, orbit.detections(0)
     calls = recorded(monkeypatch, recovery, "search_by_votes", "the fix")
     chosen: Any = ("the map", "the camera", navigator.setup.parameters)
-    assert recovery.search_widely(prior, "the pose", found, *chosen) == "the fix"  # type: ignore[arg-type]
+    assert recovery.search_widely(prior, "the pose", found, *chosen) == "the fix"
     ((wide, pose, given, *rest, radius_m),) = calls
     assert (pose, radius_m) == ("the pose", 8_000.0) and given is found and tuple(rest) == chosen
     added = np.zeros_like(prior.covariance)
@@ -486,7 +486,7 @@ def test_what_identification_is_given_is_the_spread_of_prediction_and_catalogue(
     calls = recorded(monkeypatch, association, "identify", "pairs")
     found = orbit.detections(2)
     pairs = association.associate(prior, sighting, found, landmarks, orbit.case.camera, parameters)
-    assert pairs == "pairs"  # type: ignore[comparison-overlap]
+    assert pairs == "pairs"
     ((given, seen, spread, own, variance, area_px2, rules, place),) = calls
     assert given is found and seen is sighting and rules is parameters.identification
     assert area_px2 == 512.0 * 512.0
@@ -584,11 +584,11 @@ def test_a_pass_ends_when_nothing_was_seen_for_the_memory_of_craters(
 
 def test_the_landmarks_of_a_pass_serve_from_its_end_on(orbit: Orbit, monkeypatch: pytest.MonkeyPatch) -> None:
     navigator = orbit.navigator()
-    before = replace(navigator.state, places="searched before")  # type: ignore[arg-type]
+    before = replace(navigator.state, places="searched before")
     after, made = anchored.end_pass(before, navigator.setup)
     # Nothing was mapped: the map stays.
     assert made == () and after.landmarks is before.landmarks and after.places is before.places
-    mapped: Any = MapState(landmarks=("one",))  # type: ignore[arg-type]
+    mapped: Any = MapState(landmarks=("one",))
     recorded(monkeypatch, anchored.mapping, "close", (mapped, ("new",)))
     joined = recorded(monkeypatch, anchored.mapping, "with_catalogue", "both")
     after, made = anchored.end_pass(before, navigator.setup)

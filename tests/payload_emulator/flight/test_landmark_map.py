@@ -44,7 +44,7 @@ class Mapper:
     """A map under construction with its rules."""
 
     def __init__(self, **changes: float) -> None:
-        self.parameters, self.state = MappingParameters(**changes), MapState()  # type: ignore[arg-type]  # integers among them
+        self.parameters, self.state = MappingParameters(**changes), MapState()
 
     def __len__(self) -> int:
         return len(self.state.landmarks)
