@@ -248,7 +248,7 @@ class LocalOperations:
         return {"windows": import_plan(self.ground, entries, actor=self._actor)}
 
     def list_audit(
-        self, *, limit: int = 100, since: str | None = None, until: str | None = None, **equal: str | None
+        self, *, limit: int = 100, since: str | None = None, until: str | None = None, **equal: Any
     ) -> View:
         from ground_service.access.audit_log import list_entries
         from ground_service.http.times import time_of

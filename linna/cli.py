@@ -9,7 +9,7 @@ import argparse
 import importlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from linna import __version__
 
@@ -89,7 +89,7 @@ def _run(arguments: Sequence[str]) -> int:
     return _guarded(handler, namespace)
 
 
-def _guarded(handler, namespace: argparse.Namespace) -> int:
+def _guarded(handler: Callable[[argparse.Namespace], int | None], namespace: argparse.Namespace) -> int:
     try:
         return int(handler(namespace) or 0)
     except KeyboardInterrupt:

@@ -235,7 +235,7 @@ def study_lost_in_frames(
     rng = np.random.default_rng((seed, 3))
     index = place_index(world.board)
     rules = LostParameters(attitude_sigma_rad=attitude_rad)
-    results = []
+    results: list[tuple[float | None, float]] = []
     while len(results) < sets:
         group = _consecutive(world, combined, rng, model, attitude_rad, altitudes_m, least_detections, camera)
         if group is None:

@@ -114,14 +114,14 @@ def _partners(frames: Sequence[tuple[Dataset, Frame]], rule: PairRule) -> list[i
     for k, (_, frame) in enumerate(frames):
         apart = np.abs((azimuth - azimuth[k] + 180.0) % 360.0 - 180.0) >= rule.suns_apart_deg
         best, share = -1, rule.overlap
-        for j in np.flatnonzero(apart):
+        for j in np.flatnonzero(apart).tolist():
             other = frames[j][1]
             near = np.linalg.norm(other.position_mcmf_m - frame.position_mcmf_m) < 300_000.0
             if other.source != frame.source or not near:
                 continue
             seen = float(_in_view(*frames[j], ground[k])[1].mean())
             if seen >= share:
-                best, share = int(j), seen
+                best, share = j, seen
         chosen.append(best)
     return chosen
 

@@ -22,7 +22,7 @@ from ground_service.http.common import (
     RowId,
     page_of,
 )
-from ground_service.http.model import Given
+from ground_service.http.model import Given, Schema
 from ground_service.http.requests import StrictRoute
 from ground_service.http.times import time_of
 
@@ -61,7 +61,7 @@ class NewToken(Given):
     revoke_others: bool = Field(default=False, description="Revoke all earlier tokens of the user")
 
 
-class UserWithToken(schemas.Schema):
+class UserWithToken(Schema):
     """User and new token; the token cannot be read again."""
 
     user: users.User

@@ -241,7 +241,7 @@ def list_commands(
     ground: Ground, *, state: str | None = None, limit: int = 100, offset: int = 0
 ) -> tuple[list[CommandView], int]:
     """Telecommands, the newest first; `state` keeps those in one stored state (queued, released, rejected, sent)."""
-    equal = {"state": state} if state is not None else {}
+    equal: dict[str, Any] = {"state": state} if state is not None else {}
     with ground.database.reading() as connection:
         page = repository.page(connection, repository.TELECOMMANDS, limit=limit, offset=offset, **equal)
         return [command_view(connection, row) for row in page.rows], page.total

@@ -31,7 +31,8 @@ def albedo_picture(path: Path) -> NDArray[np.uint8]:
     small = cv2.resize(grey, (WIDTH_PX, WIDTH_PX // 2), interpolation=cv2.INTER_AREA).astype(np.float32)
     low, high = np.percentile(small, (0.5, 99.5))
     stretched = np.clip((small - low) / max(float(high - low), 1.0), 0.0, 1.0)
-    return np.rint(40.0 + 180.0 * stretched).astype(np.uint8)
+    grey_levels: NDArray[np.uint8] = np.rint(40.0 + 180.0 * stretched).astype(np.uint8)
+    return grey_levels
 
 
 def surface_map(path: Path) -> TerrainMap:

@@ -9,8 +9,7 @@ from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from ground_service.access.service import LOCAL_CALLER, Caller, authenticate, has_users
-from ground_service.errors import NotAuthorised
-from ground_service.http.problems import Forbidden
+from ground_service.errors import Forbidden, NotAuthorised
 
 VERIFIED_CALLER = "verified_caller"
 """Key in the request state for the user whose token was verified; absent without a verified token."""

@@ -13,7 +13,7 @@ from ground_service.passes.series import Series
 from ground_service.planning.core import Candidate, SearchResult
 from ground_service.store.repository import Row
 from lunar.timescales import format_utc
-from tmtc.dictionary import FAILURES
+from tmtc.codes import FAILURES
 
 _FAILURES = dict(FAILURES)
 

@@ -200,7 +200,7 @@ def add_edges(
     connection: Connection, domain: str, edges: Iterable[Edge], file_sha256: str | None = None
 ) -> list[bytes]:
     """Store the new edges of a domain; return the identities of all."""
-    rows = [
+    rows: list[dict[str, Any]] = [
         {
             "domain": domain,
             "identity": identity_of(edge, file_sha256),
@@ -216,8 +216,8 @@ def add_edges(
         }
         for edge in edges
     ]
-    _insert_new(connection, STREAM_EDGES, sorted(rows, key=lambda row: bytes(row["identity"])))
-    return [row["identity"] for row in rows]
+    _insert_new(connection, STREAM_EDGES, sorted(rows, key=lambda row: row["identity"]))
+    return [bytes(row["identity"]) for row in rows]
 
 
 def identity_of(edge: Edge, file_sha256: str | None) -> bytes:

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sqlalchemy import Connection
 
 from ground_service.ground import Ground
 from ground_service.ingest import edge_store as store
@@ -126,7 +127,7 @@ class Joiner:
     _found: _Found = field(default_factory=_Found)
     _joined_cadus: _Found = field(default_factory=_Found)
 
-    def vehicle(self, connection: repository.Connection, spacecraft: int) -> int:
+    def vehicle(self, connection: Connection, spacecraft: int) -> int:
         """Return the vehicle id of a spacecraft; create it if it is new."""
         if spacecraft not in self.vehicles:
             vehicle = repository.vehicle_id(connection, spacecraft, self.piece.scope)
@@ -134,7 +135,7 @@ class Joiner:
             self.vehicles[spacecraft] = vehicle
         return self.vehicles[spacecraft]
 
-    def keep_channel_edges(self, connection: repository.Connection, edges: Sequence[ChannelEdge]) -> None:
+    def keep_channel_edges(self, connection: Connection, edges: Sequence[ChannelEdge]) -> None:
         """Store the fragments in channels for `join`, within the caller's transaction."""
         by_domain: dict[str, list[Edge]] = {}
         for one in edges:
@@ -144,7 +145,7 @@ class Joiner:
         for domain, mine in sorted(by_domain.items()):
             self._channels += [(domain, identity) for identity in store.add_edges(connection, domain, mine)]
 
-    def keep_edges(self, connection: repository.Connection, link: Link, edges: Sequence[Edge]) -> None:
+    def keep_edges(self, connection: Connection, link: Link, edges: Sequence[Edge]) -> None:
         """Store the edges of the piece, whose link is `link`, within the caller's transaction."""
         domain = raw_domain(self.piece, link)
         if self.piece.stream:
@@ -207,17 +208,13 @@ class Joiner:
                 self.joined.samples += stored.samples
         return waiting
 
-    def _open(
-        self, connection: repository.Connection, domain: str, identities: Sequence[bytes]
-    ) -> Iterator[StoredEdge]:
+    def _open(self, connection: Connection, domain: str, identities: Sequence[bytes]) -> Iterator[StoredEdge]:
         """Yield the edges that wait and are not used by results found meanwhile."""
         for edge in store.open_edges(connection, domain, identities):
             if edge.edge.role != PLACED and not self._found.uses(edge):
                 yield edge
 
-    def _candidates(
-        self, connection: repository.Connection, domain: str, role: int, **wanted: Any
-    ) -> list[StoredEdge]:
+    def _candidates(self, connection: Connection, domain: str, role: int, **wanted: Any) -> list[StoredEdge]:
         found = store.candidates(connection, domain, role, **wanted)
         return [edge for edge in found if not self._found.uses(edge)]
 
@@ -226,9 +223,7 @@ class Joiner:
 
     # CADUs
 
-    def _join_cadus_by_place(
-        self, connection: repository.Connection, domain: str, settings: LinkSettings
-    ) -> None:
+    def _join_cadus_by_place(self, connection: Connection, domain: str, settings: LinkSettings) -> None:
         length, octets = settings.cadu_length, self.piece.octets
         before = store.octets_before(connection, self.piece, length - 1)
         behind = store.octets_behind(connection, self.piece, length + ASM_LENGTH - 1)
@@ -259,7 +254,7 @@ class Joiner:
                     wrong = wrong[octets:]
 
     def _join_cadu_by_content(
-        self, connection: repository.Connection, domain: str, settings: LinkSettings, edge: StoredEdge
+        self, connection: Connection, domain: str, settings: LinkSettings, edge: StoredEdge
     ) -> None:
         length = settings.cadu_length
         counts = [edge.edge.count if edge.edge.role == CLOSER else edge.edge.next_count, UNKNOWN]
@@ -276,7 +271,7 @@ class Joiner:
                 return
 
     def _with_count_first(
-        self, connection: repository.Connection, domain: str, role: int, fit: int, counts: list[int]
+        self, connection: Connection, domain: str, role: int, fit: int, counts: list[int]
     ) -> Iterator[list[StoredEdge]]:
         """Yield the edges of the right length: those with the right count first, then those with any count."""
         if counts[0] == UNKNOWN:
@@ -289,7 +284,7 @@ class Joiner:
         yield [one for one in found if one.id not in tried]
 
     def _with_middles(
-        self, connection: repository.Connection, domain: str, edge: StoredEdge, counts: list[int], length: int
+        self, connection: Connection, domain: str, edge: StoredEdge, counts: list[int], length: int
     ) -> Iterator[list[list[StoredEdge]]]:
         """Yield arrangements of a CADU with pieces without a position, those with fewer pieces first."""
         middles = self._candidates(connection, domain, MIDDLE, limit=MIDDLES_LIMIT)
@@ -381,7 +376,7 @@ class Joiner:
                 for edge in self._open(connection, domain, identities):
                     self._join_channel(connection, domain, edge)
 
-    def _join_channel(self, connection: repository.Connection, domain: str, edge: StoredEdge) -> None:
+    def _join_channel(self, connection: Connection, domain: str, edge: StoredEdge) -> None:
         """Join the packet that an edge of a channel belongs to."""
         for path in self._channel_paths(connection, domain, edge):
             octets = b"".join(one.edge.octets for one in path)
@@ -397,7 +392,7 @@ class Joiner:
         return next(spacecraft for spacecraft, one in self.vehicles.items() if one == vehicle)
 
     def _channel_paths(
-        self, connection: repository.Connection, domain: str, edge: StoredEdge
+        self, connection: Connection, domain: str, edge: StoredEdge
     ) -> Iterator[list[StoredEdge]]:
         """Yield sequences of edges, from an opener to a closer, that an edge may belong to."""
         budget = PATHS_LIMIT
@@ -413,7 +408,7 @@ class Joiner:
                     return
 
     def _backwards(
-        self, connection: repository.Connection, domain: str, path: list[StoredEdge]
+        self, connection: Connection, domain: str, path: list[StoredEdge]
     ) -> Iterator[list[StoredEdge]]:
         count = path[0].edge.count
         held = sum(len(one.edge.octets) for one in path)
@@ -429,7 +424,7 @@ class Joiner:
                     yield from self._backwards(connection, domain, [middle, *path])
 
     def _forwards(
-        self, connection: repository.Connection, domain: str, path: list[StoredEdge]
+        self, connection: Connection, domain: str, path: list[StoredEdge]
     ) -> Iterator[list[StoredEdge]]:
         octets = b"".join(one.edge.octets for one in path)
         count = path[-1].edge.next_count
@@ -446,7 +441,7 @@ class Joiner:
 
     # bare packets
 
-    def _join_packets_by_place(self, connection: repository.Connection, domain: str) -> None:
+    def _join_packets_by_place(self, connection: Connection, domain: str) -> None:
         """Cut packets from the last known packet start before the piece, as far as octets are available."""
         before = store.octets_before(connection, self.piece, PACKET_MAX_LENGTH)
         behind = store.octets_behind(connection, self.piece, PACKET_MAX_LENGTH)
@@ -470,7 +465,7 @@ class Joiner:
 
     def _walk_packets(
         self,
-        connection: repository.Connection,
+        connection: Connection,
         domain: str,
         parts: Sequence[Part],
         stream: bytes,
@@ -493,9 +488,7 @@ class Joiner:
                 opener = Edge(OPENER, UNKNOWN, UNKNOWN, octets, rest[0].start)
                 self._found.openers.append((domain, rest[0].file_sha256, opener))
 
-    def _join_packet_by_content(
-        self, connection: repository.Connection, domain: str, edge: StoredEdge
-    ) -> None:
+    def _join_packet_by_content(self, connection: Connection, domain: str, edge: StoredEdge) -> None:
         assert self.piece.spacecraft_id is not None
         middles = []
         if not self.piece.stream:
@@ -530,7 +523,7 @@ class Joiner:
 
     def _packet_path(
         self,
-        connection: repository.Connection,
+        connection: Connection,
         domain: str,
         opener: StoredEdge,
         middles: Sequence[StoredEdge],
@@ -587,7 +580,7 @@ def raw_domain(piece: Piece, link: Link) -> str:
     return f"cadus {store.link_digest(link)} {piece.scope}"
 
 
-def _known_beginnings(connection: repository.Connection, domain: str, parts: Sequence[Part]) -> list[int]:
+def _known_beginnings(connection: Connection, domain: str, parts: Sequence[Part]) -> list[int]:
     """Return the known starts of incomplete packets in a chain of parts, which are waiting openers."""
     places = []
     position = 0

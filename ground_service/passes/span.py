@@ -25,7 +25,7 @@ class PassSpan:
     correlations: tuple[TimeCorrelation, ...]
     dictionary_version: int
 
-    def utc_ns(self, ticks: Sequence[int]) -> IntArray:
+    def utc_ns(self, ticks: Sequence[int] | IntArray) -> IntArray:
         """Return the correlated UTC (n,) of on-board ticks."""
         return utc_ns_of_ticks(np.array(ticks, dtype=np.int64), self.correlations)[0]
 

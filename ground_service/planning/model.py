@@ -64,7 +64,7 @@ class ResourcesIn(Given):
 
     def value(self) -> Resources:
         """As the planner takes them."""
-        stations = STATIONS
+        stations: tuple[GroundStation, ...] = STATIONS
         if self.stations is not None:
             stations = tuple(
                 GroundStation(

@@ -25,7 +25,7 @@ from ground_service.store.states import change_if
 from ground_service.timekeeping.core import TimeCorrelation, ticks_of_utc_ns
 from ground_service.timekeeping.store import load_correlations
 from lunar.constants import NANOSECONDS_PER_SECOND
-from tmtc.dictionary import EVENTS
+from tmtc.codes import EVENTS
 
 MARGIN_NS = 60 * NANOSECONDS_PER_SECOND
 """Reports of the start and the stop may be this far from the planned times."""

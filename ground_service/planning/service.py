@@ -355,7 +355,7 @@ def list_windows(
     ground: Ground, *, state: str | None = None, limit: int = 100, offset: int = 0
 ) -> tuple[list[repository.Row], int]:
     """Windows, the newest first."""
-    equal = {"state": state} if state is not None else {}
+    equal: dict[str, Any] = {"state": state} if state is not None else {}
     with ground.database.reading() as connection:
         page = repository.page(connection, repository.WINDOWS, limit=limit, offset=offset, **equal)
         return [_joined(connection, row) for row in page.rows], page.total

@@ -10,6 +10,7 @@ from pydantic import Field
 
 from ground_service.access.service import Caller
 from ground_service.api.routes import get_job
+from ground_service.errors import Forbidden
 from ground_service.ground import Ground
 from ground_service.http import schemas
 from ground_service.http.common import (
@@ -25,8 +26,7 @@ from ground_service.http.common import (
     idempotent_id,
     page_of,
 )
-from ground_service.http.model import Given
-from ground_service.http.problems import Forbidden
+from ground_service.http.model import Given, Schema
 from ground_service.http.requests import StrictRoute
 from ground_service.http.uploads import UploadOf
 from ground_service.http.views import time_text
@@ -50,7 +50,7 @@ _ZIP = {
 regressions = APIRouter(route_class=StrictRoute, prefix=API_PREFIX, responses=PROBLEMS)
 
 
-class BuildOut(schemas.Schema):
+class BuildOut(Schema):
     """A registered payload build."""
 
     digest: str
@@ -65,7 +65,7 @@ class BuildOut(schemas.Schema):
     registered: str
 
 
-class ArchiveOut(schemas.Schema):
+class ArchiveOut(Schema):
     """A pass archive kept to be flown again."""
 
     digest: str
@@ -88,7 +88,7 @@ class RegressionRequest(Given):
     )
 
 
-class RegressionOut(schemas.Schema):
+class RegressionOut(Schema):
     """The verdict on a candidate build."""
 
     id: str
@@ -97,7 +97,7 @@ class RegressionOut(schemas.Schema):
     result: dict[str, Any] = Field(description="As printed by `linna regress run --json`")
 
 
-class RegressionItem(schemas.Schema):
+class RegressionItem(Schema):
     """One line of the list of verdicts."""
 
     id: str

@@ -27,13 +27,14 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, InvalidInput
 from ground_service.ground import Ground
 from ground_service.regression.archives import PassArchive, check_out, keep_archive, store_of
-from ground_service.regression.build_runs import OK, OUTCOMES, PERFORMANCE, read_performance, run_build
+from ground_service.regression.build_runs import OK, OUTCOMES, read_performance, run_build
 from ground_service.regression.builds import Build
 from ground_service.regression.core import FAIL, INCONCLUSIVE, PASS, Gate, judge, verdict_of
 from ground_service.regression.metrics import outcome_shares, same_telemetry
 from ground_service.regression.model import PassFrames
 from ground_service.regression.policy import PolicyFile
 from ground_service.regression.replay_samples import PassContext, ReadDownlink, pass_context, read_downlink
+from ground_service.regression.runner import PERFORMANCE
 from ground_service.store import repository
 from lunar.errors import LunarError
 from lunar.timescales import format_utc

@@ -24,6 +24,8 @@ import stat
 import struct
 import sys
 import time
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, BinaryIO
 
 from ground_service.sandbox import kernel
 
@@ -43,6 +45,8 @@ WORLD_WRITABLE = ("/tmp", "/dev/shm", "/var/tmp", "/run")
 DEVICES = ("null", "zero", "full", "random", "urandom")
 WRITABLE = ("/out", "/tmp", "/home/build", "/dev/shm")
 _CHUNK = 1 << 16
+
+Json = dict[str, Any]
 
 
 class Refused(Exception):
@@ -66,7 +70,7 @@ def main() -> None:
 # Mode "namespaces"
 
 
-def run_in_namespaces(run):
+def run_in_namespaces(run: Json) -> Json:
     mapping, uid = user_map()
     entered, mapped, control, reports, printed = (os.pipe() for _ in range(5))
     b = os.fork()
@@ -103,7 +107,7 @@ def run_in_namespaces(run):
         close(entered[0], mapped[1], control[1], reports[0], printed[0])
 
 
-def user_map():
+def user_map() -> tuple[tuple[tuple[str, str | None], ...], int]:
     """Return the maps of the user namespace, and the user of the build inside it.
 
     A service that runs as root assigns the build a unique user, derived from the process id: limits per user apply to
@@ -127,12 +131,14 @@ def user_map():
     ), me
 
 
-def build_uid():
+def build_uid() -> int:
     """Return a user id for this run."""
     return FIRST_BUILD_UID + os.getpid()
 
 
-def enter_namespaces(run, uid, entered, mapped, control, reports, printed):
+def enter_namespaces(
+    run: Json, uid: int, entered: int, mapped: int, control: int, reports: int, printed: int
+) -> None:
     """Run process B."""
     kernel.die_with_parent()
     try:
@@ -158,7 +164,7 @@ def enter_namespaces(run, uid, entered, mapped, control, reports, printed):
     os._exit(os.waitstatus_to_exitcode(os.waitpid(c, 0)[1]) & 0xFF)
 
 
-def be_init(run, uid, control, reports, printed):
+def be_init(run: Json, uid: int, control: int, reports: int, printed: int) -> None:
     """Run process C, process 1 of the namespace."""
     try:
         kernel.die_with_parent()
@@ -197,7 +203,7 @@ def be_init(run, uid, control, reports, printed):
     send_outputs(reports, run)
 
 
-def build_root(run, uid):
+def build_root(run: Json, uid: int) -> str:
     """Create a root with only the parts that the run needs; all other paths become unreachable."""
     limits = run["limits"]
     kernel.mount("", "/", "", kernel.MS_REC | kernel.MS_PRIVATE)
@@ -250,7 +256,7 @@ def build_root(run, uid):
     return ", ".join(parts if has_proc else [*parts, "no /proc"])
 
 
-def bind(source, target):
+def bind(source: str, target: str) -> None:
     if os.path.isdir(source):
         os.makedirs(target, exist_ok=True)
     else:
@@ -259,7 +265,7 @@ def bind(source, target):
     kernel.mount(source, target, "", kernel.MS_BIND | kernel.MS_REC)
 
 
-def check_network():
+def check_network() -> None:
     """Refuse to continue with any network interface other than a loopback that is down."""
     try:
         with open("/proc/net/route") as stream:
@@ -273,7 +279,7 @@ def check_network():
 # Mode "user"
 
 
-def run_as_user(run):
+def run_as_user(run: Json) -> Json:
     """Run in a dedicated runner container, as a user that is used for this run only."""
     if os.geteuid() != 0:
         raise Refused("separate user: expected a runner with CAP_SETUID, CAP_SETGID and CAP_KILL")
@@ -317,17 +323,17 @@ def run_as_user(run):
         close(reports[0], printed[0])
 
 
-def prepare_home(home):
+def prepare_home(home: str) -> None:
     for path in ("", "/out", "/tmp", "/home"):
         os.mkdir(home + path, 0o700)
 
 
-def kill_user(uid):
+def kill_user(uid: int) -> None:
     """Kill every process of a user."""
     as_user(uid, lambda: os.kill(-1, signal.SIGKILL))
 
 
-def as_user(uid, action):
+def as_user(uid: int, action: Callable[[], object]) -> None:
     """Call a function in a child process with this user id, and wait for it."""
     child = os.fork()
     if child == 0:
@@ -341,13 +347,13 @@ def as_user(uid, action):
     os.waitpid(child, 0)
 
 
-def put_on_user(uid):
+def put_on_user(uid: int) -> None:
     os.setgroups([])
     os.setresgid(uid, uid, uid)
     os.setresuid(uid, uid, uid)
 
 
-def remove_owned(uid):
+def remove_owned(uid: int) -> None:
     """Remove the files of this user in the world-writable folders."""
     for place in WORLD_WRITABLE:
         # A folder without permissions hides its content: make all folders accessible before os.walk reads them.
@@ -361,7 +367,7 @@ def remove_owned(uid):
                     (os.rmdir if stat.S_ISDIR(os.lstat(path).st_mode) else os.unlink)(path)
 
 
-def owned(folder, names, uid):
+def owned(folder: str, names: Iterable[str], uid: int) -> Iterator[str]:
     """Yield the paths of these names in a folder that belong to a user."""
     for name in names:
         path = os.path.join(folder, name)
@@ -373,7 +379,7 @@ def owned(folder, names, uid):
 # Both
 
 
-def become_build(run, uid, gid, printed, change_user):
+def become_build(run: Json, uid: int, gid: int, printed: int, change_user: bool) -> None:
     """Replace this forked process by the program (process D)."""
     limits = run["limits"]
     try:
@@ -422,24 +428,42 @@ def become_build(run, uid, gid, printed, change_user):
 class Watch:
     """Supervision by process A: limits, printed text, and the report of process C."""
 
-    def __init__(self, run, root, reports, printed, stop, *, own=0, shared_disk=False):
+    def __init__(
+        self,
+        run: Json,
+        root: int,
+        reports: int,
+        printed: int,
+        stop: Callable[[], object],
+        *,
+        own: int = 0,
+        shared_disk: bool = False,
+    ) -> None:
         # `own`: number of first descendants that belong to the sandbox; their memory is not counted.
         self.run, self.root, self.stop, self.own, self.shared_disk = run, root, stop, own, shared_disk
         self.occupied_before = occupied()
         self.reports, self.printed = reports, printed
         self.tail, self.octets_printed = b"", 0
-        self.buffer, self.file, self.left = b"", None, 0
-        self.report = {"cause": "", "exit_status": None, "signal": None, "cpu_s": 0.0, "peak_rss_mib": 0.0}
-        self.started, self.deadline, self.next_sample = None, time.monotonic() + SETUP_S, 0.0
+        self.buffer, self.left = b"", 0
+        self.file: BinaryIO | None = None
+        self.report: Json = {
+            "cause": "",
+            "exit_status": None,
+            "signal": None,
+            "cpu_s": 0.0,
+            "peak_rss_mib": 0.0,
+        }
+        self.started: float | None = None
+        self.deadline, self.next_sample = time.monotonic() + SETUP_S, 0.0
         self.open = {reports, printed}
         self.done = False
         self.most_mib = self.cpu_s = 0.0
 
     @property
-    def expired(self):
+    def expired(self) -> bool:
         return time.monotonic() > self.deadline
 
-    def until_done(self):
+    def until_done(self) -> Json:
         while not self.done and not self.expired and self.reports in self.open:
             self.turn(POLL_S)
         if self.file is not None:
@@ -458,7 +482,7 @@ class Watch:
         self.report.setdefault("wall_s", time.monotonic() - self.started)
         return self.report
 
-    def turn(self, timeout_s):
+    def turn(self, timeout_s: float) -> None:
         for descriptor in select.select(list(self.open), [], [], timeout_s)[0]:
             octets = os.read(descriptor, _CHUNK)
             if not octets:
@@ -475,11 +499,11 @@ class Watch:
             if now - self.started > self.run["limits"]["wall_s"]:
                 self.end("timeout")
 
-    def keep(self, octets):
+    def keep(self, octets: bytes) -> None:
         self.octets_printed += len(octets)
         self.tail = (self.tail + octets)[-PRINTED_OCTETS:]
 
-    def drain(self):
+    def drain(self) -> None:
         """Read the rest of the pipe after all writers have ended."""
         while self.printed in self.open and select.select([self.printed], [], [], 0)[0]:
             octets = os.read(self.printed, _CHUNK)
@@ -487,12 +511,12 @@ class Watch:
                 return
             self.keep(octets)
 
-    def end(self, cause):
+    def end(self, cause: str) -> None:
         self.report["cause"] = cause
         self.deadline = time.monotonic() + COLLECT_S
         self.stop()
 
-    def sample(self):
+    def sample(self) -> None:
         limits = self.run["limits"]
         rss, cpu, counted = 0, 0.0, []
         for place, process in enumerate(descendants(self.root)):
@@ -516,12 +540,12 @@ class Watch:
         elif self.folder_full():
             self.end("disk")
 
-    def folder_full(self):
+    def folder_full(self) -> bool:
         """Return whether a run without its own file system has exceeded its file space, including deleted files."""
         written = occupied() - self.occupied_before
         return self.shared_disk and written > self.run["limits"]["folder_mib"] << 20
 
-    def take(self, octets):
+    def take(self, octets: bytes) -> None:
         """Process octets of the report: messages, each followed by the file that it announces."""
         self.buffer += octets
         while self.buffer:
@@ -543,7 +567,7 @@ class Watch:
             self.buffer = self.buffer[4 + length :]
             self.obey(message)
 
-    def obey(self, message):
+    def obey(self, message: Json) -> None:
         now = time.monotonic()
         if "started" in message:
             self.started, self.deadline = now, float("inf")
@@ -551,7 +575,7 @@ class Watch:
         elif "ended" in message:
             self.deadline = now + COLLECT_S
             status = message["ended"]
-            self.report["wall_s"] = now - self.started
+            self.report["wall_s"] = now - (now if self.started is None else self.started)
             self.report["cpu_s"], self.report["peak_rss_mib"] = message["cpu_s"], message["peak_rss_mib"]
             self.report["full"] = message["full"]
             if status is not None and os.WIFEXITED(status):
@@ -577,7 +601,7 @@ class Watch:
             self.done = True
 
 
-def send_outputs(reports, run):
+def send_outputs(reports: int, run: Json) -> None:
     """Send the output files: only regular files of a permitted size with requested names."""
     folder = os.open(run.get("collect", "/out"), os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     for name in run["outputs"]:
@@ -599,22 +623,22 @@ def send_outputs(reports, run):
     send(reports, {"done": True})
 
 
-def send(descriptor, message):
+def send(descriptor: int, message: Json) -> None:
     octets = json.dumps(message).encode()
     write_all(descriptor, struct.pack(">I", len(octets)) + octets)
 
 
-def write_all(descriptor, octets):
+def write_all(descriptor: int, octets: bytes) -> None:
     while octets:
         octets = octets[os.write(descriptor, octets) :]
 
 
-def read_some(descriptor, timeout_s):
+def read_some(descriptor: int, timeout_s: float) -> bytes:
     """Return the octets that can be read within a time; empty if the other end is closed or sends nothing."""
     return os.read(descriptor, _CHUNK) if select.select([descriptor], [], [], timeout_s)[0] else b""
 
 
-def reaped(wanted):
+def reaped(wanted: int) -> int | None:
     """Return the status of a child that has ended, reaping all other ended children; None while it runs."""
     status = None
     while True:
@@ -628,7 +652,7 @@ def reaped(wanted):
             status = found
 
 
-def wait_for(child, timeout_s):
+def wait_for(child: int, timeout_s: float) -> None:
     """Wait for a child to end, without reaping it."""
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
@@ -637,7 +661,7 @@ def wait_for(child, timeout_s):
         time.sleep(POLL_S)
 
 
-def reap():
+def reap() -> None:
     """Wait for all children that have ended."""
     deadline = time.monotonic() + 5.0
     while time.monotonic() < deadline:
@@ -648,12 +672,12 @@ def reap():
             return
 
 
-def usage():
+def usage() -> dict[str, float]:
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return {"cpu_s": used.ru_utime + used.ru_stime, "peak_rss_mib": used.ru_maxrss / 1024.0}
 
 
-def occupied():
+def occupied() -> int:
     """Return the number of octets used in the world-writable folders."""
     total = 0
     for place in ("/tmp", "/dev/shm"):
@@ -663,7 +687,7 @@ def occupied():
     return total
 
 
-def proportional_memory(process):
+def proportional_memory(process: int) -> int:
     """Return the proportional set size of a process in octets; the resident set size if that is not readable."""
     with (
         contextlib.suppress(OSError, IndexError, ValueError),
@@ -677,9 +701,9 @@ def proportional_memory(process):
     return 0
 
 
-def descendants(root):
+def descendants(root: int) -> list[int]:
     """Return the descendants of a process, parents first."""
-    children = {}
+    children: dict[int, list[int]] = {}
     for name in os.listdir("/proc"):
         if name.isdigit():
             with contextlib.suppress(OSError, IndexError, ValueError), open(f"/proc/{name}/stat") as stream:
@@ -691,7 +715,7 @@ def descendants(root):
     return found
 
 
-def close(*descriptors):
+def close(*descriptors: int) -> None:
     for descriptor in descriptors:
         os.close(descriptor)
 

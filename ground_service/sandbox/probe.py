@@ -9,6 +9,7 @@ import json
 import os
 import socket
 import sys
+from collections.abc import Callable
 
 LIBC = ctypes.CDLL(None, use_errno=True)
 
@@ -38,7 +39,7 @@ def main() -> None:
         json.dump(results, stream)
 
 
-def refused(action) -> bool:
+def refused(action: Callable[[], object]) -> bool:
     try:
         action()
     except OSError as error:
@@ -46,8 +47,8 @@ def refused(action) -> bool:
     return False
 
 
-def called(name, *arguments) -> bool:
-    return getattr(LIBC, name)(*arguments) == 0
+def called(name: str, *arguments: int | bytes | None) -> bool:
+    return bool(getattr(LIBC, name)(*arguments) == 0)
 
 
 def own_processes_only() -> bool:

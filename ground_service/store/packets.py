@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -19,10 +19,13 @@ RANGE_GAP_TICKS = 600 << 16
 """Stored packets are looked up by ranges of on-board time; a silence of ten minutes splits a range, so that a batch
 with one stray packet of another year does not read the years between."""
 
-_TABLES = {table.__tablename__: table.__table__ for table in SAMPLE_TABLES}
+_TABLES: dict[str, Any] = {table.__tablename__: table.__table__ for table in SAMPLE_TABLES}
 _PACKETS: Any = Packet.__table__
 
-_PACKED = {"detections": pack_detections, "identifications": pack_identifications}
+_PACKED: dict[str, Callable[..., list[bytes]]] = {
+    "detections": pack_detections,
+    "identifications": pack_identifications,
+}
 
 _IN_RANGE = select(_PACKETS.c.digest).where(
     _PACKETS.c.vehicle_id == bindparam("vehicle_id"),

@@ -139,9 +139,8 @@ def page(
         order = [table.c.created_utc_ns, key]
     else:
         order = [key]
-    if newest_first:
-        order = [column.desc() for column in order]
-    rows = connection.execute(query.order_by(*order).limit(limit).offset(offset)).mappings()
+    query = query.order_by(*(column.desc() if newest_first else column for column in order))
+    rows = connection.execute(query.limit(limit).offset(offset)).mappings()
     return Page([dict(row) for row in rows], int(total))
 
 

@@ -64,7 +64,7 @@ _DELETED = delete(_TABLE).where(
 
 def width_ticks(level: int) -> int:
     """Length of the buckets of a level."""
-    return BASE_TICKS * 4**level
+    return int(BASE_TICKS * 4**level)
 
 
 def add_to_rollups(

@@ -377,7 +377,7 @@ def _light_time_ns(
     unknown = np.isnan(light_s)
     if unknown.all():
         away = np.asarray(earth_position_icrf_m(np.asarray(tdb_s_from_utc_ns(earth_utc_ns))))
-        return np.rint(np.linalg.norm(away, axis=-1) / SPEED_OF_LIGHT_M_S * 1e9).astype(np.int64)
+        return np.asarray(np.rint(np.linalg.norm(away, axis=-1) / SPEED_OF_LIGHT_M_S * 1e9), dtype=np.int64)
     return np.where(unknown, -1, np.rint(np.where(unknown, 0.0, light_s) * 1e9)).astype(np.int64)
 
 

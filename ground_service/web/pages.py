@@ -16,7 +16,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 
 from ground_service.commanding.approval import DEFAULT_POLICY
 from ground_service.errors import NotFound
-from ground_service.passes.service import PARAMETERS, STATE_VALUES
+from ground_service.passes.series import PARAMETERS, STATE_VALUES
 from ground_service.web.basemap import basemap_jpeg
 from tmtc.dictionary import DICTIONARY
 from tmtc.schema import Field, PacketDefinition

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from sqlalchemy import Connection, MetaData, Table, func, insert, select
+from sqlalchemy import ColumnDefault, Connection, MetaData, Table, func, insert, select
 
 from ground_service.errors import (
     Conflict,
@@ -411,7 +411,7 @@ def _upgraded(
             continue
         if (table.name, column.name) in EARLIER_VALUES:
             added[column.name] = EARLIER_VALUES[table.name, column.name]
-        elif column.default is not None and column.default.is_scalar:
+        elif isinstance(column.default, ColumnDefault) and column.default.is_scalar:
             added[column.name] = column.default.arg
         elif column.nullable:
             added[column.name] = None

@@ -30,4 +30,5 @@ def readyz(ground: GroundOf) -> schemas.Health:
 @operations.get("/metrics")
 def metrics(request: Request, ground: GroundOf) -> Response:
     """Figures for Prometheus."""
-    return request.app.state.metrics.answer(ground)
+    answer: Response = request.app.state.metrics.answer(ground)
+    return answer

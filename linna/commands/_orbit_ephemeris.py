@@ -72,7 +72,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
     if epochs is not None:
         epochs = epochs[second.covers(epochs)]
     difference = compare(first, second, epochs if epochs is not None and len(epochs) else None)
-    figures = {
+    figures: dict[str, Any] = {
         "max_m": difference.max_m,
         "rms_m": difference.rms_m,
         "rms_rtn_m": list(difference.rms_rtn_m),
@@ -160,7 +160,7 @@ def run_stats(arguments: argparse.Namespace) -> int:
     orientation = default_orientation(data_folder())
     track = ground_track(ephemeris, orientation, _epochs(arguments.step, ephemeris))
     numbers = track_statistics(ephemeris, track)
-    figures = {
+    figures: dict[str, Any] = {
         "states": numbers.states,
         "start": format_utc(int(track.utc_ns[0])),
         "stop": format_utc(int(track.utc_ns[-1])),

@@ -54,7 +54,7 @@ def run_visibility(arguments: argparse.Namespace) -> int:
             for start, stop in spans
         ]
 
-    figures = {
+    figures: dict[str, Any] = {
         "start": format_utc(found.start_utc_ns),
         "stop": format_utc(found.stop_utc_ns),
         "eclipses": listed(found.eclipse),
@@ -67,10 +67,10 @@ def run_visibility(arguments: argparse.Namespace) -> int:
         "data": [f"lunar orientation {orientation.name}"],
     }
     kinds = {
-        "eclipses": figures["eclipses"],
-        "nights below": figures["nights"],
-        "occultations": figures["occultations"],
-        **{f"contacts {name}": spans for name, spans in figures["contacts"].items()},
+        "eclipses": listed(found.eclipse),
+        "nights below": listed(found.night),
+        "occultations": listed(found.occultation),
+        **{f"contacts {name}": listed(spans) for name, spans in found.contacts.items()},
     }
     whole_s = (found.stop_utc_ns - found.start_utc_ns) / 1e9
     lines = [f"{figures['start']} to {figures['stop']}, orientation {orientation.name}"]

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 from linna.output import add_json_flag, emit
 
 if TYPE_CHECKING:
+    from lunar.arrays import FloatArray
     from lunar.catalogue import CraterCatalogue
+    from payload_emulator.sim.terrain.curation import Region
 
 SYNTHETIC = ("paper-density", "paper-density-synthetic", "paper-density-uniform")
 CATALOGUE_HELP = (
@@ -179,7 +181,7 @@ def run_curate(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _region(text: str):
+def _region(text: str) -> Region:
     from linna.errors import UsageError
     from payload_emulator.sim.terrain.curation import Region
 
@@ -212,7 +214,7 @@ def open_catalogue(name: str | None, seed: int) -> CraterCatalogue:
     return load_catalogue(found)
 
 
-def _range(values) -> dict[str, float]:
+def _range(values: FloatArray) -> dict[str, float]:
     if len(values) == 0:
         return {"min": float("nan"), "max": float("nan")}
     return {"min": float(values.min()), "max": float(values.max())}

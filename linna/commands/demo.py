@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
+from typing import Any
 
 from linna.commands.pass_ import requirement_lines
 from linna.output import add_json_flag, emit, log, progress
@@ -61,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def describe(figures: dict) -> str:
+def describe(figures: dict[str, Any]) -> str:
     """The short table at the end of the demo."""
     detector = figures["detector"]
     lines = [

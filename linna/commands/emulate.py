@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from linna.output import add_json_flag, emit, log, progress
 
@@ -172,7 +172,7 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
     return 0
 
 
-def describe(summary: dict, out: Path) -> str:
+def describe(summary: dict[str, Any], out: Path) -> str:
     """A few lines about an emulated window, for people."""
     altitude, link = summary["altitude_km"], summary["link"]
     outcomes = ", ".join(f"{name} {count}" for name, count in summary["outcomes"].items() if count)

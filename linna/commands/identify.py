@@ -5,8 +5,12 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from linna.output import add_json_flag, emit, log
+
+if TYPE_CHECKING:
+    from studies.identification import DetectionModel, StudyWorld
 
 LEVEL = "level 1-2: simulated detections of the craters of a catalogue (stated recall, precision and errors), no images"
 
@@ -80,7 +84,7 @@ def run_lost(arguments: argparse.Namespace) -> int:
     sets = hostile if arguments.sets is None else arguments.sets
     log(f"{sets} sets of four frames")
     scores.append(study_lost_in_frames(world, sets, arguments.seed, model=model, attitude_rad=attitude_rad))
-    figures = {
+    figures: dict[str, Any] = {
         "single_correct_share": scores[0].correct_share,
         "four_frames_correct_share": scores[-1].correct_share,
         "wrong": sum(score.wrong for score in scores),
@@ -119,7 +123,7 @@ def run_tracking(arguments: argparse.Namespace) -> int:
         log(f"{frames} frames, {kind}")
         scores.append(study_tracking(world, max(frames, 1), arguments.seed, kind=kind, model=model))
     pairs = sum(score.pairs for score in scores)
-    figures = {
+    figures: dict[str, Any] = {
         "frames": sum(score.frames for score in scores),
         "wrong_association_share": sum(score.wrong_pairs for score in scores) / max(pairs, 1),
         "wrong_fixes": sum(score.wrong_fixes for score in scores),
@@ -146,7 +150,7 @@ def run_tracking(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _provenance(arguments: argparse.Namespace, name: str, model) -> dict[str, object]:
+def _provenance(arguments: argparse.Namespace, name: str, model: DetectionModel) -> dict[str, object]:
     return {
         "detections": asdict(model),
         "seed": arguments.seed,
@@ -155,7 +159,7 @@ def _provenance(arguments: argparse.Namespace, name: str, model) -> dict[str, ob
     }
 
 
-def _model(arguments: argparse.Namespace):
+def _model(arguments: argparse.Namespace) -> DetectionModel:
     from linna.errors import UsageError
     from studies.identification import DetectionModel
 
@@ -176,7 +180,7 @@ def _model(arguments: argparse.Namespace):
     )
 
 
-def _world(arguments: argparse.Namespace):
+def _world(arguments: argparse.Namespace) -> StudyWorld:
     from linna.commands.catalogue import open_catalogue
     from payload_emulator.sim.terrain.curation import catalogue_of_table
     from studies.identification import study_world

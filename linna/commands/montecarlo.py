@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
+from typing import Any
 
 from linna.output import add_json_flag, emit
 
@@ -58,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 1 if arguments.gate and not judged.consistent else 0
 
 
-def describe(figures: dict) -> str:
+def describe(figures: dict[str, Any]) -> str:
     """A few lines about the runs, for people."""
     low, high = figures["anees_bounds"]
     inside = ", ".join(f"{share:.3f}" for share in figures["contained_95"])

@@ -114,7 +114,7 @@ def _bar(items: Iterable[Any], total: int) -> Any:
     return progress(items, total, "frames", "frame")
 
 
-def _describe(summary: dict, out: Path) -> str:
+def _describe(summary: dict[str, Any], out: Path) -> str:
     outcomes = ", ".join(f"{name} {count}" for name, count in summary["outcomes"].items() if count)
     return "\n".join(
         [

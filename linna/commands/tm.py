@@ -201,7 +201,8 @@ def _add_link_options(parser: argparse.ArgumentParser) -> None:
 def _read(arguments: argparse.Namespace, dictionary: Dictionary | None = None) -> DownlinkDecode:
     from linna.errors import UsageError
     from tmtc.dictionary import DICTIONARY
-    from tmtc.downlink import LinkSettings, decode
+    from tmtc.downlink import decode
+    from tmtc.link import LinkSettings
 
     octets = arguments.file.read_bytes()
     given = {

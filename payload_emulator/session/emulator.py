@@ -48,7 +48,7 @@ from payload_emulator.session.world import (
 from payload_emulator.sim.board.faults import parse_fault
 from payload_emulator.sim.board.link import Reception, save_receptions, save_time_receptions, transmit
 from tmtc.dictionary import DICTIONARY
-from tmtc.downlink import LinkSettings
+from tmtc.link import LinkSettings
 
 Progress = Callable[[Iterable[Any], int], Iterator[Any]]
 

@@ -35,7 +35,7 @@ from payload_emulator.session.world import (
 from payload_emulator.sim.board.link import LIGHT_S, Receiver, Transmitter, contacts
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import APID_TIME_REPORT, DICTIONARY
-from tmtc.downlink import LinkSettings
+from tmtc.link import LinkSettings
 
 SPACECRAFT_ID = 0x4C
 

@@ -43,8 +43,8 @@ from payload_emulator.session.spacecraft import Spacecraft
 from payload_emulator.session.world import World, exposures
 from payload_emulator.sim.board.link import LIGHT_S, Receiver, Transmitter, transmit
 from tmtc.dictionary import DICTIONARY
-from tmtc.downlink import LinkSettings
 from tmtc.errors import TmtcError
+from tmtc.link import LinkSettings
 from tmtc.uplink import CLTU_START, CLTU_TAIL
 
 Signal = TypeVar("Signal")

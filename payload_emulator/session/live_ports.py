@@ -60,7 +60,7 @@ class Server:
     port: int
     host: str
     receive: Callable[[int, bytes], None]
-    ended: Callable[[int], None] = lambda number: None
+    ended: Callable[[int], object] = lambda number: None
     listener: socket.socket = field(init=False)
     clients: dict[int, Client] = field(default_factory=dict)
     _selector: selectors.BaseSelector | None = None

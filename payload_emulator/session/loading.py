@@ -279,10 +279,9 @@ def filter_field(name: str, degree: int, data: DataFolder) -> GravityField:
 def _orientation_table(orientation: Orientation, start_utc_ns: int, stop_utc_ns: int) -> bytes:
     """The rotation of the Moon as uploaded, an hour between samples, with a margin for interpolation."""
     times = np.arange(
-        start_utc_ns - _ORIENTATION_MARGIN_NS,
-        stop_utc_ns + _ORIENTATION_MARGIN_NS,
-        _ORIENTATION_STEP_NS,
-        np.int64,
+        np.int64(start_utc_ns - _ORIENTATION_MARGIN_NS),
+        np.int64(stop_utc_ns + _ORIENTATION_MARGIN_NS),
+        np.int64(_ORIENTATION_STEP_NS),
     )
     tdb_s = np.asarray(tdb_s_from_utc_ns(times), dtype=np.float64)
     mcmf_from_icrf = orientation.mcmf_from_icrf(tdb_s)

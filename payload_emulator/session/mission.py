@@ -28,7 +28,7 @@ from payload_emulator.session.scenario import SHIPPED, RequirementsSection, Scen
 from payload_emulator.session.world import World, build_world
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
-from tmtc.downlink import LinkSettings
+from tmtc.link import LinkSettings
 
 MISSION_FILE = "mission.toml"
 ATTITUDE_FILE = "attitude.csv"

@@ -369,7 +369,7 @@ def parse_scenario(text: str, source: str = "scenario") -> Scenario:
         raise ScenarioError(f"{source}: not TOML: {error}") from None
     if "name" not in table:
         raise ScenarioError(f"{source}: key 'name' is missing, expected a short text")
-    scenario = _build(Scenario, table, source, "")
+    scenario: Scenario = _build(Scenario, table, source, "")
     _check(scenario, source)
     return scenario
 

@@ -158,7 +158,7 @@ def build_world(scenario: Scenario, data: DataFolder) -> World:
 def _one_arc_of(interval: int, frame_utc_ns: IntArray, step_ns: int) -> IntArray:
     """The frames of one arc out of so many; an arc ends where the latitude limit interrupts the frames."""
     arc = np.cumsum(np.diff(frame_utc_ns, prepend=frame_utc_ns[:1]) > step_ns)
-    return frame_utc_ns[arc % interval == 0]
+    return np.asarray(frame_utc_ns[arc % interval == 0])
 
 
 def _disturbed(
@@ -312,7 +312,7 @@ def true_sun_direction(
         return sun_direction_mcmf(elevation, azimuth, float(latitude), float(longitude))
     tdb_s = float(tdb_s_from_utc_ns(utc_ns))
     from_moon = sun_position_icrf_m(tdb_s) - world.truth.states(utc_ns)[0][0]
-    return world.truth.orientation.mcmf_from_icrf(tdb_s) @ (from_moon / np.linalg.norm(from_moon))
+    return np.asarray(world.truth.orientation.mcmf_from_icrf(tdb_s) @ (from_moon / np.linalg.norm(from_moon)))
 
 
 def clock_ticks(world: World, utc_ns: int) -> int:

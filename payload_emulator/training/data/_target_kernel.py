@@ -4,32 +4,34 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lunar._compile import njit
 
 
 @njit(nogil=True)
-def paint(  # type: ignore[no-untyped-def]
-    x,
-    y,
-    radius,
-    labelled,
-    weight,
-    size_class,
-    log_diameter,
-    tenfold_depth,
-    sigma_of_radius,
-    min_sigma,
-    ignore_of_radius,
-    min_ignore,
-    heat,
-    positive,
-    negative,
-    geometry,
-    regressed,
-):
+def paint(
+    x: NDArray[Any],
+    y: NDArray[Any],
+    radius: NDArray[Any],
+    labelled: NDArray[Any],
+    weight: NDArray[Any],
+    size_class: NDArray[Any],
+    log_diameter: NDArray[Any],
+    tenfold_depth: NDArray[Any],
+    sigma_of_radius: float,
+    min_sigma: float,
+    ignore_of_radius: float,
+    min_ignore: float,
+    heat: NDArray[Any],
+    positive: NDArray[Any],
+    negative: NDArray[Any],
+    geometry: NDArray[Any],
+    regressed: NDArray[Any],
+) -> None:
     """Paint craters (n,) given in cells into the target maps; see `targets.Targets` for what each map holds."""
     channels, rows, columns = heat.shape
     strength = np.zeros((rows, columns))

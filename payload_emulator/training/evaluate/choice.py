@@ -25,7 +25,7 @@ def choose(
     DatasetError
         There are no validation frames, or they are of another camera than a detector's.
     """
-    rows = {}
+    rows: dict[str, dict[str, Any]] = {}
     for name, octets in models.items():
         detector = open_for_evaluation(octets)
         scored = run(detector, datasets, "val", progress=progress)

@@ -328,7 +328,10 @@ def _row(
         return None
     latitude, longitude, height = spherical_from_mcmf(point[group].mean(axis=0))
     place = Landmarks(
-        *(np.array([float(value)]) for value in (latitude, longitude, height, np.median(size[group]))),
+        np.array([float(latitude)]),
+        np.array([float(longitude)]),
+        np.array([float(height)]),
+        np.array([float(np.median(size[group]))]),
         sightings=np.array([group.size]),
         looks=np.array([0]),
         score=np.array([score[group].mean()]),

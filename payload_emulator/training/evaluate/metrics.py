@@ -146,7 +146,7 @@ def score(
     }
 
 
-def repeatability(tallied: Tally, threshold: float) -> dict[str, float | int]:
+def repeatability(tallied: Tally, threshold: float) -> dict[str, float | int | dict[str, float | int]]:
     """P(found in one frame | found in another that shows the same crater), over ordered pairs of frames.
 
     The frames of a data set differ in Sun and pose, so this is harder than from one exposure to the next of a pass;

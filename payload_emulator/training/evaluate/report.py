@@ -243,15 +243,20 @@ def _bias(figures: dict[str, Any]) -> tuple[BiasBin, ...]:
         BiasBin(
             label,
             row["pairs"],
-            *(
-                (row[key], *row["interval_95"][key])
-                for key in ("du_px", "dv_px", "toward_sun_px", "across_sun_px")
-            ),
-            row["median_length_px"],
+            _mean_with_interval(row, "du_px"),
+            _mean_with_interval(row, "dv_px"),
+            _mean_with_interval(row, "toward_sun_px"),
+            _mean_with_interval(row, "across_sun_px"),
+            median_length_px=row["median_length_px"],
         )
         for label, row in rows
         if row["pairs"]
     )
+
+
+def _mean_with_interval(row: dict[str, Any], key: str) -> tuple[float, float, float]:
+    low, high = row["interval_95"][key]
+    return row[key], low, high
 
 
 def _sigma(calibration: dict[str, Any]) -> tuple[SigmaBin, ...]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -296,8 +297,7 @@ def match_any(
         return np.zeros(detection_u.size, bool)
     limit = np.full(truth_u.shape[0], rule.pixels) if rule.radii == 0.0 else 0.5 * rule.radii * truth_diameter
     distance = np.hypot(detection_u[:, None] - truth_u[None, :], detection_v[:, None] - truth_v[None, :])
-    near: BoolArray = (distance <= limit[None, :]).any(axis=1)
-    return near
+    return np.asarray((distance <= limit[None, :]).any(axis=1))
 
 
 def best_threshold(
@@ -406,7 +406,7 @@ def bootstrap_recall(
     return float(np.percentile(recall, 2.5)), float(np.percentile(recall, 97.5))
 
 
-def _columns(parts: list[tuple[NDArray[np.generic], ...]], count: int) -> list[NDArray[np.generic]]:
+def _columns(parts: list[tuple[NDArray[Any], ...]], count: int) -> list[NDArray[Any]]:
     if not parts:
         return [np.zeros(0) for _ in range(count)]
     return [np.concatenate(column) for column in zip(*parts, strict=True)]
