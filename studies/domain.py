@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from lunar.arrays import BoolArray
 from payload_emulator.errors import DatasetError
 from payload_emulator.training.data.dataset import Dataset, Frame, frame_truth
 from payload_emulator.training.data.truth import FrameTruth
@@ -118,7 +119,7 @@ def _figures(
     truths: Sequence[FrameTruth],
     found: Sequence[FrameDetections],
     reference: Sequence[FrameDetections],
-    mask: np.typing.BoolArray,
+    mask: BoolArray,
     threshold: float,
 ) -> dict[str, Any]:
     chosen = [int(k) for k in np.flatnonzero(mask)]

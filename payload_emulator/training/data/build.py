@@ -280,7 +280,7 @@ def _terrain(source: Source, seed: int, data_root: str) -> Any:
     if key not in _open_terrains:
         _open_terrains.clear()
         data = find_data(Path(data_root) if data_root else None)
-        options = {} if source.sharpen else {"sharpen": False}
+        options: dict[str, Any] = {} if source.sharpen else {"sharpen": False}
         _open_terrains[key] = open_terrain(_TERRAIN_KINDS[source.terrain], data, seed, **options)
     return _open_terrains[key]
 

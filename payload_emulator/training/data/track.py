@@ -132,8 +132,8 @@ def _places(source: Source, data: DataFolder) -> tuple[IntArray, FloatArray]:
         orbit = propagate_scenario(scenario, model, source.days * _DAY_S)
         ephemeris, orientation = sample(orbit, source.step_s)[0], model.orientation
     step_ns = round(source.step_s * _NS)
-    utc_ns: list[NDArray[np.int64]] = []
-    position_icrf_m: list[NDArray[np.float64]] = []
+    utc_ns: list[IntArray] = []
+    position_icrf_m: list[FloatArray] = []
     for segment in ephemeris.segments:
         times = np.arange(segment.start_utc_ns, segment.stop_utc_ns + 1, step_ns, dtype=np.int64)
         if utc_ns:
