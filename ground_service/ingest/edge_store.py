@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from sqlalchemy import Connection, bindparam, insert, select, update
@@ -76,8 +76,33 @@ def add_piece(connection: Connection, piece: Piece) -> None:
 
 def piece_of(connection: Connection, ingest_id: int) -> Piece:
     """Return the piece of an ingest."""
-    row = connection.execute(select(PIECES).where(PIECES.c.ingest_id == ingest_id)).mappings().one()
+    columns = [PIECES.c[field.name] for field in fields(Piece)]
+    row = connection.execute(select(*columns).where(PIECES.c.ingest_id == ingest_id)).mappings().one()
     return Piece(**row)
+
+
+def count_stored(connection: Connection, ingest_id: int, packets: int, samples: int, *, joined: bool) -> None:
+    """Add to the totals of an ingest, in the transaction that stores the packets.
+
+    An ingest that is interrupted and run again finds its own packets in the archive: the totals stay complete.
+    """
+    if not packets and not samples:
+        return
+    added = {"packets_stored": packets, "samples_stored": samples, "packets_joined": packets if joined else 0}
+    connection.execute(
+        update(PIECES)
+        .where(PIECES.c.ingest_id == ingest_id)
+        .values({name: PIECES.c[name] + number for name, number in added.items()})
+    )
+
+
+def stored_by(connection: Connection, ingest_id: int) -> tuple[int, int, int]:
+    """Return the new packets, those of them that were joined, and the samples that an ingest has stored."""
+    columns = PIECES.c.packets_stored, PIECES.c.packets_joined, PIECES.c.samples_stored
+    packets, joined, samples = connection.execute(
+        select(*columns).where(PIECES.c.ingest_id == ingest_id)
+    ).one()
+    return int(packets), int(joined), int(samples)
 
 
 def note_read(connection: Connection, ingest_id: int, links_tried: int | None) -> None:

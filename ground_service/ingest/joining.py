@@ -80,7 +80,6 @@ class Joined:
     """Result of joining."""
 
     packets: int = 0
-    samples: int = 0
     frames: int = 0
 
 
@@ -205,7 +204,7 @@ class Joiner:
             for vehicle, spacecraft in sorted(vehicles.items()):
                 stored = store_batch(connection, vehicle, batches[spacecraft])
                 self.joined.packets += stored.new
-                self.joined.samples += stored.samples
+                store.count_stored(connection, self.piece.ingest_id, stored.new, stored.samples, joined=True)
         return waiting
 
     def _open(self, connection: Connection, domain: str, identities: Sequence[bytes]) -> Iterator[StoredEdge]:

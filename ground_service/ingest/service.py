@@ -292,7 +292,7 @@ class _Reading:
         self.progress = progress
         self.vehicles: dict[int, int] = {} if vehicles is None else vehicles
         self.joiner = Joiner(ground, piece, self.vehicles)
-        self.new = self.samples = self.unknown = 0
+        self.new = self.unknown = 0
         self.ticks: list[int] = []
         self.reader = DownlinkReader(piece.spacecraft_id)
 
@@ -367,7 +367,7 @@ class _Reading:
         self.joiner.keep_channel_edges(connection, found.channel_edges)
         stored = store_batch(connection, vehicle, found.packets)
         self.new += stored.new
-        self.samples += stored.samples
+        edges.count_stored(connection, self.piece.ingest_id, stored.new, stored.samples, joined=False)
         self.unknown += found.packets.unknown
         timed = found.packets.ticks[found.packets.ticks != NO_TICKS]
         if timed.size:
@@ -427,15 +427,16 @@ class _Reading:
         found, joined = self.reader.accounting, self.joiner.joined
         with self.ground.database.reading() as connection:
             pending = edges.octets_pending(connection, self.piece.file_sha256)
+            packets_new, packets_joined, samples = edges.stored_by(connection, self.piece.ingest_id)
         return IngestResult(
             ingest_id=self.piece.ingest_id,
             vehicle_id=next(iter(self.vehicles.values()), None),
             octets=found.octets,
             packets=found.packets,
-            packets_new=self.new + joined.packets,
-            packets_joined=joined.packets,
-            packets_repeated=found.packets - self.new,
-            samples=self.samples + joined.samples,
+            packets_new=packets_new,
+            packets_joined=packets_joined,
+            packets_repeated=found.packets - (packets_new - packets_joined),
+            samples=samples,
             crc_errors=found.crc_errors,
             octets_skipped=found.octets_skipped,
             octets_pending=pending,

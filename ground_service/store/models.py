@@ -117,6 +117,8 @@ class Piece(Base):
     one spacecraft; NULL: those of every spacecraft. `stream` and `position` (octets from its start) are stated by the
     sender. Otherwise, `stream` is empty and `position` is the number of the ingest, so that successive ingests are
     adjacent. `links_tried` is the number of known links of the scope that could not read it; NULL if one could.
+    `packets_stored` counts the new packets that the ingest added to the archive, `packets_joined` those of them that
+    were joined with other pieces, and `samples_stored` their samples, over all attempts of the ingest.
     """
 
     __tablename__ = "pieces"
@@ -132,6 +134,9 @@ class Piece(Base):
     stream: Mapped[str] = mapped_column(String(200))
     position: Mapped[int] = mapped_column(BigInteger)
     links_tried: Mapped[int | None] = mapped_column(Integer)
+    packets_stored: Mapped[int] = mapped_column(BigInteger, default=0)
+    packets_joined: Mapped[int] = mapped_column(BigInteger, default=0)
+    samples_stored: Mapped[int] = mapped_column(BigInteger, default=0)
 
 
 class KnownLink(Base):

@@ -406,6 +406,9 @@ def test_an_ingest_that_ends_after_any_commit_is_made_up_for_by_the_next(
             dialect.do_commit = commit
             ingest(ground, pieces[2], tmp_path)
             assert archive(ground) == expected, f"after commit {commits}"
+            with ground.database.reading() as connection:
+                stored = connection.execute(select(func.sum(repository.PIECES.c.packets_stored))).scalar_one()
+            assert stored == len(packets), f"after commit {commits}"
 
 
 def ingest_pieces(url: str, home: str, pieces: list[tuple[int, bytes]], placed: bool) -> None:
