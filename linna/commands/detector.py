@@ -42,7 +42,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="F.csv",
         help="uncatalogued landmarks as further labels",
     )
-    train.add_argument("--start-from", type=Path, default=None, metavar="CHECKPOINT")
+    train.add_argument(
+        "--start-from",
+        type=Path,
+        default=None,
+        metavar="FILE",
+        help="first weights: a checkpoint or an ONNX network",
+    )
+    train.add_argument(
+        "--enlarge",
+        type=int,
+        choices=(1, 2),
+        default=1,
+        help="the network enlarges images so many times, for high altitudes; --crop counts pixels before that",
+    )
     train.add_argument(
         "--replicas", type=int, default=0, help="threads that train side by side (0: one per core)"
     )
@@ -152,6 +165,7 @@ def _train(arguments: argparse.Namespace) -> int:
         patience=arguments.patience,
         seed=arguments.seed,
         replicas=arguments.replicas,
+        enlarge=arguments.enlarge,
     )
     datasets = [Dataset(folder) for folder in arguments.datasets]
     landmarks = None if arguments.landmarks is None else load_landmarks(arguments.landmarks)

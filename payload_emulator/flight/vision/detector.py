@@ -1,9 +1,10 @@
 """Craters found in a camera frame by the on-board network: centre, diameter, score and predicted error in pixels.
 
 The network (MobileNetV3 backbone, CenterNet heads) sees one gray plane of 512 x 512, Sun-up, and gives two maps at a
-quarter of that resolution: the probability that a crater is centred in a cell, and its geometry (offset of the centre
-from the cell, logarithm of the diameter, logarithm of the one-sigma centre error, and from newer networks ten times the
-depth/diameter). Size in kilometres is not its business: that needs the altitude.
+quarter of that resolution (half of it if the network enlarges the image first, for high altitudes): the probability
+that a crater is centred in a cell, and its geometry (offset of the centre from the cell, logarithm of the diameter,
+logarithm of the one-sigma centre error, and from newer networks ten times the depth/diameter). Size in kilometres is
+not its business: that needs the altitude.
 
 What the eye (and the network) takes for the centre of a crater is the middle of its walls, which lies some way below
 the rim; away from the middle of a wide picture that displaces it inward, by parallax. The network cannot know where in
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 INPUT_SIZE_PX = 512
 STRIDE_PX = 4
+STRIDES_PX = (4, 2)
 REFERENCE_DIAMETER_PX = 16.0  # the network gives ln(diameter / this)
 INPUT_NAME = "image"
 HEATMAP_NAME = "heatmap"
@@ -75,6 +77,7 @@ class OnnxDetector:
     threads: int = 1
     sha256: str = field(init=False)
     metadata: dict[str, str] = field(init=False)
+    stride_px: int = field(init=False)
     score_threshold: float = field(init=False)
     parallax_per_px: float = field(init=False)
     _session: onnxruntime.InferenceSession = field(init=False, repr=False)
@@ -86,6 +89,7 @@ class OnnxDetector:
                 f"detector network: expected SHA-256 {self.expected_sha256.lower()}, found {self.sha256}"
             )
         self._session = _open_session(self.model_octets, self.threads)
+        self.stride_px = INPUT_SIZE_PX // int(self._session.get_outputs()[0].shape[-1])
         self.metadata = dict(self._session.get_modelmeta().custom_metadata_map)
         chosen = self.parameters.score_threshold
         self.score_threshold = (
@@ -161,7 +165,7 @@ class OnnxDetector:
             padded[:rows, :columns] = tile
             tile = padded
         heatmap, geometry = self.run_network(np.ascontiguousarray(tile)[None, None])
-        found = decode(heatmap[0, 0], geometry[0], self.score_threshold)
+        found = decode(heatmap[0, 0], geometry[0], self.score_threshold, self.stride_px)
         inside = (found.u_px < columns) & (found.v_px < rows)
         found = found.select(inside)
         return replace(found, u_px=found.u_px + left, v_px=found.v_px + top)
@@ -290,15 +294,16 @@ def _open_session(model_octets: bytes, threads: int) -> onnxruntime.InferenceSes
         ) from error
     inputs = [(item.name, list(item.shape)) for item in session.get_inputs()]
     outputs = {item.name: list(item.shape) for item in session.get_outputs()}
-    cells = INPUT_SIZE_PX // STRIDE_PX
+    heat = outputs.get(HEATMAP_NAME, [])
+    cells = [INPUT_SIZE_PX // stride for stride in STRIDES_PX]
     if (
         inputs != [(INPUT_NAME, [1, 1, INPUT_SIZE_PX, INPUT_SIZE_PX])]
-        or outputs.get(HEATMAP_NAME) is None
-        or outputs[HEATMAP_NAME][2:] != [cells, cells]
-        or outputs.get(GEOMETRY_NAME) not in ([1, 4, cells, cells], [1, 5, cells, cells])
+        or heat[2:] not in [[n, n] for n in cells]
+        or outputs.get(GEOMETRY_NAME) not in [[1, maps, *heat[2:]] for maps in (4, 5)]
     ):
         raise ModelError(
             f"detector network: expected input {INPUT_NAME} [1, 1, {INPUT_SIZE_PX}, {INPUT_SIZE_PX}] and outputs "
-            f"{HEATMAP_NAME}, {GEOMETRY_NAME} of {cells} x {cells} cells, found {inputs} and {outputs}"
+            f"{HEATMAP_NAME}, {GEOMETRY_NAME} of {' or '.join(f'{n} x {n}' for n in cells)} cells, "
+            f"found {inputs} and {outputs}"
         )
     return session

@@ -33,6 +33,8 @@ from lunar.camera import PinholeCamera, intersect_sphere
 from lunar.catalogue import size_class
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import DatasetError
+from payload_emulator.session.recipe import Box
+from payload_emulator.training.data.shots import inside_box
 from payload_emulator.training.data.targets import Tier
 from payload_emulator.training.data.truth import FrameTruth
 
@@ -138,6 +140,11 @@ class Dataset:
             raise DatasetError(
                 f"{index}: schema_version: expected {SCHEMA_VERSION}, found {self.index.get('schema_version')!r}"
             )
+        self._scored_boxes = {
+            source["name"]: [Box(**box) for box in source["boxes"]]
+            for source in self.index["recipe"]["sources"]
+            if source.get("footprint") == "centre"
+        }
         self._frames: list[Frame] = []
         for name in sorted(self.index["shards"]):
             self._frames.extend(shard_frames(load_shard(folder / "shards" / f"{name}.npz")))
@@ -171,18 +178,30 @@ class Dataset:
             f for f in self._frames if (not split or f.split == split) and (not source or f.source == source)
         ]
 
+    def is_scored(self, frame: Frame, latitude_deg: FloatArray, longitude_deg: FloatArray) -> BoolArray:
+        """Whether places count in the scores of a frame: all, but where its source keeps only the middle in a box."""
+        boxes = self._scored_boxes.get(frame.source)
+        if boxes is None:
+            return np.ones(np.shape(latitude_deg), dtype=bool)
+        within = [inside_box(box, latitude_deg, longitude_deg, 0.0) for box in boxes]
+        return np.asarray(np.any(within, axis=0), dtype=bool)
+
     def image(self, frame: Frame) -> OctetArray:
         """Gray image (H, W) of a frame, the upper 8 bits where it has 16."""
         return read_gray(self.folder / "images" / f"{frame.number:06d}.png")
 
 
 def choose_tiers(
-    craters: dict[str, NDArray[Any]], width_px: int, height_px: int, complete: bool
+    craters: dict[str, NDArray[Any]],
+    width_px: int,
+    height_px: int,
+    complete: bool,
+    least_px: float = LABEL_MINIMUM_DIAMETER_PX,
 ) -> tuple[NDArray[np.int8], FloatArray]:
     """Tier and weight of the craters of a frame, (n,) each, by what can be seen of them.
 
     `complete` (procedural terrain) says that the terrain shows craters of any size; real terrain does so only for those
-    stamped on it (negative id) and for what its rasters resolve.
+    stamped on it (negative id) and for what its rasters resolve. `least_px` is the least diameter of a label.
     """
     resolved = complete | (craters["id"] < 0) | (craters["diameter_m"] >= LABEL_MINIMUM_DIAMETER_M)
     inside = (
@@ -193,7 +212,7 @@ def choose_tiers(
     )
     label = (
         inside
-        & (craters["diameter_px"] >= LABEL_MINIMUM_DIAMETER_PX)
+        & (craters["diameter_px"] >= least_px)
         & (craters["diameter_px"] <= LABEL_MAXIMUM_DIAMETER_PX)
         & resolved
         & (craters["depth_ratio"] >= LABEL_MINIMUM_DEPTH_RATIO)
@@ -209,8 +228,10 @@ def choose_tiers(
 
 
 def frame_truth(dataset: Dataset, frame: Frame) -> FrameTruth:
-    """The frame's catalogued craters as scoring wants them."""
-    listed = frame.craters["id"] >= 0
+    """The frame's catalogued craters as scoring wants them, on the ground that is scored."""
+    listed = (frame.craters["id"] >= 0) & dataset.is_scored(
+        frame, frame.craters["latitude_deg"], frame.craters["longitude_deg"]
+    )
     craters = {key: values[listed] for key, values in frame.craters.items()}
     return FrameTruth(
         u_px=craters["u_px"].astype(np.float64),

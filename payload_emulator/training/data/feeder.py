@@ -12,8 +12,11 @@ from numpy.typing import NDArray
 from lunar.arrays import IntArray, OctetArray
 from lunar.catalogue import size_class
 from payload_emulator.training.data.augment import AugmentParameters, make_crop
-from payload_emulator.training.data.dataset import Dataset, Frame, choose_tiers
+from payload_emulator.training.data.dataset import LABEL_MINIMUM_DIAMETER_PX, Dataset, Frame, choose_tiers
 from payload_emulator.training.data.targets import Tier, make_targets
+
+LEAST_CROP_DIAMETER_PX = 8.0
+"""A labelled crater that a crop shows smaller than this is ignored there."""
 
 EVEN_DIAMETER_PX = 28.0
 EMPHASIS_LIMITS = (0.5, 4.0)
@@ -28,7 +31,8 @@ class TrainParameters:
     minutes : wall-clock budget; the learning rate falls to zero over it (0: `steps` counts instead).
     micro_batch : crops that a replica sees at once; more does not pay on a CPU, whose cache they must share.
     soft_labels : the weight of a label grows with its depth/diameter; else all weigh the same.
-    backbone, stride_px : as in `model.ModelConfig`.
+    backbone, stride_px, enlarge : as in `model.ModelConfig`. Lengths in pixels that suit the network's first layer are
+        shorter in the image by the enlargement.
     """
 
     minutes: float = 15.0
@@ -52,6 +56,7 @@ class TrainParameters:
     detail_channels: int = 24
     backbone: str = "small"
     stride_px: int = 4
+    enlarge: int = 1
     soft_labels: bool = True
     augment: AugmentParameters = field(default_factory=AugmentParameters)
 
@@ -68,7 +73,10 @@ class Feeder:
         self.frames = frames
         self.images = images
         self.parameters = parameters
-        self.tiers = [choose_tiers(f.craters, d.width_px, d.height_px, f.complete) for d, f in frames]
+        least_px = LABEL_MINIMUM_DIAMETER_PX / parameters.enlarge
+        self.tiers = [
+            choose_tiers(f.craters, d.width_px, d.height_px, f.complete, least_px) for d, f in frames
+        ]
 
     def batch(self, first: int, count: int) -> dict[str, NDArray[Any]]:
         """Arrays of `count` crops from crop number `first` on."""
@@ -102,8 +110,10 @@ class Feeder:
             & (crop.v_px < p.crop_px + margin)
         )
         inside = (crop.u_px > 1) & (crop.u_px < p.crop_px - 2) & (crop.v_px > 1) & (crop.v_px < p.crop_px - 2)
-        tier = np.where(inside & (crop.diameter_px >= 8.0), tiers, Tier.IGNORE).astype(np.int8)[near]
-        emphasis = np.clip(crop.diameter_px / EVEN_DIAMETER_PX, *EMPHASIS_LIMITS)
+        tier = np.where(
+            inside & (crop.diameter_px >= LEAST_CROP_DIAMETER_PX / p.enlarge), tiers, Tier.IGNORE
+        ).astype(np.int8)[near]
+        emphasis = np.clip(p.enlarge * crop.diameter_px / EVEN_DIAMETER_PX, *EMPHASIS_LIMITS)
         if not p.soft_labels:
             weights = np.ones_like(weights)
         weights = weights * np.where(craters["id"] < 0, STAMPED_EMPHASIS, 1.0) * emphasis
@@ -117,7 +127,7 @@ class Feeder:
             weights[near],
             size_class(craters["diameter_m"].astype(np.float64))[near] if p.paper_classes else None,
             np.nan_to_num(craters["depth_ratio"].astype(np.float64))[near],
-            p.stride_px,
+            p.stride_px // p.enlarge,
         )
         return {
             "image": crop.image[None],

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lunar.frames import spherical_from_mcmf
 from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.detector import (
@@ -18,7 +19,13 @@ from payload_emulator.flight.vision.detector import (
     drop_duplicates,
 )
 from payload_emulator.flight.vision.preprocess import prepare_image, sun_up_turns, turn_back
-from payload_emulator.training.data.dataset import Dataset, Frame, diameter_on_ground_m, frame_truth
+from payload_emulator.training.data.dataset import (
+    Dataset,
+    Frame,
+    diameter_on_ground_m,
+    frame_truth,
+    ground_points,
+)
 from payload_emulator.training.data.refits import RefittedRims
 from payload_emulator.training.data.truth import FrameTruth
 from payload_emulator.training.evaluate.localisation import against_rims
@@ -53,7 +60,7 @@ def detect_with_network(network: Any, dataset: Dataset, frame: Frame, device: st
         torch.sigmoid(heat)[0, 0].cpu().contiguous().numpy(),
         geometry[0].cpu().contiguous().numpy(),
         SCORE_FLOOR,
-        network.config.stride_px,
+        network.config.cell_px,
     )
     found = drop_duplicates(found.select(np.argsort(-found.score, kind="stable")), DetectorParameters())
     u_px, v_px = turn_back(found.u_px, found.v_px, turns, *gray.shape)
@@ -84,7 +91,7 @@ def detect_by_class(detector: OnnxDetector, dataset: Dataset, frame: Frame) -> F
         raise ModelError(
             f"detector network: expected the paper's three class heatmaps, found {heatmap.shape[1] - 1}"
         )
-    parts = [decode(heatmap[0, 1 + k], geometry[0], SCORE_FLOOR) for k in range(3)]
+    parts = [decode(heatmap[0, 1 + k], geometry[0], SCORE_FLOOR, detector.stride_px) for k in range(3)]
     column = {
         name: np.concatenate([getattr(part, name) for part in parts])
         for name in ("u_px", "v_px", "diameter_px", "score", "sigma_px")
@@ -94,14 +101,16 @@ def detect_by_class(detector: OnnxDetector, dataset: Dataset, frame: Frame) -> F
     column = {name: values[order] for name, values in column.items()}
     classes = classes[order]
     u_px, v_px = turn_back(column["u_px"], column["v_px"], turns, *prepared.shape)
+    latitude, longitude, _ = spherical_from_mcmf(ground_points(dataset, frame, u_px, v_px))
+    scored = dataset.is_scored(frame, np.degrees(latitude), np.degrees(longitude)) | ~np.isfinite(latitude)
     return FrameDetections(
-        u_px,
-        v_px,
-        column["diameter_px"],
-        np.array(_CLASS_DIAMETERS_M)[classes],
-        column["score"],
-        column["sigma_px"],
-        size_class=classes,
+        u_px[scored],
+        v_px[scored],
+        column["diameter_px"][scored],
+        np.array(_CLASS_DIAMETERS_M)[classes[scored]],
+        column["score"][scored],
+        column["sigma_px"][scored],
+        size_class=classes[scored],
     )
 
 
@@ -345,6 +354,10 @@ def refuse_other_camera(detector: OnnxDetector, dataset: Dataset) -> None:
 
 
 def _on_ground(dataset: Dataset, frame: Frame, found: Detections) -> FrameDetections:
+    latitude, longitude, _ = spherical_from_mcmf(ground_points(dataset, frame, found.u_px, found.v_px))
+    # A detection in the sky has no place on the ground and counts as wrong.
+    scored = dataset.is_scored(frame, np.degrees(latitude), np.degrees(longitude)) | ~np.isfinite(latitude)
+    found = found.select(np.flatnonzero(scored))
     return FrameDetections(
         found.u_px,
         found.v_px,

@@ -71,8 +71,9 @@ def calibrate(network: Any, datasets: Sequence[Dataset], limit: int = 400) -> Ca
     truths = [truth for truth, _ in pairs]
     found = [without_parallax(detections, parallax, truth) for truth, detections in pairs]
     provisional, _ = best_threshold(tally(truths, found))
-    shift = geometry_shift(tally(truths, found, low_m=3_000.0, ignore_aware=True), provisional)
-    strict = tally(truths, [_shifted(detections, shift) for detections in found])
+    cell_px = network.config.cell_px
+    shift = geometry_shift(tally(truths, found, low_m=3_000.0, ignore_aware=True), provisional, cell_px)
+    strict = tally(truths, [_shifted(detections, shift, cell_px) for detections in found])
     balanced, _ = best_threshold(strict)
     threshold, figures = best_threshold(strict, beta=ON_BOARD_BETA)
     return Calibration(
@@ -149,7 +150,9 @@ def without_parallax(found: FrameDetections, share_per_px: float, truth: FrameTr
     return replace(found, u_px=moved.u_px, v_px=moved.v_px)
 
 
-def geometry_shift(tallied: Tally, threshold: float) -> tuple[float, float, float, float]:
+def geometry_shift(
+    tallied: Tally, threshold: float, cell_px: int = STRIDE_PX
+) -> tuple[float, float, float, float]:
     """What to add to the network's geometry so that errors in the Sun-up image are centred and sigma is one sigma."""
     right = (tallied.outcome == 1) & (tallied.score >= threshold)
     if np.count_nonzero(right) < _LEAST_PAIRS:
@@ -158,16 +161,18 @@ def geometry_shift(tallied: Tally, threshold: float) -> tuple[float, float, floa
     bias_u, bias_v = float(np.median(error_u)), float(np.median(error_v))
     ratio = np.abs(np.concatenate([error_u - bias_u, error_v - bias_v])) / np.tile(tallied.sigma_px[right], 2)
     log_ratio = float(np.median(tallied.log_diameter_ratio[right]))
-    return (-bias_u / STRIDE_PX, -bias_v / STRIDE_PX, -log_ratio, float(np.log(np.quantile(ratio, 0.683))))
+    return (-bias_u / cell_px, -bias_v / cell_px, -log_ratio, float(np.log(np.quantile(ratio, 0.683))))
 
 
-def _shifted(found: FrameDetections, shift: tuple[float, float, float, float]) -> FrameDetections:
+def _shifted(
+    found: FrameDetections, shift: tuple[float, float, float, float], cell_px: int
+) -> FrameDetections:
     """Detections in a Sun-up image as the corrected network would give them."""
     factor = float(np.exp(shift[2]))
     return replace(
         found,
-        u_px=found.u_px + STRIDE_PX * shift[0],
-        v_px=found.v_px + STRIDE_PX * shift[1],
+        u_px=found.u_px + cell_px * shift[0],
+        v_px=found.v_px + cell_px * shift[1],
         diameter_px=factor * found.diameter_px,
         diameter_m=factor * found.diameter_m,
         sigma_px=float(np.exp(shift[3])) * found.sigma_px,

@@ -1,9 +1,9 @@
 """The crater network: MobileNetV3 backbone, depthwise feature pyramid, CenterNet heads at stride 4.
 
-Input (B, 1, H, W), H and W multiples of 32, as `flight.vision.preprocess` makes it. Outputs at (H/4, W/4):
-heatmap logits (B, 1 or 4, h, w): any crater, then the three classes of the paper; geometry (B, 4 or 5, h, w):
-offset to the centre in cells (right, down), ln(diameter / 16 px), ln(one-sigma centre error / 1 px), and if asked
-for ten times the depth/diameter, by which a crater is fresh or degraded.
+Input (B, 1, H, W), H and W multiples of 32, as `flight.vision.preprocess` makes it. Outputs at (H/4, W/4), finer where
+the network enlarges the image first: heatmap logits (B, 1 or 4, h, w): any crater, then the three classes of the paper;
+geometry (B, 4 or 5, h, w): offset to the centre in cells (right, down), ln(diameter / 16 px), ln(one-sigma centre error
+/ 1 px), and if asked for ten times the depth/diameter, by which a crater is fresh or degraded.
 
 References
 ----------
@@ -65,8 +65,9 @@ _INITIAL_TENFOLD_DEPTH = 0.8  # depth/diameter 0.08, the middle of the catalogue
 class ModelConfig:
     """Shape of the network. `detail_blocks` adds blocks at stride 4, where small craters live.
 
-    backbone : "small" or "large" of MobileNetV3; stride_px : of the output maps, 4 or (for studies: flight reads
-        stride 4) 2.
+    backbone : "small" or "large" of MobileNetV3.
+    stride_px : stride of the output maps in pixels of the network's first layer, 4 or 2.
+    enlarge : the network enlarges the image so many times first, for craters of few pixels (high altitudes).
     """
 
     pyramid_channels: int = 64
@@ -76,12 +77,22 @@ class ModelConfig:
     depth: bool = False
     backbone: str = "small"
     stride_px: int = 4
+    enlarge: int = 1
 
     def __post_init__(self) -> None:
         if self.backbone not in _BACKBONES:
             raise ModelError(f"backbone: expected one of {', '.join(_BACKBONES)}, found {self.backbone!r}")
         if self.stride_px not in STRIDES_PX:
             raise ModelError(f"stride: expected 2 or 4 pixels, found {self.stride_px}")
+        if self.enlarge < 1 or self.stride_px % self.enlarge:
+            raise ModelError(
+                f"enlarge: expected a divisor of the stride {self.stride_px}, found {self.enlarge}"
+            )
+
+    @property
+    def cell_px(self) -> int:
+        """Size of an output cell in pixels of the image."""
+        return self.stride_px // self.enlarge
 
     def to_dict(self) -> dict[str, int | bool | str]:
         return asdict(self)
@@ -142,6 +153,10 @@ class CraterNet(nn.Module):
     def maps(self, image: Tensor) -> Tensor:
         """Heatmap logits and geometry as one stack of maps."""
         features: list[Tensor] = []
+        if self.config.enlarge > 1:
+            image = nn.functional.interpolate(
+                image, scale_factor=float(self.config.enlarge), mode="bilinear", align_corners=False
+            )
         x = stem = self.stem(image)
         for index, block in enumerate(self.blocks):
             x = block(x)

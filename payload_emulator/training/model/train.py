@@ -70,6 +70,7 @@ def train(
     import torch
 
     from payload_emulator.training.model.model import CraterNet, ModelConfig
+    from payload_emulator.training.model.restore import count_statistics
 
     if train_frames is None:
         train_frames = [(d, f) for d in datasets for f in d.frames("train")]
@@ -95,6 +96,7 @@ def train(
         parameters.depth,
         parameters.backbone,
         parameters.stride_px,
+        parameters.enlarge,
     )
     network = CraterNet(config).to(device, memory_format=torch.channels_last)
     average = copy.deepcopy(network).eval()
@@ -116,8 +118,10 @@ def train(
         report(f"started from {start_from.name}")
     images = _load_images(train_frames, report)
     _write_run(run, parameters, datasets, config.to_dict(), replicas, device, origin)
-    team = _Team(network, replicas, device, parameters)
     feeder = Feeder(train_frames, images, parameters)
+    if origin is not None and start_from is not None and start_from.suffix == ".onnx":
+        count_statistics(network, feeder, average)
+    team = _Team(network, replicas, device, parameters)
     shown = _Shown()
     began = time.monotonic() - state.seconds
     last_saved = last_validated = time.monotonic()
@@ -268,7 +272,7 @@ class _Team:
                 tensors["regressed"],
                 tensors["incomplete"],
                 LossWeights(),
-                p.stride_px,
+                p.stride_px // p.enlarge,
             )
             (terms.total * (size / count)).backward()
             values = (
@@ -284,13 +288,14 @@ class _Team:
 
 
 def _start_from(path: Path, network: Any, average: Any) -> dict[str, Any]:
-    """Give both networks the averaged weights of a checkpoint; what it was comes back.
+    """Give both networks the averaged weights of a checkpoint or an exported network; what it was comes back.
 
-    A checkpoint with fewer heads gives those it has; class heatmaps begin as copies of the common one.
+    One with fewer heads gives those it has; class heatmaps begin as copies of the common one.
     """
     from payload_emulator.training.model.export import load_network
+    from payload_emulator.training.model.restore import network_from_onnx
 
-    other, stored = load_network(path)
+    other, stored = network_from_onnx(path) if path.suffix == ".onnx" else load_network(path)
     weights = other.state_dict()
     heats, mine = other.heat_channels, network.heat_channels
     for name in ("head.weight", "head.bias"):
@@ -299,6 +304,9 @@ def _start_from(path: Path, network: Any, average: Any) -> dict[str, Any]:
         new[: min(heats, mine)] = old[: min(heats, mine)]
         shared = min(other.geometry_channels, network.geometry_channels)
         new[mine : mine + shared] = old[heats : heats + shared]
+        if name == "head.bias":
+            # Diameters and errors are in pixels of the image, which the network sees enlarged.
+            new[mine + 2 : mine + 4] -= math.log(network.config.enlarge / other.config.enlarge)
         weights[name] = new
     try:
         network.load_state_dict(weights)

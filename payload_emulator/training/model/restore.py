@@ -1,0 +1,112 @@
+"""Trainable network out of an exported one: weights of the ONNX file, and statistics of its normalisation counted anew.
+
+The export folds every batch normalisation into the convolution before it. A folded network cannot be trained further
+as it stands: its normalisation would begin with statistics of zero and one. `network_from_onnx` gives the layers the
+folded values, `count_statistics` rewrites each normalisation as that of the data it sees, without a change of the
+outputs.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from payload_emulator.errors import ModelError
+from payload_emulator.training.model.model import CraterNet, ModelConfig
+
+if TYPE_CHECKING:
+    from payload_emulator.training.data.feeder import Feeder
+
+_PREFIX = "network."
+_CROPS = 64
+
+
+def network_from_onnx(path: Path) -> tuple[CraterNet, dict[str, Any]]:
+    """The network of an exported ONNX file, and a document as a checkpoint has it (steps and minutes of training).
+
+    Raises
+    ------
+    ModelError
+        The file is no export of this project's network.
+    """
+    import onnx
+    from onnx import numpy_helper
+
+    try:
+        model = onnx.load(str(path))
+        metadata = {item.key: item.value for item in model.metadata_props}
+        config = json.loads(metadata["model_config"])
+        stored = {
+            item.name.removeprefix(_PREFIX): torch.from_numpy(np.array(numpy_helper.to_array(item)))
+            for item in model.graph.initializer
+            if item.name.startswith(_PREFIX)
+        }
+        maps = int(stored["head.bias"].shape[0])
+        heats = maps - (5 if config.get("depth") else 4)
+        network = CraterNet(ModelConfig(**(config | {"paper_classes": heats == 4})))
+        _fill(network, stored)
+    except FileNotFoundError:
+        raise ModelError(f"{path}: expected an exported network, found no file") from None
+    except Exception as error:  # onnx and torch raise whatever they meet
+        raise ModelError(f"{path}: expected an exported network, found: {str(error)[:120]}") from error
+    progress = {
+        "step": int(metadata.get("training_steps", 0)),
+        "seconds": 60.0 * float(metadata.get("training_minutes", 0.0)),
+    }
+    return network.eval(), {"progress": progress, "config": config}
+
+
+def count_statistics(network: CraterNet, feeder: Feeder, average: CraterNet, crops: int = _CROPS) -> None:
+    """Write every normalisation as that of the first crops of a run; outputs in evaluation mode stay the same."""
+    layers = [layer for layer in network.modules() if isinstance(layer, nn.BatchNorm2d)]
+    sums = {layer: torch.zeros(3, layer.num_features, dtype=torch.float64) for layer in layers}
+
+    def count(layer: nn.Module, inputs: tuple[Tensor, ...]) -> None:
+        assert isinstance(layer, nn.BatchNorm2d)
+        x = inputs[0].detach().to("cpu", torch.float64)
+        sums[layer] += torch.stack([torch.ones_like(x), x, x * x]).sum(dim=(1, 3, 4))
+
+    hooks = [layer.register_forward_pre_hook(count) for layer in layers]
+    was_training, device = network.training, next(network.parameters()).device
+    network.eval()
+    with torch.no_grad():
+        for first in range(crops):
+            image = torch.from_numpy(feeder.batch(first, 1)["image"]).to(device)
+            network(image.contiguous(memory_format=torch.channels_last))
+        for hook in hooks:
+            hook.remove()
+        for layer in layers:
+            number, total, squares = sums[layer]
+            mean = (total / number).to(device, torch.float32)
+            variance = (squares / number - (total / number) ** 2).clamp(min=0.0).to(device, torch.float32)
+            assert layer.running_mean is not None and layer.running_var is not None
+            scale = layer.weight / torch.sqrt(layer.running_var + layer.eps)
+            shift = layer.bias - scale * layer.running_mean
+            layer.weight.copy_(scale * torch.sqrt(variance + layer.eps))
+            layer.bias.copy_(shift + scale * mean)
+            layer.running_mean.copy_(mean)
+            layer.running_var.copy_(variance)
+    network.train(was_training)
+    average.load_state_dict(network.state_dict())
+
+
+def _fill(network: CraterNet, stored: dict[str, Tensor]) -> None:
+    """Give the layers of a network the values of folded convolutions."""
+    state = network.state_dict()
+    for name, layer in network.named_modules():
+        if isinstance(layer, nn.Conv2d):
+            state[f"{name}.weight"] = stored[f"{name}.weight"]
+            if layer.bias is not None:
+                state[f"{name}.bias"] = stored[f"{name}.bias"]
+        elif isinstance(layer, nn.BatchNorm2d):
+            before, number = name.rsplit(".", 1)
+            state[f"{name}.weight"] = torch.ones(layer.num_features)
+            state[f"{name}.bias"] = stored[f"{before}.{int(number) - 1}.weight_bias"]
+            state[f"{name}.running_mean"] = torch.zeros(layer.num_features)
+            state[f"{name}.running_var"] = torch.full((layer.num_features,), 1.0 - layer.eps)
+    network.load_state_dict(state)
