@@ -23,10 +23,10 @@ from benchmarks._ground_service import answers_under_load, memory_of_a_stream
 from benchmarks.campaigns._deployment import PostgresServer
 from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
+from ground_service.ingest.store import store_samples
 from ground_service.passes.service import define_pass, state_series
 from ground_service.store import repository
 from ground_service.store.database import prepare_database
-from ground_service.store.packets import store_samples
 from ground_service.store.rollups import STATE_VALUES
 from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
 from tmtc.dictionary import DICTIONARY

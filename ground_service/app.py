@@ -35,7 +35,7 @@ from ground_service.web.live import live
 from ground_service.web.pages import pages
 from ground_service.web.payload_console import payload_console
 from ground_service.web.sockets import Sockets
-from ground_service.worker.dispatch import dispatcher_for
+from ground_service.worker.dispatch import dispatcher_for, follow
 from ground_service.worker.jobs import enter_redecoding
 from ground_service.worker.metrics import Metrics, Watch
 from ground_service.worker.routes import operations
@@ -76,11 +76,13 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         threads = SQLITE_THREADS if ground.database.dialect == "sqlite" else SERVER_THREADS
         to_thread.current_default_thread_limiter().total_tokens = threads
         app.state.dispatcher = dispatcher_for(ground, settings, inline=inline_jobs)
+        app.state.follow_up = follow(ground, settings, app.state.dispatcher)
         for job in enter_redecoding(ground):
             log.warning("decoding the archive again with a newer dictionary: job %s", job)
             app.state.dispatcher.start(job)
         if inline_jobs or settings.resolved_broker_url() is None:
             app.state.dispatcher.resume()
+        app.state.follow_up.drain()
         app.state.sockets = Sockets(
             ground,
             open_without_users=app.state.open_without_users,
@@ -172,6 +174,7 @@ async def _sweeps(app: FastAPI) -> None:
         await asyncio.sleep(SWEEP_S)
         try:
             await run_in_threadpool(app.state.dispatcher.resume)
+            await run_in_threadpool(app.state.follow_up.drain)
             until = utc_now_ns()
             for command in await run_in_threadpool(note_timeouts, app.state.ground, since, until):
                 log.warning("telecommand %d: its end is overdue", command, extra={"telecommand": command})

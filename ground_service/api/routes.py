@@ -45,11 +45,10 @@ from ground_service.http.views import (
     series_view,
     time_text,
 )
-from ground_service.ingest.service import FLOWN, Place
+from ground_service.ingest.service import FLOWN, Place, enter_ingest
 from ground_service.passes import service as pass_service
 from ground_service.passes.series import STATE_VALUES
 from ground_service.store import repository
-from ground_service.worker.jobs import enter_ingest
 from ground_service.worker.upkeep import spacecraft_trends, trend_view
 
 UPLOAD_PATHS = tuple(f"{API_PREFIX}/{name}" for name in ("telemetry", "ephemerides", "archives"))

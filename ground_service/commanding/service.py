@@ -20,12 +20,11 @@ from ground_service.clock import utc_now_ns
 from ground_service.commanding.approval import DEFAULT_POLICY, ApprovalPolicy
 from ground_service.commanding.command_state import CommandView, command_view
 from ground_service.errors import Conflict, InvalidInput
-from ground_service.feed import publish
+from ground_service.events import CommandsSent, CommandStateChanged, publish
 from ground_service.ground import Ground
 from ground_service.ingest.redecode import readable_version
 from ground_service.ingest.service import FLOWN
-from ground_service.missions.store import approval_in_force
-from ground_service.planning.progress import advance_windows
+from ground_service.missions.store import approval_in_force, in_force
 from ground_service.store import repository
 from ground_service.store.counters import lock_spacecraft, next_telecommand
 from ground_service.store.states import TELECOMMAND, change_if, move, move_all
@@ -189,7 +188,8 @@ def take_uplink(
         move_all(connection, TELECOMMAND, [table.c.carrier_id.in_(ids)], "sent", **sent)
         for command_id in ids:
             _note(connection, actor, "send", command_id, "sent", {})
-    advance_windows(ground, vehicle)
+        if ids:
+            publish(connection, CommandsSent(vehicle_id=vehicle, telecommands=tuple(ids)))
     packets = [bytes(row["octets"]) for row in rows]
     stream = UplinkEncoder(spacecraft_id).encode(packets) if framed else b"".join(packets)
     return stream, ids
@@ -275,6 +275,7 @@ def _add(
             requested_by=actor,
             created_utc_ns=utc_now_ns(),
             window_id=window_id,
+            mission_id=in_force(connection, vehicle),
             **issued,
         )
     )
@@ -380,4 +381,4 @@ def _note(
     connection: Connection, actor: str, action: str, command_id: int, state: str, detail: dict[str, Any]
 ) -> None:
     audit(connection, actor, f"{action} telecommand", str(command_id), detail)
-    publish(connection, "telecommand", {"id": command_id, "state": state})
+    publish(connection, CommandStateChanged(id=command_id, state=state))

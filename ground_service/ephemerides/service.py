@@ -5,11 +5,11 @@ from __future__ import annotations
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput
+from ground_service.events import EphemerisAdded, publish
 from ground_service.ground import Ground
 from ground_service.store import repository
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile
-from ground_service.timekeeping.recorrelation import recorrelate_all
 from lunar.ephemeris import load_ephemeris
 from lunar.errors import LunarError
 
@@ -52,6 +52,8 @@ def add_ephemeris(
             created_utc_ns=now,
         )
         audit(connection, actor, "add ephemeris", name, {"id": key, "sha256": stored.sha256})
-        row = repository.get(connection, repository.EPHEMERIDES, key, "ephemeris")
-    recorrelate_all(ground)
-    return row
+        publish(
+            connection,
+            EphemerisAdded(id=key, start_utc_ns=ephemeris.start_utc_ns, stop_utc_ns=ephemeris.stop_utc_ns),
+        )
+        return repository.get(connection, repository.EPHEMERIDES, key, "ephemeris")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import uuid
@@ -16,8 +17,8 @@ from ground_service.evaluation.core import PassInputs, evaluate_pass, summary_of
 from ground_service.evaluation.pdf_process import Press, worthwhile
 from ground_service.evaluation.store import load_pass_inputs
 from ground_service.evaluation.surface import surface_map
+from ground_service.events import PassEvaluated, publish
 from ground_service.ground import Ground
-from ground_service.planning.progress import advance_windows
 from ground_service.store import repository
 from ground_service.store.files import make_durable_folder, replace_durably
 from lunar.timescales import format_utc
@@ -38,6 +39,14 @@ class MadeReport:
     json: Path
     pdf: Path | None
     summary: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Reevaluation:
+    """Number of the event that causes a re-evaluation, and the row of the report before it."""
+
+    event: int
+    previous: Mapping[str, Any]
 
 
 def evaluate(ground: Ground, pass_id: int, *, created_utc: str = "") -> PassReport:
@@ -65,6 +74,7 @@ def make_report(
     report_id: str | None = None,
     out: Path | None = None,
     pdf: bool = False,
+    again: Reevaluation | None = None,
 ) -> MadeReport:
     """Evaluate a pass, render its report as HTML and JSON, and as PDF where wanted, and keep them.
 
@@ -74,6 +84,8 @@ def make_report(
         Name of the report; the same name again gives the report that was made under it.
     out
         Folder for the documents; ``reports/pass-<id>`` under the service's home when None.
+    again
+        Cause of a re-evaluation and the report before it; the changed figures are stored with the new report.
     """
     identity = report_id or uuid.uuid4().hex
     now = utc_now_ns()
@@ -90,7 +102,8 @@ def make_report(
     with ground.database.writing() as connection:
         for kind, file in stored.items():
             repository.register_file(connection, file, "report", f"report of pass {pass_id} ({kind})", now)
-        repository.add_new(
+        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        added = repository.add_new(
             connection,
             repository.REPORTS,
             id=identity,
@@ -99,10 +112,22 @@ def make_report(
             json_sha256=stored["json"].sha256,
             pdf_sha256=stored["pdf"].sha256 if pdf else None,
             summary=summary,
+            mission_id=record["mission_id"],
+            event_number=None if again is None else again.event,
+            previous_id=None if again is None else again.previous["id"],
+            changes=None if again is None else changed_figures(again.previous["summary"], summary),
             created_utc_ns=now,
         )
-        vehicle = int(repository.get(connection, repository.PASSES, pass_id, "pass")["vehicle_id"])
-    advance_windows(ground, vehicle)
+        if added is not None:
+            publish(
+                connection,
+                PassEvaluated(
+                    report_id=identity,
+                    pass_id=pass_id,
+                    vehicle_id=record["vehicle_id"],
+                    event=None if again is None else again.event,
+                ),
+            )
     folder = out if out is not None else ground.home / "reports" / f"pass-{pass_id}"
     for kind, octets in documents.items():
         _write_whole(folder / f"report.{kind}", octets)
@@ -114,6 +139,39 @@ def make_report(
         folder / "report.pdf" if pdf else None,
         summary,
     )
+
+
+def reevaluate(ground: Ground, pass_id: int, *, report_id: str, event: int) -> MadeReport | None:
+    """Evaluate a pass again because of an event; return the new report, or None if nothing in it would differ."""
+    with ground.database.reading() as connection:
+        made = repository.find(connection, repository.REPORTS, id=report_id)
+        previous = repository.newest_report(connection, pass_id, other_than=report_id)
+    if previous is None:
+        return None
+    if made is None:
+        from reports.render import to_json
+
+        report = evaluate(ground, pass_id, created_utc=format_utc(previous["created_utc_ns"]))
+        if hashlib.sha256(to_json(report).encode()).hexdigest() == previous["json_sha256"]:
+            return None
+    return make_report(
+        ground,
+        pass_id,
+        report_id=report_id,
+        pdf=previous["pdf_sha256"] is not None,
+        again=Reevaluation(event, previous),
+    )
+
+
+def changed_figures(before: Any, after: Any, name: str = "") -> list[dict[str, Any]]:
+    """Return the figures that differ between two summaries: name, value before and value after."""
+    if isinstance(before, Mapping) and isinstance(after, Mapping):
+        return [
+            change
+            for key in sorted({*before, *after})
+            for change in changed_figures(before.get(key), after.get(key), f"{name}.{key}" if name else key)
+        ]
+    return [] if before == after else [{"figure": name, "before": before, "after": after}]
 
 
 def _documents(report: PassReport, *, pdf: bool, press: Press | None = None) -> dict[str, bytes]:

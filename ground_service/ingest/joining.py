@@ -38,9 +38,9 @@ from ground_service.ingest.frames import (
 )
 from ground_service.ingest.packets import batch_of_cut
 from ground_service.ingest.redecode import note_dictionary
+from ground_service.ingest.store import store_batch
 from ground_service.ingest.stream import BARE, Link
 from ground_service.store import repository
-from ground_service.store.packets import store_batch
 from tmtc import reed_solomon
 from tmtc.cadu import ASM_LENGTH, DEFAULT_TOLERANCE
 from tmtc.crc import crc16

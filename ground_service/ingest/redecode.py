@@ -15,8 +15,8 @@ from sqlalchemy import Connection, delete, func, select
 
 from ground_service.ground import Ground
 from ground_service.ingest.packets import batch_of_cut
+from ground_service.ingest.store import store_samples
 from ground_service.store import repository
-from ground_service.store.packets import store_samples
 from ground_service.store.rollups import forget_rollups
 from tmtc.dictionary import DICTIONARY
 from tmtc.schema import Dictionary

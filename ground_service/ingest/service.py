@@ -6,7 +6,7 @@ files or on how often they came. An ingest that was cut off can simply be run ag
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,14 @@ from typing import Any
 from sqlalchemy import Connection
 
 from ground_service.clock import utc_now_ns
-from ground_service.errors import PASSING, GroundError, InvalidInput
+from ground_service.errors import PASSING, Conflict, GroundError, InvalidInput
 from ground_service.ground import Ground
 from ground_service.ingest import edge_store as edges
 from ground_service.ingest.frames import ChannelEdge, is_checked
 from ground_service.ingest.joining import Joiner
 from ground_service.ingest.packets import PacketBatch
 from ground_service.ingest.redecode import catch_up
+from ground_service.ingest.store import store_batch
 from ground_service.ingest.stream import (
     BARE,
     CADU_MAX_OCTETS,
@@ -29,11 +30,10 @@ from ground_service.ingest.stream import (
     Link,
     fragment_edges,
 )
-from ground_service.planning.progress import advance_windows
+from ground_service.jobs import OTHER_REQUEST, add_job
 from ground_service.store import repository
+from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile, read_blocks
-from ground_service.store.packets import store_batch
-from ground_service.timekeeping.recorrelation import recorrelate
 from tmtc.cuc import NO_TICKS
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import TmtcError
@@ -145,7 +145,7 @@ def ingest_stored(
             place=place,
             state="running",
         )
-    return _run(ground, ingest_id, again=False)
+    return _run(ground, ingest_id)
 
 
 def add_ingest(
@@ -189,6 +189,53 @@ def add_ingest(
     return ingest_id
 
 
+def enter_ingest(
+    ground: Ground,
+    stored: StoredFile,
+    name: str,
+    *,
+    spacecraft_id: int | None,
+    instance: str,
+    place: Place | None = None,
+    job_id: str | None = None,
+) -> tuple[int, str]:
+    """Add an archived file and the job that ingests it in one transaction; return their ids, also if the job exists.
+
+    Raises
+    ------
+    Conflict
+        If the id belongs to another ingest.
+    """
+    with ground.database.writing() as connection:
+        if job_id is not None:
+            hold(connection, f"job {job_id}")
+            known = repository.find(connection, repository.JOBS, id=job_id)
+            if known is not None:
+                return _known_ingest(connection, known, stored, spacecraft_id, instance), job_id
+        ingest_id = add_ingest(
+            connection, stored, name, spacecraft_id=spacecraft_id, instance=instance, place=place
+        )
+        arguments = {"ingest_id": ingest_id, "spacecraft_id": spacecraft_id, "instance": instance}
+        return ingest_id, add_job(connection, "ingest", arguments, job_id=job_id)
+
+
+def _known_ingest(
+    connection: Connection,
+    job: Mapping[str, Any],
+    stored: StoredFile,
+    spacecraft_id: int | None,
+    instance: str,
+) -> int:
+    """Return the ingest of an existing job with the same file and the same spacecraft."""
+    asked = {"spacecraft_id": spacecraft_id, "instance": instance}
+    if job["kind"] == "ingest" and asked.items() <= job["arguments"].items():
+        ingest_id = int(job["arguments"]["ingest_id"])
+        record = repository.get(connection, repository.INGESTS, ingest_id, "ingest")
+        if record["file_sha256"] == stored.sha256:
+            return ingest_id
+    raise Conflict(OTHER_REQUEST)
+
+
 def run_ingest(
     ground: Ground,
     ingest_id: int,
@@ -200,21 +247,19 @@ def run_ingest(
     `progress` is called with the stored share of the file, several times for a long file.
     """
     with ground.database.writing() as connection:
-        record = repository.get(connection, repository.INGESTS, ingest_id, "ingest")
+        repository.get(connection, repository.INGESTS, ingest_id, "ingest")
         repository.change(connection, repository.INGESTS, ingest_id, state="running")
-    again = record["state"] != "queued"
-    return _run(ground, ingest_id, again=again, progress=progress)
+    return _run(ground, ingest_id, progress=progress)
 
 
-def _run(
-    ground: Ground,
-    ingest_id: int,
-    *,
-    again: bool,
-    progress: Progress | None = None,
-) -> IngestResult:
+def _run(ground: Ground, ingest_id: int, *, progress: Progress | None = None) -> IngestResult:
+    with ground.database.listeners.held():  # one call for the whole file, not one for each batch
+        return _run_held(ground, ingest_id, progress)
+
+
+def _run_held(ground: Ground, ingest_id: int, progress: Progress | None) -> IngestResult:
     try:
-        result = _read_piece(ground, ingest_id, again, progress)
+        result = _read_piece(ground, ingest_id, progress)
     except PASSING:
         raise
     except (GroundError, TmtcError) as error:
@@ -245,7 +290,6 @@ def _run(
 def _read_piece(
     ground: Ground,
     ingest_id: int,
-    again: bool,
     progress: Progress | None,
 ) -> IngestResult:
     """Store the content of a piece and the units joined with others, and read pieces that wait for its link."""
@@ -262,9 +306,6 @@ def _read_piece(
             )
     for vehicle in reading.vehicles.values():
         catch_up(ground, vehicle)
-        new = reading.new + reading.joiner.joined.packets
-        if (new or learned or again) and not recorrelate(ground, vehicle):
-            advance_windows(ground, vehicle)
     return reading.result()
 
 

@@ -10,6 +10,7 @@ from sqlalchemy import Connection
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Forbidden, InvalidInput
+from ground_service.events import MissionAdded, publish
 from ground_service.ground import Ground
 from ground_service.missions import store
 from ground_service.missions.declared import mission_of_manifest
@@ -79,6 +80,8 @@ def enter(connection: Connection, mission: Mission, text: str | None = None, *, 
     )
     if new:
         audit(connection, actor, "add mission", mission.name, {"id": key, "revision": mission.revision})
+        added = MissionAdded(id=key, mission=mission.name, spacecraft_id=mission.spacecraft.id)
+        publish(connection, added)
     return key
 
 

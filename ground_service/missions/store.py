@@ -107,6 +107,12 @@ def newest_of_spacecraft(connection: Connection, ccsds_id: int) -> int | None:
     return None if found is None else int(found)
 
 
+def in_force(connection: Connection, vehicle: int) -> int | None:
+    """Return the id of the revision in force for a vehicle; None without any."""
+    row = repository.get(connection, repository.VEHICLES, vehicle, "vehicle")
+    return newest_of_spacecraft(connection, int(row["ccsds_id"]))
+
+
 def approval_in_force(connection: Connection, ccsds_id: int) -> Approval:
     """Return the approval rules of the newest revision of a spacecraft that was added by a person.
 

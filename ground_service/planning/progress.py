@@ -13,7 +13,7 @@ from sqlalchemy import Connection, func, select
 
 from ground_service.clock import utc_now_ns
 from ground_service.commanding.command_state import command_view
-from ground_service.feed import publish
+from ground_service.events import WindowChanged, publish
 from ground_service.ground import Ground
 from ground_service.ingest.core import account_sequence
 from ground_service.ingest.redecode import readable_version
@@ -57,8 +57,8 @@ def advance_windows(ground: Ground, vehicle: int) -> int:
             state = _advance(connection, row, correlations)
             if state is not None:
                 changed.append((row["id"], state))
-        for window_id, state in changed:  # last: a transaction that has published blocks others until it ends
-            publish(connection, "window", {"id": window_id, "state": state})
+        for window_id, state in changed:
+            publish(connection, WindowChanged(id=window_id, state=state))
     return len(changed)
 
 
@@ -191,13 +191,7 @@ def _pass_of(connection: Connection, row: Mapping[str, Any]) -> int:
             ephemeris_id=row["ephemeris_id"],
             catalogue_sha256=None,
             attitude_sha256=None,
-            mission_id=missions.newest_of_spacecraft(
-                connection, _spacecraft_of(connection, row["vehicle_id"])
-            ),
+            mission_id=row["mission_id"] or missions.in_force(connection, row["vehicle_id"]),
             created_utc_ns=utc_now_ns(),
         )
     )
-
-
-def _spacecraft_of(connection: Connection, vehicle: int) -> int:
-    return int(repository.get(connection, repository.VEHICLES, vehicle, "vehicle")["ccsds_id"])

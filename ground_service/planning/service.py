@@ -14,10 +14,11 @@ from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.commanding import service as commanding
 from ground_service.errors import Conflict, InvalidInput, NotFound, PlanConflict, PlanConflicts, StateConflict
-from ground_service.feed import publish
+from ground_service.events import WindowChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.views import candidate_view
 from ground_service.ingest.service import FLOWN
+from ground_service.missions import store as missions
 from ground_service.planning.core import (
     Candidate,
     Commitment,
@@ -169,6 +170,7 @@ def insert_window(
         vehicle_id=vehicle,
         decision="draft",
         state="draft",
+        mission_id=missions.in_force(connection, vehicle),
         version=1,
         created_by=actor,
         edited_by=actor,
@@ -230,6 +232,7 @@ def change_window(
             values["edited_by"] = actor
         if decision is not None:
             values["decided_by"] = actor
+            values["mission_id"] = missions.in_force(connection, row["vehicle_id"])
         changed = change_if(
             connection,
             repository.WINDOWS,
@@ -635,4 +638,4 @@ def _note(
     connection: Connection, actor: str, action: str, window_id: int, state: str, detail: dict[str, Any]
 ) -> None:
     audit(connection, actor, f"{action} window", str(window_id), detail)
-    publish(connection, "window", {"id": window_id, "state": state})
+    publish(connection, WindowChanged(id=window_id, state=state))

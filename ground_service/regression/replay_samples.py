@@ -38,7 +38,10 @@ LATENCY_LEVEL = 0.25
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PassContext:
-    """What the ground knows of an archived pass, whichever build flies it: read once, used for every build."""
+    """What the ground knows of an archived pass, whichever build flies it: read once, used for every build.
+
+    `mission` is the revision of the mission description of the archive.
+    """
 
     name: str
     manifest: Mapping[str, Any]
@@ -52,6 +55,7 @@ class PassContext:
     orientation: Orientation
     viewing: Viewing
     evidence: Evidence
+    mission: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,6 +94,7 @@ def pass_context(archive: PassArchive, data: DataFolder) -> PassContext:
         orientation=orientation_of(mission, data),
         viewing=_viewing(folder, mission.camera, camera, ticks, utc_ns),
         evidence=mission.evidence,
+        mission=mission.revision,
     )
 
 

@@ -30,12 +30,12 @@ from ground_service.http.model import Given, Schema
 from ground_service.http.requests import StrictRoute
 from ground_service.http.uploads import UploadOf
 from ground_service.http.views import time_text
+from ground_service.jobs import enter_jobs
 from ground_service.regression import archives as archive_service
 from ground_service.regression.builds import load_build, register_build
 from ground_service.regression.jobs import missing_replays, prepared
 from ground_service.store import repository
 from ground_service.store.files import StoredFile
-from ground_service.worker.jobs import enter_jobs
 
 REGRESSION_UPLOAD_PATHS = (f"{API_PREFIX}/builds", f"{API_PREFIX}/regression-archives")
 

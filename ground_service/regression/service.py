@@ -25,6 +25,7 @@ from sqlalchemy import true, update
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, InvalidInput
+from ground_service.events import RegressionJudged, publish
 from ground_service.ground import Ground
 from ground_service.regression.archives import PassArchive, check_out, keep_archive, store_of
 from ground_service.regression.build_runs import OK, OUTCOMES, read_performance, run_build
@@ -311,7 +312,7 @@ def keep_regression(ground: Ground, outcome: RegressionOutcome, *, regression_id
     now = utc_now_ns()
     with ground.database.writing() as connection:
         repository.register_file(connection, html, "report", f"regression {identity}", now)
-        repository.add_new(  # a stored verdict is not replaced
+        added = repository.add_new(  # a stored verdict is not replaced
             connection,
             repository.REGRESSIONS,
             id=identity,
@@ -319,9 +320,12 @@ def keep_regression(ground: Ground, outcome: RegressionOutcome, *, regression_id
             candidate_digest=outcome.candidate.digest,
             verdict=outcome.verdict,
             result=regression_json(outcome),
+            missions=sorted({one.context.mission for one in outcome.passes if one.context is not None}),
             html_sha256=html.sha256,
             created_utc_ns=now,
         )
+        if added is not None:
+            publish(connection, RegressionJudged(id=identity, verdict=outcome.verdict))
     return identity
 
 

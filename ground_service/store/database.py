@@ -15,7 +15,7 @@ import os
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +36,7 @@ from ground_service.errors import (
     StorageReadOnly,
     storage_error,
 )
-from ground_service.store import audit, row_digests
+from ground_service.store import audit, events, row_digests
 from ground_service.store.files import make_durable_folder
 
 if TYPE_CHECKING:
@@ -55,9 +55,10 @@ PAGE_CACHE_KIB = 16_384
 
 @dataclass(frozen=True, slots=True)
 class Database:
-    """An engine and its transactions."""
+    """An engine and its transactions; `listeners` are called after commits with events."""
 
     engine: Engine
+    listeners: events.Listeners = field(default_factory=events.Listeners, compare=False, repr=False)
 
     @property
     def dialect(self) -> str:
@@ -88,15 +89,17 @@ class Database:
     def writing(self) -> Iterator[Connection]:
         """Yield a connection in a write transaction, committed at the end and rolled back on an error.
 
-        Audit entries of the transaction are appended to their chain just before the commit.
+        Audit entries and events of the transaction are appended to their logs just before the commit.
         """
         with self._translated(), self.engine.connect() as connection:
-            connection.execution_options(**{audit.PENDING: []}, linna_write=True)
+            connection.execution_options(**{audit.PENDING: [], events.PENDING: []}, linna_write=True)
             if self.dialect == "sqlite":
                 self._prepare_writer(connection)
             with connection.begin():
                 yield connection
                 audit.append_pending(connection)
+                kinds = events.append_pending(connection)
+        self.listeners.notify(kinds)
 
     def require_writable(self) -> None:
         """Refuse a SQLite file without write permission, without waiting for writers.

@@ -491,7 +491,12 @@ class Job(Base):
 
 
 class Report(Base):
-    """A report made of a pass; its documents are files of the archive."""
+    """A report made of a pass; its documents are files of the archive.
+
+    `mission_id` is the revision of the mission description that the evaluation used. `event_number` is the event that
+    caused a re-evaluation of the pass, `previous_id` the report before it, and `changes` the changed figures; NULL for
+    a report on request.
+    """
 
     __tablename__ = "reports"
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
@@ -500,6 +505,10 @@ class Report(Base):
     json_sha256: Mapped[str] = mapped_column(ForeignKey("files.sha256"))
     pdf_sha256: Mapped[str | None] = mapped_column(String(64))
     summary: Mapped[dict[str, Any]] = mapped_column(JSON)
+    mission_id: Mapped[int | None] = mapped_column(ForeignKey("missions.id"))
+    event_number: Mapped[int | None] = mapped_column(BigInteger)
+    previous_id: Mapped[str | None] = mapped_column(String(32))
+    changes: Mapped[list[dict[str, Any]] | None] = mapped_column(JSON)
     created_utc_ns: Mapped[int] = mapped_column(BigInteger)
 
 
@@ -564,14 +573,22 @@ class RowDigest(Base):
     sha256: Mapped[str] = mapped_column(String(64))
 
 
-class FeedItem(Base):
-    """Something that happened, for those who watch; `id` is the sequence number that they see."""
+class LoggedEventRow(Base):
+    """Event of the log; `id` is its number, from 1 without gaps."""
 
-    __tablename__ = "feed"
+    __tablename__ = "event_log"
     id: Mapped[int] = mapped_column(BigKey, primary_key=True)
     utc_ns: Mapped[int] = mapped_column(BigInteger)
     kind: Mapped[str] = mapped_column(String(32))
     payload: Mapped[dict[str, Any]] = mapped_column(JSON)
+
+
+class EventPosition(Base):
+    """Number of the last event that a consumer has handled."""
+
+    __tablename__ = "event_positions"
+    consumer: Mapped[str] = mapped_column(String(32), primary_key=True)
+    number: Mapped[int] = mapped_column(BigInteger)
 
 
 class Answer(Base):
@@ -612,6 +629,7 @@ class Telecommand(Base):
     timeout_noted_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
     window_id: Mapped[int | None] = mapped_column(Integer, index=True)
     carrier_id: Mapped[int | None] = mapped_column(BigInteger)
+    mission_id: Mapped[int | None] = mapped_column(ForeignKey("missions.id"))
 
 
 class CommandCounter(Base):
@@ -644,6 +662,7 @@ class Window(Base):
     predecessor_id: Mapped[int | None] = mapped_column(ForeignKey("windows.id"))
     ephemeris_id: Mapped[int | None] = mapped_column(ForeignKey("ephemerides.id"))
     pass_id: Mapped[int | None] = mapped_column(ForeignKey("passes.id"))
+    mission_id: Mapped[int | None] = mapped_column(ForeignKey("missions.id"))
     data_octets: Mapped[int] = mapped_column(BigInteger)
     predicted: Mapped[dict[str, Any]] = mapped_column(JSON)
     version: Mapped[int] = mapped_column(Integer)
@@ -712,5 +731,6 @@ class Regression(Base):
     candidate_digest: Mapped[str] = mapped_column(String(64))
     verdict: Mapped[str] = mapped_column(String(16))
     result: Mapped[dict[str, Any]] = mapped_column(JSON)
+    missions: Mapped[list[str]] = mapped_column(JSON)
     html_sha256: Mapped[str | None] = mapped_column(String(64))
     created_utc_ns: Mapped[int] = mapped_column(BigInteger)

@@ -63,7 +63,7 @@ TOKENS = _table(models.Token)
 AUDIT = _table(models.AuditEntry)
 AUDIT_HEAD = _table(models.AuditHead)
 ROW_DIGESTS = _table(models.RowDigest)
-FEED = _table(models.FeedItem)
+EVENT_LOG = _table(models.LoggedEventRow)
 ANSWERS = _table(models.Answer)
 TELECOMMANDS = _table(models.Telecommand)
 COMMAND_COUNTERS = _table(models.CommandCounter)
@@ -90,6 +90,13 @@ def add_new(connection: Connection, table: Table, **values: Any) -> Any | None:
     make = postgresql_insert if connection.dialect.name == "postgresql" else sqlite_insert
     key = next(iter(table.primary_key.columns))
     return connection.execute(make(table).values(**values).on_conflict_do_nothing().returning(key)).scalar()
+
+
+def newest_report(connection: Connection, pass_id: int, *, other_than: str = "") -> Row | None:
+    """Return the newest report of a pass, except one; None without any."""
+    query = select(REPORTS).where(REPORTS.c.pass_id == pass_id, REPORTS.c.id != other_than)
+    found = connection.execute(query.order_by(REPORTS.c.created_utc_ns.desc()).limit(1)).mappings().first()
+    return None if found is None else dict(found)
 
 
 def change(connection: Connection, table: Table, key: Any, **values: Any) -> None:

@@ -19,11 +19,10 @@ from sqlalchemy import Connection, func, select, update
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput
-from ground_service.feed import publish
+from ground_service.events import CorrelationChanged, ReceptionsEntered, publish
 from ground_service.ground import Ground
 from ground_service.http.times import time_of
 from ground_service.missions.stations import STATIONS
-from ground_service.planning.progress import advance_windows
 from ground_service.store import repository
 from ground_service.timekeeping.core import CorrelationFit, clock_runs, fit_correlation, utc_ns_of_ticks
 from ground_service.timekeeping.store import load_correlations
@@ -173,6 +172,7 @@ def enter_receptions(
                     .values(earth_utc_ns=time)
                 )
         audit(connection, actor, "enter receptions", str(vehicle), {"reports": len(reports), "new": len(new)})
+        publish(connection, ReceptionsEntered(vehicle_id=vehicle, reports=len(first)))
     recorrelate(ground, vehicle)
     return in_force(ground, vehicle)
 
@@ -207,17 +207,16 @@ def recorrelate(ground: Ground, vehicle: int, *, over_manual: bool = False) -> b
                 created_utc_ns=now,
                 **values,
             )
-        publish(connection, "correlation", {"vehicle_id": vehicle, "segments": len(fits)})
-    advance_windows(ground, vehicle)
+        publish(connection, CorrelationChanged(vehicle_id=vehicle, segments=len(fits)))
     return True
 
 
-def recorrelate_all(ground: Ground) -> None:
-    """As `recorrelate`, of every vehicle with receptions: something that all depend on is new."""
+def vehicles_with_receptions(ground: Ground, start_utc_ns: int, stop_utc_ns: int) -> list[int]:
+    """Return the vehicles with time reports received in an interval of time."""
+    table = repository.RECEPTIONS
+    query = select(table.c.vehicle_id).where(table.c.earth_utc_ns.between(start_utc_ns, stop_utc_ns))
     with ground.database.reading() as connection:
-        vehicles = list(connection.execute(select(repository.RECEPTIONS.c.vehicle_id).distinct()).scalars())
-    for vehicle in vehicles:
-        recorrelate(ground, int(vehicle))
+        return [int(vehicle) for vehicle in connection.execute(query.distinct()).scalars()]
 
 
 def in_force(ground: Ground, vehicle: int) -> list[repository.Row]:

@@ -16,9 +16,9 @@ from sqlalchemy import select, update
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound
+from ground_service.events import CorrelationChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.times import time_of
-from ground_service.planning.progress import advance_windows
 from ground_service.store import repository
 from ground_service.timekeeping.core import CorrelationFit, fit_correlation
 from ground_service.timekeeping.recorrelation import in_force, lock_vehicle, recorrelate, residuals
@@ -83,6 +83,7 @@ def correlate(
                 created_utc_ns=now,
             )
         audit(connection, actor, "correlate time", str(vehicle), {"boots": len(fits), "points": len(points)})
+        publish(connection, CorrelationChanged(vehicle_id=vehicle, segments=len(fits)))
     return list(fits.values())
 
 
@@ -102,7 +103,6 @@ def correlate_spacecraft(
     """As `correlate`, of a spacecraft by its number; the correlations now in force."""
     vehicle = _vehicle(ground, spacecraft_id, instance)
     correlate(ground, vehicle, points, actor=actor)
-    advance_windows(ground, vehicle)
     return [row for row in correlations_on_record(ground, vehicle) if not row["superseded"]]
 
 

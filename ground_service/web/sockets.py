@@ -1,7 +1,7 @@
-"""Open WebSockets: their callers and limits, periodic authorisation, and the feed.
+"""Open WebSockets: their callers and limits, periodic authorisation, and the event log.
 
-The feed is read once for all sockets of a process. Callers are verified again every `VERIFY_S`: a socket is closed if
-its token was revoked or has expired, or if its user was disabled.
+The event log is read once for all sockets of a process. Callers are verified again every `VERIFY_S`: a socket is
+closed if its token was revoked or has expired, or if its user was disabled.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from starlette.concurrency import run_in_threadpool
 
 from ground_service.access.service import LOCAL_CALLER, Caller, authenticate, has_users
 from ground_service.errors import GroundError, NotAuthorised
-from ground_service.feed import last_number, read_feed
+from ground_service.events import last_number, read_events
 from ground_service.ground import Ground
 from ground_service.http.problems import problem
 from ground_service.http.proxies import address_key
 from ground_service.http.security import VERIFIED_CALLER
 from ground_service.http.views import time_text
+from ground_service.store.events import LoggedEvent
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +64,7 @@ class Session:
             self.ended.set_result(code)
 
     def offer(self, number: int, text: str) -> None:
-        """Queue a message of the feed."""
+        """Queue an event."""
         try:
             self.messages.put_nowait((number, text))
         except asyncio.QueueFull:
@@ -117,11 +118,11 @@ class Sockets:
             session.end(POLICY_VIOLATION)
 
     async def follow(self, session: Session, after: int | None) -> None:
-        """Open a socket and send it the feed until cancelled: first messages after a number, then new messages.
+        """Open a socket and send it events until cancelled: first messages after a number, then new messages.
 
         Without a number, only messages after the opening of the socket are sent.
         """
-        newest = await run_in_threadpool(last_number, self._ground)
+        newest = await run_in_threadpool(last_number, self._ground.database)
         if not self._readers:
             self._number = newest
         self._readers.add(session)
@@ -131,11 +132,11 @@ class Sockets:
         at = number
         while at < known:
             async with self._replays:
-                items = await run_in_threadpool(read_feed, self._ground, at, BATCH)
+                items = await run_in_threadpool(read_events, self._ground.database, at, BATCH)
             for item in items:
-                if item["id"] <= known:
+                if item.number <= known:
                     await session.socket.send_text(text_of(item))
-            at = items[-1]["id"] if items else known
+            at = items[-1].number if items else known
         number = max(number, known)
         while True:
             at, text = await session.messages.get()
@@ -143,7 +144,7 @@ class Sockets:
                 await session.socket.send_text(text)
 
     async def run(self) -> None:
-        """Read the feed for all sockets and verify their callers until cancelled."""
+        """Read the event log for all sockets and verify their callers until cancelled."""
         await asyncio.gather(self._read(), self._verify())
 
     async def _read(self) -> None:
@@ -152,15 +153,15 @@ class Sockets:
             if not self._readers:
                 continue
             try:
-                items = await run_in_threadpool(read_feed, self._ground, self._number, BATCH)
+                items = await run_in_threadpool(read_events, self._ground.database, self._number, BATCH)
             except GroundError as error:
-                log.warning("the feed cannot be read: %s", error)
+                log.warning("the event log cannot be read: %s", error)
                 continue
             for item in items:
                 text = text_of(item)
                 for session in self._readers:
-                    session.offer(item["id"], text)
-                self._number = item["id"]
+                    session.offer(item.number, text)
+                self._number = item.number
 
     async def _verify(self) -> None:
         while True:
@@ -225,12 +226,12 @@ def token_of(socket: WebSocket) -> str | None:
     return protocols[1] if len(protocols) == 2 and protocols[0] == "bearer" else None
 
 
-def text_of(item: dict[str, Any]) -> str:
-    """Return a message of the feed as text."""
+def text_of(item: LoggedEvent) -> str:
+    """Return the message of an event."""
     message = {
-        "sequence": item["id"],
-        "time": time_text(item["utc_ns"]),
-        "kind": item["kind"],
-        "payload": item["payload"],
+        "sequence": item.number,
+        "time": time_text(item.utc_ns),
+        "kind": item.kind,
+        "payload": item.payload,
     }
     return json.dumps(message, separators=(",", ":"), ensure_ascii=False)

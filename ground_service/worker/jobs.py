@@ -9,32 +9,26 @@ from __future__ import annotations
 import hashlib
 import logging
 import threading
-import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from sqlalchemy import Connection, select
-
 from ground_service.clock import utc_now_ns
 from ground_service.errors import (
     PASSING,
-    Conflict,
     GroundError,
-    InvalidInput,
     StateConflict,
     public_text,
     storage_error,
 )
-from ground_service.evaluation.service import make_report
-from ground_service.feed import publish
+from ground_service.evaluation.service import make_report, reevaluate
+from ground_service.events import JobChanged, publish
 from ground_service.ground import Ground
 from ground_service.ingest.redecode import catch_up, redecode_job_id, vehicles_behind
-from ground_service.ingest.service import Place, add_ingest, run_ingest
+from ground_service.ingest.service import run_ingest
+from ground_service.jobs import FINISHED, enter_job
 from ground_service.passes.archive_zip import import_zip
 from ground_service.store import repository
-from ground_service.store.counters import hold
-from ground_service.store.files import StoredFile
 from ground_service.store.states import JOB, change_if, move
 from ground_service.worker.upkeep import nightly
 from lunar.errors import LunarError
@@ -42,8 +36,6 @@ from reports.errors import ReportError
 from tmtc.errors import TmtcError
 
 log = logging.getLogger(__name__)
-
-FINISHED = ("done", "failed")
 
 ATTEMPTS_LIMIT = 25
 """A job that ended with its process this often (for want of memory, say) is not tried again."""
@@ -56,6 +48,13 @@ Work = Callable[[Ground, Mapping[str, Any], str], dict[str, Any]]
 def _report(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
     made = make_report(ground, int(arguments["pass_id"]), report_id=job_id, pdf=True)
     return {"report_id": made.report_id, "pass_id": made.pass_id}
+
+
+def _reevaluate(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
+    """Evaluate a pass again because of an event, and make a report if anything in it differs."""
+    pass_id, event = int(arguments["pass_id"]), int(arguments["event"])
+    made = reevaluate(ground, pass_id, report_id=job_id, event=event)
+    return {"report_id": None if made is None else made.report_id, "pass_id": pass_id, "event": event}
 
 
 def _ingest(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
@@ -92,144 +91,9 @@ WORK: dict[str, Work] = {
     "regression": _regression,
     "nightly": nightly,
     "redecode": _redecode,
+    "re-evaluation": _reevaluate,
 }
-"""What can be asked for, by kind. Each may be run twice with the same arguments and job without harm."""
-
-IDENTITY = {
-    "report": ("pass_id",),
-    "archive": ("sha256",),
-    "replay": ("archive", "build"),
-    "regression": ("candidate", "baseline"),
-    "redecode": ("vehicle_id",),
-}
-"""Arguments that must be equal for two requests with the same job id to be the same request."""
-
-_OTHER_REQUEST = "Idempotency-Key: expected the request that it was first sent with, found another"
-
-
-def enter_job(ground: Ground, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
-    """Enter a job to be done; its id. Entering the same id again changes nothing."""
-    with ground.database.writing() as connection:
-        return add_job(connection, kind, arguments, job_id=job_id)
-
-
-def add_job(
-    connection: Connection, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None
-) -> str:
-    """Add a job as `enter_job` does, within the caller's transaction.
-
-    Raises
-    ------
-    Conflict
-        If the id stands for a job that does something else.
-    """
-    if kind not in WORK:
-        raise InvalidInput("job", "kind", " or ".join(WORK), kind)
-    identity = job_id or uuid.uuid4().hex
-    added = repository.add_new(
-        connection,
-        repository.JOBS,
-        id=identity,
-        kind=kind,
-        state="queued",
-        arguments=dict(arguments),
-        progress=0.0,
-        attempts=0,
-        created_utc_ns=utc_now_ns(),
-    )
-    if added:
-        publish(connection, "job", {"id": identity, "kind": kind, "state": "queued"})
-    else:
-        known = repository.get(connection, repository.JOBS, identity, "job")
-        if known["kind"] != kind or any(
-            known["arguments"].get(name) != arguments.get(name) for name in IDENTITY.get(kind, ())
-        ):
-            raise Conflict(_OTHER_REQUEST)
-    return identity
-
-
-def enter_jobs(
-    ground: Ground,
-    first: Mapping[str, Mapping[str, Any]],
-    kind: str,
-    arguments: Mapping[str, Any],
-    job_id: str,
-) -> list[str]:
-    """Add a job and the replays that it needs first in one transaction; return the ids to start, in order.
-
-    If the job exists already, nothing is added and only the job is started.
-
-    Parameters
-    ----------
-    first
-        Arguments of the replays by their names within the job.
-
-    Raises
-    ------
-    Conflict
-        If the id stands for a job that does something else.
-    """
-    with ground.database.writing() as connection:
-        hold(connection, f"job {job_id}")
-        new = repository.find(connection, repository.JOBS, id=job_id) is None
-        before = [
-            add_job(
-                connection,
-                "replay",
-                given,
-                job_id=hashlib.blake2b(f"{job_id} {name}".encode(), digest_size=16).hexdigest(),
-            )
-            for name, given in first.items()
-            if new
-        ]
-        return [*before, add_job(connection, kind, arguments, job_id=job_id)]
-
-
-def enter_ingest(
-    ground: Ground,
-    stored: StoredFile,
-    name: str,
-    *,
-    spacecraft_id: int | None,
-    instance: str,
-    place: Place | None = None,
-    job_id: str | None = None,
-) -> tuple[int, str]:
-    """Add an archived file and the job that ingests it in one transaction; return their ids, also if the job exists.
-
-    Raises
-    ------
-    Conflict
-        If the id belongs to another ingest.
-    """
-    with ground.database.writing() as connection:
-        if job_id is not None:
-            hold(connection, f"job {job_id}")
-            known = repository.find(connection, repository.JOBS, id=job_id)
-            if known is not None:
-                return _known_ingest(connection, known, stored, spacecraft_id, instance), job_id
-        ingest_id = add_ingest(
-            connection, stored, name, spacecraft_id=spacecraft_id, instance=instance, place=place
-        )
-        arguments = {"ingest_id": ingest_id, "spacecraft_id": spacecraft_id, "instance": instance}
-        return ingest_id, add_job(connection, "ingest", arguments, job_id=job_id)
-
-
-def _known_ingest(
-    connection: Connection,
-    job: Mapping[str, Any],
-    stored: StoredFile,
-    spacecraft_id: int | None,
-    instance: str,
-) -> int:
-    """Return the ingest of an existing job with the same file and the same spacecraft."""
-    asked = {"spacecraft_id": spacecraft_id, "instance": instance}
-    if job["kind"] == "ingest" and asked.items() <= job["arguments"].items():
-        ingest_id = int(job["arguments"]["ingest_id"])
-        record = repository.get(connection, repository.INGESTS, ingest_id, "ingest")
-        if record["file_sha256"] == stored.sha256:
-            return ingest_id
-    raise Conflict(_OTHER_REQUEST)
+"""Functions of the jobs by kind (`jobs.KINDS`). Each may be run twice with the same arguments and job without harm."""
 
 
 def enter_redecoding(ground: Ground) -> list[str]:
@@ -275,7 +139,7 @@ def _run_alone(ground: Ground, job_id: str) -> dict[str, Any]:
             )
         except StateConflict:  # another process has started the job since it was read
             return repository.get(connection, repository.JOBS, job_id, JOB.kind)
-        publish(connection, "job", {"id": job_id, "kind": job["kind"], "state": "running"})
+        publish(connection, JobChanged(id=job_id, kind=job["kind"], state="running"))
     if attempt > ATTEMPTS_LIMIT:
         error = f"given up after {ATTEMPTS_LIMIT} attempts that did not come to an end"
         return _finish(ground, job_id, attempt, state="failed", error=error)
@@ -369,20 +233,9 @@ def _finish(ground: Ground, job_id: str, attempt: int, *, state: str, **values: 
         job = repository.get(connection, repository.JOBS, job_id, JOB.kind)
         publish(
             connection,
-            "job",
-            {"id": job_id, "kind": job["kind"], "state": job["state"], "result": job["result"]},
+            JobChanged(id=job_id, kind=job["kind"], state=job["state"], result=job["result"]),
         )
     took_s = (job["finished_utc_ns"] - job["started_utc_ns"]) / 1e9
     told = {"job": job_id, "kind": job["kind"], "state": job["state"], "seconds": round(took_s, 3)}
     log.info("job %s (%s) is %s after %.1f s", job_id, job["kind"], job["state"], took_s, extra=told)
     return job
-
-
-def unfinished_jobs(ground: Ground) -> list[str]:
-    """Jobs that were entered and have not come to an end, the oldest first."""
-    table = repository.JOBS
-    with ground.database.reading() as connection:
-        rows = connection.execute(
-            select(table.c.id).where(table.c.state.not_in(FINISHED)).order_by(table.c.created_utc_ns)
-        )
-        return [str(row[0]) for row in rows]

@@ -15,14 +15,14 @@ from sqlalchemy import Connection, delete, select
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import NotFound
-from ground_service.feed import publish
+from ground_service.events import LimitsBroken, publish
 from ground_service.ground import Ground
 from ground_service.ingest.redecode import readable_version
 from ground_service.passes.cache import remembered
 from ground_service.passes.series import PARAMETERS, SeriesReading
 from ground_service.passes.span import PassSpan
 from ground_service.passes.trends import Trend, trend_of
-from ground_service.store import repository, rollups
+from ground_service.store import events, repository, rollups
 from ground_service.store.files import UNPACKING, remove_leftovers
 from ground_service.timekeeping.store import load_correlations
 from lunar.timescales import format_utc
@@ -68,7 +68,7 @@ def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> 
     ]
     if broken:
         with ground.database.writing() as connection:
-            publish(connection, "limits", {"broken": broken})
+            publish(connection, LimitsBroken(broken=broken))
     removed = tidy(ground, int(arguments.get("retention_days", RETENTION_DAYS)))
     return {"spacecraft": found, "limits_broken": broken, "removed": removed}
 
@@ -118,14 +118,10 @@ def trend_view(trend: Trend) -> dict[str, Any]:
 def tidy(ground: Ground, retention_days: int) -> dict[str, int]:
     """Take away what is older than it is kept; how much of each kind that was."""
     before = utc_now_ns() - retention_days * DAY_NS
-    feed, jobs, answers = repository.FEED, repository.JOBS, repository.ANSWERS
+    jobs, answers = repository.JOBS, repository.ANSWERS
     with ground.database.writing() as connection:
-        # The newest item stays, so that numbers are never given twice.
-        newest = select(feed.c.id).order_by(feed.c.id.desc()).limit(1).scalar_subquery()
         removed = {
-            "feed": connection.execute(
-                delete(feed).where(feed.c.utc_ns < before, feed.c.id != newest)
-            ).rowcount,
+            "events": events.delete_before(connection, before),
             "jobs": connection.execute(
                 delete(jobs).where(jobs.c.finished_utc_ns < before, jobs.c.state.in_(("done", "failed")))
             ).rowcount,

@@ -68,11 +68,11 @@ def settings_of(arguments: argparse.Namespace, **given: object) -> Settings:
 
 def open_service(arguments: argparse.Namespace) -> Ground:
     """The local service, its database brought up to date where that is this program's to do."""
-    from ground_service.ground import open_ground
+    from ground_service.worker.follow_up import open_following
     from linna.data import data_folder
 
     settings = settings_of(arguments)
-    return open_ground(
+    return open_following(
         settings.home,
         data_folder(),
         database_url=settings.resolved_database_url(),

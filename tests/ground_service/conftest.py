@@ -27,6 +27,7 @@ from sqlalchemy import create_engine, text
 
 from ground_service.ground import Ground, open_ground
 from ground_service.store.database import prepare_database
+from ground_service.worker.follow_up import follow_in_process
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue, make_catalogue, save_catalogue, size_class
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
@@ -306,6 +307,7 @@ def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Ground]:
         url = request.getfixturevalue("new_postgres_database")()
         prepare_database(url, upgrade=True).engine.dispose()
     with open_ground(tmp_path / "home", database_url=url) as ground:
+        follow_in_process(ground)
         yield ground
 
 
@@ -313,6 +315,7 @@ def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Ground]:
 def ground(tmp_path: Path) -> Iterator[Ground]:
     """An empty ground service with a SQLite database of its own."""
     opened = open_ground(tmp_path / "home")
+    follow_in_process(opened)
     yield opened
     opened.close()
 

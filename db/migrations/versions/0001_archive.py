@@ -101,12 +101,18 @@ def upgrade() -> None:
         sqlite_with_rowid=False,
     )
     op.create_table(
-        "feed",
+        "event_log",
         sa.Column("id", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=False),
         sa.Column("utc_ns", sa.BigInteger(), nullable=False),
         sa.Column("kind", sa.String(length=32), nullable=False),
         sa.Column("payload", sa.JSON(), nullable=False),
-        sa.PrimaryKeyConstraint("id", name=op.f("pk_feed")),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_event_log")),
+    )
+    op.create_table(
+        "event_positions",
+        sa.Column("consumer", sa.String(length=32), nullable=False),
+        sa.Column("number", sa.BigInteger(), nullable=False),
+        sa.PrimaryKeyConstraint("consumer", name=op.f("pk_event_positions")),
     )
     op.create_table(
         "files",
@@ -286,6 +292,7 @@ def upgrade() -> None:
         sa.Column("candidate_digest", sa.String(length=64), nullable=False),
         sa.Column("verdict", sa.String(length=16), nullable=False),
         sa.Column("result", sa.JSON(), nullable=False),
+        sa.Column("missions", sa.JSON(), nullable=False),
         sa.Column("html_sha256", sa.String(length=64), nullable=True),
         sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_regressions")),
@@ -513,6 +520,19 @@ def upgrade() -> None:
         sa.PrimaryKeyConstraint("vehicle_id", name=op.f("pk_command_counters")),
     )
     op.create_table(
+        "missions",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("revision", sa.String(length=64), nullable=False),
+        sa.Column("name", sa.Text(), nullable=False),
+        sa.Column("ccsds_id", sa.Integer(), nullable=True),
+        sa.Column("text", sa.Text(), nullable=False),
+        sa.Column("entered_by", sa.String(length=64), nullable=False),
+        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_missions")),
+        sa.UniqueConstraint("revision", name=op.f("uq_missions_revision")),
+    )
+    op.create_index(op.f("ix_missions_ccsds_id"), "missions", ["ccsds_id"], unique=False)
+    op.create_table(
         "telecommands",
         sa.Column("id", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=False),
         sa.Column("vehicle_id", sa.Integer(), nullable=False),
@@ -534,6 +554,10 @@ def upgrade() -> None:
         sa.Column("timeout_noted_utc_ns", sa.BigInteger(), nullable=True),
         sa.Column("window_id", sa.Integer(), nullable=True),
         sa.Column("carrier_id", sa.BigInteger(), nullable=True),
+        sa.Column("mission_id", sa.Integer(), nullable=True),
+        sa.ForeignKeyConstraint(
+            ["mission_id"], ["missions.id"], name=op.f("fk_telecommands_mission_id_missions")
+        ),
         sa.ForeignKeyConstraint(
             ["vehicle_id"], ["vehicles.id"], name=op.f("fk_telecommands_vehicle_id_vehicles")
         ),
@@ -559,19 +583,6 @@ def upgrade() -> None:
         sa.UniqueConstraint("token_sha256", name=op.f("uq_tokens_token_sha256")),
     )
     op.create_index(op.f("ix_tokens_user_id"), "tokens", ["user_id"], unique=False)
-    op.create_table(
-        "missions",
-        sa.Column("id", sa.Integer(), nullable=False),
-        sa.Column("revision", sa.String(length=64), nullable=False),
-        sa.Column("name", sa.Text(), nullable=False),
-        sa.Column("ccsds_id", sa.Integer(), nullable=True),
-        sa.Column("text", sa.Text(), nullable=False),
-        sa.Column("entered_by", sa.String(length=64), nullable=False),
-        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
-        sa.PrimaryKeyConstraint("id", name=op.f("pk_missions")),
-        sa.UniqueConstraint("revision", name=op.f("uq_missions_revision")),
-    )
-    op.create_index(op.f("ix_missions_ccsds_id"), "missions", ["ccsds_id"], unique=False)
     op.create_table(
         "passes",
         sa.Column("id", sa.Integer(), nullable=False),
@@ -622,9 +633,14 @@ def upgrade() -> None:
         sa.Column("json_sha256", sa.String(length=64), nullable=False),
         sa.Column("pdf_sha256", sa.String(length=64), nullable=True),
         sa.Column("summary", sa.JSON(), nullable=False),
+        sa.Column("mission_id", sa.Integer(), nullable=True),
+        sa.Column("event_number", sa.BigInteger(), nullable=True),
+        sa.Column("previous_id", sa.String(length=32), nullable=True),
+        sa.Column("changes", sa.JSON(), nullable=True),
         sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
         sa.ForeignKeyConstraint(["html_sha256"], ["files.sha256"], name=op.f("fk_reports_html_sha256_files")),
         sa.ForeignKeyConstraint(["json_sha256"], ["files.sha256"], name=op.f("fk_reports_json_sha256_files")),
+        sa.ForeignKeyConstraint(["mission_id"], ["missions.id"], name=op.f("fk_reports_mission_id_missions")),
         sa.ForeignKeyConstraint(["pass_id"], ["passes.id"], name=op.f("fk_reports_pass_id_passes")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_reports")),
     )
@@ -643,6 +659,7 @@ def upgrade() -> None:
         sa.Column("predecessor_id", sa.Integer(), nullable=True),
         sa.Column("ephemeris_id", sa.Integer(), nullable=True),
         sa.Column("pass_id", sa.Integer(), nullable=True),
+        sa.Column("mission_id", sa.Integer(), nullable=True),
         sa.Column("data_octets", sa.BigInteger(), nullable=False),
         sa.Column("predicted", sa.JSON(), nullable=False),
         sa.Column("version", sa.Integer(), nullable=False),
@@ -654,6 +671,7 @@ def upgrade() -> None:
         sa.ForeignKeyConstraint(
             ["ephemeris_id"], ["ephemerides.id"], name=op.f("fk_windows_ephemeris_id_ephemerides")
         ),
+        sa.ForeignKeyConstraint(["mission_id"], ["missions.id"], name=op.f("fk_windows_mission_id_missions")),
         sa.ForeignKeyConstraint(["pass_id"], ["passes.id"], name=op.f("fk_windows_pass_id_passes")),
         sa.ForeignKeyConstraint(
             ["predecessor_id"], ["windows.id"], name=op.f("fk_windows_predecessor_id_windows")
@@ -671,9 +689,9 @@ def downgrade() -> None:
     op.drop_table("reports")
     op.drop_table("pass_frames")
     op.drop_table("passes")
-    op.drop_table("missions")
     op.drop_table("tokens")
     op.drop_table("telecommands")
+    op.drop_table("missions")
     op.drop_table("command_counters")
     op.drop_table("stream_edges")
     op.drop_table("known_links")
@@ -698,7 +716,8 @@ def downgrade() -> None:
     op.drop_table("frame_outcomes")
     op.drop_table("filter_states")
     op.drop_table("files")
-    op.drop_table("feed")
+    op.drop_table("event_positions")
+    op.drop_table("event_log")
     op.drop_table("events")
     op.drop_table("detections")
     op.drop_table("builds")

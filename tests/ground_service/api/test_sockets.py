@@ -12,8 +12,8 @@ from starlette.websockets import WebSocketDisconnect
 
 from ground_service.access import service as users
 from ground_service.app import create_app
-from ground_service.feed import publish
 from ground_service.settings import Settings
+from ground_service.store.events import publish
 from ground_service.web import sockets
 
 with warnings.catch_warnings():
@@ -161,15 +161,15 @@ def test_sockets_are_limited_for_a_user_and_in_all(client: TestClient) -> None:
 
 def test_the_feed_is_read_once_for_all_sockets(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
     reads = 0
-    read_feed = sockets.read_feed
+    read_events = sockets.read_events
 
     def counted(*arguments: Any) -> Any:
         nonlocal reads
-        items = read_feed(*arguments)
+        items = read_events(*arguments)
         reads += bool(items)
         return items
 
-    monkeypatch.setattr(sockets, "read_feed", counted)
+    monkeypatch.setattr(sockets, "read_events", counted)
     ground = ground_of(client)
     tokens = [users.add_user(ground, name, "viewer") for name in ("ann", "bob")]
     opened = [client.websocket_connect(LIVE, headers=bearer(token)) for token in tokens * 2]

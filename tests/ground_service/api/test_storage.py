@@ -13,10 +13,11 @@ import pytest
 from ground_service.app import create_app
 from ground_service.errors import StorageFull
 from ground_service.ingest import service as ingesting
+from ground_service.ingest.service import enter_ingest
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
-from ground_service.worker.jobs import enter_ingest, run_job
+from ground_service.worker.jobs import run_job
 
 with warnings.catch_warnings():
     # The test client's next version wants another HTTP library.

@@ -21,7 +21,7 @@ from ground_service.commanding.service import (
     take_uplink,
 )
 from ground_service.errors import Conflict, InvalidInput, NotFound
-from ground_service.feed import read_feed
+from ground_service.events import read_events
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
 from ground_service.planning.service import (
@@ -246,7 +246,7 @@ def test_a_time_out_is_put_on_record_once_and_stays_there(
     assert [(row["actor"], row["target"], row["detail"]["state"]) for row in record] == [
         ("service", str(silent), "sent")
     ]
-    assert {"id": silent, "state": "timed out"} in [item["payload"] for item in read_feed(ground, 0)]
+    assert {"id": silent, "state": "timed out"} in [item.payload for item in read_events(ground.database, 0)]
 
 
 @given(st.lists(st.sampled_from([1, 3, 5, 7]), unique=True), st.randoms())
@@ -387,7 +387,7 @@ def notes(ground: Ground, command: int) -> list[tuple[str, str, Any]]:
 
 
 def told(ground: Ground) -> list[Any]:
-    return [item["payload"] for item in read_feed(ground, 0) if item["kind"] == "telecommand"]
+    return [item.payload for item in read_events(ground.database, 0) if item.kind == "telecommand"]
 
 
 def test_each_step_keeps_what_was_done_when_by_whom_and_tells_those_who_watch(

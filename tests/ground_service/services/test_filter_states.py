@@ -17,11 +17,11 @@ from ground_service.ground import Ground, open_ground
 from ground_service.ingest.packets import batch_of_cut
 from ground_service.ingest.redecode import catch_up
 from ground_service.ingest.service import ingest_file
+from ground_service.ingest.store import store_batch
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.service import define_pass
 from ground_service.passes.span import pass_span
 from ground_service.store import repository
-from ground_service.store.packets import store_batch
 from tmtc.dictionary import DICTIONARY, dictionary_version
 from tmtc.downlink import encode_cadus
 from tmtc.stream import cut_packets

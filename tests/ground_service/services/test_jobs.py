@@ -17,10 +17,12 @@ from ground_service.errors import (
     public_text,
 )
 from ground_service.ground import Ground
+from ground_service.ingest.service import enter_ingest
+from ground_service.jobs import add_job, enter_job
 from ground_service.store import repository
 from ground_service.store.states import JOB, move
 from ground_service.worker import jobs
-from ground_service.worker.jobs import add_job, enter_ingest, enter_job, run_job
+from ground_service.worker.jobs import run_job
 
 Row = dict[str, Any]
 

@@ -15,11 +15,11 @@ from ground_service.ingest import redecode as redecoding
 from ground_service.ingest.packets import batch_of_cut
 from ground_service.ingest.redecode import catch_up, redecode, vehicles_behind
 from ground_service.ingest.service import ingest_file
+from ground_service.ingest.store import store_batch
 from ground_service.passes.service import define_pass, events, parameter_series, state_series
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
-from ground_service.store.packets import store_batch
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
 

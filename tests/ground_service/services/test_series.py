@@ -8,11 +8,11 @@ from sqlalchemy import delete
 
 from ground_service.evaluation.store import PassSpan
 from ground_service.ground import Ground
+from ground_service.ingest.store import store_samples
 from ground_service.passes import series
 from ground_service.passes.service import trend_series
 from ground_service.store import repository
 from ground_service.store.models import Rollup
-from ground_service.store.packets import store_samples
 from ground_service.store.rollups import BASE_TICKS, HOUSEKEEPING_VALUES, STATE_VALUES, build_rollups
 from tmtc.dictionary import DICTIONARY
 

@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 from ground_service.access.service import audit
-from ground_service.feed import publish, read_feed
+from ground_service.events import read_events
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
+from ground_service.jobs import enter_job
 from ground_service.passes.core import downsample
 from ground_service.passes.trends import trend_of
 from ground_service.store import repository
-from ground_service.worker.jobs import enter_job, run_job
+from ground_service.store.events import publish
+from ground_service.worker.jobs import run_job
 from ground_service.worker.upkeep import nightly_job_id, spacecraft_trends, tidy
 from tmtc.dictionary import DICTIONARY
 
@@ -56,8 +58,8 @@ def test_what_is_old_goes_and_the_record_stays(ground: Ground, monkeypatch: pyte
         with monkeypatch.context() as long_ago:
             long_ago.setattr("ground_service.access.service.utc_now_ns", lambda: 0)
             audit(connection, "ann", "look", "", {})
-        connection.execute(repository.FEED.update().values(utc_ns=0))
     with ground.database.writing() as connection:
+        connection.execute(repository.EVENT_LOG.update().values(utc_ns=0))
         connection.execute(
             repository.ANSWERS.insert().values(key="k", request="r", answer={"id": 1}, created_utc_ns=0)
         )
@@ -65,8 +67,8 @@ def test_what_is_old_goes_and_the_record_stays(ground: Ground, monkeypatch: pyte
         ground.files.root.mkdir(exist_ok=True)
         (ground.files.root / name).write_bytes(b"")
     os.utime(ground.files.root / ".incoming-old", (0, 0))
-    assert tidy(ground, 90) == {"feed": 2, "jobs": 0, "answers": 1, "files": 1}
-    assert [item["id"] for item in read_feed(ground, 0)] == [3]
+    assert tidy(ground, 90) == {"events": 2, "jobs": 0, "answers": 1, "files": 1}
+    assert [item.number for item in read_events(ground.database, 0)] == [3]
     with ground.database.reading() as connection:
         assert repository.page(connection, repository.AUDIT).total == 1
 

@@ -11,12 +11,12 @@ from sqlalchemy import create_engine, make_url, text
 from sqlalchemy.exc import DBAPIError
 
 from ground_service.access.service import audit
-from ground_service.clock import utc_now_ns
 from ground_service.ground import ground_from_settings
 from ground_service.ingest.service import ingest_file
 from ground_service.settings import load_settings
 from ground_service.store import repository
 from ground_service.store.database import open_database
+from ground_service.store.events import publish
 from ground_service.store.roles import PowerfulRole, check_role
 from ground_service.worker.upkeep import tidy
 from linna import cli
@@ -107,12 +107,13 @@ def test_the_service_does_its_work_with_its_role(
     with ground_from_settings(settings) as ground:
         result = ingest_file(ground, synthetic_pass.folder / "downlink.cadu", spacecraft_id=76, instance="a")
         assert result is not None
-        now = utc_now_ns()
         with ground.database.writing() as connection:
             audit(connection, "tests", "user.add", "somebody", {})
-            repository.add(connection, repository.FEED, utc_ns=1, kind="test", payload={})
-            repository.add(connection, repository.FEED, utc_ns=now, kind="test", payload={})
-        assert tidy(ground, 30)["feed"] >= 1
+            publish(connection, "test", {})
+            publish(connection, "test", {})
+        with ground.database.writing() as connection:
+            connection.execute(repository.EVENT_LOG.update().values(utc_ns=1))
+        assert tidy(ground, 30)["events"] >= 1
 
 
 def test_a_role_with_more_power_than_the_service_needs_is_refused(

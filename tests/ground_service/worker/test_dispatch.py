@@ -14,13 +14,12 @@ import pytest
 from ground_service.errors import StorageFull
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest import service as ingesting
-from ground_service.ingest.service import ingest_file
+from ground_service.ingest.service import enter_ingest, ingest_file
 from ground_service.ingest.stream import DownlinkReader
 from ground_service.store import files, repository
 from ground_service.store.canonical import archive_hash
 from ground_service.worker import dispatch
 from ground_service.worker.dispatch import ThreadDispatcher
-from ground_service.worker.jobs import enter_ingest
 
 
 @pytest.fixture(scope="module")

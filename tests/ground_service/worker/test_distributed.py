@@ -16,6 +16,7 @@ from ground_service.errors import DatabaseNotMigrated, SettingsError
 from ground_service.evaluation.service import pass_summary
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
+from ground_service.jobs import enter_job
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from ground_service.store import repository
@@ -29,7 +30,7 @@ from ground_service.store.database import (
 from ground_service.store.models import Base
 from ground_service.worker.app import run_worker, worker_answers
 from ground_service.worker.dispatch import dispatcher_for
-from ground_service.worker.jobs import _lock_key, enter_job, run_job
+from ground_service.worker.jobs import _lock_key, run_job
 from tests.ground_service.schema import described_schema
 
 SPACECRAFT = 76

@@ -9,9 +9,10 @@ from typing import Any, Protocol
 import numpy as np
 from sqlalchemy import Connection, bindparam, func, select
 
+from ground_service.events import TelemetryReceived, publish
 from ground_service.store.bulk import insert_columns
 from ground_service.store.codec import pack_detections, pack_filter_states, pack_identifications
-from ground_service.store.models import SAMPLE_TABLES, Packet, Vehicle
+from ground_service.store.models import NO_TICKS, SAMPLE_TABLES, Packet, Vehicle
 from ground_service.store.rollups import add_to_rollups
 from lunar.arrays import IntArray
 
@@ -94,6 +95,13 @@ def store_batch(connection: Connection, vehicle_id: int, batch: Batch) -> Stored
     ids[new] = _insert_packets(connection, vehicle_id, batch, new)
     added = int(np.count_nonzero(ids))
     samples = store_samples(connection, vehicle_id, batch.dictionary_version, batch.rows, ids)
+    if added:
+        ticks = batch.ticks[(ids > 0) & (batch.ticks != NO_TICKS)]
+        first, last = (int(ticks.min()), int(ticks.max())) if ticks.size else (None, None)
+        publish(
+            connection,
+            TelemetryReceived(vehicle_id=vehicle_id, packets=added, first_ticks=first, last_ticks=last),
+        )
     return Stored(added, count - added, samples)
 
 

@@ -1,0 +1,158 @@
+"""Events that the capabilities publish, each defined once.
+
+A capability publishes an event in the transaction of its change and does not know what follows. `worker.follow_up`
+decides that; pages and WebSockets show the same log.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Self
+
+from pydantic import BaseModel, ConfigDict
+from sqlalchemy import Connection
+
+from ground_service.store import events as log
+from ground_service.store.database import Database
+from ground_service.store.events import LoggedEvent
+
+
+class Event(BaseModel):
+    """Event of the kind `event_kind`; its fields are the payload in the log."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    event_kind: ClassVar[str]
+
+    @classmethod
+    def of(cls, logged: LoggedEvent) -> Self:
+        """Return the event of a log entry of this kind."""
+        return cls.model_validate(logged.payload)
+
+
+class TelemetryReceived(Event):
+    """New packets of a vehicle were stored; `first_ticks` and `last_ticks` are None if no packet has a time."""
+
+    event_kind = "telemetry"
+    vehicle_id: int
+    packets: int
+    first_ticks: int | None = None
+    last_ticks: int | None = None
+
+
+class ReceptionsEntered(Event):
+    """Reception times of time reports of a vehicle were entered."""
+
+    event_kind = "receptions"
+    vehicle_id: int
+    reports: int
+
+
+class CorrelationChanged(Event):
+    """The time correlations of a vehicle were replaced."""
+
+    event_kind = "correlation"
+    vehicle_id: int
+    segments: int
+
+
+class EphemerisAdded(Event):
+    """A reference ephemeris was added."""
+
+    event_kind = "ephemeris"
+    id: int
+    start_utc_ns: int
+    stop_utc_ns: int
+
+
+class CommandsSent(Event):
+    """Released telecommands of a vehicle were handed over for transmission."""
+
+    event_kind = "uplink"
+    vehicle_id: int
+    telecommands: tuple[int, ...]
+
+
+class CommandStateChanged(Event):
+    """A telecommand was entered, decided, sent, or has timed out."""
+
+    event_kind = "telecommand"
+    id: int
+    state: str
+
+
+class WindowChanged(Event):
+    """A planned window was entered, decided, or changed its state."""
+
+    event_kind = "window"
+    id: int
+    state: str
+
+
+class PassEvaluated(Event):
+    """A report of a pass was made; `event` is the event that caused it, None for a report on request."""
+
+    event_kind = "report"
+    report_id: str
+    pass_id: int
+    vehicle_id: int
+    event: int | None = None
+
+
+class RegressionJudged(Event):
+    """A candidate build was judged."""
+
+    event_kind = "regression"
+    id: str
+    verdict: str
+
+
+class MissionAdded(Event):
+    """A revision of a mission description was added or taken over by a person."""
+
+    event_kind = "mission"
+    id: int
+    mission: str
+    spacecraft_id: int | None = None
+
+
+class JobChanged(Event):
+    """A job was added, started or has ended."""
+
+    event_kind = "job"
+    id: str
+    kind: str
+    state: str
+    result: dict[str, Any] | None = None
+
+
+class LimitsBroken(Event):
+    """Trends of housekeeping parameters are outside their limits."""
+
+    event_kind = "limits"
+    broken: list[dict[str, Any]]
+
+
+class FollowUpFailed(Event):
+    """Follow-up work of events failed and is not repeated."""
+
+    event_kind = "follow-up failed"
+    work: str
+    events: tuple[int, ...]
+    error: str
+
+
+def publish(connection: Connection, event: Event) -> None:
+    """Publish an event in the write transaction of this connection."""
+    log.publish(connection, event.event_kind, event.model_dump(mode="json", exclude_none=True))
+
+
+def read_events(database: Database, after: int, limit: int = 200) -> list[LoggedEvent]:
+    """Return the events with numbers above `after`, in order."""
+    with database.reading() as connection:
+        return log.read_events(connection, after, limit)
+
+
+def last_number(database: Database) -> int:
+    """Return the number of the newest event; 0 without events."""
+    with database.reading() as connection:
+        return log.last_number(connection)

@@ -1,0 +1,317 @@
+"""Follow-up work of events: what happens after telemetry, ephemerides, uplinks and reports.
+
+A consumer of the event log with a durable position. It works in the process of the event (embedded service, one-shot
+commands, workers), and the work is complete before the commit's caller continues. Otherwise a task for the workers is
+sent. Work is derived from the state of the database, so that doing it again gives the same result: an event that a
+killed process has left is handled by the next run, and an event that two processes handle changes nothing twice.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+from pydantic import ValidationError
+from sqlalchemy import Connection, select
+
+from ground_service.errors import PASSING, public_text
+from ground_service.events import (
+    CommandsSent,
+    CorrelationChanged,
+    EphemerisAdded,
+    FollowUpFailed,
+    PassEvaluated,
+    ReceptionsEntered,
+    TelemetryReceived,
+    WindowChanged,
+    publish,
+)
+from ground_service.ground import Ground, open_ground
+from ground_service.jobs import add_job
+from ground_service.missions.store import get_mission
+from ground_service.passes.span import pass_span
+from ground_service.planning.progress import advance_windows
+from ground_service.store import events, repository
+from ground_service.store.events import LoggedEvent
+from ground_service.timekeeping.recorrelation import recorrelate, vehicles_with_receptions
+from ground_service.worker.jobs import run_job
+from lunar.datafolder import DataFolder
+
+log = logging.getLogger(__name__)
+
+CONSUMER = "follow-up"
+LOCK = 7603
+BATCH = 1000
+WAIT_S = 0.05
+
+Work = tuple[str, int]
+"""Name of the work and the id of the vehicle, pass or window that it is for."""
+
+Start = Callable[[str], object]
+"""Function that runs a job, or has it run."""
+
+
+def _after_telemetry(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
+    event = TelemetryReceived.of(logged)
+    yield "recorrelate", event.vehicle_id
+    yield "advance windows", event.vehicle_id
+    if event.first_ticks is not None and event.last_ticks is not None:
+        with _ground.database.reading() as connection:
+            yield from (
+                ("re-evaluate", pass_id)
+                for pass_id in _reported_passes(
+                    connection, event.vehicle_id, event.first_ticks, event.last_ticks
+                )
+            )
+
+
+def _after_receptions(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
+    yield "recorrelate", ReceptionsEntered.of(logged).vehicle_id
+
+
+def _after_correlation(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
+    yield "advance windows", CorrelationChanged.of(logged).vehicle_id
+
+
+def _after_ephemeris(ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
+    event = EphemerisAdded.of(logged)
+    for vehicle in vehicles_with_receptions(ground, event.start_utc_ns, event.stop_utc_ns):
+        yield "recorrelate", vehicle
+    table = repository.PASSES
+    query = select(table.c.id).where(
+        table.c.ephemeris_id.is_(None),
+        table.c.start_utc_ns <= event.stop_utc_ns,
+        table.c.stop_utc_ns >= event.start_utc_ns,
+        table.c.id.in_(select(repository.REPORTS.c.pass_id)),
+    )
+    with ground.database.reading() as connection:
+        for pass_id in connection.execute(query.order_by(table.c.id)).scalars():
+            yield "re-evaluate", int(pass_id)
+
+
+def _after_uplink(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
+    yield "advance windows", CommandsSent.of(logged).vehicle_id
+
+
+def _after_report(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
+    yield "advance windows", PassEvaluated.of(logged).vehicle_id
+
+
+def _after_window(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
+    event = WindowChanged.of(logged)
+    if event.state == "downlinked":
+        yield "report", event.id
+
+
+FOLLOWING: Mapping[str, Callable[[Ground, LoggedEvent], Iterator[Work]]] = {
+    TelemetryReceived.event_kind: _after_telemetry,
+    ReceptionsEntered.event_kind: _after_receptions,
+    CorrelationChanged.event_kind: _after_correlation,
+    EphemerisAdded.event_kind: _after_ephemeris,
+    CommandsSent.event_kind: _after_uplink,
+    PassEvaluated.event_kind: _after_report,
+    WindowChanged.event_kind: _after_window,
+}
+"""The work that follows an event, by its kind."""
+
+
+def _recorrelate(ground: Ground, vehicle: int, _event: int) -> None:
+    recorrelate(ground, vehicle)
+
+
+def _advance(ground: Ground, vehicle: int, _event: int) -> None:
+    advance_windows(ground, vehicle)
+
+
+def _reevaluate(ground: Ground, pass_id: int, event: int) -> str | None:
+    """Add the job of a re-evaluation, unless one waits already, which will find the same data."""
+    table = repository.JOBS
+    with ground.database.writing() as connection:
+        waiting = select(table.c.arguments).where(table.c.kind == "re-evaluation", table.c.state == "queued")
+        if any(arguments["pass_id"] == pass_id for arguments in connection.execute(waiting).scalars()):
+            return None
+        identity = _job_id("re-evaluation", pass_id, event)
+        return add_job(connection, "re-evaluation", {"pass_id": pass_id, "event": event}, job_id=identity)
+
+
+def _report(ground: Ground, window_id: int, event: int) -> str | None:
+    """Add the job of the first report of a window if its mission description asks for automatic evaluation."""
+    with ground.database.writing() as connection:
+        window = repository.get(connection, repository.WINDOWS, window_id, "window")
+        pass_id, mission_id = window["pass_id"], window["mission_id"]
+        if pass_id is None or mission_id is None or window["state"] != "downlinked":
+            return None
+        if not get_mission(connection, mission_id).automation.evaluate:
+            return None
+        return add_job(connection, "report", {"pass_id": pass_id}, job_id=_job_id("report", pass_id, 0))
+
+
+DOING: Mapping[str, Callable[[Ground, int, int], str | None]] = {
+    "recorrelate": _recorrelate,
+    "advance windows": _advance,
+    "re-evaluate": _reevaluate,
+    "report": _report,
+}
+"""Functions of the work in the order in which they run; each returns the id of a job to start, or None."""
+
+_ORDER = {name: number for number, name in enumerate(DOING)}
+
+
+class FollowUp:
+    """Consumer of the event log in this process."""
+
+    def __init__(self, ground: Ground, start: Start | None = None) -> None:
+        self._ground = ground
+        self._start = start or (lambda job_id: run_job(ground, job_id))
+        self._lock = threading.Lock()
+        self._here = threading.local()
+
+    def __call__(self, kinds: frozenset[str]) -> None:
+        """Handle the events of a commit; the commit has succeeded, so errors are logged."""
+        if not kinds.isdisjoint(FOLLOWING):
+            self.drain()
+
+    def drain(self) -> None:
+        """Handle all events so far, or wait until another thread or process has handled them."""
+        if getattr(self._here, "draining", False):
+            return  # an event of the work itself, which the loop below handles
+        try:
+            for job_id in self._drained():
+                self._start(job_id)
+        except PASSING as error:
+            log.warning("follow-up work will be repeated: %s", error)
+
+    def _drained(self) -> list[str]:
+        jobs: list[str] = []
+        database = self._ground.database
+        with database.reading() as connection:
+            last = events.last_number(connection)
+        while True:
+            with self._lock, database.alone(LOCK) as alone:
+                if alone:
+                    self._here.draining = True
+                    try:
+                        while self._handle_batch(jobs):
+                            pass
+                    finally:
+                        self._here.draining = False
+                    return jobs
+            with database.reading() as connection:
+                if events.position_of(connection, CONSUMER) >= last:
+                    return jobs
+            self._ground.check_stopping()
+            time.sleep(WAIT_S)
+
+    def _handle_batch(self, jobs: list[str]) -> bool:
+        """Handle the next events, equal work once; return whether there were any."""
+        ground = self._ground
+        with ground.database.reading() as connection:
+            position = events.position_of(connection, CONSUMER)
+            batch = events.read_events(connection, position, BATCH, FOLLOWING)
+        work: dict[Work, list[int]] = {}
+        failed = []
+        for event in batch:
+            try:
+                for one in FOLLOWING[event.kind](ground, event):
+                    work.setdefault(one, []).append(event.number)
+            except ValidationError as error:
+                log.error("event %d (%s) is not valid: %s", event.number, event.kind, error)
+                failed.append(
+                    FollowUpFailed(work=event.kind, events=(event.number,), error="the event is not valid")
+                )
+        for one in sorted(work, key=lambda one: (_ORDER[one[0]], one[1])):
+            ground.check_stopping()
+            try:
+                job_id = DOING[one[0]](ground, one[1], work[one][-1])
+                if job_id is not None:
+                    jobs.append(job_id)
+            except PASSING:
+                raise
+            except Exception as error:  # one fault must not stop the work of later events
+                log.exception("follow-up work failed: %s %d", *one)
+                name = f"{one[0]} {one[1]}"
+                failed.append(FollowUpFailed(work=name, events=tuple(work[one]), error=public_text(error)))
+        if batch:
+            with ground.database.writing() as connection:
+                events.advance(connection, CONSUMER, batch[-1].number)
+                for fault in failed:
+                    publish(connection, fault)
+        return bool(batch)
+
+
+def follow_in_process(ground: Ground, start: Start | None = None) -> FollowUp:
+    """Handle the events of this process in the committing thread; return the consumer.
+
+    Parameters
+    ----------
+    start
+        Function that starts a job of the follow-up work; None: run it before the commit's caller continues.
+    """
+    follow_up = FollowUp(ground, start)
+    ground.database.listeners.add(follow_up)
+    return follow_up
+
+
+def open_following(
+    home: Path,
+    data: DataFolder | None = None,
+    *,
+    database_url: str | None = None,
+    runner: Path | None = None,
+) -> Ground:
+    """Return the ground service under `home` (see `open_ground`), which handles its events in this process."""
+    ground = open_ground(home, data, database_url=database_url, runner=runner)
+    follow_in_process(ground)
+    return ground
+
+
+class WorkersFollow:
+    """Follow-up work done by workers: a task is sent after each commit with events that have follow-up work."""
+
+    def __init__(self, ground: Ground, send: Callable[[], object]) -> None:
+        self._ground = ground
+        self._send = send
+
+    def __call__(self, kinds: frozenset[str]) -> None:
+        """Send a task for the events of a commit."""
+        if not kinds.isdisjoint(FOLLOWING):
+            self._send()
+
+    def drain(self) -> None:
+        """Send a task if a broker or a worker that was killed has lost one."""
+        with self._ground.database.reading() as connection:
+            waiting = events.read_events(
+                connection, events.position_of(connection, CONSUMER), limit=1, kinds=FOLLOWING
+            )
+        if waiting:
+            self._send()
+
+
+def follow_by_workers(ground: Ground, send: Callable[[], object]) -> WorkersFollow:
+    """Have the events of this process handled by workers; return the consumer."""
+    follow = WorkersFollow(ground, send)
+    ground.database.listeners.add(follow)
+    return follow
+
+
+def _reported_passes(connection: Connection, vehicle: int, first_ticks: int, last_ticks: int) -> list[int]:
+    """Return the passes of a vehicle that have a report and that contain on-board times of an interval."""
+    table = repository.PASSES
+    query = select(table).where(
+        table.c.vehicle_id == vehicle, table.c.id.in_(select(repository.REPORTS.c.pass_id))
+    )
+    found = []
+    for record in connection.execute(query.order_by(table.c.id)).mappings():
+        span = pass_span(connection, record)
+        if span.start_ticks <= last_ticks and first_ticks <= span.stop_ticks:
+            found.append(int(record["id"]))
+    return found
+
+
+def _job_id(kind: str, key: int, event: int) -> str:
+    """Return the id of the job of an event: the same event again adds the same job."""
+    return hashlib.blake2b(f"{kind} {key} {event}".encode(), digest_size=16).hexdigest()
