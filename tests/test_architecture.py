@@ -69,6 +69,122 @@ def test_a_planted_import_across_a_wall_is_refused(copy_of_the_tree: Path, modul
     assert "BROKEN" in result.stdout
 
 
+def modules_of(root: Path) -> dict[str, Path]:
+    """Modules and packages of the product by dotted name."""
+    found = {}
+    for package in PACKAGES:
+        for file in sorted((root / package).rglob("*.py")):
+            parts = file.relative_to(root).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = file
+    return found
+
+
+def imported_names(name: str, file: Path) -> set[str]:
+    """Dotted names that a module imports anywhere: also in functions and for type checking."""
+    package = name if file.name == "__init__.py" else name.rpartition(".")[0]
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            parts = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            origin = ".".join([*parts, *([node.module] if node.module else [])])
+            found |= {f"{origin}.{alias.name}" for alias in node.names}
+    return found
+
+
+def import_cycles(root: Path) -> list[list[str]]:
+    """Groups of modules or packages of one package that import each other.
+
+    An import from one module to another is an edge between the members of their closest common package.
+    """
+    modules = modules_of(root)
+    edges: dict[str, dict[str, set[str]]] = {}
+    for name, file in modules.items():
+        for imported in imported_names(name, file):
+            target = imported if imported in modules else imported.rpartition(".")[0]
+            if target not in modules:
+                continue
+            mine, theirs = name.split("."), target.split(".")
+            common = next((k for k, (a, b) in enumerate(zip(mine, theirs, strict=False)) if a != b), None)
+            if common is None:  # a package and its own member
+                continue
+            below = edges.setdefault(".".join(mine[:common]), {})
+            below.setdefault(mine[common], set()).add(theirs[common])
+    cycles = []
+    for package, graph in edges.items():
+        reached = {start: reachable(graph, start) for start in graph}
+        groups = {
+            frozenset(other for other in reached[one] if one in reached.get(other, ()))
+            for one in graph
+            if one in reached[one]
+        }
+        cycles += [[f"{package}.{one}".lstrip(".") for one in sorted(group)] for group in groups]
+    return sorted(cycles)
+
+
+def reachable(graph: dict[str, set[str]], start: str) -> set[str]:
+    """Members that can be reached over at least one edge."""
+    found: set[str] = set()
+    waiting = list(graph.get(start, ()))
+    while waiting:
+        one = waiting.pop()
+        if one not in found:
+            found.add(one)
+            waiting += graph.get(one, ())
+    return found
+
+
+KNOWN_CYCLES = [
+    # through `http.views`, whose functions move to the models of the capabilities
+    [
+        "ground_service.access",
+        "ground_service.commanding",
+        "ground_service.ephemerides",
+        "ground_service.evaluation",
+        "ground_service.http",
+        "ground_service.missions",
+        "ground_service.passes",
+        "ground_service.planning",
+        "ground_service.timekeeping",
+    ],
+    # through the route of jobs
+    ["ground_service.api", "ground_service.regression", "ground_service.worker"],
+    ["ground_service.regression.documents", "ground_service.regression.service"],
+    ["linna.commands._catalogue_landmarks", "linna.commands.catalogue"],
+    ["lunar.ephemeris", "lunar.oem", "lunar.stk"],
+    ["lunar.errors", "lunar.timescales"],
+    ["tmtc.schema", "tmtc.stream"],
+]
+
+
+def test_no_other_import_cycles_also_in_functions_and_for_type_checking() -> None:
+    assert import_cycles(ROOT) == KNOWN_CYCLES
+
+
+@pytest.mark.parametrize(
+    ("module", "planted", "cycle"),
+    [
+        (
+            "ground_service/ingest/core.py",
+            "def late():\n    from ground_service.ingest import service",
+            "ground_service.ingest.core",
+        ),
+        (
+            "ground_service/store/files.py",
+            "if TYPE_CHECKING:\n    from ground_service.store.repository import Row",
+            "ground_service.store.files",
+        ),
+        ("lunar/constants.py", "import lunar.frames", "lunar.constants"),
+        ("tmtc/crc.py", "from tmtc import frames", "tmtc.crc"),
+    ],
+)
+def test_a_planted_cycle_is_found(copy_of_the_tree: Path, module: str, planted: str, cycle: str) -> None:
+    file = copy_of_the_tree / module
+    file.write_text(file.read_text() + f"\n{planted}\n")
+    assert any(cycle in one for one in import_cycles(copy_of_the_tree))
+
+
 def compiled_functions() -> list[tuple[Path, ast.FunctionDef]]:
     """Functions of the product that numba compiles."""
     found = []

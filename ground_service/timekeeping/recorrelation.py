@@ -182,9 +182,10 @@ def recorrelate(ground: Ground, vehicle: int, *, over_manual: bool = False) -> b
 
     Correlations that an operator entered stay in force until `over_manual` is asked for.
     """
-    with ground.database.writing() as connection:
+    with ground.database.reading() as connection:
         if not _has_receptions(connection, vehicle):
             return False
+    with ground.database.writing() as connection:
         lock_vehicle(connection, vehicle)
         table = repository.CORRELATIONS
         mine = (table.c.vehicle_id == vehicle, table.c.superseded == 0)

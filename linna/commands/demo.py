@@ -27,9 +27,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from ground_service.evaluation.service import make_report
-    from ground_service.ground import open_ground
     from ground_service.passes.archive_import import import_archive
-    from ground_service.worker.follow_up import follow_in_process
+    from ground_service.worker.follow_up import open_following
     from linna.data import data_folder
     from payload_emulator.session.emulator import emulate
     from payload_emulator.session.scenario import load_scenario
@@ -47,8 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
         progress=lambda frames, total: progress(frames, total, "frames", "frame"),
     )
     log("ingesting the downlink, aligning, reporting ...")
-    with open_ground(arguments.out / "ground", data) as ground:
-        follow_in_process(ground)
+    with open_following(arguments.out / "ground", data) as ground:
         pass_id = import_archive(ground, archive)
         made = make_report(ground, pass_id)
     figures = {

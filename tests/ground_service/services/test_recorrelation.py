@@ -11,7 +11,7 @@ import pytest
 
 from ground_service.ephemerides.service import add_ephemeris
 from ground_service.errors import InvalidInput
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
 from ground_service.passes.service import define_pass, events
 from ground_service.timekeeping import recorrelation
@@ -24,6 +24,7 @@ from ground_service.timekeeping.recorrelation import (
     residuals,
 )
 from ground_service.timekeeping.service import TimePoint, correlate, correlate_again, correlations_on_record
+from ground_service.worker.follow_up import open_following
 from linna.cli import run
 from lunar.constants import MOON_RADIUS_M, SPEED_OF_LIGHT_M_S
 from lunar.ephemeris import ephemeris_from_states
@@ -141,7 +142,7 @@ def test_the_order_of_telemetry_and_receptions_does_not_matter(
     found = []
     for number, seed in enumerate(range(4)):
         rng = random.Random(seed)
-        with open_ground(tmp_path / f"home{number}") as ground:
+        with open_following(tmp_path / f"home{number}") as ground:
             steps: list[tuple[str, Any]] = [("file", octets) for octets in cut]
             steps += [("times", spacecraft.reports[k : k + 11]) for k in range(0, REPORTS, 10)]
             rng.shuffle(steps)

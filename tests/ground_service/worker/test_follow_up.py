@@ -1,0 +1,300 @@
+"""Events and their follow-up work: nothing lost, nothing done twice, re-evaluation after late data."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import select, update
+
+from ground_service import events
+from ground_service.errors import StorageFull
+from ground_service.evaluation.service import changed_figures, make_report
+from ground_service.events import CommandsSent, FollowUpFailed, PassEvaluated, TelemetryReceived, publish
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest.service import ingest_file
+from ground_service.jobs import unfinished_jobs
+from ground_service.passes.service import define_pass
+from ground_service.store import events as log
+from ground_service.store import repository
+from ground_service.store.database import prepare_database
+from ground_service.worker import follow_up
+from ground_service.worker.follow_up import FollowUp, follow_in_process, open_following
+from lunar.timescales import parse_utc
+from tests.ground_service.conftest import SPACECRAFT, SyntheticPass, encode_downlink
+
+
+def kinds(ground: Ground) -> list[str]:
+    return [event.kind for event in events.read_events(ground.database, 0, 1000)]
+
+
+def position(ground: Ground) -> int:
+    with ground.database.reading() as connection:
+        return log.position_of(connection, follow_up.CONSUMER)
+
+
+def jobs_of(ground: Ground, kind: str) -> list[dict[str, Any]]:
+    with ground.database.reading() as connection:
+        rows = connection.execute(select(repository.JOBS).where(repository.JOBS.c.kind == kind)).mappings()
+        return [dict(row) for row in rows]
+
+
+def say(ground: Ground, *given: events.Event) -> None:
+    with ground.database.writing() as connection:
+        for event in given:
+            publish(connection, event)
+
+
+class Recorded:
+    """Stands in for the work: keeps what was asked for, and can fail."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.done: list[tuple[str, int]] = []
+        self.error: Exception | None = None
+        doing = {name: self._work(name) for name in follow_up.DOING}
+        monkeypatch.setattr(follow_up, "DOING", doing)
+
+    def _work(self, name: str) -> Callable[[Ground, int, int], str | None]:
+        def work(_ground: Ground, key: int, _event: int) -> str | None:
+            if self.error is not None:
+                raise self.error
+            self.done.append((name, key))
+            return None
+
+        return work
+
+
+@pytest.fixture
+def recorded(monkeypatch: pytest.MonkeyPatch) -> Recorded:
+    return Recorded(monkeypatch)
+
+
+def test_an_event_exists_only_if_its_change_was_committed(either: Ground) -> None:
+    with pytest.raises(RuntimeError), either.database.writing() as connection:
+        publish(connection, CommandsSent(vehicle_id=1, telecommands=(1,)))
+        raise RuntimeError
+    assert kinds(either) == []
+    with either.database.reading() as connection, pytest.raises(RuntimeError, match="writing"):
+        publish(connection, CommandsSent(vehicle_id=1, telecommands=(1,)))
+
+
+def test_numbers_have_no_gaps_and_follow_the_order_of_commits(either: Ground) -> None:
+    def write(seed: int) -> None:
+        for k in range(10):
+            if (seed + k) % 3 == 0:
+                with pytest.raises(RuntimeError), either.database.writing() as connection:
+                    log.publish(connection, "test", {"lost": k})
+                    raise RuntimeError
+            with either.database.writing() as connection:
+                log.publish(connection, "test", {"seed": seed, "k": k})
+
+    threads = [threading.Thread(target=write, args=(seed,)) for seed in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    found = events.read_events(either.database, 0, 1000)
+    assert [event.number for event in found] == list(range(1, 41))
+    for seed in range(4):
+        assert [event.payload["k"] for event in found if event.payload["seed"] == seed] == list(range(10))
+
+
+def test_equal_work_of_several_events_is_done_once_and_in_order(ground: Ground, recorded: Recorded) -> None:
+    with ground.database.listeners.held():
+        for vehicle in (7, 5, 7):
+            say(ground, TelemetryReceived(vehicle_id=vehicle, packets=1))
+        assert recorded.done == []
+    assert recorded.done == [
+        ("recorrelate", 5),
+        ("recorrelate", 7),
+        ("advance windows", 5),
+        ("advance windows", 7),
+    ]
+    assert position(ground) == 3
+
+
+def test_work_of_a_failed_block_is_still_done(ground: Ground, recorded: Recorded) -> None:
+    with pytest.raises(RuntimeError), ground.database.listeners.held():
+        say(ground, CommandsSent(vehicle_id=3, telecommands=(1,)))
+        raise RuntimeError
+    assert recorded.done == [("advance windows", 3)]
+
+
+def test_events_of_a_process_that_ended_are_handled_by_the_next(tmp_path: Path, recorded: Recorded) -> None:
+    with open_ground(tmp_path) as ground:  # ends between the commit and the follow-up work
+        say(ground, CommandsSent(vehicle_id=3, telecommands=(1,)))
+    assert recorded.done == []
+    with open_ground(tmp_path) as ground:
+        follow_in_process(ground).drain()
+        assert recorded.done == [("advance windows", 3)]
+        follow_in_process(ground).drain()
+        assert recorded.done == [("advance windows", 3)]
+
+
+def test_work_that_meets_a_passing_error_is_repeated(ground: Ground, recorded: Recorded) -> None:
+    recorded.error = StorageFull("disk")
+    say(ground, CommandsSent(vehicle_id=3, telecommands=(1,)))
+    assert (recorded.done, position(ground)) == ([], 0)
+    recorded.error = None
+    say(ground, CommandsSent(vehicle_id=4, telecommands=(2,)))
+    assert recorded.done == [("advance windows", 3), ("advance windows", 4)]
+    assert FollowUpFailed.event_kind not in kinds(ground)
+
+
+def test_work_that_fails_is_reported_with_its_events_and_does_not_stop_others(
+    ground: Ground, recorded: Recorded
+) -> None:
+    recorded.error = ValueError("broken")
+    say(ground, CommandsSent(vehicle_id=3, telecommands=(1,)))
+    recorded.error = None
+    say(ground, CommandsSent(vehicle_id=4, telecommands=(2,)))
+    assert recorded.done == [("advance windows", 4)]
+    [failed] = [e for e in events.read_events(ground.database, 0) if e.kind == FollowUpFailed.event_kind]
+    assert failed.payload == {"work": "advance windows 3", "events": [1], "error": "ValueError: broken"}
+
+
+def test_an_event_that_cannot_be_read_does_not_stop_others(ground: Ground, recorded: Recorded) -> None:
+    with ground.database.writing() as connection:
+        log.publish(connection, CommandsSent.event_kind, {"vehicle": "?"})
+        publish(connection, CommandsSent(vehicle_id=4, telecommands=(2,)))
+    assert recorded.done == [("advance windows", 4)]
+    assert kinds(ground)[-1] == FollowUpFailed.event_kind
+
+
+def test_several_processes_handle_each_event_once(
+    new_postgres_database: Callable[[], str], recorded: Recorded, tmp_path: Path
+) -> None:
+    url = new_postgres_database()
+    prepare_database(url, upgrade=True).engine.dispose()
+    grounds = [open_following(tmp_path / f"{k}", database_url=url) for k in range(3)]
+
+    def run(ground: Ground, first: int) -> None:
+        for k in range(8):
+            say(ground, CommandsSent(vehicle_id=first + k, telecommands=(1,)))
+            assert ("advance windows", first + k) in recorded.done  # complete before the caller continues
+
+    threads = [threading.Thread(target=run, args=(ground, 100 * k)) for k, ground in enumerate(grounds)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(recorded.done) == len(set(recorded.done)) == 24
+    assert position(grounds[0]) == 24
+    for ground in grounds:
+        ground.close()
+
+
+def test_old_events_are_deleted_only_after_they_were_handled(ground: Ground, recorded: Recorded) -> None:
+    say(ground, CommandsSent(vehicle_id=1, telecommands=(1,)))
+    recorded.error = StorageFull("disk")
+    say(ground, CommandsSent(vehicle_id=2, telecommands=(1,)), CommandsSent(vehicle_id=3, telecommands=(1,)))
+    with ground.database.writing() as connection:
+        connection.execute(update(repository.EVENT_LOG).values(utc_ns=0))
+        assert log.delete_before(connection, 10) == 1
+    assert [event.number for event in events.read_events(ground.database, 0)] == [2, 3]
+
+
+@pytest.fixture(scope="module")
+def halves(
+    make_pass: Callable[..., SyntheticPass], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Path]:
+    """Downlink of the first three quarters of a pass, and the rest."""
+    made = make_pass(frames=24, seed=6)
+    folder = tmp_path_factory.mktemp("late")
+    cut = len(made.packets) * 3 // 4
+    for name, packets in (("early", made.packets[:cut]), ("late", made.packets[cut:])):
+        (folder / f"{name}.cadu").write_bytes(encode_downlink(packets))
+    return folder / "early.cadu", folder / "late.cadu"
+
+
+def reported_pass(ground: Ground, early: Path) -> int:
+    ingest_file(ground, early, spacecraft_id=SPACECRAFT)
+    pass_id = define_pass(
+        ground,
+        name="late data",
+        start_utc_ns=parse_utc("2029-08-07T05:50:00Z"),
+        stop_utc_ns=parse_utc("2029-08-07T06:30:00Z"),
+        spacecraft_id=SPACECRAFT,
+    )
+    make_report(ground, pass_id)
+    return pass_id
+
+
+def reports_of(ground: Ground, pass_id: int) -> list[dict[str, Any]]:
+    with ground.database.reading() as connection:
+        page = repository.page(connection, repository.REPORTS, limit=10, pass_id=pass_id)
+    return sorted(page.rows, key=lambda row: int(row["created_utc_ns"]))
+
+
+def test_late_data_make_a_report_with_the_changed_figures_and_their_event(
+    either: Ground, halves: tuple[Path, Path]
+) -> None:
+    pass_id = reported_pass(either, halves[0])
+    assert len(reports_of(either, pass_id)) == 1
+    ingest_file(either, halves[1], spacecraft_id=SPACECRAFT)
+    first, again = reports_of(either, pass_id)
+    assert again["previous_id"] == first["id"] and first["event_number"] is None
+    cause = next(e for e in events.read_events(either.database, 0, 1000) if e.number == again["event_number"])
+    assert cause.kind == TelemetryReceived.event_kind
+    changed = {one["figure"]: (one["before"], one["after"]) for one in again["changes"]}
+    assert changed["frames"] == (first["summary"]["frames"], again["summary"]["frames"])
+    assert first["summary"]["frames"] < again["summary"]["frames"]
+    made = [e for e in events.read_events(either.database, 0, 1000) if e.kind == PassEvaluated.event_kind]
+    assert [e.payload.get("event") for e in made] == [None, again["event_number"]]
+
+
+def test_the_same_data_again_make_no_report(ground: Ground, halves: tuple[Path, Path]) -> None:
+    pass_id = reported_pass(ground, halves[0])
+    ingest_file(ground, halves[0], spacecraft_id=SPACECRAFT)
+    assert len(reports_of(ground, pass_id)) == 1 and jobs_of(ground, "re-evaluation") == []
+
+
+def test_an_event_that_changes_nothing_of_a_pass_makes_no_report(
+    ground: Ground, halves: tuple[Path, Path]
+) -> None:
+    pass_id = reported_pass(ground, halves[0])
+    with ground.database.reading() as connection:
+        vehicle = repository.get(connection, repository.PASSES, pass_id, "pass")["vehicle_id"]
+    say(ground, TelemetryReceived(vehicle_id=vehicle, packets=1, first_ticks=0, last_ticks=(1 << 48) - 1))
+    [job] = jobs_of(ground, "re-evaluation")
+    assert (job["state"], job["result"]["report_id"]) == ("done", None)
+    assert len(reports_of(ground, pass_id)) == 1
+
+
+def test_telemetry_of_another_time_does_not_evaluate_a_pass_again(
+    ground: Ground, halves: tuple[Path, Path]
+) -> None:
+    pass_id = reported_pass(ground, halves[0])
+    with ground.database.reading() as connection:
+        vehicle = repository.get(connection, repository.PASSES, pass_id, "pass")["vehicle_id"]
+    say(ground, TelemetryReceived(vehicle_id=vehicle, packets=1, first_ticks=0, last_ticks=1))
+    assert jobs_of(ground, "re-evaluation") == []
+
+
+def test_a_re_evaluation_that_waits_already_is_not_added_again(
+    tmp_path: Path, halves: tuple[Path, Path]
+) -> None:
+    with open_ground(tmp_path) as ground:
+        follow = FollowUp(ground, start=lambda _job: None)
+        pass_id = reported_pass(ground, halves[0])
+        follow.drain()
+        for cut in halves[::-1]:
+            ingest_file(ground, cut, spacecraft_id=SPACECRAFT)
+            follow.drain()
+            follow.drain()
+        assert len(jobs_of(ground, "re-evaluation")) == 1 == len(unfinished_jobs(ground))
+        assert len(reports_of(ground, pass_id)) == 1
+
+
+def test_changed_figures_of_nested_summaries() -> None:
+    before = {"a": 1, "b": {"c": 2.0, "d": None}, "e": [1, 2]}
+    after = {"a": 1, "b": {"c": 3.0, "d": None}, "e": [1, 3], "f": "new"}
+    assert changed_figures(before, after) == [
+        {"figure": "b.c", "before": 2.0, "after": 3.0},
+        {"figure": "e", "before": [1, 2], "after": [1, 3]},
+        {"figure": "f", "before": None, "after": "new"},
+    ]
+    assert changed_figures(before, before) == []
