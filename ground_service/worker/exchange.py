@@ -51,6 +51,7 @@ DERIVED = frozenset({"rollups", "stream_edges", *(one.__tablename__ for one in S
 EARLIER_VALUES: dict[tuple[str, str], Any] = {
     ("users", "state"): "active",
     ("tokens", "hint"): "",
+    ("regressions", "missions"): [],
 }
 """Values of columns missing in an earlier revision, if neither NULL nor the default of the column is correct."""
 
