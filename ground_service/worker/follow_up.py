@@ -306,7 +306,7 @@ def _reported_passes(connection: Connection, vehicle: int, first_ticks: int, las
     )
     found = []
     for record in connection.execute(query.order_by(table.c.id)).mappings():
-        span = pass_span(connection, record)
+        span = pass_span(connection, dict(record))
         if span.start_ticks <= last_ticks and first_ticks <= span.stop_ticks:
             found.append(int(record["id"]))
     return found
