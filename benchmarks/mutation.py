@@ -145,7 +145,7 @@ GROUPS = {
         ),
     ),
     "authorisation": Group(
-        ("ground_service/access/service.py", "ground_service/http/security.py"),
+        ("ground_service/access/service.py", "ground_service/access/security.py"),
         (
             f"{_GROUND_TESTS}/services/test_users.py",
             f"{_GROUND_TESTS}/api/test_access.py",

@@ -12,12 +12,13 @@ from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.routing import Route
 
-from ground_service.api.access import access
-from ground_service.api.routes import UPLOAD_PATHS, router
+from ground_service.access.routes import access
 from ground_service.clock import utc_now_ns
 from ground_service.commanding.routes import telecommands
 from ground_service.commanding.service import note_timeouts
+from ground_service.ephemerides import routes as ephemeris_routes
 from ground_service.errors import GroundError
+from ground_service.evaluation.routes import evaluation
 from ground_service.ground import ground_from_settings
 from ground_service.http import problems
 from ground_service.http.common import API_PREFIX
@@ -26,9 +27,12 @@ from ground_service.http.origins import LOOPBACK, SameOrigin
 from ground_service.http.proxies import ForwardedHeaders, TrustedProxies
 from ground_service.http.requests import PlainText
 from ground_service.http.uploads import UploadPool
+from ground_service.ingest import routes as ingest_routes
+from ground_service.jobs.routes import jobs
 from ground_service.missions.routes import missions
+from ground_service.passes import routes as pass_routes
 from ground_service.planning.routes import planning
-from ground_service.regression.routes import REGRESSION_UPLOAD_PATHS, regressions
+from ground_service.regression import routes as regression_routes
 from ground_service.settings import Settings
 from ground_service.timekeeping.routes import timekeeping
 from ground_service.web.live import live
@@ -117,7 +121,21 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
     app.state.open_without_users = settings.host in LOOPBACK
     app.state.live_console = settings.resolved_live_console()
     app.state.upload_limit_octets = settings.upload_limit_mib << 20
-    routers = (router, missions, timekeeping, planning, telecommands, regressions, access, operations, pages)
+    routers = (
+        ephemeris_routes.ephemerides,
+        ingest_routes.ingests,
+        pass_routes.passes,
+        evaluation,
+        jobs,
+        missions,
+        timekeeping,
+        planning,
+        telecommands,
+        regression_routes.regressions,
+        access,
+        operations,
+        pages,
+    )
     for one in (*routers, live, payload_console):
         app.include_router(one)
     app.state.operations = [route for one in routers for route in one.routes if isinstance(route, Route)]
@@ -125,7 +143,11 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
     problems.install(app)
     app.add_middleware(
         BodyLimit,
-        upload_paths=(*UPLOAD_PATHS, *REGRESSION_UPLOAD_PATHS),
+        upload_paths=tuple(
+            path
+            for one in (ephemeris_routes, ingest_routes, pass_routes, regression_routes)
+            for path in one.UPLOAD_PATHS
+        ),
         upload_limit_octets=settings.upload_limit_mib << 20,
     )
     app.add_middleware(RateLimit, per_second=settings.rate_limit_per_s, budgets=budgets)

@@ -9,15 +9,6 @@ from typing import Any
 
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
-from ground_service.http.views import (
-    correlation_view,
-    ephemeris_view,
-    pass_view,
-    search_view,
-    telecommand_view,
-    time_report_view,
-    window_view,
-)
 
 View = dict[str, Any]
 
@@ -38,8 +29,7 @@ class LocalOperations:
     def list_passes(self, limit: int = 100) -> View:
         from ground_service.passes.service import list_passes
 
-        page = list_passes(self.ground, limit=limit)
-        return {"items": [pass_view(row) for row in page.rows], "total": page.total}
+        return _page(*list_passes(self.ground, limit=limit))
 
     def pass_summary(self, pass_id: int) -> View:
         from ground_service.evaluation.service import pass_summary
@@ -85,17 +75,14 @@ class LocalOperations:
         if not path.is_file():
             raise InvalidInput(str(path), "", "an ephemeris file", "nothing there")
         stored = self.ground.files.put_file(path)
-        return ephemeris_view(
-            add_ephemeris(
-                self.ground, stored, name=name or path.name, precedence=precedence, actor=self._actor
-            )
-        )
+        return add_ephemeris(
+            self.ground, stored, name=name or path.name, precedence=precedence, actor=self._actor
+        ).model_dump(mode="json")
 
     def list_missions(self, limit: int = 100) -> View:
         from ground_service.missions.service import list_missions
 
-        items, total = list_missions(self.ground, limit=limit)
-        return {"items": [one.model_dump(mode="json") for one in items], "total": total}
+        return _page(*list_missions(self.ground, limit=limit))
 
     def add_mission(self, path: Path) -> View:
         from ground_service.missions.service import add_mission
@@ -117,12 +104,12 @@ class LocalOperations:
         from ground_service.commanding.service import list_commands
 
         views, total = list_commands(self.ground, limit=limit)
-        return {"items": [telecommand_view(view) for view in views], "total": total}
+        return _page([view.telecommand for view in views], total)
 
     def get_command(self, command_id: int) -> View:
         from ground_service.commanding.service import get_command
 
-        return telecommand_view(get_command(self.ground, command_id))
+        return get_command(self.ground, command_id).telecommand.model_dump(mode="json")
 
     def release_command(self, command_id: int) -> View:
         from ground_service.commanding.service import release_command
@@ -150,7 +137,7 @@ class LocalOperations:
     def uplink_state(self, spacecraft_id: int, instance: str = "flight") -> View:
         from ground_service.commanding.receiver import uplink_state
 
-        return uplink_state(self.ground, spacecraft_id, instance)
+        return uplink_state(self.ground, spacecraft_id, instance).model_dump(mode="json")
 
     def correlate(self, spacecraft_id: int, instance: str, points: list[View]) -> View:
         from ground_service.timekeeping.service import correlate_spacecraft, time_points
@@ -158,19 +145,19 @@ class LocalOperations:
         rows = correlate_spacecraft(
             self.ground, spacecraft_id, instance, time_points(points), actor=self._actor
         )
-        return {"items": [correlation_view(row) for row in rows], "total": len(rows)}
+        return _correlations(rows)
 
     def correlations(self, spacecraft_id: int, instance: str) -> View:
         from ground_service.timekeeping.service import spacecraft_correlations
 
         rows = spacecraft_correlations(self.ground, spacecraft_id, instance)
-        return {"items": [correlation_view(row) for row in rows], "total": len(rows)}
+        return _correlations(rows)
 
     def correlate_again(self, spacecraft_id: int, instance: str) -> View:
         from ground_service.timekeeping.service import correlate_again
 
         rows = correlate_again(self.ground, spacecraft_id, instance, actor=self._actor)
-        return {"items": [correlation_view(row) for row in rows], "total": len(rows)}
+        return _correlations(rows)
 
     def enter_receptions(self, spacecraft_id: int, instance: str, receptions: list[View]) -> View:
         from ground_service.timekeeping.recorrelation import enter_receptions, received_reports
@@ -178,51 +165,49 @@ class LocalOperations:
         rows = enter_receptions(
             self.ground, spacecraft_id, instance, received_reports(receptions), actor=self._actor
         )
-        return {"items": [correlation_view(row) for row in rows], "total": len(rows)}
+        return _correlations(rows)
 
     def time_reports(self, spacecraft_id: int, instance: str) -> View:
+        from ground_service.timekeeping.model import TimeReport
         from ground_service.timekeeping.service import spacecraft_time_reports
 
         rows = spacecraft_time_reports(self.ground, spacecraft_id, instance)
-        return {"items": [time_report_view(row) for row in rows], "total": len(rows)}
+        return _page([TimeReport.of(row) for row in rows], len(rows))
 
     def search_windows(self, request: Mapping[str, Any]) -> View:
-        from ground_service.planning.requests import search
+        from ground_service.planning.service import search_windows
 
-        return search_view(*search(self.ground, self._read("WindowSearch", request)))
+        return search_windows(self.ground, self._read("WindowSearch", request)).model_dump(mode="json")
 
     def add_window(self, request: Mapping[str, Any]) -> View:
-        from ground_service.planning.requests import window_entry
         from ground_service.planning.service import add_window
 
-        entry = window_entry(self._read("WindowIn", request))
-        return window_view(add_window(self.ground, entry, actor=self._actor))
+        entry = self._read("WindowIn", request).entry()
+        return add_window(self.ground, entry, actor=self._actor).model_dump(mode="json")
 
     def list_windows(self, limit: int = 100) -> View:
         from ground_service.planning.service import list_windows
 
-        rows, total = list_windows(self.ground, limit=limit)
-        return {"items": [window_view(row) for row in rows], "total": total}
+        return _page(*list_windows(self.ground, limit=limit))
 
     def get_window(self, window_id: int) -> View:
         from ground_service.planning.service import get_window
 
-        return window_view(get_window(self.ground, window_id))
+        return get_window(self.ground, window_id).model_dump(mode="json")
 
     def change_window(self, window_id: int, request: Mapping[str, Any]) -> View:
-        from ground_service.planning.requests import window_changes
         from ground_service.planning.service import change_window
 
         given = self._read("WindowChange", request)
-        row = change_window(
+        window = change_window(
             self.ground,
             window_id,
             actor=self._actor,
-            changes=window_changes(given),
+            changes=given.changes(),
             decision=given.state,
             reason=given.reason,
         )
-        return window_view(row)
+        return window.model_dump(mode="json")
 
     def delete_window(self, window_id: int) -> None:
         from ground_service.planning.service import delete_window
@@ -238,14 +223,13 @@ class LocalOperations:
     def export_plan(self) -> View:
         from ground_service.planning.exchange import export_plan
 
-        return export_plan(self.ground)
+        return export_plan(self.ground).model_dump(mode="json")
 
     def import_plan(self, plan: Mapping[str, Any]) -> View:
         from ground_service.planning.exchange import import_plan
-        from ground_service.planning.requests import plan_entries
 
-        entries = plan_entries(self._read("Plan", plan))
-        return {"windows": import_plan(self.ground, entries, actor=self._actor)}
+        windows = self._read("Plan", plan).windows
+        return {"windows": import_plan(self.ground, windows, actor=self._actor)}
 
     def list_audit(
         self, *, limit: int = 100, since: str | None = None, until: str | None = None, **equal: Any
@@ -260,7 +244,7 @@ class LocalOperations:
             limit=limit,
             **equal,
         )
-        return {"items": [entry.model_dump() for entry in entries], "total": total}
+        return _page(entries, total)
 
     def audit_head(self) -> View:
         from ground_service.access.audit_log import audit_head
@@ -281,6 +265,16 @@ class LocalOperations:
             raise InvalidInput(
                 "request", where, first["msg"].lower(), repr(first.get("input"))[:80]
             ) from None
+
+
+def _page(items: Any, total: int) -> View:
+    return {"items": [one.model_dump(mode="json") for one in items], "total": total}
+
+
+def _correlations(rows: Any) -> View:
+    from ground_service.timekeeping.store import correlation_of
+
+    return _page([correlation_of(row) for row in rows], len(rows))
 
 
 def _octets_of(path: Path) -> bytes:

@@ -279,7 +279,7 @@ class Campaign:
         start = WINDOWS_FROM_NS + self.windows * 7200 * NS
         self.windows += 1
         entry = WindowEntry(f"race {self.windows}", start, start + 600 * NS, 30.0, spacecraft)
-        return int(add_window(self.ground, entry, actor="ann")["id"])
+        return int(add_window(self.ground, entry, actor="ann").id)
 
     def _approve(self, number: int) -> None:
         window = self._new_window(FIRST_SPACECRAFT + SPACECRAFT + number % SPACECRAFT)

@@ -4,38 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import and_, func, select
 
+from ground_service.access.model import AuditEntry, AuditHead
 from ground_service.errors import AuditBroken, InvalidInput
 from ground_service.ground import Ground
-from ground_service.http.views import time_text
 from ground_service.store import audit as chain
 from ground_service.store import repository
-
-
-class AuditEntry(BaseModel):
-    """Entry of the audit log with its hash chain values."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    number: int = Field(examples=[1], description="1 for the first entry, without gaps")
-    time: str = Field(examples=["2029-08-07T06:00:00.000000000Z"])
-    actor: str = Field(examples=["ann"])
-    action: str = Field(examples=["release telecommand"])
-    target: str = Field(examples=["7"])
-    detail: dict[str, Any]
-    previous_sha256: str = Field(description="Hash of the previous entry")
-    sha256: str = Field(description="Hash of this entry")
-
-
-class AuditHead(BaseModel):
-    """Newest entry of the chain; a copy stored elsewhere shows whether the log was truncated later."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    number: int = Field(examples=[1], description="0: no entry yet")
-    sha256: str
 
 
 def list_entries(
@@ -111,13 +86,4 @@ def parse_head(text: str) -> chain.Head:
 
 
 def _entry(row: repository.Row) -> AuditEntry:
-    return AuditEntry(
-        number=row["id"],
-        time=time_text(row["utc_ns"]),
-        actor=row["actor"],
-        action=row["action"],
-        target=row["target"],
-        detail=row["detail"],
-        previous_sha256=row["previous_sha256"],
-        sha256=row["sha256"],
-    )
+    return AuditEntry.of(row, number=row["id"], time=row["utc_ns"])

@@ -14,15 +14,14 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, or_, select, update
 
+from ground_service.access.model import DAYS_LIMIT, Token, User
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, InvalidInput, NotAuthorised, NotFound, StoreError
 from ground_service.ground import Ground
 from ground_service.store import audit as audit_log
 from ground_service.store import repository
-from lunar.timescales import format_utc
 
 ROLES = ("viewer", "operator", "admin")
 """Each may do what those before it may: look; plan, upload and command; manage users."""
@@ -37,7 +36,6 @@ HINT_LENGTH = 12
 USED_STEP_NS = 3_600_000_000_000
 """Resolution of the stored time of last use, to limit the number of writes."""
 
-DAYS_LIMIT = 36_500.0
 RESERVED_NAMES = ("local", "service", "archive")
 """Names of the program itself as an actor in the audit log."""
 
@@ -60,32 +58,6 @@ class Caller:
 
 LOCAL_CALLER = Caller("local", "admin")
 """Caller of a service without users, which listens only on the local machine."""
-
-
-class User(BaseModel):
-    """User of the service."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    name: str = Field(examples=["ann"])
-    role: Literal["viewer", "operator", "admin"]
-    state: Literal["active", "disabled"]
-    created: str = Field(examples=["2029-08-07T06:00:00.000000000Z"])
-
-
-class Token(BaseModel):
-    """Bearer token without its secret."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    id: int = Field(examples=[1])
-    user: str = Field(examples=["ann"])
-    hint: str = Field(description="Beginning of the token", examples=["linna_3fXk2a"])
-    state: Literal["active", "expired", "revoked"]
-    created: str
-    expires: str | None = Field(description="null: never")
-    revoked: str | None
-    used: str | None = Field(description="Last use, to the hour; null: never used")
 
 
 def add_user(
@@ -397,18 +369,8 @@ def _note_use(ground: Ground, token_id: int, now: int) -> None:
         )
 
 
-def _time_text(utc_ns: int) -> str:
-    return format_utc(int(utc_ns), 9)
-
-
-def _optional_time(utc_ns: int | None) -> str | None:
-    return None if utc_ns is None else _time_text(utc_ns)
-
-
 def _user(row: repository.Row) -> User:
-    return User(
-        name=row["name"], role=row["role"], state=row["state"], created=_time_text(row["created_utc_ns"])
-    )
+    return User.of(row)
 
 
 def _token(row: repository.Row) -> Token:
@@ -418,16 +380,7 @@ def _token(row: repository.Row) -> Token:
         state = "revoked"
     elif expires is not None and expires <= utc_now_ns():
         state = "expired"
-    return Token(
-        id=row["id"],
-        user=row["name"],
-        hint=row["hint"],
-        state=state,
-        created=_time_text(row["created_utc_ns"]),
-        expires=_optional_time(expires),
-        revoked=_optional_time(row["revoked_utc_ns"]),
-        used=_optional_time(row["used_utc_ns"]),
-    )
+    return Token.of(row, user=row["name"], state=state)
 
 
 def _add_token(connection: Connection, user_id: int, now: int, lifetime_ns: int | None) -> tuple[int, str]:

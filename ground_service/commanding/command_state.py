@@ -8,9 +8,13 @@ from typing import Any
 from sqlalchemy import Connection, func, select
 
 from ground_service.clock import utc_now_ns
-from ground_service.commanding.core import CommandFate, SentCommand, VerificationReport, fate_of
+from ground_service.commanding.core import STAGES, CommandFate, SentCommand, VerificationReport, fate_of
+from ground_service.commanding.model import CommandReport, Telecommand
 from ground_service.ingest.redecode import readable_version
 from ground_service.store import repository
+from tmtc.codes import FAILURES
+
+_FAILURES = dict(FAILURES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +30,31 @@ class CommandView:
     def state(self) -> str:
         """Where the command is on its way."""
         return self.fate.state if self.fate is not None else str(self.row["state"])
+
+    @property
+    def telecommand(self) -> Telecommand:
+        """The telecommand as an entity."""
+        reports = self.fate.reports if self.fate is not None else ()
+        return Telecommand.of(
+            self.row,
+            spacecraft_id=self.spacecraft_id,
+            instance=self.instance,
+            state=self.state,
+            critical=bool(self.row["critical"]),
+            timed_out=self.fate is not None and self.fate.timed_out,
+            requested=self.row["created_utc_ns"],
+            reports=[
+                CommandReport(
+                    stage=STAGES.get(report.subtype, str(report.subtype)),
+                    ticks=report.ticks,
+                    step=report.step,
+                    failure=None
+                    if report.failure_code is None
+                    else _FAILURES.get(report.failure_code, str(report.failure_code)),
+                )
+                for report in reports
+            ],
+        )
 
 
 def command_view(connection: Connection, row: repository.Row) -> CommandView:

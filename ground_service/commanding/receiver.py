@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from sqlalchemy import select
 
+from ground_service.commanding.model import UplinkChannel, UplinkState
 from ground_service.errors import NotFound
 from ground_service.ground import Ground
-from ground_service.http.views import time_text
 from ground_service.store import repository
 
 INGESTS_LOOKED_AT = 200
 """So many ingests back a channel is looked for: receptions without frames of it may have come in between."""
 
 
-def uplink_state(ground: Ground, spacecraft_id: int, instance: str) -> dict[str, Any]:
+def uplink_state(ground: Ground, spacecraft_id: int, instance: str) -> UplinkState:
     """Each telecommand channel of a spacecraft as the ingest that was entered last tells it.
 
     Telemetry that is ingested late is the newest to the ground all the same: `received` says when it came.
@@ -37,15 +35,12 @@ def uplink_state(ground: Ground, spacecraft_id: int, instance: str) -> dict[str,
             .order_by(ingests.c.id.desc())
             .limit(INGESTS_LOOKED_AT)
         )
-        newest: dict[int, dict[str, Any]] = {}
+        newest: dict[int, UplinkChannel] = {}
         for ingest_id, received_utc_ns, accounting in rows:
             for seen in accounting.get("uplink", ()):
                 if seen["spacecraft_id"] == spacecraft_id:
-                    found = {name: value for name, value in seen.items() if name != "spacecraft_id"}
-                    found |= {"ingest_id": ingest_id, "received": time_text(received_utc_ns)}
-                    newest.setdefault(seen["virtual_channel"], found)
-    return {
-        "spacecraft_id": spacecraft_id,
-        "instance": instance,
-        "channels": [newest[channel] for channel in sorted(newest)],
-    }
+                    channel = UplinkChannel.of(seen, ingest_id=ingest_id, received=received_utc_ns)
+                    newest.setdefault(channel.virtual_channel, channel)
+    return UplinkState(
+        spacecraft_id=spacecraft_id, instance=instance, channels=[newest[one] for one in sorted(newest)]
+    )

@@ -1,57 +1,54 @@
-"""Operations on telecommands and the uplink."""
+"""HTTP operations on telecommands and the uplink."""
 
 from __future__ import annotations
 
 import base64
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Query, Response
+from fastapi import Query, Response
 
 from ground_service.access.idempotency import once
+from ground_service.access.security import Operator, Viewer
 from ground_service.commanding import service as commanding
+from ground_service.commanding.model import CommandEntry, Rejection, Telecommand, UplinkState
 from ground_service.commanding.receiver import uplink_state
-from ground_service.http import schemas
 from ground_service.http.common import (
-    API_PREFIX,
-    PROBLEMS,
     GroundOf,
     Instance,
     Limit,
     Offset,
     OnceKey,
-    Operator,
     RowId,
     SpacecraftId,
-    Viewer,
     page_of,
 )
-from ground_service.http.requests import StrictRoute
-from ground_service.http.views import telecommand_view
+from ground_service.http.model import PageOf
+from ground_service.http.requests import operations, problems
 from ground_service.ingest.service import FLOWN
 
-telecommands = APIRouter(
-    route_class=StrictRoute, prefix=API_PREFIX, responses=PROBLEMS, tags=["telecommands"]
-)
+telecommands = operations("telecommands")
 
 
-@telecommands.get("/telecommands", response_model=schemas.PageOf[schemas.Telecommand])
+@telecommands.get("/telecommands")
 def list_telecommands(
     ground: GroundOf,
     _: Viewer,
-    state: Annotated[str | None, Query(pattern="^(queued|released|rejected|sent)$")] = None,
+    state: Annotated[
+        Literal["queued", "carried", "released", "rejected", "sent"] | None, Query(description="Stored state")
+    ] = None,
     limit: Limit = 100,
     offset: Offset = 0,
-) -> Any:
-    """Telecommands with their verification, the newest first."""
+) -> PageOf[Telecommand]:
+    """List the telecommands with their verification, newest first."""
     views, total = commanding.list_commands(ground, state=state, limit=limit, offset=offset)
-    return page_of([telecommand_view(view) for view in views], total, limit, offset)
+    return page_of([view.telecommand for view in views], total, limit, offset)
 
 
-@telecommands.post("/telecommands", status_code=201, response_model=schemas.Telecommand)
-def entertelecommand_view(
-    ground: GroundOf, caller: Operator, given: schemas.CommandEntry, idempotency_key: OnceKey = None
-) -> Any:
-    """Queue a telecommand; the dictionary has to accept it."""
+@telecommands.post("/telecommands", status_code=201)
+def enter_telecommand(
+    ground: GroundOf, caller: Operator, given: CommandEntry, idempotency_key: OnceKey = None
+) -> Telecommand:
+    """Queue a telecommand; its name and arguments must agree with the dictionary."""
 
     def enter() -> dict[str, Any]:
         command_id = commanding.enter_command(
@@ -63,9 +60,9 @@ def entertelecommand_view(
             timeout_s=given.timeout_s,
             actor=caller.name,
         )
-        return telecommand_view(commanding.get_command(ground, command_id))
+        return commanding.get_command(ground, command_id).telecommand.model_dump(mode="json")
 
-    return once(
+    answer = once(
         ground,
         actor=caller.name,
         operation="telecommand",
@@ -73,54 +70,55 @@ def entertelecommand_view(
         request=given.model_dump(mode="json"),
         work=enter,
     )
+    return Telecommand.model_validate(answer)
 
 
-@telecommands.get("/telecommands/{command_id}", response_model=schemas.Telecommand)
-def gettelecommand_view(ground: GroundOf, _: Viewer, command_id: RowId) -> Any:
-    """One telecommand with its verification."""
-    return telecommand_view(commanding.get_command(ground, command_id))
+@telecommands.get("/telecommands/{command_id}")
+def get_telecommand(ground: GroundOf, _: Viewer, command_id: RowId) -> Telecommand:
+    """Show a telecommand with its verification."""
+    return commanding.get_command(ground, command_id).telecommand
 
 
-@telecommands.post("/telecommands/{command_id}/release", response_model=schemas.Telecommand)
-def releasetelecommand_view(ground: GroundOf, caller: Operator, command_id: RowId) -> Any:
-    """Release a queued telecommand; a critical one by another person than who entered it."""
+@telecommands.post("/telecommands/{command_id}/release", responses=problems(409))
+def release_telecommand(ground: GroundOf, caller: Operator, command_id: RowId) -> Telecommand:
+    """Release a queued telecommand; a critical one must be released by a second person."""
     commanding.release_command(ground, command_id, actor=caller.name)
-    return telecommand_view(commanding.get_command(ground, command_id))
+    return commanding.get_command(ground, command_id).telecommand
 
 
-@telecommands.post("/telecommands/{command_id}/reject", response_model=schemas.Telecommand)
-def rejecttelecommand_view(
-    ground: GroundOf, caller: Operator, command_id: RowId, given: schemas.Rejection
-) -> Any:
-    """Take a queued telecommand out of the queue."""
+@telecommands.post("/telecommands/{command_id}/reject", responses=problems(409))
+def reject_telecommand(
+    ground: GroundOf, caller: Operator, command_id: RowId, given: Rejection
+) -> Telecommand:
+    """Reject a queued telecommand."""
     commanding.reject_command(ground, command_id, actor=caller.name, reason=given.reason)
-    return telecommand_view(commanding.get_command(ground, command_id))
+    return commanding.get_command(ground, command_id).telecommand
 
 
-@telecommands.get("/spacecraft/{spacecraft_id}/uplink", response_model=schemas.UplinkState)
+@telecommands.get("/spacecraft/{spacecraft_id}/uplink")
 def get_uplink_state(
     ground: GroundOf, _: Viewer, spacecraft_id: SpacecraftId, instance: Instance = FLOWN
-) -> Any:
-    """The state of a spacecraft's telecommand receiver, by the control words of its newest telemetry."""
+) -> UplinkState:
+    """Return the state of a telecommand receiver, from the control words of the newest telemetry."""
     return uplink_state(ground, spacecraft_id, instance)
 
 
 @telecommands.post(
     "/uplink",
     response_class=Response,
-    responses={200: {"content": {"application/octet-stream": {}}, "description": "What is to be sent now"}},
+    responses={200: {"content": {"application/octet-stream": {}}, "description": "Octets to radiate"}},
 )
 def take_uplink(
     ground: GroundOf,
     caller: Operator,
     spacecraft_id: Annotated[int, Query(ge=0, le=1023)],
     instance: Instance = FLOWN,
-    format: Annotated[str, Query(pattern="^(cltu|packets)$")] = "cltu",
+    format: Literal["cltu", "packets"] = "cltu",
     idempotency_key: OnceKey = None,
 ) -> Response:
-    """Take all released telecommands as octets to radiate; they count as sent from then on.
+    """Take all released telecommands as octets to radiate, and mark them as sent.
 
-    With an idempotency key, an answer that was lost on its way can be asked for again.
+    With an Idempotency-Key, a response that was lost can be requested again.
     """
 
     def take() -> dict[str, Any]:

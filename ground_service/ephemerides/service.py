@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
+from ground_service.ephemerides.model import Ephemeris
 from ground_service.errors import InvalidInput
 from ground_service.events import EphemerisAdded, publish
 from ground_service.ground import Ground
@@ -16,7 +17,7 @@ from lunar.errors import LunarError
 
 def add_ephemeris(
     ground: Ground, stored: StoredFile, *, name: str, precedence: int = 0, actor: str = "local"
-) -> repository.Row:
+) -> Ephemeris:
     """Enter an archived OEM or STK file as a reference ephemeris; the same file again gives the same entry.
 
     Raises
@@ -37,7 +38,7 @@ def add_ephemeris(
             connection, repository.EPHEMERIDES, file_sha256=stored.sha256, precedence=precedence, name=name
         )
         if known is not None:
-            return known
+            return _ephemeris(known)
         key = repository.add(
             connection,
             repository.EPHEMERIDES,
@@ -56,4 +57,15 @@ def add_ephemeris(
             connection,
             EphemerisAdded(id=key, start_utc_ns=ephemeris.start_utc_ns, stop_utc_ns=ephemeris.stop_utc_ns),
         )
-        return repository.get(connection, repository.EPHEMERIDES, key, "ephemeris")
+        return _ephemeris(repository.get(connection, repository.EPHEMERIDES, key, "ephemeris"))
+
+
+def list_ephemerides(ground: Ground, *, limit: int = 100, offset: int = 0) -> tuple[list[Ephemeris], int]:
+    """Return a page of the reference ephemerides, newest first, and the total number."""
+    with ground.database.reading() as connection:
+        page = repository.page(connection, repository.EPHEMERIDES, limit=limit, offset=offset)
+    return [_ephemeris(row) for row in page.rows], page.total
+
+
+def _ephemeris(row: repository.Row) -> Ephemeris:
+    return Ephemeris.of(row, sha256=row["file_sha256"])

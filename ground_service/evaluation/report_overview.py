@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ground_service.errors import NotFound
+from ground_service.evaluation.model import ReportOverview
 from ground_service.ground import Ground
 from ground_service.passes.core import downsample
 from ground_service.store import repository
@@ -18,7 +19,7 @@ from ground_service.store.files import FileArchive
 _TEXTS = ("title", "verdict", "verdict_level", "evidence_level", "created_utc", "headline", "not_available")
 
 
-def report_overview(ground: Ground, report_id: str, max_points: int) -> dict[str, Any]:
+def report_overview(ground: Ground, report_id: str, max_points: int) -> ReportOverview:
     """The head of a report and, per navigation solution, its 3-D error in at most `max_points` stretches.
 
     Columns of one series have one length: seconds of UTC at the middle of each stretch, least, greatest and mean
@@ -29,11 +30,16 @@ def report_overview(ground: Ground, report_id: str, max_points: int) -> dict[str
     NotFound
         If there is no such report, or it has no JSON document.
     """
-    with ground.database.reading() as connection:
-        row = repository.get(connection, repository.REPORTS, report_id, "report")
+    row = report_row(ground, report_id)
     if row["json_sha256"] is None:
         raise NotFound(f"report {report_id} as", "json")
-    return {"report_id": report_id, **_overview(ground.files, row["json_sha256"], max_points)}
+    return ReportOverview(report_id=report_id, **_overview(ground.files, row["json_sha256"], max_points))
+
+
+def report_row(ground: Ground, report_id: str) -> repository.Row:
+    """Return the row of a report."""
+    with ground.database.reading() as connection:
+        return repository.get(connection, repository.REPORTS, report_id, "report")
 
 
 @lru_cache(maxsize=64)

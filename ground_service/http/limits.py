@@ -16,13 +16,15 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from ground_service.http.origins import refuse
 from ground_service.http.problems import busy, problem
 from ground_service.http.proxies import address_key
-from ground_service.http.security import VERIFIED_CALLER
 
 log = logging.getLogger(__name__)
 
 JSON_LIMIT_OCTETS = 1 << 20
 HELD_LIMIT_OCTETS = 64 << 20
 TAGGED_LIMIT_OCTETS = 4 << 20
+
+VERIFIED_CALLER = "verified_caller"
+"""Key in the request state for the user whose token was verified; absent without a verified token."""
 
 CALLERS_KEPT = 10_000
 BURST_S = 2.0

@@ -1,17 +1,70 @@
-"""Base classes of requests and responses."""
+"""Base classes of entities, pages of lists, and problem documents."""
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict
+from collections.abc import Mapping
+from typing import Annotated, Any, Generic, Self, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Item = TypeVar("Item")
+
+TIME_COLUMN = "_utc_ns"
+"""Ending of database columns with times; the fields of entities have the name without it."""
+
+InstanceName = Annotated[
+    str, Field(min_length=1, max_length=96, pattern=r"^[A-Za-z0-9._@-]+$", examples=["flight"])
+]
+SpacecraftNumber = Annotated[int, Field(ge=0, le=1023, examples=[76])]
 
 
-class Schema(BaseModel):
-    """Base of everything sent; what is not known is refused."""
+class Entity(BaseModel):
+    """Base class of entities: database row, API response, client result and printed object in one definition."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @classmethod
+    def of(cls, row: Mapping[str, Any], **values: Any) -> Self:
+        """Return the entity of a database row: columns by field name, times without `_utc_ns`.
+
+        `values` are fields that are not columns, or replace them.
+        """
+        for name in cls.model_fields:
+            if name not in values:
+                column = name if name in row else name + TIME_COLUMN
+                if column in row:
+                    values[name] = row[column]
+        return cls.model_validate(values)
 
 
-class Given(Schema):
+class Given(BaseModel):
     """Base class of requests; values are not converted between types, such as true to 1."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
+
+
+class PageOf(Entity, Generic[Item]):
+    """A page of a list."""
+
+    items: list[Item]
+    total: int = Field(description="Number of items in all pages", examples=[1])
+    limit: int = Field(examples=[100])
+    offset: int = Field(examples=[0])
+
+    @classmethod
+    def all_of(cls, items: list[Item]) -> Self:
+        """Return a list as its only page."""
+        return cls(items=items, total=len(items), limit=max(len(items), 1), offset=0)
+
+
+class Problem(BaseModel):
+    """An RFC 9457 problem document."""
+
+    type: str = Field(examples=["about:blank"])
+    title: str = Field(examples=["not found"])
+    status: int = Field(examples=[404])
+    detail: str = Field(examples=["pass 7: not found"])
+    instance: str | None = Field(default=None, examples=["/api/v1/passes/7"])
+    request_id: str | None = Field(default=None, description="Id of the request in the log")
+    errors: list[dict[str, str]] | None = Field(default=None, description="All faults of the request")
+    state: str | None = Field(default=None, description="For a conflict: the state found instead")

@@ -1,7 +1,8 @@
-"""Request validation before the operations: characters, query keys, and unambiguous JSON."""
+"""Operations of the API: their description, and validation of requests before they run."""
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
 import re
@@ -12,12 +13,15 @@ from difflib import get_close_matches
 from typing import Any, get_args, get_origin
 from urllib.parse import parse_qsl, unquote
 
-from fastapi import Request, Response
+from fastapi import APIRouter, Request, Response
+from fastapi.dependencies.utils import get_dependant
 from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
+from ground_service.http.common import API_PREFIX, IDEMPOTENCY_HEADER, IF_MATCH_HEADER
+from ground_service.http.model import Problem
 from ground_service.http.origins import refuse
 from ground_service.http.problems import problem
 
@@ -62,8 +66,65 @@ class QueryKeys:
     lists: frozenset[str]
 
 
+PROBLEMS = {
+    400: "Malformed or incomplete body",
+    401: "No valid token",
+    403: "The role does not permit it",
+    404: "Not found",
+    409: "Conflict with the present state, or with an earlier request with the same Idempotency-Key",
+    412: "Changed since the version in If-Match",
+    413: "Body too large",
+    415: "Content-Encoding not supported",
+    421: "Host name not served",
+    422: "Invalid parameter, body or unknown query key",
+    429: "Too many requests; Retry-After tells when to repeat",
+    503: "Busy, or the database or archive is unavailable",
+    507: "No space left",
+}
+ALWAYS = (401, 403, 421, 422, 429, 503)
+"""Errors of every operation."""
+
+
+def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Return the description of error responses."""
+    return {
+        status: {
+            "model": Problem,
+            "content": {"application/problem+json": {}},
+            "description": PROBLEMS[status],
+        }
+        for status in statuses
+    }
+
+
 class StrictRoute(APIRoute):
-    """Operation that refuses unknown or duplicate query keys, and JSON that `StrictRequest` refuses."""
+    """Operation that refuses unknown or duplicate query keys, and JSON that `StrictRequest` refuses.
+
+    Its id is the name of the function, its summary the first sentence of the docstring. Errors that follow from
+    method, path, body and headers are declared here; an operation declares only further ones (`problems`).
+    """
+
+    def __init__(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
+        summary, _, rest = inspect.cleandoc(endpoint.__doc__ or "").partition("\n\n")
+        options["summary"] = " ".join(summary.split()).removesuffix(".")
+        options["description"] = rest
+        options["operation_id"] = endpoint.__name__
+        dependant = get_dependant(path=path, call=endpoint)
+        upload = "requestBody" in (options.get("openapi_extra") or {})
+        body = upload or bool(dependant.body_params)
+        headers = header_names(dependant)
+        derived = {
+            400: body,
+            404: "{" in path,
+            409: IDEMPOTENCY_HEADER in headers,
+            412: IF_MATCH_HEADER in headers,
+            413: body,
+            415: upload,
+            507: options.get("methods") not in (["GET"], {"GET"}),
+        }
+        found = problems(*ALWAYS, *(status for status, applies in derived.items() if applies))
+        options["responses"] = {**found, **(options.get("responses") or {})}
+        super().__init__(path, endpoint, **options)
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         handler = super().get_route_handler()
@@ -76,6 +137,11 @@ class StrictRoute(APIRoute):
         return strict
 
 
+def operations(tag: str) -> APIRouter:
+    """Return a router for the operations of a capability."""
+    return APIRouter(route_class=StrictRoute, prefix=API_PREFIX, tags=[tag])
+
+
 def query_keys(dependant: Any) -> QueryKeys:
     """Return the query keys of an operation and its dependencies."""
     known = {field.alias for field in dependant.query_params}
@@ -84,6 +150,12 @@ def query_keys(dependant: Any) -> QueryKeys:
         known |= inner.known
         lists |= inner.lists
     return QueryKeys(frozenset(known), frozenset(lists))
+
+
+def header_names(dependant: Any) -> frozenset[str]:
+    """Return the headers that an operation and its dependencies read."""
+    found = frozenset(field.alias for field in dependant.header_params)
+    return found.union(*map(header_names, dependant.dependencies))
 
 
 def _is_list(annotation: Any) -> bool:

@@ -12,14 +12,12 @@ from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from random import random
-from typing import Annotated, TypeVar
+from typing import TypeVar
 
-from fastapi import Depends, Request
+from fastapi import Request
 from starlette.requests import ClientDisconnect
 
-from ground_service.access.service import Caller
 from ground_service.http.problems import BrokenOff, Busy, TooLarge, UnsupportedEncoding
-from ground_service.http.security import requires
 from ground_service.store.files import FileArchive, StoredFile
 
 BLOCK_OCTETS = 1 << 19
@@ -123,15 +121,3 @@ class Upload:
             raise BrokenOff(f"body: expected a complete body, found {taken} octets") from None
         finally:
             incoming.discard()
-
-
-async def upload_of(
-    request: Request, _: Annotated[Caller, Depends(requires("operator"))]
-) -> AsyncIterator[Upload]:
-    """Yield an upload slot for a request whose caller may upload."""
-    pool: UploadPool = request.app.state.uploads
-    async with pool.place():
-        yield Upload(request, pool)
-
-
-UploadOf = Annotated[Upload, Depends(upload_of)]

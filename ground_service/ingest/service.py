@@ -30,7 +30,7 @@ from ground_service.ingest.stream import (
     Link,
     fragment_edges,
 )
-from ground_service.jobs import OTHER_REQUEST, add_job
+from ground_service.jobs.service import OTHER_REQUEST, add_job
 from ground_service.store import repository
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile, read_blocks

@@ -16,6 +16,8 @@ from typing import Annotated, Any, Final, Literal, get_args
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from ground_service.errors import InvalidInput
+from ground_service.http.model import Entity
+from ground_service.http.times import UtcTime
 from tmtc.effects import EFFECTS
 
 SCHEMA_VERSION: Final = 1
@@ -299,17 +301,15 @@ class Mission(Section):
         return tuple(_not_stated(self))
 
 
-class MissionRevision(BaseModel):
+class MissionRevision(Entity):
     """Stored revision of a mission description."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     id: int = Field(examples=[1])
     mission: str = Field(examples=["selenita"])
     revision: str = Field(description="SHA-256 of the stated values")
     spacecraft_id: int | None = Field(examples=[76])
     unknown: tuple[str, ...] = Field(description="Keys that the document does not state")
-    entered: str = Field(examples=["2029-08-07T00:00:00.000000000Z"])
+    entered: UtcTime
     entered_by: str
 
 

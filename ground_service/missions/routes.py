@@ -2,40 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
-from fastapi import APIRouter, Body, Path
+from fastapi import Body, Path
 
-from ground_service.http.common import (
-    API_PREFIX,
-    PROBLEMS,
-    GroundOf,
-    Limit,
-    Offset,
-    Operator,
-    Viewer,
-    page_of,
-)
-from ground_service.http.requests import StrictRoute
-from ground_service.http.schemas import PageOf
+from ground_service.access.security import Operator, Viewer
+from ground_service.http.common import GroundOf, Limit, Offset, page_of
+from ground_service.http.model import PageOf
+from ground_service.http.requests import operations
 from ground_service.missions import service
 from ground_service.missions.model import MissionDetail, MissionRevision
 
-missions = APIRouter(route_class=StrictRoute, prefix=API_PREFIX, responses=PROBLEMS, tags=["missions"])
+missions = operations("missions")
 
 Text = Annotated[bytes, Body(media_type="text/plain", description="mission.toml")]
 Revision = Annotated[str, Path(pattern=r"^[0-9a-f]{8,64}$", description="Hash or its first digits")]
 
 
-@missions.get("/missions", response_model=PageOf[MissionRevision], operation_id="list_missions")
-def list_missions(ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Offset = 0) -> Any:
+@missions.get("/missions")
+def list_missions(
+    ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Offset = 0
+) -> PageOf[MissionRevision]:
     """List the revisions of mission descriptions, newest first."""
     items, total = service.list_missions(ground, limit=limit, offset=offset)
     return page_of(items, total, limit, offset)
 
 
-@missions.post("/missions", status_code=201, response_model=MissionDetail, operation_id="add_mission")
-def add_mission(ground: GroundOf, caller: Operator, document: Text) -> Any:
+@missions.post("/missions", status_code=201)
+def add_mission(ground: GroundOf, caller: Operator, document: Text) -> MissionDetail:
     """Add a mission description (TOML) as a revision; the same content gives the same revision.
 
     Only an administrator may change which telecommands need a second person.
@@ -45,7 +39,7 @@ def add_mission(ground: GroundOf, caller: Operator, document: Text) -> Any:
     )
 
 
-@missions.get("/missions/{revision}", response_model=MissionDetail, operation_id="get_mission")
-def get_mission(ground: GroundOf, _: Viewer, revision: Revision) -> Any:
-    """Return a revision with its document."""
+@missions.get("/missions/{revision}")
+def get_mission(ground: GroundOf, _: Viewer, revision: Revision) -> MissionDetail:
+    """Show a revision with its document."""
     return service.get_mission(ground, revision)

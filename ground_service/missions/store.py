@@ -10,7 +10,6 @@ from sqlalchemy.exc import IntegrityError
 from ground_service.errors import NotFound
 from ground_service.missions.model import Approval, Mission, MissionDetail, MissionRevision, parse_mission
 from ground_service.store import repository
-from lunar.timescales import format_utc
 
 MISSIONS = repository.MISSIONS
 ARCHIVE_ACTOR = "archive"
@@ -147,6 +146,6 @@ def _columns(row: repository.Row, document: Mission) -> dict[str, Any]:
         "revision": row["revision"],
         "spacecraft_id": row["ccsds_id"],
         "unknown": document.unknown,
-        "entered": format_utc(int(row["created_utc_ns"]), 9),
+        "entered": row["created_utc_ns"],
         "entered_by": row["entered_by"],
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection
@@ -22,7 +23,7 @@ from ground_service.store.rollups import HOUSEKEEPING_VALUES as PARAMETERS
 from ground_service.store.rollups import STATE_VALUES
 from ground_service.timekeeping.core import IDEAL_CLOCK, utc_ns_of_ticks
 
-__all__ = ["PARAMETERS", "STATE_VALUES", "Series", "SeriesReading"]
+__all__ = ["PARAMETERS", "STATE_VALUES", "Series", "SeriesReading", "series_document"]
 
 FEW_ROWS = 50_000
 """Up to this many samples are read one by one, which is exact to the sample and quick enough."""
@@ -161,3 +162,31 @@ class SeriesReading:
     def _equal(self) -> dict[str, int]:
         column = rollups.KINDS[self.kind][1]
         return {} if column is None else {column: self.part}
+
+
+def series_document(series: Series) -> dict[str, Any]:
+    """Return a series as the JSON values of `model.ParameterSeries`, formatting all times at once."""
+    buckets = series.buckets
+    columns = (
+        _time_texts(buckets.start_utc_ns),
+        _time_texts(buckets.stop_utc_ns),
+        buckets.count.tolist(),
+        buckets.low.tolist(),
+        buckets.high.tolist(),
+        buckets.mean.tolist(),
+        buckets.after_gap.tolist(),
+    )
+    names = ("start", "stop", "count", "min", "max", "mean", "after_gap")
+    return {
+        "name": series.name,
+        "unit": series.unit,
+        "samples": series.samples,
+        "correlation_id": series.correlation_id,
+        "buckets": [dict(zip(names, values, strict=True)) for values in zip(*columns, strict=True)],
+    }
+
+
+def _time_texts(utc_ns: Any) -> list[str]:
+    """Return the texts of many times, as `http.times.time_text` does."""
+    texts = np.datetime_as_string(np.asarray(utc_ns, dtype=np.int64).astype("datetime64[ns]"), unit="us")
+    return [f"{text}Z" for text in texts.tolist()]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -13,16 +13,24 @@ from sqlalchemy import Connection
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
-from ground_service.http.views import series_view
+from ground_service.http.times import UtcTime
 from ground_service.ingest.redecode import readable_version
 from ground_service.ingest.service import FLOWN
 from ground_service.missions import store as missions
 from ground_service.passes.cache import remembered
+from ground_service.passes.model import (
+    Detection,
+    Event,
+    PassDetail,
+    PassSummary,
+    Trend,
+)
 from ground_service.passes.packet_accounting import packet_accounting
-from ground_service.passes.series import PARAMETERS, STATE_VALUES, Series, SeriesReading
+from ground_service.passes.series import PARAMETERS, STATE_VALUES, Series, SeriesReading, series_document
 from ground_service.passes.span import PassSpan, pass_span
 from ground_service.passes.store import detection_frames, detection_samples, event_list
-from ground_service.store import repository
+from ground_service.passes.trends import trend_of
+from ground_service.store import repository, rollups
 from ground_service.text import require_line
 from ground_service.timekeeping.core import ticks_of_utc_ns
 from ground_service.timekeeping.store import load_correlations
@@ -30,43 +38,39 @@ from reports.values import PacketAccounting, PassEvent
 from tmtc.dictionary import DICTIONARY
 
 LAST_TICKS = (1 << 48) - 1
+TREND_DAYS = 30
+TREND_POINTS = 60
 
 
-@dataclass(frozen=True, slots=True)
-class Detection:
-    """One detection of one frame."""
-
-    frame_number: int
-    utc_ns: int
-    u_px: float
-    v_px: float
-    diameter_px: float
-    score: float
-    size_class: int
-    correlation_id: int
-
-
-def list_passes(ground: Ground, *, limit: int = 100, offset: int = 0) -> repository.Page:
-    """Passes, the latest entered first."""
+def list_passes(ground: Ground, *, limit: int = 100, offset: int = 0) -> tuple[list[PassSummary], int]:
+    """Return a page of the passes, newest first, and the total number."""
     with ground.database.reading() as connection:
-        return repository.page(connection, repository.PASSES, limit=limit, offset=offset)
+        page = repository.page(connection, repository.PASSES, limit=limit, offset=offset)
+    return [PassSummary.of(row) for row in page.rows], page.total
 
 
-def get_pass(ground: Ground, pass_id: int) -> dict[str, Any]:
-    """A pass with the spacecraft it is of and its packets counted."""
+def get_pass(ground: Ground, pass_id: int) -> PassDetail:
+    """Return a pass with its spacecraft, mission and newest reports.
+
+    Raises
+    ------
+    NotFound
+        There is no such pass.
+    """
     with ground.database.reading() as connection:
         record = repository.get(connection, repository.PASSES, pass_id, "pass")
         vehicle = repository.get(connection, repository.VEHICLES, record["vehicle_id"], "vehicle")
         reports = repository.page(connection, repository.REPORTS, limit=20, pass_id=pass_id)
         mission = None if record["mission_id"] is None else missions.detail(connection, record["mission_id"])
-    return {
-        **record,
-        "spacecraft_id": vehicle["ccsds_id"],
-        "instance": vehicle["instance"],
-        "mission": None if mission is None else mission.mission,
-        "mission_revision": None if mission is None else mission.revision,
-        "reports": [row["id"] for row in reports.rows],
-    }
+    return PassDetail.of(
+        record,
+        spacecraft_id=vehicle["ccsds_id"],
+        instance=vehicle["instance"],
+        archive_sha256=record["archive_digest"],
+        mission=None if mission is None else mission.mission,
+        mission_revision=None if mission is None else mission.revision,
+        reports=[row["id"] for row in reports.rows],
+    )
 
 
 def define_pass(
@@ -107,7 +111,7 @@ def define_pass(
 
 
 def completeness(ground: Ground, pass_id: int) -> PacketAccounting:
-    """Packets of a pass that came and that did not."""
+    """Return the accounting of the received and missing packets of a pass."""
     with ground.database.reading() as connection:
         record = repository.get(connection, repository.PASSES, pass_id, "pass")
         return remembered(
@@ -119,7 +123,7 @@ def completeness(ground: Ground, pass_id: int) -> PacketAccounting:
 
 
 def events(ground: Ground, pass_id: int) -> tuple[PassEvent, ...]:
-    """Event reports of a pass, in time order."""
+    """Return the event reports of a pass, in time order."""
     with ground.database.reading() as connection:
         record = repository.get(connection, repository.PASSES, pass_id, "pass")
         return remembered(
@@ -130,8 +134,14 @@ def events(ground: Ground, pass_id: int) -> tuple[PassEvent, ...]:
         )
 
 
+def list_events(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tuple[list[Event], int]:
+    """Return a page of the event reports of a pass, in time order, and the total number."""
+    found = events(ground, pass_id)
+    return [Event.of(asdict(one), time=one.utc_ns) for one in found[offset : offset + limit]], len(found)
+
+
 def detections(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tuple[list[Detection], int]:
-    """Detections of a pass, a page of them in time order, and how many there are."""
+    """Return a page of the detections of a pass, in time order, and the total number."""
     with ground.database.reading() as connection:
         record = repository.get(connection, repository.PASSES, pass_id, "pass")
         span = pass_span(connection, record)
@@ -149,7 +159,7 @@ def detections(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tupl
     return [
         Detection(
             frame_number=int(samples.frame_number[frame]),
-            utc_ns=int(samples.utc_ns[frame]),
+            time=UtcTime(samples.utc_ns[frame]),
             u_px=float(samples.u_px[row]),
             v_px=float(samples.v_px[row]),
             diameter_px=float(samples.diameter_px[row]),
@@ -187,7 +197,7 @@ def states_document(
 
         def make() -> bytes:
             found = _state_series(connection, record, estimator, values, max_points)
-            return _json({"estimator": estimator, "series": [series_view(one) for one in found]})
+            return _json({"estimator": estimator, "series": [series_document(one) for one in found]})
 
         return remembered(ground, connection, ("states", pass_id, estimator, values, max_points), make)
 
@@ -235,7 +245,7 @@ def parameter_document(ground: Ground, pass_id: int, parameter: str, max_points:
 
         def make() -> bytes:
             span = pass_span(connection, record)
-            return _json(series_view(_parameter_series(connection, span, parameter, max_points)))
+            return _json(series_document(_parameter_series(connection, span, parameter, max_points)))
 
         return remembered(ground, connection, ("parameter", pass_id, parameter, max_points), make)
 
@@ -279,3 +289,38 @@ def trend_series(
 def _check_parameter(parameter: str) -> None:
     if parameter not in PARAMETERS:
         raise NotFound("parameter", parameter[:80])
+
+
+def spacecraft_trends(ground: Ground, spacecraft_id: int, instance: str) -> list[Trend]:
+    """Return the trends of the housekeeping parameters of a spacecraft; see `vehicle_trends`.
+
+    Raises
+    ------
+    NotFound
+        There is no such spacecraft.
+    """
+    with ground.database.reading() as connection:
+        row = repository.find(connection, repository.VEHICLES, ccsds_id=spacecraft_id, instance=instance)
+    if row is None:
+        raise NotFound("spacecraft", f"{spacecraft_id} ({instance})")
+    return vehicle_trends(ground, row["id"])
+
+
+def vehicle_trends(ground: Ground, vehicle: int) -> list[Trend]:
+    """Return the trends over the last `TREND_DAYS` days of on-board time with housekeeping."""
+    with ground.database.reading() as connection:
+        return remembered(ground, connection, ("trends", vehicle), lambda: _trends(connection, vehicle))
+
+
+def _trends(connection: Connection, vehicle: int) -> list[Trend]:
+    version = readable_version(connection, vehicle)
+    _, _, last = rollups.rolled_extent(connection, "housekeeping", vehicle, version, 0, 0, LAST_TICKS)
+    if last == 0:
+        return []
+    first = max(last - (TREND_DAYS * 86_400 << 16), 0)
+    span = PassSpan(vehicle, first, last, load_correlations(connection, vehicle), version)
+    reading = SeriesReading(connection, span, "housekeeping", 0, TREND_POINTS)
+    definition = DICTIONARY.packet("housekeeping")
+    read = reading.series({name: definition.field(name).unit for name in PARAMETERS})
+    trends = (trend_of(definition.field(one.name), one.buckets) for one in read)
+    return [Trend.of(asdict(trend)) for trend in trends if trend is not None]

@@ -3,32 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 from sqlalchemy import Connection, select
 
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
-from ground_service.http.views import time_text
-from ground_service.planning.service import WindowEntry, insert_window
+from ground_service.http.times import UtcTime
+from ground_service.planning.model import Plan, PlanWindow, WindowEntry
+from ground_service.planning.service import insert_window
 from ground_service.store import repository
 from ground_service.store.counters import lock_spacecraft
 
-SCHEMA_VERSION = 1
 
-
-@dataclass(frozen=True, slots=True)
-class PlanEntry:
-    """A window of a plan: its key, the key of the one before it, and the window."""
-
-    key: str
-    after: str | None
-    window: WindowEntry
-
-
-def export_plan(ground: Ground) -> dict[str, Any]:
-    """All windows that have not failed, in order of time."""
+def export_plan(ground: Ground) -> Plan:
+    """Return all windows that have not failed, in order of time."""
     table, vehicles = repository.WINDOWS, repository.VEHICLES
     with ground.database.reading() as connection:
         rows = (
@@ -42,25 +31,24 @@ def export_plan(ground: Ground) -> dict[str, Any]:
             .all()
         )
     known = {row["id"] for row in rows}
-    return {
-        "schema_version": SCHEMA_VERSION,
-        "windows": [
-            {
-                "key": f"w{row['id']}",
-                "after": f"w{row['predecessor_id']}" if row["predecessor_id"] in known else None,
-                "name": row["name"],
-                "start": time_text(row["start_utc_ns"]),
-                "stop": time_text(row["stop_utc_ns"]),
-                "cadence_s": row["cadence_s"],
-                "spacecraft_id": row["ccsds_id"],
-                "instance": row["instance"],
-            }
+    return Plan(
+        windows=[
+            PlanWindow(
+                key=f"w{row['id']}",
+                after=f"w{row['predecessor_id']}" if row["predecessor_id"] in known else None,
+                name=row["name"],
+                start=UtcTime(row["start_utc_ns"]),
+                stop=UtcTime(row["stop_utc_ns"]),
+                cadence_s=row["cadence_s"],
+                spacecraft_id=row["ccsds_id"],
+                instance=row["instance"],
+            )
             for row in rows
-        ],
-    }
+        ]
+    )
 
 
-def import_plan(ground: Ground, entries: Sequence[PlanEntry], *, actor: str) -> dict[str, int]:
+def import_plan(ground: Ground, entries: Sequence[PlanWindow], *, actor: str) -> dict[str, int]:
     """Enter the windows of a plan as drafts, or none where one is refused; the id of each by its key.
 
     A window of the same spacecraft, span and name that is there already is taken for the same.
@@ -76,9 +64,7 @@ def import_plan(ground: Ground, entries: Sequence[PlanEntry], *, actor: str) -> 
     ordered = _in_order(entries)
     with ground.database.writing() as connection:
         # Lock all spacecraft of the plan in a fixed order, so that simultaneous imports do not deadlock.
-        for spacecraft_id, instance in sorted(
-            {(one.window.spacecraft_id, one.window.instance) for one in entries}
-        ):
+        for spacecraft_id, instance in sorted({(one.spacecraft_id, one.instance) for one in entries}):
             vehicle = repository.vehicle_id(connection, spacecraft_id, instance)
             vehicles = repository.VEHICLES.c.id
             connection.execute(
@@ -86,20 +72,20 @@ def import_plan(ground: Ground, entries: Sequence[PlanEntry], *, actor: str) -> 
             )
             lock_spacecraft(connection, vehicle)
         for entry in ordered:
-            window = replace(entry.window, predecessor_id=ids[entry.after] if entry.after else None)
+            window = replace(entry.entry(), predecessor_id=ids[entry.after] if entry.after else None)
             found = _known(connection, window)
             if found is None:
-                found = int(insert_window(ground, connection, window, actor=actor)["id"])
+                found = insert_window(ground, connection, window, actor=actor).id
             ids[entry.key] = found
     return ids
 
 
-def _in_order(entries: Sequence[PlanEntry]) -> list[PlanEntry]:
+def _in_order(entries: Sequence[PlanWindow]) -> list[PlanWindow]:
     """Predecessors before those that follow them."""
     by_key = {entry.key: entry for entry in entries}
     if len(by_key) != len(entries):
         raise InvalidInput("plan", "windows", "keys that differ", "one twice")
-    ordered: list[PlanEntry] = []
+    ordered: list[PlanWindow] = []
     done: set[str] = set()
     left = list(entries)
     while left:

@@ -1,29 +1,48 @@
-"""What goes over the wire about plans: constraints, candidates, windows, whole plans."""
+"""Entities of plans: constraints, candidates, windows, whole plans."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from ground_service.http.model import Given, Schema
+from ground_service.http.model import Entity, Given, InstanceName, SpacecraftNumber
+from ground_service.http.times import GivenTime, UtcTime
 from ground_service.missions.stations import STATIONS
+from ground_service.planning import core
 from ground_service.planning.core import Constraints, Resources
 from ground_service.text import LINE_PATTERN_JSON
 from lunar.visibility import GroundStation
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1, max_length=200, pattern=LINE_PATTERN_JSON)]
-InstanceName = Annotated[str, Field(min_length=1, max_length=96, pattern=r"^[A-Za-z0-9._@-]+$")]
-Time = Annotated[str, Field(min_length=10, max_length=40, examples=["2029-08-07T06:00:00Z"])]
+Time = Annotated[GivenTime, AfterValidator(lambda time: UtcTime(time.utc_ns // 1000 * 1000))]
+"""Time of a plan, in whole microseconds, so that an exported plan states it exactly."""
+
 WindowState = Literal[
     "draft", "approved", "uplinked", "executing", "executed", "downlinked", "processed", "failed"
 ]
 
 
+@dataclass(frozen=True, slots=True)
+class WindowEntry:
+    """Request of a window."""
+
+    name: str
+    start_utc_ns: int
+    stop_utc_ns: int
+    cadence_s: float
+    spacecraft_id: int
+    instance: str = "flight"
+    predecessor_id: int | None = None
+    ephemeris_id: int | None = None
+    resources: Resources = field(default_factory=Resources)
+
+
 class Limits(Given):
-    """A least and a greatest value."""
+    """A minimum and a maximum."""
 
     min: Finite = Field(examples=[30.0])
     max: Finite = Field(examples=[100.0])
@@ -35,7 +54,7 @@ class Limits(Given):
         return self
 
     def scaled(self, factor: float) -> tuple[float, float]:
-        """Both values times a factor."""
+        """Return both values times a factor."""
         return self.min * factor, self.max * factor
 
 
@@ -50,7 +69,7 @@ class Station(Given):
 
 
 class ResourcesIn(Given):
-    """What the spacecraft and the ground have to offer."""
+    """Resources of the spacecraft and of the ground."""
 
     storage_mib: Finite = Field(default=64.0, gt=0.0, le=1e6)
     downlink_kbit_s: Finite = Field(default=16.0, ge=0.0, le=1e6)
@@ -63,7 +82,7 @@ class ResourcesIn(Given):
     )
 
     def value(self) -> Resources:
-        """As the planner takes them."""
+        """Return the value for the planner."""
         stations: tuple[GroundStation, ...] = STATIONS
         if self.stations is not None:
             stations = tuple(
@@ -88,7 +107,7 @@ class ResourcesIn(Given):
 
 
 class WindowSearch(Given):
-    """Constraints that a window has to fulfil all along; what is left out is not asked for."""
+    """Constraints that a window must fulfil throughout; a constraint that is not stated does not apply."""
 
     start: Time | None = Field(default=None, description="Default: where the ephemeris begins")
     stop: Time | None = Field(default=None, description="Default: where the ephemeris ends")
@@ -112,11 +131,11 @@ class WindowSearch(Given):
     minimum_duration_s: Finite = Field(default=300.0, ge=0.0, le=86_400.0)
     maximum_duration_s: Finite = Field(default=2400.0, ge=30.0, le=86_400.0)
     minimum_battery: Finite | None = Field(default=None, ge=0.0, le=1.0, description="Share of its capacity")
-    needs_contact: bool = Field(default=False, description="Its data have to be down within the span")
+    needs_contact: bool = Field(default=False, description="Its data must be downlinked within the span")
     resources: ResourcesIn = Field(default_factory=ResourcesIn)
 
     def constraints(self) -> Constraints:
-        """As the planner takes them."""
+        """Return the value for the planner."""
 
         def angles(limits: Limits | None) -> tuple[float, float] | None:
             return None if limits is None else limits.scaled(math.pi / 180.0)
@@ -136,18 +155,23 @@ class WindowSearch(Given):
         )
 
 
-class Span(Schema):
-    """A least and a greatest value that were found."""
+class Span(Entity):
+    """Minimum and maximum over a window."""
 
     min: float
     max: float
 
+    @classmethod
+    def degrees(cls, limits_rad: tuple[float, float]) -> Span:
+        """Return limits in radians as degrees."""
+        return cls(min=math.degrees(limits_rad[0]), max=math.degrees(limits_rad[1]))
 
-class CandidateOut(Schema):
-    """A window that fulfils the constraints, and what it would be like."""
 
-    start: str
-    stop: str
+class Candidate(Entity):
+    """A window that fulfils the constraints, with its predicted conditions."""
+
+    start: UtcTime
+    stop: UtcTime
     frames: int
     altitude_km: Span
     sun_elevation_deg: Span
@@ -157,27 +181,50 @@ class CandidateOut(Schema):
     mare_share: float | None
     data_octets: int
     energy_wh: float
-    battery_minimum: float = Field(description="Least charge of the battery, share of its capacity")
+    battery_minimum: float = Field(description="Minimum charge of the battery, share of its capacity")
     storage_peak_octets: int
-    downlinked_by: str | None = Field(description="When its data are down; null: not within the contacts")
+    downlinked_by: UtcTime | None = Field(
+        description="When its data are downlinked; null: not within the contacts"
+    )
+
+    @classmethod
+    def from_core(cls, found: core.Candidate) -> Candidate:
+        """Return the entity of a candidate of the planner."""
+        craters = found.craters_per_frame
+        return cls(
+            start=UtcTime(found.start_utc_ns),
+            stop=UtcTime(found.stop_utc_ns),
+            frames=found.frames,
+            altitude_km=Span(min=found.altitude_m[0] / 1e3, max=found.altitude_m[1] / 1e3),
+            sun_elevation_deg=Span.degrees(found.sun_elevation_rad),
+            latitude_deg=Span.degrees(found.latitude_rad),
+            sunlit_share=found.sunlit_share,
+            craters_per_frame=None if craters is None else Span(min=craters[0], max=craters[1]),
+            mare_share=found.mare_share,
+            data_octets=found.data_octets,
+            energy_wh=found.energy_wh,
+            battery_minimum=found.battery_minimum,
+            storage_peak_octets=found.storage_peak_octets,
+            downlinked_by=None if found.downlinked_by_utc_ns is None else UtcTime(found.downlinked_by_utc_ns),
+        )
 
 
-class ContactOut(Schema):
-    """A span in which a station sees the spacecraft."""
+class Contact(Entity):
+    """An interval in which a station sees the spacecraft."""
 
     station: str
-    start: str
-    stop: str
+    start: UtcTime
+    stop: UtcTime
 
 
-class SearchOut(Schema):
+class SearchResult(Entity):
     """Candidate windows in order of time."""
 
     ephemeris_id: int
     data: list[str]
-    candidates: list[CandidateOut]
-    contacts: list[ContactOut]
-    refused: dict[str, int] = Field(description="Spans left out, by reason")
+    candidates: list[Candidate]
+    contacts: list[Contact]
+    refused: dict[str, int] = Field(description="Number of rejected intervals, by reason")
 
 
 class WindowIn(Given):
@@ -187,15 +234,29 @@ class WindowIn(Given):
     start: Time
     stop: Time
     cadence_s: Finite = Field(default=15.0, ge=0.1, le=3600.0)
-    spacecraft_id: int = Field(ge=0, le=1023, examples=[76])
+    spacecraft_id: SpacecraftNumber
     instance: InstanceName = "flight"
     predecessor_id: int | None = Field(default=None, ge=1, le=2**31 - 1)
     ephemeris_id: int | None = Field(default=None, ge=1, le=2**31 - 1)
     resources: ResourcesIn = Field(default_factory=ResourcesIn)
 
+    def entry(self) -> WindowEntry:
+        """Return the requested window."""
+        return WindowEntry(
+            name=self.name,
+            start_utc_ns=self.start.utc_ns,
+            stop_utc_ns=self.stop.utc_ns,
+            cadence_s=self.cadence_s,
+            spacecraft_id=self.spacecraft_id,
+            instance=self.instance,
+            predecessor_id=self.predecessor_id,
+            ephemeris_id=self.ephemeris_id,
+            resources=self.resources.value(),
+        )
+
 
 class WindowChange(Given):
-    """Changes of a draft, or a decision on a window; what is left out stays."""
+    """Changes of a draft, or a decision on a window; fields that are not stated do not change."""
 
     name: Name | None = None
     start: Time | None = None
@@ -205,14 +266,25 @@ class WindowChange(Given):
     state: Literal["draft", "approved", "failed"] | None = Field(default=None, examples=["approved"])
     reason: str | None = Field(default=None, max_length=500, pattern=LINE_PATTERN_JSON)
 
+    def changes(self) -> dict[str, Any]:
+        """Return the changed fields of the `WindowEntry`."""
+        given = {name: getattr(self, name) for name in self.model_fields_set - {"state", "reason"}}
+        return {
+            f"{name}_utc_ns" if isinstance(value, UtcTime) else name: value.utc_ns
+            if isinstance(value, UtcTime)
+            else value
+            for name, value in given.items()
+            if value is not None or name == "predecessor_id"
+        }
 
-class WindowOut(Schema):
-    """A planned window and where it has come."""
+
+class Window(Entity):
+    """A planned window and its state."""
 
     id: int = Field(examples=[1])
     name: str
-    start: str
-    stop: str
+    start: UtcTime
+    stop: UtcTime
     cadence_s: float
     state: WindowState
     reason: str | None
@@ -220,14 +292,14 @@ class WindowOut(Schema):
     instance: str
     predecessor_id: int | None
     ephemeris_id: int | None
-    pass_id: int | None = Field(description="The pass of its telemetry, once some came down")
+    pass_id: int | None = Field(description="The pass of its telemetry, once received")
     data_octets: int
     predicted: dict[str, Any]
     telecommands: list[int]
     version: int
     created_by: str
-    created: str
-    changed: str
+    created: UtcTime
+    changed: UtcTime
 
 
 class PlanWindow(Given):
@@ -239,18 +311,29 @@ class PlanWindow(Given):
     start: Time
     stop: Time
     cadence_s: Finite = Field(ge=0.1, le=3600.0)
-    spacecraft_id: int = Field(ge=0, le=1023)
+    spacecraft_id: SpacecraftNumber
     instance: InstanceName = "flight"
+
+    def entry(self) -> WindowEntry:
+        """Return the requested window, without its predecessor."""
+        return WindowEntry(
+            name=self.name,
+            start_utc_ns=self.start.utc_ns,
+            stop_utc_ns=self.stop.utc_ns,
+            cadence_s=self.cadence_s,
+            spacecraft_id=self.spacecraft_id,
+            instance=self.instance,
+        )
 
 
 class Plan(Given):
-    """Windows as they are exchanged between services."""
+    """Windows for the exchange between services."""
 
     schema_version: Literal[1] = 1
     windows: list[PlanWindow] = Field(max_length=1000)
 
 
-class Imported(Schema):
-    """Windows that a plan became, by their keys."""
+class Imported(Entity):
+    """Ids of the windows of an imported plan, by their keys."""
 
     windows: dict[str, int]

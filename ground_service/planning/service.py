@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -16,20 +16,19 @@ from ground_service.commanding import service as commanding
 from ground_service.errors import Conflict, InvalidInput, NotFound, PlanConflict, PlanConflicts, StateConflict
 from ground_service.events import WindowChanged, publish
 from ground_service.ground import Ground
-from ground_service.http.views import candidate_view
-from ground_service.ingest.service import FLOWN
+from ground_service.http.times import UtcTime
 from ground_service.missions import store as missions
+from ground_service.planning import model
 from ground_service.planning.core import (
     Candidate,
     Commitment,
-    Constraints,
     Planner,
     Resources,
-    SearchResult,
     data_octets,
     frames_between,
     storage_peak,
 )
+from ground_service.planning.model import Contact, SearchResult, Window, WindowEntry, WindowSearch
 from ground_service.planning.window_states import COMMITTED, PlannedSpan, span_conflicts
 from ground_service.store import repository
 from ground_service.store.counters import lock_spacecraft
@@ -64,45 +63,11 @@ _DECIDABLE = {
 """States in which a window can be decided, by decision."""
 
 
-@dataclass(frozen=True, slots=True)
-class WindowEntry:
-    """Request of a window."""
+def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
+    """Search candidate windows over a reference ephemeris.
 
-    name: str
-    start_utc_ns: int
-    stop_utc_ns: int
-    cadence_s: float
-    spacecraft_id: int
-    instance: str = FLOWN
-    predecessor_id: int | None = None
-    ephemeris_id: int | None = None
-    resources: Resources = field(default_factory=Resources)
-
-
-def search_windows(
-    ground: Ground,
-    constraints: Constraints,
-    *,
-    start_utc_ns: int | None = None,
-    stop_utc_ns: int | None = None,
-    cadence_s: float = 15.0,
-    step_s: float = 30.0,
-    resources: Resources | None = None,
-    ephemeris_id: int | None = None,
-    catalogue_pass_id: int | None = None,
-    spacecraft_id: int | None = None,
-    instance: str = FLOWN,
-) -> tuple[SearchResult, repository.Row, tuple[str, ...]]:
-    """Candidates over a reference ephemeris, its row, and the names of the data used.
-
-    Parameters
-    ----------
-    ephemeris_id
-        Which ephemeris; the one that covers the start of the span best when None.
-    catalogue_pass_id
-        Use the crater catalogue of this pass; None: the available public one.
-    spacecraft_id
-        Count with the storage that the windows of this spacecraft claim already.
+    Without `ephemeris_id` the ephemeris that covers the start of the span best is used, without `catalogue_pass_id` the
+    available public crater catalogue.
 
     Raises
     ------
@@ -111,18 +76,21 @@ def search_windows(
     NotFound
         If there is no such ephemeris or pass.
     """
+    constraints = given.constraints()
+    start = None if given.start is None else given.start.utc_ns
+    stop = None if given.stop is None else given.stop.utc_ns
     with ground.database.reading() as connection:
-        row = _ephemeris_for(connection, ephemeris_id, start_utc_ns, stop_utc_ns)
-        commitments = _commitments(connection, spacecraft_id, instance)
+        row = _ephemeris_for(connection, given.ephemeris_id, start, stop)
+        commitments = _commitments(connection, given.spacecraft_id, given.instance)
         catalogue_sha256 = None
-        if catalogue_pass_id is not None:
-            record = repository.get(connection, repository.PASSES, catalogue_pass_id, "pass")
+        if given.catalogue_pass_id is not None:
+            record = repository.get(connection, repository.PASSES, given.catalogue_pass_id, "pass")
             catalogue_sha256 = record["catalogue_sha256"]
             if catalogue_sha256 is None:
                 raise InvalidInput("search", "catalogue_pass_id", "a pass with a crater catalogue", "none")
-    start = row["start_utc_ns"] if start_utc_ns is None else start_utc_ns
-    stop = row["stop_utc_ns"] if stop_utc_ns is None else stop_utc_ns
-    _check_span(start, stop, step_s, row)
+    start = row["start_utc_ns"] if start is None else start
+    stop = row["stop_utc_ns"] if stop is None else stop
+    _check_span(start, stop, given.step_s, row)
     catalogue = _catalogue(ground, catalogue_sha256) if constraints.craters_per_frame is not None else None
     if constraints.craters_per_frame is not None and catalogue is None:
         raise InvalidInput(
@@ -132,18 +100,29 @@ def search_windows(
     if constraints.mare is not None and mare is None:
         raise InvalidInput("search", "terrain", "an albedo map among the public data", "none")
     planner = Planner(
-        _load(ground, row), ground.orientation, resources or Resources(), PinholeCamera(), catalogue, mare
+        _load(ground, row), ground.orientation, given.resources.value(), PinholeCamera(), catalogue, mare
     )
-    found = planner.search(constraints, start, stop, cadence_s, step_s=step_s, commitments=commitments)
+    found = planner.search(
+        constraints, start, stop, given.cadence_s, step_s=given.step_s, commitments=commitments
+    )
     names = [f"ephemeris {row['name']}", f"orientation {ground.orientation.name}"]
     if catalogue is not None:
         names.append(f"crater catalogue {catalogue.source}")
     if mare is not None:
         names.append("albedo map")
-    return found, row, tuple(names)
+    return SearchResult(
+        ephemeris_id=row["id"],
+        data=names,
+        candidates=[model.Candidate.from_core(one) for one in found.candidates],
+        contacts=[
+            Contact(station=one.station, start=UtcTime(one.start_utc_ns), stop=UtcTime(one.stop_utc_ns))
+            for one in found.contacts
+        ],
+        refused=found.refused,
+    )
 
 
-def add_window(ground: Ground, entry: WindowEntry, *, actor: str) -> repository.Row:
+def add_window(ground: Ground, entry: WindowEntry, *, actor: str) -> Window:
     """Enter a window as a draft.
 
     Raises
@@ -155,9 +134,7 @@ def add_window(ground: Ground, entry: WindowEntry, *, actor: str) -> repository.
         return insert_window(ground, connection, entry, actor=actor)
 
 
-def insert_window(
-    ground: Ground, connection: Connection, entry: WindowEntry, *, actor: str
-) -> repository.Row:
+def insert_window(ground: Ground, connection: Connection, entry: WindowEntry, *, actor: str) -> Window:
     """Add a window as `add_window` does, within the caller's transaction."""
     _check_entry(entry)
     vehicle = repository.vehicle_id(connection, entry.spacecraft_id, entry.instance)
@@ -179,7 +156,7 @@ def insert_window(
         **values,
     )
     _note(connection, actor, "enter", int(key), "draft", {"name": entry.name})
-    return window_row(connection, int(key))
+    return _window(connection, int(key))
 
 
 def change_window(
@@ -190,8 +167,8 @@ def change_window(
     changes: Mapping[str, Any],
     decision: str | None = None,
     reason: str | None = None,
-    expected: Callable[[repository.Row], None] | None = None,
-) -> repository.Row:
+    expected: Callable[[Window], None] | None = None,
+) -> Window:
     """Change a draft, or decide on a window: approved, back to draft, or failed with a reason.
 
     Parameters
@@ -213,7 +190,7 @@ def change_window(
     with ground.database.writing() as connection:
         row = _locked_window(connection, window_id)
         if expected is not None:
-            expected(row)
+            expected(Window.of(row))
         if changes and row["state"] != "draft":
             raise StateConflict("window", window_id, "draft", row["state"])
         if decision is not None and row["state"] not in _DECIDABLE[decision]:
@@ -248,7 +225,7 @@ def change_window(
         if not changed:
             raise StateConflict("window", window_id, row["state"], window_row(connection, window_id)["state"])
         _note(connection, actor, decision or "change", window_id, wanted, {"reason": reason or ""})
-        return window_row(connection, window_id)
+        return _window(connection, window_id)
 
 
 def delete_window(
@@ -256,7 +233,7 @@ def delete_window(
     window_id: int,
     *,
     actor: str,
-    expected: Callable[[repository.Row], None] | None = None,
+    expected: Callable[[Window], None] | None = None,
 ) -> None:
     """Delete a window from the plan, unless its telecommands were sent.
 
@@ -270,7 +247,7 @@ def delete_window(
     with ground.database.writing() as connection:
         row = _locked_window(connection, window_id)
         if expected is not None:
-            expected(row)
+            expected(Window.of(row))
         if "sent" in _command_states(connection, window_id) or row["pass_id"] is not None:
             raise Conflict(f"window {window_id}: was uplinked; it can be declared failed, not deleted")
         follower = repository.find(connection, repository.WINDOWS, predecessor_id=window_id)
@@ -348,20 +325,30 @@ def uplink_window(ground: Ground, window_id: int, *, actor: str) -> list[int]:
         return ids
 
 
-def get_window(ground: Ground, window_id: int) -> repository.Row:
-    """One window as it stands."""
+def get_window(ground: Ground, window_id: int) -> Window:
+    """Return a window.
+
+    Raises
+    ------
+    NotFound
+        There is no such window.
+    """
     with ground.database.reading() as connection:
-        return window_row(connection, window_id)
+        return _window(connection, window_id)
 
 
 def list_windows(
     ground: Ground, *, state: str | None = None, limit: int = 100, offset: int = 0
-) -> tuple[list[repository.Row], int]:
-    """Windows, the newest first."""
+) -> tuple[list[Window], int]:
+    """Return a page of the windows, newest first, and the total number."""
     equal: dict[str, Any] = {"state": state} if state is not None else {}
     with ground.database.reading() as connection:
         page = repository.page(connection, repository.WINDOWS, limit=limit, offset=offset, **equal)
-        return [_joined(connection, row) for row in page.rows], page.total
+        return [Window.of(_joined(connection, row)) for row in page.rows], page.total
+
+
+def _window(connection: Connection, window_id: int) -> Window:
+    return Window.of(window_row(connection, window_id))
 
 
 def window_row(connection: Connection, window_id: int) -> repository.Row:
@@ -431,7 +418,7 @@ def _assessed(
         "predicted": {
             "frames": frames,
             "resources": kept,
-            **(candidate_view(prediction) if prediction else {}),
+            **(model.Candidate.from_core(prediction).model_dump(mode="json") if prediction else {}),
         },
     }
 

@@ -9,7 +9,7 @@ import numpy as np
 from ground_service.evaluation.service import plain
 from ground_service.regression.core import metric_interval
 from ground_service.regression.metrics import figures_of, joined
-from ground_service.regression.model import PassFrames
+from ground_service.regression.samples import PassFrames
 from ground_service.regression.service import RegressionOutcome, pass_figures
 
 

@@ -37,7 +37,7 @@ from ground_service.regression.metrics import (
     same_telemetry,
     shift_samples,
 )
-from ground_service.regression.model import PassFrames
+from ground_service.regression.samples import PassFrames
 from ground_service.regression.statistics import (
     Spread,
     autocorrelation_time,

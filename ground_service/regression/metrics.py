@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ground_service.regression.model import BAD_OUTCOMES, EstimatorFrames, PassFrames
+from ground_service.regression.samples import BAD_OUTCOMES, EstimatorFrames, PassFrames
 from ground_service.regression.statistics import weighted_quantile, weighted_ratio
 from lunar.arrays import FloatArray
 

@@ -19,7 +19,7 @@ from ground_service.missions.model import Camera, Evidence
 from ground_service.passes.archive_import import ATTITUDE_FILE, archived_mission
 from ground_service.passes.samples import DetectionSamples, NavigationSamples
 from ground_service.regression.archives import PassArchive, frame_inputs
-from ground_service.regression.model import PassFrames, pass_frames
+from ground_service.regression.samples import PassFrames, pass_frames
 from lunar.arrays import IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, load_catalogue

@@ -16,8 +16,8 @@ from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
 from ground_service.regression.builds import BUILD_FILE, Build, load_build, register_build
 from ground_service.regression.metrics import Figure, figures_of, joined
-from ground_service.regression.model import PassFrames
 from ground_service.regression.policy import PolicyFile
+from ground_service.regression.samples import PassFrames
 from ground_service.regression.service import RegressionOutcome, run_regression
 
 MODEL = "model"

@@ -32,10 +32,10 @@ from ground_service.regression.build_runs import OK, OUTCOMES, read_performance,
 from ground_service.regression.builds import Build
 from ground_service.regression.core import FAIL, INCONCLUSIVE, PASS, Gate, judge, verdict_of
 from ground_service.regression.metrics import outcome_shares, same_telemetry
-from ground_service.regression.model import PassFrames
 from ground_service.regression.policy import PolicyFile
 from ground_service.regression.replay_samples import PassContext, ReadDownlink, pass_context, read_downlink
 from ground_service.regression.runner import PERFORMANCE
+from ground_service.regression.samples import PassFrames
 from ground_service.store import repository
 from lunar.errors import LunarError
 from lunar.timescales import format_utc

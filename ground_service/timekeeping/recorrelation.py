@@ -87,7 +87,7 @@ def received_reports(given: Sequence[Mapping[str, Any]]) -> list[ReceivedReport]
         place = f"receptions.{number}"
         try:
             ticks, count = int(one["packet_ticks"]), int(one["sequence_count"])
-            received = time_of(str(one["received"]), f"{place}.received")
+            received = time_of(one["received"], f"{place}.received")
         except (KeyError, TypeError, ValueError, LunarError) as error:
             raise InvalidInput(
                 "time report", place, "packet_ticks, sequence_count and received", str(error)[:120]

@@ -139,7 +139,7 @@ def time_points(given: Sequence[Mapping[str, Any]]) -> list[TimePoint]:
             points.append(
                 TimePoint(
                     ticks=int(one["ticks"]),
-                    earth_utc_ns=time_of(str(one["received"]), f"points.{number}.received"),
+                    earth_utc_ns=time_of(one["received"], f"points.{number}.received"),
                     light_time_ns=round(float(one["light_time_s"]) * 1e9),
                     boot_count=int(one.get("boot_count") or 0),
                 )

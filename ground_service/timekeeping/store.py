@@ -6,6 +6,7 @@ from sqlalchemy import Connection, select
 
 from ground_service.store import repository
 from ground_service.timekeeping.core import TimeCorrelation
+from ground_service.timekeeping.model import Correlation
 
 
 def load_correlations(connection: Connection, vehicle: int) -> tuple[TimeCorrelation, ...]:
@@ -27,3 +28,8 @@ def load_correlations(connection: Connection, vehicle: int) -> tuple[TimeCorrela
         )
         for row in rows
     )
+
+
+def correlation_of(row: repository.Row) -> Correlation:
+    """Return the entity of a row."""
+    return Correlation.of(row, in_force=not row["superseded"], reference=row["reference_utc_ns"])

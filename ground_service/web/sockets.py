@@ -23,10 +23,10 @@ from ground_service.access.service import LOCAL_CALLER, Caller, authenticate, ha
 from ground_service.errors import GroundError, NotAuthorised
 from ground_service.events import last_number, read_events
 from ground_service.ground import Ground
+from ground_service.http.limits import VERIFIED_CALLER
 from ground_service.http.problems import problem
 from ground_service.http.proxies import address_key
-from ground_service.http.security import VERIFIED_CALLER
-from ground_service.http.views import time_text
+from ground_service.http.times import time_text
 from ground_service.store.events import LoggedEvent
 
 log = logging.getLogger(__name__)

@@ -19,7 +19,7 @@ from kombu.exceptions import OperationalError
 from ground_service.clock import utc_now_ns
 from ground_service.errors import PASSING, SettingsError
 from ground_service.ground import Ground, ground_from_settings
-from ground_service.jobs import enter_job
+from ground_service.jobs.service import enter_job
 from ground_service.logs import logging_config
 from ground_service.settings import Settings
 from ground_service.worker.follow_up import FollowUp, follow_in_process

@@ -7,11 +7,12 @@ import threading
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Protocol
+from typing import Any
 
 from ground_service.errors import PASSING
 from ground_service.ground import Ground
-from ground_service.jobs import enter_job, unfinished_jobs
+from ground_service.jobs.dispatcher import Dispatcher
+from ground_service.jobs.service import enter_job, unfinished_jobs
 from ground_service.settings import Settings
 from ground_service.worker.follow_up import FollowUp, WorkersFollow, follow_by_workers, follow_in_process
 from ground_service.worker.jobs import run_job
@@ -21,22 +22,6 @@ log = logging.getLogger(__name__)
 FIRST_WAIT_S = 10.0
 LONGEST_WAIT_S = 300.0
 """A job that the database or the disk stopped waits so long before it is taken up again, doubled each time."""
-
-
-class Dispatcher(Protocol):
-    """Takes jobs and sees to it that they are done."""
-
-    def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
-        """Enter a job and have it done; its id."""
-
-    def start(self, job_id: str) -> None:
-        """Have a job done that was entered already."""
-
-    def resume(self) -> None:
-        """Start unfinished jobs of ended processes again; may be called repeatedly."""
-
-    def close(self) -> None:
-        """End what runs here: a job that can be broken off goes on at the next start, others come to their end."""
 
 
 class InlineDispatcher:

@@ -31,7 +31,7 @@ from ground_service.events import (
     publish,
 )
 from ground_service.ground import Ground, open_ground
-from ground_service.jobs import add_job
+from ground_service.jobs.service import add_job
 from ground_service.missions.store import get_mission
 from ground_service.passes.span import pass_span
 from ground_service.planning.progress import advance_windows

@@ -4,27 +4,27 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Request, Response
 
-from ground_service.http import schemas
 from ground_service.http.common import GroundOf
 from ground_service.store import repository
+from ground_service.worker.model import Health
 
 operations = APIRouter(include_in_schema=False)
 
 
 @operations.get("/healthz")
-async def healthz() -> schemas.Health:
+async def healthz() -> Health:
     """Report that the process is alive; `front` answers this if it is the first request of a connection."""
-    return schemas.Health(status="ok")
+    return Health(status="ok")
 
 
 @operations.get("/readyz")
-def readyz(ground: GroundOf) -> schemas.Health:
+def readyz(ground: GroundOf) -> Health:
     """The service can be used: its database answers and takes what is written, and so does the archive of files."""
     with ground.database.reading() as connection:
         repository.page(connection, repository.JOBS, limit=1)
     ground.database.require_writable()
     ground.files.require_writable()
-    return schemas.Health(status="ok")
+    return Health(status="ok")
 
 
 @operations.get("/metrics")

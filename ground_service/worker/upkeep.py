@@ -8,28 +8,18 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any
 
-from sqlalchemy import Connection, delete, select
+from sqlalchemy import delete, select
 
 from ground_service.clock import utc_now_ns
-from ground_service.errors import NotFound
 from ground_service.events import LimitsBroken, publish
 from ground_service.ground import Ground
-from ground_service.ingest.redecode import readable_version
-from ground_service.passes.cache import remembered
-from ground_service.passes.series import PARAMETERS, SeriesReading
-from ground_service.passes.span import PassSpan
-from ground_service.passes.trends import Trend, trend_of
-from ground_service.store import events, repository, rollups
+from ground_service.passes.service import vehicle_trends
+from ground_service.store import events, repository
 from ground_service.store.files import UNPACKING, remove_leftovers
-from ground_service.timekeeping.store import load_correlations
 from lunar.timescales import format_utc
-from tmtc.dictionary import DICTIONARY
 
-TREND_DAYS = 30
-TREND_POINTS = 60
 RETENTION_DAYS = 90
 DAY_NS = 86_400_000_000_000
 ABANDONED_S = 86_400.0
@@ -53,7 +43,7 @@ def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> 
                 {
                     "spacecraft_id": vehicle["ccsds_id"],
                     "instance": vehicle["instance"],
-                    "trends": [trend_view(trend) for trend in trends],
+                    "trends": [trend.model_dump(mode="json") for trend in trends],
                 }
             )
     broken = [
@@ -71,48 +61,6 @@ def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> 
             publish(connection, LimitsBroken(broken=broken))
     removed = tidy(ground, int(arguments.get("retention_days", RETENTION_DAYS)))
     return {"spacecraft": found, "limits_broken": broken, "removed": removed}
-
-
-def spacecraft_trends(ground: Ground, spacecraft_id: int, instance: str) -> list[Trend]:
-    """Trends of the last days of a spacecraft.
-
-    Raises
-    ------
-    NotFound
-        If nothing is known of it.
-    """
-    with ground.database.reading() as connection:
-        row = repository.find(connection, repository.VEHICLES, ccsds_id=spacecraft_id, instance=instance)
-    if row is None:
-        raise NotFound("spacecraft", f"{spacecraft_id} ({instance})")
-    return vehicle_trends(ground, row["id"])
-
-
-def vehicle_trends(ground: Ground, vehicle: int) -> list[Trend]:
-    """Trends of the last `TREND_DAYS` days of on-board time in which there is housekeeping."""
-    with ground.database.reading() as connection:
-        return remembered(ground, connection, ("trends", vehicle), lambda: _trends(connection, vehicle))
-
-
-def _trends(connection: Connection, vehicle: int) -> list[Trend]:
-    version = readable_version(connection, vehicle)
-    _, _, last = rollups.rolled_extent(connection, "housekeeping", vehicle, version, 0, 0, (1 << 48) - 1)
-    if last == 0:
-        return []
-    first = max(last - (TREND_DAYS * 86_400 << 16), 0)
-    span = PassSpan(vehicle, first, last, load_correlations(connection, vehicle), version)
-    reading = SeriesReading(connection, span, "housekeeping", 0, TREND_POINTS)
-    definition = DICTIONARY.packet("housekeeping")
-    read = reading.series({name: definition.field(name).unit for name in PARAMETERS})
-    trends = (trend_of(definition.field(one.name), one.buckets) for one in read)
-    return [trend for trend in trends if trend is not None]
-
-
-def trend_view(trend: Trend) -> dict[str, Any]:
-    """A trend as plain values; a slope that is not known as None."""
-    values = asdict(trend)
-    slope = values["slope_per_day"]
-    return {**values, "slope_per_day": None if slope != slope else slope}
 
 
 def tidy(ground: Ground, retention_days: int) -> dict[str, int]:

@@ -117,7 +117,7 @@ def test_passes_are_listed_in_pages_and_shown(client: TestClient) -> None:
     assert len(page["items"]) == 1
     shown = client.get(f"{V1}/passes/1").json()
     assert shown["name"] == "synthetic pass"
-    assert shown["start"] == "2029-08-07T06:00:00.000000000Z"
+    assert shown["start"] == "2029-08-07T06:00:00.000000Z"
     assert is_problem(client.get(f"{V1}/passes/999"), 404)
     assert is_problem(client.get(f"{V1}/passes/x"), 422)
     assert is_problem(client.get(f"{V1}/passes", params={"limit": 0}), 422)
@@ -520,7 +520,7 @@ def test_passes_and_windows_sent_again_under_their_key_are_entered_once(client: 
 
 
 def test_figures_of_work_that_is_over_go_away(tmp_path: Path) -> None:
-    from ground_service.jobs import enter_job
+    from ground_service.jobs.service import enter_job
     from ground_service.worker.jobs import run_job
 
     with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as opened:
@@ -535,7 +535,7 @@ def test_figures_of_work_that_is_over_go_away(tmp_path: Path) -> None:
 
 def test_jobs_left_unfinished_are_taken_up_again(synthetic_pass: Any, tmp_path: Path) -> None:
     from ground_service.ground import open_ground
-    from ground_service.jobs import enter_job
+    from ground_service.jobs.service import enter_job
 
     with open_ground(tmp_path) as ground:
         import_archive(ground, synthetic_pass.folder)

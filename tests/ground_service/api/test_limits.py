@@ -13,8 +13,14 @@ import pytest
 from starlette.requests import ClientDisconnect
 
 from ground_service.http import limits
-from ground_service.http.limits import CALLERS_KEPT, BodyLimit, LocalBudgets, RateLimit, SharedBudgets
-from ground_service.http.security import VERIFIED_CALLER
+from ground_service.http.limits import (
+    CALLERS_KEPT,
+    VERIFIED_CALLER,
+    BodyLimit,
+    LocalBudgets,
+    RateLimit,
+    SharedBudgets,
+)
 from ground_service.logs import JsonFormatter, logging_config
 
 

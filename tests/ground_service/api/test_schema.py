@@ -22,7 +22,7 @@ from schemathesis.specs.openapi.checks import (
 
 from ground_service.app import create_app
 from ground_service.ground import ground_from_settings
-from ground_service.jobs import enter_job
+from ground_service.jobs.service import enter_job
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from ground_service.store.database import prepare_database

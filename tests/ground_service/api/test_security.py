@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from fastapi.security import HTTPAuthorizationCredentials
 
+from ground_service.access.security import caller_of, requires
 from ground_service.access.service import LOCAL_CALLER, Caller, add_user, change_user
 from ground_service.errors import NotAuthorised
 from ground_service.ground import Ground
 from ground_service.http.problems import Forbidden
-from ground_service.http.security import caller_of, requires
 
 ROLES = ("viewer", "operator", "admin")
 

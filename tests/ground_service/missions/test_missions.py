@@ -30,6 +30,7 @@ from ground_service.missions.service import (
 )
 from ground_service.missions.store import approval_in_force, newest_of_spacecraft
 from ground_service.passes.archive_import import import_archive
+from ground_service.passes.model import PassDetail
 from ground_service.passes.service import define_pass, get_pass
 from ground_service.settings import Settings
 from ground_service.store import repository
@@ -154,20 +155,20 @@ def test_a_revision_that_is_not_entered_is_not_found(ground, name: str) -> None:
 
 
 def test_a_pass_refers_to_the_newest_description_of_its_spacecraft(ground) -> None:
-    def define(spacecraft: int) -> dict:
+    def define(spacecraft: int) -> PassDetail:
         return get_pass(
             ground,
             define_pass(ground, name="p", start_utc_ns=0, stop_utc_ns=10**9, spacecraft_id=spacecraft),
         )
 
-    assert define(76)["mission_revision"] is None
+    assert define(76).mission_revision is None
     first = add_mission(ground, TEXT.encode())
     add_mission(ground, TEXT.replace("id = 76", "id = 77").encode())
     before = define(76)
-    assert before["mission_revision"] == first.revision
+    assert before.mission_revision == first.revision
     second = add_mission(ground, TEXT.replace("120", "90").encode())
-    assert define(76)["mission_revision"] == second.revision
-    assert get_pass(ground, before["id"])["mission_revision"] == first.revision
+    assert define(76).mission_revision == second.revision
+    assert get_pass(ground, before.id).mission_revision == first.revision
 
 
 def test_an_archive_without_a_description_states_what_its_manifest_declares(ground, synthetic_pass) -> None:
@@ -187,7 +188,7 @@ def test_the_description_in_an_archive_becomes_a_revision(ground, make_pass) -> 
     (folder / "mission.toml").write_text(TEXT)
     _manifest_again(folder)
     detail = get_pass(ground, import_archive(ground, folder))
-    assert (detail["mission"], detail["mission_revision"]) == ("test", parse_mission(TEXT).revision)
+    assert (detail.mission, detail.mission_revision) == ("test", parse_mission(TEXT).revision)
 
 
 def test_the_description_of_an_archive_holds_for_its_own_pass_only(ground, make_pass) -> None:
@@ -195,16 +196,16 @@ def test_the_description_of_an_archive_holds_for_its_own_pass_only(ground, make_
     (folder / "mission.toml").write_text(TEXT)
     _manifest_again(folder)
 
-    def define() -> dict:
+    def define() -> PassDetail:
         return get_pass(
             ground, define_pass(ground, name="p", start_utc_ns=0, stop_utc_ns=10**9, spacecraft_id=76)
         )
 
     import_archive(ground, folder)
-    assert define()["mission_revision"] is None
+    assert define().mission_revision is None
     entered = add_mission(ground, TEXT.replace("120", "90").encode())
     import_archive(ground, make_pass(frames=2, seed=34).folder)
-    assert define()["mission_revision"] == entered.revision
+    assert define().mission_revision == entered.revision
 
 
 def test_a_description_that_came_with_an_archive_is_in_force_once_a_person_enters_it(

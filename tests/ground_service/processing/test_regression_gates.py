@@ -21,7 +21,7 @@ from ground_service.regression.core import (
     verdict_of,
 )
 from ground_service.regression.metrics import Percentile, Ratio
-from ground_service.regression.model import EstimatorFrames, PassFrames
+from ground_service.regression.samples import EstimatorFrames, PassFrames
 
 POLICY = GatePolicy(
     version="test",

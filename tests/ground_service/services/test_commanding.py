@@ -332,7 +332,7 @@ def raise_rule(monkeypatch: pytest.MonkeyPatch) -> None:
 def planned(ground: Ground, entered_by: str, approved_by: str) -> int:
     start = parse_utc("2029-08-07T06:00:00Z")
     entry = WindowEntry("window", start, start + 600 * 10**9, 15.0, SPACECRAFT)
-    window = int(add_window(ground, entry, actor=entered_by)["id"])
+    window = int(add_window(ground, entry, actor=entered_by).id)
     change_window(ground, window, actor=approved_by, changes={}, decision="approved")
     return window
 
@@ -348,7 +348,7 @@ def test_the_approval_of_a_window_by_somebody_else_is_the_second_person_of_its_t
     with pytest.raises(Conflict, match="expected a window that a second person has approved"):
         uplink_window(ground, planned(ground, "ann", "ann"), actor="bob")
     assert list_commands(ground)[1] == 0
-    [window] = [row["id"] for row in list_windows(ground)[0]]
+    [window] = [row.id for row in list_windows(ground)[0]]
     change_window(ground, window, actor="bob", changes={}, decision="draft")
     change_window(ground, window, actor="bob", changes={}, decision="approved")
     assert len(uplink_window(ground, window, actor="ann")) == 3
@@ -358,7 +358,7 @@ def test_who_changes_a_window_has_entered_it(ground: Ground, monkeypatch: pytest
     raise_rule(monkeypatch)
     start = parse_utc("2029-08-07T06:00:00Z")
     entry = WindowEntry("window", start, start + 600 * 10**9, 15.0, SPACECRAFT)
-    window = int(add_window(ground, entry, actor="ann")["id"])
+    window = int(add_window(ground, entry, actor="ann").id)
     change_window(ground, window, actor="bob", changes={"cadence_s": 20.0}, decision="approved")
     with pytest.raises(Conflict, match="a second person"):
         uplink_window(ground, window, actor="ann")

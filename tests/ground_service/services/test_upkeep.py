@@ -10,13 +10,14 @@ from ground_service.access.service import audit
 from ground_service.events import read_events
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
-from ground_service.jobs import enter_job
+from ground_service.jobs.service import enter_job
 from ground_service.passes.core import downsample
+from ground_service.passes.service import spacecraft_trends
 from ground_service.passes.trends import trend_of
 from ground_service.store import repository
 from ground_service.store.events import publish
 from ground_service.worker.jobs import run_job
-from ground_service.worker.upkeep import nightly_job_id, spacecraft_trends, tidy
+from ground_service.worker.upkeep import nightly_job_id, tidy
 from tmtc.dictionary import DICTIONARY
 
 DAY_NS = 86_400_000_000_000

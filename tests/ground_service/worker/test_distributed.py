@@ -16,7 +16,7 @@ from ground_service.errors import DatabaseNotMigrated, SettingsError
 from ground_service.evaluation.service import pass_summary
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
-from ground_service.jobs import enter_job
+from ground_service.jobs.service import enter_job
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from ground_service.store import repository

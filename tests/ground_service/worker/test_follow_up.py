@@ -16,7 +16,7 @@ from ground_service.evaluation.service import changed_figures, make_report
 from ground_service.events import CommandsSent, FollowUpFailed, PassEvaluated, TelemetryReceived, publish
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
-from ground_service.jobs import unfinished_jobs
+from ground_service.jobs.service import unfinished_jobs
 from ground_service.passes.service import define_pass
 from ground_service.store import events as log
 from ground_service.store import repository

@@ -1,8 +1,9 @@
-"""Who calls, and what they may do."""
+"""Authentication of requests, and roles that operations require."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine
+import hashlib
+from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Annotated, Any
 
 from fastapi import Depends, Request
@@ -10,9 +11,8 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from ground_service.access.service import LOCAL_CALLER, Caller, authenticate, has_users
 from ground_service.errors import Forbidden, NotAuthorised
-
-VERIFIED_CALLER = "verified_caller"
-"""Key in the request state for the user whose token was verified; absent without a verified token."""
+from ground_service.http.limits import VERIFIED_CALLER
+from ground_service.http.uploads import Upload, UploadPool
 
 _bearer = HTTPBearer(auto_error=False, description="Token given out by 'linna user add'")
 
@@ -20,7 +20,7 @@ _bearer = HTTPBearer(auto_error=False, description="Token given out by 'linna us
 def caller_of(
     request: Request, given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
 ) -> Caller:
-    """The caller of a request: the owner of its token, or the local user of a service without users."""
+    """Return the owner of the token of a request, or the local user of a service without users."""
     ground = request.app.state.ground
     if given is None:
         if request.app.state.open_without_users and not has_users(ground):
@@ -34,7 +34,7 @@ def caller_of(
 
 
 def requires(role: str) -> Callable[..., Coroutine[Any, Any, Caller]]:
-    """A dependency that lets only callers of this role or a higher one pass."""
+    """Return a dependency that refuses callers without this role or a higher one."""
 
     async def check(caller: Annotated[Caller, Depends(caller_of)]) -> Caller:
         if not caller.may(role):
@@ -42,3 +42,25 @@ def requires(role: str) -> Callable[..., Coroutine[Any, Any, Caller]]:
         return caller
 
     return check
+
+
+Viewer = Annotated[Caller, Depends(requires("viewer"))]
+Operator = Annotated[Caller, Depends(requires("operator"))]
+Admin = Annotated[Caller, Depends(requires("admin"))]
+
+
+async def upload_of(request: Request, _: Operator) -> AsyncIterator[Upload]:
+    """Yield an upload slot for a request whose caller may upload."""
+    pool: UploadPool = request.app.state.uploads
+    async with pool.place():
+        yield Upload(request, pool)
+
+
+UploadOf = Annotated[Upload, Depends(upload_of)]
+
+
+def idempotent_id(what: str, caller: Caller, key: str | None) -> str | None:
+    """Return the id of the job that belongs to an idempotency key of this caller."""
+    if key is None:
+        return None
+    return hashlib.sha256(f"{caller.name}\0{what}\0{key}".encode()).hexdigest()[:32]

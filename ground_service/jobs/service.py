@@ -17,6 +17,7 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, InvalidInput
 from ground_service.events import JobChanged, publish
 from ground_service.ground import Ground
+from ground_service.jobs.model import Job
 from ground_service.store import repository
 from ground_service.store.counters import hold
 
@@ -124,3 +125,25 @@ def unfinished_jobs(ground: Ground) -> list[str]:
             select(table.c.id).where(table.c.state.not_in(FINISHED)).order_by(table.c.created_utc_ns)
         )
         return [str(row[0]) for row in rows]
+
+
+def get_job(ground: Ground, job_id: str) -> Job:
+    """Return a job.
+
+    Raises
+    ------
+    NotFound
+        There is no such job.
+    """
+    with ground.database.reading() as connection:
+        return Job.of(repository.get(connection, repository.JOBS, job_id, "job"))
+
+
+def list_jobs(
+    ground: Ground, *, kind: str | None = None, limit: int = 100, offset: int = 0
+) -> tuple[list[Job], int]:
+    """Return a page of the jobs, newest first, and the total number; `kind` selects jobs of one kind."""
+    equal: dict[str, Any] = {} if kind is None else {"kind": kind}
+    with ground.database.reading() as connection:
+        page = repository.page(connection, repository.JOBS, limit=limit, offset=offset, **equal)
+    return [Job.of(row) for row in page.rows], page.total

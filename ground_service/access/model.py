@@ -1,0 +1,90 @@
+"""Entities of users, tokens and the audit log."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from ground_service.http.model import Entity, Given
+from ground_service.http.times import UtcTime
+
+DAYS_LIMIT = 36_500.0
+
+USER_NAME = r"^[A-Za-z0-9][A-Za-z0-9._@-]{0,63}$"
+Role = Literal["viewer", "operator", "admin"]
+Days = Annotated[
+    float | None,
+    Field(default=None, gt=0.0, le=DAYS_LIMIT, allow_inf_nan=False, description="null: unlimited validity"),
+]
+
+
+class User(Entity):
+    """User of the service."""
+
+    name: str = Field(examples=["ann"])
+    role: Role
+    state: Literal["active", "disabled"]
+    created: UtcTime
+
+
+class Token(Entity):
+    """Bearer token without its secret."""
+
+    id: int = Field(examples=[1])
+    user: str = Field(examples=["ann"])
+    hint: str = Field(description="Beginning of the token", examples=["linna_3fXk2a"])
+    state: Literal["active", "expired", "revoked"]
+    created: UtcTime
+    expires: UtcTime | None = Field(description="null: never")
+    revoked: UtcTime | None
+    used: UtcTime | None = Field(description="Last use, to the hour; null: never used")
+
+
+class UserWithToken(Entity):
+    """User and new token; the token cannot be read again."""
+
+    user: User
+    token: str
+
+
+class NewUser(Given):
+    """User to add."""
+
+    name: str = Field(pattern=USER_NAME, examples=["ann"])
+    role: Role
+    days_valid: Days
+
+
+class UserChange(Given):
+    """Change of the state or role of a user, or both."""
+
+    state: Literal["active", "disabled"] | None = None
+    role: Role | None = None
+
+
+class NewToken(Given):
+    """Token to create."""
+
+    days_valid: Days
+    revoke_others: bool = Field(default=False, description="Revoke all earlier tokens of the user")
+
+
+class AuditEntry(Entity):
+    """Entry of the audit log with its hash chain values."""
+
+    number: int = Field(examples=[1], description="1 for the first entry, without gaps")
+    time: UtcTime
+    actor: str = Field(examples=["ann"])
+    action: str = Field(examples=["release telecommand"])
+    target: str = Field(examples=["7"])
+    detail: dict[str, Any]
+    previous_sha256: str = Field(description="Hash of the previous entry")
+    sha256: str = Field(description="Hash of this entry")
+
+
+class AuditHead(Entity):
+    """Newest entry of the chain; a copy stored elsewhere shows whether the log was truncated later."""
+
+    number: int = Field(examples=[1], description="0: no entry yet")
+    sha256: str

@@ -1,0 +1,111 @@
+"""HTTP operations on users, tokens and the audit log."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import Path, Query, Response
+
+from ground_service.access import audit_log
+from ground_service.access import service as users
+from ground_service.access.model import (
+    USER_NAME,
+    AuditEntry,
+    AuditHead,
+    NewToken,
+    NewUser,
+    Token,
+    User,
+    UserChange,
+    UserWithToken,
+)
+from ground_service.access.security import Admin, Operator
+from ground_service.errors import InvalidInput
+from ground_service.http.common import GroundOf, Limit, Offset, RowId, page_of
+from ground_service.http.model import PageOf
+from ground_service.http.requests import operations, problems
+from ground_service.http.times import GivenTime
+
+access = operations("access")
+
+UserName = Annotated[str, Path(pattern=USER_NAME)]
+Words = Annotated[str | None, Query(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+
+
+@access.get("/users")
+def list_users(ground: GroundOf, _: Admin) -> PageOf[User]:
+    """List all users."""
+    return PageOf.all_of(users.list_users(ground))
+
+
+@access.post("/users", status_code=201, responses=problems(409))
+def add_user(ground: GroundOf, caller: Admin, given: NewUser) -> UserWithToken:
+    """Add a user; the response contains the token, which cannot be read again."""
+    token = users.add_user(ground, given.name, given.role, days_valid=given.days_valid, actor=caller.name)
+    return UserWithToken(user=users.get_user(ground, given.name), token=token)
+
+
+@access.get("/users/{name}")
+def get_user(ground: GroundOf, _: Admin, name: UserName) -> User:
+    """Show one user."""
+    return users.get_user(ground, name)
+
+
+@access.patch("/users/{name}", responses=problems(409))
+def change_user(ground: GroundOf, caller: Admin, name: UserName, given: UserChange) -> User:
+    """Disable or enable a user, or change the role; 409 states the conflicting state."""
+    return users.change_user(ground, name, state=given.state, role=given.role, actor=caller.name)
+
+
+@access.post("/users/{name}/tokens", status_code=201)
+def add_token(ground: GroundOf, caller: Admin, name: UserName, given: NewToken) -> UserWithToken:
+    """Create a token for a user; the response contains it, and it cannot be read again."""
+    make = users.renew_token if given.revoke_others else users.add_token
+    token = make(ground, name, days_valid=given.days_valid, actor=caller.name)
+    return UserWithToken(user=users.get_user(ground, name), token=token)
+
+
+@access.get("/tokens", responses=problems(404))
+def list_tokens(ground: GroundOf, _: Admin, user: Words = None) -> PageOf[Token]:
+    """List tokens without their secrets, newest first."""
+    return PageOf.all_of(users.list_tokens(ground, user))
+
+
+@access.delete("/tokens/{token_id}", status_code=204, response_class=Response, responses=problems(409))
+def revoke_token(ground: GroundOf, caller: Admin, token_id: RowId) -> None:
+    """Revoke a token."""
+    users.revoke_token(ground, token_id, actor=caller.name)
+
+
+@access.get("/audit")
+def list_audit(
+    ground: GroundOf,
+    _: Operator,
+    actor: Words = None,
+    action: Words = None,
+    target: Words = None,
+    since: GivenTime | None = None,
+    until: Annotated[GivenTime | None, Query(description="UTC, RFC 3339; exclusive")] = None,
+    limit: Limit = 100,
+    offset: Offset = 0,
+) -> PageOf[AuditEntry]:
+    """List the audit entries, newest first: actor, time, action and target."""
+    if since is not None and until is not None and since.utc_ns > until.utc_ns:
+        raise InvalidInput("audit", "until", f"a time after {since}", str(until))
+    found, total = audit_log.list_entries(
+        ground,
+        actor=actor,
+        action=action,
+        target=target,
+        since_utc_ns=None if since is None else since.utc_ns,
+        until_utc_ns=None if until is None else until.utc_ns,
+        limit=limit,
+        offset=offset,
+    )
+    return page_of(found, total, limit, offset)
+
+
+@access.get("/audit/head")
+def get_audit_head(ground: GroundOf, _: Operator) -> AuditHead:
+    """Show number and hash of the newest entry, to be stored elsewhere."""
+    return audit_log.audit_head(ground)

@@ -1,0 +1,44 @@
+"""HTTP operations on reference ephemerides."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import Query
+
+from ground_service.access.security import Operator, UploadOf, Viewer
+from ground_service.ephemerides import service
+from ground_service.ephemerides.model import Ephemeris
+from ground_service.http.common import API_PREFIX, GroundOf, Limit, Name, Offset, page_of, upload_body
+from ground_service.http.model import PageOf
+from ground_service.http.requests import operations
+
+UPLOAD_PATHS = (f"{API_PREFIX}/ephemerides",)
+
+ephemerides = operations("ephemerides")
+
+
+@ephemerides.post("/ephemerides", status_code=201, openapi_extra=upload_body("text/plain"))
+async def add_ephemeris(
+    upload: UploadOf,
+    ground: GroundOf,
+    caller: Operator,
+    name: Name = "reference",
+    precedence: Annotated[int, Query(ge=-1000, le=1000)] = 0,
+) -> Ephemeris:
+    """Add a reference ephemeris: a CCSDS OEM or an STK .e file as the body."""
+    stored = await upload.stored()
+
+    def add() -> Ephemeris:
+        return service.add_ephemeris(ground, stored, name=name, precedence=precedence, actor=caller.name)
+
+    return await upload.run(add)
+
+
+@ephemerides.get("/ephemerides")
+def list_ephemerides(
+    ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Offset = 0
+) -> PageOf[Ephemeris]:
+    """List the reference ephemerides, newest first."""
+    items, total = service.list_ephemerides(ground, limit=limit, offset=offset)
+    return page_of(items, total, limit, offset)

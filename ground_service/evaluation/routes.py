@@ -1,0 +1,105 @@
+"""HTTP operations on evaluations and reports."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from fastapi import Query, Request, Response
+
+from ground_service.access.security import Operator, Viewer, idempotent_id
+from ground_service.errors import NotFound
+from ground_service.evaluation import service
+from ground_service.evaluation.model import ReportOverview
+from ground_service.evaluation.report_overview import report_overview, report_row
+from ground_service.http.common import API_PREFIX, GroundOf, IdempotencyKey, Key, PassId
+from ground_service.http.requests import operations
+from ground_service.jobs.dispatcher import DispatcherOf
+from ground_service.jobs.model import Job
+from ground_service.jobs.service import get_job
+from ground_service.passes.service import get_pass
+
+REPORT_MEDIA = {"html": "text/html", "pdf": "application/pdf", "json": "application/json"}
+
+evaluation = operations("reports")
+
+
+@evaluation.get("/passes/{pass_id}/summary")
+def evaluate_pass(ground: GroundOf, _: Viewer, pass_id: PassId) -> dict[str, Any]:
+    """Evaluate a pass now: frames, packets, detector, navigation and baselines."""
+    return service.pass_summary(ground, pass_id)
+
+
+@evaluation.post("/passes/{pass_id}/reports", status_code=202)
+def request_report(
+    response: Response,
+    ground: GroundOf,
+    caller: Operator,
+    dispatcher: DispatcherOf,
+    pass_id: PassId,
+    idempotency_key: IdempotencyKey = None,
+) -> Job:
+    """Request a report of a pass; a job makes it."""
+    get_pass(ground, pass_id)
+    job_id = dispatcher.submit(
+        "report", {"pass_id": pass_id}, job_id=idempotent_id(f"report {pass_id}", caller, idempotency_key)
+    )
+    response.headers["Location"] = f"{API_PREFIX}/jobs/{job_id}"
+    return get_job(ground, job_id)
+
+
+@evaluation.get(
+    "/reports/{report_id}",
+    response_class=Response,
+    responses={200: {"content": {media: {} for media in REPORT_MEDIA.values()}, "description": "The report"}},
+)
+def get_report(
+    request: Request,
+    ground: GroundOf,
+    _: Viewer,
+    report_id: Key,
+    format: Annotated[
+        Literal["html", "pdf", "json"] | None, Query(description="Default: by the Accept header")
+    ] = None,
+) -> Response:
+    """Return a report as HTML, PDF or JSON."""
+    row = report_row(ground, report_id)
+    kind = format or preferred_kind(request.headers.get("accept", ""))
+    sha256 = row[f"{kind}_sha256"]
+    if sha256 is None:
+        raise NotFound(f"report {report_id} as", kind)
+    media = REPORT_MEDIA[kind] + ("; charset=utf-8" if kind == "html" else "")
+    return Response(ground.files.get(sha256), media_type=media)
+
+
+def preferred_kind(accept: str) -> str:
+    """Return the kind of document that an Accept header prefers; JSON if it does not say."""
+    best, weight = "json", 0.0
+    for part in accept.split(","):
+        media, *parameters = (piece.strip() for piece in part.split(";"))
+        quality = next((text[2:] for text in parameters if text.startswith("q=")), "1")
+        try:
+            value = float(quality)
+        except ValueError:
+            continue
+        kind = next((kind for kind, name in REPORT_MEDIA.items() if name == media.lower()), None)
+        if kind is not None and value > weight:
+            best, weight = kind, value
+    return best
+
+
+@evaluation.get("/reports/{report_id}/summary")
+def get_report_summary(ground: GroundOf, _: Viewer, report_id: Key) -> dict[str, Any]:
+    """Return the figures of a report."""
+    summary: dict[str, Any] = report_row(ground, report_id)["summary"]
+    return summary
+
+
+@evaluation.get("/reports/{report_id}/overview")
+def get_report_overview(
+    ground: GroundOf,
+    _: Viewer,
+    report_id: Key,
+    max_points: Annotated[int, Query(ge=1, le=10_000)] = 600,
+) -> ReportOverview:
+    """Return the verdict and headline figures of a report, and the 3-D error of every solution over time."""
+    return report_overview(ground, report_id, max_points)

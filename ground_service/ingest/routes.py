@@ -1,0 +1,100 @@
+"""HTTP operations on telemetry uploads and ingests."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import Query, Response
+
+from ground_service.access.security import Operator, UploadOf, Viewer, idempotent_id
+from ground_service.errors import InvalidInput
+from ground_service.http.common import (
+    API_PREFIX,
+    GroundOf,
+    IdempotencyKey,
+    Instance,
+    Limit,
+    Name,
+    Offset,
+    RowId,
+    page_of,
+    upload_body,
+)
+from ground_service.http.model import PageOf
+from ground_service.http.requests import operations
+from ground_service.ingest import listing
+from ground_service.ingest.model import Ingest, IngestAccepted
+from ground_service.ingest.service import FLOWN, Place, enter_ingest
+from ground_service.jobs.dispatcher import DispatcherOf
+
+UPLOAD_PATHS = (f"{API_PREFIX}/telemetry",)
+
+ingests = operations("telemetry")
+
+
+@ingests.post("/telemetry", status_code=202, openapi_extra=upload_body("application/octet-stream"))
+async def upload_telemetry(
+    response: Response,
+    upload: UploadOf,
+    ground: GroundOf,
+    caller: Operator,
+    dispatcher: DispatcherOf,
+    spacecraft_id: Annotated[int | None, Query(ge=0, le=1023, description="Needed for bare packets")] = None,
+    instance: Instance = FLOWN,
+    name: Name = "upload",
+    stream: Annotated[
+        str | None,
+        Query(
+            min_length=1,
+            max_length=200,
+            pattern=r"^[^\x00-\x1f\x7f]*$",
+            description="Stream to which the octets belong; requires `offset`",
+        ),
+    ] = None,
+    offset: Annotated[
+        int | None, Query(ge=0, lt=1 << 62, description="Offset of the piece in `stream`, in octets")
+    ] = None,
+    idempotency_key: IdempotencyKey = None,
+) -> IngestAccepted:
+    """Ingest a downlink, or a piece of one cut at any octet.
+
+    A downlink is a stream of CADUs or of space packets. Pieces are joined by `stream` and `offset` if given, otherwise
+    by order of arrival and by content.
+    """
+    if (stream is None) != (offset is None):
+        raise InvalidInput("telemetry", "stream, offset", "both or neither", "one of them")
+    place = None if stream is None or offset is None else Place(stream, offset)
+    stored = await upload.stored()
+    if stored.octets == 0:
+        raise InvalidInput("body", "", "the octets of a downlink", "nothing")
+    job_id = idempotent_id("ingest", caller, idempotency_key)
+
+    def enter() -> tuple[int, str]:
+        ingest_id, job = enter_ingest(
+            ground,
+            stored,
+            name,
+            spacecraft_id=spacecraft_id,
+            instance=instance,
+            place=place,
+            job_id=job_id,
+        )
+        dispatcher.start(job)
+        return ingest_id, job
+
+    ingest_id, job = await upload.run(enter)
+    response.headers["Location"] = f"{API_PREFIX}/ingests/{ingest_id}"
+    return IngestAccepted(ingest_id=ingest_id, job_id=job, sha256=stored.sha256, octets=stored.octets)
+
+
+@ingests.get("/ingests")
+def list_ingests(ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Offset = 0) -> PageOf[Ingest]:
+    """List the ingests, newest first."""
+    items, total = listing.list_ingests(ground, limit=limit, offset=offset)
+    return page_of(items, total, limit, offset)
+
+
+@ingests.get("/ingests/{ingest_id}")
+def get_ingest(ground: GroundOf, _: Viewer, ingest_id: RowId) -> Ingest:
+    """Show an ingest: its state and the accounting of the file."""
+    return listing.get_ingest(ground, ingest_id)

@@ -1,0 +1,1 @@
+"""Jobs as records: entry, state and result. `worker` runs them."""

@@ -1,0 +1,26 @@
+"""Entities of jobs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import Field
+
+from ground_service.http.model import Entity
+from ground_service.http.times import UtcTime
+
+
+class Job(Entity):
+    """A background job."""
+
+    id: str
+    kind: str = Field(examples=["report"])
+    state: str = Field(examples=["done"], description="queued, running, done or failed")
+    progress: float = Field(ge=0.0, le=1.0)
+    attempts: int
+    arguments: dict[str, Any]
+    result: dict[str, Any] | None
+    error: str | None
+    created: UtcTime
+    started: UtcTime | None
+    finished: UtcTime | None

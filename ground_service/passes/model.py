@@ -1,0 +1,157 @@
+"""Entities of passes and their telemetry."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field
+
+from ground_service.http.model import Entity, Given, InstanceName, SpacecraftNumber
+from ground_service.http.times import GivenTime, UtcTime
+from ground_service.text import LINE_PATTERN_JSON
+from reports.values import PacketAccounting
+
+CorrelationId = Annotated[int, Field(description="Time correlation used; 0 is an ideal clock")]
+
+
+def _known(value: Any) -> Any:
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+class PassSummary(Entity):
+    """A pass in a list."""
+
+    id: int = Field(examples=[1])
+    name: str = Field(examples=["selenita pass 1"])
+    start: UtcTime
+    stop: UtcTime
+
+
+class PassDetail(PassSummary):
+    """A pass."""
+
+    spacecraft_id: int = Field(examples=[76])
+    instance: str = Field(examples=["flight"])
+    archive_sha256: str | None
+    mission: str | None = Field(examples=["selenita"])
+    mission_revision: str | None = Field(description="Revision of the mission description in force")
+    manifest: dict[str, Any]
+    reports: list[str] = Field(description="Ids of the newest reports")
+
+
+class PassDefinition(Given):
+    """An interval of a spacecraft's time to be kept as a pass."""
+
+    name: str = Field(min_length=1, max_length=200, pattern=LINE_PATTERN_JSON, examples=["evening pass"])
+    start: GivenTime
+    stop: GivenTime
+    spacecraft_id: SpacecraftNumber
+    instance: InstanceName = "flight"
+
+
+class ApidCompleteness(Entity):
+    """Packets of one APID."""
+
+    apid: int = Field(examples=[161])
+    name: str = Field(examples=["detections"])
+    packets: int
+    lost: int = Field(description="Missing between received packets, by sequence count")
+    lost_at_edges: int | None = Field(
+        description="Missing before the first and after the last packet, by the plan"
+    )
+    duplicates: int | None = Field(description="Received again with the same octets; null: not computed")
+    conflicts: int
+    crc_errors: int | None = Field(description="Received with a wrong checksum; null: not computed")
+
+
+class Completeness(Entity):
+    """Received and missing packets of a pass; null: not computed."""
+
+    packets: int
+    expected: int = Field(description="Received packets plus packets known to be missing")
+    lost: int
+    lost_at_edges: int | None
+    duplicates: int | None
+    conflicts: int
+    crc_errors: int | None
+    octets_skipped: int | None
+    frames: int | None
+    frames_bad: int | None
+    symbols_corrected: int | None
+    by_apid: list[ApidCompleteness]
+
+    @classmethod
+    def of_accounting(cls, found: PacketAccounting) -> Completeness:
+        """Return the entity of a packet accounting."""
+        by_apid = [ApidCompleteness.of(asdict(one), apid=apid) for apid, one in sorted(found.by_apid.items())]
+        names = set(cls.model_fields) - {"by_apid"}
+        return cls(**{name: getattr(found, name) for name in names}, by_apid=by_apid)
+
+
+class Detection(Entity):
+    """One detection of one frame; pixel centres are at whole numbers."""
+
+    frame_number: int
+    time: UtcTime
+    u_px: float
+    v_px: float
+    diameter_px: float
+    score: float
+    size_class: int = Field(description="0: 5-10 km, 1: 10-15 km, 2: 15-30 km, 3: 3-5 km, -1: none")
+    correlation_id: CorrelationId
+
+
+class Bucket(Entity):
+    """An interval of a series: minimum, maximum and mean of its samples."""
+
+    start: UtcTime
+    stop: UtcTime
+    count: int
+    min: float
+    max: float
+    mean: float
+    after_gap: bool = Field(description="A gap precedes the interval: draw no line across it")
+
+
+class ParameterSeries(Entity):
+    """A series of one parameter, reduced to intervals."""
+
+    name: str = Field(examples=["altitude_m"])
+    unit: str = Field(examples=["m"])
+    samples: int
+    correlation_id: CorrelationId
+    buckets: list[Bucket]
+
+
+class States(Entity):
+    """Series of one estimator's states."""
+
+    estimator: str = Field(examples=["spherical"])
+    series: list[ParameterSeries]
+
+
+class Event(Entity):
+    """An event report of the payload."""
+
+    time: UtcTime
+    severity: str = Field(examples=["info"])
+    name: str = Field(examples=["observation_stopped"])
+    detail: str
+    correlation_id: CorrelationId
+
+
+class Trend(Entity):
+    """Statistics, slope and limit state of a housekeeping parameter over an interval."""
+
+    parameter: str = Field(examples=["temperature_c"])
+    unit: str
+    samples: int
+    low: float
+    high: float
+    mean: float
+    slope_per_day: Annotated[float | None, BeforeValidator(_known)] = Field(
+        description="By least squares; null: too few samples"
+    )
+    limit_state: str = Field(description="Worst found: within, warning or alarm", examples=["within"])

@@ -1,0 +1,199 @@
+"""HTTP operations on passes, their telemetry, and pass archives."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import Path, Query, Response
+
+from ground_service.access.idempotency import once
+from ground_service.access.security import Operator, UploadOf, Viewer, idempotent_id
+from ground_service.clock import utc_now_ns
+from ground_service.http.common import (
+    API_PREFIX,
+    GroundOf,
+    IdempotencyKey,
+    Instance,
+    Limit,
+    Name,
+    Offset,
+    OnceKey,
+    PassId,
+    SpacecraftId,
+    page_of,
+    upload_body,
+)
+from ground_service.http.model import PageOf
+from ground_service.http.requests import operations
+from ground_service.http.times import GivenTime
+from ground_service.ingest.service import FLOWN
+from ground_service.jobs.dispatcher import DispatcherOf
+from ground_service.jobs.model import Job
+from ground_service.jobs.service import get_job
+from ground_service.passes import service
+from ground_service.passes.model import (
+    Completeness,
+    Detection,
+    Event,
+    ParameterSeries,
+    PassDefinition,
+    PassDetail,
+    PassSummary,
+    States,
+    Trend,
+)
+from ground_service.passes.series import STATE_VALUES, series_document
+from ground_service.store import repository
+
+UPLOAD_PATHS = (f"{API_PREFIX}/archives",)
+
+MaxPoints = Annotated[int, Query(ge=1, le=10_000, description="Most intervals of a series")]
+Parameter = Annotated[str, Path(max_length=64, examples=["temperature_c"])]
+
+passes = operations("passes")
+
+
+@passes.post("/archives", status_code=202, openapi_extra=upload_body("application/zip"))
+async def upload_archive(
+    response: Response,
+    upload: UploadOf,
+    ground: GroundOf,
+    caller: Operator,
+    dispatcher: DispatcherOf,
+    name: Name = "archive.zip",
+    idempotency_key: IdempotencyKey = None,
+) -> Job:
+    """Import a zipped pass archive: manifest, downlink, reference, catalogue and images."""
+    stored = await upload.stored()
+    job_id = idempotent_id("archive", caller, idempotency_key)
+
+    def enter() -> Job:
+        with ground.database.writing() as connection:
+            repository.register_file(connection, stored, "archive", name, utc_now_ns())
+        job = dispatcher.submit("archive", {"sha256": stored.sha256, "name": name}, job_id=job_id)
+        return get_job(ground, job)
+
+    job = await upload.run(enter)
+    response.headers["Location"] = f"{API_PREFIX}/jobs/{job.id}"
+    return job
+
+
+@passes.get("/passes")
+def list_passes(ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Offset = 0) -> PageOf[PassSummary]:
+    """List the passes, newest first."""
+    items, total = service.list_passes(ground, limit=limit, offset=offset)
+    return page_of(items, total, limit, offset)
+
+
+@passes.post("/passes", status_code=201)
+def define_pass(
+    ground: GroundOf, caller: Operator, given: PassDefinition, idempotency_key: OnceKey = None
+) -> PassDetail:
+    """Define a pass: an interval of a spacecraft's time."""
+
+    def define() -> dict[str, Any]:
+        pass_id = service.define_pass(
+            ground,
+            name=given.name,
+            start_utc_ns=given.start.utc_ns,
+            stop_utc_ns=given.stop.utc_ns,
+            spacecraft_id=given.spacecraft_id,
+            instance=given.instance,
+        )
+        return service.get_pass(ground, pass_id).model_dump(mode="json")
+
+    answer = once(
+        ground,
+        actor=caller.name,
+        operation="pass",
+        key=idempotency_key,
+        request=given.model_dump(mode="json"),
+        work=define,
+    )
+    return PassDetail.model_validate(answer)
+
+
+@passes.get("/passes/{pass_id}")
+def get_pass(ground: GroundOf, _: Viewer, pass_id: PassId) -> PassDetail:
+    """Show a pass with its manifest and reports."""
+    return service.get_pass(ground, pass_id)
+
+
+@passes.get("/passes/{pass_id}/completeness")
+def get_completeness(ground: GroundOf, _: Viewer, pass_id: PassId) -> Completeness:
+    """Count the received and missing packets of a pass."""
+    return Completeness.of_accounting(service.completeness(ground, pass_id))
+
+
+@passes.get("/passes/{pass_id}/detections")
+def list_detections(
+    ground: GroundOf, _: Viewer, pass_id: PassId, limit: Limit = 100, offset: Offset = 0
+) -> PageOf[Detection]:
+    """List the detections of a pass, in time order."""
+    items, total = service.detections(ground, pass_id, limit=limit, offset=offset)
+    return page_of(items, total, limit, offset)
+
+
+@passes.get("/passes/{pass_id}/states", response_model=States)
+def get_states(
+    ground: GroundOf,
+    _: Viewer,
+    pass_id: PassId,
+    estimator: Annotated[str, Query(max_length=40, examples=["spherical"])] = "paper",
+    value: Annotated[list[str] | None, Query(max_length=len(STATE_VALUES))] = None,
+    max_points: MaxPoints = 1000,
+) -> Response:
+    """Return series of one estimator's states: minimum, maximum and mean per interval, gaps marked."""
+    names = tuple(value) if value else ("latitude_deg", "longitude_deg", "altitude_m")
+    document = service.states_document(ground, pass_id, estimator, names, max_points)
+    return Response(document, media_type="application/json")
+
+
+@passes.get("/passes/{pass_id}/events")
+def list_events(
+    ground: GroundOf, _: Viewer, pass_id: PassId, limit: Limit = 100, offset: Offset = 0
+) -> PageOf[Event]:
+    """List the event reports of a pass, in time order."""
+    items, total = service.list_events(ground, pass_id, limit=limit, offset=offset)
+    return page_of(items, total, limit, offset)
+
+
+@passes.get("/passes/{pass_id}/telemetry/{parameter}", response_model=ParameterSeries)
+def get_parameter(
+    ground: GroundOf, _: Viewer, pass_id: PassId, parameter: Parameter, max_points: MaxPoints = 1000
+) -> Response:
+    """Return the series of a housekeeping parameter of a pass."""
+    document = service.parameter_document(ground, pass_id, parameter, max_points)
+    return Response(document, media_type="application/json")
+
+
+@passes.get("/spacecraft/{spacecraft_id}/telemetry/{parameter}")
+def get_trend(
+    ground: GroundOf,
+    _: Viewer,
+    spacecraft_id: SpacecraftId,
+    parameter: Parameter,
+    instance: Instance = FLOWN,
+    start: GivenTime | None = None,
+    stop: GivenTime | None = None,
+    max_points: MaxPoints = 1000,
+) -> ParameterSeries:
+    """Return the series of a housekeeping parameter of a spacecraft over an interval; by default over all."""
+    found = service.trend_series(
+        ground,
+        spacecraft_id,
+        instance,
+        parameter,
+        max_points,
+        start_utc_ns=None if start is None else start.utc_ns,
+        stop_utc_ns=None if stop is None else stop.utc_ns,
+    )
+    return ParameterSeries.model_validate(series_document(found))
+
+
+@passes.get("/spacecraft/{spacecraft_id}/trends")
+def list_trends(
+    ground: GroundOf, _: Viewer, spacecraft_id: SpacecraftId, instance: Instance = FLOWN
+) -> list[Trend]:
+    """List statistics, slope and limit state of the housekeeping parameters over 30 days of on-board time."""
+    return service.spacecraft_trends(ground, spacecraft_id, instance)
