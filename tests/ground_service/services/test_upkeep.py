@@ -78,7 +78,7 @@ def test_answers_are_kept_until_telemetry_is_new(
     ground: Ground, synthetic_pass: Any, monkeypatch: Any, tmp_path: Any
 ) -> None:
     from ground_service.ingest.service import ingest_file
-    from ground_service.worker import upkeep
+    from ground_service.passes import service as upkeep
     from tmtc.downlink import encode_cadus
 
     half = len(synthetic_pass.packets) // 2
