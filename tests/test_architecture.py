@@ -136,20 +136,6 @@ def reachable(graph: dict[str, set[str]], start: str) -> set[str]:
 
 
 KNOWN_CYCLES = [
-    # through `http.views`, whose functions move to the models of the capabilities
-    [
-        "ground_service.access",
-        "ground_service.commanding",
-        "ground_service.ephemerides",
-        "ground_service.evaluation",
-        "ground_service.http",
-        "ground_service.missions",
-        "ground_service.passes",
-        "ground_service.planning",
-        "ground_service.timekeeping",
-    ],
-    # through the route of jobs
-    ["ground_service.api", "ground_service.regression", "ground_service.worker"],
     ["ground_service.regression.documents", "ground_service.regression.service"],
     ["linna.commands._catalogue_landmarks", "linna.commands.catalogue"],
     ["lunar.ephemeris", "lunar.oem", "lunar.stk"],
