@@ -1,7 +1,8 @@
-"""The packet dictionary of the payload: version 3, and versions 1 and 2 before it.
+"""The packet dictionary of the payload with all its versions.
 
-Everything that crosses the link is defined here and nowhere else; the ICD and the XTCE export are generated
-from it. A version only adds packets, so that each version decodes the telemetry of older payloads.
+Everything that crosses the link is defined here and, for optional instruments, in `tmtc.instruments`; the ICD and the
+XTCE export are generated from it. A version only adds packets, so that each version decodes the telemetry of older
+payloads. Versions after the third add the packets of instruments.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from tmtc.codes import (
     Labels,
 )
 from tmtc.errors import UnknownPacket
+from tmtc.instruments import instrument_telemetry
 from tmtc.packets import TYPE_TELECOMMAND
 from tmtc.schema import Dictionary, Field, Group, PacketDefinition
 
@@ -517,13 +519,25 @@ DICTIONARY_2 = Dictionary(
     telemetry=_telemetry(EVENTS, FAILURES, TABLES) + _second_telemetry(),
     telecommands=_telecommands(EVENTS, FUNCTIONS, TABLES, ARGUMENTS, 31) + _second_telecommands(),
 )
-DICTIONARY = Dictionary(
+DICTIONARY_3 = Dictionary(
     version=3,
     telemetry=DICTIONARY_2.telemetry + _third_telemetry(),
     telecommands=DICTIONARY_2.telecommands,
 )
 
-_VERSIONS = {dictionary.version: dictionary for dictionary in (DICTIONARY_1, DICTIONARY_2, DICTIONARY)}
+
+def _with_instruments(version: int) -> Dictionary:
+    """Return the dictionary of a version after the third: with the packets of the instruments known by then."""
+    known = tuple(one.packet for one in instrument_telemetry() if one.since <= version)
+    return Dictionary(version, DICTIONARY_3.telemetry + known, DICTIONARY_3.telecommands)
+
+
+_ADDED = sorted({one.since for one in instrument_telemetry()})
+_VERSIONS = {
+    dictionary.version: dictionary
+    for dictionary in (DICTIONARY_1, DICTIONARY_2, DICTIONARY_3, *map(_with_instruments, _ADDED))
+}
+DICTIONARY = _VERSIONS[max(_VERSIONS)]
 
 
 def dictionary_version(version: int) -> Dictionary:

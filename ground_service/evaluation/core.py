@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -62,6 +62,7 @@ from reports.values import (
     GalleryFrame,
     HeadlineFigure,
     HousekeepingParameter,
+    InstrumentReport,
     NavigationSeries,
     NavigationStatistics,
     PacketAccounting,
@@ -133,6 +134,7 @@ class PassInputs:
     filter_states: FilterStates | None = None
     identifications: IdentificationSamples | None = None
     landmarks: MappedCraters | None = None
+    instruments: tuple[InstrumentReport, ...] = ()
     sun_known: bool = False
     burns: tuple[CommandedBurn, ...] = ()
     gravity: GravityField | None = None
@@ -211,6 +213,7 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
         craters=craters,
         terrain=inputs.surface,
         payload_map=payload_map(inputs.landmarks, inputs.identifications, inputs.catalogue),
+        instruments=inputs.instruments,
         housekeeping=inputs.housekeeping,
         events=inputs.events,
         truth_ledger=_anchor_reads(inputs.outcomes),
@@ -248,6 +251,7 @@ def summary_of(report: PassReport) -> dict[str, Any]:
         "navigation": {s.name: _figures(s.statistics) for s in report.navigation if s.kind == "estimate"},
         "smoothed": {s.name: _figures(s.statistics) for s in report.navigation if s.kind == SMOOTHED},
         "baselines": {s.name: _figures(s.statistics) for s in report.navigation if s.kind == "baseline"},
+        "instruments": {one.name: asdict(one) for one in report.instruments},
         "verdict": report.verdict,
         "verdict_level": report.verdict_level,
         "requirements": [

@@ -17,6 +17,7 @@ from ground_service.errors import EvaluationError, InvalidInput
 from ground_service.evaluation.baselines import StartState
 from ground_service.evaluation.core import PassInputs
 from ground_service.evaluation.fixes import IdentificationSamples
+from ground_service.evaluation.instruments import instrument_reports
 from ground_service.evaluation.landmarks import MappedCraters, mapped_craters
 from ground_service.evaluation.smoother import SIZE, CommandedBurn, FilterStates
 from ground_service.evaluation.verdict import Limits
@@ -44,8 +45,10 @@ from lunar.lens import BrownCamera
 from lunar.timescales import parse_utc
 from reports.values import (
     HousekeepingParameter,
+    InstrumentReport,
 )
 from tmtc.dictionary import APID_DETECTIONS, APID_PERFORMANCE, DICTIONARY
+from tmtc.instruments import APID_INSTRUMENTS, instrument_telemetry
 from tmtc.stream import cut_packets
 
 _TRENDS = (
@@ -134,6 +137,7 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             filter_states=filter_states(connection, span),
             identifications=identification_samples(connection, span),
             landmarks=landmark_reports(connection, span),
+            instruments=reported_instruments(connection, span),
             sun_known=manifest.get("light", "real") == "real",
             burns=burns_of(manifest),
             gravity=declared.gravity,
@@ -237,6 +241,15 @@ def landmark_reports(connection: Connection, span: PassSpan) -> MappedCraters:
     )
     tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=("landmarks",))
     return mapped_craters(tables.get("landmarks"))
+
+
+def reported_instruments(connection: Connection, span: PassSpan) -> tuple[InstrumentReport, ...]:
+    """Return the statistics of the optional instruments of the payload, out of the packets."""
+    octets = repository.packet_octets(
+        connection, span.vehicle, APID_INSTRUMENTS, span.start_ticks, span.stop_ticks
+    )
+    names = tuple(one.name for one in instrument_telemetry())
+    return instrument_reports(DICTIONARY.unpack_many(octets, cut_packets(octets), only=names))
 
 
 def outcome_samples(connection: Connection, span: PassSpan) -> tuple[OutcomeSamples, ...]:

@@ -19,6 +19,7 @@ from payload_emulator.flight.onboard.commanding import Command, Refusal, failure
 from payload_emulator.flight.onboard.fdir import Monitors, Reaction
 from payload_emulator.flight.onboard.housekeeping import StageTimer
 from payload_emulator.flight.onboard.housekeeping_packets import send_large_data, send_structure
+from payload_emulator.flight.onboard.instrument_suite import NO_SAMPLES, Samples
 from payload_emulator.flight.onboard.loads import MODEL_NUMBER, TABLE_NUMBERS, FlightParameters, FlightTables
 from payload_emulator.flight.onboard.machine import PARAMETERS_NUMBER, Machine, Observation
 from payload_emulator.flight.onboard.memory import ProtectedMemory
@@ -122,7 +123,12 @@ class Payload:
         self._sent_octets = 0
 
     def step(
-        self, image: NDArray[Any], attitude: FloatArray, clock_ticks: int, telecommand_octets: bytes
+        self,
+        image: NDArray[Any],
+        attitude: FloatArray,
+        clock_ticks: int,
+        telecommand_octets: bytes,
+        instruments: Samples = NO_SAMPLES,
     ) -> list[bytes]:
         """Return the space packets that go down after one frame, or one turn without a frame.
 
@@ -137,6 +143,9 @@ class Payload:
             On-board time of the image, units of 2^-16 s.
         telecommand_octets
             Telecommand packets that arrived since the frame before, one after another.
+        instruments
+            Samples since the frame before by the name of the instrument, shape (n, k) with the columns that its module
+            in `flight.instruments` declares.
         """
         machine = self._machine
         machine.timer.enter(Stage.commands)
@@ -147,7 +156,7 @@ class Payload:
         for item in parse_commands(telecommand_octets):
             self._receive(item)
         self._release_activities()
-        self._look(image, np.asarray(attitude, dtype=np.float64).reshape(-1))
+        self._look(image, np.asarray(attitude, dtype=np.float64).reshape(-1), instruments)
         machine.timer.enter(Stage.monitoring)
         self._monitor()
         machine.timer.enter(Stage.telemetry)
@@ -334,7 +343,7 @@ class Payload:
 
     # Frames
 
-    def _look(self, image: NDArray[Any], attitude: FloatArray) -> None:
+    def _look(self, image: NDArray[Any], attitude: FloatArray, instruments: Samples) -> None:
         """Work on a frame, if it is time for one; end the observation when its time is over."""
         machine = self._machine
         ticks, window = machine.telemetry.ticks, machine.observation
@@ -359,6 +368,7 @@ class Payload:
             parameters["detector_score_floor"],
             parameters["detector_timeout_s"],
             machine.monitors.in_streak,
+            instruments,
         )
         machine.timer.detector_max_ms = max(machine.timer.detector_max_ms, observer.detector_ms)
         interval = int(parameters["thumbnail_interval"])

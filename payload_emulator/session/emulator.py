@@ -26,6 +26,7 @@ from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.flight.ports import ResetCause
 from payload_emulator.session.flying import SPACECRAFT_ID, CatalogueDetector, Sender, fly, timeline
+from payload_emulator.session.instruments import onboard_attitudes
 from payload_emulator.session.loading import LoadedPayload, load_payload
 from payload_emulator.session.mission import save_attitudes, save_mission
 from payload_emulator.session.recording import (
@@ -157,7 +158,8 @@ def _emulate_into(
     reception = transmit(sender.transmitter.dumps, sender.transmitter.settings, scenario.link, scenario.seed)
     save_record(folder, inputs, loaded.parameters, loaded.tables)
     save_frame_times(folder, world.frame_utc_ns)
-    save_attitudes(folder, inputs)
+    packets = [packet for dump in sender.transmitter.dumps for packet in dump.packets]
+    save_attitudes(folder, inputs, onboard_attitudes(packets))
     save_mission(folder, world, data)
     save_oem(sample_truth(world.truth, world.frame_utc_ns), folder / "truth.oem")
     save_oem(reference, folder / "reference.oem")
@@ -168,7 +170,6 @@ def _emulate_into(
     save_time_receptions(
         folder, [packet for packet, _ in sender.time_reports], emitted, world.truth.states(emitted)[0]
     )
-    packets = [packet for dump in sender.transmitter.dumps for packet in dump.packets]
     wall_s = time.monotonic() - started
     summary = _summary(world, loaded, spacecraft, packets, reception, len(kept), wall_s)
     summary |= score_navigation(world, loaded, catalogue, attitudes, b"".join(packets))

@@ -22,9 +22,11 @@ from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.flight.ports import UNLIMITED
 from payload_emulator.flight.vision.detections import Detections, no_detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
+from payload_emulator.session.instruments import InstrumentBench
 from payload_emulator.session.scenario import ClockSection
 from payload_emulator.session.spacecraft import Spacecraft
 from payload_emulator.session.world import (
+    NO_SAMPLES,
     Exposure,
     World,
     clock_ticks,
@@ -312,7 +314,7 @@ class Nobody:
 def fly(world: World, spacecraft: Spacecraft) -> Generator[Flown]:
     """Fly the moments of a scenario in order."""
     operator, receiver = Operator(world), Receiver(SPACECRAFT_ID)
-    frames = exposures(world)
+    frames = exposures(world, InstrumentBench(world).sample)
     for moment in timeline(world):
         exposure = next(frames) if moment.frame >= 0 else None
         receiver.carrier = receiver.bit_lock = moment.heard
@@ -341,6 +343,7 @@ def fly_moment(
         orders,
         sunlit=moment.sunlit,
         downlink_octets=moment.downlink_octets,
+        instruments=NO_SAMPLES if exposure is None else exposure.instruments,
     )
     return Flown(moment, exposure, orders, packets, receiver.clcw)
 

@@ -38,6 +38,7 @@ from payload_emulator.session.flying import (
     fly_moment,
     timeline,
 )
+from payload_emulator.session.instruments import InstrumentBench
 from payload_emulator.session.live_ports import Server
 from payload_emulator.session.spacecraft import Spacecraft
 from payload_emulator.session.world import World, exposures
@@ -240,7 +241,7 @@ class LivePayload:
 
     def _fly(self) -> None:
         operator = Operator(self.world) if self.has_operator else Nobody()
-        frames = exposures(self.world)
+        frames = exposures(self.world, InstrumentBench(self.world).sample)
         moments = timeline(self.world)
         interval_ns = round(self.world.scenario.camera.frame_interval_s * _NS)
         last = moments[-1]

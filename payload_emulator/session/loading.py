@@ -33,6 +33,7 @@ from payload_emulator.flight.payload import FlightParameters, FlightTables, Payl
 from payload_emulator.flight.ports import Board
 from payload_emulator.flight.vision.detections import Detector
 from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
+from payload_emulator.session.instruments import flight_parameters
 from payload_emulator.session.parameter_file import BuildParameters, format_parameters, parse_parameters
 from payload_emulator.session.scenario import Scenario
 from payload_emulator.sim.orbit.disturbances import TrueBurn
@@ -127,6 +128,7 @@ def load_payload(
             modes=tuple(Mode[name] for name in navigation.estimators),
             odometry=OdometryParameters(safety_timeout_s=navigation.safety_timeout_s or None),
             anchored=AnchoredParameters(gravity_degree=field.degree, errors=_attitude_errors(scenario)),
+            instruments=flight_parameters(scenario),
         ),
     )
     # Flight is given what the parameter file of the archive says, so that a replay is given the same.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 
@@ -125,13 +125,23 @@ def save_mission(folder: Path, world: World, data: DataFolder) -> None:
     (folder / MISSION_FILE).write_text(mission_text(world, data), encoding="utf-8")
 
 
-def save_attitudes(folder: Path, inputs: Iterable[StepInput]) -> None:
-    """Write the attitude of every frame, as the attitude control reported it, into an archive."""
-    rows = [
-        f"{item.clock_ticks},{','.join(repr(float(value)) for value in item.attitude[:4])}\n"
-        for item in inputs
-        if item.number >= 0 and np.isfinite(item.attitude[:4]).all()
-    ]
+def save_attitudes(
+    folder: Path, inputs: Iterable[StepInput], from_instruments: Mapping[int, FloatArray]
+) -> None:
+    """Write the attitude of every frame, as attitude control or an instrument gave it, into an archive.
+
+    Parameters
+    ----------
+    from_instruments
+        Quaternions q_wxyz (4,) by on-board time of the frame, for frames without attitude from attitude control.
+    """
+    rows = []
+    for item in inputs:
+        q_wxyz = item.attitude[:4]
+        if not np.isfinite(q_wxyz).all():
+            q_wxyz = from_instruments.get(item.clock_ticks, q_wxyz)
+        if item.number >= 0 and np.isfinite(q_wxyz).all():
+            rows.append(f"{item.clock_ticks},{','.join(repr(float(value)) for value in q_wxyz)}\n")
     (folder / ATTITUDE_FILE).write_text(f"{ATTITUDE_HEADER}\n{''.join(rows)}", encoding="utf-8")
 
 

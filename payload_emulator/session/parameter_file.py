@@ -11,6 +11,7 @@ import dataclasses
 import difflib
 import math
 import tomllib
+from collections.abc import Mapping
 from enum import IntEnum
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -18,6 +19,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 from payload_emulator.errors import ParameterError
+from payload_emulator.flight.instruments import flight_instruments
 from payload_emulator.flight.payload import FlightParameters
 from payload_emulator.flight.vision.detector import DetectorParameters
 
@@ -116,7 +118,10 @@ def _flat(value: Any, path: str) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for item in dataclasses.fields(value):
         inner, name = getattr(value, item.name), f"{path}.{item.name}" if path else item.name
-        if dataclasses.is_dataclass(inner):
+        if isinstance(inner, Mapping):
+            for key, one in inner.items():
+                found |= _flat(one, f"{name}.{key}")
+        elif dataclasses.is_dataclass(inner):
             found |= _flat(inner, name)
         else:
             found[name] = _plain(inner)
@@ -127,7 +132,10 @@ def _section(value: Any, path: str) -> list[str]:
     lines, sections = [], []
     for item in dataclasses.fields(value):
         inner, name = getattr(value, item.name), f"{path}.{item.name}" if path else item.name
-        if dataclasses.is_dataclass(inner):
+        if isinstance(inner, Mapping):
+            for key, one in inner.items():
+                sections += _section(one, f"{name}.{key}") or ["", f"[{name}.{key}]"]
+        elif dataclasses.is_dataclass(inner):
             sections += _section(inner, name)
         elif inner is not None:
             lines.append(f"{item.name} = {_toml(_plain(inner))}")
@@ -179,6 +187,26 @@ def _changed(
     return result
 
 
+def _instruments(
+    present: Mapping[str, Any], table: Any, source: str, path: str, dropped: list[str] | None
+) -> dict[str, Any]:
+    """Return the parameters of installed instruments with those that `table` names changed or added."""
+    if not isinstance(table, dict):
+        raise ParameterError(source, path, "a table", repr(table)[:SHOWN])
+    known, changed = flight_instruments(), dict(present)
+    for name, given in table.items():
+        place = f"{path}.{name}"
+        if name in known:
+            kind = known[name].parameters
+            changed[name] = _changed(changed.get(name, kind()), kind, given, source, place, dropped)
+        elif dropped is not None:
+            dropped.append(place)
+        else:
+            expected = f"one of {', '.join(known)}" if known else "no section: this build has no instruments"
+            raise ParameterError(source, place, expected, "an unknown instrument")
+    return changed
+
+
 def _refuse_crossed(value: Any, changed: dict[str, Any], source: str, path: str) -> None:
     """Refuse a lower limit of a section that lies above its upper limit.
 
@@ -219,6 +247,8 @@ def _converted(
     hint: Any, present: Any, given: Any, source: str, place: str, dropped: list[str] | None = None
 ) -> Any:
     origin, inner = get_origin(hint), get_args(hint)
+    if origin is Mapping:
+        return _instruments(present or {}, given, source, place, dropped)
     if origin in (Union, UnionType):
         if given is None and NoneType in inner:
             return None

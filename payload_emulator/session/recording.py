@@ -1,9 +1,9 @@
 """What a payload was given during a pass, kept so that another build can be given the same.
 
 In a pass archive this is the folder `payload/`: `inputs.jsonl` (one line per step: on-board time, message of the ADCS,
-telecommands, hash of the image, what the board said), `parameters.toml`, `tables/*.bin` as uploaded, and
-`dictionary.json` (the packet definitions the downlink was made with); images lie in `frames/`. Nothing of the truth is
-here.
+telecommands, hash of the image, what the board said, samples of instruments), `parameters.toml`, `tables/*.bin` as
+uploaded, and `dictionary.json` (the packet definitions the downlink was made with); images lie in `frames/`. Nothing of
+the truth is here.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import base64
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,6 +55,8 @@ class StepInput:
     image_shape, image_sha256
         Shape of the pixels and SHA-256 of their octets, row by row; an empty shape and hash for a camera that gave
         none.
+    instruments
+        Samples since the frame before, (n, k) by name of the instrument.
     """
 
     number: int
@@ -67,6 +69,7 @@ class StepInput:
     sensors: FloatArray
     uptime_ticks: int
     downlink_octets: int
+    instruments: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,6 +101,7 @@ def step_input(number: int, given: Given) -> StepInput:
         np.asarray(given.sensors, np.float64),
         given.uptime_ticks,
         given.downlink_octets,
+        given.instruments,
     )
 
 
@@ -233,7 +237,7 @@ def _size(shape: tuple[int, ...]) -> str:
 
 
 def _line(item: StepInput) -> str:
-    row = {
+    row: dict[str, Any] = {
         "frame": item.number,
         "ticks": item.clock_ticks,
         "attitude": _numbers(item.attitude),
@@ -246,6 +250,10 @@ def _line(item: StepInput) -> str:
         "uptime_ticks": item.uptime_ticks,
         "downlink_octets": item.downlink_octets,
     }
+    if item.instruments:
+        row["instruments"] = {
+            name: [_numbers(sample) for sample in rows] for name, rows in item.instruments.items()
+        }
     return json.dumps(row) + "\n"
 
 
@@ -255,6 +263,10 @@ def _numbers(values: FloatArray) -> list[float | None]:
 
 def _array(values: list[float | None]) -> FloatArray:
     return np.array([math.nan if value is None else float(value) for value in values], dtype=np.float64)
+
+
+def _table(rows: list[list[float | None]]) -> FloatArray:
+    return np.stack([_array(row) for row in rows]) if rows else np.zeros((0, 0))
 
 
 def _parse(line: str, path: Path, index: int) -> StepInput:
@@ -271,6 +283,7 @@ def _parse(line: str, path: Path, index: int) -> StepInput:
             _array(row["sensors"]),
             int(row["uptime_ticks"]),
             int(row["downlink_octets"]),
+            {name: _table(rows) for name, rows in row.get("instruments", {}).items()},
         )
     except (ValueError, KeyError, TypeError) as error:
         raise RecordError(

@@ -232,7 +232,7 @@ def replay(
             payload = started()
         detector.reset()
         began = cpu_clock()
-        packets += payload.step(image, item.attitude, item.clock_ticks, item.telecommands)
+        packets += payload.step(image, item.attitude, item.clock_ticks, item.telecommands, item.instruments)
         step_s = cpu_clock() - began
         if item.number < 0:
             continue

@@ -9,7 +9,7 @@ import dataclasses
 import difflib
 import math
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import UnionType
@@ -20,6 +20,7 @@ from lunar.timescales import parse_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.sim.board.faults import parse_fault
 from payload_emulator.sim.board.link import LinkSection
+from payload_emulator.sim.instruments import simulated_instruments
 from payload_emulator.sim.render.sensor import SensorModel
 
 SHIPPED = Path(__file__).resolve().parents[2] / "scenarios"
@@ -317,6 +318,13 @@ class Scenario:
     faults: FaultsSection = field(default_factory=FaultsSection)
     reference: ReferenceSection = field(default_factory=ReferenceSection)
     requirements: RequirementsSection = field(default_factory=RequirementsSection)
+    # Settings of each instrument that the scenario has a section of, by name.
+    instruments: Mapping[str, Any] = field(default_factory=dict, hash=False)
+
+    @property
+    def instruments_give_attitude(self) -> bool:
+        """Whether an instrument gives the attitude in place of the message of the ADCS."""
+        return any(simulated_instruments()[name].gives_attitude for name in self.instruments)
 
     @property
     def epoch_utc_ns(self) -> int:
@@ -369,7 +377,12 @@ def parse_scenario(text: str, source: str = "scenario") -> Scenario:
         raise ScenarioError(f"{source}: not TOML: {error}") from None
     if "name" not in table:
         raise ScenarioError(f"{source}: key 'name' is missing, expected a short text")
-    scenario: Scenario = _build(Scenario, table, source, "")
+    known = simulated_instruments()
+    sections = {key: value for key, value in table.items() if key not in known}
+    installed = {
+        name: _build(known[name].settings, table[name], source, name) for name in known if name in table
+    }
+    scenario: Scenario = dataclasses.replace(_build(Scenario, sections, source, ""), instruments=installed)
     _check(scenario, source)
     return scenario
 
@@ -380,14 +393,22 @@ def format_scenario(scenario: Scenario) -> str:
     sections: list[str] = []
     for item in dataclasses.fields(scenario):
         value = getattr(scenario, item.name)
-        if dataclasses.is_dataclass(value):
-            sections += ["", f"[{item.name}]"]
-            sections += [
-                f"{key.name} = {_toml(getattr(value, key.name))}" for key in dataclasses.fields(value)
-            ]
+        if item.name == "instruments":
+            for name, settings in value.items():
+                sections += _section(name, settings)
+        elif dataclasses.is_dataclass(value):
+            sections += _section(item.name, value)
         else:
             lines.append(f"{item.name} = {_toml(value)}")
     return "\n".join(lines + sections) + "\n"
+
+
+def _section(name: str, values: Any) -> list[str]:
+    return [
+        "",
+        f"[{name}]",
+        *(f"{key.name} = {_toml(getattr(values, key.name))}" for key in dataclasses.fields(values)),
+    ]
 
 
 def _toml(value: object) -> str:
@@ -405,6 +426,9 @@ def _build(kind: type, table: Any, source: str, path: str) -> Any:
         raise ScenarioError(f"{source}: [{path}] must be a table, found {type(table).__name__}")
     hints = get_type_hints(kind)
     known = [item.name for item in dataclasses.fields(kind)]
+    if kind is Scenario:
+        # Instruments have sections of their own names.
+        known = [name for name in known if name != "instruments"] + list(simulated_instruments())
     values: dict[str, Any] = {}
     for key, value in table.items():
         place = f"{path}.{key}" if path else key
@@ -646,3 +670,12 @@ def _check(scenario: Scenario, source: str) -> None:
     require(link.rate_bps > 0.0, "link.rate_bps", "positive", link.rate_bps)
     for text in scenario.faults.events:
         parse_fault(text)
+    for name, settings in scenario.instruments.items():
+        instrument = simulated_instruments()[name]
+        for limit in instrument.limits(settings):
+            require(limit.good, f"{name}.{limit.key}", limit.expected, limit.found)
+        for key in instrument.replaces:
+            section, _, item = key.partition(".")
+            there = getattr(scenario, section)
+            found, default = getattr(there, item), getattr(type(there)(), item)
+            require(found == default, key, f"left out because [{name}] takes its place", found)

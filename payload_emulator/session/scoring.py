@@ -132,6 +132,8 @@ def score_navigation(
                 np.linalg.norm(errors.state_error_rtn[settled, 3:], axis=1), 95.0
             ),
             "bias_rtn_m": _means(errors.state_error_rtn[settled, :3]),
+            "median_rtn_m": _absolute_percentiles(errors.state_error_rtn[settled, :3], 50.0),
+            "p95_rtn_m": _absolute_percentiles(errors.state_error_rtn[settled, :3], 95.0),
             "nees6": _means(errors.nees[settled, None])[0],
             "nis_per_degree": _ratio(float(np.sum(nis[tracked])), float(2 * np.sum(matched[tracked]))),
             "fixed_share_imaging": _ratio(float(np.sum(fixed & imaging)), float(np.sum(imaging))),
@@ -402,6 +404,11 @@ def _means(values: FloatArray) -> list[float | None]:
     if not len(values):
         return [None] * values.shape[1]
     return [round(float(value), 3) for value in values.mean(axis=0)]
+
+
+def _absolute_percentiles(values: FloatArray, percent: float) -> list[float | None]:
+    """Return a percentile of the absolute values of each column of (n, k)."""
+    return [_percentile(column, percent) for column in np.abs(values).T]
 
 
 def _ratio(part: float, whole: float) -> float | None:

@@ -17,6 +17,7 @@ from payload_emulator.flight.ports import SETTINGS_OCTETS, STORE_OCTETS, UNLIMIT
 from payload_emulator.flight.vision.detections import Detections, Detector
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from payload_emulator.session.loading import LoadedPayload
+from payload_emulator.session.world import NO_SAMPLES, Samples
 from payload_emulator.sim.board.faults import Fault
 from payload_emulator.sim.board.platform import PlatformModel, SimulatedBoard
 from payload_emulator.sim.orbit.truth import ReadCount, counted_reads
@@ -53,6 +54,7 @@ class Given:
     sensors: FloatArray
     uptime_ticks: int
     downlink_octets: int
+    instruments: Samples = field(default_factory=dict)
 
 
 class ProcessorHang(BaseException):
@@ -136,6 +138,7 @@ class Spacecraft:
         *,
         sunlit: float = 1.0,
         downlink_octets: int = UNLIMITED,
+        instruments: Samples = NO_SAMPLES,
     ) -> list[bytes]:
         """What goes down after a step; None for an image: nobody looks now. Faults change what comes in."""
         board = self.board
@@ -153,15 +156,24 @@ class Spacecraft:
         if self._camera_dead and not board.camera_on:
             self._camera_dead = False
         shown, ticks = _NO_IMAGE if picture is None else picture, clock_ticks + self._clock_error_ticks
+        samples = _with_clock_error(instruments, self._clock_error_ticks)
         cause, self._booted = self._booted, None
         try:
             with counted_reads(self.truth_reads):
-                packets = self.payload.step(shown, message, ticks, telecommands)
+                packets = self.payload.step(shown, message, ticks, telecommands, samples)
         except ProcessorHang:
             self._down_until_ns = utc_ns + round(board.model.watchdog_s * _NS)
             packets = []
         self.given = Given(
-            shown, message, ticks, telecommands, cause, board.readings, board.uptime_ticks(), downlink_octets
+            shown,
+            message,
+            ticks,
+            telecommands,
+            cause,
+            board.readings,
+            board.uptime_ticks(),
+            downlink_octets,
+            samples,
         )
         if self._down_until_ns is not None:
             return []
@@ -239,3 +251,10 @@ class Spacecraft:
         used = np.flatnonzero(memory)
         for at in self._rng.choice(used, min(bits, used.size), replace=False).tolist() if used.size else ():
             memory[at] ^= 1 << int(self._rng.integers(0, 8))
+
+
+def _with_clock_error(samples: Samples, error_ticks: int) -> Samples:
+    """Return samples as a clock with an additional error stamps them: their first column is the time."""
+    if not error_ticks:
+        return samples
+    return {name: rows + error_ticks * (np.arange(rows.shape[1]) == 0) for name, rows in samples.items()}

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,10 @@ from payload_emulator.sim.terrain.tiles import TiledTerrain
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 
+Samples = Mapping[str, FloatArray]
+"""Samples of each instrument by its name: rows, the on-board time first."""
+
+NO_SAMPLES: Samples = MappingProxyType({})
 _NS = 1_000_000_000
 _EPHEMERIS_STEP_NS = 10 * _NS
 _EPHEMERIS_MARGIN_NS = 120 * _NS
@@ -109,6 +114,8 @@ class Exposure:
     ----------
     camera_from_mcmf
         True attitude, shape (3, 3).
+    instruments
+        Samples since the frame before.
     """
 
     utc_ns: int
@@ -116,6 +123,7 @@ class Exposure:
     attitude: FloatArray
     clock_ticks: int
     camera_from_mcmf: FloatArray
+    instruments: Samples = field(default_factory=dict)
 
 
 def build_world(scenario: Scenario, data: DataFolder) -> World:
@@ -184,18 +192,35 @@ def _disturbed(
     return truth, burns
 
 
-def exposures(world: World) -> Generator[Exposure]:
-    """The frames of a world in time order, the next ones rendered while the payload works on this one.
+def no_instruments(utc_ns: int, camera_from_mcmf: FloatArray) -> Samples:
+    """Return no samples."""
+    return NO_SAMPLES
 
-    One thread renders, as a terrain wants it; a second lets the sensor take the picture of what the first has rendered.
+
+def exposures(
+    world: World, sample: Callable[[int, FloatArray], Samples] = no_instruments
+) -> Generator[Exposure]:
+    """Yield the frames of a world in time order, the next ones rendered while the payload works on this one.
+
+    One thread renders and samples the instruments, because a terrain serves one thread; a second lets the sensor take
+    the picture of what the first has rendered.
+
+    Parameters
+    ----------
+    sample
+        From time and true attitude of a frame to the samples before it; called in order of time.
     """
     world.terrain.hand_over()
     try:
         with ThreadPoolExecutor(max_workers=1) as renderer, ThreadPoolExecutor(max_workers=1) as sensor:
 
             def begin(number: int) -> Future[Exposure]:
-                scene = renderer.submit(_scene, world, number)
-                return sensor.submit(lambda: _exposed(world, scene.result()))
+                def prepared() -> tuple[_Scene, Samples]:
+                    scene = _scene(world, number)
+                    return scene, sample(scene.utc_ns, scene.camera_from_mcmf)
+
+                scene = renderer.submit(prepared)
+                return sensor.submit(lambda: _exposed(world, *scene.result()))
 
             pending = [begin(0)]
             for number in range(world.frame_utc_ns.size):
@@ -263,7 +288,7 @@ def _scene(world: World, number: int) -> _Scene:
     return _Scene(utc_ns, camera_from_mcmf, camera_from_icrf, sun, radiance, picture, rng)
 
 
-def _exposed(world: World, scene: _Scene) -> Exposure:
+def _exposed(world: World, scene: _Scene, instruments: Samples = NO_SAMPLES) -> Exposure:
     scenario, rng = world.scenario, scene.rng
     image = scene.picture
     if scene.radiance is not None:
@@ -275,12 +300,17 @@ def _exposed(world: World, scene: _Scene) -> Exposure:
     ).standard_normal(3)
     noise = np.radians(attitude.knowledge_noise_deg) * rng.standard_normal(3)
     known = perturbed(scene.camera_from_icrf, bias + noise)
+    sun_in_camera = known @ scene.camera_from_icrf.T @ scene.camera_from_mcmf @ scene.sun_mcmf
+    message = attitude_message(known, sun_in_camera)
+    if scenario.instruments_give_attitude:
+        message[:4] = np.nan
     return Exposure(
         scene.utc_ns,
         image,
-        attitude_message(known, known @ scene.camera_from_icrf.T @ scene.camera_from_mcmf @ scene.sun_mcmf),
+        message,
         clock_ticks(world, scene.utc_ns),
         scene.camera_from_mcmf,
+        instruments,
     )
 
 

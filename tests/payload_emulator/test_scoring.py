@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from payload_emulator.session.scoring import frames_to_recover
+from payload_emulator.session.scoring import _absolute_percentiles, frames_to_recover
 
 
 @pytest.mark.parametrize(
@@ -23,3 +23,10 @@ def test_a_recovery_is_the_first_frame_from_which_the_error_stays_small(
     error_m: list[float], frames: int | None
 ) -> None:
     assert frames_to_recover(np.array(error_m)) == frames
+
+
+def test_percentiles_of_each_direction_are_of_absolute_errors_and_unknown_without_any() -> None:
+    errors = np.array([[-3.0, 1.0, np.nan], [1.0, -1.0, 2.0], [2.0, 4.0, np.nan]])
+    assert _absolute_percentiles(errors, 50.0) == [2.0, 1.0, 2.0]
+    assert _absolute_percentiles(errors, 100.0) == [3.0, 4.0, 2.0]
+    assert _absolute_percentiles(errors[:0], 95.0) == [None, None, None]

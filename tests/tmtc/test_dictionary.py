@@ -50,18 +50,20 @@ def test_the_layouts_have_the_lengths_of_the_interface():
 
 def test_versions_have_the_hashes_under_which_they_were_released():
     # a change here is a change of the interface: it needs a new version beside the old ones, which stay decodable
-    assert DICTIONARY.version == 3
-    assert DICTIONARY.hash == "fecd1f46e3bf78e3033177112b36250116a4f011a2d8f6f9d6e5192a876f9ba0"
+    # versions after the third add instruments, whose tests hold the hashes
+    third = dictionary_version(3)
+    assert third.hash == "fecd1f46e3bf78e3033177112b36250116a4f011a2d8f6f9d6e5192a876f9ba0"
     second = dictionary_version(2)
     assert second.hash == "a8edf79b77d6eb0094a5ef96cbedca4d0f7c6fb3a97b4d8b9d6631eebc014772"
     first = dictionary_version(1)
     assert first.hash == "bf94b11b68e9327bf0ca1d262ca2a69719c71215d16f98dbcd6be24d057661b9"
-    assert dictionary_version(3) is DICTIONARY
-    with pytest.raises(UnknownPacket, match="expected version 1, 2, 3, found 4"):
-        dictionary_version(4)
+    assert dictionary_version(DICTIONARY.version) is DICTIONARY
+    later = DICTIONARY.version + 1
+    with pytest.raises(UnknownPacket, match=f"expected version 1, 2, 3.*, found {later}"):
+        dictionary_version(later)
 
 
-@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("version", range(1, DICTIONARY.version))
 def test_packets_of_older_versions_read_the_same_in_the_newest(version):
     older = dictionary_version(version)
     octets = older.pack("housekeeping", HOUSEKEEPING, ticks=5 << 16, sequence_count=1)

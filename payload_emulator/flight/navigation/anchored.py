@@ -47,6 +47,7 @@ from payload_emulator.flight.navigation.lost_in_space import PlaceIndex, place_i
 from payload_emulator.flight.navigation.outcomes import Outcome
 from payload_emulator.flight.navigation.prediction import is_usable, predicted
 from payload_emulator.flight.navigation.relative import Remembered, tie, with_clone, without_clone
+from payload_emulator.flight.navigation.scalar import Innovation, ScalarMeasurement, scalar_update
 from payload_emulator.flight.navigation.sighting import (
     LandmarkMap,
     Pose,
@@ -141,11 +142,14 @@ class Observation:
         Detections; None where there was no usable image.
     camera_from_icrf
         Attitude, shape (3, 3); None where the ADCS gave none: the frame is then coasted over.
+    attitude_sigma_rad
+        Standard deviation of this attitude, per axis; None: as in the parameters.
     """
 
     ticks: int
     found: Detections | None
     camera_from_icrf: FloatArray | None
+    attitude_sigma_rad: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -256,6 +260,7 @@ def step(
     Outside the orientation table neither dynamics nor catalogue can be used: the state then stays as it is.
     """
     found, camera_from_icrf = observation.found, observation.camera_from_icrf
+    setup = _with_attitude_sigma(setup, observation.attitude_sigma_rad)
     parameters = setup.parameters
     mcmf_from_icrf = setup.model.mcmf_from_icrf(observation.ticks)
     prior = predicted(state.estimate, observation.ticks, setup.model, setup.burns, parameters.errors)
@@ -295,6 +300,28 @@ def step(
     return state, _report(state, setup, outcome, mcmf_from_icrf, decided)
 
 
+def measured(
+    state: AnchoredState, measurement: ScalarMeasurement, setup: AnchoredSetup
+) -> tuple[AnchoredState, Innovation | None]:
+    """Return the state after a scalar measurement, and its innovation; None where it cannot be predicted.
+
+    A measurement before the time of the estimate is not used. The state stays as it is where a measurement is not used.
+    """
+    estimate, parameters = state.estimate, setup.parameters
+    mcmf_from_icrf = setup.model.mcmf_from_icrf(measurement.ticks)
+    if measurement.ticks < estimate.ticks or mcmf_from_icrf is None:
+        return state, None
+    prior = predicted(estimate, measurement.ticks, setup.model, setup.burns, parameters.errors)
+    if prior is None or not is_usable(prior, parameters.limits):
+        return state, None
+    prediction = measurement.model(prior, mcmf_from_icrf, state.landmarks)
+    result = None if prediction is None else scalar_update(prior, measurement, prediction)
+    if result is None:
+        return state, None
+    estimate, innovation = result
+    return replace(state, estimate=estimate) if innovation.used else state, innovation
+
+
 def widened(state: AnchoredState, sigma_position_m: float, sigma_velocity_m_s: float) -> AnchoredState:
     """Return the state with more uncertainty per axis, after an event outside dynamics and burns such as a restart."""
     return replace(state, estimate=kalman.widened(state.estimate, sigma_position_m, sigma_velocity_m_s))
@@ -303,6 +330,13 @@ def widened(state: AnchoredState, sigma_position_m: float, sigma_velocity_m_s: f
 def is_lost(state: AnchoredState, parameters: AnchoredParameters) -> bool:
     """Return whether the estimate is too uncertain to be of use."""
     return not state.estimate.finite or state.estimate.position_sigma_m > parameters.divergence_limit_m
+
+
+def _with_attitude_sigma(setup: AnchoredSetup, sigma_rad: float | None) -> AnchoredSetup:
+    if sigma_rad is None:
+        return setup
+    errors = replace(setup.parameters.errors, attitude_noise_rad=sigma_rad)
+    return replace(setup, parameters=replace(setup.parameters, errors=errors))
 
 
 def _entered(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 
+from payload_emulator.flight.instruments import flight_instruments
 from payload_emulator.flight.onboard.modes import ALL_MODES, ALLOWED, TRANSITIONS, PayloadMode
 from payload_emulator.flight.onboard.parameters import PARAMETERS, Parameter
 from payload_emulator.flight.ports import SENSORS, Board, Load, ResetCause, Stage
@@ -24,8 +25,8 @@ The interfaces of Fig. 1 of the paper. All that crosses them is arrays, counts a
 
 ## A step
 
-The spacecraft calls `Payload.step(image, attitude, clock_ticks, telecommand_octets)` for every frame, and now and then
-without one; telemetry packets come back.
+The spacecraft calls `Payload.step(image, attitude, clock_ticks, telecommand_octets, instruments)` for every frame, and
+now and then without one; telemetry packets come back. The last argument may be left out.
 
 | argument | from | content |
 |---|---|---|
@@ -33,6 +34,7 @@ without one; telemetry packets come back.
 | attitude | ADCS | seven f64: q_wxyz of camera from ICRF, unit Sun vector in the camera frame; NaN where absent |
 | clock_ticks | OBDH | on-board time of the image, 2^-16 s |
 | telecommand_octets | TM/TC | telecommand packets that came since the step before, one after another |
+| instruments | instruments | by name, samples since the frame before, f64 (n, k); see "Instruments" |
 | returned | TM/TC | telemetry packets, no more than `downlink_octets` in all |
 """
 
@@ -137,7 +139,23 @@ that used it (u16).
 
 def format_interfaces() -> str:
     """The document, in Markdown."""
-    return "\n".join([_STEP, *_ports(), *_modes(), *_parameters(), *_store(), _PRODUCTS, *_faults()])
+    return "\n".join(
+        [_STEP, *_instruments(), *_ports(), *_modes(), *_parameters(), *_store(), _PRODUCTS, *_faults()]
+    )
+
+
+def _instruments() -> list[str]:
+    """Columns of the samples of each optional instrument."""
+    lines = [
+        "## Instruments\n",
+        "Optional. A row per sample in order of time, up to the time of the frame; the packet of the same name reports "
+        "their use.\n",
+        "| instrument | columns | gives attitude |\n|---|---|---|",
+    ]
+    for name, instrument in flight_instruments().items():
+        gives = "in place of the ADCS" if instrument.gives_attitude else "no"
+        lines.append(f"| {name} | {', '.join(instrument.columns)} | {gives} |")
+    return [*lines, ""]
 
 
 def _ports() -> list[str]:

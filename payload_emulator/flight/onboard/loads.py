@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from lunar.camera import PinholeCamera
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
@@ -55,6 +56,8 @@ class FlightParameters:
         Rules of `anchored`.
     housekeeping_interval_s
         Time between housekeeping packets until it is changed by telecommand.
+    instruments
+        Parameters of each installed instrument by name.
     """
 
     camera: PinholeCamera = field(default_factory=PinholeCamera)
@@ -62,16 +65,19 @@ class FlightParameters:
     odometry: OdometryParameters = field(default_factory=OdometryParameters)
     anchored: AnchoredParameters = field(default_factory=AnchoredParameters)
     housekeeping_interval_s: float = 60.0
+    # Without instruments the text, and so the hash in telemetry, is that of builds that knew none.
+    instruments: Mapping[str, Any] = field(default_factory=dict, repr=False, hash=False)
 
     @property
     def hash(self) -> int:
         """First 32 bits of the SHA-256 of the parameters as text."""
-        return int.from_bytes(hashlib.sha256(repr(self).encode()).digest()[:4], "big")
+        return int(self.sha256[:8], 16)
 
     @property
     def sha256(self) -> str:
         """SHA-256 of the parameters as text, hexadecimal."""
-        return hashlib.sha256(repr(self).encode()).hexdigest()
+        installed = "".join(f"{name}={self.instruments[name]!r}" for name in sorted(self.instruments))
+        return hashlib.sha256((repr(self) + installed).encode()).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)

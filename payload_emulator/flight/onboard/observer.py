@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import size_class
 from lunar.frames import matrix_from_quaternion
+from payload_emulator.flight.instruments import AttitudeEstimate
 from payload_emulator.flight.navigation import anchored, odometry
 from payload_emulator.flight.navigation import filter as kalman
 from payload_emulator.flight.navigation.anchored import (
@@ -24,6 +25,14 @@ from payload_emulator.flight.navigation.landmark_map import map_rows
 from payload_emulator.flight.navigation.odometry import OdometryState
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.onboard.housekeeping import StageTimer
+from payload_emulator.flight.onboard.instrument_suite import (
+    NO_SAMPLES,
+    FrameReadings,
+    Samples,
+    packets,
+    read_frame,
+    start_suite,
+)
 from payload_emulator.flight.onboard.loads import TABLE_NUMBERS, FlightParameters, FlightTables
 from payload_emulator.flight.ports import Stage
 from payload_emulator.flight.telemetry.packets import Telemetry
@@ -92,6 +101,7 @@ class Observer:
         self._anchored: AnchoredState | None = None
         self._in_trouble: set[str] = set()
         self._tables = FlightTables()
+        self._instruments = start_suite(parameters.instruments)
 
     @property
     def anchor_reads(self) -> int:
@@ -108,6 +118,7 @@ class Observer:
     def reset(self) -> None:
         """Forget all estimates; each estimator starts from its tables."""
         self._odometry.clear()
+        self._instruments = start_suite(self._parameters.instruments)
         self._start_navigator()
 
     def widen(self, position_m: float, velocity_m_s: float) -> None:
@@ -116,16 +127,24 @@ class Observer:
             self._anchored = anchored.widened(self._anchored, position_m, velocity_m_s)
 
     def frame(
-        self, image: NDArray[Any], attitude: FloatArray, score_floor: float, timeout_s: float, quiet: bool
+        self,
+        image: NDArray[Any],
+        attitude: FloatArray,
+        score_floor: float,
+        timeout_s: float,
+        quiet: bool,
+        samples: Samples = NO_SAMPLES,
     ) -> None:
         """Detect craters in one frame, run every estimator on them, report both.
 
-        `quiet` leaves out the event about the quality of the image.
+        `quiet` leaves out the event about the quality of the image; `samples` are those of the instruments.
         """
         telemetry = self._telemetry
         sun = attitude[4:7] if attitude.size == 7 and np.all(np.isfinite(attitude[4:7])) else None
-        camera_from_icrf = _rotation(attitude)
-        if camera_from_icrf is None:
+        self._instruments, readings = read_frame(
+            self._parameters.instruments, self._instruments, samples, telemetry.ticks, _rotation(attitude)
+        )
+        if readings.attitude.camera_from_icrf is None:
             telemetry.event("low", "attitude_missing")
         quality, found = self._detect(image, sun, timeout_s)
         numbers = np.stack([found.u_px, found.v_px, found.diameter_px])
@@ -138,10 +157,11 @@ class Observer:
                 telemetry.event("low", f"image_{quality.name.lower()}")
         self._timer.enter(Stage.navigation)
         altitude_m = _NAN
+        self._measure(readings)
         for mode in self._parameters.modes:
             if mode is Mode.anchored:
                 usable = found if quality is ImageQuality.OK and not self.detector_failed else None
-                below_m = self._anchored_frame(usable, camera_from_icrf)
+                below_m = self._anchored_frame(usable, readings.attitude)
             else:
                 below_m = self._odometry_frame(mode, found)
             altitude_m = below_m if np.isfinite(below_m) else altitude_m
@@ -235,12 +255,26 @@ class Observer:
                 burns,
             )
 
-    def _anchored_frame(self, found: Detections | None, camera_from_icrf: FloatArray | None) -> float:
+    def _measure(self, readings: FrameReadings) -> None:
+        """Give the anchored estimator what instruments measured before the frame, and report each instrument."""
+        innovations = []
+        for _, _, measurement in readings.measurements:
+            innovation = None
+            if self._setup is not None and self._anchored is not None:
+                self._anchored, innovation = anchored.measured(self._anchored, measurement, self._setup)
+            innovations.append(innovation)
+        telemetry = self._telemetry
+        for name, values in packets(readings, innovations, telemetry.frame_number, telemetry.ticks):
+            telemetry.send(name, values)
+
+    def _anchored_frame(self, found: Detections | None, attitude: AttitudeEstimate) -> float:
         """Run the anchored estimator on one frame, report it, and return its altitude."""
         mode, detections = Mode.anchored, 0 if found is None else len(found)
         report = None
         if self._setup is not None and self._anchored is not None:
-            observation = Observation(self._telemetry.ticks, found, camera_from_icrf)
+            observation = Observation(
+                self._telemetry.ticks, found, attitude.camera_from_icrf, attitude.sigma_rad
+            )
             try:
                 self._anchored, report = anchored.step(self._anchored, observation, self._setup)
             except np.linalg.LinAlgError:

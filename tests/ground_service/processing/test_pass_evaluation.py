@@ -774,7 +774,7 @@ def test_the_summary_holds_the_figures_of_the_report(report: PassReport) -> None
         "evidence_level": "", "data": [],
     }  # fmt: skip
     assert {name: summary[name] for name in named} == named
-    assert set(summary) == {*named, "detector", "navigation", "requirements", "error_budget"}
+    assert set(summary) == {*named, "detector", "instruments", "navigation", "requirements", "error_budget"}
     assert summary["navigation"]["paper"] == {
         "median_3d_m": pytest.approx(500.0, abs=0.01),
         "p68_3d_m": paper_of.statistics.p68_3d_m,

@@ -135,7 +135,9 @@ def test_estimates_of_either_version_are_stored_with_covariance_and_degrees(
         assert found.innovation_degrees.tolist() == [-1 if version == 2 else 24] * 8
         with ground.database.reading() as connection:
             table = repository.SAMPLES["filter_states"]
-            assert set(connection.execute(select(table.c.dictionary_version)).scalars()) == {3}
+            assert set(connection.execute(select(table.c.dictionary_version)).scalars()) == {
+                DICTIONARY.version
+            }
 
 
 def test_what_version_2_decoded_is_decoded_again_to_the_same_states(tmp_path: Path, make_pass: Any) -> None:
