@@ -299,11 +299,11 @@ def plan(desk: Transcript, api: Client, scenario: str, folder: Path, now_utc_ns:
         "--name",
         "observation of the day",
     )
-    window = int(api.list_windows(1)["items"][0]["id"])
+    window = api.list_windows().page(1).items[0].id
     desk.linna("plan", "approve", window, by="bob")
     desk.linna("plan", "uplink", window, by="bob")
     desk.linna("command", "enter", "disable_event", "event_id=3", "--spacecraft-id", SPACECRAFT_ID)
-    critical = int(api.list_commands(1)["items"][0]["id"])
+    critical = api.list_telecommands().page(1).items[0].id
     desk.linna("command", "release", critical, refused=True)
     desk.linna("command", "release", critical, by="bob")
     return window
@@ -312,7 +312,7 @@ def plan(desk: Transcript, api: Client, scenario: str, folder: Path, now_utc_ns:
 def execute(desk: Transcript, api: Client, payload: Payload, window: int) -> None:
     """Uplink to the payload, and its flight through the window, followed by its telemetry."""
     planned = api.get_window(window)
-    start, stop = parse_utc(planned["start"]), parse_utc(planned["stop"])
+    start, stop = parse_utc(str(planned.start)), parse_utc(str(planned.stop))
     desk.linna(
         "command", "uplink", "--spacecraft-id", SPACECRAFT_ID, "--tcp", f"127.0.0.1:{payload.telecommands}"
     )
@@ -321,11 +321,11 @@ def execute(desk: Transcript, api: Client, payload: Payload, window: int) -> Non
         desk.say(f"# the payload at {format_utc(now)[:19]}Z: mode {mode}")
 
         def is_reached(wanted: str = state) -> bool:
-            return bool(api.get_window(window)["state"] == wanted)
+            return bool(api.get_window(window).state == wanted)
 
         wait_until(
             is_reached,
-            f"window {state}, found {api.get_window(window)['state']}",
+            f"window {state}, found {api.get_window(window).state}",
             PATIENCE_S,
         )
         desk.linna("plan", "show", window)
@@ -334,17 +334,18 @@ def execute(desk: Transcript, api: Client, payload: Payload, window: int) -> Non
 def evaluate(desk: Transcript, api: Client, window: int, folder: Path) -> dict[str, Any]:
     """Verification of the telecommands, completeness, report; how the day ended."""
     desk.linna("command", "list")
-    pass_id = int(api.get_window(window)["pass_id"])
+    pass_id = api.get_window(window).pass_id
+    assert pass_id is not None
     desk.linna("report", pass_id, "--out", folder / "report")
     desk.linna("plan", "show", window)
     desk.linna("pass", "show", pass_id)
-    summary = api.pass_summary(pass_id)
+    summary = api.evaluate_pass(pass_id)
     done = api.get_window(window)
-    commands = Counter(row["state"] for row in api.list_commands(100)["items"])
+    commands = Counter(one.state for one in api.list_telecommands())
     return {
-        "window": done["state"],
+        "window": done.state,
         "frames": summary["frames"],
-        "frames_planned": done["predicted"]["frames"],
+        "frames_planned": done.predicted["frames"],
         "packets": summary["packets"],
         "packets_lost": summary["packets_lost"],
         "telecommands": dict(commands),

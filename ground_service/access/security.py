@@ -21,6 +21,9 @@ def caller_of(
     request: Request, given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
 ) -> Caller:
     """Return the owner of the token of a request, or the local user of a service without users."""
+    local: Caller | None = getattr(request.app.state, "local_caller", None)
+    if local is not None:
+        return local
     ground = request.app.state.ground
     if given is None:
         if request.app.state.open_without_users and not has_users(ground):

@@ -134,7 +134,8 @@ def install(app: FastAPI) -> None:
             return problem(415, "unsupported encoding", str(error), request)
         if isinstance(error, PreconditionFailed):
             return problem(412, "precondition failed", str(error), request)
-        told = public_text(error)  # the log contains the complete text
+        is_local = getattr(request.app.state, "local_caller", None) is not None
+        told = str(error) if is_local else public_text(error)  # the log contains the complete text
         if isinstance(error, PlanConflicts):
             found = [
                 {"where": f"window {one.window_id}" if one.window_id else one.kind, "detail": one.detail}
@@ -144,7 +145,7 @@ def install(app: FastAPI) -> None:
         if isinstance(error, StateConflict):
             return problem(409, "conflict", told, request, state=error.found)
         status, title = next((s, t) for kind, s, t in STATUSES if isinstance(error, kind))
-        if status < 500:
+        if status < 500 or is_local:
             return problem(status, title, told, request)
         # The message may contain paths or addresses: it is logged with the id of the request.
         request_id = getattr(request.state, "request_id", None)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import Body, Path
+from fastapi import Body, Path, Query
 
 from ground_service.access.security import Operator, Viewer
-from ground_service.http.common import GroundOf, Limit, Offset, page_of
+from ground_service.http.common import GroundOf, Limit, Name, Offset, page_of
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
 from ground_service.missions import service
@@ -29,13 +29,18 @@ def list_missions(
 
 
 @missions.post("/missions", status_code=201)
-def add_mission(ground: GroundOf, caller: Operator, document: Text) -> MissionDetail:
+def add_mission(
+    ground: GroundOf,
+    caller: Operator,
+    document: Text,
+    name: Annotated[Name, Query(description="Name of the file in messages")] = "body",
+) -> MissionDetail:
     """Add a mission description (TOML) as a revision; the same content gives the same revision.
 
     Only an administrator may change which telecommands need a second person.
     """
     return service.add_mission(
-        ground, document, source="body", actor=caller.name, may_change_approval=caller.role == "admin"
+        ground, document, source=name, actor=caller.name, may_change_approval=caller.role == "admin"
     )
 
 

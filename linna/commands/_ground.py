@@ -1,4 +1,4 @@
-"""What the ground's commands share: which service they work on, here or at a server."""
+"""Options and client of the commands that work on the ground service, of this machine or of a server."""
 
 from __future__ import annotations
 
@@ -6,49 +6,57 @@ import argparse
 import getpass
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from ground_service.client import Client
     from ground_service.ground import Ground
     from ground_service.settings import Settings
 
 
 def add_service_options(parser: argparse.ArgumentParser) -> None:
-    """Options that choose the local service."""
+    """Add the option that chooses the local service."""
     parser.add_argument(
         "--home",
         type=Path,
         metavar="DIR",
-        help="folder of database, raw files and reports (default: $LINNA_HOME)",
+        help="folder of the database, raw files and reports (default: $LINNA_HOME)",
     )
 
 
 def add_operator_options(parser: argparse.ArgumentParser) -> None:
-    """Options that choose the local service or a server."""
+    """Add the options that choose the local service or a server."""
     add_service_options(parser)
     parser.add_argument(
-        "--server", metavar="URL", help="work on this server (default: $LINNA_SERVER, else this machine)"
+        "--server", metavar="URL", help="work on this server (default: $LINNA_SERVER, otherwise this machine)"
     )
     parser.add_argument("--token", metavar="T", help="token for the server (default: $LINNA_TOKEN)")
     parser.add_argument(
-        "--as", dest="actor", metavar="NAME", help="who does it, without a server (default: you)"
+        "--as",
+        dest="actor",
+        metavar="NAME",
+        help="actor in the audit log, without a server (default: the login name)",
     )
 
 
-def operations(arguments: argparse.Namespace) -> Any:
-    """The operators' work (`LocalOperations` or `Client`), to be used in a with statement."""
-    server = arguments.server or (None if arguments.home else os.environ.get("LINNA_SERVER"))
-    if server:
-        from ground_service.client import Client
+def ground_client(arguments: argparse.Namespace) -> Client:
+    """Return a client of the server that the options name, otherwise of the service of this machine."""
+    server = server_of(arguments)
+    if server is None:
+        from ground_service.client.local import local_client
 
-        if arguments.home:
-            from linna.errors import UsageError
+        return local_client(open_service(arguments), str(arguments.actor or local_actor()))
+    from ground_service.client import Client
+    from linna.errors import UsageError
 
-            raise UsageError("--home and --server: expected one of them, found both")
-        return Client(server, arguments.token or os.environ.get("LINNA_TOKEN"))
-    from ground_service.operations import LocalOperations
+    if arguments.home:
+        raise UsageError("--home and --server: expected one of them, found both")
+    return Client(server, arguments.token or os.environ.get("LINNA_TOKEN"))
 
-    return LocalOperations(open_service(arguments), str(arguments.actor or local_actor()))
+
+def server_of(arguments: argparse.Namespace) -> str | None:
+    """Return the URL of the server that the options or the environment name; None for this machine."""
+    return arguments.server or (None if arguments.home else os.environ.get("LINNA_SERVER")) or None
 
 
 def local_actor() -> str:
@@ -60,14 +68,14 @@ def local_actor() -> str:
 
 
 def settings_of(arguments: argparse.Namespace, **given: object) -> Settings:
-    """The deployment's settings, with what the command line overrides."""
+    """Return the settings of the deployment, overridden by the command line."""
     from ground_service.settings import load_settings
 
     return load_settings(home=getattr(arguments, "home", None), **given)
 
 
 def open_service(arguments: argparse.Namespace) -> Ground:
-    """The local service, its database brought up to date where that is this program's to do."""
+    """Return the opened service of this machine."""
     from ground_service.worker.follow_up import open_following
     from linna.data import data_folder
 

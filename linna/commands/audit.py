@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from linna.commands._ground import add_operator_options, operations
+from linna.commands._ground import add_operator_options, ground_client
 from linna.output import add_json_flag, emit
-
-LIMIT = 1000
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -35,18 +33,19 @@ def list_entries(arguments: argparse.Namespace) -> int:
         for name in ("actor", "action", "target", "since", "until")
         if getattr(arguments, name) is not None
     }
-    with operations(arguments) as service:
-        page = service.list_audit(limit=min(max(arguments.limit, 1), LIMIT), **chosen)
+    with ground_client(arguments) as service:
+        page = service.list_audit(**chosen).page(arguments.limit)
     lines = [
-        f"{one['number']:>6}  {one['time'][:19]}Z  {one['actor']:<12} {one['action']} {one['target']}"
-        for one in page["items"]
+        f"{one.number:>6}  {str(one.time)[:19]}Z  {one.actor:<12} {one.action} {one.target}"
+        for one in page.items
     ]
-    emit(arguments, {"entries": page["items"], "total": page["total"]}, text="\n".join(lines) or "no entries")
+    entries = [one.model_dump(mode="json") for one in page.items]
+    emit(arguments, {"entries": entries, "total": page.total}, text="\n".join(lines) or "no entries")
     return 0
 
 
 def show_head(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        head = service.audit_head()
-    emit(arguments, head, text=f"{head['number']}:{head['sha256']}")
+    with ground_client(arguments) as service:
+        head = service.get_audit_head()
+    emit(arguments, head.model_dump(mode="json"), text=f"{head.number}:{head.sha256}")
     return 0

@@ -5,10 +5,13 @@ from __future__ import annotations
 import argparse
 import contextlib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from linna.commands._ground import add_operator_options, operations
+from linna.commands._ground import add_operator_options, ground_client
 from linna.output import add_json_flag, emit
+
+if TYPE_CHECKING:
+    from ground_service.commanding.model import Telecommand, UplinkChannel
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -18,29 +21,35 @@ def configure(parser: argparse.ArgumentParser) -> None:
     entering.add_argument("arguments", nargs="*", metavar="FIELD=VALUE")
     entering.add_argument("--spacecraft-id", type=int, required=True, metavar="N")
     entering.add_argument(
-        "--timeout-s", type=int, default=600, help="time in which its end is expected (default: 600)"
+        "--timeout-s",
+        type=int,
+        default=600,
+        help="time limit for its completion report, in seconds (default: 600)",
     )
     entering.set_defaults(handler=enter)
-    listing = actions.add_parser("list", help="telecommands and their state, the newest first")
+    listing = actions.add_parser("list", help="list telecommands and their states, newest first")
     listing.add_argument("--limit", type=int, default=50)
     listing.set_defaults(handler=list_all)
-    showing = actions.add_parser("show", help="one telecommand and the reports about it")
+    showing = actions.add_parser("show", help="show a telecommand and the number of its verification reports")
     showing.set_defaults(handler=show)
     releasing = actions.add_parser("release", help="release a queued telecommand")
     releasing.set_defaults(handler=release)
-    rejecting = actions.add_parser("reject", help="take a queued telecommand out of the queue")
+    rejecting = actions.add_parser("reject", help="remove a queued telecommand from the queue")
     rejecting.add_argument("--reason", required=True)
     rejecting.set_defaults(handler=reject)
     for action in (showing, releasing, rejecting):
         action.add_argument("command_id", type=int, metavar="ID")
-    taking = actions.add_parser("uplink", help="write what is to be sent now; it counts as sent from then on")
+    taking = actions.add_parser(
+        "uplink",
+        help="take the released telecommands and write or send them; they count as sent from then on",
+    )
     taking.add_argument("--spacecraft-id", type=int, required=True, metavar="N")
     taking.add_argument("--format", choices=("cltu", "packets"), default="cltu")
-    taking.add_argument("--out", type=Path, metavar="FILE", help="file to write them to")
-    taking.add_argument("--tcp", metavar="HOST:PORT", help="send them there, too")
+    taking.add_argument("--out", type=Path, metavar="FILE", help="file for the octets")
+    taking.add_argument("--tcp", metavar="HOST:PORT", help="TCP address to send the octets to")
     taking.set_defaults(handler=uplink)
     looking = actions.add_parser(
-        "receiver", help="state of the telecommand receiver, by the newest telemetry"
+        "receiver", help="show the state of the telecommand receiver according to the newest telemetry"
     )
     looking.add_argument("--spacecraft-id", type=int, required=True, metavar="N")
     looking.set_defaults(handler=receiver)
@@ -54,41 +63,39 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def enter(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        view = service.enter_command(
+    with ground_client(arguments) as service:
+        telecommand = service.enter_telecommand(
             arguments.name,
             dict(_argument(text) for text in arguments.arguments),
             spacecraft_id=arguments.spacecraft_id,
             instance=arguments.instance,
             timeout_s=arguments.timeout_s,
         )
-    return _show(arguments, view)
+    return _show(arguments, telecommand)
 
 
 def list_all(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        page = service.list_commands(max(arguments.limit, 1))
-    rows = [_figures(view) for view in page["items"]]
+    with ground_client(arguments) as service:
+        page = service.list_telecommands().page(arguments.limit)
+    rows = [_figures(one) for one in page.items]
     lines = [f"{row['id']:>6}  {row['state']:<10} {row['name']}  {row['requested_by']}" for row in rows]
-    emit(
-        arguments, {"telecommands": rows, "total": page["total"]}, text="\n".join(lines) or "no telecommands"
-    )
+    emit(arguments, {"telecommands": rows, "total": page.total}, text="\n".join(lines) or "no telecommands")
     return 0
 
 
 def show(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        return _show(arguments, service.get_command(arguments.command_id))
+    with ground_client(arguments) as service:
+        return _show(arguments, service.get_telecommand(arguments.command_id))
 
 
 def release(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        return _show(arguments, service.release_command(arguments.command_id))
+    with ground_client(arguments) as service:
+        return _show(arguments, service.release_telecommand(arguments.command_id))
 
 
 def reject(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        return _show(arguments, service.reject_command(arguments.command_id, arguments.reason))
+    with ground_client(arguments) as service:
+        return _show(arguments, service.reject_telecommand(arguments.command_id, arguments.reason))
 
 
 def uplink(arguments: argparse.Namespace) -> int:
@@ -103,32 +110,42 @@ def uplink(arguments: argparse.Namespace) -> int:
         if arguments.out is not None:
             arguments.out.parent.mkdir(parents=True, exist_ok=True)
             file = opened.enter_context(arguments.out.open("wb"))
-        service = opened.enter_context(operations(arguments))
-        stream, ids = service.take_uplink(arguments.spacecraft_id, arguments.instance, arguments.format)
+        service = opened.enter_context(ground_client(arguments))
+        taken = service.take_uplink(
+            arguments.spacecraft_id, instance=arguments.instance, format=arguments.format
+        )
         if file is not None:
-            file.write(stream)
+            file.write(taken.octets)
         if link is not None:
-            link.sendall(stream)
+            link.sendall(taken.octets)
     where = str(arguments.out or arguments.tcp)
-    figures = {"file": where, "octets": len(stream), "telecommands": ids}
-    emit(arguments, figures, text=f"{where}: {len(ids)} telecommands, {len(stream)} octets")
+    figures = {"file": where, "octets": len(taken.octets), "telecommands": list(taken.telecommands)}
+    emit(
+        arguments,
+        figures,
+        text=f"{where}: {len(taken.telecommands)} telecommands, {len(taken.octets)} octets",
+    )
     return 0
 
 
 def receiver(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        state = service.uplink_state(arguments.spacecraft_id, arguments.instance)
-    lines = [_channel_line(channel) for channel in state["channels"]]
-    emit(arguments, state, text="\n".join(lines) or "no telemetry that tells of the telecommand receiver")
+    with ground_client(arguments) as service:
+        state = service.get_uplink_state(arguments.spacecraft_id, instance=arguments.instance)
+    lines = [_channel_line(channel) for channel in state.channels]
+    emit(
+        arguments,
+        state.model_dump(mode="json"),
+        text="\n".join(lines) or "no telemetry with the state of the telecommand receiver",
+    )
     return 0
 
 
-def _channel_line(channel: dict[str, Any]) -> str:
+def _channel_line(channel: UplinkChannel) -> str:
     flags = ("no_rf_available", "no_bit_lock", "lockout", "wait", "retransmit")
-    said = ", ".join(flag.replace("_", " ") for flag in flags if channel[flag]) or "ready"
+    states = ", ".join(flag.replace("_", " ") for flag in flags if getattr(channel, flag)) or "ready"
     return (
-        f"channel {channel['virtual_channel']}: {said}; expects frame {channel['report_value']}, "
-        f"expedited frames {channel['farm_b_counter']} (modulo 4); received {channel['received']}"
+        f"channel {channel.virtual_channel}: {states}; expects frame {channel.report_value}, "
+        f"expedited frames {channel.farm_b_counter} (modulo 4); received {channel.received}"
     )
 
 
@@ -143,18 +160,20 @@ def _connection(address: str) -> Any:
     try:
         return socket.create_connection((host.strip("[]"), int(port)), timeout=10.0)
     except OSError as error:
-        raise UsageError(f"--tcp {address}: expected a receiver of telecommands, found {error}") from None
+        raise UsageError(
+            f"--tcp {address}: expected a TCP server that accepts telecommands, found {error}"
+        ) from None
 
 
-def _show(arguments: argparse.Namespace, view: dict[str, Any]) -> int:
-    figures = _figures(view)
-    emit(arguments, figures, text=f"telecommand {figures['id']} ({figures['name']}): {figures['state']}")
+def _show(arguments: argparse.Namespace, telecommand: Telecommand) -> int:
+    text = f"telecommand {telecommand.id} ({telecommand.name}): {telecommand.state}"
+    emit(arguments, _figures(telecommand), text=text)
     return 0
 
 
-def _figures(view: dict[str, Any]) -> dict[str, Any]:
-    kept = ("id", "name", "arguments", "state", "critical", "timed_out", "requested_by", "decided_by")
-    return {**{name: view[name] for name in kept}, "reports": len(view["reports"])}
+def _figures(telecommand: Telecommand) -> dict[str, Any]:
+    kept = {"id", "name", "arguments", "state", "critical", "timed_out", "requested_by", "decided_by"}
+    return {**telecommand.model_dump(mode="json", include=kept), "reports": len(telecommand.reports)}
 
 
 def _argument(text: str) -> tuple[str, object]:

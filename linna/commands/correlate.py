@@ -1,32 +1,36 @@
-"""`linna correlate`: how a spacecraft's clock runs: segments, what the time reports leave of them, fitting again."""
+"""`linna correlate list | residuals | run | receptions`: time correlation of a spacecraft."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from linna.commands._ground import add_operator_options, operations
+from linna.commands._ground import add_operator_options, ground_client
 from linna.output import add_json_flag, emit
 
+if TYPE_CHECKING:
+    from ground_service.timekeeping.model import Correlation
+
 BLOCK = 10_000
-"""Receptions told to a server at a time."""
+"""Number of receptions in one request."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(metavar="ACTION", required=True)
-    listing = actions.add_parser("list", help="the segments in force, one for each run of the clock")
-    listing.add_argument("--all", action="store_true", help="also those that were in force before")
+    listing = actions.add_parser("list", help="list the segments in force, one for each run of the clock")
+    listing.add_argument("--all", action="store_true", help="also segments that are no longer in force")
     listing.set_defaults(handler=list_segments)
-    reports = actions.add_parser("residuals", help="every received time report and what the fit leaves of it")
+    reports = actions.add_parser("residuals", help="list the received time reports and their residuals")
     reports.set_defaults(handler=residuals)
     running = actions.add_parser(
-        "run", help="fit again from the received time reports, over what was entered by hand"
+        "run",
+        help="fit the segments again from the received time reports; this replaces segments entered by hand",
     )
     running.set_defaults(handler=run)
-    receiving = actions.add_parser("receptions", help="tell when time reports were received (CSV)")
+    receiving = actions.add_parser("receptions", help="enter reception times of time reports (CSV)")
     receiving.add_argument(
-        "file", type=Path, help="columns packet_ticks, sequence_count, received_utc, and maybe station"
+        "file", type=Path, help="columns packet_ticks, sequence_count, received_utc; optional: station"
     )
     receiving.set_defaults(handler=receptions)
     for action in (listing, reports, running, receiving):
@@ -37,16 +41,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def list_segments(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        rows = service.correlations(arguments.spacecraft_id, arguments.instance)["items"]
+    with ground_client(arguments) as service:
+        rows = list(service.list_correlations(arguments.spacecraft_id, instance=arguments.instance))
     if not arguments.all:
-        rows = sorted((row for row in rows if row["in_force"]), key=lambda row: int(row["start_ticks"]))
+        rows = sorted((row for row in rows if row.in_force), key=lambda row: row.start_ticks)
     return _show(arguments, rows)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        rows = service.correlate_again(arguments.spacecraft_id, arguments.instance)["items"]
+    with ground_client(arguments) as service:
+        rows = service.run_correlation(arguments.spacecraft_id, instance=arguments.instance)
     return _show(arguments, rows)
 
 
@@ -63,38 +67,40 @@ def receptions(arguments: argparse.Namespace) -> int:
         }
         for one in read_receptions(arguments.file)
     ]
-    rows: list[dict[str, Any]] = []
-    with operations(arguments) as service:
+    rows: list[Correlation] = []
+    with ground_client(arguments) as service:
         for start in range(0, len(given), BLOCK):
             block = given[start : start + BLOCK]
-            rows = service.enter_receptions(arguments.spacecraft_id, arguments.instance, block)["items"]
+            rows = service.add_receptions(arguments.spacecraft_id, block, instance=arguments.instance)
     return _show(arguments, rows)
 
 
 def residuals(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        rows = service.time_reports(arguments.spacecraft_id, arguments.instance)["items"]
+    with ground_client(arguments) as service:
+        rows = list(service.list_time_reports(arguments.spacecraft_id, instance=arguments.instance))
     lines = [
-        f"{row['received']}  boot {row['boot_count']}  light time {row['light_time_s']:.6f} s  "
-        f"correlation {row['correlation_id']}  left {row['residual_ns'] * 1e-3:+.1f} us"
-        for row in rows
-    ]
-    emit(
-        arguments, {"time_reports": rows}, text="\n".join(lines) or "no time reports whose reception is known"
-    )
-    return 0
-
-
-def _show(arguments: argparse.Namespace, rows: list[dict[str, Any]]) -> int:
-    lines = [
-        f"{row['id']:>5}  boot {row['boot_count']}  from {row['reference']}  drift {row['drift_ppb']:+.1f} ppb  "
-        f"{row['points']} reports ({row['rejected']} left out)  rms {(row['residual_rms_ns'] or 0.0) * 1e-3:.1f} us"
-        f"{'' if row['in_force'] else '  not in force'}"
+        f"{row.received}  boot {row.boot_count}  light time {row.light_time_s:.6f} s  "
+        f"correlation {row.correlation_id}  residual {row.residual_ns * 1e-3:+.1f} us"
         for row in rows
     ]
     emit(
         arguments,
-        {"correlations": rows},
-        text="\n".join(lines) or "no time correlation: the clock is taken as ideal",
+        {"time_reports": [row.model_dump(mode="json") for row in rows]},
+        text="\n".join(lines) or "no time reports with a known reception time",
+    )
+    return 0
+
+
+def _show(arguments: argparse.Namespace, rows: list[Correlation]) -> int:
+    lines = [
+        f"{row.id:>5}  boot {row.boot_count}  from {row.reference}  drift {row.drift_ppb:+.1f} ppb  "
+        f"{row.points} reports ({row.rejected} rejected)  rms {(row.residual_rms_ns or 0.0) * 1e-3:.1f} us"
+        f"{'' if row.in_force else '  not in force'}"
+        for row in rows
+    ]
+    emit(
+        arguments,
+        {"correlations": [row.model_dump(mode="json") for row in rows]},
+        text="\n".join(lines) or "no time correlation: the on-board clock is assumed to be ideal",
     )
     return 0

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from linna.commands._ground import local_actor
 from linna.commands.pass_ import requirement_lines
 from linna.output import add_json_flag, emit, log, progress
 
@@ -26,9 +27,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from ground_service.evaluation.service import make_report
-    from ground_service.passes.archive_import import import_archive
-    from ground_service.worker.follow_up import open_following
+    from ground_service.client.local import local_client
+    from ground_service.ground import open_ground
     from linna.data import data_folder
     from payload_emulator.session.emulator import emulate
     from payload_emulator.session.scenario import load_scenario
@@ -46,15 +46,17 @@ def run(arguments: argparse.Namespace) -> int:
         progress=lambda frames, total: progress(frames, total, "frames", "frame"),
     )
     log("ingesting the downlink, aligning, reporting ...")
-    with open_following(arguments.out / "ground", data) as ground:
-        pass_id = import_archive(ground, archive)
-        made = make_report(ground, pass_id)
+    home = arguments.out / "ground"
+    with local_client(open_ground(home, data), local_actor()) as service:
+        pass_id = service.import_archive(archive)
+        report_id = service.make_report(pass_id)
+        summary = service.get_report_summary(report_id)
     figures = {
-        "report": str(made.html),
+        "report": str(home.absolute() / "reports" / f"pass-{pass_id}" / "report.html"),
         "archive": str(archive),
         "pass_id": pass_id,
         "frames": emulated["frames"],
-        **made.summary,
+        **summary,
         "wall_s": round(time.monotonic() - started, 2),
         "data": emulated["data"],
     }

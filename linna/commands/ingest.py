@@ -1,4 +1,4 @@
-"""`linna ingest`: downlink files and pass archives into the ground database, or telemetry as it comes."""
+"""`linna ingest`: ingest of downlink files, pass archives and live telemetry."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from linna.commands._ground import add_operator_options, operations, settings_of
+from linna.commands._ground import add_operator_options, ground_client, settings_of
 from linna.output import add_json_flag, emit, log
 
 
@@ -14,24 +14,28 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "files", nargs="*", type=Path, metavar="FILE", help="downlink file or pass archive folder"
     )
-    parser.add_argument("--tcp", metavar="HOST:PORT", help="take telemetry from this sender until it closes")
-    parser.add_argument("--watch", type=Path, metavar="DIR", help="ingest files as they appear in a folder")
+    parser.add_argument(
+        "--tcp",
+        metavar="HOST:PORT",
+        help="receive telemetry from this TCP server until it closes the connection",
+    )
+    parser.add_argument("--watch", type=Path, metavar="DIR", help="ingest the files that appear in a folder")
     parser.add_argument(
         "--follow",
         action="store_true",
-        help="with --tcp connect again, with --watch go on looking, until Ctrl-C",
+        help="until Ctrl-C: with --tcp, connect again; with --watch, continue to watch",
     )
     parser.add_argument(
         "--spacecraft-id",
         type=int,
         metavar="N",
-        help="whose the files are; needed for bare packets, 0 to 1023",
+        help="spacecraft of the files, 0 to 1023; required for packets without frames",
     )
     parser.add_argument("--instance", default="flight", help="instance of the spacecraft (default: flight)")
     parser.add_argument(
         "--stream",
         metavar="NAME",
-        help="stream of which the files are consecutive pieces (default: joined by order and content)",
+        help="name of the stream of which the files are consecutive pieces (default: joined by order and content)",
     )
     parser.add_argument(
         "--offset", type=int, metavar="N", help="offset of the first file in --stream, octets (default: 0)"
@@ -42,7 +46,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from ground_service.errors import InvalidInput
+    from ground_service.client.problems import InvalidRequest, JobFailed, Unavailable, Unreachable
+    from ground_service.errors import InvalidInput, StoreError
     from linna.errors import UsageError
 
     if arguments.spacecraft_id is not None and not 0 <= arguments.spacecraft_id <= 1023:
@@ -57,12 +62,12 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("--stream: expected the files of the stream, found none")
     done: list[dict[str, Any]] = []
     offset = arguments.offset or 0
-    with operations(arguments) as service:
+    with ground_client(arguments) as service:
 
         def ingest(path: Path) -> dict[str, Any]:
             if path.is_dir():
                 return {"file": str(path), "pass_id": service.import_archive(path)}
-            result = service.ingest_file(
+            made = service.ingest_file(
                 path,
                 spacecraft_id=arguments.spacecraft_id,
                 instance=arguments.instance,
@@ -70,10 +75,20 @@ def run(arguments: argparse.Namespace) -> int:
                 offset=offset,
             )
             kept = (
-                "ingest_id", "packets", "packets_new", "crc_errors", "octets_skipped", "octets_pending",
-                "frames_bad", "symbols_corrected",
+                "packets", "packets_new", "crc_errors", "octets_skipped", "octets_pending", "frames_bad",
+                "symbols_corrected",
             )  # fmt: skip
-            return {"file": str(path), **{name: result[name] for name in kept}}
+            figures = {name: made.accounting[name] for name in kept}
+            return {"file": str(path), "ingest_id": made.id, **figures}
+
+        def ingest_live(path: Path) -> dict[str, Any]:
+            try:
+                return ingest(path)
+            except (
+                Unreachable,
+                Unavailable,
+            ) as error:  # not a fault of the data, which remain to be ingested
+                raise StoreError(str(error)) from None
 
         def report(path: Path, result: Any) -> None:
             one = result if isinstance(result, dict) else {"file": str(path), "error": str(result)}
@@ -81,15 +96,15 @@ def run(arguments: argparse.Namespace) -> int:
             log(_line(one))
 
         if arguments.tcp is not None:
-            _follow(arguments, ingest, report)
+            _follow(arguments, ingest_live, report)
         elif arguments.watch is not None:
-            _watch(arguments, ingest, report)
+            _watch(arguments, ingest_live, report)
         else:
             for path in arguments.files:
                 log(f"ingesting {path} ...")
                 try:
                     done.append(ingest(path))
-                except InvalidInput as error:
+                except (InvalidInput, InvalidRequest, JobFailed) as error:
                     if len(arguments.files) == 1:
                         raise
                     log(str(error))

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from linna.commands._ground import add_operator_options, operations
+from linna.commands._ground import add_operator_options, ground_client
 from linna.output import add_json_flag, emit
 
 
@@ -68,27 +68,27 @@ def check(arguments: argparse.Namespace) -> int:
 
 
 def add(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        figures = service.add_mission(arguments.file)
+    with ground_client(arguments) as service:
+        figures = service.add_mission(arguments.file).model_dump(mode="json")
     emit(arguments, figures, text=_described(figures))
     return 0
 
 
 def list_missions(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        page = service.list_missions(max(arguments.limit, 1))
+    with ground_client(arguments) as service:
+        page = service.list_missions().page(arguments.limit)
     lines = [
-        f"{one['revision'][:16]}  {one['entered'][:19]}Z  {one['mission']}  ({len(one['unknown'])} not stated)"
-        for one in page["items"]
+        f"{one.revision[:16]}  {str(one.entered)[:19]}Z  {one.mission}  ({len(one.unknown)} not stated)"
+        for one in page.items
     ]
-    figures = {"missions": page["items"], "total": page["total"]}
+    figures = {"missions": [one.model_dump(mode="json") for one in page.items], "total": page.total}
     emit(arguments, figures, text="\n".join(lines) or "no mission descriptions")
     return 0
 
 
 def show(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        figures = service.get_mission(arguments.revision)
+    with ground_client(arguments) as service:
+        figures = service.get_mission(arguments.revision).model_dump(mode="json")
     emit(arguments, figures, text=f"{_described(figures)}\n\n{figures['text'].rstrip()}")
     return 0
 

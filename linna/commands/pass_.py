@@ -1,20 +1,20 @@
-"""`linna pass list | show`: passes of the ground database."""
+"""`linna pass list | show`: passes and their metrics."""
 
 from __future__ import annotations
 
 import argparse
 from typing import Any
 
-from linna.commands._ground import add_operator_options, operations
+from linna.commands._ground import add_operator_options, ground_client
 from linna.output import add_json_flag, emit
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(metavar="ACTION", required=True)
-    listing = actions.add_parser("list", help="all passes, the newest first")
-    listing.add_argument("--limit", type=int, default=50, help="how many (default: 50)")
+    listing = actions.add_parser("list", help="list passes, newest first")
+    listing.add_argument("--limit", type=int, default=50, help="largest number of passes (default: 50)")
     listing.set_defaults(handler=list_passes)
-    showing = actions.add_parser("show", help="the figures of one pass")
+    showing = actions.add_parser("show", help="evaluate a pass and show its metrics")
     showing.add_argument("pass_id", type=int, metavar="ID")
     showing.set_defaults(handler=show_pass)
     for action in (listing, showing):
@@ -23,36 +23,36 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def list_passes(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        page = service.list_passes(max(arguments.limit, 1))
+    with ground_client(arguments) as service:
+        page = service.list_passes().page(arguments.limit)
     rows = [
         {
-            "pass_id": item["id"],
-            "name": item["name"],
-            "start": _milliseconds(item["start"]),
-            "stop": _milliseconds(item["stop"]),
+            "pass_id": item.id,
+            "name": item.name,
+            "start": _milliseconds(item.start),
+            "stop": _milliseconds(item.stop),
         }
-        for item in page["items"]
+        for item in page.items
     ]
     lines = [f"{row['pass_id']:>6}  {row['start']}  {row['stop']}  {row['name']}" for row in rows]
-    emit(arguments, {"passes": rows, "total": page["total"]}, text="\n".join(lines) or "no passes")
+    emit(arguments, {"passes": rows, "total": page.total}, text="\n".join(lines) or "no passes")
     return 0
 
 
 def show_pass(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        figures = service.pass_summary(arguments.pass_id)
+    with ground_client(arguments) as service:
+        figures = service.evaluate_pass(arguments.pass_id)
     emit(arguments, figures, text=describe(figures))
     return 0
 
 
-def _milliseconds(time: str) -> str:
-    """A time with nanoseconds, cut to milliseconds."""
-    return f"{time[:23]}Z"
+def _milliseconds(time: object) -> str:
+    """Return the text of a time with milliseconds."""
+    return f"{str(time)[:23]}Z"
 
 
 def describe(figures: dict[str, Any]) -> str:
-    """The figures of a pass as lines of text."""
+    """Return the metrics of a pass as lines of text."""
     lines = [
         f"pass {figures['pass_id']}: {figures['frames']} frames, {figures['packets']} packets, "
         f"{figures['packets_lost']} lost",

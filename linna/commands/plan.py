@@ -1,14 +1,17 @@
-"""`linna plan`: planned observation windows, from the search over an ephemeris to their uplink."""
+"""`linna plan`: search, planning, approval, uplink and exchange of observation windows."""
 
 from __future__ import annotations
 
 import argparse
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from linna.commands._ground import add_operator_options, operations
+from linna.commands._ground import add_operator_options, ground_client
 from linna.output import add_json_flag, emit
+
+if TYPE_CHECKING:
+    from ground_service.planning.model import Window
 
 RANGE = ("MIN", "MAX")
 
@@ -20,7 +23,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     ephemeris.add_argument("--name")
     ephemeris.add_argument("--precedence", type=int, default=0)
     ephemeris.set_defaults(handler=add_ephemeris)
-    searching = actions.add_parser("search", help="candidate windows over a reference ephemeris")
+    searching = actions.add_parser("search", help="search candidate windows over a reference ephemeris")
     _search_options(searching)
     searching.set_defaults(handler=search)
     adding = actions.add_parser("add", help="enter a window as a draft")
@@ -30,18 +33,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
     adding.add_argument("--instance", default="flight")
     adding.add_argument("--name", default="observation")
     adding.add_argument("--cadence-s", type=float, default=15.0)
-    adding.add_argument("--after", type=int, metavar="ID", help="window that has to come before")
+    adding.add_argument("--after", type=int, metavar="ID", help="window that must precede this one")
     adding.set_defaults(handler=add)
-    listing = actions.add_parser("list", help="planned windows, the newest first")
+    listing = actions.add_parser("list", help="list planned windows, newest first")
     listing.add_argument("--limit", type=int, default=100)
     listing.set_defaults(handler=list_all)
     parsers = [ephemeris, searching, adding, listing]
     for name, handler, text in (
-        ("show", show, "one window"),
+        ("show", show, "show a window"),
         ("approve", decide, "approve a draft"),
-        ("draft", decide, "make a window a draft again"),
-        ("fail", decide, "declare a window failed"),
-        ("delete", delete, "take a window off the plan"),
+        ("draft", decide, "return a window to the state draft"),
+        ("fail", decide, "mark a window as failed"),
+        ("delete", delete, "remove a window from the plan"),
         ("uplink", uplink, "release the time-tagged telecommands of a window"),
     ):
         one = actions.add_parser(name, help=text)
@@ -62,32 +65,44 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _search_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--start", metavar="UTC", help="default: where the ephemeris begins")
-    parser.add_argument("--stop", metavar="UTC", help="default: where the ephemeris ends")
+    parser.add_argument("--start", metavar="UTC", help="default: start of the ephemeris")
+    parser.add_argument("--stop", metavar="UTC", help="default: end of the ephemeris")
     parser.add_argument("--ephemeris-id", type=int, metavar="ID")
     parser.add_argument(
-        "--spacecraft-id", type=int, metavar="N", help="count with what it has to store already"
+        "--spacecraft-id",
+        type=int,
+        metavar="N",
+        help="consider the data that this spacecraft has already stored",
     )
     for name, unit in (("altitude", "km"), ("sun-elevation", "deg"), ("latitude", "deg")):
         parser.add_argument(f"--{name}-{unit}", type=float, nargs=2, metavar=RANGE)
-    parser.add_argument("--craters-per-frame", type=float, metavar="N", help="catalogued craters at least")
-    parser.add_argument("--catalogue-pass-id", type=int, metavar="ID", help="crater catalogue of this pass")
+    parser.add_argument(
+        "--craters-per-frame", type=float, metavar="N", help="minimum number of catalogued craters in a frame"
+    )
+    parser.add_argument(
+        "--catalogue-pass-id", type=int, metavar="ID", help="use the crater catalogue of this pass"
+    )
     parser.add_argument("--terrain", choices=("mare", "highland"))
-    parser.add_argument("--sunlit", action="store_true", help="the spacecraft in full sunlight")
+    parser.add_argument(
+        "--sunlit", action="store_true", help="require that the spacecraft is in full sunlight"
+    )
     parser.add_argument("--minimum-duration-s", type=float, metavar="S")
     parser.add_argument("--maximum-duration-s", type=float, metavar="S")
     parser.add_argument("--minimum-battery", type=float, metavar="SHARE")
     parser.add_argument(
-        "--needs-contact", action="store_true", help="its data have to be down within the span"
+        "--needs-contact",
+        action="store_true",
+        help="require that the data are downlinked within the time span",
     )
     parser.add_argument("--cadence-s", type=float, metavar="S")
     parser.add_argument("--step-s", type=float, metavar="S")
 
 
 def add_ephemeris(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        made = service.add_ephemeris(arguments.file, arguments.name, arguments.precedence)
-    emit(arguments, made, text=f"ephemeris {made['id']} ({made['name']}): {made['start']} to {made['stop']}")
+    with ground_client(arguments) as service:
+        made = service.add_ephemeris(arguments.file, name=arguments.name, precedence=arguments.precedence)
+    text = f"ephemeris {made.id} ({made.name}): {made.start} to {made.stop}"
+    emit(arguments, made.model_dump(mode="json"), text=text)
     return 0
 
 
@@ -102,16 +117,16 @@ def search(arguments: argparse.Namespace) -> int:
         request[name] = None if limits is None else {"min": limits[0], "max": limits[1]}
     request = {name: value for name, value in request.items() if value is not None}
     request |= {"sunlit": arguments.sunlit, "needs_contact": arguments.needs_contact}
-    with operations(arguments) as service:
+    with ground_client(arguments) as service:
         found = service.search_windows(request)
     lines = [
-        f"{one['start'][:19]}Z  {one['stop'][:19]}Z  {one['frames']:>4} frames  "
-        f"{one['altitude_km']['min']:.1f} to {one['altitude_km']['max']:.1f} km  "
-        f"Sun {one['sun_elevation_deg']['min']:.0f} to {one['sun_elevation_deg']['max']:.0f} deg"
-        for one in found["candidates"]
+        f"{str(one.start)[:19]}Z  {str(one.stop)[:19]}Z  {one.frames:>4} frames  "
+        f"{one.altitude_km.min:.1f} to {one.altitude_km.max:.1f} km  "
+        f"Sun {one.sun_elevation_deg.min:.0f} to {one.sun_elevation_deg.max:.0f} deg"
+        for one in found.candidates
     ]
-    lines.append(f"{len(found['candidates'])} candidates; data: {'; '.join(found['data'])}")
-    emit(arguments, found, text="\n".join(lines))
+    lines.append(f"{len(found.candidates)} candidates; data: {'; '.join(found.data)}")
+    emit(arguments, found.model_dump(mode="json"), text="\n".join(lines))
     return 0
 
 
@@ -125,21 +140,22 @@ def add(arguments: argparse.Namespace) -> int:
         "instance": arguments.instance,
         "predecessor_id": arguments.after,
     }
-    with operations(arguments) as service:
+    with ground_client(arguments) as service:
         window = service.add_window(request)
     return _show(arguments, window)
 
 
 def list_all(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        page = service.list_windows(max(arguments.limit, 1))
-    text = "\n".join(_line(window) for window in page["items"]) or "no windows"
-    emit(arguments, {"windows": page["items"], "total": page["total"]}, text=text)
+    with ground_client(arguments) as service:
+        page = service.list_windows().page(arguments.limit)
+    text = "\n".join(_line(window) for window in page.items) or "no windows"
+    windows = [window.model_dump(mode="json") for window in page.items]
+    emit(arguments, {"windows": windows, "total": page.total}, text=text)
     return 0
 
 
 def show(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
+    with ground_client(arguments) as service:
         return _show(arguments, service.get_window(arguments.window_id))
 
 
@@ -148,28 +164,29 @@ def decide(arguments: argparse.Namespace) -> int:
     request = {"state": state}
     if arguments.action == "fail":
         request["reason"] = arguments.reason
-    with operations(arguments) as service:
+    with ground_client(arguments) as service:
         return _show(arguments, service.change_window(arguments.window_id, request))
 
 
 def delete(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
+    with ground_client(arguments) as service:
         service.delete_window(arguments.window_id)
     emit(arguments, {"deleted": arguments.window_id}, text=f"window {arguments.window_id}: deleted")
     return 0
 
 
 def uplink(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        commands = service.uplink_window(arguments.window_id)["items"]
-    lines = [f"telecommand {one['id']} ({one['name']}): {one['state']}" for one in commands]
-    emit(arguments, {"window_id": arguments.window_id, "telecommands": commands}, text="\n".join(lines))
+    with ground_client(arguments) as service:
+        released = service.uplink_window(arguments.window_id)
+    lines = [f"telecommand {one.id} ({one.name}): {one.state}" for one in released]
+    telecommands = [one.model_dump(mode="json") for one in released]
+    emit(arguments, {"window_id": arguments.window_id, "telecommands": telecommands}, text="\n".join(lines))
     return 0
 
 
 def export(arguments: argparse.Namespace) -> int:
-    with operations(arguments) as service:
-        plan = service.export_plan()
+    with ground_client(arguments) as service:
+        plan = service.export_plan().model_dump(mode="json")
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     arguments.out.write_text(json.dumps(plan, indent=2) + "\n", encoding="utf-8")
     figures = {"file": str(arguments.out), "windows": len(plan["windows"])}
@@ -183,25 +200,24 @@ def import_file(arguments: argparse.Namespace) -> int:
     try:
         plan = json.loads(arguments.file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError):
-        raise UsageError(f"{arguments.file}: expected a plan as JSON, found something else") from None
+        raise UsageError(f"{arguments.file}: expected a plan as JSON, found other text") from None
     if not isinstance(plan, dict):
         raise UsageError(f"{arguments.file}: expected a plan as a JSON object, found {type(plan).__name__}")
-    with operations(arguments) as service:
+    with ground_client(arguments) as service:
         made = service.import_plan(plan)
-    emit(
-        arguments, made, text="\n".join(f"{key}: window {number}" for key, number in made["windows"].items())
-    )
+    lines = [f"{key}: window {number}" for key, number in made.windows.items()]
+    emit(arguments, made.model_dump(mode="json"), text="\n".join(lines))
     return 0
 
 
-def _show(arguments: argparse.Namespace, window: dict[str, Any]) -> int:
-    emit(arguments, window, text=_line(window))
+def _show(arguments: argparse.Namespace, window: Window) -> int:
+    emit(arguments, window.model_dump(mode="json"), text=_line(window))
     return 0
 
 
-def _line(window: dict[str, Any]) -> str:
-    reason = f" ({window['reason']})" if window["reason"] else ""
+def _line(window: Window) -> str:
+    reason = f" ({window.reason})" if window.reason else ""
     return (
-        f"{window['id']:>4}  {window['start'][:19]}Z  {window['stop'][:19]}Z  {window['state']}{reason}  "
-        f"{window['name']}"
+        f"{window.id:>4}  {str(window.start)[:19]}Z  {str(window.stop)[:19]}Z  {window.state}{reason}  "
+        f"{window.name}"
     )

@@ -1,11 +1,12 @@
-"""`linna report PASS`: the report of a pass as HTML, PDF and JSON."""
+"""`linna report PASS`: report of a pass as HTML, PDF and JSON."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
-from linna.commands._ground import add_operator_options, operations
+from linna.commands._ground import add_operator_options, ground_client, server_of, settings_of
 from linna.commands.pass_ import requirement_lines
 from linna.output import add_json_flag, emit, log
 
@@ -13,7 +14,10 @@ from linna.output import add_json_flag, emit, log
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("pass_id", type=int, metavar="PASS", help="number of the pass (see linna pass list)")
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for the documents (default: under the service's home)"
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="folder for the documents (default: reports/pass-N in the home folder; with a server: pass-N)",
     )
     add_operator_options(parser)
     add_json_flag(parser)
@@ -21,9 +25,28 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    folder = arguments.out or _default_folder(arguments)
     log("evaluating the pass ...")
-    with operations(arguments) as service:
-        figures = service.make_report(arguments.pass_id, arguments.out)
+    with ground_client(arguments) as service:
+        report_id = service.make_report(arguments.pass_id)
+        for kind in ("html", "json", "pdf"):
+            service.get_report(report_id, folder / f"report.{kind}", kind=kind)
+        summary = service.get_report_summary(report_id)
+    figures: dict[str, Any] = {
+        "report": str(folder / "report.html"),
+        "report_json": str(folder / "report.json"),
+        "report_pdf": str(folder / "report.pdf"),
+        "report_id": report_id,
+        **summary,
+    }
     lines = [figures["report"], figures["verdict"], *requirement_lines(figures.get("requirements") or [])]
     emit(arguments, figures, text="\n".join(lines))
     return 0
+
+
+def _default_folder(arguments: argparse.Namespace) -> Path:
+    name = f"pass-{arguments.pass_id}"
+    if server_of(arguments) is not None:
+        return Path(name)
+    home: Path = settings_of(arguments).home.expanduser().absolute()
+    return home / "reports" / name

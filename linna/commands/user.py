@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import argparse
 
-from linna.commands._ground import add_service_options, local_actor, open_service
+from linna.commands._ground import (
+    add_operator_options,
+    add_service_options,
+    ground_client,
+    local_actor,
+    open_service,
+)
 from linna.output import add_json_flag, emit
 
 ROLES = ("viewer", "operator", "admin")
@@ -47,39 +53,24 @@ def configure(parser: argparse.ArgumentParser) -> None:
     revoking = actions.add_parser("revoke", help="revoke one token")
     revoking.add_argument("token_id", type=int, metavar="ID", help="number shown by 'linna user tokens'")
     revoking.set_defaults(handler=revoke)
-    for action in (
-        adding,
-        renewing,
-        ensuring,
-        disabling,
-        enabling,
-        ranking,
-        listing,
-        showing,
-        revoking,
-    ):
-        add_service_options(action)
+    add_service_options(ensuring)
+    add_json_flag(ensuring)
+    for action in (adding, renewing, disabling, enabling, ranking, listing, showing, revoking):
+        add_operator_options(action)
         add_json_flag(action)
 
 
 def add(arguments: argparse.Namespace) -> int:
-    from ground_service.access.service import add_user
-
-    with open_service(arguments) as ground:
-        token = add_user(
-            ground, arguments.name, arguments.role, days_valid=arguments.days, actor=local_actor()
-        )
-    emit(arguments, {"name": arguments.name, "role": arguments.role, "token": token}, text=token)
+    with ground_client(arguments) as service:
+        made = service.add_user(arguments.name, arguments.role, days_valid=arguments.days)
+    emit(arguments, {"name": arguments.name, "role": arguments.role, "token": made.token}, text=made.token)
     return 0
 
 
 def renew(arguments: argparse.Namespace) -> int:
-    from ground_service.access.service import add_token, renew_token
-
-    make = add_token if arguments.keep else renew_token
-    with open_service(arguments) as ground:
-        token = make(ground, arguments.name, days_valid=arguments.days, actor=local_actor())
-    emit(arguments, {"name": arguments.name, "token": token}, text=token)
+    with ground_client(arguments) as service:
+        made = service.add_token(arguments.name, days_valid=arguments.days, revoke_others=not arguments.keep)
+    emit(arguments, {"name": arguments.name, "token": made.token}, text=made.token)
     return 0
 
 
@@ -100,52 +91,43 @@ def ensure(arguments: argparse.Namespace) -> int:
 
 
 def change(arguments: argparse.Namespace) -> int:
-    from ground_service.access.service import change_user
-
-    with open_service(arguments) as ground:
-        user = change_user(
-            ground, arguments.name, state=arguments.state, role=arguments.role, actor=local_actor()
-        )
-    emit(arguments, user.model_dump(), text=f"{user.name}: {user.role}, {user.state}")
+    with ground_client(arguments) as service:
+        user = service.change_user(arguments.name, state=arguments.state, role=arguments.role)
+    emit(arguments, user.model_dump(mode="json"), text=f"{user.name}: {user.role}, {user.state}")
     return 0
 
 
 def list_all(arguments: argparse.Namespace) -> int:
-    from ground_service.access.service import list_users
-
-    with open_service(arguments) as ground:
-        users = list_users(ground)
+    with ground_client(arguments) as service:
+        users = list(service.list_users())
     emit(
         arguments,
-        {"users": [user.model_dump() for user in users]},
+        {"users": [user.model_dump(mode="json") for user in users]},
         text="\n".join(f"{user.role:<9} {user.state:<9} {user.name}" for user in users) or "no users",
     )
     return 0
 
 
 def list_tokens(arguments: argparse.Namespace) -> int:
-    from ground_service.access.service import list_tokens as read_tokens
-
-    with open_service(arguments) as ground:
-        tokens = read_tokens(ground, arguments.name)
+    with ground_client(arguments) as service:
+        tokens = list(service.list_tokens(user=arguments.name))
     lines = [
-        f"{one.id:>5}  {one.user:<12} {one.hint:<12}  {one.state:<8} created {one.created[:19]}Z  "
-        f"expires {one.expires[:19] + 'Z' if one.expires else 'never':<20}  "
-        f"used {one.used[:13] + 'h' if one.used else 'never'}"
+        f"{one.id:>5}  {one.user:<12} {one.hint:<12}  {one.state:<8} created {str(one.created)[:19]}Z  "
+        f"expires {str(one.expires)[:19] + 'Z' if one.expires else 'never':<20}  "
+        f"used {str(one.used)[:13] + 'h' if one.used else 'never'}"
         for one in tokens
     ]
     emit(
         arguments,
-        {"tokens": [one.model_dump() for one in tokens]},
+        {"tokens": [one.model_dump(mode="json") for one in tokens]},
         text="\n".join(lines) or "no tokens",
     )
     return 0
 
 
 def revoke(arguments: argparse.Namespace) -> int:
-    from ground_service.access.service import revoke_token
-
-    with open_service(arguments) as ground:
-        token = revoke_token(ground, arguments.token_id, actor=local_actor())
-    emit(arguments, token.model_dump(), text=f"{token.id}: revoked")
+    with ground_client(arguments) as service:
+        service.revoke_token(arguments.token_id)
+        token = next(one for one in service.list_tokens() if one.id == arguments.token_id)
+    emit(arguments, token.model_dump(mode="json"), text=f"{token.id}: revoked")
     return 0

@@ -1,18 +1,45 @@
-"""Client of the HTTP interface with a busy server: repeated requests, their duration, and their limits."""
+"""Client of the ground service: retries, problem details, paging, streams and coverage of the API."""
 
+import inspect
 import json
+import re
 import threading
-from collections.abc import Iterator
+import tracemalloc
+from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
-from ground_service import client as client_module
-from ground_service.client import BUSY_S, Client, ServiceProblem
+from ground_service.app import create_app
+from ground_service.client import Client, ServiceProblem, connection
+from ground_service.client.connection import ATTEMPTS, BUSY_S
+from ground_service.client.problems import (
+    Conflict,
+    InvalidRequest,
+    JobFailed,
+    NotAuthenticated,
+    NotFound,
+    NotPermitted,
+    Unavailable,
+    Unreachable,
+)
+from ground_service.settings import Settings
 
-EPHEMERIS = {"id": 1}
+EPHEMERIS = {
+    "id": 1,
+    "name": "reference.oem",
+    "object_name": "SELENITA",
+    "frame": "ICRF",
+    "start": "2029-08-07T00:00:00.000000Z",
+    "stop": "2029-08-07T01:00:00.000000Z",
+    "states": 241,
+    "precedence": 0,
+    "sha256": "0" * 64,
+}
+MIB = 1 << 20
 
 
 class Clock:
@@ -36,19 +63,35 @@ class Service:
     def __init__(self) -> None:
         self.answers: list[tuple[int, dict[str, str]]] = []
         self.bodies: list[bytes] = []
+        self.octets_received = 0
         service = self
 
         class Handler(BaseHTTPRequestHandler):
             def do_POST(self) -> None:
-                service.bodies.append(self.rfile.read(int(self.headers.get("Content-Length", "0"))))
+                octets = int(self.headers.get("Content-Length", "0"))
+                if octets > MIB:
+                    while service.octets_received < octets:
+                        service.octets_received += len(self.rfile.read(min(MIB, octets)))
+                else:
+                    service.bodies.append(self.rfile.read(octets))
                 status, headers = service.answers[min(len(service.bodies), len(service.answers)) - 1]
-                body = json.dumps(EPHEMERIS if status < 300 else {"detail": "busy now"}).encode()
+                self._answer(
+                    status, headers, json.dumps(EPHEMERIS if status < 300 else {"detail": "busy now"})
+                )
+
+            def do_GET(self) -> None:
+                self.send_response(200)
+                self.end_headers()
+                for _ in range(64):
+                    self.wfile.write(b"\0" * MIB)
+
+            def _answer(self, status: int, headers: dict[str, str], text: str) -> None:
                 self.send_response(status)
                 for name, value in headers.items():
                     self.send_header(name, value)
-                self.send_header("Content-Length", str(len(body)))
+                self.send_header("Content-Length", str(len(text)))
                 self.end_headers()
-                self.wfile.write(body)
+                self.wfile.write(text.encode())
 
             def log_message(self, *_: Any) -> None:
                 pass
@@ -62,7 +105,7 @@ class Service:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     made = Clock()
-    monkeypatch.setattr(client_module, "time", made)
+    monkeypatch.setattr(connection, "time", made)
     return made
 
 
@@ -82,11 +125,16 @@ def body(tmp_path: Path) -> Path:
     return path
 
 
+def client_of(answer: Callable[[httpx.Request], httpx.Response]) -> Client:
+    """Return a client whose requests are answered by a function."""
+    return Client("http://ground", "secret", transport=httpx.MockTransport(answer))
+
+
 def test_an_upload_that_finds_the_service_busy_is_sent_again_whole(
     service: Service, clock: Clock, body: Path
 ) -> None:
     service.answers = [(503, {"Retry-After": "1"}), (503, {"Retry-After": "3"}), (201, {})]
-    assert Client(service.url).add_ephemeris(body) == EPHEMERIS
+    assert Client(service.url).add_ephemeris(body).model_dump(mode="json") == EPHEMERIS
     assert clock.slept == [1.0, 3.0]
     assert service.bodies == [body.read_bytes()] * 3
 
@@ -112,3 +160,230 @@ def test_what_is_no_invitation_to_come_again_is_told_at_once(
         Client(service.url).add_ephemeris(body)
     assert caught.value.status == answer[0]
     assert (len(service.bodies), clock.slept) == (1, [])
+
+
+@pytest.mark.parametrize(
+    ("call", "attempts"),
+    [
+        (lambda client: client.evaluate_pass(1), ATTEMPTS),
+        (lambda client: client.enter_telecommand("test_connection", {}, spacecraft_id=76), ATTEMPTS),
+        (lambda client: client.release_telecommand(1), 1),
+        (lambda client: client.change_window(1, {"state": "approved"}), 1),
+        (lambda client: client.delete_window(1), 1),
+    ],
+)
+def test_after_a_broken_connection_only_safe_requests_and_those_with_a_key_are_repeated(
+    clock: Clock, call: Callable[[Client], object], attempts: int
+) -> None:
+    keys = []
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        keys.append(request.headers.get("Idempotency-Key"))
+        raise httpx.RemoteProtocolError("server disconnected")
+
+    with pytest.raises(Unreachable, match="http://ground: the connection broke: server disconnected"):
+        call(client_of(answer))
+    assert len(keys) == attempts
+    assert len(set(keys)) == 1  # the key stays the same, so the service processes the request once
+
+
+def test_a_service_that_cannot_be_reached_is_not_asked_again(clock: Clock) -> None:
+    def answer(_: httpx.Request) -> httpx.Response:
+        raise httpx.ConnectError("connection refused")
+
+    with pytest.raises(Unreachable, match="http://ground: cannot be reached: connection refused"):
+        client_of(answer).evaluate_pass(1)
+    assert clock.slept == []
+
+
+@pytest.mark.parametrize(
+    ("status", "kind"),
+    [
+        (401, NotAuthenticated),
+        (403, NotPermitted),
+        (404, NotFound),
+        (409, Conflict),
+        (412, Conflict),
+        (422, InvalidRequest),
+        (507, Unavailable),
+        (500, ServiceProblem),
+        (302, ServiceProblem),
+    ],
+)
+def test_a_refusal_is_an_exception_of_its_kind_with_the_problem_details(
+    status: int, kind: type[ServiceProblem]
+) -> None:
+    problem = {
+        "type": "about:blank",
+        "title": "t",
+        "status": status,
+        "detail": "window 3: no",
+        "state": "draft",
+    }
+    with pytest.raises(ServiceProblem) as caught:
+        client_of(lambda _: httpx.Response(status, json={**problem, "new_field": 1})).get_window(3)
+    assert type(caught.value) is kind
+    assert (caught.value.status, str(caught.value)) == (status, "window 3: no")
+    assert caught.value.problem is not None and caught.value.problem.state == "draft"
+
+
+def test_a_response_of_another_program_is_reported_with_the_server() -> None:
+    with pytest.raises(ServiceProblem, match="http://ground: expected JSON of a LINNA service, found other"):
+        client_of(lambda _: httpx.Response(200, text="<html>")).get_job("0" * 32)
+    with pytest.raises(ServiceProblem, match="404 Not Found") as caught:
+        client_of(lambda _: httpx.Response(404, text="<html>")).get_job("0" * 32)
+    assert caught.value.problem is None
+
+
+def test_a_failed_job_is_an_exception_with_its_error() -> None:
+    job = {
+        "id": "0" * 32, "kind": "ingest", "state": "failed", "progress": 0.0, "attempts": 1, "arguments": {},
+        "result": None, "error": "no downlink", "created": "2029-08-07T00:00:00Z", "started": None, "finished": None,
+    }  # fmt: skip
+    with pytest.raises(JobFailed, match="no downlink"):
+        client_of(lambda _: httpx.Response(200, json=job)).wait("0" * 32)
+
+
+def passes_of(total: int, asked: list[tuple[int, int]]) -> Callable[[httpx.Request], httpx.Response]:
+    """Return a service with passes of which it sends at most 1000 in a page."""
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        limit, offset = int(request.url.params["limit"]), int(request.url.params["offset"])
+        asked.append((limit, offset))
+        items = [
+            {"id": number, "name": "p", "start": "2029-08-07T00:00:00Z", "stop": "2029-08-07T01:00:00Z"}
+            for number in range(offset, min(offset + limit, total))
+        ]
+        return httpx.Response(200, json={"items": items, "total": total, "limit": limit, "offset": offset})
+
+    return answer
+
+
+@pytest.mark.parametrize(("total", "pages"), [(0, 1), (999, 1), (1000, 1), (1001, 2), (2500, 3)])
+def test_a_list_is_fetched_page_by_page_until_its_end(total: int, pages: int) -> None:
+    asked: list[tuple[int, int]] = []
+    client = client_of(passes_of(total, asked))
+    assert [one.id for one in client.list_passes()] == list(range(total))
+    assert asked == [(1000, 1000 * number) for number in range(pages)]
+
+
+@pytest.mark.parametrize(
+    ("limit", "expected", "requests"),
+    [
+        (1, 1, [(1, 0)]),
+        (0, 1, [(1, 0)]),
+        (50, 50, [(50, 0)]),
+        (1200, 1200, [(1000, 0), (200, 1000)]),
+        (5000, 2500, [(1000, 0), (1000, 1000), (1000, 2000)]),
+    ],
+)
+def test_a_page_has_as_many_items_as_asked_for(
+    limit: int, expected: int, requests: list[tuple[int, int]]
+) -> None:
+    asked: list[tuple[int, int]] = []
+    page = client_of(passes_of(2500, asked)).list_passes().page(limit)
+    assert (len(page.items), page.total, asked) == (expected, 2500, requests)
+
+
+def test_a_list_that_shrinks_while_it_is_fetched_ends() -> None:
+    def answer(request: httpx.Request) -> httpx.Response:
+        return httpx.Response(200, json={"items": [], "total": 7, "limit": 1, "offset": 0})
+
+    assert list(client_of(answer).list_passes()) == []
+    assert client_of(answer).list_passes().page(5).items == []
+
+
+def peak_of(work: Callable[[], object]) -> int:
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_large_files_are_sent_and_received_in_blocks(service: Service, tmp_path: Path) -> None:
+    large = tmp_path / "large"
+    with large.open("wb") as stream:
+        stream.truncate(64 * MIB)
+    service.answers = [(201, {})]
+    with Client(service.url) as client:
+        assert peak_of(lambda: client.add_ephemeris(large)) < 8 * MIB
+        assert service.octets_received == 64 * MIB
+        target = tmp_path / "reports" / "report.pdf"
+        assert peak_of(lambda: client.get_report("0" * 32, target, kind="pdf")) < 8 * MIB
+    assert target.stat().st_size == 64 * MIB
+
+
+def test_a_download_that_breaks_leaves_no_file(tmp_path: Path, clock: Clock) -> None:
+    class Broken(httpx.SyncByteStream):
+        def __iter__(self) -> Iterator[bytes]:
+            yield b"half"
+            raise httpx.ReadError("connection reset")
+
+    with pytest.raises(Unreachable):
+        client_of(lambda _: httpx.Response(200, stream=Broken())).get_report(
+            "0" * 32, tmp_path / "report.html"
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+ARGUMENTS: dict[str, Any] = {
+    "file": b"octets", "definition": {"a": 1}, "constraints": {"a": 1}, "window": {"a": 1}, "change": {"a": 1},
+    "plan": {"a": 1}, "request": {"a": 1}, "points": [{"a": 1}], "receptions": [{"a": 1}], "arguments": {"a": 1},
+    "parameter": "temperature_c", "report_id": "0" * 32, "regression_id": "0" * 32, "job_id": "0" * 32,
+    "revision": "0" * 64, "role": "viewer", "name": "ann", "reason": "wrong cadence",
+}  # fmt: skip
+
+
+def operations_of(tmp_path: Path) -> list[Any]:
+    document = create_app(Settings(home=tmp_path)).openapi()
+    return [
+        (path, verb.upper(), operation)
+        for path, operations in document["paths"].items()
+        for verb, operation in operations.items()
+    ]
+
+
+def test_every_operation_of_the_api_has_a_method_of_its_name_with_its_path_keys_and_result(
+    tmp_path: Path,
+) -> None:
+    sent: list[httpx.Request] = []
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        sent.append(request)
+        return httpx.Response(418, json={})
+
+    client = client_of(answer)
+    operations = operations_of(tmp_path)
+    assert len(operations) > 60
+    for path, verb, operation in operations:
+        method = getattr(client, operation["operationId"])
+        given = inspect.signature(method).parameters.values()
+        known = {item["name"] for item in operation.get("parameters", []) if item["in"] == "query"}
+        values = {
+            one.name: tmp_path / "target"
+            if one.name == "target"
+            else ARGUMENTS.get(one.name, 1 if one.name.endswith("_id") else "x")
+            for one in given
+            if one.default is one.empty or one.name in known or one.name in ("if_match", "key")
+        }
+        if operation["operationId"] in ("add_ephemeris", "upload_archive", "keep_archive", "add_build"):
+            values["file"] = Path(__file__)
+        result = None
+        with pytest.raises(ServiceProblem):
+            result = method(**values)
+            list(result)  # a list sends its request when it is iterated
+        request = sent[-1]
+        pattern = re.sub(r"\{\w+\}", "[^/]+", path)
+        assert (request.method, bool(re.fullmatch(pattern, request.url.path))) == (verb, True), path
+        assert set(request.url.params) == known & {*request.url.params, *values, "limit", "offset"}, path
+        heads = {item["name"] for item in operation.get("parameters", []) if item["in"] == "header"}
+        assert {name for name in ("Idempotency-Key", "If-Match") if name in request.headers} == heads, path
+        assert ("requestBody" in operation) == bool(request.headers.get("content-type")), path
+        success = next(found for code, found in operation["responses"].items() if code.startswith("2"))
+        schema = json.dumps(success.get("content", {}).get("application/json", {}).get("schema", {}))
+        found = re.search(r"schemas/(?:PageOf_)?([A-Za-z]+)", schema)
+        returned = str(inspect.signature(method).return_annotation)
+        assert (found is None) == (returned in ("None", "Uplink", "dict[str, Any]")), path
+        assert found is None or re.search(rf"\b{found[1]}\b", returned), path

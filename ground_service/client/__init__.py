@@ -1,0 +1,10 @@
+"""Client of the ground service: over HTTP, or in process on the database of this machine.
+
+`Client` has one method for each operation of the HTTP API, with the name of the operation. Results are the pydantic
+models of the capabilities; lists fetch their pages as they are iterated.
+"""
+
+from ground_service.client.operations import Client
+from ground_service.client.problems import ServiceProblem
+
+__all__ = ["Client", "ServiceProblem"]

@@ -1,0 +1,494 @@
+"""Operations of the ground service: one method for each operation of the HTTP API, under the same name."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import quote
+
+from ground_service.access.model import AuditEntry, AuditHead, Token, User, UserWithToken
+from ground_service.client.connection import Body, Connection, Listing, new_key
+from ground_service.client.problems import JobFailed
+from ground_service.commanding.model import Telecommand, UplinkState
+from ground_service.ephemerides.model import Ephemeris
+from ground_service.errors import InvalidInput
+from ground_service.evaluation.model import ReportOverview
+from ground_service.ingest.model import Ingest, IngestAccepted
+from ground_service.jobs.model import Job
+from ground_service.missions.model import MissionDetail, MissionRevision
+from ground_service.passes.model import (
+    Completeness,
+    Detection,
+    Event,
+    ParameterSeries,
+    PassDetail,
+    PassSummary,
+    States,
+    Trend,
+)
+from ground_service.planning.model import Imported, Plan, SearchResult, Window
+from ground_service.regression.model import Build, KeptArchive, Regression, RegressionSummary
+from ground_service.timekeeping.model import Correlation, TimeReport
+
+FIRST_WAIT_S, LONGEST_WAIT_S = 0.05, 2.0
+
+ReportKind = Literal["html", "json", "pdf"]
+Fields = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Uplink:
+    """Octets to radiate now, and the ids of the telecommands in them."""
+
+    octets: bytes
+    telecommands: tuple[int, ...]
+
+
+class Client(Connection):
+    """Operations of a ground service.
+
+    Operations that create something take an idempotency key: the service processes requests with the same key once. The
+    default is a new key for each call, so that a request can be repeated after a broken connection.
+    """
+
+    # Telemetry
+
+    def upload_telemetry(
+        self,
+        file: Path | bytes,
+        *,
+        name: str | None = None,
+        spacecraft_id: int | None = None,
+        instance: str = "flight",
+        stream: str | None = None,
+        offset: int = 0,
+        key: str | None = None,
+    ) -> IngestAccepted:
+        """Upload a downlink, or a piece of one cut at any octet."""
+        return self._post(
+            IngestAccepted,
+            "/telemetry",
+            file,
+            key=key or new_key(),
+            name=name or _name_of(file),
+            spacecraft_id=spacecraft_id,
+            instance=instance,
+            stream=stream,
+            offset=None if stream is None else offset,
+        )
+
+    def list_ingests(self) -> Listing[Ingest]:
+        """List ingests, newest first."""
+        return self._list(Ingest, "/ingests")
+
+    def get_ingest(self, ingest_id: int) -> Ingest:
+        """Return an ingest: its state and the octet accounting of the file."""
+        return self._get(Ingest, f"/ingests/{ingest_id}")
+
+    def ingest_file(self, file: Path | bytes, **options: Any) -> Ingest:
+        """Upload a downlink with the options of `upload_telemetry`, and wait until it is ingested."""
+        accepted = self.upload_telemetry(file, **options)
+        self.wait(accepted.job_id)
+        return self.get_ingest(accepted.ingest_id)
+
+    # Pass archives
+
+    def upload_archive(self, file: Path, *, name: str | None = None, key: str | None = None) -> Job:
+        """Upload a zipped pass archive; the job imports it."""
+        return self._post(Job, "/archives", file, key=key or new_key(), name=name or file.name)
+
+    def import_archive(self, archive: Path) -> int:
+        """Upload a pass archive (folder or zip), wait until it is imported, and return the id of the pass."""
+        if archive.is_file():
+            return int(self._result(self.upload_archive(archive))["pass_id"])
+        from ground_service.passes.archive_zip import zip_folder
+
+        if not (archive / "manifest.json").is_file():
+            raise InvalidInput(str(archive), "", "a pass archive with manifest.json", "no manifest.json")
+        packed = zip_folder(archive)
+        try:
+            return int(self._result(self.upload_archive(packed, name=f"{archive.name}.zip"))["pass_id"])
+        finally:
+            packed.unlink()
+
+    # Passes
+
+    def list_passes(self) -> Listing[PassSummary]:
+        """List passes, newest first."""
+        return self._list(PassSummary, "/passes")
+
+    def define_pass(self, definition: Fields, *, key: str | None = None) -> PassDetail:
+        """Define an interval of a spacecraft's time as a pass."""
+        return self._post(PassDetail, "/passes", definition, key=key or new_key())
+
+    def get_pass(self, pass_id: int) -> PassDetail:
+        """Return a pass with its manifest and the ids of its reports."""
+        return self._get(PassDetail, f"/passes/{pass_id}")
+
+    def evaluate_pass(self, pass_id: int) -> dict[str, Any]:
+        """Evaluate a pass now and return its metrics."""
+        return self._document(f"/passes/{pass_id}/summary")
+
+    def get_completeness(self, pass_id: int) -> Completeness:
+        """Return the received and missing packets of a pass."""
+        return self._get(Completeness, f"/passes/{pass_id}/completeness")
+
+    def list_detections(self, pass_id: int) -> Listing[Detection]:
+        """List the detections of a pass in time order."""
+        return self._list(Detection, f"/passes/{pass_id}/detections")
+
+    def list_events(self, pass_id: int) -> Listing[Event]:
+        """List the event reports of a pass in time order."""
+        return self._list(Event, f"/passes/{pass_id}/events")
+
+    def get_states(
+        self, pass_id: int, *, estimator: str = "paper", values: Sequence[str] = (), max_points: int = 1000
+    ) -> States:
+        """Return series of the states of an estimator: minimum, maximum and mean of each interval."""
+        return self._get(
+            States,
+            f"/passes/{pass_id}/states",
+            estimator=estimator,
+            value=list(values) or None,
+            max_points=max_points,
+        )
+
+    def get_parameter(self, pass_id: int, parameter: str, *, max_points: int = 1000) -> ParameterSeries:
+        """Return the series of a housekeeping parameter of a pass."""
+        path = f"/passes/{pass_id}/telemetry/{_part(parameter)}"
+        return self._get(ParameterSeries, path, max_points=max_points)
+
+    def get_trend(
+        self,
+        spacecraft_id: int,
+        parameter: str,
+        *,
+        instance: str = "flight",
+        start: str | None = None,
+        stop: str | None = None,
+        max_points: int = 1000,
+    ) -> ParameterSeries:
+        """Return the series of a housekeeping parameter over any time span."""
+        return self._get(
+            ParameterSeries,
+            f"/spacecraft/{spacecraft_id}/telemetry/{_part(parameter)}",
+            instance=instance,
+            start=start,
+            stop=stop,
+            max_points=max_points,
+        )
+
+    def list_trends(self, spacecraft_id: int, *, instance: str = "flight") -> list[Trend]:
+        """List the statistics of the housekeeping parameters over the last 30 days of on-board time."""
+        return self._all(Trend, f"/spacecraft/{spacecraft_id}/trends", instance=instance)
+
+    # Reports
+
+    def request_report(self, pass_id: int, *, key: str | None = None) -> Job:
+        """Start the job that evaluates a pass and renders its report."""
+        return self._post(Job, f"/passes/{pass_id}/reports", key=key or new_key())
+
+    def make_report(self, pass_id: int) -> str:
+        """Request a report, wait until it is rendered, and return its id."""
+        return str(self._result(self.request_report(pass_id))["report_id"])
+
+    def get_report(self, report_id: str, target: Path, *, kind: ReportKind = "html") -> None:
+        """Download a report into a file."""
+        self._download(f"/reports/{_part(report_id)}", target, format=kind)
+
+    def get_report_summary(self, report_id: str) -> dict[str, Any]:
+        """Return the metrics of a report."""
+        return self._document(f"/reports/{_part(report_id)}/summary")
+
+    def get_report_overview(self, report_id: str, *, max_points: int = 600) -> ReportOverview:
+        """Return verdict, headline metrics and error series of a report."""
+        return self._get(ReportOverview, f"/reports/{_part(report_id)}/overview", max_points=max_points)
+
+    # Reference ephemerides
+
+    def add_ephemeris(self, file: Path, *, name: str | None = None, precedence: int = 0) -> Ephemeris:
+        """Upload a reference ephemeris (OEM or STK .e)."""
+        return self._post(Ephemeris, "/ephemerides", file, name=name or file.name, precedence=precedence)
+
+    def list_ephemerides(self) -> Listing[Ephemeris]:
+        """List reference ephemerides, newest first."""
+        return self._list(Ephemeris, "/ephemerides")
+
+    # Mission descriptions
+
+    def list_missions(self) -> Listing[MissionRevision]:
+        """List the revisions of mission descriptions, newest first."""
+        return self._list(MissionRevision, "/missions")
+
+    def add_mission(self, file: Path | bytes) -> MissionDetail:
+        """Add a mission description (TOML) as a revision."""
+        return self._post(MissionDetail, "/missions", file, name=_name_of(file))
+
+    def get_mission(self, revision: str) -> MissionDetail:
+        """Return a revision with its document."""
+        return self._get(MissionDetail, f"/missions/{_part(revision)}")
+
+    # Telecommands
+
+    def list_telecommands(self, *, state: str | None = None) -> Listing[Telecommand]:
+        """List telecommands with their verification, newest first."""
+        return self._list(Telecommand, "/telecommands", state=state)
+
+    def enter_telecommand(
+        self,
+        name: str,
+        arguments: Fields,
+        *,
+        spacecraft_id: int,
+        instance: str = "flight",
+        timeout_s: int = 600,
+        key: str | None = None,
+    ) -> Telecommand:
+        """Queue a telecommand."""
+        entry = {
+            "name": name,
+            "arguments": dict(arguments),
+            "spacecraft_id": spacecraft_id,
+            "instance": instance,
+            "timeout_s": timeout_s,
+        }
+        return self._post(Telecommand, "/telecommands", entry, key=key or new_key())
+
+    def get_telecommand(self, command_id: int) -> Telecommand:
+        """Return a telecommand with its verification."""
+        return self._get(Telecommand, f"/telecommands/{command_id}")
+
+    def release_telecommand(self, command_id: int) -> Telecommand:
+        """Release a queued telecommand."""
+        return self._post(Telecommand, f"/telecommands/{command_id}/release")
+
+    def reject_telecommand(self, command_id: int, reason: str) -> Telecommand:
+        """Remove a queued telecommand from the queue."""
+        return self._post(Telecommand, f"/telecommands/{command_id}/reject", {"reason": reason})
+
+    def take_uplink(
+        self,
+        spacecraft_id: int,
+        *,
+        instance: str = "flight",
+        format: Literal["cltu", "packets"] = "cltu",
+        key: str | None = None,
+    ) -> Uplink:
+        """Take all released telecommands; they count as sent from then on."""
+        response = self._send(
+            "POST",
+            "/uplink",
+            query={"spacecraft_id": spacecraft_id, "instance": instance, "format": format},
+            key=key or new_key(),
+        )
+        ids = response.headers.get("X-Telecommands", "").split(",")
+        return Uplink(response.content, tuple(int(text) for text in ids if text))
+
+    def get_uplink_state(self, spacecraft_id: int, *, instance: str = "flight") -> UplinkState:
+        """Return the state of the telecommand receiver according to the newest telemetry."""
+        return self._get(UplinkState, f"/spacecraft/{spacecraft_id}/uplink", instance=instance)
+
+    # Time correlation
+
+    def list_correlations(self, spacecraft_id: int, *, instance: str = "flight") -> Listing[Correlation]:
+        """List the time correlations of a spacecraft, newest first."""
+        return self._list(
+            Correlation, f"/spacecraft/{spacecraft_id}/correlations", paged=False, instance=instance
+        )
+
+    def add_correlations(
+        self, spacecraft_id: int, points: Sequence[Fields], *, instance: str = "flight"
+    ) -> list[Correlation]:
+        """Fit the time correlation from time reports with their reception times."""
+        path = f"/spacecraft/{spacecraft_id}/correlations"
+        return self._items(Correlation, path, {"points": list(points)}, instance=instance)
+
+    def run_correlation(self, spacecraft_id: int, *, instance: str = "flight") -> list[Correlation]:
+        """Fit the time correlation from the received time reports; return the correlations in force."""
+        return self._items(Correlation, f"/spacecraft/{spacecraft_id}/correlations/run", instance=instance)
+
+    def add_receptions(
+        self, spacecraft_id: int, receptions: Sequence[Fields], *, instance: str = "flight"
+    ) -> list[Correlation]:
+        """Enter reception times of time reports; return the correlations in force."""
+        path = f"/spacecraft/{spacecraft_id}/receptions"
+        return self._items(Correlation, path, {"receptions": list(receptions)}, instance=instance)
+
+    def list_time_reports(self, spacecraft_id: int, *, instance: str = "flight") -> Listing[TimeReport]:
+        """List received time reports with their residuals."""
+        return self._list(
+            TimeReport, f"/spacecraft/{spacecraft_id}/time-reports", paged=False, instance=instance
+        )
+
+    # Observation windows
+
+    def search_windows(self, constraints: Body) -> SearchResult:
+        """Search candidate windows over a reference ephemeris."""
+        return self._post(SearchResult, "/windows/search", constraints)
+
+    def list_windows(self, *, state: str | None = None) -> Listing[Window]:
+        """List planned windows, newest first."""
+        return self._list(Window, "/windows", state=state)
+
+    def add_window(self, window: Body, *, key: str | None = None) -> Window:
+        """Enter a window as a draft."""
+        return self._post(Window, "/windows", window, key=key or new_key())
+
+    def get_window(self, window_id: int) -> Window:
+        """Return a planned window."""
+        return self._get(Window, f"/windows/{window_id}")
+
+    def change_window(self, window_id: int, change: Body, *, if_match: str | None = None) -> Window:
+        """Change a draft, or the state of a window; `if_match` is the entity tag of the expected version."""
+        return self._call(Window, "PATCH", f"/windows/{window_id}", body=change, headers=_match(if_match))
+
+    def delete_window(self, window_id: int, *, if_match: str | None = None) -> None:
+        """Remove a window from the plan."""
+        self._octets("DELETE", f"/windows/{window_id}", headers=_match(if_match))
+
+    def uplink_window(self, window_id: int) -> list[Telecommand]:
+        """Release the time-tagged telecommands of an approved window."""
+        return self._items(Telecommand, f"/windows/{window_id}/uplink")
+
+    def export_plan(self) -> Plan:
+        """Return all windows that have not failed, as a plan."""
+        return self._get(Plan, "/plan")
+
+    def import_plan(self, plan: Body) -> Imported:
+        """Enter all windows of a plan as drafts, or none of them."""
+        return self._post(Imported, "/plan", plan)
+
+    # Payload builds and regressions
+
+    def list_builds(self) -> Listing[Build]:
+        """List registered payload builds, newest first."""
+        return self._list(Build, "/builds")
+
+    def add_build(self, file: Path) -> Build:
+        """Register a payload build: a zip of build.toml and the files that it names."""
+        return self._post(Build, "/builds", file)
+
+    def list_kept_archives(self) -> list[KeptArchive]:
+        """List the pass archives that are kept for regressions, oldest first."""
+        return self._all(KeptArchive, "/regression-archives")
+
+    def keep_archive(self, file: Path, *, pinned: bool = False) -> KeptArchive:
+        """Upload a zipped pass archive to keep it for regressions."""
+        return self._post(KeptArchive, "/regression-archives", file, pinned=pinned)
+
+    def start_regression(self, request: Body, *, key: str | None = None) -> Job:
+        """Start the jobs that compare a candidate build with a baseline over archives."""
+        return self._post(Job, "/regressions", request, key=key or new_key())
+
+    def list_regressions(self) -> Listing[RegressionSummary]:
+        """List verdicts, newest first."""
+        return self._list(RegressionSummary, "/regressions")
+
+    def get_regression(self, regression_id: str) -> Regression:
+        """Return a verdict."""
+        return self._get(Regression, f"/regressions/{_part(regression_id)}")
+
+    def get_regression_report(self, regression_id: str, target: Path) -> None:
+        """Download the report of a regression (HTML) into a file."""
+        self._download(f"/regressions/{_part(regression_id)}/report", target)
+
+    # Jobs
+
+    def list_jobs(self, *, kind: str | None = None) -> Listing[Job]:
+        """List jobs, newest first."""
+        return self._list(Job, "/jobs", kind=kind)
+
+    def get_job(self, job_id: str) -> Job:
+        """Return a job: its state, progress and result."""
+        return self._get(Job, f"/jobs/{_part(job_id)}")
+
+    def wait(self, job_id: str, *, progress: Callable[[Job], None] | None = None) -> Job:
+        """Return a job when it is done.
+
+        Raises
+        ------
+        JobFailed
+            The job failed; the message is its error.
+        """
+        pause = FIRST_WAIT_S
+        while True:
+            job = self.get_job(job_id)
+            if job.state == "failed":
+                raise JobFailed(422, str(job.error))
+            if progress is not None:
+                progress(job)
+            if job.state == "done":
+                return job
+            time.sleep(pause)
+            pause = min(2.0 * pause, LONGEST_WAIT_S)
+
+    # Users, tokens and the audit log
+
+    def list_users(self) -> Listing[User]:
+        """List all users."""
+        return self._list(User, "/users", paged=False)
+
+    def add_user(self, name: str, role: str, *, days_valid: float | None = None) -> UserWithToken:
+        """Add a user; the token cannot be read again."""
+        return self._post(UserWithToken, "/users", {"name": name, "role": role, "days_valid": days_valid})
+
+    def get_user(self, name: str) -> User:
+        """Return a user."""
+        return self._get(User, f"/users/{_part(name)}")
+
+    def change_user(self, name: str, *, state: str | None = None, role: str | None = None) -> User:
+        """Enable or disable a user, or change the role."""
+        change = {key: value for key, value in (("state", state), ("role", role)) if value is not None}
+        return self._call(User, "PATCH", f"/users/{_part(name)}", body=change)
+
+    def add_token(
+        self, name: str, *, days_valid: float | None = None, revoke_others: bool = False
+    ) -> UserWithToken:
+        """Create a token for a user; it cannot be read again."""
+        request = {"days_valid": days_valid, "revoke_others": revoke_others}
+        return self._post(UserWithToken, f"/users/{_part(name)}/tokens", request)
+
+    def list_tokens(self, *, user: str | None = None) -> Listing[Token]:
+        """List tokens without their secrets, newest first."""
+        return self._list(Token, "/tokens", paged=False, user=user)
+
+    def revoke_token(self, token_id: int) -> None:
+        """Revoke a token."""
+        self._octets("DELETE", f"/tokens/{token_id}")
+
+    def list_audit(
+        self,
+        *,
+        actor: str | None = None,
+        action: str | None = None,
+        target: str | None = None,
+        since: str | None = None,
+        until: str | None = None,
+    ) -> Listing[AuditEntry]:
+        """List the entries of the audit log, newest first."""
+        return self._list(
+            AuditEntry, "/audit", actor=actor, action=action, target=target, since=since, until=until
+        )
+
+    def get_audit_head(self) -> AuditHead:
+        """Return number and hash of the newest entry of the audit log."""
+        return self._get(AuditHead, "/audit/head")
+
+    def _result(self, job: Job) -> dict[str, Any]:
+        return self.wait(job.id).result or {}
+
+
+def _part(text: str) -> str:
+    """Return a text as one segment of a path."""
+    return quote(text, safe="")
+
+
+def _name_of(file: Path | bytes) -> str | None:
+    return file.name if isinstance(file, Path) else None
+
+
+def _match(tag: str | None) -> dict[str, str]:
+    return {} if tag is None else {"If-Match": tag}
