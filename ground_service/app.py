@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -13,15 +12,10 @@ from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.routing import Route
 
-from ground_service.access.routes import access
-from ground_service.access.service import Caller
 from ground_service.clock import utc_now_ns
-from ground_service.commanding.routes import telecommands
 from ground_service.commanding.service import note_timeouts
-from ground_service.ephemerides import routes as ephemeris_routes
 from ground_service.errors import GroundError
-from ground_service.evaluation.routes import evaluation
-from ground_service.ground import Ground, ground_from_settings
+from ground_service.ground import ground_from_settings
 from ground_service.http import problems
 from ground_service.http.common import API_PREFIX
 from ground_service.http.limits import BodyLimit, HeadersAndTags, RateLimit, SharedBudgets
@@ -29,19 +23,13 @@ from ground_service.http.origins import LOOPBACK, SameOrigin
 from ground_service.http.proxies import ForwardedHeaders, TrustedProxies
 from ground_service.http.requests import PlainText
 from ground_service.http.uploads import UploadPool
-from ground_service.ingest import routes as ingest_routes
-from ground_service.jobs.routes import jobs
-from ground_service.missions.routes import missions
-from ground_service.passes import routes as pass_routes
-from ground_service.planning.routes import planning
-from ground_service.regression import routes as regression_routes
+from ground_service.routers import OPERATIONS
 from ground_service.settings import Settings
-from ground_service.timekeeping.routes import timekeeping
 from ground_service.web.live import live
 from ground_service.web.pages import pages
 from ground_service.web.payload_console import payload_console
 from ground_service.web.sockets import Sockets
-from ground_service.worker.dispatch import InlineDispatcher, dispatcher_for, follow
+from ground_service.worker.dispatch import dispatcher_for, follow
 from ground_service.worker.jobs import enter_redecoding
 from ground_service.worker.metrics import Metrics, Watch
 from ground_service.worker.routes import operations
@@ -57,7 +45,6 @@ CATCH_UP_S = 60.0
 """A service that was not running then enters it so long after its start."""
 
 SWEEP_S = 15.0
-LOCAL_UPLOADS = 2
 
 SQLITE_THREADS = 4
 SERVER_THREADS = 20
@@ -124,14 +111,16 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
     app.state.open_without_users = settings.host in LOOPBACK
     app.state.live_console = settings.resolved_live_console()
     app.state.upload_limit_octets = settings.upload_limit_mib << 20
-    _add_operations(app)
+    routers = (*(one.load() for one in OPERATIONS), operations, pages)
+    for one in (*routers, live, payload_console):
+        app.include_router(one)
+    app.state.operations = [route for one in routers for route in one.routes if isinstance(route, Route)]
     app.state.metrics = Metrics()
+    problems.install(app)
     app.add_middleware(
         BodyLimit,
         upload_paths=tuple(
-            path
-            for one in (ephemeris_routes, ingest_routes, pass_routes, regression_routes)
-            for path in one.UPLOAD_PATHS
+            path for one in OPERATIONS for path in getattr(one.imported(), "UPLOAD_PATHS", ())
         ),
         upload_limit_octets=settings.upload_limit_mib << 20,
     )
@@ -142,45 +131,6 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
     app.add_middleware(Watch, metrics=app.state.metrics)
     app.add_middleware(ForwardedHeaders, proxies=TrustedProxies(settings.trusted_proxies))
     return app
-
-
-def create_local_app(ground: Ground, actor: str) -> FastAPI:
-    """Return the application for callers in this process, all of whom act as administrator `actor`.
-
-    Nothing runs in the background: jobs are finished when their request returns. There are no limits for network
-    and errors are described completely.
-    """
-    app = FastAPI()
-    app.state.ground = ground
-    app.state.local_caller = Caller(actor, "admin")
-    app.state.dispatcher = InlineDispatcher(ground)
-    app.state.uploads = UploadPool(LOCAL_UPLOADS)
-    app.state.upload_limit_octets = sys.maxsize
-    _add_operations(app)
-    app.add_middleware(PlainText)
-    return app
-
-
-def _add_operations(app: FastAPI) -> None:
-    routers = (
-        ephemeris_routes.ephemerides,
-        ingest_routes.ingests,
-        pass_routes.passes,
-        evaluation,
-        jobs,
-        missions,
-        timekeeping,
-        planning,
-        telecommands,
-        regression_routes.regressions,
-        access,
-        operations,
-        pages,
-    )
-    for one in (*routers, live, payload_console):
-        app.include_router(one)
-    app.state.operations = [route for one in routers for route in one.routes if isinstance(route, Route)]
-    problems.install(app)
 
 
 def shared_budgets(settings: Settings) -> SharedBudgets | None:

@@ -1,18 +1,30 @@
-"""Client of a ground service in this process: the same application and operations, without a server."""
+"""Client of a ground service in this process: the same operations, without a server."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Iterator
+import sys
+from collections.abc import AsyncIterator, Iterator, Mapping
 from contextlib import ExitStack
+from typing import Any
 
 import httpx
 from anyio.from_thread import start_blocking_portal
+from fastapi import FastAPI
+from starlette.routing import Match
+from starlette.types import ASGIApp, Receive, Scope, Send
 
-from ground_service.app import create_local_app
+from ground_service.access.service import Caller
+from ground_service.client.connection import API_PREFIX
 from ground_service.client.operations import Client
 from ground_service.ground import Ground
+from ground_service.http import problems
+from ground_service.http.requests import PlainText
+from ground_service.http.uploads import UploadPool
+from ground_service.routers import OPERATIONS
+from ground_service.store.events import Notify
 
 LOCAL_URL = "http://localhost"
+LOCAL_UPLOADS = 2
 
 
 def local_client(ground: Ground, actor: str) -> Client:
@@ -24,12 +36,90 @@ def local_client(ground: Ground, actor: str) -> Client:
     return Client(LOCAL_URL, transport=LocalTransport(ground, actor))
 
 
+def local_app(ground: Ground, actor: str) -> ASGIApp:
+    """Return the operations of the API for callers in this process, all of whom act as administrator `actor`.
+
+    Nothing runs in the background, there are no limits for network callers, and errors are described completely.
+    """
+    app = FastAPI()
+    app.state.ground = ground
+    app.state.local_caller = Caller(actor, "admin")
+    app.state.dispatcher = LocalDispatcher(ground)
+    app.state.uploads = UploadPool(LOCAL_UPLOADS)
+    app.state.upload_limit_octets = sys.maxsize
+    app.state.operations = []
+    problems.install(app)
+    app.add_middleware(PlainText)
+    return OperationsOnDemand(app)
+
+
+class OperationsOnDemand:
+    """Application that includes a router when the first request for one of its operations arrives."""
+
+    def __init__(self, app: FastAPI) -> None:
+        self._app = app
+        self._missing = list(OPERATIONS)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        segment = scope["path"].removeprefix(f"{API_PREFIX}/").partition("/")[0]
+        self._missing.sort(key=lambda router: router.segment != segment)
+        while self._missing and not self._has_operation(scope):
+            routes = self._missing.pop(0).load()
+            self._app.include_router(routes)
+            self._app.state.operations += routes.routes
+        await self._app(scope, receive, send)
+
+    def _has_operation(self, scope: Scope) -> bool:
+        return any(route.matches(scope)[0] is Match.FULL for route in self._app.state.operations)
+
+
+class LocalDispatcher:
+    """Finishes every job before its request returns."""
+
+    def __init__(self, ground: Ground) -> None:
+        self._ground = ground
+
+    def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
+        """Enter a job and finish it."""
+        from ground_service.worker.dispatch import InlineDispatcher
+
+        return InlineDispatcher(self._ground).submit(kind, arguments, job_id=job_id)
+
+    def start(self, job_id: str) -> None:
+        """Finish a job that was entered already."""
+        from ground_service.worker.dispatch import InlineDispatcher
+
+        InlineDispatcher(self._ground).start(job_id)
+
+    def resume(self) -> None:
+        """Leave unfinished jobs of other processes to the server."""
+
+    def close(self) -> None:
+        """Do nothing: no job is running."""
+
+
+class FollowUpOnDemand:
+    """Follow-up work of events in this process, imported with the first event."""
+
+    def __init__(self, ground: Ground) -> None:
+        self._ground = ground
+        self._follow_up: Notify | None = None
+
+    def __call__(self, kinds: frozenset[str]) -> None:
+        if self._follow_up is None:
+            from ground_service.worker.follow_up import FollowUp
+
+            self._follow_up = FollowUp(self._ground, None)
+        self._follow_up(kinds)
+
+
 class LocalTransport(httpx.BaseTransport):
     """Requests to an application in this process. Request bodies are streamed, response bodies are held in memory."""
 
     def __init__(self, ground: Ground, actor: str) -> None:
         self._ground = ground
-        self._asgi = httpx.ASGITransport(create_local_app(ground, actor))
+        ground.database.listeners.add(FollowUpOnDemand(ground))
+        self._asgi = httpx.ASGITransport(local_app(ground, actor))
         self._opened = ExitStack()
         self._opened.callback(ground.close)
         self._portal = self._opened.enter_context(start_blocking_portal())

@@ -6,12 +6,14 @@ write lock at once (BEGIN IMMEDIATE), so that what it reads first is what it cha
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import errno
 import functools
 import json
 import logging
 import os
+import re
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -45,6 +47,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 BUSY_TIMEOUT_MS = 30_000
+
+_REVISION = re.compile(r"^(revision|down_revision) = (.+)$", re.MULTILINE)
 
 REVISIONS_BEFORE_1_0 = tuple(f"{number:04d}" for number in range(1, 12))
 """Schema revisions before version 1.0, which have no migrations."""
@@ -211,16 +215,25 @@ def prepare_database(url: str, *, upgrade: bool | None = None) -> Database:
 
 
 def schema_revisions(database: Database) -> tuple[str | None, str, tuple[str, ...]]:
-    """The revision of the database (None: empty), the newest one known here, and all known here."""
-    from alembic.script import ScriptDirectory
+    """Return the revision of the database (None: empty), the newest one known here, and all known here, newest first.
 
-    scripts = ScriptDirectory.from_config(migration_config())
-    known = tuple(script.revision for script in scripts.walk_revisions())
+    The revisions are read from the names in the scripts: the import of Alembic takes longer than many commands.
+    """
+    previous = dict(map(_script_revision, sorted((migrations_folder() / "versions").glob("*.py"))))
+    known = [next(one for one in previous if one not in previous.values())]
+    while (earlier := previous[known[-1]]) is not None:
+        known.append(earlier)
     with database.reading() as connection:
         found = None
         if inspect(connection).has_table("alembic_version"):
             found = connection.execute(text("SELECT version_num FROM alembic_version")).scalar()
-    return found, known[0], known
+    return found, known[0], tuple(known)
+
+
+def _script_revision(path: Path) -> tuple[str, str | None]:
+    """Return the revision of a migration script and the one before it."""
+    stated = dict(_REVISION.findall(path.read_text(encoding="utf-8")))
+    return ast.literal_eval(stated["revision"]), ast.literal_eval(stated["down_revision"])
 
 
 def upgrade_database(database: Database) -> None:

@@ -45,7 +45,7 @@ def ground_client(arguments: argparse.Namespace) -> Client:
     if server is None:
         from ground_service.client.local import local_client
 
-        return local_client(open_service(arguments), str(arguments.actor or local_actor()))
+        return local_client(_opened(arguments), str(arguments.actor or local_actor()))
     from ground_service.client import Client
     from linna.errors import UsageError
 
@@ -75,12 +75,20 @@ def settings_of(arguments: argparse.Namespace, **given: object) -> Settings:
 
 
 def open_service(arguments: argparse.Namespace) -> Ground:
-    """Return the opened service of this machine."""
-    from ground_service.worker.follow_up import open_following
+    """Return the opened service of this machine, which handles its events in this process."""
+    from ground_service.worker.follow_up import follow_in_process
+
+    ground = _opened(arguments)
+    follow_in_process(ground)
+    return ground
+
+
+def _opened(arguments: argparse.Namespace) -> Ground:
+    from ground_service.ground import open_ground
     from linna.data import data_folder
 
     settings = settings_of(arguments)
-    return open_following(
+    return open_ground(
         settings.home,
         data_folder(),
         database_url=settings.resolved_database_url(),

@@ -1,0 +1,43 @@
+"""Routers of the capabilities. They are imported when they are needed: all of them together take a second."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from types import ModuleType
+
+from fastapi import APIRouter
+
+
+@dataclass(frozen=True, slots=True)
+class Router:
+    """Router `name` in the module `module`; most of its operations are under the path `segment` of the API."""
+
+    module: str
+    name: str
+    segment: str
+
+    def imported(self) -> ModuleType:
+        """Return the module."""
+        return import_module(self.module)
+
+    def load(self) -> APIRouter:
+        """Return the router."""
+        router: APIRouter = getattr(self.imported(), self.name)
+        return router
+
+
+OPERATIONS = (
+    Router("ground_service.passes.routes", "passes", "passes"),
+    Router("ground_service.ingest.routes", "ingests", "telemetry"),
+    Router("ground_service.evaluation.routes", "evaluation", "reports"),
+    Router("ground_service.ephemerides.routes", "ephemerides", "ephemerides"),
+    Router("ground_service.jobs.routes", "jobs", "jobs"),
+    Router("ground_service.missions.routes", "missions", "missions"),
+    Router("ground_service.timekeeping.routes", "timekeeping", "spacecraft"),
+    Router("ground_service.planning.routes", "planning", "windows"),
+    Router("ground_service.commanding.routes", "telecommands", "telecommands"),
+    Router("ground_service.regression.routes", "regressions", "regressions"),
+    Router("ground_service.access.routes", "access", "users"),
+)
+"""Operations of the HTTP API."""
