@@ -21,7 +21,7 @@ SpacecraftNumber = Annotated[int, Field(ge=0, le=1023, examples=[76])]
 class Entity(BaseModel):
     """Base class of entities: database row, API response, client result and printed object in one definition."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     @classmethod
     def of(cls, row: Mapping[str, Any], **values: Any) -> Self:
@@ -40,7 +40,7 @@ class Entity(BaseModel):
 class Given(BaseModel):
     """Base class of requests; values are not converted between types, such as true to 1."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, defer_build=True)
+    model_config = ConfigDict(extra="forbid", strict=True)
 
 
 class PageOf(Entity, Generic[Item]):

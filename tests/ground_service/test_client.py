@@ -16,6 +16,7 @@ import pytest
 from ground_service.app import create_app
 from ground_service.client import Client, ServiceProblem, connection
 from ground_service.client.connection import ATTEMPTS, BUSY_S
+from ground_service.client.local import LocalTransport, local_client
 from ground_service.client.problems import (
     Conflict,
     InvalidRequest,
@@ -26,7 +27,11 @@ from ground_service.client.problems import (
     Unavailable,
     Unreachable,
 )
+from ground_service.ground import open_ground
 from ground_service.settings import Settings
+from lunar.timescales import parse_utc, ticks_from_utc_ns
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import encode_cadus
 
 EPHEMERIS = {
     "id": 1,
@@ -387,3 +392,43 @@ def test_every_operation_of_the_api_has_a_method_of_its_name_with_its_path_keys_
         returned = str(inspect.signature(method).return_annotation)
         assert (found is None) == (returned in ("None", "Uplink", "dict[str, Any]")), path
         assert found is None or re.search(rf"\b{found[1]}\b", returned), path
+
+
+def test_the_example_of_the_documentation_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "client.md").read_text()
+    example = text.split("```python\n")[1].split("```")[0]
+    assert len(example.strip().splitlines()) <= 15
+    packets = [
+        DICTIONARY.pack(
+            "event_info",
+            {"event_id": 1, "frame_number": 0, "value_1": 0.0, "value_2": 0.0},
+            ticks=int(ticks_from_utc_ns(parse_utc("2029-08-07T06:01:00Z"))) + number,
+            sequence_count=number,
+        )
+        for number in range(5)
+    ]
+    downlink = tmp_path / "downlink.cadu"
+    downlink.write_bytes(encode_cadus(packets, spacecraft_id=76))
+    with local_client(open_ground(tmp_path / "home"), "ann") as ground:
+        ground.ingest_file(downlink)
+        span = {"start": "2029-08-07T06:00:00Z", "stop": "2029-08-07T06:10:00Z"}
+        ground.define_pass({"name": "evening pass", "spacecraft_id": 76, **span})
+
+    class OnThisMachine(Client):
+        """Client that ignores the address of the example."""
+
+        def __init__(self, _server: str, token: str | None = None) -> None:
+            transport = LocalTransport(open_ground(tmp_path / "home"), "ann")
+            super().__init__("http://localhost", token, transport=transport)
+
+    monkeypatch.setattr("ground_service.client.Client", OnThisMachine)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(example, "docs/client.md", "exec"), {})
+    assert capsys.readouterr().out.splitlines() == [
+        "5 packets",
+        "evening pass 2029-08-07T06:00:00.000000Z 0 packets lost",
+        "['boot', 'boot', 'boot', 'boot', 'boot']",
+        "404 pass 99: not found",
+    ]

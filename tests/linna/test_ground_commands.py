@@ -1,9 +1,12 @@
 """The operators' commands on this machine and on a server: the same words, the same figures."""
 
+import argparse
+import importlib
 import json
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +19,7 @@ from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
 from ground_service.server import bind
 from ground_service.settings import Settings
-from linna.cli import run
+from linna.cli import GROUPS, run
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
 from lunar.oem import save_oem
@@ -62,12 +65,12 @@ def downlink(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[list[str]]:
-    """A served service with one operator: the options that name it."""
-    settings = Settings(home=tmp_path / "served")
+@contextmanager
+def served(home: Path, role: str) -> Iterator[list[str]]:
+    """Serve a service with the user ann; yield the options that name it."""
+    settings = Settings(home=home)
     with open_ground(settings.home) as ground:
-        token = add_user(ground, "ann", "operator")
+        token = add_user(ground, "ann", role)
     listener = bind("127.0.0.1", 0)
     service = uvicorn.Server(uvicorn.Config(create_app(settings), log_level="error"))
     thread = threading.Thread(target=service.run, kwargs={"sockets": [listener]})
@@ -80,6 +83,13 @@ def server(tmp_path: Path) -> Iterator[list[str]]:
         service.should_exit = True
         thread.join(30)
         listener.close()
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[list[str]]:
+    """A served service with one operator: the options that name it."""
+    with served(tmp_path / "served", "operator") as options:
+        yield options
 
 
 def asked(capsys: pytest.CaptureFixture[str], *words: Any, status: int = 0) -> Any:
@@ -193,3 +203,155 @@ def test_a_wrong_token_and_a_wrong_server_are_told_in_one_line(
     assert gone.startswith("linna: error: http://127.0.0.1:1: cannot be reached")
     odd = asked(capsys, "pass", "list", "--server", "ftp://x", status=2)
     assert "expected a URL such as" in odd
+
+
+def ground_commands() -> set[tuple[str, ...]]:
+    """Return the commands that accept --server, as group and action."""
+    found: set[tuple[str, ...]] = set()
+    for group, (module, _) in GROUPS.items():
+        parser = argparse.ArgumentParser()
+        importlib.import_module(f"linna.commands.{module}").configure(parser)
+        actions = [one for one in parser._actions if isinstance(one, argparse._SubParsersAction)]
+        inner = {(group, name): one for action in actions for name, one in action.choices.items()}
+        for words, one in (inner or {(group,): parser}).items():
+            if "--server" in one.format_help():
+                found.add(words)
+    return found
+
+
+SHIPPED_MISSION = """\
+name = "exercise"
+
+[spacecraft]
+id = 76
+name = "EXERCISE"
+"""
+
+
+def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
+    capsys: pytest.CaptureFixture[str],
+    reference: Path,
+    downlink: Path,
+    synthetic_archive: Path,
+    tmp_path: Path,
+) -> None:
+    mission = tmp_path / "mission.toml"
+    mission.write_text(SHIPPED_MISSION)
+    receptions = tmp_path / "receptions.csv"
+    receptions.write_text("packet_ticks,sequence_count,received_utc\n1,1,2029-08-07T06:00:01.3Z\n")
+    started: set[tuple[str, ...]] = set()
+    outputs: list[list[tuple[Any, ...]]] = []
+    with open_ground(tmp_path / "here") as ground:
+        add_user(ground, "ann", "admin")
+    with served(tmp_path / "served", "admin") as options:
+        for where in (["--home", tmp_path / "here", "--as", "ann"], options):
+            said: list[tuple[Any, ...]] = []
+
+            def ask(*words: Any, said: list[Any] = said, where: list[Any] = where, text: bool = True) -> Any:
+                """Run a command with --json, and without it if that changes nothing."""
+                started.update({words[:1], words[:2]})
+                code = run([*map(str, (*words, *where)), "--json"])
+                printed = capsys.readouterr()
+                figures = json.loads(printed.out) if printed.out else None
+                said.append((words[:2], code, steady(figures), printed.err if code else ""))
+                if text:
+                    code = run([*map(str, (*words, *where))])
+                    printed = capsys.readouterr()
+                    said.append((words[:2], code, printed.out, printed.err if code else ""))
+                return figures
+
+            def do(*words: Any) -> Any:
+                return ask(*words, text=False)
+
+            do("mission", "add", mission)
+            ask("mission", "add", downlink)
+            revision = do("mission", "list")["missions"][0]["revision"]
+            do("mission", "show", revision)
+            ask("mission", "show", "0" * 64)
+            do("plan", "ephemeris", reference)
+            ask("plan", "search", "--altitude-km", 30, 50, "--maximum-duration-s", 900)
+            window = [
+                "--start",
+                "2029-08-07T06:10:00Z",
+                "--stop",
+                "2029-08-07T06:20:00Z",
+                "--spacecraft-id",
+                76,
+            ]
+            number = do("plan", "add", *window)["id"]
+            do("plan", "approve", number)
+            do("plan", "draft", number)
+            do("plan", "approve", number)
+            do("plan", "uplink", number)
+            ask("plan", "show", number)
+            ask("plan", "list")
+            do("plan", "export", "--out", tmp_path / "plan.json")
+            do("plan", "import", tmp_path / "plan.json")
+            do("plan", "fail", number, "--reason", "exercise")
+            draft = do("plan", "add", *window, "--name", "second")["id"]
+            do("plan", "delete", draft)
+            ask("plan", "delete", draft)
+            ask("command", "enter", "test_connection", "--spacecraft-id", 76, "unknown=1")
+            entered = do("command", "enter", "test_connection", "--spacecraft-id", 76)["id"]
+            do("command", "release", entered)
+            ask("command", "release", entered)
+            ask("command", "show", entered)
+            do("command", "uplink", "--spacecraft-id", 76, "--out", tmp_path / "up.cltu")
+            rejected = do("command", "enter", "test_connection", "--spacecraft-id", 76)["id"]
+            do("command", "reject", rejected, "--reason", "exercise")
+            ask("command", "list", "--limit", 2)
+            ask("command", "receiver", "--spacecraft-id", 76)
+            do("ingest", synthetic_archive)
+            do("ingest", downlink)
+            ask("ingest", tmp_path / "nothing", downlink)
+            ask("ingest", mission)
+            ask("pass", "list")
+            ask("pass", "show", 1)
+            ask("pass", "show", 2)
+            do("report", 1, "--out", tmp_path / "report")
+            ask("report", 2, "--out", tmp_path / "report")
+            ask("correlate", "list", "--spacecraft-id", 76)
+            ask("correlate", "residuals", "--spacecraft-id", 76)
+            ask("correlate", "run", "--spacecraft-id", 76)
+            ask("correlate", "receptions", receptions, "--spacecraft-id", 76)
+            ask("correlate", "receptions", mission, "--spacecraft-id", 76)
+            do("user", "add", "bob", "--role", "viewer")
+            ask("user", "add", "bob", "--role", "viewer")
+            ask("user", "add", "b/b", "--role", "viewer")
+            do("user", "token", "bob", "--keep")
+            do("user", "disable", "bob")
+            ask("user", "disable", "bob")
+            do("user", "enable", "bob")
+            do("user", "role", "bob", "operator")
+            ask("user", "disable", "ann")  # the last administrator
+            ask("user", "list")
+            tokens = do("user", "tokens", "bob")["tokens"]
+            do("user", "revoke", tokens[0]["id"])
+            ask("user", "revoke", tokens[0]["id"])
+            do("audit", "list", "--actor", "ann", "--limit", 5)
+            ask("audit", "list", "--since", "yesterday")
+            do("audit", "head")
+            outputs.append(said)
+    assert ground_commands() <= started
+    for here, there in zip(*outputs, strict=True):
+        assert here == there
+
+
+def steady(value: Any) -> Any:
+    """Return figures without times of entry, hashes and tokens, which differ between two services."""
+    times = {
+        "created",
+        "changed",
+        "requested",
+        "decided",
+        "sent",
+        "entered",
+        "expires",
+        "used",
+        "revoked",
+        "time",
+    }
+    random = {"token", "hint", "sha256", "previous_sha256", "report_id", "number"}
+    if isinstance(value, dict):
+        return {key: None if key in times | random else steady(item) for key, item in value.items()}
+    return [steady(item) for item in value] if isinstance(value, list) else value
