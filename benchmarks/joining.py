@@ -34,9 +34,10 @@ from ground_service.ingest import edge_store as edges
 from ground_service.ingest.edges import CLOSER, OPENER, UNKNOWN, Edge
 from ground_service.ingest.joining import Joiner, raw_domain
 from ground_service.ingest.service import ingest_file
-from ground_service.ingest.stream import DownlinkReader, Link
+from ground_service.ingest.stream import Link, reaches_of
 from ground_service.store import repository
 from ground_service.store.database import prepare_database
+from tmtc.schema import as_octets
 
 SPACECRAFT = 76
 SCOPE = "flight"
@@ -112,10 +113,7 @@ def measure(database_url: str | None, count: int, pieces: int) -> dict[str, Any]
                 commits.append(1e3 * (time.perf_counter() - begun))
 
             opened.enter_context(patch.object(ground.database.engine.dialect, "do_commit", timed_commit))
-            reader = DownlinkReader()
-            for _ in reader.batches([stream[:100_000]]):
-                pass
-            assert reader.link is not None
+            ((reach, *_), _) = reaches_of(as_octets(stream[:100_000]))
             size = len(stream) // (2 * pieces + 2)
             path = Path(name) / "piece"
 
@@ -144,7 +142,7 @@ def measure(database_url: str | None, count: int, pieces: int) -> dict[str, Any]
                         with ground.database.reading() as connection:
                             vehicle = repository.find(connection, repository.VEHICLES, ccsds_id=SPACECRAFT)
                         assert vehicle is not None
-                        fill(ground, reader.link, count, f"channel {vehicle['id']} 0 6 1113")
+                        fill(ground, reach.link, count, f"channel {vehicle['id']} 0 6 1113")
     return figures
 
 

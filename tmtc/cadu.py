@@ -110,37 +110,23 @@ def cadu_octets(octets: OctetArray, sync: CaduSync) -> OctetArray:
     return result
 
 
-def find_period(octets: OctetArray) -> int:
-    """Return the most frequent distance of undamaged markers in octets; 0 if the stream has no markers.
+def undamaged_candidates(octets: OctetArray) -> Iterator[IntArray]:
+    """Yield the start bits of all markers without a wrong bit, upright or inverted, in order."""
+    from tmtc import _markers  # numba is imported only where it is used
 
-    Markers are searched at every bit of the whole stream. A single marker at the start is taken as a stream of one
-    CADU.
-    """
-    starts, _ = undamaged_markers(octets)
-    distances = distances_of(starts)
-    if distances:
-        return next(iter(distances))
-    return octets.size if starts.tolist() == [0] else 0
-
-
-def undamaged_markers(octets: OctetArray) -> tuple[IntArray, BoolArray]:
-    """Return the start bits (n,) of all markers without a wrong bit, and whether they are inverted (n,)."""
-    none = np.empty(0, dtype=np.int64)
-    starts = np.concatenate([none, *_candidates(octets, 0, 0, _SCAN_BITS)])
-    if not starts.size:
-        return none, np.empty(0, dtype=np.bool_)
-    return starts, _marker_errors(octets, starts)[1]
+    readable = octets.view()
+    readable.flags.writeable = False
+    first, stop = 0, 8 * octets.size - MARKER_BITS + 1
+    found = np.empty(_CANDIDATES, dtype=np.int64)
+    while first < stop:
+        count, first = _markers.find_undamaged(readable, first, stop, _markers.second_octets(), found)
+        if count:
+            yield found[:count].copy()
 
 
-def distances_of(start_bits: IntArray) -> dict[int, int]:
-    """Return how often each distance in octets occurs between consecutive markers, the most frequent first.
-
-    Distances that are not a whole number of octets, because bits were lost or inserted, are left out.
-    """
-    distance = np.diff(start_bits)
-    whole = distance[(distance % 8 == 0) & (distance >= 8 * ASM_LENGTH)] // 8
-    values, counts = np.unique(whole, return_counts=True)
-    return {int(values[k]): int(counts[k]) for k in np.argsort(-counts, kind="stable")}
+def are_inverted(octets: OctetArray, start_bits: IntArray) -> BoolArray:
+    """Return whether the marker at each start bit (n,) is inverted."""
+    return _marker_errors(octets, start_bits)[1]
 
 
 def synchronise(

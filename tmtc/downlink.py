@@ -8,7 +8,7 @@ by trial where they are not given, and never fails on damage: what is lost is co
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -18,20 +18,24 @@ from tmtc.arrays import BoolArray, IntArray, OctetArray
 from tmtc.clcw import UplinkSeen, uplink_seen
 from tmtc.crc import CRC_LENGTH, crc16
 from tmtc.dictionary import DICTIONARY
-from tmtc.errors import LinkFormatError, ValueRefused
+from tmtc.errors import UnknownCoding, ValueRefused
+from tmtc.frame_reading import proof_of, read_frames
 from tmtc.frames import (
     FRAME_HEADER_LENGTH,
     IDLE_CHANNEL,
     NO_PACKET_BEGINS,
     OCF_LENGTH,
     ONLY_IDLE_DATA,
+    TmFrameHeaders,
     append_frame_checksums,
     frame_checksums_hold,
     frame_headers,
     idle_data,
 )
 from tmtc.link import Coding, LinkSettings
-from tmtc.link_check import LinkProposal, propose_link
+from tmtc.link_check import CountPackets, LinkProposal, propose_link
+from tmtc.link_plan import LinkPlan, LinkSection, one_section, plan_link
+from tmtc.marker_survey import survey_markers
 from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, idle_packet
 from tmtc.pus import TM_HEADER_LENGTH
 from tmtc.randomiser import Randomiser, randomise
@@ -42,9 +46,6 @@ from tmtc.stream import Octets, PacketCut, PrimaryHeaders, cut_packets, primary_
 FRAME_GOOD, FRAME_UNCORRECTABLE, FRAME_BAD_CHECKSUM, FRAME_FOREIGN, FRAME_UNCHECKED = 0, 1, 2, 3, 4
 FRAME_VERDICTS = ("good", "uncorrectable", "bad_checksum", "foreign", "unchecked")
 """A frame without code and checksum is `unchecked`: its packets are read, but the frame never counts as good."""
-
-_BATCH = 512
-
 
 _DEFAULT = LinkSettings()
 
@@ -182,14 +183,15 @@ def encode_cadus(
 class FrameTable:
     """Table with one row for every CADU found, including discarded ones.
 
-    `offset` of the marker in the stream, `marker_errors` wrong bits of it, `corrected` symbols repaired
-    ((n, interleave), -1 where a codeword is lost), `verdict` an index of `FRAME_VERDICTS`; the header
-    fields of lost frames are not reliable. `buffer_offset` and `buffer_octets` locate the packet zone of the frame in
-    the buffer of packet octets; they are -1 and 0 for frames without packet octets. Packets that were reassembled from
-    parts follow the packet zones in the buffer.
+    `offset` of the marker in the stream, `octets` of the CADU, `marker_errors` wrong bits of the marker, `corrected`
+    symbols repaired ((n, interleave), -1 where a codeword is lost, 0 beyond the depth of the frame's code), `verdict`
+    an index of `FRAME_VERDICTS`; the header fields of lost frames are not reliable. `buffer_offset` and
+    `buffer_octets` locate the packet zone of the frame in the buffer of packet octets; they are -1 and 0 for frames
+    without packet octets. Packets that were reassembled from parts follow the packet zones in the buffer.
     """
 
     offset: IntArray
+    octets: IntArray
     marker_errors: IntArray
     corrected: npt.NDArray[np.int16]
     verdict: npt.NDArray[np.int8]
@@ -213,7 +215,7 @@ class DownlinkDecode:
     `buffer` holds the packet octets that `cut` points into. `unknown` counts packets with a right checksum that the
     dictionary does not know or that are not as long as it says. `octets` says where the octets of the input went;
     its values sum to their number. `frames_bad` counts frames that were found but could not be used, truncated ones
-    included.
+    included. `plan` holds the sections of a stream of frames; `settings` are those of the first section.
     """
 
     buffer: OctetArray
@@ -221,13 +223,18 @@ class DownlinkDecode:
     headers: PrimaryHeaders
     sequence: SequenceReport
     unknown: int
-    settings: LinkSettings | None
+    plan: LinkPlan
     frames: FrameTable | None
     spacecraft_id: int | None
     octets: dict[str, int]
     frames_bad: int
     frames_lost: int
     symbols_corrected: int
+
+    @property
+    def settings(self) -> LinkSettings | None:
+        """Link settings of the first section; None for bare packets."""
+        return self.plan.sections[0].settings if self.plan.sections else None
 
     @property
     def packets(self) -> int:
@@ -324,6 +331,11 @@ class DownlinkDecode:
             "octets": self.octets,
             "spacecraft_id": self.spacecraft_id,
             "link": None if self.settings is None else self.settings.describe(),
+            "link_sections": [
+                {"start": one.start, "stop": one.stop, **one.settings.describe()}
+                for one in self.plan.sections
+            ],
+            "link_ambiguous": self.plan.ambiguous,
         }
 
 
@@ -334,6 +346,7 @@ def decode(
     spacecraft_id: int | None = None,
     dictionary: Dictionary = DICTIONARY,
     error_control: bool = True,
+    plan: LinkPlan | None = None,
 ) -> DownlinkDecode:
     """Everything that a downlink file holds: a stream of CADUs or of bare packets, told apart by their
     content.
@@ -346,19 +359,28 @@ def decode(
         Frames of other spacecraft are not used; the commonest id by default.
     error_control
         False: packets do not end with a checksum; they are told by their headers and sequence counts.
+    plan
+        Sections of the stream, if they are already known.
 
     Raises
     ------
-    LinkFormatError
-        Markers stand in the stream, but no setting known here makes frames of what is between them.
+    UnknownCoding
+        The stream contains markers, but no frame is valid under any known link setting.
     """
     stream = as_octets(octets)
-    if settings is None:
-        settings = settings_of(stream, dictionary, error_control=error_control)
-    if settings is None:
+    if plan is None and settings is not None:
+        plan = one_section(stream, settings)
+    if plan is None:
+        plan = plan_of(stream, dictionary=dictionary, error_control=error_control)
+    if not plan.sections:
         return _bare_packets(stream, dictionary, error_control)
-    synchronised = cadu.synchronise(stream, settings.cadu_length, verify=proof_of(stream, settings))
-    return _frames_to_packets(stream, synchronised, settings, spacecraft_id, dictionary, error_control)
+    sections = []
+    for section in plan.sections:
+        part = stream[section.start : section.stop]
+        verify = proof_of(part, section.settings)
+        sync = cadu.synchronise(part, section.settings.cadu_length, verify=verify)
+        sections.append(_read_section(part, sync, section))
+    return _frames_to_packets(stream, sections, plan, spacecraft_id, dictionary, error_control)
 
 
 def propose_settings(
@@ -366,34 +388,45 @@ def propose_settings(
 ) -> LinkProposal:
     """Return the link settings that the whole stream supports, with the evidence."""
     stream = as_octets(octets)
+    counter = _packet_counter(stream, dictionary, error_control)
+    return propose_link(stream, counter, survey_markers(stream))
 
+
+def plan_of(
+    octets: Octets,
+    known: Sequence[LinkSettings] = (),
+    *,
+    dictionary: Dictionary = DICTIONARY,
+    error_control: bool = True,
+) -> LinkPlan:
+    """Return the sections of a stream of CADUs and their link settings; no sections for bare packets.
+
+    `known` settings are tried first (see `link_plan.plan_link`).
+
+    Raises
+    ------
+    UnknownCoding
+        The stream contains markers, but no frame is valid under any known link setting.
+    """
+    stream = as_octets(octets)
+    plan = plan_link(stream, _packet_counter(stream, dictionary, error_control), known)
+    no_frames = not plan.sections and plan.has_regular_markers
+    if no_frames and not _holds_packets(stream, error_control):
+        proposal = plan.proposal
+        distance = next(iter(proposal.distances), 0) if proposal else 0
+        raise UnknownCoding(proposal.markers if proposal else 0, distance)
+    return plan
+
+
+def _packet_counter(stream: OctetArray, dictionary: Dictionary, error_control: bool) -> CountPackets:
     def count_packets(sync: cadu.CaduSync, settings: LinkSettings) -> tuple[int, float]:
-        found = _frames_to_packets(stream, sync, settings, None, dictionary, error_control)
+        section = _read_section(stream, sync, LinkSection(0, stream.size, settings))
+        plan = one_section(stream, settings)
+        found = _frames_to_packets(stream, [section], plan, None, dictionary, error_control)
         filled = found.octets["packets"] + found.octets["idle_packets"] + found.octets["idle_frames"]
         return found.packets, filled / max(len(sync.start_bits) * settings.frame_length, 1)
 
-    return propose_link(stream, count_packets)
-
-
-def settings_of(
-    octets: Octets, dictionary: Dictionary = DICTIONARY, *, error_control: bool = True
-) -> LinkSettings | None:
-    """Return the link settings of a stream of CADUs; None for bare packets.
-    Raises
-    ------
-    LinkFormatError
-        The stream contains markers, but no frame is valid under any known link setting.
-    """
-    proposal = propose_settings(octets, dictionary, error_control=error_control)
-    no_frames = proposal.settings is None and proposal.has_regular_markers
-    if no_frames and not _holds_packets(octets, error_control):
-        distance = next(iter(proposal.distances), 0)
-        raise LinkFormatError(
-            f"downlink: found {proposal.markers} markers in the stream, mostly {distance} octets apart, but no "
-            "known combination of coding and randomiser fits; expected valid Reed-Solomon codewords, frame error "
-            "control fields or packets, found none; state the link settings if they are known"
-        )
-    return proposal.settings
+    return count_packets
 
 
 def _holds_packets(octets: Octets, error_control: bool) -> bool:
@@ -412,7 +445,7 @@ def _bare_packets(stream: OctetArray, dictionary: Dictionary, error_control: boo
         headers=headers,
         sequence=_account(stream, cut, headers, dictionary),
         unknown=_unknown(stream, cut, dictionary),
-        settings=None,
+        plan=LinkPlan((), None, has_regular_markers=False),
         frames=None,
         spacecraft_id=None,
         octets=octets,
@@ -422,141 +455,179 @@ def _bare_packets(stream: OctetArray, dictionary: Dictionary, error_control: boo
     )
 
 
-def _frames_to_packets(
-    stream: OctetArray,
-    sync: cadu.CaduSync,
-    settings: LinkSettings,
-    spacecraft_id: int | None,
-    dictionary: Dictionary,
-    error_control: bool,
-) -> DownlinkDecode:
-    frames, corrected = _read_frames(stream, sync, settings)
-    header = frame_headers(frames)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Section:
+    """Frames (n, frame_length) of one section; `offset` (n,) in the whole stream."""
+
+    settings: LinkSettings
+    offset: IntArray
+    marker_errors: IntArray
+    truncated: int
+    frames: OctetArray
+    corrected: npt.NDArray[np.int16]
+    header: TmFrameHeaders
+    verdict: npt.NDArray[np.int8]
+
+
+def _read_section(part: OctetArray, sync: cadu.CaduSync, section: LinkSection) -> _Section:
+    """Return the frames of a section from its octets and their synchronisation."""
+    settings = section.settings
+    frames, corrected = read_frames(part, sync, settings)
     verdict = np.full(frames.shape[0], FRAME_GOOD, dtype=np.int8)
     verdict[(corrected < 0).any(axis=1)] = FRAME_UNCORRECTABLE
     if settings.checksum:
         usable = np.flatnonzero(verdict == FRAME_GOOD)
         verdict[usable[~frame_checksums_hold(frames[usable])]] = FRAME_BAD_CHECKSUM
-    usable = np.flatnonzero((verdict == FRAME_GOOD) & (header.version == 0))
-    if spacecraft_id is None and usable.size:
-        spacecraft_id = int(np.bincount(header.spacecraft_id[usable]).argmax())
-    foreign = (header.version != 0) | (header.spacecraft_id != spacecraft_id)
-    verdict[(verdict == FRAME_GOOD) & foreign] = FRAME_FOREIGN
-    good = verdict == FRAME_GOOD
-    if not settings.proves_frames:
-        verdict[good] = FRAME_UNCHECKED
-
-    end = settings.frame_length - (CRC_LENGTH if settings.checksum else 0)
-    clcw = np.zeros(frames.shape[0], dtype=np.uint32)
-    has_clcw = np.flatnonzero(good & header.ocf)
-    clcw[has_clcw] = np.ascontiguousarray(frames[has_clcw, end - OCF_LENGTH : end]).view(">u4")[:, 0]
-
-    parts: list[OctetArray] = []
-    segments: list[IntArray] = []
-    filled, zone_octets, orphaned, idle_octets, frames_lost = 0, 0, 0, 0, 0
-    buffer_offset = np.full(frames.shape[0], -1, dtype=np.int64)
-    buffer_octets = np.zeros(frames.shape[0], dtype=np.int64)
-    # where the packet zone begins and ends: behind the secondary header, before the operational control field
-    zone_start = FRAME_HEADER_LENGTH + np.where(
-        header.secondary_header, (frames[:, FRAME_HEADER_LENGTH] & 0x3F).astype(np.int64) + 1, 0
+    return _Section(
+        settings,
+        sync.offsets + section.start,
+        sync.marker_errors,
+        int(sync.truncated.size),
+        frames,
+        corrected,
+        frame_headers(frames),
+        verdict,
     )
-    zone_stop = end - np.where(header.ocf, OCF_LENGTH, 0)
-    # all frames of a channel have one layout; should they not, the layouts are kept apart
-    layout = np.stack((header.virtual_channel, zone_start, zone_stop), axis=1)
-    for channel, start, stop in np.unique(layout[good & (zone_start < zone_stop)], axis=0).tolist():
-        mine = np.flatnonzero(good & (layout == (channel, start, stop)).all(axis=1))
-        rebuilt = _rebuild(
-            frames[mine, start:stop],
-            header.channel_count[mine],
-            header.first_header_pointer[mine],
-            error_control,
+
+
+def _commonest_spacecraft(sections: Sequence[_Section]) -> int | None:
+    ids = np.concatenate(
+        [
+            one.header.spacecraft_id[(one.verdict == FRAME_GOOD) & (one.header.version == 0)]
+            for one in sections
+        ]
+    )
+    return int(np.bincount(ids).argmax()) if ids.size else None
+
+
+@dataclass(slots=True)
+class _Filling:
+    """Buffer of packet octets while it is filled, and its accounting."""
+
+    parts: list[OctetArray] = field(default_factory=list)
+    segments: list[IntArray] = field(default_factory=list)
+    tables: list[FrameTable] = field(default_factory=list)
+    filled: int = 0
+    orphaned: int = 0
+    idle: int = 0
+    overhead: int = 0
+    bad: int = 0
+    lost: int = 0
+
+    def add(self, section: _Section, spacecraft_id: int | None, depth: int, error_control: bool) -> None:
+        """Add the packet octets of a section; `depth` is the largest interleaving depth of all sections."""
+        settings, frames, header = section.settings, section.frames, section.header
+        verdict = section.verdict.copy()
+        foreign = (header.version != 0) | (header.spacecraft_id != spacecraft_id)
+        verdict[(verdict == FRAME_GOOD) & foreign] = FRAME_FOREIGN
+        good = verdict == FRAME_GOOD
+        if not settings.proves_frames:
+            verdict[good] = FRAME_UNCHECKED
+        end = settings.frame_length - (CRC_LENGTH if settings.checksum else 0)
+        clcw = np.zeros(frames.shape[0], dtype=np.uint32)
+        has_clcw = np.flatnonzero(good & header.ocf)
+        clcw[has_clcw] = np.ascontiguousarray(frames[has_clcw, end - OCF_LENGTH : end]).view(">u4")[:, 0]
+        buffer_offset = np.full(frames.shape[0], -1, dtype=np.int64)
+        buffer_octets = np.zeros(frames.shape[0], dtype=np.int64)
+        # where the packet zone begins and ends: behind the secondary header, before the operational control field
+        zone_start = FRAME_HEADER_LENGTH + np.where(
+            header.secondary_header, (frames[:, FRAME_HEADER_LENGTH] & 0x3F).astype(np.int64) + 1, 0
         )
-        used = mine[header.first_header_pointer[mine] != ONLY_IDLE_DATA]
-        buffer_offset[used] = filled + (stop - start) * np.arange(used.size)
-        buffer_octets[used] = stop - start
-        parts.append(rebuilt.buffer)
-        segments.append(rebuilt.segments + filled)
-        filled += rebuilt.buffer.size
-        zone_octets += rebuilt.octets + rebuilt.idle_octets
-        idle_octets += rebuilt.idle_octets
-        orphaned += rebuilt.orphaned
-        frames_lost += rebuilt.frames_lost
+        zone_stop = end - np.where(header.ocf, OCF_LENGTH, 0)
+        zone_octets = 0
+        # all frames of a channel have one layout; should they not, the layouts are kept apart
+        layout = np.stack((header.virtual_channel, zone_start, zone_stop), axis=1)
+        for channel, start, stop in np.unique(layout[good & (zone_start < zone_stop)], axis=0).tolist():
+            mine = np.flatnonzero(good & (layout == (channel, start, stop)).all(axis=1))
+            rebuilt = _rebuild(
+                frames[mine, start:stop],
+                header.channel_count[mine],
+                header.first_header_pointer[mine],
+                error_control,
+            )
+            used = mine[header.first_header_pointer[mine] != ONLY_IDLE_DATA]
+            buffer_offset[used] = self.filled + (stop - start) * np.arange(used.size)
+            buffer_octets[used] = stop - start
+            self.parts.append(rebuilt.buffer)
+            self.segments.append(rebuilt.segments + self.filled)
+            self.filled += rebuilt.buffer.size
+            zone_octets += rebuilt.octets + rebuilt.idle_octets
+            self.idle += rebuilt.idle_octets
+            self.orphaned += rebuilt.orphaned
+            self.lost += rebuilt.frames_lost
+        n_good = int(np.count_nonzero(good))
+        self.overhead += n_good * settings.cadu_length - zone_octets
+        self.bad += (frames.shape[0] - n_good) * settings.cadu_length
+        corrected = np.zeros((frames.shape[0], depth), dtype=np.int16)
+        corrected[:, : section.corrected.shape[1]] = section.corrected
+        self.tables.append(
+            FrameTable(
+                offset=section.offset,
+                octets=np.full(frames.shape[0], settings.cadu_length, dtype=np.int64),
+                marker_errors=section.marker_errors,
+                corrected=corrected,
+                verdict=verdict,
+                spacecraft_id=header.spacecraft_id,
+                virtual_channel=header.virtual_channel,
+                master_count=header.master_count,
+                channel_count=header.channel_count,
+                first_header_pointer=header.first_header_pointer,
+                clcw=clcw,
+                buffer_offset=buffer_offset,
+                buffer_octets=buffer_octets,
+            )
+        )
+
+    def table(self) -> FrameTable:
+        """Return the frames of all sections."""
+        if len(self.tables) == 1:
+            return self.tables[0]
+        return FrameTable(
+            *(np.concatenate([getattr(one, f.name) for one in self.tables]) for f in fields(FrameTable))
+        )
+
+
+def _frames_to_packets(
+    stream: OctetArray,
+    sections: Sequence[_Section],
+    plan: LinkPlan,
+    spacecraft_id: int | None,
+    dictionary: Dictionary,
+    error_control: bool,
+) -> DownlinkDecode:
+    if spacecraft_id is None:
+        spacecraft_id = _commonest_spacecraft(sections)
+    filling = _Filling()
+    depth = max(one.corrected.shape[1] for one in sections)
+    for section in sections:
+        filling.add(section, spacecraft_id, depth, error_control)
+    parts, segments = filling.parts, filling.segments
     buffer = np.concatenate(parts) if parts else np.empty(0, dtype=np.uint8)
     ranges = np.concatenate(segments) if segments else np.empty((0, 2), dtype=np.int64)
     cut = cut_packets(buffer, segments=ranges, error_control=error_control)
     headers = primary_headers(buffer, cut)
-    n_good = int(np.count_nonzero(good))
+    table = filling.table()
     octets = _octet_account(int((ranges[:, 1] - ranges[:, 0]).sum()), cut)
-    octets["orphaned"] = orphaned
-    octets["idle_frames"] = idle_octets
-    octets["frame_overhead"] = n_good * settings.cadu_length - zone_octets
-    octets["bad_frames"] = (frames.shape[0] - n_good) * settings.cadu_length
-    octets["unsynchronised"] = stream.size - frames.shape[0] * settings.cadu_length
-    table = FrameTable(
-        offset=sync.offsets,
-        marker_errors=sync.marker_errors,
-        corrected=corrected,
-        verdict=verdict,
-        spacecraft_id=header.spacecraft_id,
-        virtual_channel=header.virtual_channel,
-        master_count=header.master_count,
-        channel_count=header.channel_count,
-        first_header_pointer=header.first_header_pointer,
-        clcw=clcw,
-        buffer_offset=buffer_offset,
-        buffer_octets=buffer_octets,
-    )
+    octets["orphaned"] = filling.orphaned
+    octets["idle_frames"] = filling.idle
+    octets["frame_overhead"] = filling.overhead
+    octets["bad_frames"] = filling.bad
+    octets["unsynchronised"] = stream.size - int(table.octets.sum())
+    used = np.isin(table.verdict, (FRAME_GOOD, FRAME_UNCHECKED))
     return DownlinkDecode(
         buffer=buffer,
         cut=cut,
         headers=headers,
         sequence=_account(buffer, cut, headers, dictionary),
         unknown=_unknown(buffer, cut, dictionary),
-        settings=settings,
+        plan=plan,
         frames=table,
         spacecraft_id=spacecraft_id,
         octets=octets,
-        frames_bad=frames.shape[0] - n_good + int(sync.truncated.size),
-        frames_lost=frames_lost,
-        symbols_corrected=int(corrected[corrected > 0].sum()),
+        frames_bad=int(np.count_nonzero(~used)) + sum(one.truncated for one in sections),
+        frames_lost=filling.lost,
+        symbols_corrected=int(table.corrected[table.corrected > 0].sum()),
     )
-
-
-def _read_frames(
-    stream: OctetArray, sync: cadu.CaduSync, settings: LinkSettings
-) -> tuple[OctetArray, npt.NDArray[np.int16]]:
-    """Frames (n, frame_length), de-randomised and repaired, and corrected symbols (n, interleave)."""
-    code = settings.code
-    n = sync.offsets.size
-    frames = np.empty((n, settings.frame_length), dtype=np.uint8)
-    corrected = np.zeros((n, code.interleave if code else 1), dtype=np.int16)
-    for first in range(0, n, _BATCH):
-        part = slice(first, min(first + _BATCH, n))
-        blocks = randomise(_blocks(stream, sync.take(np.arange(n)[part])), settings.randomiser)
-        if code is None:
-            frames[part] = blocks
-        else:
-            repaired = reed_solomon.decode(blocks, code)
-            frames[part], corrected[part] = repaired.frames, repaired.corrected
-    return frames, corrected
-
-
-def _blocks(stream: OctetArray, sync: cadu.CaduSync) -> OctetArray:
-    """Return the octets that follow each marker (n, period - 4), aligned and upright."""
-    return cadu.cadu_octets(stream, sync)[:, cadu.ASM_LENGTH :]
-
-
-def proof_of(stream: OctetArray, settings: LinkSettings) -> cadu.Verify | None:
-    """Return a function that checks the code or checksum of CADUs; None if frames have neither."""
-    if not settings.proves_frames:
-        return None
-
-    def proves(sync: cadu.CaduSync) -> BoolArray:
-        frames, corrected = _read_frames(stream, sync, settings)
-        repaired: BoolArray = np.all(corrected >= 0, axis=1)
-        return repaired & frame_checksums_hold(frames) if settings.checksum else repaired
-
-    return proves
 
 
 _LATE_FRAMES = 64

@@ -67,5 +67,14 @@ class LinkFormatError(TmtcError):
     """A stream whose framing cannot be told, or link settings that contradict each other."""
 
 
+class UnknownCoding(LinkFormatError):
+    """A stream with regular markers in which no frame is valid under any known link settings."""
+
+    def __init__(self, markers: int, distance_octets: int) -> None:
+        self.expected = "frames that are valid under a known coding and randomiser, or stated link settings"
+        self.found = f"{markers} markers, mostly {distance_octets} octets apart, and no valid frame or packet"
+        super().__init__(f"downlink: expected {self.expected}, found {self.found}")
+
+
 class DefinitionError(TmtcError):
     """An imported packet definition that is damaged, contradicts itself or uses what is not supported."""

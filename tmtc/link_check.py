@@ -21,6 +21,7 @@ from tmtc.arrays import BoolArray, IntArray, OctetArray
 from tmtc.errors import LinkFormatError
 from tmtc.frames import FRAME_HEADER_LENGTH, FRAME_MAX_LENGTH, frame_checksums_hold
 from tmtc.link import FRAME_MIN_LENGTH, LinkSettings
+from tmtc.marker_survey import MarkerSurvey
 from tmtc.randomiser import Randomiser, randomise
 
 CountPackets = Callable[[cadu.CaduSync, LinkSettings], tuple[int, float]]
@@ -104,7 +105,7 @@ class LinkProposal:
         return self.markers >= 3 or max(self.distances.values(), default=0) >= 2
 
 
-def propose_link(stream: OctetArray, count_packets: CountPackets) -> LinkProposal:
+def propose_link(stream: OctetArray, count_packets: CountPackets, survey: MarkerSurvey) -> LinkProposal:
     """Return the link settings that fit a stream of CADUs, with the evidence.
 
     Parameters
@@ -112,9 +113,10 @@ def propose_link(stream: OctetArray, count_packets: CountPackets) -> LinkProposa
     stream : (n,) uint8
     count_packets
         Counts the valid packets in some CADUs of the stream.
+    survey
+        Undamaged markers of the stream.
     """
-    starts, inverted = cadu.undamaged_markers(stream)
-    distances = cadu.distances_of(starts)
+    starts, inverted, distances = survey.start_bits, survey.inverted, survey.distances
     if not starts.size:
         return LinkProposal(None, (), 0, distances, False)
     found: list[LinkEvidence] = []
@@ -130,10 +132,10 @@ def propose_link(stream: OctetArray, count_packets: CountPackets) -> LinkProposa
             break
     found.sort(key=_rank, reverse=True)
     if not found:
-        return LinkProposal(None, (), int(starts.size), distances, False)
+        return LinkProposal(None, (), survey.markers, distances, False)
     best = found[0]
     rivals = [one for one in found[1:] if one.packets >= best.packets > 0 and one.regular >= best.regular]
-    return LinkProposal(best.settings, tuple(found), int(starts.size), distances, bool(rivals))
+    return LinkProposal(best.settings, tuple(found), survey.markers, distances, bool(rivals))
 
 
 def _rank(evidence: LinkEvidence) -> tuple[float, float]:
@@ -188,7 +190,7 @@ def _examine(
         without = [
             replace(c, checksum=False)
             for c in uncoded
-            if _regular(plain[c.randomiser]).mean() >= LEAST_REGULAR
+            if are_regular(plain[c.randomiser]).mean() >= LEAST_REGULAR
         ]
         weighed = [_weigh(stream, sync, plain[c.randomiser], c, count_packets) for c in without]
         return [one for one in weighed if one.packets >= LEAST_PROOFS and one.filled >= LEAST_FILLED]
@@ -230,7 +232,7 @@ def _weigh(
     if code is not None:
         settings = replace(candidate, checksum=bool(held[good].sum() > good.sum() / 2))
     proved = good & held if settings.checksum else good
-    regular = _regular(frames)
+    regular = are_regular(frames)
     share = float(regular[proved].mean()) if proved.any() else 0.0
     first = int(np.argmax(proved)) if proved.any() else 0
     begin = int(sync.start_bits[first] >> 3)
@@ -257,7 +259,7 @@ def _weigh(
     )
 
 
-def _regular(frames: OctetArray) -> BoolArray:
+def are_regular(frames: OctetArray) -> BoolArray:
     """Return whether each frame (n, length) has version 0, no data field flags and segment length id 11."""
     regular: BoolArray = (frames[:, 0] >> 6 == 0) & (frames[:, 4] >> 3 == 0b00011)
     return regular

@@ -1,9 +1,8 @@
 """Reed-Solomon (255,223) and (255,239) of CCSDS 131.0-B: interleaved, shortened, dual or conventional basis.
 
 Encoding and the check whether codewords are clean are linear over bits, so both are sums (exclusive or) of
-one table row per symbol, done for all codewords at once; the tables are made for the basis in use and no
-symbol is converted. Only codewords with errors go through the decoder proper, in the conventional basis, again
-many at once, so that a stream of nothing but noise does not hold up its reader.
+one table row per symbol; the tables are made for the basis in use and no symbol is converted. Only codewords with
+errors go through the decoder proper, in the conventional basis.
 
 References
 ----------
@@ -75,10 +74,14 @@ class ReedSolomon:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RsDecode:
-    """Frames (n, frame_length) and corrected symbols (n, interleave), `UNCORRECTABLE` where a codeword is lost."""
+    """Frames (n, frame_length) and corrected symbols (n, interleave), `UNCORRECTABLE` where a codeword is lost.
+
+    `wrong_bits` (n,): corrected bits of all codewords of a block.
+    """
 
     frames: OctetArray
     corrected: npt.NDArray[np.int16]
+    wrong_bits: npt.NDArray[np.int64]
 
 
 def code_for(
@@ -105,9 +108,7 @@ def encode(frames: OctetArray, code: ReedSolomon) -> OctetArray:
     blocks[:, : code.frame_length] = frames
     data = frames.reshape(-1, code.symbols, code.interleave)
     check = blocks[:, code.frame_length :].reshape(-1, code.parity, code.interleave)
-    for start in range(0, frames.shape[0], _BLOCK):
-        part = slice(start, start + _BLOCK)
-        check[part] = _parity(data[part], code)
+    check[:] = _parity(data, code).transpose(0, 2, 1)
     return blocks
 
 
@@ -118,6 +119,7 @@ def decode(blocks: OctetArray, code: ReedSolomon) -> RsDecode:
             f"Reed-Solomon: expected codeblocks of {code.block_length} octets, found {blocks.shape}"
         )
     corrected = np.zeros((blocks.shape[0], code.interleave), dtype=np.int16)
+    wrong_bits = np.zeros(blocks.shape[0], dtype=np.int64)
     frames = blocks[:, : code.frame_length]
     dirty = np.argwhere(~clean(blocks, code))
     if dirty.size:
@@ -126,110 +128,48 @@ def decode(blocks: OctetArray, code: ReedSolomon) -> RsDecode:
         data = frames.reshape(-1, code.symbols, code.interleave)
         for start in range(0, dirty.shape[0], _BLOCK):
             block, column = dirty[start : start + _BLOCK].T
-            data[block, :, column], corrected[block, column] = repair(words[block, :, column], code)
-    return RsDecode(frames, corrected)
+            received = words[block, :, column]
+            mended, corrected[block, column] = repair(received, code)
+            data[block, :, column] = mended[:, : code.symbols]
+            np.add.at(wrong_bits, block, np.bitwise_count(received ^ mended).sum(axis=1, dtype=np.int64))
+    return RsDecode(frames, corrected, wrong_bits)
 
 
 def clean(blocks: OctetArray, code: ReedSolomon) -> BoolArray:
     """Whether each codeword of codeblocks (n, block_length) is free of errors, shape (n, interleave)."""
     words = blocks.reshape(blocks.shape[0], CODEWORD - code.virtual_fill, code.interleave)
-    result = np.empty((blocks.shape[0], code.interleave), dtype=np.bool_)
-    for start in range(0, blocks.shape[0], _BLOCK):
-        part = words[start : start + _BLOCK]
-        same = _parity(part[:, : code.symbols], code) == part[:, code.symbols :]
-        result[start : start + _BLOCK] = same.all(axis=1)
+    sent = words[:, code.symbols :].transpose(0, 2, 1)
+    result: npt.NDArray[np.bool_] = (_parity(words, code) == sent).all(axis=2)
     return result
 
 
 def repair(words: OctetArray, code: ReedSolomon) -> tuple[OctetArray, npt.NDArray[np.int16]]:
-    """Data symbols (n, symbols) and corrected symbols (n,) of codewords (n, 255 - virtual fill) as sent.
+    """Return codewords (n, 255 - virtual fill) as sent, corrected, and the number of corrected symbols (n,).
 
-    Where a codeword has more wrong symbols than the code repairs, its data stay as they are and the count is
-    `UNCORRECTABLE`.
-
-    References
-    ----------
-    Berlekamp and Massey's algorithm without inversions, Chien's search, Forney's formula (for example Blahut,
-    Algebraic Codes for Data Transmission, chapter 7), each step for all codewords at once.
+    A codeword with more wrong symbols than the code corrects is returned as it is, with the count `UNCORRECTABLE`.
     """
+    from tmtc import _rs_kernel  # numba is imported only where it is used
+
     to_dual, from_dual = dual_basis_tables()
     received = np.zeros((words.shape[0], CODEWORD), dtype=np.uint8)
     received[:, code.virtual_fill :] = from_dual[words] if code.dual_basis else words
-    syndromes = _syndromes(received, code.errors)
-    locator = _error_locator(syndromes, code.errors)
-    values = _error_values(syndromes, locator, code.errors)
-    count = np.count_nonzero(values, axis=1)
-    degree = locator.shape[1] - 1 - np.argmax(locator[:, ::-1] != 0, axis=1)
-    # as many roots as the locator promises, none where zeros were never sent, and a codeword afterwards
-    good = (degree == count) & (count <= code.errors) & ~values[:, : code.virtual_fill].any(axis=1)
-    mended = received ^ values
-    good &= ~_syndromes(mended, code.errors).any(axis=1)
-    mended = np.where(good[:, None], mended, received)[:, code.virtual_fill : CODEWORD - code.parity]
-    counts = np.where(good, count, UNCORRECTABLE).astype(np.int16)
+    counts = np.empty(words.shape[0], dtype=np.int16)
+    exponent, logarithm = _field_tables()
+    _rs_kernel.correct(
+        received,
+        code.virtual_fill,
+        code.errors,
+        _parity_table(code.errors, False),
+        _syndrome_table(code.errors),
+        _place_table(code.errors),
+        np.concatenate((exponent, exponent)).astype(np.uint8),
+        logarithm,
+        _places(),
+        -(128 - code.errors) * _places() % 255,
+        counts,
+    )
+    mended = received[:, code.virtual_fill :]
     return (to_dual[mended] if code.dual_basis else mended), counts
-
-
-def _syndromes(received: OctetArray, errors: int) -> OctetArray:
-    """Values (n, parity) of codewords (n, 255) in the conventional basis at the generator's roots."""
-    whole = ReedSolomon(errors, 1, 0, dual_basis=False)
-    parity = _parity(received[:, : whole.symbols, None], whole)[:, :, 0]
-    # a codeword plus the difference of check symbols: its value at a root is that of the difference alone
-    difference = parity ^ received[:, whole.symbols :]
-    times, roots = _multiplication_table(), _roots(errors)
-    value = np.zeros((received.shape[0], 2 * errors), dtype=np.uint8)
-    for k in range(2 * errors):
-        value = times[roots, value] ^ difference[:, k : k + 1]
-    return value
-
-
-def _error_locator(syndromes: OctetArray, errors: int) -> OctetArray:
-    """Coefficients (n, parity + 1), lowest power first, of the polynomial whose roots locate the errors."""
-    times = _multiplication_table()
-    n, parity = syndromes.shape
-    locator = np.zeros((n, parity + 1), dtype=np.uint8)
-    locator[:, 0] = 1
-    before = locator.copy()
-    scale = np.ones(n, dtype=np.uint8)
-    length = np.zeros(n, dtype=np.int64)
-    for step in range(parity):
-        terms = times[locator[:, : step + 1], syndromes[:, step::-1][:, : step + 1]]
-        discrepancy = np.bitwise_xor.reduce(terms, axis=1)
-        shifted = np.zeros_like(before)
-        shifted[:, 1:] = before[:, :-1]
-        after = times[scale[:, None], locator] ^ times[discrepancy[:, None], shifted]
-        longer = (discrepancy != 0) & (2 * length <= step)
-        before = np.where(longer[:, None], locator, shifted)
-        scale = np.where(longer, discrepancy, scale)
-        length = np.where(longer, step + 1 - length, length)
-        locator = after
-    return locator
-
-
-def _error_values(syndromes: OctetArray, locator: OctetArray, errors: int) -> OctetArray:
-    """What was added (n, 255) to each symbol, by the roots of the locator."""
-    times, inverse = _multiplication_table(), _inverses()
-    n, parity = syndromes.shape
-    locator = locator[:, : errors + 1]
-    # evaluator: the product with the syndromes, powers below the parity
-    evaluator = np.zeros((n, parity), dtype=np.uint8)
-    for k in range(errors + 1):
-        evaluator[:, k:] ^= times[locator[:, k : k + 1], syndromes[:, : parity - k]]
-    powers = _inverse_powers(parity)
-    total, odd = np.zeros((n, CODEWORD), dtype=np.uint8), np.zeros((n, CODEWORD), dtype=np.uint8)
-    for k in range(errors + 1):
-        term = times[locator[:, k : k + 1], powers[k]]
-        total ^= term
-        if k % 2:
-            odd ^= term
-    values = np.zeros((n, CODEWORD), dtype=np.uint8)
-    word, place = np.nonzero((total == 0) & (odd != 0))
-    numerator = np.zeros(word.size, dtype=np.uint8)
-    for k in range(errors):
-        numerator ^= times[evaluator[word, k], powers[k, place]]
-    # the odd terms of the locator are its derivative divided by the place
-    value = times[times[numerator, inverse[odd[word, place]]], _offsets(errors)[place]]
-    values[word, place] = value
-    return values
 
 
 @functools.cache
@@ -261,19 +201,16 @@ def generator(errors: int) -> tuple[int, ...]:
     return tuple(polynomial)
 
 
-def _parity(data: OctetArray, code: ReedSolomon) -> OctetArray:
-    """Check symbols (n, parity, interleave) of data symbols (n, symbols, interleave)."""
+def _parity(words: OctetArray, code: ReedSolomon) -> OctetArray:
+    """Check symbols (n, interleave, parity) of codewords (n, at least symbols, interleave)."""
+    from tmtc import _rs_kernel
+
     table = _parity_table(code.errors, code.dual_basis)
-    n = data.shape[0] * code.interleave
-    # one row per symbol, so that each step reads a contiguous row of all codewords
-    rows = np.ascontiguousarray(data.transpose(1, 0, 2)).reshape(code.symbols, n).astype(np.intp)
-    total = np.zeros((n, table.shape[2]), dtype=np.uint64)
-    row = np.empty_like(total)
-    for position in range(code.symbols):
-        np.take(table[code.virtual_fill + position], rows[position], axis=0, out=row, mode="clip")
-        total ^= row
-    parity = total.view(np.uint8).reshape(data.shape[0], code.interleave, code.parity)
-    return parity.transpose(0, 2, 1)
+    total = np.zeros((words.shape[0], code.interleave, table.shape[2]), dtype=np.uint64)
+    readable = words.view()
+    readable.flags.writeable = False  # one compiled variant for frames of every origin
+    _rs_kernel.add_checks(readable, code.virtual_fill, code.symbols, table, total)
+    return total.view(np.uint8)
 
 
 @functools.cache
@@ -314,36 +251,30 @@ def _multiplication_table() -> OctetArray:
 
 
 @functools.cache
-def _roots(errors: int) -> npt.NDArray[np.intp]:
-    """The generator's roots."""
-    exponent, _ = _field_tables()
-    roots: npt.NDArray[np.intp] = exponent[11 * np.arange(128 - errors, 128 + errors) % 255].astype(np.intp)
-    return roots
+def _places() -> npt.NDArray[np.int64]:
+    """(255,): logarithm of the place b^(254 - index) of every symbol, b = a^11."""
+    places: npt.NDArray[np.int64] = 11 * (254 - np.arange(CODEWORD)) % 255
+    return places
 
 
 @functools.cache
-def _inverse_powers(count: int) -> OctetArray:
-    """(count, 255): powers 0, 1, ... of the inverse of every symbol's place b^(254 - index), b = a^11."""
+def _syndrome_table(errors: int) -> npt.NDArray[np.uint64]:
+    """(parity, 256, parity / 8): values at the generator's roots of one value at one place of the check symbols."""
     exponent, _ = _field_tables()
-    places = 11 * (254 - np.arange(CODEWORD))
-    powers: OctetArray = exponent[-np.arange(count)[:, None] * places % 255].astype(np.uint8)
-    return powers
+    powers = 11 * np.arange(128 - errors, 128 + errors)
+    place = 2 * errors - 1 - np.arange(2 * errors)
+    table = _multiplication_table()[:, exponent[np.outer(place, powers) % 255]].transpose(1, 0, 2)
+    return np.ascontiguousarray(table).view(np.uint64)
 
 
 @functools.cache
-def _offsets(errors: int) -> OctetArray:
-    """(255,): the place of every symbol to the power -(128 - E)."""
+def _place_table(errors: int) -> npt.NDArray[np.uint64]:
+    """(errors + 1, 256, 32): products of a value and the inverses of all 255 places to a power; the last octet is 1."""
     exponent, _ = _field_tables()
-    places = 11 * (254 - np.arange(CODEWORD))
-    return exponent[-(128 - errors) * places % 255].astype(np.uint8)
-
-
-@functools.cache
-def _inverses() -> OctetArray:
-    exponent, logarithm = _field_tables()
-    inverse = np.zeros(256, dtype=np.uint8)
-    inverse[1:] = exponent[-logarithm[1:] % 255]
-    return inverse
+    powers = exponent[-np.outer(np.arange(errors + 1), _places()) % 255]
+    table = np.ones((errors + 1, 256, 256), dtype=np.uint8)
+    table[:, :, :CODEWORD] = _multiplication_table()[:, powers].transpose(1, 0, 2)
+    return table.view(np.uint64)
 
 
 def _times(a: int, b: int) -> int:

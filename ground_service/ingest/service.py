@@ -6,7 +6,7 @@ files or on how often they came. An ingest that was cut off can simply be run ag
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -28,17 +28,21 @@ from ground_service.ingest.stream import (
     PROBE_OCTETS,
     DownlinkReader,
     Link,
+    LinkAccounting,
+    Reach,
     fragment_edges,
+    reaches_of,
 )
 from ground_service.jobs.service import OTHER_REQUEST, add_job
 from ground_service.store import repository
 from ground_service.store.counters import hold
-from ground_service.store.files import StoredFile, read_blocks
+from ground_service.store.files import StoredFile, mapped_octets, read_blocks
 from tmtc.cuc import NO_TICKS
 from tmtc.dictionary import DICTIONARY
-from tmtc.errors import TmtcError
+from tmtc.errors import TmtcError, UnknownCoding
 from tmtc.link import LinkSettings
 from tmtc.packets import PACKET_MAX_LENGTH
+from tmtc.schema import as_octets
 
 FLOWN = "flight"
 """Instance of a spacecraft that telemetry belongs to when nothing else is said."""
@@ -315,6 +319,7 @@ class _Batch:
 
     packets: PacketBatch
     channel_edges: list[ChannelEdge]
+    is_bare: bool
 
 
 class _Reading:
@@ -335,23 +340,16 @@ class _Reading:
         self.joiner = Joiner(ground, piece, self.vehicles)
         self.new = self.unknown = 0
         self.ticks: list[int] = []
-        self.reader = DownlinkReader(piece.spacecraft_id)
+        self.accounting = LinkAccounting(octets=piece.octets, octets_skipped=piece.octets)
 
     def read(self) -> list[edges.Piece]:
         """Read and join the piece; return the pieces that can be read now because its link is known."""
         while True:
             with self.ground.database.reading() as connection:
                 known = edges.known_links(connection, self.piece.scope)
-            candidates = [*known, *(link for link in DEFAULT_LINKS if link not in known)]
-            self.reader = DownlinkReader(self.spacecraft_id, known=candidates)
-            last = self._store_batches()
-            link = self.reader.link
-            if link is not None:
-                with self.ground.database.writing() as connection:
-                    self._store(connection, last)
-                    self.joiner.keep_channel_edges(connection, self.reader.take_channel_edges())
-                    self.joiner.keep_edges(connection, link, self.reader.edges)
-                    self._learn(connection, link, known, None)
+            reaches = self._reaches(known)
+            if reaches:
+                self._read_reaches(reaches, known)
                 self.joiner.join()
                 return self._readable_now()
             link = self._link_by_place(known) if self.piece.octets <= CADU_MAX_OCTETS else None
@@ -369,6 +367,36 @@ class _Reading:
                 if len(edges.known_links(connection, self.piece.scope)) == len(known):
                     return []
 
+    def _reaches(self, known: list[Link]) -> list[Reach]:
+        """Return the sections of the file; none without sufficient evidence of its link.
+
+        Raises
+        ------
+        InvalidInput
+            If the file has frames whose coding is unknown.
+        """
+        candidates = [*known, *(link for link in DEFAULT_LINKS if link not in known)]
+        octets = mapped_octets(self.ground.files.path(self.piece.file_sha256))
+        try:
+            reaches, _ = reaches_of(octets, candidates)
+        except UnknownCoding as error:
+            source = _name(self.ground, self.piece.file_sha256)
+            raise InvalidInput(source, "", error.expected, error.found) from error
+        return reaches
+
+    def _read_reaches(self, reaches: Sequence[Reach], known: list[Link]) -> None:
+        """Read the sections of the file and store their packets and edges."""
+        self.accounting = LinkAccounting()
+        for reach in reaches:
+            reader = DownlinkReader(reach, self.spacecraft_id)
+            last = self._store_batches(reader)
+            with self.ground.database.writing() as connection:
+                self._store(connection, last)
+                self.joiner.keep_channel_edges(connection, reader.take_channel_edges())
+                self.joiner.keep_edges(connection, reach.link, reader.edges)
+                self._learn(connection, reach.link, known, None)
+            self.accounting.add(reader.accounting)
+
     def _learn(self, connection: Connection, link: Link, known: list[Link], links_tried: int | None) -> None:
         edges.note_read(connection, self.piece.ingest_id, links_tried)
         if link not in known:
@@ -383,25 +411,25 @@ class _Reading:
                 if one != self.piece.ingest_id
             ]
 
-    def _store_batches(self) -> _Batch | None:
-        """Store all batches of the file except the last one, which is returned."""
-        ground, total = self.ground, max(self.piece.octets, 1)
+    def _store_batches(self, reader: DownlinkReader) -> _Batch | None:
+        """Store all batches of a section except the last one, which is returned."""
+        ground, total, reach = self.ground, max(self.piece.octets, 1), reader.reach
         path = ground.files.path(self.piece.file_sha256)
         last: _Batch | None = None
-        for batch in self.reader.batches(read_blocks(path)):
+        for batch in reader.batches(read_blocks(path, start=reach.start, stop=reach.stop)):
             ground.check_stopping()
             if batch.spacecraft_id is None:
                 raise InvalidInput("downlink of bare packets", "", "the id of their spacecraft", "none given")
             if last is not None:
                 with self.ground.database.writing() as connection:
                     self._store(connection, last)
-            last = _Batch(batch, self.reader.take_channel_edges())
+            last = _Batch(batch, reader.take_channel_edges(), reach.link == BARE)
             if self.progress is not None:
-                self.progress(self.reader.accounting.octets / total)
+                self.progress((reach.start + reader.accounting.octets) / total)
         return last
 
     def _store(self, connection: Connection, found: _Batch | None) -> None:
-        if found is None or (not len(found.packets) and self.reader.link == BARE):
+        if found is None or (found.is_bare and not len(found.packets)):
             return
         assert found.packets.spacecraft_id is not None
         vehicle = self.joiner.vehicle(connection, found.packets.spacecraft_id)
@@ -425,15 +453,13 @@ class _Reading:
             return None
         parts = [*before, edges.Part(self.piece.file_sha256, 0, self.piece.octets), *behind]
         octets = b"".join(self.ground.files.read(one.file_sha256, one.start, one.stop) for one in parts)
-        probe = DownlinkReader(self.spacecraft_id, known=DEFAULT_LINKS)
         try:
-            for _ in probe.batches([octets]):
-                pass
-        except TmtcError:
+            reaches, _ = reaches_of(as_octets(octets), DEFAULT_LINKS)
+        except UnknownCoding:
             return None
-        link = probe.link  # octets that are adjacent only by order of arrival must not determine a link
-        certain = link is None or link.settings is None or is_checked(link.settings)
-        return link if certain else None
+        # octets that are adjacent only by order of arrival must not determine a link without proof
+        link = reaches[0].link if reaches else None
+        return link if link is None or link.settings is None or is_checked(link.settings) else None
 
     def _keep_fragment(self, connection: Connection, link: Link | None, known: list[Link]) -> None:
         """Store a piece without a complete unit as fragments, for each possible link."""
@@ -465,7 +491,7 @@ class _Reading:
 
     def result(self) -> IngestResult:
         """Return the result of the reading."""
-        found, joined = self.reader.accounting, self.joiner.joined
+        found, joined = self.accounting, self.joiner.joined
         with self.ground.database.reading() as connection:
             pending = edges.octets_pending(connection, self.piece.file_sha256)
             packets_new, packets_joined, samples = edges.stored_by(connection, self.piece.ingest_id)

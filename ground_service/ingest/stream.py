@@ -29,10 +29,12 @@ from tmtc import cadu
 from tmtc.cadu import ASM, ASM_LENGTH
 from tmtc.clcw import UplinkSeen, uplink_seen
 from tmtc.dictionary import DICTIONARY
-from tmtc.downlink import decode, proof_of
-from tmtc.errors import LinkFormatError
+from tmtc.downlink import plan_of
+from tmtc.errors import UnknownCoding
+from tmtc.frame_reading import proof_of
 from tmtc.frames import FRAME_HEADER_LENGTH, frame_headers
 from tmtc.link import LinkSettings
+from tmtc.link_plan import LinkPlan
 from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH
 from tmtc.randomiser import randomise
 from tmtc.schema import Dictionary, as_octets
@@ -43,7 +45,7 @@ WINDOW_OCTETS = 2 << 20
 decoding and storing take about ten times as much."""
 
 PROBE_OCTETS = 256 << 10
-"""Number of octets used to determine the link settings; the whole window if the stream begins with noise."""
+"""Number of octets around a small piece from which its link is determined."""
 
 CADU_MAX_OCTETS = 2048 + 2 * 16 * 8 + ASM_LENGTH
 """Length of the longest CADU of the known link settings."""
@@ -57,11 +59,8 @@ _CONTEXT_CADUS = 6
 _LED_BACK = 64
 """Number of CADUs tried before the first marker."""
 
-_REGULAR_FRAMES = 3
-"""Number of equally spaced frames without code or checksum needed to determine their link."""
-
-_CERTAIN_PERIODS = 8
-"""Number of equal marker distances that exclude chance: an unknown coding is then an error."""
+_CERTAIN_OCTETS = 8 * CADU_MAX_OCTETS // 2
+"""Length of a stream from which an unknown coding is an error, and not a lack of evidence."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,42 +87,63 @@ class LinkAccounting:
     uplink: dict[tuple[int, int], UplinkSeen] = field(default_factory=dict)
     """Telecommand channels by spacecraft and number, as the frames show them."""
 
+    def add(self, later: LinkAccounting) -> None:
+        """Add the accounting of a later section of the same stream."""
+        self.octets += later.octets
+        self.packets += later.packets
+        self.crc_errors += later.crc_errors
+        self.octets_skipped += later.octets_skipped
+        self.frames += later.frames
+        self.frames_bad += later.frames_bad
+        self.symbols_corrected += later.symbols_corrected
+        for key, seen in later.uplink.items():
+            self.uplink[key] = self.uplink[key].followed_by(seen, 1) if key in self.uplink else seen
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """Octets [start, stop) of a stream that have one link; `whole` is the size of the stream."""
+
+    link: Link
+    start: int
+    stop: int
+    whole: int
+
 
 class DownlinkReader:
-    """Reader of one stream of CADUs or bare space packets, distinguished by content.
+    """Reader of one section of a stream: CADUs with one link, or bare space packets.
 
-    After the last batch, `link` is the form of the stream (None: unreadable), `edges` holds the fragments at its ends,
-    and `take_channel_edges` returns the fragments in its channels.
+    After the last batch, `edges` holds the fragments at the ends of the stream, and `take_channel_edges` returns the
+    fragments in its channels.
 
     Parameters
     ----------
+    reach
+        Section of the stream that is read.
     spacecraft_id
         Only frames of this spacecraft are used; None: those of every spacecraft in the stream. Bare packets carry no
         spacecraft id.
-    known
-        Links that are tried before the settings are determined from the stream.
     """
 
     def __init__(
         self,
+        reach: Reach,
         spacecraft_id: int | None = None,
         dictionary: Dictionary = DICTIONARY,
         window_octets: int = WINDOW_OCTETS,
-        known: Sequence[Link] = (),
     ) -> None:
         self.accounting = LinkAccounting()
-        self.link: Link | None = None
+        self.reach = reach
         self.edges: list[Edge] = []
         self._spacecraft_id = spacecraft_id
         self._dictionary = dictionary
         self._window_octets = window_octets
-        self._known = known
         self._channels = ChannelReader(dictionary)
         self._last_words: dict[int, NDArray[np.uint32]] = {}
         self._believed: set[int] = set()
         self._held: OctetArray = np.empty(0, dtype=np.uint8)
         self._context = 0
-        self._position = 0
+        self._position = reach.start
         self._located = False
 
     def take_channel_edges(self) -> list[ChannelEdge]:
@@ -132,44 +152,19 @@ class DownlinkReader:
         return edges
 
     def batches(self, blocks: Iterable[bytes]) -> Iterator[PacketBatch]:
-        """The packets of the stream, in batches.
-
-        Raises
-        ------
-        LinkFormatError
-            If frames stand in the stream whose coding is not known.
-        """
+        """Yield the packets of the section in batches; `blocks` are its octets."""
         rest = b""
+        settings = self.reach.link.settings
         for block, final in _last_marked(_rebuffered(blocks, self._window_octets)):
             self.accounting.octets += len(block)
-            window = rest + block
-            rest = b""
-            if self.link is None:
-                self.link = self._link_of(window)
-            if self.link is None:
-                rest = window if final else window[-2 * CADU_MAX_OCTETS :]
-                self.accounting.octets_skipped += len(window) - (0 if final else len(rest))
-                self._position += len(window) - len(rest)
-            elif self.link.settings is None:
-                rest, batch = self._packets(window, final)
+            if settings is None:
+                rest, batch = self._packets(rest + block, final)
                 yield batch
             else:
-                yield from self._frames(as_octets(window), self.link.settings, final)
-        if self.link is not None and self.link.settings is not None:
+                yield from self._frames(as_octets(block), settings, final)
+        if settings is not None:
             self._channels.close()
             self._count_channels()
-        elif self.link is None and rest:
-            self.edges = fragment_edges(rest, None)
-
-    def _link_of(self, window: bytes) -> Link | None:
-        """Return the link of a stream that begins with these octets; None if it cannot be determined yet."""
-        for link in self._known:
-            if link.settings is not None and _good_frames(window, link.settings):
-                return link
-        found = proposed_link(window, self._dictionary)
-        if found is None and BARE in self._known and np.any(cut_packets(window).crc_ok):
-            return BARE
-        return found
 
     def _packets(self, window: bytes, final: bool) -> tuple[bytes, PacketBatch]:
         """Return the remaining octets and the packets of a window of bare packets."""
@@ -179,7 +174,7 @@ class DownlinkReader:
             head = int(cut.skipped[0, 1]) if len(cut.skipped) and cut.skipped[0, 0] == 0 else 0
             if 0 < head <= PACKET_MAX_LENGTH and self._position == 0:
                 self.edges.append(Edge(CLOSER, UNKNOWN, UNKNOWN, window[:head], 0))
-        if final and len(cut.skipped) and cut.skipped[-1, 1] == len(window):
+        if final and self._ends and len(cut.skipped) and cut.skipped[-1, 1] == len(window):
             start = int(cut.skipped[-1, 0])
             if 0 < len(window) - start <= PACKET_MAX_LENGTH and (start or self._position):
                 self.edges.append(Edge(OPENER, UNKNOWN, UNKNOWN, window[start:], self._position + start))
@@ -269,6 +264,8 @@ class DownlinkReader:
     def _tail_edge(self, stream: OctetArray, block: FrameBlock, end: int, base: int) -> None:
         """Add the octets after the last CADU, the start of a CADU that continues after the stream, to the edges."""
         settings = block.settings
+        if not self._ends:
+            return
         if 0 < stream.size - end < settings.cadu_length and (self._located or block.offsets.size):
             count = UNKNOWN
             if block.good.any() and len(block.spacecraft()) == 1:
@@ -277,35 +274,66 @@ class DownlinkReader:
                 count = UNKNOWN if odd else (int(block.header.master_count[last]) + away) % COUNTS
             self.edges.append(opener_of(stream[end:].tobytes(), settings, base + end, count))
 
+    @property
+    def _ends(self) -> bool:
+        """Whether the stream ends with this section."""
+        return self.reach.stop == self.reach.whole
+
     def _count_channels(self) -> None:
         self.accounting.packets += self._channels.packets
         self.accounting.crc_errors += self._channels.crc_errors
         self.accounting.octets_skipped += self._channels.octets_unused
 
 
-def proposed_link(window: bytes, dictionary: Dictionary = DICTIONARY) -> Link | None:
-    """Return the link of a stream with these octets; None if they are not sufficient evidence.
+def reaches_of(
+    octets: OctetArray,
+    known: Sequence[Link] = (),
+    *,
+    stated: LinkSettings | None = None,
+    dictionary: Dictionary = DICTIONARY,
+) -> tuple[list[Reach], LinkPlan | None]:
+    """Return the sections of a stream and the plan they follow from; no sections without sufficient evidence.
+
+    Parameters
+    ----------
+    octets
+        The whole stream; a memory map for a large file.
+    known
+        Links that the stream is expected to have.
+    stated
+        Settings that are used without evidence.
 
     Raises
     ------
-    LinkFormatError
+    UnknownCoding
         If markers have a regular distance and no known coding fits.
     """
+    size = int(octets.size)
+    if stated is not None:
+        return [Reach(Link(stated), 0, size, size)], None
+    expected = [link.settings for link in known if link.settings is not None]
     try:
-        probe = decode(window[:PROBE_OCTETS], dictionary=dictionary)
-        if probe.settings is None and len(window) > PROBE_OCTETS and ASM in window:
-            probe = decode(window, dictionary=dictionary)
-    except LinkFormatError:
-        period = cadu.find_period(as_octets(window))
-        if len(window) >= _CERTAIN_PERIODS * max(period, CADU_MAX_OCTETS // 2):
+        plan = plan_of(octets, expected, dictionary=dictionary)
+    except UnknownCoding:
+        if size >= _CERTAIN_OCTETS:
             raise
-        return None
-    if probe.settings is not None:
-        good = probe.frame_count - probe.frames_bad
-        enough = good >= 1 if is_checked(probe.settings) else good >= _REGULAR_FRAMES and probe.packets >= 2
-        return Link(probe.settings) if enough else None
-    octets = probe.octets["packets"]
-    return BARE if probe.packets >= 2 or (octets and 2 * octets >= len(window)) else None
+        return [], None
+    if plan.sections:
+        return [Reach(Link(one.settings), one.start, one.stop, size) for one in plan.sections], plan
+    if _has_packets(octets, BARE in known):
+        return [Reach(BARE, 0, size, size)], plan
+    return [], plan
+
+
+def _has_packets(octets: OctetArray, is_known: bool) -> bool:
+    """Return whether a stream contains bare packets; `is_known`: bare packets have been received before."""
+    for start in range(0, octets.size, WINDOW_OCTETS):
+        window = octets[start : start + WINDOW_OCTETS + PACKET_MAX_LENGTH]
+        cut = cut_packets(window)
+        packets = int(np.count_nonzero(cut.crc_ok))
+        if packets >= 2 or (packets and (is_known or 2 * int(cut.lengths[cut.crc_ok].sum()) >= window.size)):
+            return True
+    return False
 
 
 def fragment_edges(octets: bytes, settings: LinkSettings | None) -> list[Edge]:
@@ -361,22 +389,6 @@ def opener_of(octets: bytes, settings: LinkSettings, start: int, count: int) -> 
         if fields.version[0] == 0 and header[4] >> 3 & 0b111 == 0b011:
             count = int(fields.master_count[0])
     return Edge(OPENER, UNKNOWN, count, octets, start, settings.cadu_length - len(octets))
-
-
-def _good_frames(window: bytes, settings: LinkSettings) -> bool:
-    """Return whether a window holds a good frame with these settings."""
-    for octets in (window[:PROBE_OCTETS], window if len(window) > PROBE_OCTETS and ASM in window else b""):
-        stream = as_octets(octets)
-        sync = cadu.synchronise(stream, settings.cadu_length, verify=proof_of(stream, settings))
-        for first in range(0, sync.start_bits.size, 64):
-            some = sync.take(np.arange(first, min(first + 64, sync.start_bits.size)))
-            block = frames_of(cadu.cadu_octets(stream, some), some.offsets, settings)
-            if not is_checked(settings):
-                regular = block.good & (block.frames[:, 4] >> 3 == 0b00011)
-                return bool(np.count_nonzero(regular) * 2 > regular.size)
-            if block.good.any():
-                return True
-    return False
 
 
 def _led_back(stream: OctetArray, first: int, settings: LinkSettings) -> IntArray:

@@ -100,7 +100,7 @@ def read_raw(octets: Octets, spacecraft_id: int | None) -> RawFile:
         joined = order[_frame_of(found, starts[order]) < 0]
         skipped_ticks = np.concatenate([skipped_ticks, ticks[joined]])
         octets_skipped = np.concatenate([octets_skipped, -found.cut.lengths[joined]])
-        loose = frames[3] - _cadu_length(found)
+        loose = frames[3] - found.frames.octets[found.frames.verdict != FRAME_FOREIGN]
         skipped_ticks = np.concatenate([skipped_ticks, frames[0]])
         octets_skipped = np.concatenate([octets_skipped, np.maximum(loose, 0)])
     return RawFile(
@@ -220,11 +220,6 @@ def _filled(ticks: IntArray) -> IntArray:
 
 def _none(count: int) -> IntArray:
     return np.full(count, NO_TICKS, dtype=np.int64)
-
-
-def _cadu_length(found: DownlinkDecode) -> int:
-    assert found.settings is not None
-    return found.settings.cadu_length
 
 
 def _stream_octets(found: DownlinkDecode) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import mmap
 import os
 import shutil
 import socket
@@ -18,6 +19,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ground_service.errors import FileDamaged, NotFound, StoreError, storage_error
 
@@ -208,12 +212,26 @@ class IncomingFile:
         return self._stream
 
 
-def read_blocks(path: Path) -> Iterator[bytes]:
-    """The octets of a file, block by block."""
+def read_blocks(path: Path, start: int = 0, stop: int | None = None) -> Iterator[bytes]:
+    """Yield the octets [start, stop) of a file, block by block; by default all of them."""
     try:
         with path.open("rb") as stream:
-            while block := stream.read(BLOCK_OCTETS):
+            stream.seek(start)
+            left = BLOCK_OCTETS if stop is None else stop - start
+            while left > 0 and (block := stream.read(min(BLOCK_OCTETS, left))):
+                left -= 0 if stop is None else len(block)
                 yield block
+    except OSError as error:
+        raise storage_error(error, path) from None
+
+
+def mapped_octets(path: Path) -> NDArray[np.uint8]:
+    """Return the octets of a file as a memory map, which is closed with the last reference to it."""
+    try:
+        with path.open("rb") as stream:
+            if not os.fstat(stream.fileno()).st_size:
+                return np.empty(0, dtype=np.uint8)
+            return np.frombuffer(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ), dtype=np.uint8)
     except OSError as error:
         raise storage_error(error, path) from None
 

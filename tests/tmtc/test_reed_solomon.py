@@ -123,7 +123,7 @@ def test_errors_found_in_the_virtual_fill_mean_that_too_many_others_were_there()
     word = encode(frames_for(full, 1), full)[:, 10:]
     data, corrected = repair(word, code)
     assert corrected.tolist() == [UNCORRECTABLE]
-    assert np.array_equal(data, word[:, :213])
+    assert np.array_equal(data, word)
 
 
 @pytest.mark.parametrize("errors", [8, 16])
@@ -143,8 +143,8 @@ def test_repair_agrees_with_an_independent_decoder_up_to_and_beyond_its_power(er
         except reedsolo.ReedSolomonError:
             assert corrected[n] == UNCORRECTABLE
             continue
-        assert bytes(message) == data[n].tobytes() and len(positions) == corrected[n]
-    assert np.array_equal(data[corrected >= 0], frames[corrected >= 0])
+        assert bytes(message) == data[n, : 255 - 2 * errors].tobytes() and len(positions) == corrected[n]
+    assert np.array_equal(data[corrected >= 0, : 255 - 2 * errors], frames[corrected >= 0])
 
 
 def test_noise_is_uncorrectable():

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground_service.ingest.stream import DownlinkReader
+from ground_service.ingest.stream import DownlinkReader, reaches_of
 from tmtc.downlink import DownlinkEncoder, LinkSettings, decode, encode_cadus
 from tmtc.frames import Clcw, pack_clcw
+from tmtc.schema import as_octets
 
 SPACECRAFT = 76
 
@@ -19,8 +20,13 @@ def packets(make_pass: Callable[..., Any]) -> list[bytes]:
     return list(make_pass(frames=30).packets)
 
 
+def reader_of(octets: bytes, spacecraft_id: int | None = None, **options: Any) -> DownlinkReader:
+    ((reach,), _) = reaches_of(as_octets(octets))
+    return DownlinkReader(reach, spacecraft_id, **options)
+
+
 def read(octets: bytes, block: int, window: int, spacecraft_id: int | None = None) -> tuple[list[bytes], Any]:
-    reader = DownlinkReader(spacecraft_id, window_octets=window)
+    reader = reader_of(octets, spacecraft_id, window_octets=window)
     blocks = (octets[i : i + block] for i in range(0, len(octets), block))
     found = [packet for batch in reader.batches(blocks) for packet in batch.octets]
     return found, reader.accounting
@@ -64,7 +70,7 @@ def test_bare_packets_are_read_in_any_blocks(packets: list[bytes]) -> None:
 
 def test_two_spacecraft_in_one_file_are_told_apart(packets: list[bytes]) -> None:
     stream = encode_cadus(packets[:40], spacecraft_id=76) + encode_cadus(packets[20:60], spacecraft_id=33)
-    reader = DownlinkReader()
+    reader = reader_of(stream)
     by_spacecraft: dict[int | None, list[bytes]] = {}
     for batch in reader.batches([stream]):
         by_spacecraft.setdefault(batch.spacecraft_id, []).extend(batch.octets)
@@ -82,7 +88,7 @@ def test_frames_of_another_spacecraft_are_left_out_when_one_is_named(packets: li
 def test_memory_does_not_grow_with_the_stream(packets: list[bytes]) -> None:
     stream = encode_cadus(packets, spacecraft_id=SPACECRAFT, frame_length=223)
     read(stream, 1 << 20, 1 << 20)  # imports and compiles
-    reader = DownlinkReader(SPACECRAFT, window_octets=5 * len(stream))
+    reader = reader_of(stream, SPACECRAFT, window_octets=5 * len(stream))
     peaks: list[int] = []
     tracemalloc.start()
     for _ in reader.batches(stream for _ in range(75)):
