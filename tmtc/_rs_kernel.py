@@ -176,9 +176,15 @@ def correct(
 
 @njit
 def _locate(
-    syndromes: RecordArray, parity: int, errors: int, locator: RecordArray, before: RecordArray, kept: RecordArray, exponent: RecordArray,
+    syndromes: RecordArray,
+    parity: int,
+    errors: int,
+    locator: RecordArray,
+    before: RecordArray,
+    kept: RecordArray,
+    exponent: RecordArray,
     logarithm: RecordArray,
-) -> int:  # fmt: skip
+) -> int:
     """Write the error locator, lowest power first; return its degree, or more than `errors` if there is none."""
     locator[:] = 0
     before[:] = 0
