@@ -34,6 +34,7 @@ from payload_emulator.flight.navigation.lost_in_space import (
 )
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, in_view, landmark_map
 from payload_emulator.flight.vision.detections import Detections
+from payload_emulator.sim.detector import SimulatedDetector
 from tmtc.tables import CatalogueTable
 
 # An estimate this far from the truth is another place, not an inaccurate one: ten times the error of a good fix.
@@ -46,14 +47,10 @@ _CAMERA = PinholeCamera()
 _IDENTIFICATION = IdentificationParameters()
 
 
-@dataclass(frozen=True, slots=True)
-class DetectionModel:
-    """How detections differ from the craters in view; sigmas per axis."""
-
-    recall: float = 0.5
-    precision: float = 0.8
-    sigma_px: float = 1.4
-    log_diameter_sigma: float = 0.05
+STUDY_DETECTOR = SimulatedDetector(
+    recall=(0.5, 0.5, 0.5, 0.5), recall_outside=0.5, precision=0.8, sigma_px=1.4, log_diameter_sigma=0.05
+)
+"""Detector of the study unless another one is given."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,7 +150,7 @@ def draw_frame(
     world: StudyWorld,
     position_mcmf_m: FloatArray,
     attitude_error_rad: FloatArray,
-    model: DetectionModel,
+    model: SimulatedDetector,
     camera: PinholeCamera,
     rng: np.random.Generator,
     kind: str = "true",
@@ -169,14 +166,12 @@ def draw_frame(
     nothing = np.zeros(3)
     pose = Pose(position_mcmf_m, left @ right, np.eye(3), nothing, np.zeros(2), nothing)
     seen = in_view(world.true, pose, camera, 0.0)
-    seen = seen.select(rng.uniform(size=len(seen)) < model.recall)
-    count = len(seen)
-    uv = seen.uv_px + model.sigma_px * rng.standard_normal((count, 2))
-    size = seen.diameter_px * np.exp(model.log_diameter_sigma * rng.standard_normal(count))
-    false = int(rng.poisson(count * (1.0 / model.precision - 1.0)))
+    seen = seen.select(model.found(world.true.diameter_m[seen.index], rng))
     corner = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
-    uv = np.concatenate([uv, rng.uniform(size=(false, 2)) * corner])
-    size = np.concatenate([size, rng.choice(size, false) if count else np.full(false, 30.0)])
+    uv, size = seen.uv_px, seen.diameter_px
+    if len(seen):  # a frame without craters has no false detections either: it is drawn again
+        uv, size = model.detect(uv, size, corner, rng)
+    false = size.size - len(seen)
     crater = np.concatenate([world.true.ids[seen.index], np.full(false, -1)])
     if kind == "all_false":
         uv = rng.uniform(size=uv.shape) * corner
@@ -187,7 +182,9 @@ def draw_frame(
     if kind != "true":
         crater[:] = -1
     total = crater.size
-    found = Detections(uv[:, 0], uv[:, 1], size, rng.uniform(0.3, 1.0, total), np.full(total, model.sigma_px))
+    found = Detections(
+        uv[:, 0], uv[:, 1], size, rng.uniform(0.3, 1.0, total), np.full(total, model.told_sigma_px)
+    )
     return StudyFrame(pose, told, found, crater.astype(np.int64), radius - MOON_RADIUS_M)
 
 
@@ -197,7 +194,7 @@ def study_lost(
     seed: int,
     *,
     kind: str = "true",
-    model: DetectionModel = DetectionModel(),
+    model: SimulatedDetector = STUDY_DETECTOR,
     attitude_rad: float = math.radians(0.5),
     altitudes_m: tuple[float, float] = (14e3, 50e3),
     least_detections: int = 6,
@@ -225,7 +222,7 @@ def study_lost_in_frames(
     seed: int,
     *,
     combined: int = 4,
-    model: DetectionModel = DetectionModel(),
+    model: SimulatedDetector = STUDY_DETECTOR,
     attitude_rad: float = math.radians(0.5),
     altitudes_m: tuple[float, float] = (14e3, 50e3),
     least_detections: int = 6,
@@ -266,7 +263,7 @@ def study_tracking(
     seed: int,
     *,
     kind: str = "true",
-    model: DetectionModel = DetectionModel(),
+    model: SimulatedDetector = STUDY_DETECTOR,
     prior_m: tuple[float, float] = (30.0, 1_400.0),
     attitude_noise_rad: float = math.radians(0.01),
     altitudes_m: tuple[float, float] = (14e3, 50e3),
@@ -304,7 +301,7 @@ def _frames(
     frames: int,
     rng: np.random.Generator,
     kind: str,
-    model: DetectionModel,
+    model: SimulatedDetector,
     attitude_rad: float,
     altitudes_m: tuple[float, float],
     least_detections: int,
@@ -339,7 +336,7 @@ def _consecutive(
     world: StudyWorld,
     combined: int,
     rng: np.random.Generator,
-    model: DetectionModel,
+    model: SimulatedDetector,
     attitude_rad: float,
     altitudes_m: tuple[float, float],
     least_detections: int,

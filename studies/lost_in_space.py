@@ -346,4 +346,6 @@ def _joined(parts: Sequence[Detections]) -> Detections:
     def column(name: str) -> FloatArray:
         return np.concatenate([np.empty(0), *(getattr(part, name) for part in parts)])
 
-    return Detections(*(column(name) for name in ("u_px", "v_px", "diameter_px", "score", "sigma_px")))
+    return Detections(
+        column("u_px"), column("v_px"), column("diameter_px"), column("score"), column("sigma_px")
+    )

@@ -16,7 +16,7 @@ import numpy as np
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
-from lunar.catalogue import CraterCatalogue, size_class
+from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import Orientation, matrix_from_quaternion, rtn_from_inertial
 from lunar.gravity import GravityField
@@ -34,6 +34,7 @@ from payload_emulator.flight.navigation.landmark_map import FIRST_LANDMARK_ID
 from payload_emulator.flight.navigation.outcomes import Outcome
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, in_view, landmark_map, look
 from payload_emulator.flight.vision.detections import Detections
+from payload_emulator.sim.detector import SimulatedDetector
 from tmtc.tables import (
     CatalogueTable,
     GravityTable,
@@ -50,42 +51,6 @@ _NS = 1_000_000_000
 _ORIENTATION_STEP_NS = 7_200 * _NS
 _PUSH_S = 60.0
 _ORIENTATION_MARGIN_NS = 5 * _ORIENTATION_STEP_NS
-
-
-@dataclass(frozen=True, slots=True)
-class SimulatedDetector:
-    """Detector model given by its confusion table.
-
-    Attributes
-    ----------
-    recall
-        By size class 0, 1, 2 and 3 (3 to 5 km).
-    precision
-        Share of detections that are craters; the others are distributed uniformly, with the diameters of true ones.
-    sigma_px
-        Error of centres, per axis; `claimed_sigma_px` is the value that the detector reports (None: the true one).
-    persistence
-        Share of the variance that is common to all frames of a crater.
-    bias_px, bias_sigma_px, bias_correlation_s
-        Shift of all detections, right and down: a given value plus a first-order Gauss-Markov process with this
-        correlation time (infinite: constant for a run).
-    scale, scale_sigma
-        Scale error of all detections about the image centre: a given value plus a random value for each run.
-    log_diameter_sigma
-        Error of the logarithm of the diameter.
-    """
-
-    recall: tuple[float, float, float, float] = (0.6, 0.6, 0.7, 0.6)
-    precision: float = 0.85
-    sigma_px: float = 1.5
-    claimed_sigma_px: float | None = None
-    persistence: float = 0.0
-    bias_px: tuple[float, float] = (0.0, 0.0)
-    bias_sigma_px: float = 0.0
-    bias_correlation_s: float = float("inf")
-    scale: float = 0.0
-    scale_sigma: float = 0.0
-    log_diameter_sigma: float = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -548,24 +513,19 @@ def _detect(
         detector.scale,
     )
     index = in_view(craters, pose, camera, 0.0).index
-    recall = np.array([*detector.recall, 0.0])[size_class(craters.diameter_m[index])]
-    index = index[rng.uniform(size=index.size) < recall]
+    index = index[detector.found(craters.diameter_m[index], rng)]
     seen = look(craters, index, pose, camera)
-    fresh, kept = np.sqrt(1.0 - detector.persistence), np.sqrt(detector.persistence)
-    error = detector.sigma_px * (fresh * rng.standard_normal((index.size, 2)) + kept * lasting[index])
-    uv = seen.uv_px + error + bias_px
-    diameter = seen.diameter_px * np.exp(detector.log_diameter_sigma * rng.standard_normal(index.size))
-    false = int(rng.poisson(max(index.size, 1) * (1.0 / detector.precision - 1.0)))
     corner = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
-    uv = np.concatenate([uv, rng.uniform(size=(false, 2)) * corner])
-    sizes = rng.choice(diameter, false) if index.size else rng.uniform(15.0, 60.0, false)
-    diameter = np.concatenate([diameter, sizes])
-    truth = np.concatenate([index, np.full(false, -1, dtype=np.int64)])
+    uv, diameter = detector.detect(seen.uv_px, seen.diameter_px, corner, rng, lasting[index], bias_px)
+    truth = np.concatenate([index, np.full(diameter.size - index.size, -1, dtype=np.int64)])
     order = rng.permutation(truth.size)
     order = order[np.all((uv[order] >= -0.5) & (uv[order] <= corner + 0.5), axis=1)]
-    sigma = detector.sigma_px if detector.claimed_sigma_px is None else detector.claimed_sigma_px
     found = Detections(
-        uv[order, 0], uv[order, 1], diameter[order], np.ones(order.size), np.full(order.size, sigma)
+        uv[order, 0],
+        uv[order, 1],
+        diameter[order],
+        np.ones(order.size),
+        np.full(order.size, detector.told_sigma_px),
     )
     return found, craters.ids[truth[order]] * (truth[order] >= 0) - (truth[order] < 0)
 

@@ -19,7 +19,8 @@ from lunar.gravity import GravityField, builtin_gravity, load_gravity
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
 from payload_emulator.flight.navigation.dynamics import ProcessNoise, process_noise
-from studies.montecarlo import CatalogueErrors, NavigationCase, SimulatedDetector
+from payload_emulator.sim.detector import SimulatedDetector
+from studies.montecarlo import CatalogueErrors, NavigationCase
 
 Track = Literal["test", "tuning", "inclined", "limb"]
 TRACKS: tuple[Track, ...] = get_args(Track)

@@ -50,6 +50,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="first weights: a checkpoint or an ONNX network",
     )
     train.add_argument(
+        "--normalise-first",
+        action="store_true",
+        help="the paper's order: channels of an RGB data set are normalised, then averaged",
+    )
+    train.add_argument(
         "--enlarge",
         type=int,
         choices=(1, 2),
@@ -77,6 +82,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     export.add_argument("--note", default="", help="a remark on the training for the model's metadata")
     export.add_argument(
         "--paper-classes", action="store_true", help="keep the heatmaps of the paper's three classes"
+    )
+    export.add_argument(
+        "--classes-only",
+        action="store_true",
+        help="the paper's detector: class heatmaps and offsets, no sizes; flies as a build",
     )
     export.add_argument(
         "--test", action="store_true", help="score the test splits and write the figures into the model"
@@ -150,6 +160,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from linna.output import emit, log
 
     need_torch()
+    from payload_emulator.flight.vision.preprocess import Preparation
     from payload_emulator.training.data.dataset import Dataset
     from payload_emulator.training.data.feeder import TrainParameters
     from payload_emulator.training.evaluate.landmarks import load_landmarks
@@ -166,6 +177,7 @@ def _train(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         replicas=arguments.replicas,
         enlarge=arguments.enlarge,
+        preparation=Preparation.normalise_first if arguments.normalise_first else Preparation.gray_first,
     )
     datasets = [Dataset(folder) for folder in arguments.datasets]
     landmarks = None if arguments.landmarks is None else load_landmarks(arguments.landmarks)
@@ -200,6 +212,7 @@ def _export(arguments: argparse.Namespace) -> int:
         arguments.revision,
         {"training_note": arguments.note} if arguments.note else None,
         paper_classes=arguments.paper_classes,
+        classes_only=arguments.classes_only,
         test=arguments.test,
     )
     emit(arguments, figures)

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 from linna.output import add_json_flag, emit, log
 
 if TYPE_CHECKING:
-    from studies.identification import DetectionModel, StudyWorld
+    from payload_emulator.sim.detector import SimulatedDetector
+    from studies.identification import StudyWorld
 
 LEVEL = "level 1-2: simulated detections of the craters of a catalogue (stated recall, precision and errors), no images"
 
@@ -150,18 +151,21 @@ def run_tracking(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _provenance(arguments: argparse.Namespace, name: str, model: DetectionModel) -> dict[str, object]:
+def _provenance(arguments: argparse.Namespace, name: str, model: SimulatedDetector) -> dict[str, object]:
     return {
-        "detections": asdict(model),
+        "detections": {
+            "recall": arguments.recall,
+            **{name: getattr(model, name) for name in ("precision", "sigma_px", "log_diameter_sigma")},
+        },
         "seed": arguments.seed,
         "level": LEVEL,
         "data": [f"crater catalogue {name}"],
     }
 
 
-def _model(arguments: argparse.Namespace) -> DetectionModel:
+def _model(arguments: argparse.Namespace) -> SimulatedDetector:
     from linna.errors import UsageError
-    from studies.identification import DetectionModel
+    from payload_emulator.sim.detector import SimulatedDetector
 
     if arguments.frames < 1:
         raise UsageError(f"--frames: expected at least 1, found {arguments.frames}")
@@ -175,8 +179,12 @@ def _model(arguments: argparse.Namespace) -> DetectionModel:
             f"--sigma-px, --log-diameter-sigma: expected positive sizes, found {arguments.sigma_px:g} and "
             f"{arguments.log_diameter_sigma:g}"
         )
-    return DetectionModel(
-        arguments.recall, arguments.precision, arguments.sigma_px, arguments.log_diameter_sigma
+    return SimulatedDetector(
+        recall=(arguments.recall,) * 4,
+        recall_outside=arguments.recall,
+        precision=arguments.precision,
+        sigma_px=arguments.sigma_px,
+        log_diameter_sigma=arguments.log_diameter_sigma,
     )
 
 

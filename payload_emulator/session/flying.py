@@ -35,6 +35,7 @@ from payload_emulator.session.world import (
     sample_truth,
 )
 from payload_emulator.sim.board.link import LIGHT_S, Receiver, Transmitter, contacts
+from payload_emulator.sim.detector import SimulatedDetector
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import APID_TIME_REPORT, DICTIONARY
 from tmtc.link import LinkSettings
@@ -55,7 +56,8 @@ _PATIENCE_NS = 600 * _NS
 _AHEAD_NS = 12 * 3_600 * _NS
 _NO_ATTITUDE = np.full(7, np.nan)
 # A detector as the one that flies, roughly: what is drawn where no image is rendered.
-_REDUCED_RECALL, _REDUCED_SIGMA_PX, _SMALLEST_PX = 0.7, 0.6, 5.0
+_REDUCED_RECALL, _SMALLEST_PX = 0.7, 5.0
+_REDUCED_DETECTOR = SimulatedDetector(precision=1.0, sigma_px=0.6, log_diameter_sigma=0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,15 +101,11 @@ class CatalogueDetector:
         """Prepare what is found in the next frame."""
         _, uv, diameter_px = craters_in_view(self.world, exposure, _SMALLEST_PX)
         seen = self._rng.random(diameter_px.size) < _REDUCED_RECALL
-        count = int(np.count_nonzero(seen))
-        noise = _REDUCED_SIGMA_PX * self._rng.standard_normal((count, 2))
-        self._next = Detections(
-            uv[seen, 0] + noise[:, 0],
-            uv[seen, 1] + noise[:, 1],
-            diameter_px[seen],
-            np.full(count, 0.9),
-            np.full(count, _REDUCED_SIGMA_PX),
-        )
+        camera = self.world.camera
+        corner = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
+        places, sizes = _REDUCED_DETECTOR.detect(uv[seen], diameter_px[seen], corner, self._rng)
+        sigma = np.full(sizes.size, _REDUCED_DETECTOR.told_sigma_px)
+        self._next = Detections(places[:, 0], places[:, 1], sizes, np.full(sizes.size, 0.9), sigma)
 
     def examine(
         self, image: NDArray[Any], sun_in_camera: FloatArray | None = None

@@ -16,12 +16,12 @@ from payload_emulator.flight.navigation.anchored_parameters import AnchoredParam
 from payload_emulator.flight.navigation.dynamics import ProcessNoise, process_noise
 from payload_emulator.flight.navigation.filter import CommonErrors
 from payload_emulator.flight.navigation.outcomes import Outcome
+from payload_emulator.sim.detector import SimulatedDetector
 from studies import montecarlo
 from studies.montecarlo import (
     CatalogueErrors,
     Consistency,
     Kidnap,
-    SimulatedDetector,
     anees_bounds,
     consistency,
     fly,

@@ -195,7 +195,11 @@ def frame_features(
         east, north = x * altitude_m, -y * altitude_m
     else:
         east, north, depth = _sphere_places(x, y, altitude_m)
-    size_class = _size_class(detections.diameter_px * depth / camera.focal_px)
+    size_class = (
+        _size_class(detections.diameter_px * depth / camera.focal_px)
+        if detections.size_class is None
+        else detections.size_class
+    )
     size_class = np.where(np.isfinite(east) & np.isfinite(north), size_class, -1)
     return FrameFeatures(
         detections.u_px, detections.v_px, GroundFeatures(east, north, size_class), altitude_m

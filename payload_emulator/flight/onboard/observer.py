@@ -89,6 +89,7 @@ class Observer:
         self.counts: Counter[str] = Counter()
         self.reacquisitions = 0
         self.manual_step = False
+        self._altitude_m = _NAN
         self.sightings: Counter[int] = Counter()
         self._parameters = parameters
         self._telemetry = telemetry
@@ -147,7 +148,9 @@ class Observer:
         if readings.attitude.camera_from_icrf is None:
             telemetry.event("low", "attitude_missing")
         quality, found = self._detect(image, sun, timeout_s)
-        numbers = np.stack([found.u_px, found.v_px, found.diameter_px])
+        found = self._with_sizes(found)
+        size_px = found.diameter_px if found.size_class is None else np.nan_to_num(found.diameter_px)
+        numbers = np.stack([found.u_px, found.v_px, size_px])
         somewhere = np.all(np.abs(numbers) < _FARTHEST_PX, axis=0)
         found = found.select(somewhere & ~(found.score < score_floor))
         self.last_quality = quality
@@ -166,7 +169,8 @@ class Observer:
                 below_m = self._odometry_frame(mode, found)
             altitude_m = below_m if np.isfinite(below_m) else altitude_m
         self._timer.enter(Stage.telemetry)
-        self._report_detections(found, altitude_m)
+        self._altitude_m = altitude_m if np.isfinite(altitude_m) else self._altitude_m
+        self._report_detections(self._with_sizes(found), altitude_m)
         self.manual_step = False
         self.counts["frames"] += 1
         self.counts["detections"] += len(found)
@@ -462,8 +466,18 @@ class Observer:
             },
         )
 
+    def _with_sizes(self, found: Detections) -> Detections:
+        """Return classified detections with apparent diameters of their priors at the last known altitude."""
+        if found.diameter_m is None:
+            return found
+        camera = self._parameters.camera
+        depth_m = odometry.depth_on_sphere(found.u_px, found.v_px, self._altitude_m, camera)
+        return found.with_prior_sizes(depth_m, camera.focal_px)
+
     def _size_class(self, found: Detections, altitude_m: float) -> NDArray[np.int8]:
         """Return size classes by diameter on the sphere below the given altitude; -1 where it is unknown."""
+        if found.size_class is not None:
+            return found.size_class.astype(np.int8)
         camera = self._parameters.camera
         depth = odometry.depth_on_sphere(found.u_px, found.v_px, altitude_m, camera)
         return size_class(found.diameter_px * depth / camera.focal_px)

@@ -5,13 +5,13 @@ Pixel centres lie at integer coordinates, u to the right, v down.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lunar.arrays import FloatArray
+from lunar.arrays import FloatArray, IntArray
 from payload_emulator.flight.vision.preprocess import ImageQuality
 
 FRESH_DEPTH_RATIO = 0.10
@@ -21,7 +21,7 @@ DEGRADED_DEPTH_RATIO = 0.06
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detections:
-    """Craters found in one image; float64 arrays of one length n, NaN where a quantity is not known.
+    """Craters found in one image; arrays of one length n, float64 (classes int64), NaN where a quantity is not known.
 
     `depth_ratio` is None where the network does not tell it.
 
@@ -37,6 +37,9 @@ class Detections:
         Standard deviation of the centre along each axis.
     depth_ratio
         Depth over diameter as it looks: about 0.2 fresh, under `DEGRADED_DEPTH_RATIO` worn down.
+    size_class, diameter_m
+        Of a detector that gives classes and no sizes: the class (0, 1, 2), and as a prior of the size the median
+        diameter of that class; None otherwise. Its `diameter_px` is NaN until `with_prior_sizes`.
     """
 
     u_px: FloatArray
@@ -45,6 +48,8 @@ class Detections:
     score: FloatArray
     sigma_px: FloatArray
     depth_ratio: FloatArray | None = None
+    size_class: IntArray | None = None
+    diameter_m: FloatArray | None = None
 
     def __len__(self) -> int:
         return int(self.u_px.shape[0])
@@ -57,8 +62,17 @@ class Detections:
             self.diameter_px[which],
             self.score[which],
             self.sigma_px[which],
-            None if self.depth_ratio is None else self.depth_ratio[which],
+            *(
+                None if values is None else values[which]
+                for values in (self.depth_ratio, self.size_class, self.diameter_m)
+            ),
         )
+
+    def with_prior_sizes(self, depth_m: FloatArray, focal_px: float) -> Detections:
+        """Return the detections with apparent diameters of their priors at a depth (n,) along the boresight."""
+        if self.diameter_m is None:
+            return self
+        return replace(self, diameter_px=focal_px * self.diameter_m / depth_m)
 
 
 def states(found: Detections) -> list[str]:
@@ -73,7 +87,8 @@ def states(found: Detections) -> list[str]:
 
 def no_detections() -> Detections:
     """Return an empty set of detections."""
-    return Detections(*(np.empty(0) for _ in range(5)))
+    none = np.empty(0)
+    return Detections(none, none, none, none, none)
 
 
 class Detector(Protocol):

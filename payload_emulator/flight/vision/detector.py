@@ -10,6 +10,10 @@ What the eye (and the network) takes for the centre of a crater is the middle of
 the rim; away from the middle of a wide picture that displaces it inward, by parallax. The network cannot know where in
 the picture it looks, so the detector puts it right with the share of the depth that the model's metadata carry.
 
+The paper's own design, "classified detections only", is flown too: a network that gives three heatmaps, one for each
+size class, and the offset of the centre, and no size. A detection then carries its class, and the median diameter of
+that class (in the model's metadata) as a prior of its size.
+
 Pixel centres are integers; a cell (row i, column j) of stride 4 is centred at (4 j + 1.5, 4 i + 1.5).
 
 References
@@ -20,8 +24,9 @@ X. Zhou, D. Wang, P. Kraehenbuehl, "Objects as Points", 2019, section 4 (peaks b
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+import json
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +34,13 @@ from numpy.typing import NDArray
 from lunar.arrays import FloatArray
 from payload_emulator.errors import ModelError
 from payload_emulator.flight.vision.detections import Detections, no_detections
-from payload_emulator.flight.vision.preprocess import ImageQuality, prepare_image, sun_up_turns, turn_back
+from payload_emulator.flight.vision.preprocess import (
+    ImageQuality,
+    Preparation,
+    prepare_image,
+    sun_up_turns,
+    turn_back,
+)
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -37,6 +48,13 @@ if TYPE_CHECKING:
 INPUT_SIZE_PX = 512
 STRIDE_PX = 4
 STRIDES_PX = (4, 2)
+UNTOLD_SIGMA_PX = 2.0
+"""Error of a centre whose network does not tell it: half a cell of stride 4."""
+
+SAME_PLACE_CELLS = 1.5
+"""Peaks of different classes nearer than this are one crater: neighbouring cells of one offset."""
+
+CLASSES = 3
 REFERENCE_DIAMETER_PX = 16.0  # the network gives ln(diameter / this)
 INPUT_NAME = "image"
 HEATMAP_NAME = "heatmap"
@@ -78,6 +96,8 @@ class OnnxDetector:
     sha256: str = field(init=False)
     metadata: dict[str, str] = field(init=False)
     stride_px: int = field(init=False)
+    preparation: Preparation = field(init=False)
+    class_medians_m: FloatArray | None = field(init=False)
     score_threshold: float = field(init=False)
     parallax_per_px: float = field(init=False)
     _session: onnxruntime.InferenceSession = field(init=False, repr=False)
@@ -91,6 +111,8 @@ class OnnxDetector:
         self._session = _open_session(self.model_octets, self.threads)
         self.stride_px = INPUT_SIZE_PX // int(self._session.get_outputs()[0].shape[-1])
         self.metadata = dict(self._session.get_modelmeta().custom_metadata_map)
+        self.preparation = Preparation(self.metadata.get("preparation", Preparation.gray_first))
+        self.class_medians_m = _class_medians(self._session, self.metadata)
         chosen = self.parameters.score_threshold
         self.score_threshold = (
             float(self.metadata.get("score_threshold", "0.4")) if chosen is None else chosen
@@ -125,7 +147,7 @@ class OnnxDetector:
         self, image: NDArray[np.generic], sun_in_camera: FloatArray | None = None
     ) -> tuple[ImageQuality, Detections]:
         """As `examine`, any size: smaller images are padded, larger ones searched in overlapping tiles."""
-        prepared = prepare_image(image)
+        prepared = prepare_image(image, self.preparation)
         if prepared.quality is not ImageQuality.OK:
             return prepared.quality, no_detections()
         height_px, width_px = prepared.gray.shape
@@ -165,7 +187,12 @@ class OnnxDetector:
             padded[:rows, :columns] = tile
             tile = padded
         heatmap, geometry = self.run_network(np.ascontiguousarray(tile)[None, None])
-        found = decode(heatmap[0, 0], geometry[0], self.score_threshold, self.stride_px)
+        if self.class_medians_m is None:
+            found = decode(heatmap[0, 0], geometry[0], self.score_threshold, self.stride_px)
+        else:
+            found = decode_classes(
+                heatmap[0], geometry[0], self.class_medians_m, self.score_threshold, self.stride_px
+            )
         inside = (found.u_px < columns) & (found.v_px < rows)
         found = found.select(inside)
         return replace(found, u_px=found.u_px + left, v_px=found.v_px + top)
@@ -177,7 +204,7 @@ def decode(
     score_threshold: float,
     stride_px: int = STRIDE_PX,
 ) -> Detections:
-    """Detections of one image from heatmap (h, w) and geometry (4 or 5, h, w): see the head of this module.
+    """Detections of one image from heatmap (h, w) and geometry (2, 4 or 5, h, w): see the head of this module.
 
     A peak is a cell not below its eight neighbours. Its centre and diameter are the score-weighted means of what the
     nine cells around it say, since each was trained to point at the same centre.
@@ -199,8 +226,7 @@ def decode(
     weight = heatmap[near_row, near_column].astype(np.float64)
     centre_column = near_column + geometry[0][near_row, near_column].astype(np.float64)
     centre_row = near_row + geometry[1][near_row, near_column].astype(np.float64)
-    log_diameter = geometry[2][near_row, near_column].astype(np.float64)
-    log_sigma = geometry[3][near_row, near_column].astype(np.float64)
+    sized = geometry.shape[0] > 2
     total = weight.sum(axis=(1, 2))
     total = np.where(total > 0.0, total, 1.0)
 
@@ -212,13 +238,41 @@ def decode(
     return Detections(
         stride_px * mean(centre_column) + centre_of_cell,
         stride_px * mean(centre_row) + centre_of_cell,
-        REFERENCE_DIAMETER_PX * np.exp(mean(log_diameter)),
+        REFERENCE_DIAMETER_PX * np.exp(mean(geometry[2][near_row, near_column].astype(np.float64)))
+        if sized
+        else np.full(row.size, np.nan),
         score,
-        np.exp(mean(log_sigma)),
+        np.exp(mean(geometry[3][near_row, near_column].astype(np.float64)))
+        if sized
+        else np.full(row.size, UNTOLD_SIGMA_PX),
         np.clip(0.1 * mean(geometry[4][near_row, near_column].astype(np.float64)), 0.0, 0.25)
         if geometry.shape[0] > 4
         else None,
     )
+
+
+def decode_classes(
+    heatmaps: NDArray[np.float32],
+    geometry: NDArray[np.float32],
+    medians_m: FloatArray,
+    score_threshold: float,
+    stride_px: int = STRIDE_PX,
+) -> Detections:
+    """Classified detections of one image from heatmaps (3, h, w) and offsets (2, h, w), best first.
+
+    Of detections of several classes at one place, the best counts.
+    """
+    parts = [decode(heatmap, geometry, score_threshold, stride_px) for heatmap in heatmaps]
+    classes = np.concatenate([np.full(len(part), k, dtype=np.int64) for k, part in enumerate(parts)])
+    found = replace(_joined(parts), size_class=classes, diameter_m=medians_m[classes])
+    found = found.select(np.argsort(-found.score, kind="stable"))
+    distance = np.hypot(found.u_px[:, None] - found.u_px, found.v_px[:, None] - found.v_px)
+    repeated = np.triu(distance < SAME_PLACE_CELLS * stride_px, 1)
+    keep = np.ones(len(found), bool)
+    for k in range(len(found)):
+        if keep[k]:
+            keep &= ~repeated[k]
+    return found.select(keep)
 
 
 TYPICAL_DEPTH_RATIO = 0.1  # of craters that are found, where the network does not tell
@@ -234,7 +288,7 @@ def remove_parallax(found: Detections, share_per_px: float, height_px: int, widt
     if share_per_px == 0.0 or len(found) == 0:
         return found
     ratio = TYPICAL_DEPTH_RATIO if found.depth_ratio is None else found.depth_ratio
-    outward = share_per_px * ratio * found.diameter_px
+    outward = np.nan_to_num(share_per_px * ratio * found.diameter_px)  # unknown sizes: no correction
     return replace(
         found,
         u_px=found.u_px + outward * (found.u_px - 0.5 * (width_px - 1)),
@@ -243,15 +297,11 @@ def remove_parallax(found: Detections, share_per_px: float, height_px: int, widt
 
 
 def _joined(parts: list[Detections]) -> Detections:
-    known = [part.depth_ratio for part in parts if part.depth_ratio is not None]
-    return Detections(
-        np.concatenate([part.u_px for part in parts]),
-        np.concatenate([part.v_px for part in parts]),
-        np.concatenate([part.diameter_px for part in parts]),
-        np.concatenate([part.score for part in parts]),
-        np.concatenate([part.sigma_px for part in parts]),
-        np.concatenate(known) if len(known) == len(parts) else None,
-    )
+    def column(name: str) -> Any:
+        values = [getattr(part, name) for part in parts]
+        return None if any(value is None for value in values) else np.concatenate(values)
+
+    return Detections(**{item.name: column(item.name) for item in fields(Detections)})
 
 
 def _tile_starts(length: int) -> list[int]:
@@ -263,7 +313,7 @@ def _tile_starts(length: int) -> list[int]:
 
 
 def drop_duplicates(found: Detections, parameters: DetectorParameters) -> Detections:
-    """Detections (best first) without those that repeat a better one."""
+    """Detections (best first) without those that repeat a better one; of unknown sizes, all."""
     radius = 0.5 * found.diameter_px
     size = np.log(found.diameter_px)
     distance = np.hypot(found.u_px[:, None] - found.u_px, found.v_px[:, None] - found.v_px)
@@ -276,6 +326,22 @@ def drop_duplicates(found: Detections, parameters: DetectorParameters) -> Detect
         if keep[first]:
             keep[second] = False
     return found.select(keep)
+
+
+def _class_medians(session: onnxruntime.InferenceSession, metadata: dict[str, str]) -> FloatArray | None:
+    """Median diameters of the classes of a network that gives classes only, m; None for one that gives sizes."""
+    if session.get_outputs()[0].shape[1] != CLASSES:
+        return None
+    text = metadata.get("class_median_diameter_m", "")
+    try:
+        medians = np.array(json.loads(text), dtype=np.float64)
+    except ValueError:
+        medians = np.zeros(0)
+    if medians.shape != (CLASSES,) or not (np.isfinite(medians).all() and (medians > 0.0).all()):
+        raise ModelError(
+            f"detector network: expected three median diameters in class_median_diameter_m, found {text!r}"
+        )
+    return medians
 
 
 def _open_session(model_octets: bytes, threads: int) -> onnxruntime.InferenceSession:
@@ -299,7 +365,8 @@ def _open_session(model_octets: bytes, threads: int) -> onnxruntime.InferenceSes
     if (
         inputs != [(INPUT_NAME, [1, 1, INPUT_SIZE_PX, INPUT_SIZE_PX])]
         or heat[2:] not in [[n, n] for n in cells]
-        or outputs.get(GEOMETRY_NAME) not in [[1, maps, *heat[2:]] for maps in (4, 5)]
+        or outputs.get(GEOMETRY_NAME) not in [[1, maps, *heat[2:]] for maps in (2, 4, 5)]
+        or (heat[1] == CLASSES) != (outputs[GEOMETRY_NAME][1] == 2)
     ):
         raise ModelError(
             f"detector network: expected input {INPUT_NAME} [1, 1, {INPUT_SIZE_PX}, {INPUT_SIZE_PX}] and outputs "

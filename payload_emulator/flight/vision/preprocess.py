@@ -35,6 +35,13 @@ class ImageQuality(enum.IntEnum):
     INVALID = 4
 
 
+class Preparation(enum.StrEnum):
+    """Order of the two steps that make the network's input of a colour frame (the paper, section IV-B)."""
+
+    gray_first = "gray-then-normalise"
+    normalise_first = "normalise-then-gray"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PreparedImage:
     """Network input, float32 (H, W), zero mean and unit deviation; `quality` other than OK leaves it all zero."""
@@ -43,16 +50,21 @@ class PreparedImage:
     quality: ImageQuality
 
 
-def prepare_image(image: NDArray[np.generic]) -> PreparedImage:
+def prepare_image(
+    image: NDArray[np.generic], preparation: Preparation = Preparation.gray_first
+) -> PreparedImage:
     """Normalised gray plane of a frame of (H, W) or (H, W, 1|3|4), unsigned integer or float in 0..1.
 
     The square root of the mean of the colour channels is taken (shot noise becomes even, shadows open), then mean and
-    standard deviation of the frame are removed, so that exposure and gain do not matter.
+    standard deviation of the frame are removed, so that exposure and gain do not matter. The paper's order normalises
+    every channel by itself and averages the results; a gray frame gives the same in either order.
     """
     image = np.asarray(image)
     colours_ok = image.ndim == 2 or (image.ndim == 3 and image.shape[2] in (1, 3, 4))
     if not colours_ok or image.size == 0 or image.dtype.kind not in "uf":
         return PreparedImage(np.zeros(_plane_shape(image), np.float32), ImageQuality.INVALID)
+    if preparation is Preparation.normalise_first and image.ndim == 3 and image.shape[2] >= 3:
+        return _prepare_channels(image)
     if image.dtype == np.uint8:
         return _prepare_bytes(image)
     gray = _square_root_gray(image)
@@ -147,6 +159,22 @@ def _prepare_bytes(image: NDArray[np.generic]) -> PreparedImage:
         return PreparedImage(np.zeros(total.shape, np.float32), quality)
     table = np.clip((root - mean) / max(deviation, 1e-6), -_CLIP, _CLIP).astype(np.float32)
     return PreparedImage(np.take(table, total), ImageQuality.OK)
+
+
+def _prepare_channels(image: NDArray[np.generic]) -> PreparedImage:
+    """Mean of the normalised channels; the verdict is that on the mean of the channels as they are."""
+    gray = _square_root_gray(image)
+    if gray is None:
+        return PreparedImage(np.zeros(_plane_shape(image), np.float32), ImageQuality.INVALID)
+    quality = _judge(gray)
+    if quality is not ImageQuality.OK:
+        return PreparedImage(np.zeros(gray.shape, np.float32), quality)
+    total = np.zeros(gray.shape, np.float32)
+    for k in range(3):
+        plane = _square_root_gray(image[..., k])
+        assert plane is not None  # finite, as the mean of the channels is
+        total += normalise(plane)
+    return PreparedImage(total * np.float32(1.0 / 3.0), ImageQuality.OK)
 
 
 def _square_root_gray(image: NDArray[np.generic]) -> NDArray[np.float32] | None:

@@ -52,14 +52,18 @@ def make_crop(
     parameters: AugmentParameters,
     rng: np.random.Generator,
 ) -> Crop:
-    """One training crop of a frame (H, W); half of them are drawn about a labelled crater, large ones more often."""
+    """One training crop of a frame, gray (H, W) or RGB (H, W, 3).
+
+    The channels of an RGB frame are normalised, then averaged. Half of the crops are drawn about a labelled crater,
+    large ones more often.
+    """
     import cv2
 
     turns = sun_up_turns(sun_camera)
-    height, width = gray.shape
+    height, width = gray.shape[:2]
     turned = np.rot90(gray, turns)
     u, v = turn_forward(np.asarray(u_px, float), np.asarray(v_px, float), turns, height, width)
-    rows, columns = turned.shape
+    rows, columns = turned.shape[:2]
 
     scale = math.exp(rng.uniform(math.log(parameters.scale[0]), math.log(parameters.scale[1])))
     scale = max(scale, size_px / min(rows, columns))
@@ -87,8 +91,16 @@ def make_crop(
         borderMode=cv2.BORDER_REFLECT_101,
     ).astype(np.float32)
     moved = matrix @ np.stack([u, v]) + shift[:, None]
-    tone = _vary_tone(picture * np.float32(1.0 / 255.0), parameters, rng)
-    return Crop(normalise(tone), moved[0], moved[1], scale * np.asarray(diameter_px, float))
+    if picture.ndim == 2:
+        image = normalise(_vary_tone(picture * np.float32(1.0 / 255.0), parameters, rng))
+    else:
+        # One tone for all channels: the draws begin at the same state for each.
+        state = rng.bit_generator.state
+        image = np.zeros(picture.shape[:2], np.float32)
+        for plane in np.moveaxis(picture, -1, 0):
+            rng.bit_generator.state = state
+            image += normalise(_vary_tone(plane * np.float32(1.0 / 255.0), parameters, rng)) / np.float32(3.0)
+    return Crop(image, moved[0], moved[1], scale * np.asarray(diameter_px, float))
 
 
 def _vary_tone(

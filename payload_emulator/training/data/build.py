@@ -150,13 +150,13 @@ def make_shard(
             position = np.array(shard.position_mcmf_m[k])
             return pose_at(terrain, camera, source, position, f"frame {number}", generator)
 
-        shot = take_frame(terrain, camera, source, pose_of, number, recipe.bits, render, rng)
+        shot = take_frame(terrain, camera, source, pose_of, number, recipe, render, rng)
         split = shard.split[k] if shard.split else source.split
         utc_ns = shard.utc_ns[k] if shard.utc_ns else None
         document = describe(camera, shot, source, split, terrain, utc_ns)
         hashes.append(
             (
-                store.write_gray(folder / "images" / f"{number:06d}.png", shot.image),
+                store.write_frame(folder / "images" / f"{number:06d}.png", shot.image),
                 store.write_json(folder / "metadata" / f"{number:06d}.json", document),
             )
         )

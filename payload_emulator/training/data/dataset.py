@@ -3,7 +3,7 @@
 Layout of the folder::
 
     dataset.json            recipe, camera, counts, data sources, hashes of the shards
-    images/000123.png       gray, 8 or 16 bits, the mean of the colour channels, as the camera saw it (not turned)
+    images/000123.png       8 or 16 bits, the mean of the colour channels or RGB, as the camera saw it (not turned)
     metadata/000123.json    pose, corner coordinates, Sun vector
     shards/0006.npz         labels and poses of the frames of one shard; written last, so that its presence means "done"
     coco_train.json ...     COCO annotations by split
@@ -33,6 +33,7 @@ from lunar.camera import PinholeCamera, intersect_sphere
 from lunar.catalogue import size_class
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import DatasetError
+from payload_emulator.flight.vision.preprocess import gray_levels
 from payload_emulator.session.recipe import Box
 from payload_emulator.training.data.shots import inside_box
 from payload_emulator.training.data.targets import Tier
@@ -187,8 +188,14 @@ class Dataset:
         return np.asarray(np.any(within, axis=0), dtype=bool)
 
     def image(self, frame: Frame) -> OctetArray:
-        """Gray image (H, W) of a frame, the upper 8 bits where it has 16."""
-        return read_gray(self.folder / "images" / f"{frame.number:06d}.png")
+        """Image of a frame, gray (H, W) or RGB (H, W, 3) as the set keeps it, the upper 8 bits where it has 16."""
+        path = self.folder / "images" / f"{frame.number:06d}.png"
+        return read_rgb(path) if self.index["recipe"].get("colour") == "rgb" else read_gray(path)
+
+    def gray(self, frame: Frame) -> OctetArray:
+        """Gray image (H, W) of a frame."""
+        image = self.image(frame)
+        return image if image.ndim == 2 else gray_levels(image)
 
 
 def choose_tiers(
@@ -363,6 +370,16 @@ def read_gray(path: Path) -> OctetArray:
     return np.asarray(image, dtype=np.uint8)
 
 
+def read_rgb(path: Path) -> OctetArray:
+    """An RGB PNG (H, W, 3) in 8 bits."""
+    import cv2
+
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise DatasetError(f"{path}: expected an RGB PNG image, found none that can be read")
+    return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)
+
+
 def write_picture(path: Path, image: NDArray[Any]) -> str:
     """Write a PNG of 8 or 16 bits, gray (H, W) or blue-green-red (H, W, 3), in one move; its SHA-256 comes back."""
     import cv2
@@ -378,6 +395,11 @@ def write_picture(path: Path, image: NDArray[Any]) -> str:
 def write_gray(path: Path, image: NDArray[Any]) -> str:
     """Write a gray frame (H, W); its SHA-256 comes back."""
     return write_picture(path, image)
+
+
+def write_frame(path: Path, image: NDArray[Any]) -> str:
+    """Write a frame, gray (H, W) or RGB (H, W, 3); its SHA-256 comes back."""
+    return write_picture(path, image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1]))
 
 
 def write_json(path: Path, document: dict[str, Any]) -> str:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lunar.arrays import IntArray, OctetArray
 from lunar.catalogue import size_class
+from payload_emulator.flight.vision.preprocess import Preparation
 from payload_emulator.training.data.augment import AugmentParameters, make_crop
 from payload_emulator.training.data.dataset import LABEL_MINIMUM_DIAMETER_PX, Dataset, Frame, choose_tiers
 from payload_emulator.training.data.targets import Tier, make_targets
@@ -30,6 +31,7 @@ class TrainParameters:
 
     minutes : wall-clock budget; the learning rate falls to zero over it (0: `steps` counts instead).
     micro_batch : crops that a replica sees at once; more does not pay on a CPU, whose cache they must share.
+    preparation : how RGB frames become gray; the paper's order needs a data set in colour.
     soft_labels : the weight of a label grows with its depth/diameter; else all weigh the same.
     backbone, stride_px, enlarge : as in `model.ModelConfig`. Lengths in pixels that suit the network's first layer are
         shorter in the image by the enlargement.
@@ -58,6 +60,7 @@ class TrainParameters:
     stride_px: int = 4
     enlarge: int = 1
     soft_labels: bool = True
+    preparation: Preparation = Preparation.gray_first
     augment: AugmentParameters = field(default_factory=AugmentParameters)
 
 

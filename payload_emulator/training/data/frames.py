@@ -18,7 +18,7 @@ from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from lunar.timescales import format_utc
 from payload_emulator.errors import DatasetError
-from payload_emulator.session.recipe import Source
+from payload_emulator.session.recipe import Recipe, Source
 from payload_emulator.training.data.shots import Pose, draw_photometry, draw_sensor, draw_sun
 
 _LABEL_MINIMUM_M = 2_000.0
@@ -30,7 +30,10 @@ _TRIES_OF_LIGHT = 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shot:
-    """A finished frame: gray image (H, W) of 8 or 16 bits, frame values, crater columns, pose, direction of the Sun."""
+    """A finished frame: image of 8 or 16 bits, frame values, crater columns, pose, direction of the Sun.
+
+    The image is gray (H, W) or RGB (H, W, 3).
+    """
 
     image: NDArray[Any]
     row: dict[str, float]
@@ -62,7 +65,7 @@ def take_frame(
     source: Source,
     pose_of: Callable[[np.random.Generator], Pose],
     number: int,
-    bits: int,
+    recipe: Recipe,
     render: Callable[..., Any],
     rng: np.random.Generator,
 ) -> Shot:
@@ -82,7 +85,7 @@ def take_frame(
             sun,
             draw_photometry(source.vary, rng),
         )
-        image, coarse = _exposed(rendering.radiance, draw_sensor(source.vary, rng), bits, rng)
+        image, coarse = _exposed(rendering.radiance, draw_sensor(source.vary, rng), recipe, rng)
         if prepare_image(coarse).quality is ImageQuality.OK:
             break
     position, rotation = pose.position_mcmf_m, pose.camera_from_mcmf
@@ -144,19 +147,22 @@ def describe(
 
 
 def _exposed(
-    radiance: NDArray[np.float32], sensor: Any, bits: int, rng: np.random.Generator
+    radiance: NDArray[np.float32], sensor: Any, recipe: Recipe, rng: np.random.Generator
 ) -> tuple[NDArray[Any], OctetArray]:
-    """Mean of the colour channels (H, W) in the depth wanted, and in 8 bits."""
+    """The frame as the recipe wants it, mean of the channels (H, W) or RGB (H, W, 3), and its mean in 8 bits."""
     from payload_emulator.flight.vision.preprocess import gray_levels
     from payload_emulator.sim.render.sensor import expose, expose_deep
 
-    if bits == 8:
-        image = gray_levels(expose(radiance, sensor, rng))
-        return image, image
-    red, green, blue = np.moveaxis(expose_deep(radiance, replace(sensor, bits=bits), rng), -1, 0)
+    in_colour = recipe.colour == "rgb"
+    if recipe.bits == 8:
+        picture = expose(radiance, sensor, rng)
+        gray = gray_levels(picture)
+        return (picture if in_colour else gray), gray
+    deep_picture = expose_deep(radiance, replace(sensor, bits=recipe.bits), rng)
+    red, green, blue = np.moveaxis(deep_picture, -1, 0)
     total = red.astype(np.uint32) + green + blue  # a sum along an axis of three is ten times slower
     deep = ((total + 1) // 3).astype(np.uint16)
-    return deep, (deep >> 8).astype(np.uint8)
+    return (deep_picture if in_colour else deep), (deep >> 8).astype(np.uint8)
 
 
 def _label(

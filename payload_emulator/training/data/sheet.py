@@ -53,7 +53,7 @@ def draw_frame(dataset: Dataset, frame: Frame, tile_px: int = 512) -> OctetArray
     """RGB picture (tile_px, tile_px, 3) of a frame with the rims of its labelled craters."""
     import cv2
 
-    gray = dataset.image(frame)
+    gray = dataset.gray(frame)
     scale = tile_px / max(gray.shape)
     size = round(gray.shape[1] * scale), round(gray.shape[0] * scale)
     picture = np.zeros((tile_px, tile_px, 3), np.uint8)

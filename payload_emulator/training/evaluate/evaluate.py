@@ -18,7 +18,7 @@ from payload_emulator.flight.vision.detector import (
     decode,
     drop_duplicates,
 )
-from payload_emulator.flight.vision.preprocess import prepare_image, sun_up_turns, turn_back
+from payload_emulator.flight.vision.preprocess import Preparation, prepare_image, sun_up_turns, turn_back
 from payload_emulator.training.data.dataset import (
     Dataset,
     Frame,
@@ -33,7 +33,7 @@ from payload_emulator.training.evaluate.metrics import Scene, Thresholds, score
 from payload_emulator.training.evaluate.scoring import FrameDetections
 
 SCORE_FLOOR = 0.10  # detections are kept down to this for curves; figures are given at the threshold
-_CLASS_DIAMETERS_M = (7_000.0, 12_000.0, 20_000.0)
+_CLASS_DIAMETERS_M = (7_000.0, 12_000.0, 20_000.0)  # where a network does not tell its priors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +51,7 @@ def detect_with_network(network: Any, dataset: Dataset, frame: Frame, device: st
     """Detections of a torch network (in evaluation mode) in one frame, prepared as on board."""
     import torch
 
-    gray = prepare_image(dataset.image(frame)).gray
+    gray = prepare_image(dataset.image(frame), Preparation(network.config.preparation)).gray
     turns = sun_up_turns(frame.sun_camera)
     with torch.no_grad():
         image = torch.from_numpy(np.ascontiguousarray(np.rot90(gray, turns)))[None, None].to(device)
@@ -84,14 +84,15 @@ def detect_by_class(detector: OnnxDetector, dataset: Dataset, frame: Frame) -> F
     ModelError
         The network has no class heatmaps.
     """
-    prepared = prepare_image(dataset.image(frame)).gray
+    prepared = prepare_image(dataset.image(frame), detector.preparation).gray
     turns = sun_up_turns(frame.sun_camera)
     heatmap, geometry = detector.run_network(np.ascontiguousarray(np.rot90(prepared, turns))[None, None])
-    if heatmap.shape[1] != 4:
+    if heatmap.shape[1] not in (3, 4):
         raise ModelError(
             f"detector network: expected the paper's three class heatmaps, found {heatmap.shape[1] - 1}"
         )
-    parts = [decode(heatmap[0, 1 + k], geometry[0], SCORE_FLOOR, detector.stride_px) for k in range(3)]
+    heats = heatmap[0, -3:]
+    parts = [decode(heat, geometry[0], SCORE_FLOOR, detector.stride_px) for heat in heats]
     column = {
         name: np.concatenate([getattr(part, name) for part in parts])
         for name in ("u_px", "v_px", "diameter_px", "score", "sigma_px")
@@ -103,11 +104,12 @@ def detect_by_class(detector: OnnxDetector, dataset: Dataset, frame: Frame) -> F
     u_px, v_px = turn_back(column["u_px"], column["v_px"], turns, *prepared.shape)
     latitude, longitude, _ = spherical_from_mcmf(ground_points(dataset, frame, u_px, v_px))
     scored = dataset.is_scored(frame, np.degrees(latitude), np.degrees(longitude)) | ~np.isfinite(latitude)
+    medians_m = np.array(_CLASS_DIAMETERS_M) if detector.class_medians_m is None else detector.class_medians_m
     return FrameDetections(
         u_px[scored],
         v_px[scored],
         column["diameter_px"][scored],
-        np.array(_CLASS_DIAMETERS_M)[classes[scored]],
+        medians_m[classes[scored]],
         column["score"][scored],
         column["sigma_px"][scored],
         size_class=classes[scored],
@@ -354,6 +356,7 @@ def refuse_other_camera(detector: OnnxDetector, dataset: Dataset) -> None:
 
 
 def _on_ground(dataset: Dataset, frame: Frame, found: Detections) -> FrameDetections:
+    """Detections with diameters on the ground, on the ground that is scored."""
     latitude, longitude, _ = spherical_from_mcmf(ground_points(dataset, frame, found.u_px, found.v_px))
     # A detection in the sky has no place on the ground and counts as wrong.
     scored = dataset.is_scored(frame, np.degrees(latitude), np.degrees(longitude)) | ~np.isfinite(latitude)
@@ -362,8 +365,11 @@ def _on_ground(dataset: Dataset, frame: Frame, found: Detections) -> FrameDetect
         found.u_px,
         found.v_px,
         found.diameter_px,
-        diameter_on_ground_m(dataset, frame, found.u_px, found.v_px, found.diameter_px),
+        diameter_on_ground_m(dataset, frame, found.u_px, found.v_px, found.diameter_px)
+        if found.diameter_m is None
+        else found.diameter_m,
         found.score,
         found.sigma_px,
         found.depth_ratio,
+        None if found.size_class is None else found.size_class.astype(np.int8),
     )

@@ -424,7 +424,7 @@ def _picture(scored: Scored, k: int, threshold: float) -> GalleryFrame:
     return GalleryFrame(
         frame_number=frame.number,
         utc_ns=None,
-        image=dataset.image(frame),
+        image=dataset.gray(frame),
         detection_u_px=found.u_px[d],
         detection_v_px=found.v_px[d],
         detection_diameter_px=found.diameter_px[d],

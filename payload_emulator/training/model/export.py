@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from payload_emulator.errors import ModelError
+from lunar.catalogue import size_class
+from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.flight.vision.detector import (
     GEOMETRY_NAME,
     HEATMAP_NAME,
@@ -20,6 +21,7 @@ from payload_emulator.flight.vision.detector import (
     INPUT_SIZE_PX,
     OnnxDetector,
 )
+from payload_emulator.flight.vision.preprocess import Preparation
 from payload_emulator.training.data.dataset import Dataset
 from payload_emulator.training.model.calibrate import Calibration, calibrate, paper_threshold
 
@@ -62,12 +64,15 @@ def export(
     notes: dict[str, str] | None = None,
     *,
     paper_classes: bool = False,
+    classes_only: bool = False,
     test: bool = False,
 ) -> dict[str, Any]:
     """Write the ONNX network of a checkpoint; its parity with torch and its metadata come back.
 
-    `paper_classes` keeps the class heatmaps of a network that has them. `test` scores the test splits, source by
-    source, at the thresholds fixed on validation, and writes the figures into the model.
+    `paper_classes` keeps the class heatmaps of a network that has them; `classes_only` keeps only these and the
+    offsets, as in the paper: the network flies with the median diameters of the data set's classes as a prior. `test`
+    scores the test splits, source by source, at the thresholds fixed on validation, and writes the figures into the
+    model.
 
     Raises
     ------
@@ -78,22 +83,30 @@ def export(
     from payload_emulator.training.model.model import ExportedCraterNet
 
     network, stored = load_network(checkpoint)
+    paper_classes = paper_classes or classes_only
     if paper_classes and network.heat_channels == 1:
         raise ModelError(
             f"{checkpoint}: expected a network with the paper's class heatmaps, found one without"
         )
     calibration = calibrate(network, datasets)
     exported = ExportedCraterNet(
-        network, calibration.geometry_shift, network.heat_channels if paper_classes else 1
+        network,
+        calibration.geometry_shift,
+        network.heat_channels if paper_classes else 1,
+        classes_only=classes_only,
     ).eval()
     model = keep_blocked(onnx_model(exported))
     metadata = _metadata(stored, calibration, checkpoint, datasets) | {
         "git_revision": revision,
         **(notes or {}),
     }
+    if classes_only:
+        metadata["class_median_diameter_m"] = json.dumps(class_medians_m(datasets))
     octets = _with_metadata(model, metadata)
     if paper_classes:
         metadata["paper_threshold"] = str(_paper_threshold(octets, datasets))
+        if classes_only:
+            metadata["score_threshold"] = metadata["paper_threshold"]
         octets = _with_metadata(model, metadata)
     difference = parity(exported, octets)
     if difference > PARITY_LIMIT:
@@ -121,6 +134,26 @@ def export(
         "validation": calibration.figures,
         "test": tested,
     }
+
+
+def class_medians_m(datasets: Sequence[Dataset]) -> list[float]:
+    """Median diameter of the craters of each of the paper's classes in the training frames, m.
+
+    Raises
+    ------
+    DatasetError
+        A class has no crater there.
+    """
+    frames = [frame for dataset in datasets for frame in dataset.frames("train")]
+    listed = [(frame.craters["id"], frame.craters["diameter_m"]) for frame in frames]
+    diameter_m = np.concatenate([sizes[ids >= 0] for ids, sizes in listed]) if listed else np.zeros(0)
+    classes = size_class(diameter_m.astype(np.float64))
+    counts = [int(np.count_nonzero(classes == k)) for k in range(3)]
+    if min(counts) == 0:
+        raise DatasetError(
+            f"class medians: expected craters of three classes in training frames, found {counts}"
+        )
+    return [round(float(np.median(diameter_m[classes == k])), 1) for k in range(3)]
 
 
 def onnx_model(exported: Any) -> Any:
@@ -224,6 +257,7 @@ def _metadata(
         "navigation_threshold": str(calibration.navigation_threshold),
         "geometry_shift": json.dumps([round(value, 5) for value in calibration.geometry_shift]),
         **({"camera_fov_deg": f"{datasets[0].index['camera']['fov_deg']:g}"} if datasets else {}),
+        "preparation": str(stored["config"].get("preparation", Preparation.gray_first)),
         "parallax_per_px": f"{calibration.parallax_per_px:.3g}",
         "validation": json.dumps(calibration.figures),
         "training_steps": str(stored["progress"]["step"]),

@@ -67,6 +67,7 @@ class ModelConfig:
 
     backbone : "small" or "large" of MobileNetV3.
     stride_px : stride of the output maps in pixels of the network's first layer, 4 or 2.
+    preparation : how a colour frame becomes the network's input, a `flight.vision.preprocess.Preparation`.
     enlarge : the network enlarges the image so many times first, for craters of few pixels (high altitudes).
     """
 
@@ -78,6 +79,7 @@ class ModelConfig:
     backbone: str = "small"
     stride_px: int = 4
     enlarge: int = 1
+    preparation: str = "gray-then-normalise"
 
     def __post_init__(self) -> None:
         if self.backbone not in _BACKBONES:
@@ -180,7 +182,8 @@ class CraterNet(nn.Module):
 class ExportedCraterNet(nn.Module):
     """The network as flight runs it: probabilities, and geometry with the corrections of `calibrate.calibrate`.
 
-    `heat_channels` 1 leaves the paper's class heatmaps out. Corrections are part of the last layer's biases, and what
+    `heat_channels` 1 leaves the paper's class heatmaps out; `classes_only` leaves all but these and the offsets out.
+    Corrections are part of the last layer's biases, and what
     is left out is not computed.
     """
 
@@ -189,6 +192,8 @@ class ExportedCraterNet(nn.Module):
         network: CraterNet,
         geometry_shift: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0),
         heat_channels: int = 1,
+        *,
+        classes_only: bool = False,
     ) -> None:
         super().__init__()
         self.network = copy.deepcopy(network)
@@ -197,12 +202,16 @@ class ExportedCraterNet(nn.Module):
         assert whole.bias is not None
         first = network.heat_channels
         kept = [*range(heat_channels), *range(first, first + network.geometry_channels)]
+        if classes_only:
+            heat_channels = self.heat_channels = network.heat_channels - 1
+            kept = [*range(1, first), first, first + 1]
         head = nn.Conv2d(whole.in_channels, len(kept), 1)
         assert head.bias is not None
         with torch.no_grad():
             head.weight.copy_(whole.weight[kept])
             head.bias.copy_(whole.bias[kept])
-            head.bias[heat_channels : heat_channels + 4] += torch.tensor(geometry_shift)
+            told = len(kept) - heat_channels
+            head.bias[heat_channels : heat_channels + 4] += torch.tensor(geometry_shift)[:told]
         self.network.head = head
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:

@@ -26,6 +26,7 @@ import numpy as np
 
 from lunar.arrays import FloatArray, OctetArray
 from payload_emulator.errors import DatasetError, ModelError
+from payload_emulator.flight.vision.preprocess import Preparation
 from payload_emulator.training.data.dataset import Dataset, Frame
 from payload_emulator.training.data.feeder import Feeder, TrainParameters
 from payload_emulator.training.evaluate.landmarks import Landmarks, with_landmarks
@@ -97,6 +98,7 @@ def train(
         parameters.backbone,
         parameters.stride_px,
         parameters.enlarge,
+        str(parameters.preparation),
     )
     network = CraterNet(config).to(device, memory_format=torch.channels_last)
     average = copy.deepcopy(network).eval()
@@ -116,7 +118,12 @@ def train(
     elif start_from is not None:
         origin = _start_from(start_from, network, average)
         report(f"started from {start_from.name}")
-    images = _load_images(train_frames, report)
+    in_colour = parameters.preparation is Preparation.normalise_first
+    if in_colour and not all(d.index["recipe"].get("colour") == "rgb" for d in datasets):
+        raise DatasetError(
+            'training: expected data sets in colour (colour = "rgb") to normalise before averaging'
+        )
+    images = _load_images(train_frames, report, in_colour)
     _write_run(run, parameters, datasets, config.to_dict(), replicas, device, origin)
     feeder = Feeder(train_frames, images, parameters)
     if origin is not None and start_from is not None and start_from.suffix == ".onnx":
@@ -378,9 +385,13 @@ def _validate(
     }
 
 
-def _load_images(frames: Sequence[tuple[Dataset, Frame]], report: Callable[[str], None]) -> list[OctetArray]:
+def _load_images(
+    frames: Sequence[tuple[Dataset, Frame]],
+    report: Callable[[str], None],
+    in_colour: bool,
+) -> list[OctetArray]:
     began = time.monotonic()
-    images = [dataset.image(frame) for dataset, frame in frames]
+    images = [dataset.image(frame) if in_colour else dataset.gray(frame) for dataset, frame in frames]
     report(f"{len(images)} training images loaded in {time.monotonic() - began:.1f} s")
     return images
 
