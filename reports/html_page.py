@@ -29,7 +29,7 @@ from reports.document import (
     evidence_number,
     evidence_text,
 )
-from reports.figures.svg import draw_svg
+from reports.figures.svg import Drawings
 from reports.stylesheet import page_style
 from reports.text import NOT_A_VALUE, headline_text
 
@@ -37,8 +37,9 @@ VERDICT_WORDS = {"good": "Verdict: good", "caution": "Verdict: with reservations
 _SHORT_TABLE_ROWS = 14
 
 
-def html_page(document: Document) -> str:
-    """The page as text."""
+def html_page(document: Document, drawings: Drawings | None = None) -> str:
+    """Return the page as text; `drawings` keeps figures that another rendering has drawn."""
+    drawn = Drawings() if drawings is None else drawings
     policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
     footer = " · ".join(t for t in ("LINNA", document.kicker, document.identity) if t)
     sections = [b.text for b in document.blocks if isinstance(b, Heading) and b.level == 2]
@@ -60,13 +61,13 @@ def html_page(document: Document) -> str:
         f'<nav class="contents" aria-label="Contents"><p>Contents</p><ol>{contents}</ol></nav>'
         f'<main id="top"><header><p class="kicker"><b>LINNA · {escape(document.kicker)}</b>'
         f"<span>{escape(document.identity)}</span></p><h1>{escape(document.title)}</h1>"
-        f'<dl class="about">{about}</dl></header>\n{"".join(_blocks(document))}'
+        f'<dl class="about">{about}</dl></header>\n{"".join(_blocks(document, drawn))}'
         f'<footer class="colophon">{escape(footer)}. Times are UTC. Figures and tables come from the same values.'
         "</footer></main></div></body></html>\n"
     )
 
 
-def _blocks(document: Document) -> Iterator[str]:
+def _blocks(document: Document, drawings: Drawings) -> Iterator[str]:
     section = table = figure = 0
     fresh_page = False
     for block in document.blocks:
@@ -82,7 +83,7 @@ def _blocks(document: Document) -> Iterator[str]:
             yield _table(block, table)
         elif isinstance(block, Picture):
             figure += 1
-            yield _picture(block, figure)
+            yield _picture(block, figure, drawings)
         else:
             yield _plain(block)
         fresh_page = False
@@ -153,8 +154,8 @@ def _evidence(level: str) -> str:
     return f'<dd class="level" title="{title}"><span aria-hidden="true">{dots}</span> {words}</dd>'
 
 
-def _picture(block: Picture, number: int) -> str:
-    svg = draw_svg(block.key, block.width_in, block.height_in, block.draw, block.alt)
+def _picture(block: Picture, number: int, drawings: Drawings) -> str:
+    svg = drawings.svg(block)
     return (
         f'\n<figure id="fig-{escape(block.key)}">{svg}'
         f"<figcaption><b>Figure {number}.</b> {escape(block.caption)}</figcaption></figure>"

@@ -11,7 +11,7 @@ from reports.values import CampaignReport, DatasetReport, DetectorReport, PassRe
 if TYPE_CHECKING:
     from reports.document import Document
 
-__all__ = ["render_html", "render_pdf", "to_json"]
+__all__ = ["render_html", "render_pages", "render_pdf", "to_json"]
 
 
 def render_html(report: Any) -> str:
@@ -42,6 +42,24 @@ def render_pdf(report: Any) -> bytes:
     from reports.pdf_pages import pdf_pages
 
     return pdf_pages(_document(report))
+
+
+def render_pages(report: Any) -> tuple[str, bytes]:
+    """Return a report as HTML page and as A4 PDF; each figure is drawn once.
+
+    Raises
+    ------
+    UnknownReportKind
+        when the value is none of those of `reports.values`
+    InconsistentReport
+        when parts of the value do not fit together
+    """
+    from reports.figures.svg import Drawings
+    from reports.html_page import html_page
+    from reports.pdf_pages import pdf_pages
+
+    document, drawings = _document(report), Drawings()
+    return html_page(document, drawings), pdf_pages(document, drawings)
 
 
 def _document(report: Any) -> Document:

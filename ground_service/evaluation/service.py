@@ -14,7 +14,6 @@ from typing import Any
 from ground_service.clock import utc_now_ns
 from ground_service.errors import storage_error
 from ground_service.evaluation.core import PassInputs, evaluate_pass, summary_of
-from ground_service.evaluation.pdf_process import Press, worthwhile
 from ground_service.evaluation.store import load_pass_inputs
 from ground_service.evaluation.surface import surface_map
 from ground_service.events import PassEvaluated, publish
@@ -90,13 +89,8 @@ def make_report(
     identity = report_id or uuid.uuid4().hex
     now = utc_now_ns()
     inputs = load_pass_inputs(ground, pass_id, created_utc=format_utc(now))
-    if pdf and worthwhile(len(inputs.detections)):
-        with Press() as press:
-            report = _evaluated(ground, inputs)
-            documents = _documents(report, pdf=True, press=press)
-    else:
-        report = _evaluated(ground, inputs)
-        documents = _documents(report, pdf=pdf)
+    report = _evaluated(ground, inputs)
+    documents = _documents(report, pdf=pdf)
     stored = {kind: ground.files.put_octets(octets) for kind, octets in documents.items()}
     summary = _summary(report, pass_id)
     with ground.database.writing() as connection:
@@ -174,17 +168,15 @@ def changed_figures(before: Any, after: Any, name: str = "") -> list[dict[str, A
     return [] if before == after else [{"figure": name, "before": before, "after": after}]
 
 
-def _documents(report: PassReport, *, pdf: bool, press: Press | None = None) -> dict[str, bytes]:
-    """The octets of a report by kind, its PDF from a press where there is one."""
-    from reports.render import render_html, render_pdf, to_json
+def _documents(report: PassReport, *, pdf: bool) -> dict[str, bytes]:
+    """Return the octets of a report by kind."""
+    from reports.render import render_html, render_pages, to_json
 
-    if press is not None:
-        press.begin(report)
-    documents = {"html": render_html(report).encode(), "json": to_json(report).encode()}
-    if pdf:
-        # Should the press have failed, so will this, and say why.
-        documents["pdf"] = (press.finish() if press is not None else None) or render_pdf(report)
-    return documents
+    data = to_json(report).encode()
+    if not pdf:
+        return {"html": render_html(report).encode(), "json": data}
+    page, printed = render_pages(report)
+    return {"html": page.encode(), "json": data, "pdf": printed}
 
 
 def _summary(report: PassReport, pass_id: int) -> dict[str, Any]:

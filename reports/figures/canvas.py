@@ -26,10 +26,9 @@ _DAY_S = 86_400
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photo:
-    """An image that a page embeds as it is, uint8 (H, W) or (H, W, 3), and how strongly it covers the paper."""
+    """An image that a page embeds unchanged, uint8 (H, W) or (H, W, 3)."""
 
     image: ByteArray
-    opacity: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +69,7 @@ class Canvas:
         """A gray or RGB image into the box left, right, bottom, top of data coordinates; row 0 at ``top``."""
         shown = image
         if self.photos is not None:
-            self.photos.append(Photo(image, opacity))
+            self.photos.append(Photo(image))
             shown = np.zeros((2, 2), dtype=np.uint8)
         limits = axes.get_xlim(), axes.get_ylim()
         axes.imshow(

@@ -11,7 +11,6 @@ import pytest
 
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.evaluation import service as reports
-from ground_service.evaluation.pdf_process import Press
 from ground_service.evaluation.service import evaluate, make_report, pass_summary
 from ground_service.ground import Ground, open_ground
 from ground_service.passes.archive_import import import_archive
@@ -174,26 +173,15 @@ def test_without_a_reference_outcomes_and_ledger_are_still_told(
     assert "Outcomes of all frames" in text and "Reads of the anchor ephemeris" in text
 
 
-def test_a_long_report_is_printed_elsewhere_with_the_same_octets(
+def test_the_stored_pdf_and_page_are_those_of_the_report(
     imported: tuple[Ground, int, PassReport], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ground, pass_id, report = imported
-    monkeypatch.setattr(reports, "worthwhile", lambda frames: frames == FRAMES)
     monkeypatch.setattr(reports, "utc_now_ns", lambda: 0)
-    printed = make_report(ground, pass_id, out=tmp_path / "press", pdf=True)
-    monkeypatch.setattr(reports, "worthwhile", lambda frames: False)
-    here = make_report(ground, pass_id, out=tmp_path / "here", pdf=True)
-    assert printed.pdf is not None and here.pdf is not None
-    assert printed.pdf.read_bytes() == here.pdf.read_bytes()
-    with Press() as press:
-        press.begin(report)
-        assert press.finish() == render_pdf(report)
-
-
-def test_a_press_that_fails_prints_nothing() -> None:
-    with Press() as press:
-        press.begin("no report")
-        assert press.finish() is None
+    made = make_report(ground, pass_id, out=tmp_path / "out", pdf=True)
+    assert made.pdf is not None
+    assert made.pdf.read_bytes() == render_pdf(report)
+    assert make_report(ground, pass_id, out=tmp_path / "page").pdf is None
 
 
 def test_a_lost_frame_shows_as_lost_packets(synthetic_pass: Any, ground: Ground, tmp_path: Path) -> None:
