@@ -3,16 +3,18 @@
 All rotations are target-from-source matrices, shape ``(..., 3, 3)``: ``position_mcmf = mcmf_from_icrf @
 position_icrf``.
 
-ICRF   axes of the International Celestial Reference Frame, origin at the centre of the Moon here; inertial
-MCI    Moon's equator and node of date at a stated epoch (IAU pole), held inertial; orbital elements are read
-in it MCMF   mean-Earth/polar-axis (ME) axes, fixed to the Moon: maps, height models, crater catalogues PA
-principal axes of the Moon's inertia, fixed to the Moon: gravity fields.  About 0.9 km from ME on the ground
-ENU    east, north, up at a place on the sphere RTN    radial, along-track (transverse), cross-track (normal)
-of an orbit
+Frames
+------
+ICRF : axes of the International Celestial Reference Frame; here with the origin at the centre of the Moon
+MCI : equator and node of the Moon at a stated epoch (IAU pole), held inertial; frame of the orbital elements
+MCMF : mean-Earth/polar-axis (ME) axes, fixed to the Moon; frame of maps, height models and crater catalogues
+PA : principal axes of inertia of the Moon, fixed to it; frame of gravity fields, about 0.9 km from ME on the ground
+ENU : east, north, up at a place on the reference sphere
+RTN : radial, along-track (transverse) and cross-track (normal) axes of an orbit
 
-The orientation of the Moon comes from `IauOrientation` (series, no file) or `De421Orientation` (binary PCK
-file).  They differ by up to some hundred metres on the ground, because the IAU series holds no physical
-libration beyond its terms.
+`IauOrientation` (a series, no file) or `De421Orientation` (a binary PCK file) gives the orientation of the Moon. They
+differ by up to a few hundred metres on the ground, because the IAU series contains only some terms of the physical
+libration.
 
 References
 ----------
@@ -39,9 +41,8 @@ ARCSECOND_RAD = np.pi / 648_000.0
 DAY_S = 86_400.0
 CENTURY_S = 36_525.0 * DAY_S
 
-# WGCCRE 2009: E1..E13 in degrees at J2000 and degrees per day, then their coefficients in right ascension
-# (sine) and
-# declination (cosine) of the pole and in the prime meridian (sine), in degrees.
+# WGCCRE 2009: E1 to E13 in degrees at J2000 and degrees per day, then their coefficients in degrees for right
+# ascension (sine) and declination (cosine) of the pole, and for the prime meridian (sine).
 _E_DEG = np.array(
     [
         125.045,
