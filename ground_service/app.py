@@ -29,7 +29,8 @@ from ground_service.web.live import live
 from ground_service.web.pages import pages
 from ground_service.web.payload_console import payload_console
 from ground_service.web.sockets import Sockets
-from ground_service.worker.dispatch import dispatcher_for, follow
+from ground_service.worker.dispatch import dispatcher_for
+from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.jobs import enter_redecoding
 from ground_service.worker.metrics import Metrics, Watch
 from ground_service.worker.routes import operations
@@ -70,7 +71,7 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         threads = SQLITE_THREADS if ground.database.dialect == "sqlite" else SERVER_THREADS
         to_thread.current_default_thread_limiter().total_tokens = threads
         app.state.dispatcher = dispatcher_for(ground, settings, inline=inline_jobs)
-        app.state.follow_up = follow(ground, settings, app.state.dispatcher)
+        app.state.follow_up = follow_in_process(ground, app.state.dispatcher.start)
         for job in enter_redecoding(ground):
             log.warning("decoding the archive again with a newer dictionary: job %s", job)
             app.state.dispatcher.start(job)

@@ -101,6 +101,7 @@ class Payload:
 
     def __init__(self, scenario: str, log: Path) -> None:
         self.telemetry, self.telecommands, console = free_port(), free_port(), free_port()
+        self.mission = free_port()
         command = [
             sys.executable,
             "-m",
@@ -118,6 +119,8 @@ class Payload:
             str(self.telecommands),
             "--console-port",
             str(console),
+            "--mission-port",
+            str(self.mission),
         ]
         with log.open("ab") as stream:
             self.process = subprocess.Popen(command, stdout=stream, stderr=stream)
@@ -160,8 +163,8 @@ class Payload:
 
 
 @contextmanager
-def station(port: int, server: str, token: str, home: Path, log: Path) -> Iterator[None]:
-    """`linna ingest --tcp`: what comes from the payload goes into the archive as it comes."""
+def station(port: int, mission: int, server: str, token: str, home: Path, log: Path) -> Iterator[None]:
+    """`linna ingest --tcp`: telemetry is ingested as it arrives, after the mission description."""
     command = [
         sys.executable,
         "-m",
@@ -169,6 +172,8 @@ def station(port: int, server: str, token: str, home: Path, log: Path) -> Iterat
         "ingest",
         "--tcp",
         f"127.0.0.1:{port}",
+        "--mission",
+        f"127.0.0.1:{mission}",
         "--follow",
         "--server",
         server,
@@ -213,7 +218,12 @@ def rehearse(
         with Client(service.apis[-1], tokens["bob"]) as api:
             window = plan(desk, api, scenario, folder, now, minutes)
             with station(
-                payload.telemetry, service.api, tokens["ann"], folder / "station", folder / "station.log"
+                payload.telemetry,
+                payload.mission,
+                service.api,
+                tokens["ann"],
+                folder / "station",
+                folder / "station.log",
             ):
                 execute(desk, api, payload, window)
             payload.stop()
@@ -262,7 +272,7 @@ def look_at_audit(desk: Transcript, ground: Ground) -> dict[str, Any]:
 
 
 def plan(desk: Transcript, api: Client, scenario: str, folder: Path, now_utc_ns: int, minutes: float) -> int:
-    """Add mission description, reference ephemeris, window, approval and telecommands; return the window."""
+    """Add reference ephemeris, window, approval and telecommands; return the window."""
     given = load_scenario(scenario)
     start = now_utc_ns + LEAD_S * NS
     stop = start + round(minutes * 60) * NS
@@ -270,8 +280,6 @@ def plan(desk: Transcript, api: Client, scenario: str, folder: Path, now_utc_ns:
     days = math.ceil(10 * ((stop + 3600 * NS - epoch) / DAY_NS)) / 10
     reference = folder / "reference.oem"
     desk.linna("orbit", "propagate", scenario, "--days", days, "--step", 60, "--out", reference)
-    desk.linna("mission", "write", scenario, "--out", folder / "mission.toml")
-    desk.linna("mission", "add", folder / "mission.toml")
     desk.linna("plan", "ephemeris", reference)
     desk.linna(
         "plan",

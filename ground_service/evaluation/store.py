@@ -42,7 +42,7 @@ from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris, load_ephemeris
 from lunar.frames import Orientation
 from lunar.lens import BrownCamera
-from lunar.timescales import parse_utc
+from lunar.timescales import format_utc, parse_utc
 from reports.values import (
     HousekeepingParameter,
     InstrumentReport,
@@ -155,7 +155,7 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             provenance=_provenance(mission, declared, manifest, record, vehicle, ephemeris, span),
             data_sources=tuple(str(name) for name in manifest.get("data_sources", ())),
             evidence_level=mission.evidence.text,
-            configuration=_configuration(manifest),
+            configuration=_configuration(manifest, record),
             scenario_text=str(manifest.get("scenario_toml", "")),
             generated_for="",
             created_utc=created_utc,
@@ -483,13 +483,13 @@ def _dictionary_text(version: int) -> str:
     return f"version {version}, {DICTIONARY.hash[:16]}"
 
 
-def _configuration(manifest: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def _configuration(manifest: Mapping[str, Any], record: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     groups: dict[str, dict[str, Any]] = {}
     if manifest.get("camera"):
         groups["camera"] = dict(manifest["camera"])
     groups["observation"] = {
-        key: manifest[key]
-        for key in ("start_utc", "stop_utc", "cadence_s", "frames_expected", "light")
-        if key in manifest
+        "start_utc": format_utc(record["start_utc_ns"]),
+        "stop_utc": format_utc(record["stop_utc_ns"]),
+        **{key: manifest[key] for key in ("cadence_s", "frames_expected", "light") if key in manifest},
     }
     return {name: group for name, group in groups.items() if group}

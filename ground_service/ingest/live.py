@@ -29,6 +29,7 @@ PAUSE_S = 0.5
 """A sender that is silent for this long has finished a unit: what came so far is ingested."""
 
 CONNECT_S = 30.0
+DOCUMENT_LIMIT_OCTETS = 1 << 20
 RETRY_S = 1.0
 SETTLED_S = 2.0
 """A file that has not changed for this long is taken to be whole."""
@@ -141,6 +142,31 @@ def follow_tcp(address: tuple[str, int], spool: Spool, *, reconnect: bool, stop:
         spool.seal()
         if not reconnect or stop():
             return taken
+
+
+def receive_document(address: tuple[str, int]) -> bytes:
+    """Return what a TCP sender sends until it closes the connection.
+
+    Raises
+    ------
+    InvalidInput
+        If there is no connection within `CONNECT_S`, or the document is longer than `DOCUMENT_LIMIT_OCTETS`.
+    """
+    octets = b""
+    with _connected(address, lambda: False, patient=False) as connection:
+        connection.settimeout(CONNECT_S)
+        try:
+            while block := connection.recv(1 << 16):
+                octets += block
+                if len(octets) > DOCUMENT_LIMIT_OCTETS:
+                    break
+        except OSError as error:
+            found = error.strerror or str(error)
+            raise InvalidInput(f"{address[0]}:{address[1]}", "", "a whole document", found) from None
+    if len(octets) > DOCUMENT_LIMIT_OCTETS:
+        expected = f"at most {DOCUMENT_LIMIT_OCTETS} octets"
+        raise InvalidInput(f"{address[0]}:{address[1]}", "", expected, "more")
+    return octets
 
 
 @contextlib.contextmanager

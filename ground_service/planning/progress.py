@@ -70,7 +70,8 @@ def _advance(
     state, reason = state_of(facts)
     values: dict[str, Any] = {}
     if facts.frames > 0 and row["pass_id"] is None:
-        values["pass_id"] = _pass_of(connection, row)
+        mission_id = row["mission_id"] or missions.in_force(connection, row["vehicle_id"])
+        values |= {"pass_id": _pass_of(connection, row, mission_id), "mission_id": mission_id}
     if state != row["state"]:
         values |= {"state": state, "reason": reason, "changed_utc_ns": utc_now_ns()}
     found = {"version": row["version"], "state": row["state"], "pass_id": row["pass_id"]}
@@ -172,7 +173,7 @@ def _open(vehicle: int) -> tuple[Any, ...]:
     )
 
 
-def _pass_of(connection: Connection, row: Mapping[str, Any]) -> int:
+def _pass_of(connection: Connection, row: Mapping[str, Any], mission_id: int | None) -> int:
     """A pass over the span of the window."""
     return int(
         repository.add(
@@ -191,7 +192,7 @@ def _pass_of(connection: Connection, row: Mapping[str, Any]) -> int:
             ephemeris_id=row["ephemeris_id"],
             catalogue_sha256=None,
             attitude_sha256=None,
-            mission_id=row["mission_id"] or missions.in_force(connection, row["vehicle_id"]),
+            mission_id=mission_id,
             created_utc_ns=utc_now_ns(),
         )
     )

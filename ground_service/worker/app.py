@@ -22,12 +22,11 @@ from ground_service.ground import Ground, ground_from_settings
 from ground_service.jobs.service import enter_job
 from ground_service.logs import logging_config
 from ground_service.settings import Settings
-from ground_service.worker.follow_up import FollowUp, follow_in_process
+from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.jobs import run_job
 from ground_service.worker.upkeep import nightly_job_id
 
 RUN_JOB = "ground_service.run_job"
-FOLLOW_UP = "ground_service.follow_up"
 NIGHTLY = "ground_service.nightly"
 TIME_LIMIT_S = 1800
 RETRIES = 5
@@ -70,16 +69,6 @@ def make_app(settings: Settings) -> Celery:
     def run(_task: Any, job_id: str) -> None:
         run_job(_ground_of(settings), job_id)
 
-    @app.task(
-        name=FOLLOW_UP,
-        autoretry_for=(OSError, *PASSING),
-        retry_backoff=2,
-        retry_backoff_max=120,
-        max_retries=RETRIES,
-    )
-    def follow() -> None:
-        _follow_up_of(settings).drain()
-
     @app.task(name=NIGHTLY)
     def night() -> None:
         ground = _ground_of(settings)
@@ -98,17 +87,6 @@ def send_job(settings: Settings, job_id: str) -> None:
         If the broker cannot be reached.
     """
     _app_of(settings).send_task(RUN_JOB, args=(job_id,), retry=False)
-
-
-def send_follow_up(settings: Settings) -> None:
-    """Have the workers handle the events that wait for follow-up work.
-
-    Raises
-    ------
-    kombu.exceptions.OperationalError
-        If the broker cannot be reached.
-    """
-    _app_of(settings).send_task(FOLLOW_UP, retry=False)
 
 
 def queue_length(settings: Settings) -> int:
@@ -135,7 +113,7 @@ def worker_answers(settings: Settings, timeout_s: float = 4.0) -> bool:
         return False
 
 
-_grounds: dict[str, tuple[Ground, FollowUp]] = {}
+_grounds: dict[str, Ground] = {}
 _apps: dict[str, Celery] = {}
 
 
@@ -144,16 +122,7 @@ def _key(settings: Settings) -> str:
 
 
 def _ground_of(settings: Settings) -> Ground:
-    """The service opened once per process."""
-    return _opened(settings)[0]
-
-
-def _follow_up_of(settings: Settings) -> FollowUp:
-    return _opened(settings)[1]
-
-
-def _opened(settings: Settings) -> tuple[Ground, FollowUp]:
-    """The service of this process and the consumer of its events, whose jobs go to all workers."""
+    """Return the service, opened once per process; jobs of its follow-up work go to all workers."""
     key = _key(settings)
     if key not in _grounds:
         ground = ground_from_settings(settings)
@@ -162,7 +131,8 @@ def _opened(settings: Settings) -> tuple[Ground, FollowUp]:
             with contextlib.suppress(OperationalError):  # sent again by the sweep of the server
                 send_job(settings, job_id)
 
-        _grounds[key] = ground, follow_in_process(ground, start)
+        follow_in_process(ground, start)
+        _grounds[key] = ground
     return _grounds[key]
 
 

@@ -14,7 +14,6 @@ from ground_service.ground import Ground
 from ground_service.jobs.dispatcher import Dispatcher
 from ground_service.jobs.service import enter_job, unfinished_jobs
 from ground_service.settings import Settings
-from ground_service.worker.follow_up import FollowUp, WorkersFollow, follow_by_workers, follow_in_process
 from ground_service.worker.jobs import run_job
 
 log = logging.getLogger(__name__)
@@ -144,21 +143,3 @@ def dispatcher_for(ground: Ground, settings: Settings, *, inline: bool = False) 
     if settings.resolved_broker_url() is not None:
         return CeleryDispatcher(ground, settings)
     return InlineDispatcher(ground) if inline else ThreadDispatcher(ground)
-
-
-def follow(ground: Ground, settings: Settings, dispatcher: Dispatcher) -> FollowUp | WorkersFollow:
-    """Have the follow-up work of events done: by the workers if there is a broker, otherwise in this process."""
-    if settings.resolved_broker_url() is None:
-        return follow_in_process(ground, dispatcher.start)
-
-    def send() -> None:
-        from kombu.exceptions import OperationalError
-
-        from ground_service.worker.app import send_follow_up
-
-        try:
-            send_follow_up(settings)
-        except (OperationalError, OSError) as error:
-            log.warning("follow-up work: the broker is away (%s); it will be sent again", error)
-
-    return follow_by_workers(ground, send)

@@ -1,9 +1,10 @@
 """Follow-up work of events: what happens after telemetry, ephemerides, uplinks and reports.
 
-A consumer of the event log with a durable position. It works in the process of the event (embedded service, one-shot
-commands, workers), and the work is complete before the commit's caller continues. Otherwise a task for the workers is
-sent. Work is derived from the state of the database, so that doing it again gives the same result: an event that a
-killed process has left is handled by the next run, and an event that two processes handle changes nothing twice.
+A consumer of the event log with one durable position in the database. Every process has one (one-shot commands, the
+server, workers): it handles the events of a commit before the caller continues, one process at a time. Long work is a
+job, which runs in the process or, with a broker, in the Celery workers. Work is derived from the state of the database,
+so that doing it again gives the same result: events that a killed process has left are handled by the next process, and
+an event that two processes handle changes nothing twice.
 """
 
 from __future__ import annotations
@@ -267,35 +268,6 @@ def open_following(
     ground = open_ground(home, data, database_url=database_url, runner=runner)
     follow_in_process(ground)
     return ground
-
-
-class WorkersFollow:
-    """Follow-up work done by workers: a task is sent after each commit with events that have follow-up work."""
-
-    def __init__(self, ground: Ground, send: Callable[[], object]) -> None:
-        self._ground = ground
-        self._send = send
-
-    def __call__(self, kinds: frozenset[str]) -> None:
-        """Send a task for the events of a commit."""
-        if not kinds.isdisjoint(FOLLOWING):
-            self._send()
-
-    def drain(self) -> None:
-        """Send a task if a broker or a worker that was killed has lost one."""
-        with self._ground.database.reading() as connection:
-            waiting = events.read_events(
-                connection, events.position_of(connection, CONSUMER), limit=1, kinds=FOLLOWING
-            )
-        if waiting:
-            self._send()
-
-
-def follow_by_workers(ground: Ground, send: Callable[[], object]) -> WorkersFollow:
-    """Have the events of this process handled by workers; return the consumer."""
-    follow = WorkersFollow(ground, send)
-    ground.database.listeners.add(follow)
-    return follow
 
 
 def _reported_passes(connection: Connection, vehicle: int, first_ticks: int, last_ticks: int) -> list[int]:

@@ -48,6 +48,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="snapshots as JSON lines out, pause|run|step|rate X|quit in (default: %(default)s)",
     )
     live.add_argument(
+        "--mission-port",
+        type=int,
+        default=10045,
+        help="mission description, sent to each client (default: %(default)s)",
+    )
+    live.add_argument(
         "--rate",
         type=float,
         default=1.0,
@@ -139,6 +145,7 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
     from linna.errors import UsageError
     from payload_emulator.session.emulator import load_scenario_payload, new_spacecraft
     from payload_emulator.session.live import LivePayload
+    from payload_emulator.session.mission import mission_text
     from payload_emulator.session.world import build_world
 
     if not arguments.rate >= 0.0:
@@ -158,6 +165,8 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
         arguments.stop_at_end,
         not arguments.no_operator,
         catalogue,
+        mission_text(world, data),
+        arguments.mission_port,
     )
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: live.stopping.set())

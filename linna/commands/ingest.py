@@ -19,6 +19,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="HOST:PORT",
         help="receive telemetry from this TCP server until it closes the connection",
     )
+    parser.add_argument(
+        "--mission",
+        metavar="HOST:PORT",
+        help="with --tcp: receive the mission description from here at the first contact of a spacecraft",
+    )
     parser.add_argument("--watch", type=Path, metavar="DIR", help="ingest the files that appear in a folder")
     parser.add_argument(
         "--follow",
@@ -54,6 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"--spacecraft-id: expected 0 to 1023, found {arguments.spacecraft_id}")
     if sum((bool(arguments.files), arguments.tcp is not None, arguments.watch is not None)) != 1:
         raise UsageError("ingest: expected one of FILE..., --tcp and --watch")
+    if arguments.mission is not None and arguments.tcp is None:
+        raise UsageError("--mission: expected --tcp, found none")
     if arguments.offset is not None and (arguments.stream is None or arguments.offset < 0):
         raise UsageError(
             f"--offset: expected octets from the beginning of --stream, found {arguments.offset}"
@@ -96,6 +103,8 @@ def run(arguments: argparse.Namespace) -> int:
             log(_line(one))
 
         if arguments.tcp is not None:
+            if arguments.mission is not None:
+                _first_contact(arguments, service)
             _follow(arguments, ingest_live, report)
         elif arguments.watch is not None:
             _watch(arguments, ingest_live, report)
@@ -121,17 +130,38 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _follow(arguments: argparse.Namespace, ingest: Any, report: Any) -> None:
-    from ground_service.ingest.live import Spool, follow_tcp
+def _address(option: str, text: str) -> tuple[str, int]:
     from linna.errors import UsageError
 
-    host, _, port = arguments.tcp.rpartition(":")
+    host, _, port = text.rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port) < 65536:
-        raise UsageError(f"--tcp: expected HOST:PORT, found {arguments.tcp!r}")
+        raise UsageError(f"{option}: expected HOST:PORT, found {text!r}")
+    return host.strip("[]"), int(port)
+
+
+def _first_contact(arguments: argparse.Namespace, service: Any) -> None:
+    """Add the mission description of the sender, unless a person has entered one of its spacecraft."""
+    from ground_service.ingest.live import receive_document
+    from ground_service.missions.service import read_mission
+    from ground_service.missions.store import ARCHIVE_ACTOR
+
+    octets = receive_document(_address("--mission", arguments.mission))
+    mission, _ = read_mission(octets, arguments.mission)
+    for known in service.list_missions():
+        if known.spacecraft_id == mission.spacecraft.id and known.entered_by != ARCHIVE_ACTOR:
+            return
+    added = service.add_mission(octets)
+    log(f"mission description of {added.mission}, revision {added.revision[:16]}")
+
+
+def _follow(arguments: argparse.Namespace, ingest: Any, report: Any) -> None:
+    from ground_service.ingest.live import Spool, follow_tcp
+
+    host, port = _address("--tcp", arguments.tcp)
     folder = settings_of(arguments).home / "incoming" / f"{host}-{port}".replace("/", "_").replace(":", "_")
     spool = Spool(folder, ingest, report)
     try:
-        follow_tcp((host.strip("[]"), int(port)), spool, reconnect=arguments.follow, stop=lambda: False)
+        follow_tcp((host, port), spool, reconnect=arguments.follow, stop=lambda: False)
     except KeyboardInterrupt:
         spool.seal()
 

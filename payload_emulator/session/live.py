@@ -1,9 +1,10 @@
 """The payload as a process to watch and to command: telemetry out and telecommands in over TCP, and a console.
 
-Three ports. Telemetry: CADUs to every connected client, from the moment of connection on. Telecommands: CLTUs or bare
+Four ports. Telemetry: CADUs to every connected client, from the moment of connection on. Telecommands: CLTUs or bare
 telecommand packets, told apart by their first octets; both are on their way for the light time (by the rate of the
 simulated clock, so not at all at rate 0), and what arrives while no station sees the spacecraft is lost, as in space.
-Console: what really happens, at once. One JSON object a line out, one word a line in (`pause`,
+Mission: the mission description as TOML, once to each
+client. Console: what really happens, at once. One JSON object a line out, one word a line in (`pause`,
 `run`, `step`, `rate X`, `quit`). A step by hand, or going on after a pause, breaks the continuity of time for those who
 watch: as in the simulator of the paper, the odometries are told to start again (trigger `manual_step`).
 """
@@ -154,6 +155,8 @@ class LivePayload:
         Whether simulated time is stopped until `run` or `step`.
     catalogue
         Craters with rim heights, for the rings of the console; None: the catalogue of the terrain.
+    mission
+        Text of the mission description, for the ground at its first contact.
     has_operator
         Whether the operator of the scenario also sends telecommands. Otherwise, telecommands come only over TCP; both
         together would use conflicting sequence counts.
@@ -170,6 +173,8 @@ class LivePayload:
     stop_at_end: bool = False
     has_operator: bool = True
     catalogue: CraterCatalogue | None = None
+    mission: str = ""
+    mission_port: int = 0
     stopping: threading.Event = field(default_factory=threading.Event)
     sent: int = 0
     _servers: dict[str, Server] = field(init=False)
@@ -207,6 +212,9 @@ class LivePayload:
                 self._take_words,
                 lambda number: self._words.pop(number, None),
             )
+            self._open(
+                "mission", self.mission_port, lambda number, octets: None, document=self.mission.encode()
+            )
         except LinkError:
             self.close()
             raise
@@ -217,8 +225,9 @@ class LivePayload:
         port: int,
         receive: Callable[[int, bytes], None],
         ended: Callable[[int], object] = lambda number: None,
+        document: bytes | None = None,
     ) -> None:
-        self._servers[name] = Server(name, port, self.host, receive, ended)
+        self._servers[name] = Server(name, port, self.host, receive, ended, document)
 
     @property
     def ports(self) -> dict[str, int]:

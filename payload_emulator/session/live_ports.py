@@ -54,6 +54,8 @@ class Server:
         Called with the number of the client and the received octets.
     ended
         Called with the number of a client that has disconnected.
+    document
+        Octets that are sent to each client, whose connection is then closed; None: connections stay open.
     """
 
     name: str
@@ -61,6 +63,7 @@ class Server:
     host: str
     receive: Callable[[int, bytes], None]
     ended: Callable[[int], object] = lambda number: None
+    document: bytes | None = None
     listener: socket.socket = field(init=False)
     clients: dict[int, Client] = field(default_factory=dict)
     _selector: selectors.BaseSelector | None = None
@@ -140,6 +143,9 @@ class Server:
         client = Client(self._accepted, connection)
         self._selector.register(connection, selectors.EVENT_READ, (self, client))
         self.clients[client.number] = client
+        if self.document is not None:
+            client.unsent += self.document
+            self._flush(client)
 
     def _read(self, client: Client) -> None:
         try:
@@ -163,6 +169,9 @@ class Server:
             self.drop(client)
             return
         if len(client.unsent) > UNSENT_LIMIT_OCTETS:
+            self.drop(client)
+            return
+        if self.document is not None and not client.unsent:
             self.drop(client)
             return
         wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.unsent else 0)

@@ -1,0 +1,258 @@
+"""One pass twice: flown live over TCP and planned over the API, and the same downlink imported as an archive.
+
+The payload is the emulator's live session in accelerated time, without an operator of its own; nothing but the ground
+commands it. Its mission description comes from its mission port at the first contact. The archive holds the octets that
+a second receiver took from the same telemetry port, the same reference ephemeris and mission description.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+
+from ground_service.access.service import add_user
+from ground_service.app import create_app
+from ground_service.client import Client
+from ground_service.ground import ground_from_settings, open_ground
+from ground_service.missions import store as missions
+from ground_service.server import bind
+from ground_service.settings import Settings
+from ground_service.store import repository
+from linna.cli import run
+from lunar.datafolder import find_data
+from lunar.oem import save_oem
+from lunar.timescales import format_utc, parse_utc
+from payload_emulator.session.emulator import load_scenario_payload, new_spacecraft
+from payload_emulator.session.flying import SPACECRAFT_ID
+from payload_emulator.session.live import LivePayload
+from payload_emulator.session.mission import mission_text
+from payload_emulator.session.scenario import parse_scenario
+from payload_emulator.session.world import build_world
+
+SCENARIO = """
+name = "live and archive"
+seed = 5
+[dynamics]
+gravity = "builtin"
+degree = 8
+orientation = "iau"
+[window]
+search = "none"
+start = "2029-08-07T01:40:00Z"
+duration_s = 1500.0
+[camera]
+images = "reduced"
+[terrain]
+source = "procedural"
+[navigation]
+estimators = ["spherical"]
+filter_gravity = "builtin"
+filter_degree = 8
+"""
+NS = 1_000_000_000
+START = parse_utc("2029-08-07T01:40:00Z")
+FIRST, LAST = START + 180 * NS, START + 600 * NS
+UNTIL = START + 1400 * NS
+PATIENCE_S = 120.0
+
+OF_THE_IMPORT = {
+    "pass_id": "number of the row",
+    "created_utc": "time at which the report was made",
+    "provenance.spacecraft": "an archive has an instance of the spacecraft of its own",
+    "provenance.archive": "a live pass has no archive",
+}
+"""Fields that must differ, with the reason; all others are equal."""
+
+
+@dataclass
+class Both:
+    """Reports of the same pass, and what the database references."""
+
+    live: dict[str, Any]
+    imported: dict[str, Any]
+    window: dict[str, Any]
+    rows: dict[str, list[dict[str, Any]]]
+    revisions: dict[int, str]
+    mission: str
+
+
+@contextmanager
+def served(settings: Settings) -> Iterator[tuple[str, str]]:
+    with ground_from_settings(settings) as ground:
+        token = add_user(ground, "ann", "operator")
+    listener = bind("127.0.0.1", 0)
+    service = uvicorn.Server(uvicorn.Config(create_app(settings), log_level="error"))
+    thread = threading.Thread(target=service.run, kwargs={"sockets": [listener]})
+    thread.start()
+    wait_for(lambda: service.started or not thread.is_alive(), "the server")
+    try:
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}", token
+    finally:
+        service.should_exit = True
+        thread.join(60)
+        listener.close()
+
+
+def wait_for(reached: Callable[[], bool], what: str) -> None:
+    until = time.monotonic() + PATIENCE_S
+    while not reached():
+        assert time.monotonic() < until, f"{what}: not reached within {PATIENCE_S} s"
+        time.sleep(0.05)
+
+
+def receive(port: int) -> tuple[bytearray, threading.Thread]:
+    """Take all telemetry of a port, as another station would."""
+    octets = bytearray()
+    connection = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)
+
+    def take() -> None:
+        with connection:
+            while block := connection.recv(1 << 16):
+                octets.extend(block)
+
+    thread = threading.Thread(target=take)
+    thread.start()
+    return octets, thread
+
+
+def write_archive(folder: Path, octets: bytes, reference: Path, mission: str, window: dict[str, Any]) -> Path:
+    folder.mkdir()
+    (folder / "downlink.cadu").write_bytes(octets)
+    (folder / "reference.oem").write_bytes(reference.read_bytes())
+    (folder / "mission.toml").write_text(mission, encoding="utf-8")
+    files = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
+    manifest = {
+        "schema_version": 1,
+        "pass_name": window["name"],
+        "spacecraft_id": SPACECRAFT_ID,
+        "start_utc": window["start"],
+        "stop_utc": window["stop"],
+        "cadence_s": window["cadence_s"],
+        "frames_expected": window["predicted"]["frames"],
+        "files": {name: {"sha256": sha256} for name, sha256 in files.items()},
+    }
+    (folder / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
+    return folder
+
+
+def report_of(api: Client, pass_id: int, out: Path) -> dict[str, Any]:
+    api.make_report(pass_id, out)
+    document: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    return document
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
+    folder = tmp_path_factory.mktemp("live")
+    data = find_data(None)
+    world = build_world(parse_scenario(SCENARIO), data)
+    loaded, reference, _ = load_scenario_payload(world, data)
+    save_oem(reference, folder / "reference.oem")
+    mission = mission_text(world, data)
+    live = LivePayload(
+        world,
+        new_spacecraft(world, loaded),
+        rate=0.0,
+        paused=True,
+        has_operator=False,
+        mission=mission,
+    )
+    flying = threading.Thread(target=live.run)
+    flying.start()
+    settings = Settings(home=folder / "home", allowed_hosts=("testserver",))
+    try:
+        with served(settings) as (server, token), Client(server, token) as api:
+            where = ["--server", server, "--token", token]
+            api.add_ephemeris(folder / "reference.oem")
+            window = api.add_window(
+                {
+                    "name": "both",
+                    "start": format_utc(FIRST),
+                    "stop": format_utc(LAST),
+                    "spacecraft_id": SPACECRAFT_ID,
+                }
+            )["id"]
+            api.change_window(window, {"state": "approved"})
+            api.uplink_window(window)
+            captured, receiving = receive(live.ports["telemetry"])
+            tcp = ["--tcp", f"127.0.0.1:{live.ports['telemetry']}"]
+            mission_port = ["--mission", f"127.0.0.1:{live.ports['mission']}"]
+            codes: list[int] = []
+            station = threading.Thread(
+                target=lambda: codes.append(run(["ingest", *tcp, *mission_port, *where]))
+            )
+            station.start()
+            wait_for(lambda: len(live._servers["telemetry"].clients) == 2, "both receivers")
+            uplink = ["--tcp", f"127.0.0.1:{live.ports['telecommand']}"]
+            assert run(["command", "uplink", "--spacecraft-id", str(SPACECRAFT_ID), *uplink, *where]) == 0
+            with socket.create_connection(
+                ("127.0.0.1", live.ports["console"]), timeout=PATIENCE_S
+            ) as console:
+                console.sendall(b"run\n")
+                with console.makefile("r") as lines:
+                    for line in lines:
+                        message = json.loads(line)
+                        if "utc" in message and parse_utc(message["utc"]) >= UNTIL:
+                            break
+                console.sendall(b"quit\n")
+            flying.join(PATIENCE_S)
+            receiving.join(PATIENCE_S)
+            station.join(PATIENCE_S)
+            assert codes == [0]
+            planned = api.get_window(window)
+            of_live = report_of(api, planned["pass_id"], folder / "report-live")
+            archive = write_archive(
+                folder / "archive", bytes(captured), folder / "reference.oem", mission, planned
+            )
+            imported = api.import_archive(archive)
+            of_archive = report_of(api, imported, folder / "report-archive")
+            planned = api.get_window(window)
+    finally:
+        live.stopping.set()
+        flying.join(PATIENCE_S)
+    with open_ground(settings.home) as ground, ground.database.reading() as connection:
+        tables = {"passes": repository.PASSES, "windows": repository.WINDOWS, "reports": repository.REPORTS}
+        rows = {name: repository.page(connection, table).rows for name, table in tables.items()}
+        revisions = {
+            row["id"]: row["revision"] for row in repository.page(connection, missions.MISSIONS).rows
+        }
+    return Both(of_live, of_archive, planned, rows, revisions, mission)
+
+
+def differences(one: Any, other: Any, name: str = "") -> Iterator[str]:
+    """Yield the dotted names of values that differ."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        for key in sorted({*one, *other}):
+            yield from differences(one.get(key), other.get(key), f"{name}.{key}" if name else key)
+    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        for number, (a, b) in enumerate(zip(one, other, strict=True)):
+            yield from differences(a, b, f"{name}[{number}]")
+    elif one != other:
+        yield name
+
+
+def test_the_pass_was_flown_and_received(both: Both) -> None:
+    assert both.window["state"] == "processed"
+    pathlib_dump = Path("/tmp/ev_live.json").write_text(json.dumps(both.live, indent=1))
+
+
+def test_live_pass_and_archive_have_equal_reports(both: Both) -> None:
+    assert set(differences(both.live, both.imported)) == set(OF_THE_IMPORT)
+
+
+def test_every_row_references_the_mission_description_of_the_payload(both: Both) -> None:
+    assert len(both.revisions) == 1
+    assert len(both.rows["passes"]) == 2 and len(both.rows["reports"]) == 2 and len(both.rows["windows"]) == 1
+    for rows in both.rows.values():
+        assert {row["mission_id"] for row in rows} == set(both.revisions)
