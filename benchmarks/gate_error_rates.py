@@ -14,8 +14,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ground_service.regression.core import GatePolicy, GateRule, judge, verdict_of
-from ground_service.regression.samples import EstimatorFrames, PassFrames
+from ground_service.regression.gates.core import GatePolicy, GateRule, judge, verdict_of
+from ground_service.regression.gates.samples import EstimatorFrames, PassFrames
 
 RECALL, PRECISION = 0.70, 0.87
 SUITES = ((2, 12), (5, 40), (5, 200))

@@ -73,20 +73,20 @@ GROUPS = {
     "verdicts": Group(
         (
             "ground_service/evaluation/verdict.py",
-            "ground_service/evaluation/reference_error.py",
-            "ground_service/evaluation/viewing.py",
+            "ground_service/evaluation/navigation/reference_error.py",
+            "ground_service/evaluation/detection/viewing.py",
         ),
         tuple(f"{_GROUND_TESTS}/processing/test_{name}.py" for name in ("verdict", "viewing")),
     ),
     "evaluation": Group(
         (
             "ground_service/evaluation/core.py",
-            "ground_service/evaluation/alignment.py",
-            "ground_service/evaluation/drift.py",
-            "ground_service/evaluation/recall.py",
-            "ground_service/evaluation/baselines.py",
-            "ground_service/evaluation/fixes.py",
-            "ground_service/evaluation/trajectory.py",
+            "ground_service/evaluation/navigation/alignment.py",
+            "ground_service/evaluation/navigation/drift.py",
+            "ground_service/evaluation/detection/recall.py",
+            "ground_service/evaluation/navigation/baselines.py",
+            "ground_service/evaluation/detection/fixes.py",
+            "ground_service/evaluation/navigation/trajectory.py",
         ),
         (
             *(
@@ -107,10 +107,11 @@ GROUPS = {
         ),
     ),
     "smoother": Group(
-        ("ground_service/evaluation/smoother.py",), (f"{_GROUND_TESTS}/processing/test_smoother.py",)
+        ("ground_service/evaluation/navigation/smoother.py",),
+        (f"{_GROUND_TESTS}/processing/test_smoother.py",),
     ),
     "gates": Group(
-        ("ground_service/regression/core.py", "ground_service/regression/statistics.py"),
+        ("ground_service/regression/gates/core.py", "ground_service/regression/gates/statistics.py"),
         (
             f"{_GROUND_TESTS}/processing/test_regression_gates.py",
             f"{_GROUND_TESTS}/processing/test_regression_statistics.py",

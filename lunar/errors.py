@@ -87,14 +87,12 @@ class OrbitError(LunarError):
 class ImpactError(OrbitError):
     """The orbit meets the ground; angles are mean-Earth latitude and east longitude of the place."""
 
-    def __init__(self, utc_ns: int, latitude_rad: float, longitude_rad: float) -> None:
-        from lunar.timescales import format_utc
-
+    def __init__(self, utc_ns: int, epoch: str, latitude_rad: float, longitude_rad: float) -> None:
         self.utc_ns = utc_ns
         self.latitude_rad = latitude_rad
         self.longitude_rad = longitude_rad
         super().__init__(
-            f"the orbit hits the Moon at {format_utc(utc_ns)}, "
+            f"the orbit hits the Moon at {epoch}, "
             f"latitude {math.degrees(latitude_rad):.3f} deg, "
             f"longitude {math.degrees(longitude_rad) % 360.0:.3f} deg E"
         )

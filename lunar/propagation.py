@@ -529,10 +529,11 @@ def _impact(
     model: ForceModel,
 ) -> ImpactError:
     from lunar.frames import spherical_from_mcmf
-    from lunar.timescales import utc_ns_from_tdb_s
+    from lunar.timescales import format_utc, utc_ns_from_tdb_s
 
     arc = Arc(elapsed, states, rates, 0, 0, 0.0, np.nan)
     position = join(epoch_tdb_s, [arc]).state_after(ground_s)[:3]
     tdb_s = epoch_tdb_s + ground_s
     latitude, longitude, _ = spherical_from_mcmf(model.orientation.mcmf_from_icrf(tdb_s) @ position)
-    return ImpactError(utc_ns_from_tdb_s(tdb_s), float(latitude), float(longitude))
+    utc_ns = utc_ns_from_tdb_s(tdb_s)
+    return ImpactError(utc_ns, format_utc(utc_ns), float(latitude), float(longitude))

@@ -136,10 +136,8 @@ def reachable(graph: dict[str, set[str]], start: str) -> set[str]:
 
 
 KNOWN_CYCLES = [
-    ["ground_service.regression.documents", "ground_service.regression.service"],
     ["linna.commands._catalogue_landmarks", "linna.commands.catalogue"],
     ["lunar.ephemeris", "lunar.oem", "lunar.stk"],
-    ["lunar.errors", "lunar.timescales"],
     ["tmtc.schema", "tmtc.stream"],
 ]
 

@@ -26,6 +26,7 @@ from ground_service.app import create_app
 from ground_service.client import Client
 from ground_service.ground import ground_from_settings, open_ground
 from ground_service.missions import store as missions
+from ground_service.planning.model import Window
 from ground_service.server import bind
 from ground_service.settings import Settings
 from ground_service.store import repository
@@ -81,7 +82,7 @@ class Both:
 
     live: dict[str, Any]
     imported: dict[str, Any]
-    window: dict[str, Any]
+    window: Window
     rows: dict[str, list[dict[str, Any]]]
     revisions: dict[int, str]
     mission: str
@@ -126,7 +127,7 @@ def receive(port: int) -> tuple[bytearray, threading.Thread]:
     return octets, thread
 
 
-def write_archive(folder: Path, octets: bytes, reference: Path, mission: str, window: dict[str, Any]) -> Path:
+def write_archive(folder: Path, octets: bytes, reference: Path, mission: str, window: Window) -> Path:
     folder.mkdir()
     (folder / "downlink.cadu").write_bytes(octets)
     (folder / "reference.oem").write_bytes(reference.read_bytes())
@@ -134,12 +135,12 @@ def write_archive(folder: Path, octets: bytes, reference: Path, mission: str, wi
     files = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
     manifest = {
         "schema_version": 1,
-        "pass_name": window["name"],
+        "pass_name": window.name,
         "spacecraft_id": SPACECRAFT_ID,
-        "start_utc": window["start"],
-        "stop_utc": window["stop"],
-        "cadence_s": window["cadence_s"],
-        "frames_expected": window["predicted"]["frames"],
+        "start_utc": format_utc(FIRST),
+        "stop_utc": format_utc(LAST),
+        "cadence_s": window.cadence_s,
+        "frames_expected": window.predicted["frames"],
         "files": {name: {"sha256": sha256} for name, sha256 in files.items()},
     }
     (folder / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
@@ -147,8 +148,8 @@ def write_archive(folder: Path, octets: bytes, reference: Path, mission: str, wi
 
 
 def report_of(api: Client, pass_id: int, out: Path) -> dict[str, Any]:
-    api.make_report(pass_id, out)
-    document: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    api.get_report(api.make_report(pass_id), out, kind="json")
+    document: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))
     return document
 
 
@@ -182,7 +183,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
                     "stop": format_utc(LAST),
                     "spacecraft_id": SPACECRAFT_ID,
                 }
-            )["id"]
+            ).id
             api.change_window(window, {"state": "approved"})
             api.uplink_window(window)
             captured, receiving = receive(live.ports["telemetry"])
@@ -211,12 +212,12 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
             station.join(PATIENCE_S)
             assert codes == [0]
             planned = api.get_window(window)
-            of_live = report_of(api, planned["pass_id"], folder / "report-live")
+            of_live = report_of(api, planned.pass_id, folder / "live.json")
             archive = write_archive(
                 folder / "archive", bytes(captured), folder / "reference.oem", mission, planned
             )
             imported = api.import_archive(archive)
-            of_archive = report_of(api, imported, folder / "report-archive")
+            of_archive = report_of(api, imported, folder / "archive.json")
             planned = api.get_window(window)
     finally:
         live.stopping.set()
@@ -243,8 +244,8 @@ def differences(one: Any, other: Any, name: str = "") -> Iterator[str]:
 
 
 def test_the_pass_was_flown_and_received(both: Both) -> None:
-    assert both.window["state"] == "processed"
-    pathlib_dump = Path("/tmp/ev_live.json").write_text(json.dumps(both.live, indent=1))
+    assert both.window.state == "processed"
+    Path("/tmp/ev_live.json").write_text(json.dumps(both.live, indent=1))
 
 
 def test_live_pass_and_archive_have_equal_reports(both: Both) -> None:

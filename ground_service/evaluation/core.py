@@ -9,17 +9,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ground_service.evaluation.alignment import (
-    ReferenceStates,
-    error_of_places_rtn_m,
-    error_of_positions_rtn_m,
-    ground_path_m,
-    places_of_positions,
-    reference_states,
+from ground_service.evaluation.detection.fixes import (
+    IdentificationSamples,
+    join_pairs,
 )
-from ground_service.evaluation.baselines import BASELINE_DEGREE, StartState, propagated_positions
-from ground_service.evaluation.consistency import nees, squared_normalised_errors
-from ground_service.evaluation.drift import drift_by_length, error_before_reset_m, navigation_statistics
+from ground_service.evaluation.detection.landmarks import MappedCraters, payload_map
+from ground_service.evaluation.detection.recall import (
+    ExpectedCraters,
+    Matches,
+    expected_craters,
+    match_detections,
+    score_detections,
+)
+from ground_service.evaluation.detection.viewing import Viewing
 from ground_service.evaluation.extras import (
     FILTER,
     snapshot_series,
@@ -28,23 +30,25 @@ from ground_service.evaluation.extras import (
     with_terrain,
     with_wrong_fixes,
 )
-from ground_service.evaluation.fixes import (
-    IdentificationSamples,
-    join_pairs,
+from ground_service.evaluation.navigation.alignment import (
+    ReferenceStates,
+    error_of_places_rtn_m,
+    error_of_positions_rtn_m,
+    ground_path_m,
+    places_of_positions,
+    reference_states,
 )
-from ground_service.evaluation.landmarks import MappedCraters, payload_map
-from ground_service.evaluation.recall import (
-    ExpectedCraters,
-    Matches,
-    expected_craters,
-    match_detections,
-    score_detections,
+from ground_service.evaluation.navigation.baselines import BASELINE_DEGREE, StartState, propagated_positions
+from ground_service.evaluation.navigation.consistency import nees, squared_normalised_errors
+from ground_service.evaluation.navigation.drift import (
+    drift_by_length,
+    error_before_reset_m,
+    navigation_statistics,
 )
-from ground_service.evaluation.reference_error import error_budget, reference_covariance_m2
-from ground_service.evaluation.smoothed_series import SMOOTHED, smoothed_series, smoother_model
-from ground_service.evaluation.smoother import CommandedBurn, FilterStates
+from ground_service.evaluation.navigation.reference_error import error_budget, reference_covariance_m2
+from ground_service.evaluation.navigation.smoothed_series import SMOOTHED, smoothed_series, smoother_model
+from ground_service.evaluation.navigation.smoother import CommandedBurn, FilterStates
 from ground_service.evaluation.verdict import Evaluated, Limits, requirements, verdict_of, without_mission
-from ground_service.evaluation.viewing import Viewing
 from ground_service.passes.samples import DetectionSamples, NavigationSamples, OutcomeSamples
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue

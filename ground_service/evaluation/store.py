@@ -14,14 +14,14 @@ from sqlalchemy import Connection, select
 
 from ground_service.ephemerides.attitudes import AttitudeTable, load_attitudes, no_attitudes
 from ground_service.errors import EvaluationError, InvalidInput
-from ground_service.evaluation.baselines import StartState
 from ground_service.evaluation.core import PassInputs
-from ground_service.evaluation.fixes import IdentificationSamples
+from ground_service.evaluation.detection.fixes import IdentificationSamples
+from ground_service.evaluation.detection.landmarks import MappedCraters, mapped_craters
+from ground_service.evaluation.detection.viewing import Viewing
 from ground_service.evaluation.instruments import instrument_reports
-from ground_service.evaluation.landmarks import MappedCraters, mapped_craters
-from ground_service.evaluation.smoother import SIZE, CommandedBurn, FilterStates
+from ground_service.evaluation.navigation.baselines import StartState
+from ground_service.evaluation.navigation.smoother import SIZE, CommandedBurn, FilterStates
 from ground_service.evaluation.verdict import Limits
-from ground_service.evaluation.viewing import Viewing
 from ground_service.ground import Ground
 from ground_service.missions.frames import DeclaredFrames, declared_frames
 from ground_service.missions.model import Camera, Mission

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ground_service.evaluation.consistency import share_inside
+from ground_service.evaluation.navigation.consistency import share_inside
 from reports.text import count_text, significant_text
 from reports.values import (
     DetectorScore,

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ground_service.evaluation.recall import expected_craters
+from ground_service.evaluation.detection.recall import expected_craters
 from ground_service.missions.stations import STATIONS
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from ground_service.evaluation.service import plain
-from ground_service.regression.core import metric_interval
-from ground_service.regression.metrics import figures_of, joined
-from ground_service.regression.samples import PassFrames
-from ground_service.regression.service import RegressionOutcome, pass_figures
+from ground_service.regression.gates.core import metric_interval
+from ground_service.regression.gates.metrics import figures_of, joined
+from ground_service.regression.gates.samples import PassFrames
+from ground_service.regression.outcome import RegressionOutcome, pass_figures
 
 
 def baseline_figures(outcome: RegressionOutcome) -> dict[str, Any]:

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from ground_service.evaluation.alignment import reference_states
-from ground_service.evaluation.drift import navigation_statistics
-from ground_service.evaluation.recall import expected_craters, match_detections
+from ground_service.evaluation.detection.recall import expected_craters, match_detections
+from ground_service.evaluation.navigation.alignment import reference_states
+from ground_service.evaluation.navigation.drift import navigation_statistics
 from ground_service.evaluation.service import plain
 from ground_service.evaluation.store import read_image
 from ground_service.ground import Ground
 from ground_service.missions.model import weakest_evidence
 from ground_service.regression.archives import store_of
-from ground_service.regression.core import FAIL, INCONCLUSIVE, PASS, Gate
+from ground_service.regression.gates.core import FAIL, INCONCLUSIVE, PASS, Gate
+from ground_service.regression.outcome import PassVerdict, RegressionOutcome, pass_figures
 from ground_service.regression.replay_samples import PassContext, ReadDownlink
-from ground_service.regression.service import PassVerdict, RegressionOutcome, pass_figures
 from ground_service.store import repository
 from lunar.timescales import format_utc
 from reports.values import (

@@ -13,7 +13,7 @@ from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
 from ground_service.regression.archives import kept_archives
 from ground_service.regression.builds import CURRENT, Build, load_build, register_build, registered_build
-from ground_service.regression.policy import load_policy
+from ground_service.regression.gates.policy import load_policy
 from ground_service.regression.service import (
     do_replay,
     find_replay,

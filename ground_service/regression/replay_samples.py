@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from ground_service.ephemerides.attitudes import load_attitudes, no_attitudes
 from ground_service.errors import InvalidInput
+from ground_service.evaluation.detection.viewing import Viewing
 from ground_service.evaluation.store import camera_of, orientation_of
-from ground_service.evaluation.viewing import Viewing
 from ground_service.missions.model import Camera, Evidence
 from ground_service.passes.archive_import import ATTITUDE_FILE, archived_mission
 from ground_service.passes.samples import DetectionSamples, NavigationSamples
 from ground_service.regression.archives import PassArchive, frame_inputs
-from ground_service.regression.samples import PassFrames, pass_frames
+from ground_service.regression.gates.samples import PassFrames, pass_frames
 from lunar.arrays import IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, load_catalogue

@@ -15,10 +15,11 @@ import numpy as np
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
 from ground_service.regression.builds import BUILD_FILE, Build, load_build, register_build
-from ground_service.regression.metrics import Figure, figures_of, joined
-from ground_service.regression.policy import PolicyFile
-from ground_service.regression.samples import PassFrames
-from ground_service.regression.service import RegressionOutcome, run_regression
+from ground_service.regression.gates.metrics import Figure, figures_of, joined
+from ground_service.regression.gates.policy import PolicyFile
+from ground_service.regression.gates.samples import PassFrames
+from ground_service.regression.outcome import RegressionOutcome
+from ground_service.regression.service import run_regression
 
 MODEL = "model"
 SHARE_OF_MOVE = 0.2

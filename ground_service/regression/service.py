@@ -16,11 +16,9 @@ import tempfile
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from sqlalchemy import true, update
 
 from ground_service.clock import utc_now_ns
@@ -30,106 +28,18 @@ from ground_service.ground import Ground
 from ground_service.regression.archives import PassArchive, check_out, keep_archive, store_of
 from ground_service.regression.build_runs import OK, OUTCOMES, read_performance, run_build
 from ground_service.regression.builds import Build
-from ground_service.regression.core import FAIL, INCONCLUSIVE, PASS, Gate, judge, verdict_of
-from ground_service.regression.metrics import outcome_shares, same_telemetry
-from ground_service.regression.policy import PolicyFile
+from ground_service.regression.documents import regression_html, regression_json
+from ground_service.regression.gates.core import judge
+from ground_service.regression.gates.metrics import same_telemetry
+from ground_service.regression.gates.policy import PolicyFile
+from ground_service.regression.outcome import KeptReplay, PassVerdict, RegressionOutcome
 from ground_service.regression.replay_samples import PassContext, ReadDownlink, pass_context, read_downlink
 from ground_service.regression.runner import PERFORMANCE
-from ground_service.regression.samples import PassFrames
 from ground_service.store import repository
 from lunar.errors import LunarError
 from lunar.timescales import format_utc
 
-EXIT_STATUS = {PASS: 0, FAIL: 1, INCONCLUSIVE: 3}
 Progress = Callable[[Sequence[Any], int], Iterator[Any]]
-
-
-@dataclass(frozen=True, slots=True)
-class KeptReplay:
-    """Completed replay: its outcome, and the location of its downlink."""
-
-    outcome: str
-    detail: str
-    downlink_sha256: str | None
-    performance_sha256: str | None
-    wall_s: float
-    cpu_s: float
-    peak_rss_mib: float
-    isolation: str
-    machine: str
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PassVerdict:
-    """One pass of a regression.
-
-    Attributes
-    ----------
-    state
-        "judged", "candidate failed", "baseline failed" or "unusable" (the archive).
-    detail
-        What went wrong, empty for a pass that was judged.
-    """
-
-    name: str
-    digest: str
-    state: str
-    detail: str = ""
-    baseline: KeptReplay | None = None
-    candidate: KeptReplay | None = None
-    context: PassContext | None = None
-    baseline_read: ReadDownlink | None = None
-    candidate_read: ReadDownlink | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RegressionOutcome:
-    """The verdict on a candidate build."""
-
-    baseline: Build
-    candidate: Build
-    policy: PolicyFile
-    gates: tuple[Gate, ...]
-    passes: tuple[PassVerdict, ...]
-    remarks: tuple[str, ...] = field(default=())
-
-    @property
-    def verdict(self) -> str:
-        """Pass, fail or inconclusive.
-
-        "fail": a gate failed, or the candidate failed on a pass. "inconclusive": there is no gate, a gate is
-        inconclusive, or a pass could not be judged because of its archive or its baseline.
-        """
-        of_gates = verdict_of(self.gates)
-        if of_gates == FAIL or any(one.state == "candidate failed" for one in self.passes):
-            return FAIL
-        return of_gates if all(one.state == "judged" for one in self.passes) else INCONCLUSIVE
-
-    @property
-    def exit_status(self) -> int:
-        """0 pass, 1 fail, 3 inconclusive."""
-        return EXIT_STATUS[self.verdict]
-
-    @property
-    def frames_judged(self) -> int:
-        """Number of frames processed by both builds."""
-        return sum(
-            len(one.baseline_read.frames)
-            for one in self.passes
-            if one.state == "judged" and one.baseline_read
-        )
-
-    @property
-    def frames_needed(self) -> int | None:
-        """Number of frames needed to decide every gate over the suite; None if no gate states a number."""
-        return max(
-            (
-                gate.frames_needed
-                for gate in self.gates
-                if gate.frames_needed is not None and not gate.pass_name and not gate.waived
-            ),
-            default=None,
-        )
 
 
 def run_regression(
@@ -305,8 +215,6 @@ def judge_regression(
 
 def keep_regression(ground: Ground, outcome: RegressionOutcome, *, regression_id: str | None = None) -> str:
     """Keep a verdict with the service; its id."""
-    from ground_service.regression.documents import regression_html, regression_json
-
     identity = regression_id or uuid.uuid4().hex
     html = ground.files.put_octets(regression_html(ground, outcome, identity).encode())
     now = utc_now_ns()
@@ -327,20 +235,6 @@ def keep_regression(ground: Ground, outcome: RegressionOutcome, *, regression_id
         if added is not None:
             publish(connection, RegressionJudged(id=identity, verdict=outcome.verdict))
     return identity
-
-
-def pass_figures(frames: PassFrames) -> dict[str, Any]:
-    """Return the additional values of a pass in a verdict: outcomes, costs in milliseconds, memory."""
-    return {
-        "outcome_shares": outcome_shares(frames),
-        "stages_ms": {
-            name: float(np.nanmedian(values))
-            for name, values in frames.latency_ms.items()
-            if np.isfinite(values).any()
-        },
-        "memory_mib": frames.memory_mib,
-        "undecodable": frames.undecodable,
-    }
 
 
 def _kept(ground: Ground, given: Path | str) -> PassArchive | PassVerdict:

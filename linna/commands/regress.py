@@ -105,7 +105,7 @@ def _run(arguments: argparse.Namespace) -> int:
         regression_junit,
         regression_text,
     )
-    from ground_service.regression.policy import load_policy
+    from ground_service.regression.gates.policy import load_policy
     from ground_service.regression.service import keep_regression, run_regression
 
     policy = load_policy(arguments.policy)
@@ -160,7 +160,7 @@ def _sandbox(arguments: argparse.Namespace) -> int:
 def _baseline(arguments: argparse.Namespace) -> int:
     from ground_service.regression.baseline import baseline_figures, baseline_text
     from ground_service.regression.builds import build_of
-    from ground_service.regression.policy import load_policy
+    from ground_service.regression.gates.policy import load_policy
     from ground_service.regression.service import run_regression
 
     with open_service(arguments) as ground:
@@ -204,7 +204,7 @@ def _suite(arguments: argparse.Namespace) -> int:
 
 def _bisect(arguments: argparse.Namespace) -> int:
     from ground_service.regression.builds import build_of
-    from ground_service.regression.policy import load_policy
+    from ground_service.regression.gates.policy import load_policy
     from ground_service.regression.search import bisect
 
     with open_service(arguments) as ground:
@@ -241,7 +241,7 @@ def _search(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from ground_service.regression.builds import build_of
-    from ground_service.regression.policy import load_policy
+    from ground_service.regression.gates.policy import load_policy
     from ground_service.regression.search import differences
     from ground_service.regression.service import run_regression
 

@@ -27,7 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
-    from ground_service.evaluation.trajectory import absolute_error, format_tum, relative_error
+    from ground_service.evaluation.navigation.trajectory import absolute_error, format_tum, relative_error
     from linna.errors import UsageError
     from lunar.frames import mcmf_from_spherical
 

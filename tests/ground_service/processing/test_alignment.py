@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from ground_service.evaluation.alignment import (
+from ground_service.evaluation.navigation.alignment import (
     ReferenceStates,
     error_of_places_rtn_m,
     error_of_positions_rtn_m,

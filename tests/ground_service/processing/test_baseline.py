@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
-from ground_service.evaluation.baselines import BASELINE_DEGREE, StartState, propagated_positions
+from ground_service.evaluation.navigation.baselines import BASELINE_DEGREE, StartState, propagated_positions
 from lunar.errors import ImpactError
 from lunar.gravity import GravityField
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ground_service.evaluation.consistency import (
+from ground_service.evaluation.navigation.consistency import (
     average_bounds,
     bounds,
     independent_samples,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ground_service.evaluation.drift import (
+from ground_service.evaluation.navigation.drift import (
     drift_by_length,
     drift_percent,
     error_before_reset_m,

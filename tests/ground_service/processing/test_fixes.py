@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ground_service.evaluation.fixes import (
+from ground_service.evaluation.detection.fixes import (
     IdentificationSamples,
     Pairs,
     join_pairs,

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from ground_service.evaluation.fixes import IdentificationSamples
-from ground_service.evaluation.landmarks import (
+from ground_service.evaluation.detection.fixes import IdentificationSamples
+from ground_service.evaluation.detection.landmarks import (
     FIRST_LANDMARK_ID,
     MappedCraters,
     compare_map,

@@ -16,7 +16,6 @@ import pytest
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from ground_service.evaluation.baselines import StartState
 from ground_service.evaluation.core import (
     PassInputs,
     _imaging_arcs,
@@ -24,11 +23,12 @@ from ground_service.evaluation.core import (
     evaluate_pass,
     summary_of,
 )
-from ground_service.evaluation.fixes import IdentificationSamples
-from ground_service.evaluation.landmarks import MappedCraters
-from ground_service.evaluation.smoother import FilterStates
+from ground_service.evaluation.detection.fixes import IdentificationSamples
+from ground_service.evaluation.detection.landmarks import MappedCraters
+from ground_service.evaluation.detection.viewing import Viewing
+from ground_service.evaluation.navigation.baselines import StartState
+from ground_service.evaluation.navigation.smoother import FilterStates
 from ground_service.evaluation.verdict import Limits
-from ground_service.evaluation.viewing import Viewing
 from ground_service.passes.samples import (
     DetectionSamples,
     NavigationSamples,

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ground_service.evaluation.recall import (
+from ground_service.evaluation.detection.recall import (
     ExpectedCraters,
     Matches,
     expected_craters,

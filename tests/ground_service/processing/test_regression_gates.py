@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from benchmarks.gate_error_rates import degraded, outcomes, simulated, suite
-from ground_service.regression.core import (
+from ground_service.regression.gates.core import (
     Gate,
     GatePolicy,
     GateRule,
@@ -20,8 +20,8 @@ from ground_service.regression.core import (
     rule_of,
     verdict_of,
 )
-from ground_service.regression.metrics import Percentile, Ratio
-from ground_service.regression.samples import EstimatorFrames, PassFrames
+from ground_service.regression.gates.metrics import Percentile, Ratio
+from ground_service.regression.gates.samples import EstimatorFrames, PassFrames
 
 POLICY = GatePolicy(
     version="test",

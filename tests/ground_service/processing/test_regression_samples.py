@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ground_service.regression.samples import _estimator
+from ground_service.regression.gates.samples import _estimator
 
 
 def test_squared_normalised_errors_are_summed_over_the_axes_and_unknown_without_every_sigma() -> None:

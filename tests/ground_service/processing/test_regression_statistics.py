@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ground_service.regression.statistics import (
+from ground_service.regression.gates.statistics import (
     Spread,
     autocorrelation_time,
     block_length,

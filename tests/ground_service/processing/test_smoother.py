@@ -7,7 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ground_service.evaluation.smoother import CommandedBurn, FilterStates, SmootherModel, _legs, smooth
+from ground_service.evaluation.navigation.smoother import (
+    CommandedBurn,
+    FilterStates,
+    SmootherModel,
+    _legs,
+    smooth,
+)
 from lunar.elements import Elements, icrf_state_from_elements
 from lunar.frames import IauOrientation
 from lunar.gravity import GravityField, builtin_gravity

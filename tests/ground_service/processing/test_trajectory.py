@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ground_service.evaluation.trajectory import absolute_error, format_tum, relative_error
+from ground_service.evaluation.navigation.trajectory import absolute_error, format_tum, relative_error
 
 COUNT = 60
 UTC_NS = 1_881_735_115_000_000_000 + np.arange(COUNT) * 15 * 10**9

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from ground_service.evaluation.fixes import Pairs, snapshot_positions, wrong_fixes
-from ground_service.evaluation.recall import expected_craters
-from ground_service.evaluation.viewing import Viewing
+from ground_service.evaluation.detection.fixes import Pairs, snapshot_positions, wrong_fixes
+from ground_service.evaluation.detection.recall import expected_craters
+from ground_service.evaluation.detection.viewing import Viewing
 from lunar.catalogue import make_catalogue
 from lunar.frames import quaternion_from_matrix
 from lunar.lens import BrownCamera

@@ -6,7 +6,7 @@ from typing import Any, cast
 import numpy as np
 
 from ground_service.evaluation.core import WORST_FRAMES, _choose_frames
-from ground_service.evaluation.recall import ExpectedCraters, Matches
+from ground_service.evaluation.detection.recall import ExpectedCraters, Matches
 
 FRAMES, CRATERS = 40, 5
 

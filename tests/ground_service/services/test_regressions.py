@@ -26,17 +26,17 @@ from ground_service.regression.archives import (
     pin_archive,
 )
 from ground_service.regression.builds import Build, build_of
-from ground_service.regression.core import GatePolicy
 from ground_service.regression.documents import (
     regression_html,
     regression_json,
     regression_junit,
     regression_text,
 )
-from ground_service.regression.policy import load_policy
+from ground_service.regression.gates.core import GatePolicy
+from ground_service.regression.gates.policy import load_policy
+from ground_service.regression.outcome import RegressionOutcome
 from ground_service.regression.search import differences
 from ground_service.regression.service import (
-    RegressionOutcome,
     find_replay,
     keep_regression,
     run_regression,
@@ -443,7 +443,7 @@ def test_a_bad_policy_is_told_by_its_key(text: str, told: str, tmp_path: Path) -
 def test_a_waiver_needs_a_reason_and_a_day(tmp_path: Path) -> None:
     shipped = load_policy()
     assert isinstance(shipped.policy, GatePolicy) and shipped.policy.waivers == ()
-    from ground_service.regression.policy import SHIPPED
+    from ground_service.regression.gates.policy import SHIPPED
 
     for waiver in ('reason = ""\nuntil = 2029-01-01', 'reason = "why"\nuntil = "soon"', "until = 2029-01-01"):
         (tmp_path / "policy.toml").write_text(f'{SHIPPED.read_text()}\n[[waiver]]\ngate = "x"\n{waiver}\n')
@@ -524,7 +524,7 @@ def test_a_regression_without_a_gate_is_never_a_pass(judge, home, policy, passes
 
 
 def waived_outcome(judge, tmp_path: Path, home: Ground, make_build, passes, packets) -> RegressionOutcome:
-    from ground_service.regression.policy import SHIPPED
+    from ground_service.regression.gates.policy import SHIPPED
 
     (tmp_path / "policy.toml").write_text(
         f"{SHIPPED.read_text()}\n[[waiver]]\ngate = 'latency.*'\nreason = 'new <network> & agreed'\n"

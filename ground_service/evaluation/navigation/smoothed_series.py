@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ground_service.evaluation.alignment import (
+from ground_service.evaluation.navigation.alignment import (
     ReferenceStates,
     error_of_places_rtn_m,
     places_of_positions,
 )
-from ground_service.evaluation.consistency import nees
-from ground_service.evaluation.drift import drift_by_length, navigation_statistics
-from ground_service.evaluation.smoother import CommandedBurn, FilterStates, SmootherModel, smooth
+from ground_service.evaluation.navigation.consistency import nees
+from ground_service.evaluation.navigation.drift import drift_by_length, navigation_statistics
+from ground_service.evaluation.navigation.smoother import CommandedBurn, FilterStates, SmootherModel, smooth
 from ground_service.passes.samples import NavigationSamples
 from lunar.arrays import FloatArray
 from lunar.frames import Orientation, mcmf_from_spherical

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ground_service.evaluation.alignment import error_of_places_rtn_m, reference_states
-from ground_service.evaluation.consistency import squared_normalised_errors
-from ground_service.evaluation.recall import SCORED_CLASSES, expected_craters, match_detections
-from ground_service.evaluation.viewing import Viewing
+from ground_service.evaluation.detection.recall import SCORED_CLASSES, expected_craters, match_detections
+from ground_service.evaluation.detection.viewing import Viewing
+from ground_service.evaluation.navigation.alignment import error_of_places_rtn_m, reference_states
+from ground_service.evaluation.navigation.consistency import squared_normalised_errors
 from ground_service.passes.samples import DetectionSamples, NavigationSamples
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera

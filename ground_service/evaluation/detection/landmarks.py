@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ground_service.evaluation.fixes import IdentificationSamples
+from ground_service.evaluation.detection.fixes import IdentificationSamples
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M

@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ground_service.regression.metrics import (
+from ground_service.regression.gates.metrics import (
     Figure,
     Percentile,
     Ratio,
@@ -37,8 +37,8 @@ from ground_service.regression.metrics import (
     same_telemetry,
     shift_samples,
 )
-from ground_service.regression.samples import PassFrames
-from ground_service.regression.statistics import (
+from ground_service.regression.gates.samples import PassFrames
+from ground_service.regression.gates.statistics import (
     Spread,
     autocorrelation_time,
     block_length,

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ground_service.regression.samples import BAD_OUTCOMES, EstimatorFrames, PassFrames
-from ground_service.regression.statistics import weighted_quantile, weighted_ratio
+from ground_service.regression.gates.samples import BAD_OUTCOMES, EstimatorFrames, PassFrames
+from ground_service.regression.gates.statistics import weighted_quantile, weighted_ratio
 from lunar.arrays import FloatArray
 
 LATENCY_LEVEL = 0.25

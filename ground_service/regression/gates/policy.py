@@ -14,7 +14,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from ground_service.errors import InvalidInput, storage_error
-from ground_service.regression.core import EXACT_METRICS, GatePolicy, GateRule, Waiver
+from ground_service.regression.gates.core import EXACT_METRICS, GatePolicy, GateRule, Waiver
 
 SHIPPED = Path(__file__).with_name("regression_policy.toml")
 SCHEMA_VERSION = 2

@@ -1,0 +1,1 @@
+"""Detections against the catalogue: viewing geometry, recall, identifications, mapped craters."""

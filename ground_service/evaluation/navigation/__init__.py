@@ -1,0 +1,1 @@
+"""Accuracy of navigation: errors against the reference, drift, baselines, consistency, smoother."""

@@ -1,0 +1,1 @@
+"""Gates of a regression: samples of frames, metrics, statistics, policy and verdict."""

@@ -1,0 +1,119 @@
+"""Outcome of a regression: replays, passes and the verdict."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ground_service.regression.builds import Build
+from ground_service.regression.gates.core import FAIL, INCONCLUSIVE, PASS, Gate, verdict_of
+from ground_service.regression.gates.metrics import outcome_shares
+from ground_service.regression.gates.policy import PolicyFile
+from ground_service.regression.gates.samples import PassFrames
+from ground_service.regression.replay_samples import PassContext, ReadDownlink
+
+EXIT_STATUS = {PASS: 0, FAIL: 1, INCONCLUSIVE: 3}
+
+
+@dataclass(frozen=True, slots=True)
+class KeptReplay:
+    """Completed replay: its outcome, and the location of its downlink."""
+
+    outcome: str
+    detail: str
+    downlink_sha256: str | None
+    performance_sha256: str | None
+    wall_s: float
+    cpu_s: float
+    peak_rss_mib: float
+    isolation: str
+    machine: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PassVerdict:
+    """One pass of a regression.
+
+    Attributes
+    ----------
+    state
+        "judged", "candidate failed", "baseline failed" or "unusable" (the archive).
+    detail
+        What went wrong, empty for a pass that was judged.
+    """
+
+    name: str
+    digest: str
+    state: str
+    detail: str = ""
+    baseline: KeptReplay | None = None
+    candidate: KeptReplay | None = None
+    context: PassContext | None = None
+    baseline_read: ReadDownlink | None = None
+    candidate_read: ReadDownlink | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RegressionOutcome:
+    """The verdict on a candidate build."""
+
+    baseline: Build
+    candidate: Build
+    policy: PolicyFile
+    gates: tuple[Gate, ...]
+    passes: tuple[PassVerdict, ...]
+    remarks: tuple[str, ...] = field(default=())
+
+    @property
+    def verdict(self) -> str:
+        """Pass, fail or inconclusive.
+
+        "fail": a gate failed, or the candidate failed on a pass. "inconclusive": there is no gate, a gate is
+        inconclusive, or a pass could not be judged because of its archive or its baseline.
+        """
+        of_gates = verdict_of(self.gates)
+        if of_gates == FAIL or any(one.state == "candidate failed" for one in self.passes):
+            return FAIL
+        return of_gates if all(one.state == "judged" for one in self.passes) else INCONCLUSIVE
+
+    @property
+    def exit_status(self) -> int:
+        """0 pass, 1 fail, 3 inconclusive."""
+        return EXIT_STATUS[self.verdict]
+
+    @property
+    def frames_judged(self) -> int:
+        """Number of frames processed by both builds."""
+        return sum(
+            len(one.baseline_read.frames)
+            for one in self.passes
+            if one.state == "judged" and one.baseline_read
+        )
+
+    @property
+    def frames_needed(self) -> int | None:
+        """Number of frames needed to decide every gate over the suite; None if no gate states a number."""
+        return max(
+            (
+                gate.frames_needed
+                for gate in self.gates
+                if gate.frames_needed is not None and not gate.pass_name and not gate.waived
+            ),
+            default=None,
+        )
+
+
+def pass_figures(frames: PassFrames) -> dict[str, Any]:
+    """Return the additional values of a pass in a verdict: outcomes, costs in milliseconds, memory."""
+    return {
+        "outcome_shares": outcome_shares(frames),
+        "stages_ms": {
+            name: float(np.nanmedian(values))
+            for name, values in frames.latency_ms.items()
+            if np.isfinite(values).any()
+        },
+        "memory_mib": frames.memory_mib,
+        "undecodable": frames.undecodable,
+    }
