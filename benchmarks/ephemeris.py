@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from lunar.ephemeris import Ephemeris, ephemeris_from_states, load_ephemeris
+from lunar.ephemeris import Ephemeris, ephemeris_from_states
+from lunar.ephemeris_files import load_ephemeris
 from lunar.oem import save_oem
 from lunar.stk import save_stk
 from lunar.timescales import NS, format_utc, parse_utc

@@ -246,29 +246,6 @@ def ephemeris_from_states(
     return Ephemeris((segment,))
 
 
-def load_ephemeris(path: Path | str) -> Ephemeris:
-    """Return the ephemeris in a CCSDS OEM (KVN) or STK ``.e`` file, distinguished by content.
-
-    Raises
-    ------
-    DataFileError
-        Where the file is neither, or says something that cannot be.
-    """
-    from lunar.oem import parse_oem
-    from lunar.stk import parse_stk
-
-    text = read_text(path, "a CCSDS OEM or STK .e ephemeris")
-    for line in text.split("\n", 50)[:50]:
-        word = line.strip()
-        if word.startswith("CCSDS_OEM_VERS"):
-            return parse_oem(text, source=str(path))
-        if word.lower().startswith("stk.v"):
-            return parse_stk(text, source=str(path))
-        if word and not word.startswith(("COMMENT", "#")):
-            raise DataFileError(path, "first line", "CCSDS_OEM_VERS or stk.v.", repr(word[:40]))
-    raise DataFileError(path, "first line", "CCSDS_OEM_VERS or stk.v.", "nothing")
-
-
 def read_text(path: Path | str, expected: str) -> str:
     """Return the text of a file; `DataFileError` where it cannot be read or is no text."""
     try:

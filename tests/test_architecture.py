@@ -136,8 +136,6 @@ def reachable(graph: dict[str, set[str]], start: str) -> set[str]:
 
 
 KNOWN_CYCLES = [
-    ["linna.commands._catalogue_landmarks", "linna.commands.catalogue"],
-    ["lunar.ephemeris", "lunar.oem", "lunar.stk"],
     ["tmtc.schema", "tmtc.stream"],
 ]
 

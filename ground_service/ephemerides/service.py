@@ -11,7 +11,7 @@ from ground_service.ground import Ground
 from ground_service.store import repository
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile
-from lunar.ephemeris import load_ephemeris
+from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import LunarError
 
 

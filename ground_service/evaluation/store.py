@@ -39,7 +39,8 @@ from ground_service.store.files import FileArchive
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.datafolder import DataFolder
-from lunar.ephemeris import Ephemeris, load_ephemeris
+from lunar.ephemeris import Ephemeris
+from lunar.ephemeris_files import load_ephemeris
 from lunar.frames import Orientation
 from lunar.lens import BrownCamera
 from lunar.timescales import format_utc, parse_utc

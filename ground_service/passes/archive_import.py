@@ -23,7 +23,7 @@ from ground_service.store.files import StoredFile
 from ground_service.text import require_line
 from ground_service.timekeeping.recorrelation import enter_receptions, read_receptions
 from lunar.catalogue import load_catalogue
-from lunar.ephemeris import load_ephemeris
+from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import LunarError
 from lunar.timescales import parse_utc
 

@@ -40,7 +40,8 @@ from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.datafolder import DataFolder
-from lunar.ephemeris import Ephemeris, load_ephemeris
+from lunar.ephemeris import Ephemeris
+from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import EphemerisCoverageError
 
 NS = NANOSECONDS_PER_SECOND

@@ -28,7 +28,8 @@ from ground_service.timekeeping.core import CorrelationFit, clock_runs, fit_corr
 from ground_service.timekeeping.store import load_correlations
 from lunar.arrays import IntArray
 from lunar.constants import SPEED_OF_LIGHT_M_S
-from lunar.ephemeris import Ephemeris, load_ephemeris
+from lunar.ephemeris import Ephemeris
+from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import LunarError
 from lunar.third_bodies import earth_position_icrf_m
 from lunar.timescales import tai_ns_from_utc_ns, tdb_s_from_utc_ns

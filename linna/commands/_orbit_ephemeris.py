@@ -64,7 +64,7 @@ def configure_convert(commands: Any) -> None:
 
 def run_compare(arguments: argparse.Namespace) -> int:
     from lunar.comparison import compare
-    from lunar.ephemeris import load_ephemeris
+    from lunar.ephemeris_files import load_ephemeris
     from lunar.timescales import format_utc
 
     first, second = load_ephemeris(arguments.a), load_ephemeris(arguments.b)
@@ -102,7 +102,7 @@ def run_interpolate(arguments: argparse.Namespace) -> int:
 
     from linna.data import data_folder
     from lunar.datafolder import default_orientation
-    from lunar.ephemeris import load_ephemeris
+    from lunar.ephemeris_files import load_ephemeris
     from lunar.ground_track import ground_track
     from lunar.timescales import format_utc
 
@@ -152,7 +152,7 @@ def run_stats(arguments: argparse.Namespace) -> int:
 
     from linna.data import data_folder
     from lunar.datafolder import default_orientation
-    from lunar.ephemeris import load_ephemeris
+    from lunar.ephemeris_files import load_ephemeris
     from lunar.ground_track import ground_track, track_statistics
     from lunar.timescales import format_utc
 
@@ -208,7 +208,8 @@ def run_convert(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
     from linna.errors import UsageError
     from lunar.datafolder import default_orientation
-    from lunar.ephemeris import ephemeris_from_states, load_ephemeris
+    from lunar.ephemeris import ephemeris_from_states
+    from lunar.ephemeris_files import load_ephemeris
     from lunar.oem import format_oem
     from lunar.stk import format_stk
     from lunar.tabular import format_csv, format_tum

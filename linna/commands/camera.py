@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from linna.commands.catalogue import CATALOGUE_HELP, open_catalogue
+from linna.commands._catalogue_choice import CATALOGUE_HELP, open_catalogue
 from linna.output import add_json_flag, emit, log
 
 
@@ -40,7 +40,7 @@ def run_fov_study(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
     from linna.errors import UsageError
     from lunar.datafolder import default_orientation
-    from lunar.ephemeris import load_ephemeris
+    from lunar.ephemeris_files import load_ephemeris
     from lunar.fov_study import PAPER_COUNTS, study_field_of_view
     from lunar.frames import mcmf_from_spherical
     from lunar.ground_track import even_epochs, ground_track

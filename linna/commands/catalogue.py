@@ -6,19 +6,12 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from linna.commands._catalogue_choice import CATALOGUE_HELP, open_catalogue
 from linna.output import add_json_flag, emit
 
 if TYPE_CHECKING:
     from lunar.arrays import FloatArray
-    from lunar.catalogue import CraterCatalogue
     from payload_emulator.sim.terrain.curation import Region
-
-SYNTHETIC = ("paper-density", "paper-density-synthetic", "paper-density-uniform")
-CATALOGUE_HELP = (
-    "catalogue (CSV, plain or gzip), or paper-density: the paper's class counts, from the real catalogue at hand "
-    "completed with random craters where it is silent (paper-density-synthetic: all random, few in the maria; "
-    "paper-density-uniform: all random); default: the catalogue of the data at hand"
-)
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -192,26 +185,6 @@ def _region(text: str) -> Region:
     if not (-90.0 <= south < north <= 90.0 and 0.0 < east - west <= 360.0):
         raise UsageError(f"--region: expected west before east and south before north, found {text!r}")
     return Region(west, east, south, north)
-
-
-def open_catalogue(name: str | None, seed: int) -> CraterCatalogue:
-    """The catalogue of a file or of one of `SYNTHETIC`; without a name, the most complete available one.
-
-    The paper's density comes from the real catalogue, completed with random craters where it is silent, or is all
-    synthetic where none is available.
-    """
-    from linna.data import data_folder
-    from lunar.catalogue import completed_to_paper, load_catalogue, paper_density_catalogue
-
-    if name is not None and name not in SYNTHETIC:
-        return load_catalogue(name)
-    data = data_folder()
-    if name == SYNTHETIC[0] and data.catalogue_lu is not None:
-        return completed_to_paper(load_catalogue(data.catalogue_lu), seed)
-    found = data.catalogue_composite or data.catalogue_lu or data.catalogue_robbins
-    if name is not None or found is None:
-        return paper_density_catalogue(seed, uniform=name == SYNTHETIC[2])
-    return load_catalogue(found)
 
 
 def _range(values: FloatArray) -> dict[str, float]:

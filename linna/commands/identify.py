@@ -189,7 +189,7 @@ def _model(arguments: argparse.Namespace) -> SimulatedDetector:
 
 
 def _world(arguments: argparse.Namespace) -> StudyWorld:
-    from linna.commands.catalogue import open_catalogue
+    from linna.commands._catalogue_choice import open_catalogue
     from payload_emulator.sim.terrain.curation import catalogue_of_table
     from studies.identification import study_world
 

@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import KroghInterpolator
 
-from lunar.ephemeris import Ephemeris, EphemerisSegment, ephemeris_from_states, load_ephemeris
+from lunar.ephemeris import Ephemeris, EphemerisSegment, ephemeris_from_states
+from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import DataFileError, EphemerisCoverageError, EphemerisError
 from lunar.timescales import NS, parse_utc
 

@@ -4,7 +4,8 @@ import numpy as np
 import oem as independent
 import pytest
 
-from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment, load_ephemeris
+from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment
+from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import DataFileError, UnknownFrameError, UnknownTimeSystemError
 from lunar.frames import icrf_from_j2000
 from lunar.oem import format_oem, load_oem, parse_oem, save_oem

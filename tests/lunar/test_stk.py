@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from lunar.comparison import compare
-from lunar.ephemeris import Ephemeris, EphemerisSegment, ephemeris_from_states, load_ephemeris
+from lunar.ephemeris import Ephemeris, EphemerisSegment, ephemeris_from_states
+from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import DataFileError, EphemerisError, UnknownFrameError, UnknownTimeSystemError
 from lunar.frames import icrf_from_j2000
 from lunar.stk import format_stk, load_stk, parse_stk, save_stk
