@@ -23,7 +23,7 @@ from ground_service.evaluation.navigation.baselines import StartState
 from ground_service.evaluation.navigation.smoother import SIZE, CommandedBurn, FilterStates
 from ground_service.evaluation.verdict import Limits
 from ground_service.ground import Ground
-from ground_service.missions.frames import DeclaredFrames, declared_frames
+from ground_service.missions.frames import DeclaredFrames, camera_of, declared_frames
 from ground_service.missions.model import Camera, Mission
 from ground_service.missions.service import mission_of_pass
 from ground_service.passes.packet_accounting import packet_accounting
@@ -36,13 +36,11 @@ from ground_service.passes.store import code_labels, detection_samples, event_li
 from ground_service.store import repository
 from ground_service.store.codec import unpack_filter_states, unpack_identifications
 from ground_service.store.files import FileArchive
-from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris
 from lunar.ephemeris_files import load_ephemeris
 from lunar.frames import Orientation
-from lunar.lens import BrownCamera
 from lunar.timescales import format_utc, parse_utc
 from reports.values import (
     HousekeepingParameter,
@@ -273,18 +271,6 @@ def outcome_samples(connection: Connection, span: PassSpan) -> tuple[OutcomeSamp
         )
         for name, part in _by_estimator(columns, "frame_outcome")
     )
-
-
-def camera_of(camera: Camera) -> PinholeCamera:
-    """Return the declared camera of a mission, with its lens; the paper's values replace sizes that are not stated."""
-    default = PinholeCamera()
-    sizes = (
-        default.width_px if camera.width_px is None else camera.width_px,
-        default.height_px if camera.height_px is None else camera.height_px,
-        default.fov_rad if camera.fov_deg is None else math.radians(camera.fov_deg),
-    )
-    lens = tuple(value or 0.0 for value in (camera.k1, camera.k2, camera.k3, camera.p1, camera.p2))
-    return BrownCamera(*sizes, *lens) if any(lens) else PinholeCamera(*sizes)
 
 
 def viewing_of(camera: Camera, attitudes: AttitudeTable, span: PassSpan) -> Viewing:

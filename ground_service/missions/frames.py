@@ -1,4 +1,4 @@
-"""Lunar orientation and gravity fields declared by a mission description.
+"""Camera, lunar orientation and gravity fields declared by a mission description.
 
 The local data folder decides only whether a declared model is available, never which model is used.
 """
@@ -6,13 +6,16 @@ The local data folder decides only whether a declared model is available, never 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from ground_service.missions.model import Frames
+from ground_service.missions.model import Camera, Frames
+from lunar.camera import PinholeCamera
 from lunar.datafolder import DataFolder
 from lunar.frames import IauOrientation, Orientation, load_orientation
 from lunar.gravity import GravityField, builtin_gravity, load_gravity
+from lunar.lens import BrownCamera
 
 REMEDY = "set LINNA_DATA to a folder that has it, or run linna data fetch"
 
@@ -52,6 +55,18 @@ def declared_frames(frames: Frames, data: DataFolder) -> DeclaredFrames:
             "gravity field of the filter", frames.onboard_gravity_field, "frames.onboard_gravity_field"
         )
     return DeclaredFrames(orientation, gravity, onboard, refused)
+
+
+def camera_of(camera: Camera) -> PinholeCamera:
+    """Return the declared camera of a mission, with its lens; the paper's values replace sizes that are not stated."""
+    default = PinholeCamera()
+    sizes = (
+        default.width_px if camera.width_px is None else camera.width_px,
+        default.height_px if camera.height_px is None else camera.height_px,
+        default.fov_rad if camera.fov_deg is None else math.radians(camera.fov_deg),
+    )
+    lens = tuple(value or 0.0 for value in (camera.k1, camera.k2, camera.k3, camera.p1, camera.p2))
+    return BrownCamera(*sizes, *lens) if any(lens) else PinholeCamera(*sizes)
 
 
 def _reason(what: str, declared: str | None, key: str) -> str:

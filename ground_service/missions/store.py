@@ -112,6 +112,24 @@ def in_force(connection: Connection, vehicle: int) -> int | None:
     return newest_of_spacecraft(connection, int(row["ccsds_id"]))
 
 
+def mission_in_force(connection: Connection, ccsds_id: int | None) -> Mission | None:
+    """Return the description in force of a spacecraft; None without any."""
+    key = None if ccsds_id is None else newest_of_spacecraft(connection, ccsds_id)
+    return None if key is None else get_mission(connection, key)
+
+
+def mission_of_vehicle(connection: Connection, vehicle: int) -> Mission | None:
+    """Return the description of the newest pass of a vehicle, otherwise that in force of its spacecraft.
+
+    The vehicle of an archive has passes of this archive only.
+    """
+    table = repository.PASSES
+    query = select(table.c.mission_id).where(table.c.vehicle_id == vehicle, table.c.mission_id.is_not(None))
+    key = connection.execute(query.order_by(table.c.id.desc()).limit(1)).scalar()
+    key = in_force(connection, vehicle) if key is None else int(key)
+    return None if key is None else get_mission(connection, key)
+
+
 def approval_in_force(connection: Connection, ccsds_id: int) -> Approval:
     """Return the approval rules of the newest revision of a spacecraft that was added by a person.
 

@@ -18,6 +18,8 @@ from ground_service.events import WindowChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
 from ground_service.missions import store as missions
+from ground_service.missions.frames import camera_of, declared_frames
+from ground_service.missions.model import Mission
 from ground_service.planning import model
 from ground_service.planning.core import (
     Candidate,
@@ -36,7 +38,6 @@ from ground_service.store.states import TELECOMMAND, change_if, move_all
 from ground_service.text import REASON_LIMIT, require_line
 from ground_service.timekeeping.core import ticks_of_utc_ns
 from ground_service.timekeeping.store import load_correlations
-from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.datafolder import DataFolder
@@ -82,6 +83,7 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
     stop = None if given.stop is None else given.stop.utc_ns
     with ground.database.reading() as connection:
         row = _ephemeris_for(connection, given.ephemeris_id, start, stop)
+        mission = missions.mission_in_force(connection, given.spacecraft_id)
         commitments = _commitments(connection, given.spacecraft_id, given.instance)
         catalogue_sha256 = None
         if given.catalogue_pass_id is not None:
@@ -100,13 +102,11 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
     mare = _mare(ground.data) if constraints.mare is not None else None
     if constraints.mare is not None and mare is None:
         raise InvalidInput("search", "terrain", "an albedo map among the public data", "none")
-    planner = Planner(
-        _load(ground, row), ground.orientation, given.resources.value(), PinholeCamera(), catalogue, mare
-    )
+    planner = _planner(ground, row, mission, given.resources.value(), catalogue, mare)
     found = planner.search(
         constraints, start, stop, given.cadence_s, step_s=given.step_s, commitments=commitments
     )
-    names = [f"ephemeris {row['name']}", f"orientation {ground.orientation.name}"]
+    names = [f"ephemeris {row['name']}", f"orientation {planner.orientation.name}"]
     if catalogue is not None:
         names.append(f"crater catalogue {catalogue.source}")
     if mare is not None:
@@ -424,10 +424,27 @@ def _assessed(
     }
 
 
+def _planner(
+    ground: Ground,
+    ephemeris: repository.Row,
+    mission: Mission | None,
+    resources: Resources,
+    catalogue: CraterCatalogue | None = None,
+    mare: Any = None,
+) -> Planner:
+    """Return a planner with camera and orientation of the mission; defaults replace what it does not state."""
+    stated = Mission(name="not stated") if mission is None else mission
+    orientation = declared_frames(stated.frames, ground.data).orientation or ground.orientation
+    return Planner(
+        _load(ground, ephemeris), orientation, resources, camera_of(stated.camera), catalogue, mare
+    )
+
+
 def _prediction(
     ground: Ground, connection: Connection, entry: WindowEntry, commitments: Sequence[Commitment]
 ) -> Candidate | None:
     """What the window would be like, where a reference ephemeris covers it."""
+    mission = missions.mission_in_force(connection, entry.spacecraft_id)
     rows = (
         [repository.get(connection, repository.EPHEMERIDES, entry.ephemeris_id, "ephemeris")]
         if entry.ephemeris_id is not None
@@ -435,7 +452,7 @@ def _prediction(
     )
     for row in rows:
         if row["start_utc_ns"] <= entry.start_utc_ns and entry.stop_utc_ns <= row["stop_utc_ns"]:
-            planner = Planner(_load(ground, row), ground.orientation, entry.resources, PinholeCamera())
+            planner = _planner(ground, row, mission, entry.resources)
             try:
                 return planner.predict(
                     entry.start_utc_ns,

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from ground_service.ephemerides.attitudes import load_attitudes, no_attitudes
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.detection.viewing import Viewing
-from ground_service.evaluation.store import camera_of, orientation_of
+from ground_service.evaluation.store import orientation_of
+from ground_service.missions.frames import camera_of
 from ground_service.missions.model import Camera, Evidence
 from ground_service.passes.archive_import import ATTITUDE_FILE, archived_mission
 from ground_service.passes.samples import DetectionSamples, NavigationSamples

@@ -23,6 +23,7 @@ from ground_service.events import CorrelationChanged, ReceptionsEntered, publish
 from ground_service.ground import Ground
 from ground_service.http.times import time_of
 from ground_service.missions.stations import STATIONS
+from ground_service.missions.store import mission_of_vehicle
 from ground_service.store import repository
 from ground_service.timekeeping.core import CorrelationFit, clock_runs, fit_correlation, utc_ns_of_ticks
 from ground_service.timekeeping.store import load_correlations
@@ -181,7 +182,8 @@ def enter_receptions(
 def recorrelate(ground: Ground, vehicle: int, *, over_manual: bool = False) -> bool:
     """Fit the correlations of a vehicle again; whether that changed any.
 
-    Correlations that an operator entered stay in force until `over_manual` is asked for.
+    Correlations that an operator entered stay in force until `over_manual` is asked for. Nothing is fitted
+    automatically if the mission description states another policy.
     """
     with ground.database.reading() as connection:
         if not _has_receptions(connection, vehicle):
@@ -192,6 +194,9 @@ def recorrelate(ground: Ground, vehicle: int, *, over_manual: bool = False) -> b
         mine = (table.c.vehicle_id == vehicle, table.c.superseded == 0)
         old = [dict(row) for row in connection.execute(select(table).where(*mine)).mappings()]
         if any(row["method"] != AUTOMATIC for row in old) and not over_manual:
+            return False
+        mission = mission_of_vehicle(connection, vehicle)
+        if mission is not None and mission.time.correlation in ("manual", "ideal") and not over_manual:
             return False
         reports = time_reports(ground, connection, vehicle)
         fits = fit_runs(reports)

@@ -15,12 +15,12 @@ from ground_service.ephemerides.attitudes import HEADER, load_attitudes
 from ground_service.errors import EvaluationError, InvalidInput
 from ground_service.evaluation.core import evaluate_pass
 from ground_service.evaluation.service import evaluate
-from ground_service.evaluation.store import camera_of, load_pass_inputs, orientation_of
+from ground_service.evaluation.store import load_pass_inputs, orientation_of
 from ground_service.evaluation.verdict import Limits
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.missions import frames as declared
-from ground_service.missions.frames import declared_frames
+from ground_service.missions.frames import camera_of, declared_frames
 from ground_service.missions.model import Camera, Frames, Mission
 from ground_service.missions.service import add_mission
 from ground_service.passes.archive_import import import_archive

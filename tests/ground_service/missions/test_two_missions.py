@@ -1,0 +1,171 @@
+"""Two spacecraft of different missions in one database: each is evaluated and planned by its own description."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ground_service.commanding.service import enter_command, get_command
+from ground_service.ephemerides.service import add_ephemeris
+from ground_service.evaluation.core import evaluate_pass
+from ground_service.evaluation.service import make_report
+from ground_service.evaluation.store import load_pass_inputs
+from ground_service.ground import Ground
+from ground_service.ingest.service import ingest_file
+from ground_service.missions.frames import camera_of
+from ground_service.missions.model import Camera
+from ground_service.missions.service import add_mission
+from ground_service.passes.service import define_pass
+from ground_service.planning import service as planning
+from ground_service.store import repository
+from ground_service.timekeeping import recorrelation
+from ground_service.timekeeping.recorrelation import ReceivedReport, enter_receptions, recorrelate
+from lunar.frames import IauOrientation
+from lunar.timescales import parse_utc
+from tests.ground_service.conftest import SyntheticPass
+from tmtc.downlink import encode_cadus
+
+START, STOP = parse_utc("2029-08-07T06:00:00Z"), parse_utc("2029-08-07T06:05:45Z")
+
+WIDE = """
+schema_version = 1
+name = "wide"
+[spacecraft]
+id = 76
+[time]
+correlation = "automatic"
+[frames]
+orientation = "IAU WGCCRE 2009"
+[camera]
+fov_deg = 120
+[evidence]
+world = "procedural"
+seed = 1
+[requirements]
+estimator = "spherical"
+median_error_m = 200
+[automation]
+evaluate = true
+"""
+
+NARROW = """
+schema_version = 1
+name = "narrow"
+[spacecraft]
+id = 77
+[time]
+correlation = "manual"
+[frames]
+orientation = "IAU WGCCRE 2009"
+[camera]
+fov_deg = 40
+[evidence]
+world = "photographs"
+[requirements]
+estimator = "spherical"
+median_error_m = 100
+"""
+
+
+@pytest.fixture(scope="module")
+def made(make_pass: Callable[..., SyntheticPass]) -> SyntheticPass:
+    return make_pass(frames=24, seed=2)
+
+
+def flown(ground: Ground, made: SyntheticPass, spacecraft: int, folder: Path) -> int:
+    """Ingest the same packets as telemetry of a spacecraft; return the id of its pass."""
+    path = folder / f"{spacecraft}.cadu"
+    path.write_bytes(encode_cadus(made.packets, spacecraft_id=spacecraft))
+    ingest_file(ground, path)
+    return define_pass(ground, name="pass", start_utc_ns=START, stop_utc_ns=STOP, spacecraft_id=spacecraft)
+
+
+def row(ground: Ground, table: Any, **equal: Any) -> dict[str, Any]:
+    with ground.database.reading() as connection:
+        found = repository.find(connection, table, **equal)
+    assert found is not None
+    return found
+
+
+def test_every_pass_is_judged_by_the_description_of_its_spacecraft(
+    either: Ground, made: SyntheticPass, tmp_path: Path
+) -> None:
+    missions = {76: add_mission(either, WIDE.encode()), 77: add_mission(either, NARROW.encode())}
+    add_ephemeris(either, either.files.put_file(made.folder / "reference.oem"), name="reference")
+    passes = {spacecraft: flown(either, made, spacecraft, tmp_path) for spacecraft in missions}
+    reports = {}
+    for spacecraft, pass_id in passes.items():
+        inputs = load_pass_inputs(either, pass_id)
+        assert inputs.viewing.camera == camera_of(Camera(fov_deg=120.0 if spacecraft == 76 else 40.0))
+        reports[spacecraft] = evaluate_pass(inputs)
+        made_report = make_report(either, pass_id)
+        for table, key in ((repository.PASSES, pass_id), (repository.REPORTS, made_report.report_id)):
+            assert row(either, table, id=key)["mission_id"] == missions[spacecraft].id
+    wide, narrow = reports[76], reports[77]
+    assert (wide.evidence_level[:1], narrow.evidence_level[:1]) == ("2", "5")
+    assert wide.provenance["mission description"].startswith("wide, revision")
+    assert narrow.provenance["mission description"].startswith("narrow, revision")
+    for report, limit in ((wide, 200.0), (narrow, 100.0)):
+        assert [one.limit for one in report.requirements if one.key == "median_error_m"] == [limit]
+
+
+def test_windows_and_telecommands_reference_the_description_of_their_spacecraft(
+    ground: Ground, made: SyntheticPass
+) -> None:
+    missions = {76: add_mission(ground, WIDE.encode()), 77: add_mission(ground, NARROW.encode())}
+    add_ephemeris(ground, ground.files.put_file(made.folder / "reference.oem"), name="reference")
+    for spacecraft, mission in missions.items():
+        command = enter_command(ground, "test_connection", {}, spacecraft_id=spacecraft, actor="ann")
+        assert get_command(ground, command).id == command
+        assert row(ground, repository.TELECOMMANDS, id=command)["mission_id"] == mission.id
+        entry = planning.WindowEntry("w", START, STOP, 15.0, spacecraft)
+        window = planning.add_window(ground, entry, actor="ann")
+        assert row(ground, repository.WINDOWS, id=window.id)["mission_id"] == mission.id
+    newer = add_mission(ground, NARROW.replace("40", "41").encode())
+    planning.change_window(ground, window.id, actor="ann", changes={}, decision="approved")
+    assert row(ground, repository.WINDOWS, id=window.id)["mission_id"] == newer.id
+
+
+def test_a_window_is_predicted_with_the_camera_of_its_spacecraft(
+    ground: Ground, made: SyntheticPass, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add_mission(ground, WIDE.encode())
+    add_mission(ground, NARROW.encode())
+    add_ephemeris(ground, ground.files.put_file(made.folder / "reference.oem"), name="reference")
+    planners = []
+    made_planner = planning._planner
+    monkeypatch.setattr(
+        planning, "_planner", lambda *given: planners.append(made_planner(*given)) or planners[-1]
+    )
+    for spacecraft in (76, 77, 78):
+        entry = planning.WindowEntry("w", START, STOP - 60_000_000_000, 15.0, spacecraft)
+        planning.add_window(ground, entry, actor="ann")
+    cameras = [planner.camera for planner in planners]
+    assert cameras == [camera_of(Camera(fov_deg=fov)) for fov in (120.0, 40.0)] + [camera_of(Camera())]
+    assert {planner.orientation.name for planner in planners[:2]} == {IauOrientation().name}
+
+
+def test_only_the_spacecraft_whose_description_permits_it_is_correlated_automatically(
+    ground: Ground, made: SyntheticPass, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fitted: list[int] = []
+
+    def reports(_ground: Ground, _connection: Any, vehicle: int) -> Any:
+        fitted.append(vehicle)
+        return recorrelation.TimeReports(*[np.zeros(0, dtype=np.int64)] * 6, ())
+
+    monkeypatch.setattr(recorrelation, "time_reports", reports)
+    for text in (WIDE, NARROW):
+        add_mission(ground, text.encode())
+    vehicles = {}
+    for spacecraft in (76, 77):
+        flown(ground, made, spacecraft, tmp_path)
+        vehicles[spacecraft] = row(ground, repository.VEHICLES, ccsds_id=spacecraft)["id"]
+        enter_receptions(ground, spacecraft, "flight", [ReceivedReport(1, 2, START)], actor="ann")
+    assert set(fitted) == {vehicles[76]}
+    recorrelate(ground, vehicles[77], over_manual=True)
+    assert set(fitted) == set(vehicles.values())
