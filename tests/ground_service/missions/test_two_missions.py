@@ -110,7 +110,7 @@ def test_every_pass_is_judged_by_the_description_of_its_spacecraft(
     assert wide.provenance["mission description"].startswith("wide, revision")
     assert narrow.provenance["mission description"].startswith("narrow, revision")
     for report, limit in ((wide, 200.0), (narrow, 100.0)):
-        assert [one.limit for one in report.requirements if one.key == "median_error"] == [limit]
+        assert [one.limit for one in report.requirements if one.key == "accuracy.median"] == [limit]
 
 
 def test_windows_and_telecommands_reference_the_description_of_their_spacecraft(
