@@ -15,7 +15,7 @@ from ground_service.client.problems import JobFailed
 from ground_service.commanding.model import Telecommand, UplinkState
 from ground_service.ephemerides.model import Ephemeris
 from ground_service.errors import InvalidInput
-from ground_service.evaluation.model import ReportOverview
+from ground_service.evaluation.model import Report, ReportOverview
 from ground_service.ingest.model import Ingest, IngestAccepted
 from ground_service.jobs.model import Job
 from ground_service.missions.model import MissionDetail, MissionRevision
@@ -186,6 +186,10 @@ class Client(Connection):
         return self._all(Trend, f"/spacecraft/{spacecraft_id}/trends", instance=instance)
 
     # Reports
+
+    def list_reports(self, pass_id: int) -> Listing[Report]:
+        """List the reports of a pass, newest first, with the changes that a re-evaluation made."""
+        return self._list(Report, f"/passes/{pass_id}/reports")
 
     def request_report(self, pass_id: int, *, key: str | None = None) -> Job:
         """Start the job that evaluates a pass and renders its report."""

@@ -7,6 +7,7 @@ from typing import Any
 from pydantic import Field
 
 from ground_service.http.model import Entity
+from ground_service.http.times import UtcTime
 
 
 class ReportErrors(Entity):
@@ -32,6 +33,26 @@ class ReportRequirement(Entity):
     at_most: bool
     status: str = Field(description="met, not met, unknown or not judged", examples=["met"])
     note: str
+
+
+class ChangedFigure(Entity):
+    """Figure of a summary that a re-evaluation changed."""
+
+    figure: str = Field(examples=["navigation.anchored.median_3d_m"])
+    before: Any
+    after: Any
+
+
+class Report(Entity):
+    """Report of a pass. The last three values are those of a re-evaluation, null for a report on request."""
+
+    id: str
+    pass_id: int
+    created: UtcTime
+    mission_revision: str | None = Field(description="Revision of the mission description of the evaluation")
+    event: int | None = Field(description="Number of the event that caused the re-evaluation")
+    previous: str | None = Field(description="The report before it")
+    changes: list[ChangedFigure] | None
 
 
 class ReportOverview(Entity):

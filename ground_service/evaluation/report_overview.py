@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from ground_service.errors import NotFound
-from ground_service.evaluation.model import ReportOverview
+from ground_service.evaluation.model import Report, ReportOverview
 from ground_service.ground import Ground
+from ground_service.http.times import UtcTime
 from ground_service.passes.core import downsample
 from ground_service.store import repository
 from ground_service.store.files import FileArchive
@@ -40,6 +41,32 @@ def report_row(ground: Ground, report_id: str) -> repository.Row:
     """Return the row of a report."""
     with ground.database.reading() as connection:
         return repository.get(connection, repository.REPORTS, report_id, "report")
+
+
+def list_reports(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tuple[list[Report], int]:
+    """Return a page of the reports of a pass, newest first, and their number.
+
+    Raises
+    ------
+    NotFound
+        If there is no such pass.
+    """
+    with ground.database.reading() as connection:
+        repository.get(connection, repository.PASSES, pass_id, "pass")
+        rows, total = repository.reports_of_pass(connection, pass_id, limit=limit, offset=offset)
+    reports = [
+        Report(
+            id=row["id"],
+            pass_id=row["pass_id"],
+            created=UtcTime(row["created_utc_ns"]),
+            mission_revision=row["mission_revision"],
+            event=row["event_number"],
+            previous=row["previous_id"],
+            changes=row["changes"],
+        )
+        for row in rows
+    ]
+    return reports, total
 
 
 @lru_cache(maxsize=64)

@@ -9,9 +9,20 @@ from fastapi import Query, Request, Response
 from ground_service.access.security import Operator, Viewer, idempotent_id
 from ground_service.errors import NotFound
 from ground_service.evaluation import service
-from ground_service.evaluation.model import ReportOverview
+from ground_service.evaluation.model import Report, ReportOverview
+from ground_service.evaluation.report_overview import list_reports as reports_of_pass
 from ground_service.evaluation.report_overview import report_overview, report_row
-from ground_service.http.common import API_PREFIX, GroundOf, IdempotencyKey, Key, PassId
+from ground_service.http.common import (
+    API_PREFIX,
+    GroundOf,
+    IdempotencyKey,
+    Key,
+    Limit,
+    Offset,
+    PassId,
+    page_of,
+)
+from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
 from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
@@ -85,6 +96,15 @@ def preferred_kind(accept: str) -> str:
         if kind is not None and value > weight:
             best, weight = kind, value
     return best
+
+
+@evaluation.get("/passes/{pass_id}/reports")
+def list_reports(
+    ground: GroundOf, _: Viewer, pass_id: PassId, limit: Limit = 100, offset: Offset = 0
+) -> PageOf[Report]:
+    """List the reports of a pass, newest first, with the changes that a re-evaluation made."""
+    items, total = reports_of_pass(ground, pass_id, limit=limit, offset=offset)
+    return page_of(items, total, limit, offset)
 
 
 @evaluation.get("/reports/{report_id}/summary")

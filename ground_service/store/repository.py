@@ -99,6 +99,23 @@ def newest_report(connection: Connection, pass_id: int, *, other_than: str = "")
     return None if found is None else dict(found)
 
 
+def reports_of_pass(
+    connection: Connection, pass_id: int, *, limit: int, offset: int
+) -> tuple[list[Row], int]:
+    """Return a page of the reports of a pass with their `mission_revision`, newest first, and their number."""
+    mine = REPORTS.c.pass_id == pass_id
+    query = (
+        select(REPORTS, MISSIONS.c.revision.label("mission_revision"))
+        .outerjoin(MISSIONS, MISSIONS.c.id == REPORTS.c.mission_id)
+        .where(mine)
+        .order_by(REPORTS.c.created_utc_ns.desc(), REPORTS.c.id)
+        .limit(limit)
+        .offset(offset)
+    )
+    total = connection.execute(select(func.count()).select_from(REPORTS).where(mine)).scalar_one()
+    return [dict(row) for row in connection.execute(query).mappings()], total
+
+
 def change(connection: Connection, table: Table, key: Any, **values: Any) -> None:
     """Change columns of the row with this primary key; states are changed by `states.move` alone."""
     column = next(iter(table.primary_key.columns))

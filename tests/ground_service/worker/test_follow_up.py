@@ -12,6 +12,7 @@ from sqlalchemy import select, update
 
 from ground_service import events
 from ground_service.errors import StorageFull
+from ground_service.evaluation.report_overview import list_reports
 from ground_service.evaluation.service import changed_figures, make_report
 from ground_service.events import CommandsSent, FollowUpFailed, PassEvaluated, TelemetryReceived, publish
 from ground_service.ground import Ground, open_ground
@@ -242,6 +243,10 @@ def test_late_data_make_a_report_with_the_changed_figures_and_their_event(
     changed = {one["figure"]: (one["before"], one["after"]) for one in again["changes"]}
     assert changed["frames"] == (first["summary"]["frames"], again["summary"]["frames"])
     assert first["summary"]["frames"] < again["summary"]["frames"]
+    items, total = list_reports(either, pass_id, limit=10, offset=0)
+    assert total == 2 and [one.id for one in items] == [again["id"], first["id"]]
+    assert (items[0].event, items[0].previous) == (again["event_number"], first["id"])
+    assert {one.figure for one in items[0].changes or ()} == set(changed) and items[1].changes is None
     made = [e for e in events.read_events(either.database, 0, 1000) if e.kind == PassEvaluated.event_kind]
     assert [e.payload.get("event") for e in made] == [None, again["event_number"]]
 
