@@ -37,7 +37,7 @@ from ground_service.ingest.service import ingest_file
 from ground_service.ingest.stream import Link, reaches_of
 from ground_service.store import repository
 from ground_service.store.database import prepare_database
-from tmtc.schema import as_octets
+from tmtc.arrays import as_octets
 
 SPACECRAFT = 76
 SCOPE = "flight"

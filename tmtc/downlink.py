@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tmtc import cadu, reed_solomon
-from tmtc.arrays import BoolArray, IntArray, OctetArray
+from tmtc.arrays import BoolArray, IntArray, OctetArray, Octets, as_octets
 from tmtc.clcw import UplinkSeen, uplink_seen
 from tmtc.crc import CRC_LENGTH, crc16
 from tmtc.dictionary import DICTIONARY
@@ -39,9 +39,9 @@ from tmtc.marker_survey import survey_markers
 from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, idle_packet
 from tmtc.pus import TM_HEADER_LENGTH
 from tmtc.randomiser import Randomiser, randomise
-from tmtc.schema import Dictionary, Table, as_octets
+from tmtc.schema import Dictionary, Table
 from tmtc.sequence import SequenceReport, account
-from tmtc.stream import Octets, PacketCut, PrimaryHeaders, cut_packets, primary_headers
+from tmtc.stream import PacketCut, PrimaryHeaders, cut_packets, primary_headers
 
 FRAME_GOOD, FRAME_UNCORRECTABLE, FRAME_BAD_CHECKSUM, FRAME_FOREIGN, FRAME_UNCHECKED = 0, 1, 2, 3, 4
 FRAME_VERDICTS = ("good", "uncorrectable", "bad_checksum", "foreign", "unchecked")

@@ -16,12 +16,12 @@ import operator
 import struct
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from tmtc.arrays import BoolArray, IntArray, OctetArray, RecordArray
+from tmtc.arrays import BoolArray, IntArray, OctetArray, Octets, RecordArray, as_octets
 from tmtc.crc import CRC_LENGTH, append_crc, check_crc
 from tmtc.errors import MalformedPacket, TruncatedPacket, UnknownPacket, ValueRefused
 from tmtc.packets import (
@@ -43,8 +43,16 @@ from tmtc.pus import (
     unpack_tm_header,
 )
 
-if TYPE_CHECKING:
-    from tmtc.stream import Octets, PacketCut
+
+class PacketPlaces(Protocol):
+    """Places (n,) of packets in a buffer; `tmtc.stream.PacketCut` is one."""
+
+    @property
+    def offsets(self) -> IntArray: ...
+    @property
+    def lengths(self) -> IntArray: ...
+    @property
+    def crc_ok(self) -> BoolArray: ...
 
 
 _STRUCT_CODES = {
@@ -370,7 +378,7 @@ class Dictionary:
             values,
         )
 
-    def identify(self, buffer: Octets, cut: PacketCut) -> IntArray:
+    def identify(self, buffer: Octets, cut: PacketPlaces) -> IntArray:
         """Index into `telemetry` of every packet of `cut`, negative where there is none.
 
         `NOT_A_TM_PACKET` (-1): bad checksum or not in this dictionary; `WRONG_LENGTH` (-2): in the
@@ -396,7 +404,7 @@ class Dictionary:
         return result
 
     def unpack_many(
-        self, buffer: Octets, cut: PacketCut, only: Collection[str] | None = None
+        self, buffer: Octets, cut: PacketPlaces, only: Collection[str] | None = None
     ) -> dict[str, Table]:
         """A table for every kind of telemetry packet in `cut`; damaged and unknown ones are left out.
 
@@ -430,13 +438,6 @@ class Dictionary:
                 f"service {service}, subtype {subtype}"
             )
         return self._compiled[definition.name]
-
-
-def as_octets(buffer: Octets) -> OctetArray:
-    """`buffer` as a one-dimensional array of octets, without a copy."""
-    if isinstance(buffer, np.ndarray):
-        return np.ascontiguousarray(buffer, dtype=np.uint8).reshape(-1)
-    return np.frombuffer(buffer, dtype=np.uint8)
 
 
 def gather(octets: OctetArray, starts: IntArray, dtype: np.dtype[Any]) -> RecordArray:

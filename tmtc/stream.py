@@ -19,13 +19,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tmtc.arrays import BoolArray, IntArray, OctetArray
+from tmtc.arrays import BoolArray, IntArray, OctetArray, Octets, as_octets
 from tmtc.crc import crc16
 from tmtc.errors import ValueRefused
 from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, TYPE_TELEMETRY
-from tmtc.schema import as_octets
-
-Octets = bytes | bytearray | memoryview | OctetArray
 
 _GOOD, _BAD, _SKIPPED, _IDLE = 0, 1, 2, 3
 

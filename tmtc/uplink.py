@@ -15,12 +15,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from tmtc.arrays import Octets
 from tmtc.crc import CRC_LENGTH, append_crc, crc16
 from tmtc.errors import ChecksumError, FrameError, TruncatedPacket, ValueRefused
 from tmtc.frames import Clcw
 from tmtc.packets import PRIMARY_HEADER_LENGTH
 from tmtc.randomiser import sequence
-from tmtc.stream import Octets, cut_packets
+from tmtc.stream import cut_packets
 
 CLTU_START = bytes.fromhex("EB90")
 CLTU_TAIL = bytes.fromhex("C5C5C5C5C5C5C579")

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tmtc.arrays import BoolArray, IntArray, OctetArray, RecordArray
+from tmtc.arrays import BoolArray, IntArray, OctetArray, Octets, RecordArray, as_octets
 from tmtc.errors import DefinitionError
-from tmtc.schema import as_octets, gather
-from tmtc.stream import Octets, PacketCut
+from tmtc.schema import gather
+from tmtc.stream import PacketCut
 from tmtc.xtce_columns import (
     ArrayColumn,
     Column,

@@ -42,13 +42,13 @@ from ground_service.ingest.store import store_batch
 from ground_service.ingest.stream import BARE, Link
 from ground_service.store import repository
 from tmtc import reed_solomon
+from tmtc.arrays import as_octets
 from tmtc.cadu import ASM_LENGTH, DEFAULT_TOLERANCE
 from tmtc.crc import crc16
 from tmtc.dictionary import DICTIONARY
 from tmtc.link import LinkSettings
 from tmtc.packets import IDLE_APID, PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH
 from tmtc.randomiser import randomise
-from tmtc.schema import as_octets
 from tmtc.stream import cut_packets
 
 OctetArray = NDArray[np.uint8]

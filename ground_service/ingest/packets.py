@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lunar.arrays import IntArray
+from tmtc.arrays import Octets, as_octets
 from tmtc.cuc import NO_TICKS, onboard_ticks
 from tmtc.dictionary import DICTIONARY
 from tmtc.estimates import ESTIMATE_PACKETS, filter_estimates
-from tmtc.schema import Dictionary, Table, as_octets, gather
-from tmtc.stream import Octets, PacketCut, primary_headers
+from tmtc.schema import Dictionary, Table, gather
+from tmtc.stream import PacketCut, primary_headers
 
 Columns = dict[str, Any]
 

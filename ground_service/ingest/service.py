@@ -37,12 +37,12 @@ from ground_service.jobs.service import OTHER_REQUEST, add_job
 from ground_service.store import repository
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile, mapped_octets, read_blocks
+from tmtc.arrays import as_octets
 from tmtc.cuc import NO_TICKS
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import TmtcError, UnknownCoding
 from tmtc.link import LinkSettings
 from tmtc.packets import PACKET_MAX_LENGTH
-from tmtc.schema import as_octets
 
 FLOWN = "flight"
 """Instance of a spacecraft that telemetry belongs to when nothing else is said."""

@@ -26,6 +26,7 @@ from ground_service.ingest.frames import (
 from ground_service.ingest.packets import PacketBatch, batch_of_cut
 from lunar.arrays import IntArray, OctetArray
 from tmtc import cadu
+from tmtc.arrays import as_octets
 from tmtc.cadu import ASM, ASM_LENGTH
 from tmtc.clcw import UplinkSeen, uplink_seen
 from tmtc.dictionary import DICTIONARY
@@ -37,7 +38,7 @@ from tmtc.link import LinkSettings
 from tmtc.link_plan import LinkPlan
 from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH
 from tmtc.randomiser import randomise
-from tmtc.schema import Dictionary, as_octets
+from tmtc.schema import Dictionary
 from tmtc.stream import cut_packets
 
 WINDOW_OCTETS = 2 << 20

@@ -16,9 +16,9 @@ import numpy as np
 
 from ground_service.ingest.packets import packet_ticks
 from lunar.arrays import BoolArray, IntArray
+from tmtc.arrays import Octets
 from tmtc.cuc import NO_TICKS
 from tmtc.downlink import FRAME_FOREIGN, FRAME_GOOD, DownlinkDecode, decode
-from tmtc.stream import Octets
 
 DIGEST_OCTETS = 16
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from ground_service.ingest.stream import DownlinkReader, reaches_of
+from tmtc.arrays import as_octets
 from tmtc.downlink import DownlinkEncoder, LinkSettings, decode, encode_cadus
 from tmtc.frames import Clcw, pack_clcw
-from tmtc.schema import as_octets
 
 SPACECRAFT = 76
 
