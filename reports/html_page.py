@@ -29,7 +29,7 @@ from reports.document import (
     evidence_number,
     evidence_text,
 )
-from reports.figures.svg import Drawings
+from reports.drawings import Drawings
 from reports.stylesheet import page_style
 from reports.text import NOT_A_VALUE, headline_text
 

@@ -35,7 +35,7 @@ from reports.document import (
     evidence_ladder,
     evidence_text,
 )
-from reports.figures.svg import Drawings
+from reports.drawings import Drawings
 from reports.figures.theme import LIGHT, color
 from reports.html_page import VERDICT_WORDS
 from reports.text import NOT_A_VALUE, headline_text

@@ -54,7 +54,7 @@ def render_pages(report: Any) -> tuple[str, bytes]:
     InconsistentReport
         when parts of the value do not fit together
     """
-    from reports.figures.svg import Drawings
+    from reports.drawings import Drawings
     from reports.html_page import html_page
     from reports.pdf_pages import pdf_pages
 

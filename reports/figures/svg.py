@@ -6,13 +6,9 @@ import base64
 import io
 import re
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 from reports.figures.canvas import Canvas, Photo
 from reports.figures.theme import LIGHT, drawing
-
-if TYPE_CHECKING:
-    from reports.document import Picture
 
 _GEOMETRY = re.compile(r' (?:d|x|y|width|height|transform|style)="[^"]*"')
 _NUMBER = re.compile(r"-?\d+\.\d{3,}")
@@ -24,21 +20,6 @@ _MARKER_STYLE = re.compile(r' style="([^"]*)"')
 _STYLE_NOISE = re.compile(
     r"font-family: [^;\"]+; |image-rendering:[^;\"]+;?|stroke-linejoin: round;? ?|stroke-linecap: butt;? ?"
 )
-
-
-class Drawings:
-    """Figures of one document, each drawn once for all its renderings."""
-
-    def __init__(self) -> None:
-        self._drawn: dict[str, str] = {}
-
-    def svg(self, picture: Picture) -> str:
-        """Return the SVG of a picture; the keys of the pictures of a document are unique."""
-        if picture.key not in self._drawn:
-            self._drawn[picture.key] = draw_svg(
-                picture.key, picture.width_in, picture.height_in, picture.draw, picture.alt
-            )
-        return self._drawn[picture.key]
 
 
 def draw_svg(key: str, width_in: float, height_in: float, draw: Callable[[Canvas], None], label: str) -> str:
