@@ -12,7 +12,7 @@ counts must continue. Damage inside such a packet cannot be detected.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -89,6 +89,7 @@ def cut_packets(
     segments: IntArray | None = None,
     final: bool = True,
     error_control: bool = True,
+    unchecked_apids: Collection[int] = (),
 ) -> PacketCut:
     """Where packets stand in `buffer`.
 
@@ -105,6 +106,9 @@ def cut_packets(
     error_control
         False: packets do not end with a checksum, as in most captures of other missions. `crc_ok` then says that the
         headers before and after fit. Supported for whole streams (`final`) only.
+    unchecked_apids
+        APIDs whose packets do not end with a checksum, in a stream of others that do. Such a packet is accepted if
+        another one, or the end of its segment, follows it.
     """
     if not error_control and not final:
         raise ValueRefused("packet stream", "final", final, "true for packets without error control")
@@ -113,11 +117,13 @@ def cut_packets(
     if segments is None:
         segments = np.array([[0, octets.size]], dtype=np.int64)
     consumed = 0
-    cutter: _Cutter | _UncheckedCutter = (
-        _Cutter(octets, packet_type, longest)
-        if error_control
-        else _UncheckedCutter(octets, packet_type, longest)
-    )
+    cutter: _Cutter | _UncheckedCutter
+    if not error_control:
+        cutter = _UncheckedCutter(octets, packet_type, longest)
+    elif unchecked_apids:
+        cutter = _MixedCutter(octets, packet_type, longest, unchecked_apids)
+    else:
+        cutter = _Cutter(octets, packet_type, longest)
     for start, stop in segments.tolist():
         consumed = cutter.cut(start, stop, final)
     rows = cutter.rows[: cutter.count]
@@ -131,6 +137,14 @@ def cut_packets(
         idle=rows[kind == _IDLE, 1:],
         consumed=octets.size if final else consumed,
     )
+
+
+def whole_packets(lengths: IntArray) -> PacketCut:
+    """Return the cut of packets of these lengths (n,), one after another, that are known to be undamaged."""
+    none = np.empty((0, 2), dtype=np.int64)
+    lengths = np.asarray(lengths, dtype=np.int64)
+    offsets = np.cumsum(lengths) - lengths
+    return PacketCut(offsets, lengths, np.ones(len(lengths), dtype=np.bool_), none, none, int(lengths.sum()))
 
 
 def primary_headers(buffer: Octets, cut: PacketCut) -> PrimaryHeaders:
@@ -167,9 +181,7 @@ class _Cutter:
         begin = self.count
         self.known[:] = -1
         while p < stop:
-            p, self.count = self.kernels.walk(
-                self.octets, p, stop, self.packet_type, self.longest, self.tables, self.rows, self.count
-            )
+            p = self.walk(p, stop, final)
             if self.count == self.rows.shape[0]:
                 self.rows = np.concatenate((self.rows, np.empty_like(self.rows)))
                 continue
@@ -185,6 +197,18 @@ class _Cutter:
                 self.note(kind, p, q, begin)
                 p = q
         return p
+
+    def walk(self, p: int, stop: int, final: bool) -> int:
+        """Write rows of undamaged packets from `p` on; return the position behind them."""
+        end, self.count = self.kernels.walk(
+            self.octets, p, stop, self.packet_type, self.longest, self.tables, self.rows, self.count
+        )
+        return int(end)
+
+    def search(self, first: int, limit: int, stop: int, state: tuple[Any, ...]) -> int:
+        """Return the first position in [first, limit) at which a packet is believed to begin, or `limit`."""
+        key = (first, limit, stop, self.packet_type, self.longest)
+        return int(self.kernels.search(self.octets, *key, *state))
 
     def note(self, kind: int, p: int, q: int, begin: int) -> None:
         """Write a row; what is skipped right after something skipped prolongs that row."""
@@ -213,7 +237,7 @@ class _Cutter:
             q = self.kernels.chain_start(self.octets, p + 1, e, self.packet_type, self.longest, *state)
             return [(self.kind_of(p), e)] if q < 0 else [(_SKIPPED, q)]
         limit = min(stop, p + self.longest)
-        q = self.kernels.search(self.octets, p + 1, limit, stop, self.packet_type, self.longest, *state)
+        q = self.search(p + 1, limit, stop, state)
         if q == limit < stop:
             return [(_SKIPPED, q)]
         # several damaged packets in a row, whose lengths still lead to the next right one
@@ -244,6 +268,42 @@ class _Cutter:
         """Whether a whole packet with a right checksum, or the header of an idle packet, stands at `p`."""
         length = self.length_at(p, stop)
         return bool(length) and (self.is_idle(p) or crc16(self.octets[p : p + length].data) == 0)
+
+
+class _MixedCutter(_Cutter):
+    """A cutter that knows APIDs whose packets do not end with a checksum."""
+
+    def __init__(
+        self, octets: npt.NDArray[np.uint8], packet_type: int, longest: int, unchecked_apids: Collection[int]
+    ) -> None:
+        from tmtc import _mixed_cutting
+
+        super().__init__(octets, packet_type, longest)
+        self.mixed: Any = _mixed_cutting
+        self.unchecked = np.zeros(1 << 11, dtype=np.bool_)
+        self.unchecked[list(unchecked_apids)] = True
+
+    def walk(self, p: int, stop: int, final: bool) -> int:
+        end, self.count = self.mixed.walk_mixed(
+            self.octets, p, stop, self.packet_type, self.longest, self.tables, self.rows, self.count,
+            self.unchecked, not final,
+        )  # fmt: skip
+        return int(end)
+
+    def search(self, first: int, limit: int, stop: int, state: tuple[Any, ...]) -> int:
+        key = (first, limit, stop, self.packet_type, self.longest)
+        return int(self.mixed.search_mixed(self.octets, *key, *state, self.unchecked))
+
+    def length_at(self, p: int, stop: int) -> int:
+        key = (p, stop, self.packet_type, self.longest)
+        found = self.mixed.unchecked_length(self.octets, *key, self.unchecked)
+        return int(found) or super().length_at(p, stop)
+
+    def stands(self, p: int, stop: int) -> bool:
+        key = (p, stop, self.packet_type, self.longest, self.unchecked)
+        if self.mixed.unchecked_length(self.octets, *key):
+            return True
+        return super().stands(p, stop)
 
 
 class _UncheckedCutter:

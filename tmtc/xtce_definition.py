@@ -12,6 +12,7 @@ from typing import Literal, Union
 
 IntegerForm = Literal["unsigned", "twosComplement", "onesComplement", "signMagnitude"]
 FloatForm = Literal["IEEE754", "MILSTD_1750A"]
+Limits = tuple[float | None, float | None]
 Operator = Literal["==", "!=", "<", "<=", ">", ">="]
 
 
@@ -143,7 +144,10 @@ Encoding = IntegerEncoding | FloatEncoding | StringEncoding | BinaryEncoding
 
 @dataclass(frozen=True, slots=True)
 class ScalarType:
-    """One value: how it is stored, and what its codes are called (first code, last code, name), rising."""
+    """One value: how it is stored, and what its codes are called (first code, last code, name), rising.
+
+    Calibrated values outside `warning` (least, greatest; None: no limit) need attention, those outside `alarm` action.
+    """
 
     name: str
     encoding: Encoding
@@ -151,6 +155,8 @@ class ScalarType:
     is_boolean: bool = False
     unit: str = ""
     epoch: str = ""
+    warning: Limits | None = None
+    alarm: Limits | None = None
 
     @property
     def bits(self) -> int | None:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from tmtc.errors import DefinitionError
@@ -38,6 +38,7 @@ from tmtc.xtce_definition import (
     FloatEncoding,
     IntegerEncoding,
     IntegerForm,
+    Limits,
     Operator,
     Parameter,
     Polynomial,
@@ -503,6 +504,8 @@ class _Importer:
             is_boolean=node.tag == "BooleanParameterType",
             unit=" ".join(u.text for u in units.children) if units is not None else "",
             epoch=_epoch(node) if is_time else "",
+            warning=_limits(chain, ("WarningRange", "WatchRange")),
+            alarm=_limits(chain, ("CriticalRange", "DistressRange", "SevereRange")),
         )
 
     def encoding(self, node: Node, system: _System, scale: tuple[float, float] | None) -> Encoding:
@@ -946,6 +949,25 @@ def _epoch(node: Node) -> str:
     reference = node.child("ReferenceTime")
     epoch = reference.child("Epoch") if reference is not None else None
     return "" if epoch is None else epoch.text
+
+
+def _limits(chain: Sequence[tuple[_System, Node]], levels: tuple[str, ...]) -> Limits | None:
+    """Return the range of values without alarm of the first of these levels that is stated; None without any.
+
+    Other alarms (inside of a range, of changes, of names, in a context) are not read.
+    """
+    alarm = next((found for _, one in chain if (found := one.child("DefaultAlarm")) is not None), None)
+    ranges = alarm.child("StaticAlarmRanges") if alarm is not None else None
+    if ranges is None or ranges.attributes.get("rangeForm", "outside") != "outside":
+        return None
+    stated = next((found for level in levels if (found := ranges.child(level)) is not None), None)
+    if stated is None:
+        return None
+    least, greatest = (
+        next((_number(stated, name, None) for name in names if name in stated.attributes), None)
+        for names in (("minInclusive", "minExclusive"), ("maxInclusive", "maxExclusive"))
+    )
+    return least, greatest
 
 
 def _fixed(node: Node, least: int | None) -> int:

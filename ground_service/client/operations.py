@@ -228,8 +228,11 @@ class Client(Connection):
         return self._list(MissionRevision, "/missions")
 
     def add_mission(self, file: Path | bytes) -> MissionDetail:
-        """Add a mission description (TOML) as a revision."""
-        return self._post(MissionDetail, "/missions", file, name=_name_of(file))
+        """Add a mission description (TOML) as a revision, with the XTCE files that it names."""
+        from ground_service.missions.definitions import read_mission_file
+
+        document = read_mission_file(file) if isinstance(file, Path) else file
+        return self._post(MissionDetail, "/missions", document, name=_name_of(file))
 
     def get_mission(self, revision: str) -> MissionDetail:
         """Return a revision with its document."""

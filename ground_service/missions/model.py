@@ -10,7 +10,7 @@ import difflib
 import hashlib
 import json
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Final, Literal, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -18,10 +18,16 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from ground_service.errors import InvalidInput
 from ground_service.http.model import Entity
 from ground_service.http.times import UtcTime
+from lunar.errors import TimeFormatError
+from lunar.timescales import parse_utc
+from tmtc.dictionary import DICTIONARY
 from tmtc.effects import EFFECTS
 
 SCHEMA_VERSION: Final = 1
 MISSION_LIMIT_OCTETS = 1 << 20
+EPOCH_TAI = " TAI"
+XTCE_COMPRESSED = "gzip:"
+DICTIONARY_APIDS = frozenset(one.apid for one in (*DICTIONARY.telemetry, *DICTIONARY.telecommands))
 NOT_STATED = "not stated"
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -269,6 +275,73 @@ class Approval(Section):
         return self
 
 
+class PacketTime(Section):
+    """Time code in the secondary header of packets.
+
+    Attributes
+    ----------
+    offset
+        Octets from the start of the packet to the first octet of the code, its P-field included if there is one.
+    whole_octets, fraction_octets
+        CUC: octets of seconds (1 to 7) and of their fraction (0 to 10). CDS: octets of days (2 or 3) and below the
+        millisecond (0, 2 or 4).
+    epoch
+        UTC of the zero of the code; with `` TAI`` at its end, TAI.
+    clock
+        "payload": the clock whose time reports are correlated with UTC. "own": another one, taken as correct.
+    """
+
+    code: Literal["cuc", "cds"]
+    offset: Annotated[int, Field(ge=6, le=4096)]
+    p_field: bool
+    whole_octets: Annotated[int, Field(ge=1, le=7)]
+    fraction_octets: Annotated[int, Field(ge=0, le=10)]
+    epoch: str
+    clock: Literal["payload", "own"]
+
+    @model_validator(mode="after")
+    def _possible(self) -> PacketTime:
+        if self.code == "cds" and self.whole_octets not in (2, 3):
+            raise ValueError(f"2 or 3 octets of days in a CDS code, found {self.whole_octets}")
+        if self.code == "cds" and self.fraction_octets not in (0, 2, 4):
+            raise ValueError(
+                f"0, 2 or 4 octets below the millisecond in a CDS code, found {self.fraction_octets}"
+            )
+        if self.code == "cds" and self.epoch.endswith(EPOCH_TAI):
+            raise ValueError("an epoch in UTC for a CDS code, found one in TAI")
+        try:
+            parse_utc(self.epoch.removesuffix(EPOCH_TAI))
+        except TimeFormatError as error:
+            raise ValueError(f"an epoch such as 1958-01-01T00:00:00 TAI: {error}") from None
+        return self
+
+
+class PacketSource(Section):
+    """Packets of some APIDs that the packet dictionary of the payload does not define.
+
+    `xtce` holds one or more XTCE documents, as texts or compressed (``gzip:`` and base64). In a file for
+    `linna mission`, an entry can be the path of a document, which is embedded when the file is read.
+    """
+
+    name: Annotated[str, Field(min_length=1, max_length=64)]
+    apids: Annotated[tuple[Annotated[int, Field(ge=0, le=2046)], ...], Array, Field(min_length=1)]
+    packet_checksum: Literal["crc16", "none"]
+    xtce: Annotated[tuple[str, ...], Array] | None = None
+    container: str | None = None
+    time: PacketTime | None = None
+
+    @model_validator(mode="after")
+    def _texts(self) -> PacketSource:
+        for text in self.xtce or ():
+            if not text.lstrip().startswith(("<", XTCE_COMPRESSED)):
+                raise ValueError(
+                    f"texts of XTCE documents, or files that `linna mission` reads, found {text[:80]!r}"
+                )
+        if self.container is not None and not self.xtce:
+            raise ValueError("xtce documents with a container, found none")
+        return self
+
+
 class Mission(Section):
     """Mission description of one spacecraft."""
 
@@ -287,6 +360,26 @@ class Mission(Section):
     requirements: Requirements = Requirements()
     automation: Automation = Automation()
     approval: Approval = Approval()
+    packets: Annotated[tuple[PacketSource, ...], Array] | None = None
+
+    @model_validator(mode="after")
+    def _apids_once(self) -> Mission:
+        owner: dict[int, str] = {}
+        for source in self.packets or ():
+            for apid in source.apids:
+                if apid in owner:
+                    raise ValueError(
+                        f"each APID in one entry of packets, found {apid} in {owner[apid]!r} and again"
+                    )
+                if apid in DICTIONARY_APIDS:
+                    raise ValueError(
+                        f"APIDs that the packet dictionary does not use, found {apid} in {source.name!r}"
+                    )
+                owner[apid] = source.name
+        names = [source.name for source in self.packets or ()]
+        if len(set(names)) < len(names):
+            raise ValueError("each name of packets once, found one again")
+        return self
 
     @property
     def revision(self) -> str:
@@ -354,18 +447,31 @@ def _read(text: str, source: str) -> Mission | list[InvalidInput]:
         return [_fault(source, one) for one in error.errors()]
 
 
+_INNER: dict[tuple[str, str], type[Section]] = {
+    ("Mission", "packets"): PacketSource,
+    ("PacketSource", "time"): PacketTime,
+}
+"""Sections in lists and optional sections, by the section that has them."""
+
+
 def _unknown_keys(kind: type[BaseModel], table: Any, source: str, path: str) -> Iterator[InvalidInput]:
     if not isinstance(table, dict):
         return
     for key, value in table.items():
         place = f"{path}.{key}" if path else key
         field = kind.model_fields.get(key)
+        inner = _INNER.get((kind.__name__, key))
         if field is None:
             known = list(kind.model_fields)
             near = difflib.get_close_matches(key, known, n=1)
             yield InvalidInput(
                 source, place, f"'{near[0]}'" if near else ", ".join(known), f"unknown key '{key}'"
             )
+        elif inner is not None:
+            for number, one in enumerate(value if isinstance(value, list) else [value]):
+                yield from _unknown_keys(
+                    inner, one, source, f"{place}.{number}" if isinstance(value, list) else place
+                )
         elif isinstance(field.annotation, type) and issubclass(field.annotation, Section):
             yield from _unknown_keys(field.annotation, value, source, place)
 
@@ -389,9 +495,13 @@ def _not_stated(section: BaseModel, path: str = "") -> Iterator[str]:
 
 def format_mission(mission: Mission) -> str:
     """Return TOML text that parses to an equal mission; values that are not stated are left out."""
-    stated = mission.model_dump(mode="json", exclude_none=True)
-    lines = [f"{key} = {_toml(value)}" for key, value in stated.items() if not isinstance(value, dict)]
-    for name, section in stated.items():
+    return format_toml(mission.model_dump(mode="json", exclude_none=True))
+
+
+def format_toml(table: Mapping[str, Any]) -> str:
+    """Return TOML text of a mission description that is given as a table."""
+    lines = [f"{key} = {_toml(value)}" for key, value in table.items() if not isinstance(value, dict)]
+    for name, section in table.items():
         if isinstance(section, dict) and section:
             lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in section.items())]
     return "\n".join(lines) + "\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Connection
@@ -14,6 +15,7 @@ from ground_service.events import MissionAdded, publish
 from ground_service.ground import Ground
 from ground_service.missions import store
 from ground_service.missions.declared import mission_of_manifest
+from ground_service.missions.definitions import definition_faults, read_mission_file
 from ground_service.missions.model import (
     MISSION_LIMIT_OCTETS,
     Approval,
@@ -21,6 +23,7 @@ from ground_service.missions.model import (
     MissionDetail,
     MissionRevision,
     format_mission,
+    mission_faults,
     parse_mission,
 )
 
@@ -40,7 +43,29 @@ def read_mission(octets: bytes, source: str = "mission.toml") -> tuple[Mission, 
     except UnicodeDecodeError as error:
         found = f"octet {error.object[error.start]:#04x} at {error.start}"
         raise InvalidInput(source, "", "UTF-8 text", found) from None
-    return parse_mission(text, source), text
+    mission = parse_mission(text, source)
+    for fault in definition_faults(mission, source):
+        raise fault
+    return mission, text
+
+
+def check_mission_file(path: Path) -> tuple[Mission | None, list[str]]:
+    """Return the mission description of a file, or None and one line for each fault.
+
+    Raises
+    ------
+    InvalidInput
+        The file, or an XTCE file that it names, cannot be read, or is not text.
+    """
+    try:
+        text = read_mission_file(path).decode("utf-8")
+    except UnicodeDecodeError:
+        raise InvalidInput(str(path), "", "UTF-8 text", "other octets") from None
+    faults = mission_faults(text, str(path))
+    if not faults:
+        mission = parse_mission(text, str(path))
+        faults = [str(fault) for fault in definition_faults(mission, str(path))]
+    return (None, faults) if faults else (mission, [])
 
 
 def add_mission(

@@ -50,19 +50,14 @@ def write(arguments: argparse.Namespace) -> int:
 
 
 def check(arguments: argparse.Namespace) -> int:
-    from ground_service.errors import InvalidInput
-    from ground_service.missions.model import mission_faults, parse_mission
+    from ground_service.missions.service import check_mission_file
 
-    try:
-        text = arguments.file.read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise InvalidInput(str(arguments.file), "", "UTF-8 text", "other octets") from None
-    faults = mission_faults(text, str(arguments.file))
-    if faults:
+    mission, faults = check_mission_file(arguments.file)
+    if mission is None:
         figures: dict[str, Any] = {"mission": None, "revision": None, "unknown": [], "faults": faults}
         emit(arguments, figures, text="\n".join(faults))
         return 2
-    figures = {**_figures(parse_mission(text, str(arguments.file))), "faults": []}
+    figures = {**_figures(mission), "faults": []}
     emit(arguments, figures, text=_described(figures))
     return 0
 

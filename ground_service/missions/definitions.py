@@ -1,0 +1,185 @@
+"""Definitions of the packets that a mission description declares: XTCE documents, time codes and error control."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import gzip
+import hashlib
+import json
+import tomllib
+import zlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from ground_service.errors import InvalidInput
+from ground_service.missions.model import XTCE_COMPRESSED, Mission, PacketSource, format_toml
+from tmtc.errors import DefinitionError
+from tmtc.xtce_decode import Decoder
+from tmtc.xtce_import import parse_xtce
+from tmtc.xtce_series import SeriesValue, packet_layouts
+from tmtc.xtce_xml import MAX_OCTETS
+
+EMBEDDED_AS_TEXT_OCTETS = 64 << 10
+"""Longer XTCE files are embedded compressed, since a mission description has a limited length."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DeclaredPackets:
+    """Packets of some APIDs: `decoder` and `layouts` of their definition, None and empty without one.
+
+    `first_number` is the number of the first container in the archive; the others follow in the order of `layouts`.
+    """
+
+    source: PacketSource
+    decoder: Decoder | None
+    layouts: dict[str, tuple[SeriesValue, ...]]
+    first_number: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PacketDefinitions:
+    """All declared packets of a mission description; `digest` identifies what is declared."""
+
+    digest: str
+    declared: tuple[DeclaredPackets, ...]
+
+    @property
+    def apids(self) -> tuple[int, ...]:
+        """APIDs with a definition."""
+        return tuple(sorted(apid for one in self.declared if one.decoder for apid in one.source.apids))
+
+    @property
+    def unchecked_apids(self) -> frozenset[int]:
+        """APIDs whose packets do not end with a checksum."""
+        return unchecked_apids(one.source for one in self.declared)
+
+    def containers(self) -> list[tuple[int, DeclaredPackets, str]]:
+        """Return number, declaration and name of every container that packets can be of."""
+        return [
+            (one.first_number + index, one, name)
+            for one in self.declared
+            for index, name in enumerate(one.layouts)
+        ]
+
+
+def unchecked_apids(sources: Iterable[PacketSource]) -> frozenset[int]:
+    """Return the APIDs of packets without a checksum."""
+    return frozenset(apid for one in sources if one.packet_checksum == "none" for apid in one.apids)
+
+
+def packet_definitions(mission: Mission) -> PacketDefinitions:
+    """Return what a mission description declares, compiled; the same declarations are compiled once.
+
+    Raises
+    ------
+    DefinitionError
+        A document is not XTCE that is supported.
+    """
+    return _compiled(mission.packets or ())
+
+
+def definition_faults(mission: Mission, source: str) -> list[InvalidInput]:
+    """Return one fault for each declaration whose documents cannot be used; empty if all can."""
+    faults = []
+    for index, one in enumerate(mission.packets or ()):
+        try:
+            _decoder(one)
+        except DefinitionError as error:
+            faults.append(InvalidInput(source, f"packets.{index}.xtce", "XTCE that is supported", str(error)))
+    return faults
+
+
+def read_mission_file(path: Path) -> bytes:
+    """Return the octets of a mission description with the XTCE files that it names embedded.
+
+    Raises
+    ------
+    InvalidInput
+        The file, or an XTCE file that it names, cannot be read.
+    """
+    try:
+        octets = path.read_bytes()
+    except OSError as error:
+        raise InvalidInput(str(path), "", "a file that can be read", error.strerror or str(error)) from None
+    try:
+        text = octets.decode("utf-8")
+    except UnicodeDecodeError:
+        return octets
+    return embed_documents(text, path.parent, str(path)).encode()
+
+
+def embed_documents(text: str, folder: Path, source: str) -> str:
+    """Return a mission description with the XTCE files that it names as paths, relative to `folder`, embedded.
+
+    Text that is not TOML is returned as it is.
+
+    Raises
+    ------
+    InvalidInput
+        A file is not readable or not text.
+    """
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        return text
+    packets = table.get("packets")
+    named = False
+    for index, one in enumerate(packets if isinstance(packets, list) else ()):
+        documents = one.get("xtce") if isinstance(one, dict) else None
+        for place, entry in enumerate(documents if isinstance(documents, list) else ()):
+            if isinstance(entry, str) and not entry.lstrip().startswith(("<", XTCE_COMPRESSED)):
+                documents[place] = _embedded(folder / entry, source, f"packets.{index}.xtce")
+                named = True
+    return format_toml(table) if named else text
+
+
+def _embedded(path: Path, source: str, place: str) -> str:
+    try:
+        octets = path.read_bytes()
+    except OSError as error:
+        raise InvalidInput(source, place, f"the file {path}", error.strerror or "none") from None
+    try:
+        text = octets.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = ""
+    if text.lstrip().startswith("<") and len(octets) <= EMBEDDED_AS_TEXT_OCTETS:
+        return text
+    return XTCE_COMPRESSED + base64.b64encode(gzip.compress(octets, mtime=0)).decode()
+
+
+def _document(entry: str) -> str | bytes:
+    """Return an embedded document."""
+    if not entry.startswith(XTCE_COMPRESSED):
+        return entry
+    try:
+        packed = base64.b64decode(entry.removeprefix(XTCE_COMPRESSED), validate=True)
+        unpacking = zlib.decompressobj(zlib.MAX_WBITS | 16)
+        octets = unpacking.decompress(packed, MAX_OCTETS + 1)
+    except (binascii.Error, ValueError, zlib.error):
+        raise DefinitionError("embedded document: expected gzip in base64, found other text") from None
+    if not unpacking.eof or len(octets) > MAX_OCTETS:
+        raise DefinitionError(f"embedded document: expected at most {MAX_OCTETS} whole octets, found others")
+    return octets
+
+
+def _decoder(source: PacketSource) -> Decoder | None:
+    if not source.xtce:
+        return None
+    documents = {f"{source.name} [{index}]": _document(entry) for index, entry in enumerate(source.xtce)}
+    return Decoder(parse_xtce(documents), source.container)
+
+
+@lru_cache(maxsize=16)
+def _compiled(sources: Sequence[PacketSource]) -> PacketDefinitions:
+    stated = json.dumps([one.model_dump(mode="json", exclude_none=True) for one in sources], sort_keys=True)
+    declared = []
+    number = 0
+    for source in sources:
+        decoder = _decoder(source)
+        layouts = {} if decoder is None else dict(sorted(packet_layouts(decoder.root).items()))
+        declared.append(DeclaredPackets(source, decoder, layouts, number))
+        number += len(layouts)
+    return PacketDefinitions(hashlib.sha256(stated.encode()).hexdigest(), tuple(declared))
