@@ -38,6 +38,11 @@ class DeclaredPackets:
     layouts: dict[str, tuple[SeriesValue, ...]]
     first_number: int
 
+    @property
+    def numbers(self) -> dict[str, int]:
+        """Numbers of the containers by name."""
+        return {name: self.first_number + place for place, name in enumerate(self.layouts)}
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PacketDefinitions:
@@ -55,14 +60,6 @@ class PacketDefinitions:
     def unchecked_apids(self) -> frozenset[int]:
         """APIDs whose packets do not end with a checksum."""
         return unchecked_apids(one.source for one in self.declared)
-
-    def containers(self) -> list[tuple[int, DeclaredPackets, str]]:
-        """Return number, declaration and name of every container that packets can be of."""
-        return [
-            (one.first_number + index, one, name)
-            for one in self.declared
-            for index, name in enumerate(one.layouts)
-        ]
 
 
 def unchecked_apids(sources: Iterable[PacketSource]) -> frozenset[int]:

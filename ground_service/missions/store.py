@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 from sqlalchemy import Connection, select, update
@@ -145,7 +146,12 @@ def approval_in_force(connection: Connection, ccsds_id: int) -> Approval:
 
 
 def _document(row: repository.Row) -> Mission:
-    return parse_mission(row["text"], f"mission revision {row['revision'][:REVISION_PREFIX]}")
+    return _parsed(row["text"], f"mission revision {row['revision'][:REVISION_PREFIX]}")
+
+
+@lru_cache(maxsize=32)
+def _parsed(text: str, source: str) -> Mission:
+    return parse_mission(text, source)
 
 
 def _revision(row: repository.Row, document: Mission) -> MissionRevision:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import Connection
 
 from ground_service.passes.core import (
@@ -22,8 +23,9 @@ from ground_service.store import repository, rollups
 from ground_service.store.rollups import HOUSEKEEPING_VALUES as PARAMETERS
 from ground_service.store.rollups import STATE_VALUES
 from ground_service.timekeeping.core import IDEAL_CLOCK, utc_ns_of_ticks
+from lunar.arrays import FloatArray
 
-__all__ = ["PARAMETERS", "STATE_VALUES", "Series", "SeriesReading", "series_document"]
+__all__ = ["PARAMETERS", "STATE_VALUES", "KindSamples", "Series", "SeriesReading", "series_document"]
 
 FEW_ROWS = 50_000
 """Up to this many samples are read one by one, which is exact to the sample and quick enough."""
@@ -43,14 +45,88 @@ class Series:
     buckets: Buckets
 
 
+class SampleSource(Protocol):
+    """Samples that a series is read from, and their roll-ups: `code`, `version` and `part` of these."""
+
+    @property
+    def code(self) -> int: ...
+    @property
+    def version(self) -> int: ...
+    @property
+    def part(self) -> int: ...
+
+    def index(self, name: str) -> int:
+        """Return the place of a value in the roll-ups."""
+
+    def arrays(
+        self, connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int, names: tuple[str, ...]
+    ) -> dict[str, NDArray[Any]]:
+        """Return ``ticks`` and values (n,) between two on-board times (both included), in order of time."""
+
+    def aggregates(
+        self,
+        connection: Connection,
+        vehicle: int,
+        start_ticks: int,
+        stop_ticks: int,
+        name: str,
+        width_ticks: int,
+    ) -> FloatArray:
+        """Return stretches of a value as `repository.sample_aggregates` does."""
+
+
+@dataclass(frozen=True, slots=True)
+class KindSamples:
+    """Samples of one kind (a table) decoded with one dictionary version; of one estimator where `part` is one."""
+
+    kind: str
+    version: int
+    part: int = 0
+
+    @property
+    def code(self) -> int:
+        """Code of the kind in the roll-ups."""
+        return rollups.KINDS[self.kind][0]
+
+    def index(self, name: str) -> int:
+        """Return the place of a value in the roll-ups."""
+        return rollups.KINDS[self.kind][2].index(name)
+
+    def arrays(
+        self, connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int, names: tuple[str, ...]
+    ) -> dict[str, NDArray[Any]]:
+        """Return ``ticks`` and values (n,) between two on-board times."""
+        columns = ("ticks", *names)
+        return repository.sample_arrays(
+            connection, self.kind, vehicle, start_ticks, stop_ticks, self.version, columns, **self._equal
+        )
+
+    def aggregates(
+        self,
+        connection: Connection,
+        vehicle: int,
+        start_ticks: int,
+        stop_ticks: int,
+        name: str,
+        width_ticks: int,
+    ) -> FloatArray:
+        """Return stretches of a value, aggregated by the database."""
+        where = (vehicle, start_ticks, stop_ticks, self.version)
+        return repository.sample_aggregates(connection, self.kind, *where, name, width_ticks, **self._equal)
+
+    @property
+    def _equal(self) -> dict[str, int]:
+        column = rollups.KINDS[self.kind][1]
+        return {} if column is None else {column: self.part}
+
+
 @dataclass(frozen=True, slots=True)
 class SeriesReading:
-    """Reads values of one kind of samples, of one part of it (an estimator), over a span of on-board time."""
+    """Reads values of one source over a span of on-board time."""
 
     connection: Connection
     span: PassSpan
-    kind: str
-    part: int
+    source: SampleSource
     max_points: int
 
     def series(self, units: Mapping[str, str]) -> list[Series]:
@@ -83,7 +159,7 @@ class SeriesReading:
 
         No ticks to a point where samples are few.
         """
-        key = (self.kind, self.span.vehicle, self.span.dictionary_version, self.part)
+        key = (self.source.code, self.span.vehicle, self.source.version, self.source.part)
         count, first, last = rollups.rolled_extent(
             self.connection, *key, self.span.start_ticks, self.span.stop_ticks
         )
@@ -97,16 +173,9 @@ class SeriesReading:
 
     def _grouped(self, name: str, length: float) -> tuple[Aggregates, int]:
         """Stretches of half the length (ticks), put together by the database from the samples."""
-        found = repository.sample_aggregates(
-            self.connection,
-            self.kind,
-            self.span.vehicle,
-            self.span.start_ticks,
-            self.span.stop_ticks,
-            self.span.dictionary_version,
-            name,
-            max(int(length / 2.0), 1),
-            **self._equal,
+        width = max(int(length / 2.0), 1)
+        found = self.source.aggregates(
+            self.connection, self.span.vehicle, self.span.start_ticks, self.span.stop_ticks, name, width
         )
         first, last, rows, count = found[:, :4].astype(np.int64).T
         begin, used = utc_ns_of_ticks(first, self.span.correlations)
@@ -121,14 +190,14 @@ class SeriesReading:
         first, last = -(-start // width), (stop + 1) // width - 1
         rows = rollups.rollup_rows(
             self.connection,
-            self.kind,
+            self.source.code,
             self.span.vehicle,
-            self.span.dictionary_version,
-            self.part,
+            self.source.version,
+            self.source.part,
             level,
             first,
             last,
-            name,
+            self.source.index(name),
         )
         begin, used = utc_ns_of_ticks(rows[0], self.span.correlations)
         end, _ = utc_ns_of_ticks(rows[1], self.span.correlations)
@@ -146,22 +215,8 @@ class SeriesReading:
         utc_ns = utc_ns_of_ticks(columns["ticks"], self.span.correlations)[0]
         return aggregate(utc_ns, columns[name].astype(np.float64))
 
-    def _samples(self, names: tuple[str, ...], start: int, stop: int) -> dict[str, np.ndarray]:
-        return repository.sample_arrays(
-            self.connection,
-            self.kind,
-            self.span.vehicle,
-            start,
-            stop,
-            self.span.dictionary_version,
-            ("ticks", *names),
-            **self._equal,
-        )
-
-    @property
-    def _equal(self) -> dict[str, int]:
-        column = rollups.KINDS[self.kind][1]
-        return {} if column is None else {column: self.part}
+    def _samples(self, names: tuple[str, ...], start: int, stop: int) -> dict[str, NDArray[Any]]:
+        return self.source.arrays(self.connection, self.span.vehicle, start, stop, names)
 
 
 def series_document(series: Series) -> dict[str, Any]:

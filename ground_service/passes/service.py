@@ -26,7 +26,7 @@ from ground_service.passes.model import (
     Trend,
 )
 from ground_service.passes.packet_accounting import packet_accounting
-from ground_service.passes.series import PARAMETERS, STATE_VALUES, Series, SeriesReading, series_document
+from ground_service.passes.series import PARAMETERS, STATE_VALUES, KindSamples, Series, SeriesReading, series_document
 from ground_service.passes.span import PassSpan, pass_span
 from ground_service.passes.store import detection_frames, detection_samples, event_list
 from ground_service.passes.trends import trend_of
@@ -216,9 +216,9 @@ def _state_series(
     if estimator not in codes:
         raise NotFound("estimator", estimator[:80])
     units = {field.name: field.unit for field in DICTIONARY.packet("navigation_state").fields}
-    reading = SeriesReading(
-        connection, pass_span(connection, record), "navigation_states", codes[estimator], max_points
-    )
+    span = pass_span(connection, record)
+    source = KindSamples("navigation_states", span.dictionary_version, codes[estimator])
+    reading = SeriesReading(connection, span, source, max_points)
     found = reading.series(
         {
             value: units.get(value, "m/s" if "_m_s" in value else "m" if value.endswith("_m") else "")
@@ -251,7 +251,8 @@ def parameter_document(ground: Ground, pass_id: int, parameter: str, max_points:
 
 
 def _parameter_series(connection: Connection, span: PassSpan, parameter: str, max_points: int) -> Series:
-    reading = SeriesReading(connection, span, "housekeeping", 0, max_points)
+    source = KindSamples("housekeeping", span.dictionary_version)
+    reading = SeriesReading(connection, span, source, max_points)
     return reading.series({parameter: DICTIONARY.packet("housekeeping").field(parameter).unit})[0]
 
 
@@ -314,12 +315,12 @@ def vehicle_trends(ground: Ground, vehicle: int) -> list[Trend]:
 
 def _trends(connection: Connection, vehicle: int) -> list[Trend]:
     version = readable_version(connection, vehicle)
-    _, _, last = rollups.rolled_extent(connection, "housekeeping", vehicle, version, 0, 0, LAST_TICKS)
+    _, _, last = rollups.rolled_extent(connection, rollups.KINDS["housekeeping"][0], vehicle, version, 0, 0, LAST_TICKS)
     if last == 0:
         return []
     first = max(last - (TREND_DAYS * 86_400 << 16), 0)
     span = PassSpan(vehicle, first, last, load_correlations(connection, vehicle), version)
-    reading = SeriesReading(connection, span, "housekeeping", 0, TREND_POINTS)
+    reading = SeriesReading(connection, span, KindSamples("housekeeping", version), TREND_POINTS)
     definition = DICTIONARY.packet("housekeeping")
     read = reading.series({name: definition.field(name).unit for name in PARAMETERS})
     trends = (trend_of(definition.field(one.name), one.buckets) for one in read)

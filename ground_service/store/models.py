@@ -356,6 +356,50 @@ SAMPLE_TABLES = (
 )
 
 
+class PacketDefinition(Base):
+    """Declarations of packets in mission descriptions, identified by their content.
+
+    `mission_id` is a revision that states them.
+    """
+
+    __tablename__ = "packet_definitions"
+    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    digest: Mapped[str] = mapped_column(String(64), unique=True)
+    mission_id: Mapped[int] = mapped_column(ForeignKey("missions.id"))
+
+
+class PacketDecoding(Base):
+    """Decoding of the packets of a vehicle with one definition.
+
+    Packets up to `decoded_to` are decoded. The values can be read when `complete` is 1: until then, those of an
+    earlier definition are read. `counts` contains numbers of packets by APID and outcome.
+    """
+
+    __tablename__ = "packet_decodings"
+    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"), primary_key=True)
+    definition_id: Mapped[int] = mapped_column(ForeignKey("packet_definitions.id"), primary_key=True)
+    decoded_to: Mapped[int] = mapped_column(BigInteger)
+    complete: Mapped[int] = mapped_column(Flag)
+    counts: Mapped[dict[str, Any]] = mapped_column(JSON)
+
+
+class ParameterSample(Base):
+    """Values of a packet decoded with a definition of the mission description.
+
+    `container` is the number of its container in the definition, `values` float64 numbers (little-endian) in the order
+    of `tmtc.xtce_series.packet_layouts`; `ticks` is the time in its secondary header.
+    """
+
+    __tablename__ = "parameter_samples"
+    __table_args__ = CLUSTERED
+    vehicle_id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
+    definition_id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
+    container: Mapped[int] = mapped_column(SmallInteger, primary_key=True, autoincrement=False)
+    ticks: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
+    packet_id: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
+    values: Mapped[bytes] = mapped_column(LargeBinary)
+
+
 class Rollup(Base):
     """Samples of one kind aggregated over a bucket of on-board time; see `store.rollups`."""
 

@@ -37,6 +37,9 @@ KINDS: dict[str, tuple[int, str | None, tuple[str, ...]]] = {
 }
 """Kinds of samples with roll-ups: code, the column that parts them, and the values (only ever added to at the end)."""
 
+PARAMETERS_CODE = 3
+"""Code of the values of packets that mission descriptions define; their parts are the numbers of their containers."""
+
 LEVELS = 7
 BASE_TICKS = 64 << 16
 """The shortest buckets are 64 s long, the longest 4^6 times that: three days."""
@@ -76,7 +79,6 @@ def add_to_rollups(
     """
     if kind not in KINDS or len(columns["ticks"]) == 0:
         return
-    hold(connection, f"rollups {vehicle_id}")
     code, part_column, names = KINDS[kind]
     ticks = np.asarray(columns["ticks"], dtype=np.int64)
     parts = (
@@ -85,42 +87,61 @@ def add_to_rollups(
         else np.asarray(columns[part_column], dtype=np.int64)
     )
     values = np.column_stack([np.asarray(columns[name], dtype=np.float64) for name in names])
+    chosen = {part: np.flatnonzero(parts == part) for part in np.unique(parts).tolist()}
+    samples = {part: (ticks[rows], values[rows]) for part, rows in chosen.items()}
+    add_values(connection, vehicle_id, dictionary_version, code, samples)
+
+
+def add_values(
+    connection: Connection,
+    vehicle_id: int,
+    version: int,
+    code: int,
+    samples: Mapping[int, tuple[IntArray, FloatArray]],
+) -> None:
+    """Add on-board times (n,) and values (n, v) of each part of a kind, as `add_to_rollups` does."""
+    hold(connection, f"rollups {vehicle_id}")
     found: list[tuple[dict[str, int], _Level]] = []
-    for part in np.unique(parts).tolist():
-        mine = parts == part
-        level_values = _buckets(ticks[mine], values[mine])
+    for part, (ticks, values) in samples.items():
+        level_values = _buckets(ticks, values)
         for level in range(LEVELS):
             if level:
                 level_values = _merged(*level_values, 4)
-            numbers = (vehicle_id, dictionary_version, code, part, level)
+            numbers = (vehicle_id, version, code, part, level)
             found.append((dict(zip(_KEY, numbers, strict=True)), level_values))
     _store(connection, found)
 
 
 def forget_rollups(connection: Connection, vehicle_id: int, dictionary_version: int) -> None:
     """Remove the roll-ups of one dictionary version, before its samples are decoded again."""
+    forget_values(connection, vehicle_id, dictionary_version, tuple(code for code, _, _ in KINDS.values()))
+
+
+def forget_values(connection: Connection, vehicle_id: int, version: int, codes: Sequence[int]) -> None:
+    """Remove the roll-ups of some kinds in one version."""
     connection.execute(
         delete(_TABLE).where(
-            _TABLE.c.vehicle_id == vehicle_id, _TABLE.c.dictionary_version == dictionary_version
+            _TABLE.c.vehicle_id == vehicle_id,
+            _TABLE.c.dictionary_version == version,
+            _TABLE.c.kind.in_(codes),
         )
     )
 
 
 def rollup_rows(
     connection: Connection,
-    kind: str,
+    code: int,
     vehicle_id: int,
     dictionary_version: int,
     part: int,
     level: int,
     first_bucket: int,
     last_bucket: int,
-    value: str,
+    index: int,
 ) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
     """First and last on-board time and number of samples (n,) of buckets, and the statistics (n, 4) of one value."""
-    code, _, names = KINDS[kind]
     length = STATISTICS * 8
-    wanted = func.substr(_TABLE.c.statistics, names.index(value) * length + 1, length, type_=LargeBinary)
+    wanted = func.substr(_TABLE.c.statistics, index * length + 1, length, type_=LargeBinary)
     rows = connection.execute(
         select(_TABLE.c.first_ticks, _TABLE.c.last_ticks, _TABLE.c.rows, wanted)
         .where(
@@ -143,7 +164,7 @@ def rollup_rows(
 
 def rolled_extent(
     connection: Connection,
-    kind: str,
+    code: int,
     vehicle_id: int,
     dictionary_version: int,
     part: int,
@@ -160,7 +181,7 @@ def rolled_extent(
         ).where(
             _TABLE.c.vehicle_id == vehicle_id,
             _TABLE.c.dictionary_version == dictionary_version,
-            _TABLE.c.kind == KINDS[kind][0],
+            _TABLE.c.kind == code,
             _TABLE.c.part == part,
             _TABLE.c.level == LEVELS - 1,
             _TABLE.c.bucket.between(start_ticks // width, stop_ticks // width),

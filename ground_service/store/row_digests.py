@@ -23,7 +23,14 @@ from sqlalchemy import Connection, LargeBinary, Table, text
 from ground_service.store import models
 
 BARE = frozenset(
-    {"packets", "audit", "audit_head", "row_digests", *(one.__tablename__ for one in models.SAMPLE_TABLES)}
+    {
+        "packets",
+        "parameter_samples",
+        "audit",
+        "audit_head",
+        "row_digests",
+        *(one.__tablename__ for one in models.SAMPLE_TABLES),
+    }
 )
 """Tables without digests: derived from raw files, or part of the audit chain."""
 

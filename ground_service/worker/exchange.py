@@ -45,7 +45,9 @@ BLOCK_OCTETS = 1 << 20
 EARLIER_REVISION = "0011"
 """Last schema revision before version 1.0; its tables can be exported."""
 
-DERIVED = frozenset({"rollups", "stream_edges", *(one.__tablename__ for one in SAMPLE_TABLES)})
+DERIVED = frozenset(
+    {"rollups", "parameter_samples", "stream_edges", *(one.__tablename__ for one in SAMPLE_TABLES)}
+)
 """Tables of an earlier revision that are not imported, because they are derived from the packets."""
 
 EARLIER_VALUES: dict[tuple[str, str], Any] = {

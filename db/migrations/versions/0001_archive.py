@@ -584,6 +584,52 @@ def upgrade() -> None:
     )
     op.create_index(op.f("ix_tokens_user_id"), "tokens", ["user_id"], unique=False)
     op.create_table(
+        "packet_definitions",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("digest", sa.String(length=64), nullable=False),
+        sa.Column("mission_id", sa.Integer(), nullable=False),
+        sa.ForeignKeyConstraint(
+            ["mission_id"], ["missions.id"], name=op.f("fk_packet_definitions_mission_id_missions")
+        ),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_packet_definitions")),
+        sa.UniqueConstraint("digest", name=op.f("uq_packet_definitions_digest")),
+    )
+    op.create_table(
+        "packet_decodings",
+        sa.Column("vehicle_id", sa.Integer(), nullable=False),
+        sa.Column("definition_id", sa.Integer(), nullable=False),
+        sa.Column("decoded_to", sa.BigInteger(), nullable=False),
+        sa.Column("complete", sa.SmallInteger(), nullable=False),
+        sa.Column("counts", sa.JSON(), nullable=False),
+        sa.ForeignKeyConstraint(
+            ["definition_id"],
+            ["packet_definitions.id"],
+            name=op.f("fk_packet_decodings_definition_id_packet_definitions"),
+        ),
+        sa.ForeignKeyConstraint(
+            ["vehicle_id"], ["vehicles.id"], name=op.f("fk_packet_decodings_vehicle_id_vehicles")
+        ),
+        sa.PrimaryKeyConstraint("vehicle_id", "definition_id", name=op.f("pk_packet_decodings")),
+    )
+    op.create_table(
+        "parameter_samples",
+        sa.Column("vehicle_id", sa.Integer(), autoincrement=False, nullable=False),
+        sa.Column("definition_id", sa.Integer(), autoincrement=False, nullable=False),
+        sa.Column("container", sa.SmallInteger(), autoincrement=False, nullable=False),
+        sa.Column("ticks", sa.BigInteger(), autoincrement=False, nullable=False),
+        sa.Column("packet_id", sa.BigInteger(), autoincrement=False, nullable=False),
+        sa.Column("values", sa.LargeBinary(), nullable=False),
+        sa.PrimaryKeyConstraint(
+            "vehicle_id",
+            "definition_id",
+            "container",
+            "ticks",
+            "packet_id",
+            name=op.f("pk_parameter_samples"),
+        ),
+        sqlite_with_rowid=False,
+    )
+    op.create_table(
         "passes",
         sa.Column("id", sa.Integer(), nullable=False),
         sa.Column("vehicle_id", sa.Integer(), nullable=False),
@@ -689,6 +735,10 @@ def downgrade() -> None:
     op.drop_table("reports")
     op.drop_table("pass_frames")
     op.drop_table("passes")
+    op.drop_table("parameter_samples")
+    op.drop_table("packet_decodings")
+    op.drop_table("packet_definitions")
+    op.drop_table("missions")
     op.drop_table("tokens")
     op.drop_table("telecommands")
     op.drop_table("missions")

@@ -61,7 +61,10 @@ def stored(ground: Ground, columns: dict[str, Any], batches: list[np.ndarray]) -
 def read(ground: Ground, vehicle: int, name: str, start: int, stop: int, points: int = 50) -> Any:
     with ground.database.reading() as connection:
         return series.SeriesReading(
-            connection, PassSpan(vehicle, start, stop, (), DICTIONARY.version), "navigation_states", 1, points
+            connection,
+            PassSpan(vehicle, start, stop, (), DICTIONARY.version),
+            series.KindSamples("navigation_states", DICTIONARY.version, 1),
+            points,
         ).series({name: ""})[0]
 
 

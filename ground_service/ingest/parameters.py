@@ -1,0 +1,149 @@
+"""Decoding of packets that the mission description defines, after they are stored, and again after a new revision.
+
+Each block of packets is one transaction with the note of the last packet, so a decoding that is cut off continues
+where it was. A new definition decodes all packets from the first one on. Until it has reached the last one, the values
+of the definition before it are read. Packets of APIDs without a definition stay stored as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from sqlalchemy import Connection
+
+from ground_service.ground import Ground
+from ground_service.missions import store as missions
+from ground_service.missions.definitions import PacketDefinitions, packet_definitions
+from ground_service.missions.model import EPOCH_TAI, PacketTime
+from ground_service.store import parameters, repository
+from ground_service.store.parameters import Decoding, StoredPackets
+from lunar.arrays import FloatArray, IntArray
+from lunar.timescales import (
+    NS,
+    ONBOARD_EPOCH_TAI_NS,
+    TICKS_PER_SECOND,
+    parse_utc,
+    tai_ns_from_utc_ns,
+    ticks_from_utc_ns,
+)
+from tmtc.cuc import NO_TICKS, TICKS_LIMIT
+from tmtc.packet_times import TimeCode, elapsed
+from tmtc.stream import Octets, PacketCut, whole_packets
+from tmtc.xtce_decode import VERDICTS
+from tmtc.xtce_series import series_matrix
+
+BLOCK_PACKETS = 20_000
+_DAY_NS = 86_400 * NS
+
+Samples = dict[int, tuple[IntArray, IntArray, FloatArray]]
+"""Times (n,), packet ids (n,) and values (n, v) by container number."""
+
+
+def decode_declared(ground: Ground, vehicle: int) -> int:
+    """Decode the packets of a vehicle that the definition in force has not decoded; return the number of samples."""
+    stored = 0
+    while True:
+        ground.check_stopping()
+        with ground.database.reading() as connection:
+            definitions, _ = definitions_in_force(connection, vehicle)
+            if not definitions.declared and parameters.readable_decoding(connection, vehicle) is None:
+                return stored
+        with ground.database.writing() as connection:
+            found = _next_block(connection, vehicle)
+        if found is None:
+            return stored
+        stored += found
+
+
+def definitions_in_force(connection: Connection, vehicle: int) -> tuple[PacketDefinitions, int]:
+    """Return the packets that the newest mission description of a spacecraft declares, and the id of its revision."""
+    spacecraft = repository.get(connection, repository.VEHICLES, vehicle, "vehicle")["ccsds_id"]
+    return definitions_of_spacecraft(connection, int(spacecraft))
+
+
+def definitions_of_spacecraft(connection: Connection, spacecraft: int) -> tuple[PacketDefinitions, int]:
+    """As `definitions_in_force`, by spacecraft id."""
+    mission_id = missions.newest_of_spacecraft(connection, spacecraft)
+    if mission_id is None:
+        return PacketDefinitions("", ()), 0
+    return packet_definitions(missions.get_mission(connection, mission_id)), mission_id
+
+
+def _next_block(connection: Connection, vehicle: int) -> int | None:
+    """Decode the next packets; None if none are left."""
+    parameters.lock_vehicle(connection, vehicle)
+    definitions, mission_id = definitions_in_force(connection, vehicle)
+    if not definitions.declared:
+        parameters.forget_others(connection, vehicle, None)
+        return None
+    definition = parameters.definition_id(connection, definitions.digest, mission_id)
+    progress = parameters.decoding(connection, vehicle, definition)
+    if progress is None:
+        progress = parameters.begin(connection, vehicle, definition)
+    packets = parameters.packets_after(
+        connection, vehicle, progress.decoded_to, definitions.apids, BLOCK_PACKETS
+    )
+    if not packets.ids:
+        end = replace(progress, decoded_to=parameters.last_packet(connection, vehicle), complete=True)
+        if end != progress:
+            parameters.change(connection, vehicle, end)
+        parameters.forget_others(connection, vehicle, definition)
+        return None
+    samples, counts = decoded_values(definitions, packets)
+    stored = parameters.store_values(connection, vehicle, definition, samples)
+    parameters.change(connection, vehicle, _with_counts(progress, packets.ids[-1], counts))
+    return stored
+
+
+def _with_counts(progress: Decoding, decoded_to: int, counts: dict[int, dict[str, int]]) -> Decoding:
+    merged = {apid: dict(found) for apid, found in progress.counts.items()}
+    for apid, found in counts.items():
+        mine = merged.setdefault(str(apid), {})
+        for verdict, number in found.items():
+            mine[verdict] = mine.get(verdict, 0) + number
+    return replace(progress, decoded_to=decoded_to, counts=merged)
+
+
+def decoded_values(
+    definitions: PacketDefinitions, packets: StoredPackets
+) -> tuple[Samples, dict[int, dict[str, int]]]:
+    """Return the values of packets, and the number of packets by APID and outcome of decoding."""
+    apids = np.array(packets.apids, dtype=np.int64)
+    ids = np.array(packets.ids, dtype=np.int64)
+    samples: Samples = {}
+    counts: dict[int, dict[str, int]] = {}
+    for declared in definitions.declared:
+        rows = np.flatnonzero(np.isin(apids, declared.source.apids))
+        if declared.decoder is None or not rows.size:
+            continue
+        octets = [packets.octets[row] for row in rows.tolist()]
+        buffer = b"".join(octets)
+        cut = whole_packets(np.array([len(one) for one in octets], dtype=np.int64))
+        found = declared.decoder.decode(buffer, cut)
+        ticks = packet_times(buffer, cut, declared.source.time)
+        numbers = declared.numbers
+        for name, table in found.tables.items():
+            index = table.packet_index
+            values = series_matrix(table, declared.layouts[name])
+            samples[numbers[name]] = (ticks[index], ids[rows][index], values)
+        for apid in np.unique(apids[rows]).tolist():
+            outcome = np.bincount(found.verdict[apids[rows] == apid], minlength=len(VERDICTS))
+            counts[apid] = {VERDICTS[k]: int(outcome[k]) for k in np.flatnonzero(outcome).tolist()}
+    return samples, counts
+
+
+def packet_times(buffer: Octets, cut: PacketCut, time: PacketTime | None) -> IntArray:
+    """Return the on-board time (n,) of packets as ticks; `NO_TICKS` where a packet has none that is possible."""
+    if time is None:
+        return np.full(len(cut), NO_TICKS, dtype=np.int64)
+    code = TimeCode(time.code, time.offset, time.whole_octets, time.fraction_octets, time.p_field)
+    whole, part, known = elapsed(buffer, cut.offsets, cut.lengths, code)
+    epoch_ns = parse_utc(time.epoch.removesuffix(EPOCH_TAI))
+    if time.code == "cds":
+        ticks = np.asarray(ticks_from_utc_ns(epoch_ns + whole * _DAY_NS + part))
+    else:
+        epoch_tai_ns = epoch_ns if time.epoch.endswith(EPOCH_TAI) else int(tai_ns_from_utc_ns(epoch_ns))
+        since = (epoch_tai_ns - ONBOARD_EPOCH_TAI_NS) * TICKS_PER_SECOND // NS
+        ticks = whole * TICKS_PER_SECOND + part + since
+    return np.where(known & (ticks >= 0) & (ticks < TICKS_LIMIT), ticks, NO_TICKS)

@@ -1,0 +1,250 @@
+"""SQL of packets that mission descriptions define: definitions, progress of decoding, and values."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection, LargeBinary, delete, func, select, update
+
+from ground_service.store import repository, rollups
+from ground_service.store.bulk import insert_columns
+from lunar.arrays import FloatArray, IntArray
+from tmtc.cuc import NO_TICKS
+
+_DEFINITIONS = repository.PACKET_DEFINITIONS
+_DECODINGS = repository.PACKET_DECODINGS
+_SAMPLES = repository.PARAMETER_SAMPLES
+_PACKETS = repository.PACKETS
+
+VALUE = np.dtype("<f8")
+"""Form of a stored value."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decoding:
+    """Progress of a definition for a vehicle: see `models.PacketDecoding`."""
+
+    definition_id: int
+    decoded_to: int
+    complete: bool
+    counts: dict[str, dict[str, int]]
+
+
+@dataclass(frozen=True, slots=True)
+class StoredPackets:
+    """Packets by their ids, in this order."""
+
+    ids: list[int]
+    apids: list[int]
+    octets: list[bytes]
+
+
+def definition_id(connection: Connection, digest: str, mission_id: int) -> int:
+    """Return the id of a definition; add it if it is new."""
+    found = repository.find(connection, _DEFINITIONS, digest=digest)
+    if found is None:
+        repository.add_new(connection, _DEFINITIONS, digest=digest, mission_id=mission_id)
+        found = repository.find(connection, _DEFINITIONS, digest=digest)
+        assert found is not None
+    return int(found["id"])
+
+
+def mission_of_definition(connection: Connection, definition: int) -> int:
+    """Return the id of a mission revision that states a definition."""
+    return int(repository.get(connection, _DEFINITIONS, definition, "packet definition")["mission_id"])
+
+
+def lock_vehicle(connection: Connection, vehicle: int) -> None:
+    """Wait until packets of a vehicle that other transactions are storing are stored, and keep others out."""
+    table = repository.VEHICLES
+    connection.execute(select(table.c.id).where(table.c.id == vehicle).with_for_update())
+
+
+def decoding(connection: Connection, vehicle: int, definition: int) -> Decoding | None:
+    """Return the progress of a definition, None if it has not begun."""
+    row = repository.find(connection, _DECODINGS, vehicle_id=vehicle, definition_id=definition)
+    return None if row is None else _decoding(row)
+
+
+def readable_decoding(connection: Connection, vehicle: int) -> Decoding | None:
+    """Return the definition that the values of a vehicle are read with, None if there is none yet."""
+    row = repository.find(connection, _DECODINGS, vehicle_id=vehicle, complete=1)
+    return None if row is None else _decoding(row)
+
+
+def begin(connection: Connection, vehicle: int, definition: int) -> Decoding:
+    """Begin decoding with a definition."""
+    repository.add(
+        connection,
+        _DECODINGS,
+        vehicle_id=vehicle,
+        definition_id=definition,
+        decoded_to=0,
+        complete=0,
+        counts={},
+    )
+    return Decoding(definition, 0, False, {})
+
+
+def change(connection: Connection, vehicle: int, progress: Decoding) -> None:
+    """Store the progress of a definition."""
+    connection.execute(
+        update(_DECODINGS)
+        .where(_DECODINGS.c.vehicle_id == vehicle, _DECODINGS.c.definition_id == progress.definition_id)
+        .values(decoded_to=progress.decoded_to, complete=int(progress.complete), counts=dict(progress.counts))
+    )
+
+
+def forget_others(connection: Connection, vehicle: int, definition: int | None) -> None:
+    """Remove what other definitions than this one have decoded from the packets of a vehicle."""
+    others = select(_DECODINGS.c.definition_id).where(_DECODINGS.c.vehicle_id == vehicle)
+    if definition is not None:
+        others = others.where(_DECODINGS.c.definition_id != definition)
+    for other in connection.execute(others).scalars().all():
+        mine = (_SAMPLES.c.vehicle_id == vehicle, _SAMPLES.c.definition_id == other)
+        connection.execute(delete(_SAMPLES).where(*mine))
+        rollups.forget_values(connection, vehicle, other, (rollups.PARAMETERS_CODE,))
+        connection.execute(
+            delete(_DECODINGS).where(_DECODINGS.c.vehicle_id == vehicle, _DECODINGS.c.definition_id == other)
+        )
+
+
+def packets_after(
+    connection: Connection, vehicle: int, packet_id: int, apids: Collection[int], limit: int
+) -> StoredPackets:
+    """Return the next packets of these APIDs, in the order of their ids."""
+    query = (
+        select(_PACKETS.c.id, _PACKETS.c.apid, _PACKETS.c.octets)
+        .where(
+            _PACKETS.c.vehicle_id == vehicle,
+            _PACKETS.c.id > packet_id,
+            _PACKETS.c.apid.in_(sorted(apids)),
+        )
+        .order_by(_PACKETS.c.id)
+        .limit(limit)
+    )
+    return _stored(connection.execute(query).all())
+
+
+def last_packet(connection: Connection, vehicle: int) -> int:
+    """Return the largest id of a packet of a vehicle, 0 without any."""
+    query = select(func.max(_PACKETS.c.id)).where(_PACKETS.c.vehicle_id == vehicle)
+    return int(connection.execute(query).scalar() or 0)
+
+
+def store_values(
+    connection: Connection,
+    vehicle: int,
+    definition: int,
+    samples: Mapping[int, tuple[IntArray, IntArray, FloatArray]],
+) -> int:
+    """Store times (n,), packet ids (n,) and values (n, v) by container number; return the number of samples."""
+    timed: dict[int, tuple[IntArray, FloatArray]] = {}
+    stored = 0
+    for container, (ticks, packet_ids, values) in sorted(samples.items()):
+        order = np.lexsort((packet_ids, ticks))
+        rows = np.ascontiguousarray(values[order], dtype=VALUE)
+        stored += insert_columns(
+            connection,
+            _SAMPLES,
+            {
+                "vehicle_id": np.full(len(order), vehicle),
+                "definition_id": np.full(len(order), definition),
+                "container": np.full(len(order), container),
+                "ticks": ticks[order],
+                "packet_id": packet_ids[order],
+                "values": [row.tobytes() for row in rows],
+            },
+        )
+        known = np.flatnonzero(ticks != NO_TICKS)
+        if known.size and values.shape[1]:
+            timed[container] = (ticks[known], values[known])
+    if timed:
+        rollups.add_values(connection, vehicle, definition, rollups.PARAMETERS_CODE, timed)
+    return stored
+
+
+def read_values(
+    connection: Connection,
+    vehicle: int,
+    definition: int,
+    container: int,
+    start_ticks: int,
+    stop_ticks: int,
+    indices: Sequence[int],
+) -> tuple[IntArray, FloatArray]:
+    """Return times (n,) and values (n, v) of some places of a container between two times (both included)."""
+    size = VALUE.itemsize
+    wanted = [
+        func.substr(_SAMPLES.c["values"], index * size + 1, size, type_=LargeBinary) for index in indices
+    ]
+    query = (
+        select(_SAMPLES.c.ticks, *wanted)
+        .where(*_between(vehicle, definition, container, start_ticks, stop_ticks))
+        .order_by(_SAMPLES.c.ticks, _SAMPLES.c.packet_id)
+    )
+    rows = connection.execute(query).all()
+    ticks = np.array([row[0] for row in rows], dtype=np.int64)
+    octets = b"".join(bytes(value) for row in rows for value in row[1:])
+    return ticks, np.frombuffer(octets, VALUE).reshape(len(rows), len(indices)).astype(np.float64)
+
+
+def sampled_containers(
+    connection: Connection, vehicle: int, definition: int, start_ticks: int, stop_ticks: int
+) -> dict[int, int]:
+    """Return the number of packets of each container between two times, by container number."""
+    query = (
+        select(_SAMPLES.c.container, func.count())
+        .where(
+            _SAMPLES.c.vehicle_id == vehicle,
+            _SAMPLES.c.definition_id == definition,
+            _SAMPLES.c.ticks.between(start_ticks, stop_ticks),
+        )
+        .group_by(_SAMPLES.c.container)
+    )
+    return {int(container): int(count) for container, count in connection.execute(query)}
+
+
+def packets_of_container(
+    connection: Connection,
+    vehicle: int,
+    definition: int,
+    container: int,
+    start_ticks: int,
+    stop_ticks: int,
+    limit: int,
+) -> tuple[IntArray, StoredPackets]:
+    """Return times (n,) and packets of a container between two times, in order of time."""
+    query = (
+        select(_SAMPLES.c.ticks, _PACKETS.c.id, _PACKETS.c.apid, _PACKETS.c.octets)
+        .join(_PACKETS, _PACKETS.c.id == _SAMPLES.c.packet_id)
+        .where(*_between(vehicle, definition, container, start_ticks, stop_ticks))
+        .order_by(_SAMPLES.c.ticks, _SAMPLES.c.packet_id)
+        .limit(limit)
+    )
+    rows = connection.execute(query).all()
+    return np.array([row[0] for row in rows], dtype=np.int64), _stored([row[1:] for row in rows])
+
+
+def _between(
+    vehicle: int, definition: int, container: int, start_ticks: int, stop_ticks: int
+) -> tuple[Any, ...]:
+    return (
+        _SAMPLES.c.vehicle_id == vehicle,
+        _SAMPLES.c.definition_id == definition,
+        _SAMPLES.c.container == container,
+        _SAMPLES.c.ticks.between(start_ticks, stop_ticks),
+    )
+
+
+def _decoding(row: repository.Row) -> Decoding:
+    return Decoding(row["definition_id"], row["decoded_to"], bool(row["complete"]), row["counts"])
+
+
+def _stored(rows: Sequence[Any]) -> StoredPackets:
+    return StoredPackets(
+        [int(row[0]) for row in rows], [int(row[1]) for row in rows], [bytes(row[2]) for row in rows]
+    )
