@@ -6,7 +6,7 @@ channel edges, so that they can be joined with those of other runs, also from ot
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -144,6 +144,15 @@ class ChannelEdge:
     edge: Edge
 
 
+UncheckedApids = Callable[[int], frozenset[int]]
+"""APIDs of a spacecraft whose packets do not end with a checksum."""
+
+
+def all_checked(_spacecraft_id: int) -> frozenset[int]:
+    """Return no APIDs: all packets end with a checksum."""
+    return frozenset()
+
+
 @dataclass(slots=True)
 class ChannelReader:
     """Reader of the packets of all channels of one stream, one block of frames at a time.
@@ -152,6 +161,7 @@ class ChannelReader:
     """
 
     dictionary: Dictionary
+    unchecked_apids: UncheckedApids = all_checked
     edges: list[ChannelEdge] = field(default_factory=list)
     packets: int = 0
     crc_errors: int = 0
@@ -176,7 +186,7 @@ class ChannelReader:
                 filled += len(octets)
         buffer = b"".join(bytes(part) for part in parts)
         used = np.array(segments, dtype=np.int64).reshape(-1, 2)
-        cut = cut_packets(buffer, segments=used)
+        cut = cut_packets(buffer, segments=used, unchecked_apids=self.unchecked_apids(spacecraft_id))
         self.packets += int(np.count_nonzero(cut.crc_ok))
         self.crc_errors += cut.crc_errors
         self.octets_unused += _not_in_packets(used, cut)

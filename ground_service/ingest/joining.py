@@ -31,6 +31,8 @@ from ground_service.ingest.frames import (
     ChannelEdge,
     ChannelReader,
     FrameBlock,
+    UncheckedApids,
+    all_checked,
     is_checked,
     marker_errors,
     packets_end,
@@ -49,7 +51,7 @@ from tmtc.dictionary import DICTIONARY
 from tmtc.link import LinkSettings
 from tmtc.packets import IDLE_APID, PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH
 from tmtc.randomiser import randomise
-from tmtc.stream import cut_packets
+from tmtc.stream import whole_packets
 
 OctetArray = NDArray[np.uint8]
 
@@ -120,6 +122,7 @@ class Joiner:
     ground: Ground
     piece: Piece
     vehicles: dict[int, int]
+    unchecked_apids: UncheckedApids = all_checked
     joined: Joined = field(default_factory=Joined)
     _channels: list[tuple[str, bytes]] = field(default_factory=list)
     _raw: list[tuple[Link, list[bytes]]] = field(default_factory=list)
@@ -192,8 +195,8 @@ class Joiner:
             found.used, found.parts = {}, []
         batches = {}
         for spacecraft, packets in found.packets.items():
-            octets = b"".join(packets)
-            batches[spacecraft] = batch_of_cut(octets, cut_packets(octets), DICTIONARY, spacecraft)
+            cut = whole_packets(np.array([len(one) for one in packets], dtype=np.int64))
+            batches[spacecraft] = batch_of_cut(b"".join(packets), cut, DICTIONARY, spacecraft)
         waiting: list[bytes] = []
         with self.ground.database.writing() as connection:
             store.use_edges(connection, found.used.values(), found.parts)
@@ -352,7 +355,7 @@ class Joiner:
             known = spacecraft in self.vehicles or spacecraft in self._found.packets
             if not is_checked(block.settings) and not (known and block.frames[index, 4] >> 3 == 0b00011):
                 continue
-            reader = ChannelReader(DICTIONARY)
+            reader = ChannelReader(DICTIONARY, self.unchecked_apids)
             buffer, cut = reader.cut(block.only(index), spacecraft)
             reader.close()
             self._found.packets.setdefault(spacecraft, []).extend(cut.packets(buffer))
@@ -379,8 +382,9 @@ class Joiner:
         """Join the packet that an edge of a channel belongs to."""
         for path in self._channel_paths(connection, domain, edge):
             octets = b"".join(one.edge.octets for one in path)
-            if _is_packet(octets):
-                self._found.packets.setdefault(self._spacecraft_of(domain), []).append(octets)
+            spacecraft = self._spacecraft_of(domain)
+            if _is_packet(octets, self.unchecked_apids(spacecraft)):
+                self._found.packets.setdefault(spacecraft, []).append(octets)
             elif not _is_even_idle(octets):
                 continue
             self._use(path)
@@ -473,7 +477,10 @@ class Joiner:
         assert self.piece.spacecraft_id is not None
         end = begin
         packets = []
-        while (length := _packet_length(stream, end)) and _is_packet_or_idle(stream[end : end + length]):
+        unchecked = self.unchecked_apids(self.piece.spacecraft_id)
+        while (length := _packet_length(stream, end)) and _is_packet_or_idle(
+            stream[end : end + length], unchecked
+        ):
             packets.append(stream[end : end + length])
             end += length
         if end == begin:
@@ -514,7 +521,7 @@ class Joiner:
         if left and last.file_sha256 is not None:
             rest = last.edge.octets[-left:]
             end = packets_end(rest, 0, len(rest))
-            if _is_packet(rest[:end]):
+            if _is_packet(rest[:end], self.unchecked_apids(self.piece.spacecraft_id)):
                 packets.append(rest[:end])
             start = (last.edge.start or 0) + len(last.edge.octets) - left + end
             opener_edge = Edge(OPENER, UNKNOWN, UNKNOWN, rest[end:], start)
@@ -542,10 +549,15 @@ class Joiner:
                 ends[missing] = self._candidates(connection, domain, CLOSER, fit=fit)
             return ends[missing]
 
+        unchecked = (
+            all_checked(0)
+            if self.piece.spacecraft_id is None
+            else self.unchecked_apids(self.piece.spacecraft_id)
+        )
         if edge.edge.role != MIDDLE:
             for closer in closers(opener.edge.fit):
                 octets = opener.edge.octets + closer.edge.octets
-                if _is_packet(octets):
+                if _is_packet(octets, unchecked):
                     return [opener, closer], octets
         for chosen in islice(_orders(middles, edge), ARRANGEMENTS_LIMIT):
             octets = opener.edge.octets + b"".join(one.edge.octets for one in chosen)
@@ -556,12 +568,12 @@ class Joiner:
             if missing == 0:
                 whole = octets[: int.from_bytes(octets[4:6], "big") + PRIMARY_HEADER_LENGTH + 1]
                 enough = edge.edge.role != CLOSER and len(whole) > held
-                if enough and _is_packet(whole) and _goes_on(whole, octets[len(whole) :]):
+                if enough and _is_packet(whole, unchecked) and _goes_on(whole, octets[len(whole) :]):
                     return [opener, *chosen], whole
             else:
                 for closer in closers(missing):
                     whole = octets + closer.edge.octets
-                    if _is_packet(whole):
+                    if _is_packet(whole, unchecked):
                         return [opener, *chosen, closer], whole
         return None
 
@@ -700,14 +712,13 @@ def _packet_length(octets: bytes, start: int) -> int:
     return length if start + length <= len(octets) else 0
 
 
-def _is_packet(octets: bytes) -> bool:
-    """Return whether these octets are one telemetry packet with a valid checksum."""
-    return (
-        len(octets) > PRIMARY_HEADER_LENGTH + 2
-        and _packet_length(octets, 0) == len(octets)
-        and not _is_idle(octets)
-        and crc16(octets) == 0
-    )
+def _is_packet(octets: bytes, unchecked: frozenset[int]) -> bool:
+    """Return whether these octets are one telemetry packet, with a valid checksum unless its APID is `unchecked`."""
+    if len(octets) <= PRIMARY_HEADER_LENGTH or _packet_length(octets, 0) != len(octets) or _is_idle(octets):
+        return False
+    if int.from_bytes(octets[:2], "big") & 0x7FF in unchecked:
+        return True
+    return len(octets) > PRIMARY_HEADER_LENGTH + 2 and crc16(octets) == 0
 
 
 def _is_idle(octets: bytes) -> bool:
@@ -720,5 +731,5 @@ def _is_even_idle(octets: bytes) -> bool:
     return _packet_length(octets, 0) == len(octets) and _is_idle(octets) and fill == fill[:1] * len(fill)
 
 
-def _is_packet_or_idle(octets: bytes) -> bool:
-    return _is_packet(octets) or _is_even_idle(octets)
+def _is_packet_or_idle(octets: bytes, unchecked: frozenset[int]) -> bool:
+    return _is_packet(octets, unchecked) or _is_even_idle(octets)

@@ -20,7 +20,7 @@ from ground_service.store import repository
 from ground_service.store.rollups import forget_rollups
 from tmtc.dictionary import DICTIONARY
 from tmtc.schema import Dictionary
-from tmtc.stream import cut_packets
+from tmtc.stream import whole_packets
 
 BLOCK_PACKETS = 20_000
 
@@ -148,7 +148,8 @@ def _block(connection: Connection, row: repository.Row, dictionary: Dictionary) 
         repository.change(connection, repository.VEHICLES, vehicle, **ended)
         return None
     buffer = b"".join(bytes(octets) for _, octets in block)
-    batch = batch_of_cut(buffer, cut_packets(buffer), dictionary)
+    cut = whole_packets(np.array([len(octets) for _, octets in block], dtype=np.int64))
+    batch = batch_of_cut(buffer, cut, dictionary)
     ids = np.array([key for key, _ in block], dtype=np.int64)
     rows = store_samples(connection, vehicle, dictionary.version, batch.rows, ids)
     repository.change(connection, repository.VEHICLES, vehicle, redecoded_to=int(ids[-1]))

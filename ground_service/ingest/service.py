@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from sqlalchemy import Connection
 
 from ground_service.clock import utc_now_ns
@@ -20,6 +21,7 @@ from ground_service.ingest import edge_store as edges
 from ground_service.ingest.frames import ChannelEdge, is_checked
 from ground_service.ingest.joining import Joiner
 from ground_service.ingest.packets import PacketBatch
+from ground_service.ingest.parameters import decode_declared, definitions_of_spacecraft
 from ground_service.ingest.redecode import catch_up
 from ground_service.ingest.store import store_batch
 from ground_service.ingest.stream import (
@@ -34,6 +36,7 @@ from ground_service.ingest.stream import (
     reaches_of,
 )
 from ground_service.jobs.service import OTHER_REQUEST, add_job
+from ground_service.missions.definitions import PacketDefinitions
 from ground_service.store import repository
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile, mapped_octets, read_blocks
@@ -310,6 +313,7 @@ def _read_piece(
             )
     for vehicle in reading.vehicles.values():
         catch_up(ground, vehicle)
+        decode_declared(ground, vehicle)
     return reading.result()
 
 
@@ -337,10 +341,21 @@ class _Reading:
         self.spacecraft_id = piece.spacecraft_id
         self.progress = progress
         self.vehicles: dict[int, int] = {} if vehicles is None else vehicles
-        self.joiner = Joiner(ground, piece, self.vehicles)
+        self.definitions: dict[int, PacketDefinitions] = {}
+        self.joiner = Joiner(ground, piece, self.vehicles, self._unchecked_apids)
         self.new = self.unknown = 0
         self.ticks: list[int] = []
         self.accounting = LinkAccounting(octets=piece.octets, octets_skipped=piece.octets)
+
+    def _definitions(self, spacecraft: int) -> PacketDefinitions:
+        """Return the packets that the mission description of a spacecraft declares."""
+        if spacecraft not in self.definitions:
+            with self.ground.database.reading() as connection:
+                self.definitions[spacecraft] = definitions_of_spacecraft(connection, spacecraft)[0]
+        return self.definitions[spacecraft]
+
+    def _unchecked_apids(self, spacecraft: int) -> frozenset[int]:
+        return self._definitions(spacecraft).unchecked_apids
 
     def read(self) -> list[edges.Piece]:
         """Read and join the piece; return the pieces that can be read now because its link is known."""
@@ -378,7 +393,10 @@ class _Reading:
         candidates = [*known, *(link for link in DEFAULT_LINKS if link not in known)]
         octets = mapped_octets(self.ground.files.path(self.piece.file_sha256))
         try:
-            reaches, _ = reaches_of(octets, candidates)
+            unchecked = frozenset[int]()
+            if self.spacecraft_id is not None:
+                unchecked = self._unchecked_apids(self.spacecraft_id)
+            reaches, _ = reaches_of(octets, candidates, unchecked_apids=unchecked)
         except UnknownCoding as error:
             source = _name(self.ground, self.piece.file_sha256)
             raise InvalidInput(source, "", error.expected, error.found) from error
@@ -388,7 +406,7 @@ class _Reading:
         """Read the sections of the file and store their packets and edges."""
         self.accounting = LinkAccounting()
         for reach in reaches:
-            reader = DownlinkReader(reach, self.spacecraft_id)
+            reader = DownlinkReader(reach, self.spacecraft_id, unchecked_apids=self._unchecked_apids)
             last = self._store_batches(reader)
             with self.ground.database.writing() as connection:
                 self._store(connection, last)
@@ -437,7 +455,8 @@ class _Reading:
         stored = store_batch(connection, vehicle, found.packets)
         self.new += stored.new
         edges.count_stored(connection, self.piece.ingest_id, stored.new, stored.samples, joined=False)
-        self.unknown += found.packets.unknown
+        defined = np.isin(found.packets.apid, self._definitions(found.packets.spacecraft_id).apids)
+        self.unknown += found.packets.unknown - int(np.count_nonzero(defined))
         timed = found.packets.ticks[found.packets.ticks != NO_TICKS]
         if timed.size:
             self.ticks = [min([*self.ticks, int(timed.min())]), max([*self.ticks, int(timed.max())])]

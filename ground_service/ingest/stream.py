@@ -18,6 +18,8 @@ from ground_service.ingest.frames import (
     ChannelEdge,
     ChannelReader,
     FrameBlock,
+    UncheckedApids,
+    all_checked,
     control_words,
     frames_of,
     is_checked,
@@ -124,6 +126,8 @@ class DownlinkReader:
     spacecraft_id
         Only frames of this spacecraft are used; None: those of every spacecraft in the stream. Bare packets carry no
         spacecraft id.
+    unchecked_apids
+        APIDs of each spacecraft whose packets do not end with a checksum.
     """
 
     def __init__(
@@ -132,6 +136,7 @@ class DownlinkReader:
         spacecraft_id: int | None = None,
         dictionary: Dictionary = DICTIONARY,
         window_octets: int = WINDOW_OCTETS,
+        unchecked_apids: UncheckedApids = all_checked,
     ) -> None:
         self.accounting = LinkAccounting()
         self.reach = reach
@@ -139,7 +144,8 @@ class DownlinkReader:
         self._spacecraft_id = spacecraft_id
         self._dictionary = dictionary
         self._window_octets = window_octets
-        self._channels = ChannelReader(dictionary)
+        self._channels = ChannelReader(dictionary, unchecked_apids)
+        self._unchecked = all_checked(0) if spacecraft_id is None else unchecked_apids(spacecraft_id)
         self._last_words: dict[int, NDArray[np.uint32]] = {}
         self._believed: set[int] = set()
         self._held: OctetArray = np.empty(0, dtype=np.uint8)
@@ -169,7 +175,7 @@ class DownlinkReader:
 
     def _packets(self, window: bytes, final: bool) -> tuple[bytes, PacketBatch]:
         """Return the remaining octets and the packets of a window of bare packets."""
-        cut = cut_packets(window, final=final)
+        cut = cut_packets(window, final=final, unchecked_apids=self._unchecked)
         if not self._located and (len(cut) or final):
             self._located = True
             head = int(cut.skipped[0, 1]) if len(cut.skipped) and cut.skipped[0, 0] == 0 else 0
@@ -292,6 +298,7 @@ def reaches_of(
     *,
     stated: LinkSettings | None = None,
     dictionary: Dictionary = DICTIONARY,
+    unchecked_apids: frozenset[int] = frozenset(),
 ) -> tuple[list[Reach], LinkPlan | None]:
     """Return the sections of a stream and the plan they follow from; no sections without sufficient evidence.
 
@@ -303,6 +310,8 @@ def reaches_of(
         Links that the stream is expected to have.
     stated
         Settings that are used without evidence.
+    unchecked_apids
+        APIDs whose packets do not end with a checksum, in a stream of bare packets.
 
     Raises
     ------
@@ -323,6 +332,11 @@ def reaches_of(
         return [Reach(Link(one.settings), one.start, one.stop, size) for one in plan.sections], plan
     if _has_packets(octets, BARE in known):
         return [Reach(BARE, 0, size, size)], plan
+    if unchecked_apids:
+        cut = cut_packets(octets[:WINDOW_OCTETS], unchecked_apids=unchecked_apids)
+        packets = cut.lengths[cut.crc_ok]
+        if packets.size >= 2 and 2 * int(packets.sum()) >= min(size, WINDOW_OCTETS):
+            return [Reach(BARE, 0, size, size)], plan
     return [], plan
 
 

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection, Table, and_, func, select, text
 
@@ -28,7 +29,7 @@ from ground_service.store.files import FileArchive, StoredFile, read_blocks
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import TmtcError
 from tmtc.packets import PRIMARY_HEADER_LENGTH
-from tmtc.stream import cut_packets
+from tmtc.stream import whole_packets
 
 BLOCK_PACKETS = 20_000
 LIMIT_OF_A_KIND = 200
@@ -298,7 +299,8 @@ def _decode_again(connection: Connection, scratch: Ground, found: _Findings) -> 
             last = int(block[-1][0])
             whole = [bytes(octets) for key, digest, octets in block if _whole(key, digest, octets, found)]
             buffer = b"".join(whole)
-            batch = batch_of_cut(buffer, cut_packets(buffer), DICTIONARY, int(row["ccsds_id"]))
+            cut = whole_packets(np.array([len(octets) for octets in whole], dtype=np.int64))
+            batch = batch_of_cut(buffer, cut, DICTIONARY, int(row["ccsds_id"]))
             with scratch.database.writing() as writing:
                 store_batch(writing, copy, batch)
 

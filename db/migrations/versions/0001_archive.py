@@ -738,7 +738,6 @@ def downgrade() -> None:
     op.drop_table("parameter_samples")
     op.drop_table("packet_decodings")
     op.drop_table("packet_definitions")
-    op.drop_table("missions")
     op.drop_table("tokens")
     op.drop_table("telecommands")
     op.drop_table("missions")
