@@ -64,8 +64,16 @@ _DECODED = select(repository.VEHICLES.c.id, repository.VEHICLES.c.decoded_versio
     repository.VEHICLES.c.id
 )
 
+_DECLARED = select(
+    repository.PACKET_DECODINGS.c.vehicle_id,
+    repository.PACKET_DECODINGS.c.definition_id,
+    repository.PACKET_DECODINGS.c.decoded_to,
+    repository.PACKET_DECODINGS.c.complete,
+).order_by(repository.PACKET_DECODINGS.c.vehicle_id, repository.PACKET_DECODINGS.c.definition_id)
+
 
 def _state(connection: Connection) -> Hashable:
     """What answers depend on: everything else of the archive is never changed."""
     newest = tuple(connection.execute(_NEWEST).one())
-    return (*newest, *(tuple(row) for row in connection.execute(_DECODED)))
+    decoded = [tuple(row) for query in (_DECODED, _DECLARED) for row in connection.execute(query)]
+    return (*newest, *decoded)

@@ -26,6 +26,7 @@ from ground_service.passes.model import (
     Trend,
 )
 from ground_service.passes.packet_accounting import packet_accounting
+from ground_service.passes.parameters import series_source
 from ground_service.passes.series import PARAMETERS, STATE_VALUES, KindSamples, Series, SeriesReading, series_document
 from ground_service.passes.span import PassSpan, pass_span
 from ground_service.passes.store import detection_frames, detection_samples, event_list
@@ -230,8 +231,7 @@ def _state_series(
 
 
 def parameter_series(ground: Ground, pass_id: int, parameter: str, max_points: int) -> Series:
-    """The series of one housekeeping parameter of a pass."""
-    _check_parameter(parameter)
+    """The series of one parameter of a pass."""
     with ground.database.reading() as connection:
         record = repository.get(connection, repository.PASSES, pass_id, "pass")
         return _parameter_series(connection, pass_span(connection, record), parameter, max_points)
@@ -239,7 +239,6 @@ def parameter_series(ground: Ground, pass_id: int, parameter: str, max_points: i
 
 def parameter_document(ground: Ground, pass_id: int, parameter: str, max_points: int) -> bytes:
     """As `parameter_series`, as JSON, kept until something is new."""
-    _check_parameter(parameter)
     with ground.database.reading() as connection:
         record = repository.get(connection, repository.PASSES, pass_id, "pass")
 
@@ -251,9 +250,8 @@ def parameter_document(ground: Ground, pass_id: int, parameter: str, max_points:
 
 
 def _parameter_series(connection: Connection, span: PassSpan, parameter: str, max_points: int) -> Series:
-    source = KindSamples("housekeeping", span.dictionary_version)
-    reading = SeriesReading(connection, span, source, max_points)
-    return reading.series({parameter: DICTIONARY.packet("housekeeping").field(parameter).unit})[0]
+    source, own_span, name, unit = series_source(connection, span, parameter)
+    return SeriesReading(connection, own_span, source, max_points).series({name: unit})[0]
 
 
 def _json(document: Mapping[str, Any]) -> bytes:
@@ -270,8 +268,7 @@ def trend_series(
     start_utc_ns: int | None = None,
     stop_utc_ns: int | None = None,
 ) -> Series:
-    """The series of one housekeeping parameter of a spacecraft over any span, all there is by default."""
-    _check_parameter(parameter)
+    """The series of one parameter of a spacecraft over any span, all there is by default."""
     with ground.database.reading() as connection:
         vehicle = repository.find(connection, repository.VEHICLES, ccsds_id=spacecraft_id, instance=instance)
         if vehicle is None:
@@ -285,11 +282,6 @@ def trend_series(
             readable_version(connection, vehicle["id"]),
         )
         return _parameter_series(connection, span, parameter, max_points)
-
-
-def _check_parameter(parameter: str) -> None:
-    if parameter not in PARAMETERS:
-        raise NotFound("parameter", parameter[:80])
 
 
 def spacecraft_trends(ground: Ground, spacecraft_id: int, instance: str) -> list[Trend]:

@@ -192,20 +192,12 @@ def read_values(
     return ticks, np.frombuffer(octets, VALUE).reshape(len(rows), len(indices)).astype(np.float64)
 
 
-def sampled_containers(
-    connection: Connection, vehicle: int, definition: int, start_ticks: int, stop_ticks: int
-) -> dict[int, int]:
-    """Return the number of packets of each container between two times, by container number."""
-    query = (
-        select(_SAMPLES.c.container, func.count())
-        .where(
-            _SAMPLES.c.vehicle_id == vehicle,
-            _SAMPLES.c.definition_id == definition,
-            _SAMPLES.c.ticks.between(start_ticks, stop_ticks),
-        )
-        .group_by(_SAMPLES.c.container)
-    )
-    return {int(container): int(count) for container, count in connection.execute(query)}
+def count_values(
+    connection: Connection, vehicle: int, definition: int, container: int, start_ticks: int, stop_ticks: int
+) -> int:
+    """Return the number of packets of a container between two times."""
+    where = _between(vehicle, definition, container, start_ticks, stop_ticks)
+    return int(connection.execute(select(func.count()).select_from(_SAMPLES).where(*where)).scalar_one())
 
 
 def packets_of_container(

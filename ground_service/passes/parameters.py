@@ -1,0 +1,359 @@
+"""Parameters of a pass: those of our housekeeping, and those of packets that the mission description defines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy import Connection
+
+from ground_service.errors import InvalidInput, NotFound
+from ground_service.ground import Ground
+from ground_service.missions import store as missions
+from ground_service.missions.definitions import DeclaredPackets, PacketDefinitions, packet_definitions
+from ground_service.passes.series import PARAMETERS, KindSamples, SampleSource
+from ground_service.passes.span import PassSpan, pass_span
+from ground_service.store import parameters as store
+from ground_service.store import repository, rollups
+from ground_service.timekeeping.core import utc_ns_of_ticks
+from lunar.arrays import FloatArray, IntArray
+from lunar.timescales import format_utc, ticks_from_utc_ns
+from tmtc.dictionary import DICTIONARY
+from tmtc.export import Record, format_records, packet_records
+from tmtc.stream import cut_packets, whole_packets
+from tmtc.xtce_records import format_xtce_records, xtce_records
+from tmtc.xtce_series import SeriesValue
+
+OWN_PACKET = "housekeeping"
+LABELS_LIMIT = 256
+"""Largest number of codes of one name that are listed."""
+
+RECORDS_LIMIT = 200_000
+"""Largest number of packets in one export."""
+
+ExportFormat = Literal["json", "csv", "parquet"]
+
+
+class ParameterInfo(BaseModel):
+    """Parameter with a series."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str = Field(
+        description="Name in addresses; with the packet where several packets have the parameter"
+    )
+    packet: str = Field(description="Packet, or XTCE container", examples=["housekeeping"])
+    source: str = Field(description="`dictionary`, or the name of the packets in the mission description")
+    description: str
+    unit: str
+    labels: dict[str, str] = Field(description="Names of codes")
+    warning: tuple[float | None, float | None] | None = Field(
+        description="Least and greatest value without warning"
+    )
+    alarm: tuple[float | None, float | None] | None = Field(
+        description="Least and greatest value without alarm"
+    )
+
+
+class PacketInfo(BaseModel):
+    """Packets of one kind in a pass."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    packet: str
+    source: str
+    packets: int = Field(description="Packets in the pass, by their on-board time")
+
+
+class PassParameters(BaseModel):
+    """Parameters of a pass, and the packets that the mission description defines."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    parameters: tuple[ParameterInfo, ...]
+    packets: tuple[PacketInfo, ...]
+    outcomes: dict[str, dict[str, int]] = Field(
+        description="Packets of the spacecraft by APID and outcome of decoding with the mission description"
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DeclaredParameter:
+    """Parameter of a container of a definition: the number of the container, and the place of the value in it."""
+
+    name: str
+    declared: DeclaredPackets
+    container: str
+    index: int
+    value: SeriesValue
+
+    @property
+    def info(self) -> ParameterInfo:
+        """The parameter as it is listed."""
+        data_type = self.value.type
+        return ParameterInfo(
+            name=self.name,
+            packet=self.container,
+            source=self.declared.source.name,
+            description=self.value.description,
+            unit=data_type.unit,
+            labels=_labels(self.value),
+            warning=data_type.warning,
+            alarm=data_type.alarm,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DeclaredReading:
+    """Definition that the values of a vehicle are read with, and its parameters by name."""
+
+    definitions: PacketDefinitions
+    decoding: store.Decoding
+    parameters: dict[str, DeclaredParameter]
+
+
+@dataclass(frozen=True, slots=True)
+class DeclaredSamples:
+    """Values of one container as a source of series; `places` are those of the values by name."""
+
+    version: int
+    part: int
+    places: Mapping[str, int]
+
+    @property
+    def code(self) -> int:
+        """Code of the kind in the roll-ups."""
+        return rollups.PARAMETERS_CODE
+
+    def index(self, name: str) -> int:
+        """Return the place of a value in the roll-ups."""
+        return self.places[name]
+
+    def arrays(
+        self, connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int, names: tuple[str, ...]
+    ) -> dict[str, NDArray[Any]]:
+        """Return ``ticks`` and values (n,) between two on-board times."""
+        places = [self.places[name] for name in names]
+        ticks, values = self._values(connection, vehicle, start_ticks, stop_ticks, places)
+        return {"ticks": ticks, **{name: values[:, k] for k, name in enumerate(names)}}
+
+    def aggregates(
+        self,
+        connection: Connection,
+        vehicle: int,
+        start_ticks: int,
+        stop_ticks: int,
+        name: str,
+        width_ticks: int,
+    ) -> FloatArray:
+        """Return stretches of a value."""
+        place = [self.places[name]]
+        ticks, found = self._values(connection, vehicle, start_ticks, stop_ticks, place)
+        if not ticks.size:
+            return np.zeros((0, 7))
+        value = found[:, 0]
+        known = np.isfinite(value)
+        first = np.flatnonzero(np.concatenate(([True], np.diff(ticks // width_ticks) > 0)))
+        last = np.concatenate((first[1:], [len(ticks)])) - 1
+        count = np.add.reduceat(known.astype(np.int64), first)
+        parts = (
+            np.add.reduceat(np.where(known, value, 0.0), first),
+            np.minimum.reduceat(np.where(known, value, np.inf), first),
+            np.maximum.reduceat(np.where(known, value, -np.inf), first),
+        )
+        figures = [np.where(count > 0, part, np.nan) for part in parts]
+        return np.column_stack([ticks[first], ticks[last], last - first + 1, count, *figures])
+
+    def _values(
+        self, connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int, places: list[int]
+    ) -> tuple[IntArray, FloatArray]:
+        return store.read_values(
+            connection, vehicle, self.version, self.part, start_ticks, stop_ticks, places
+        )
+
+
+def pass_parameters(ground: Ground, pass_id: int) -> PassParameters:
+    """Return the parameters of a pass.
+
+    Raises
+    ------
+    NotFound
+        There is no such pass.
+    """
+    with ground.database.reading() as connection:
+        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        span = pass_span(connection, record)
+        found = declared_reading(connection, record["vehicle_id"])
+        if found is None:
+            return PassParameters(parameters=own_parameters(), packets=(), outcomes={})
+        packets = []
+        for declared in found.definitions.declared:
+            own_span = span_of(span, declared)
+            for name, number in declared.numbers.items():
+                count = store.count_values(
+                    connection,
+                    span.vehicle,
+                    found.decoding.definition_id,
+                    number,
+                    own_span.start_ticks,
+                    own_span.stop_ticks,
+                )
+                packets.append(PacketInfo(packet=name, source=declared.source.name, packets=count))
+    listed = (one.info for one in found.parameters.values())
+    return PassParameters(
+        parameters=(*own_parameters(), *listed), packets=tuple(packets), outcomes=found.decoding.counts
+    )
+
+
+def own_parameters() -> tuple[ParameterInfo, ...]:
+    """Return the parameters of our housekeeping."""
+    fields = DICTIONARY.packet(OWN_PACKET).fields
+    return tuple(
+        ParameterInfo(
+            name=field.name,
+            packet=OWN_PACKET,
+            source="dictionary",
+            description=field.description,
+            unit=field.unit,
+            labels={str(code): label for code, label in field.labels},
+            warning=field.warning,
+            alarm=field.alarm,
+        )
+        for field in fields
+        if field.name in PARAMETERS
+    )
+
+
+def declared_reading(connection: Connection, vehicle: int) -> DeclaredReading | None:
+    """Return the definition that the values of a vehicle are read with, None without one."""
+    decoding = store.readable_decoding(connection, vehicle)
+    if decoding is None:
+        return None
+    mission = missions.get_mission(
+        connection, store.mission_of_definition(connection, decoding.definition_id)
+    )
+    definitions = packet_definitions(mission)
+    return DeclaredReading(definitions, decoding, declared_parameters(definitions))
+
+
+def declared_parameters(definitions: PacketDefinitions) -> dict[str, DeclaredParameter]:
+    """Return the parameters of definitions by their names in addresses.
+
+    The name is that of the parameter if only one container has it and our housekeeping does not, else
+    ``container.parameter``. A slash in a name becomes a dot.
+    """
+    found = [
+        DeclaredParameter(value.name, declared, container, index, value)
+        for declared in definitions.declared
+        for container, layout in declared.layouts.items()
+        for index, value in enumerate(layout)
+    ]
+    counts = dict.fromkeys(PARAMETERS, 1)
+    for one in found:
+        counts[one.name] = counts.get(one.name, 0) + 1
+    named = (
+        replace(
+            one, name=(one.name if counts[one.name] == 1 else f"{one.container}.{one.name}").replace("/", ".")
+        )
+        for one in found
+    )
+    return {one.name: one for one in named}
+
+
+def series_source(
+    connection: Connection, span: PassSpan, parameter: str
+) -> tuple[SampleSource, PassSpan, str, str]:
+    """Return the source of the series of a parameter, its span, the name of its value there, and its unit.
+
+    Raises
+    ------
+    NotFound
+        There is no such parameter.
+    """
+    if parameter in PARAMETERS:
+        unit = DICTIONARY.packet(OWN_PACKET).field(parameter).unit
+        return KindSamples(OWN_PACKET, span.dictionary_version), span, parameter, unit
+    found = declared_reading(connection, span.vehicle)
+    one = None if found is None else found.parameters.get(parameter)
+    if found is None or one is None:
+        raise NotFound("parameter", parameter[:80])
+    number = one.declared.numbers[one.container]
+    source = DeclaredSamples(found.decoding.definition_id, number, {parameter: one.index})
+    return source, span_of(span, one.declared), parameter, one.value.type.unit
+
+
+def span_of(span: PassSpan, declared: DeclaredPackets) -> PassSpan:
+    """Return a span in the time of declared packets, whose clock may be another one than the correlated one."""
+    time = declared.source.time
+    if time is None or time.clock == "payload" or not span.correlations:
+        return span
+    ends = np.array([span.start_ticks, span.stop_ticks], dtype=np.int64)
+    start, stop = ticks_from_utc_ns(utc_ns_of_ticks(ends, span.correlations)[0]).tolist()
+    return replace(span, start_ticks=start, stop_ticks=stop, correlations=())
+
+
+def export_packets(ground: Ground, pass_id: int, packet: str, kind: ExportFormat) -> bytes:
+    """Return the decoded packets of one kind in a pass as a file, with their UTC.
+
+    Raises
+    ------
+    NotFound
+        There is no such pass or no such packet.
+    InvalidInput
+        There are more packets than one file may have.
+    """
+    with ground.database.reading() as connection:
+        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        span = pass_span(connection, record)
+        if packet in {definition.name for definition in DICTIONARY.telemetry}:
+            return format_records(_own_records(connection, span, packet), kind)
+        found = declared_reading(connection, span.vehicle)
+        declared = None
+        if found is not None:
+            declared = next((one for one in found.definitions.declared if packet in one.layouts), None)
+        if found is None or declared is None or declared.decoder is None:
+            raise NotFound("packet", packet[:80])
+        span = span_of(span, declared)
+        ticks, packets = store.packets_of_container(
+            connection,
+            span.vehicle,
+            found.decoding.definition_id,
+            declared.numbers[packet],
+            span.start_ticks,
+            span.stop_ticks,
+            RECORDS_LIMIT + 1,
+        )
+    if len(ticks) > RECORDS_LIMIT:
+        raise InvalidInput("packets", packet, f"at most {RECORDS_LIMIT} in a pass", "more")
+    cut = whole_packets(np.array([len(octets) for octets in packets.octets], dtype=np.int64))
+    records = xtce_records(declared.decoder.decode(b"".join(packets.octets), cut))
+    times = utc_ns_of_ticks(ticks, span.correlations)[0].tolist()
+    return format_xtce_records(
+        [{"utc": format_utc(time, 9), **one} for time, one in zip(times, records, strict=True)], kind
+    )
+
+
+def _own_records(connection: Connection, span: PassSpan, packet: str) -> list[Record]:
+    apid = DICTIONARY.packet(packet).apid
+    octets = repository.packet_octets(connection, span.vehicle, apid, span.start_ticks, span.stop_ticks)
+    tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=(packet,))
+    records = packet_records(tables)
+    if len(records) > RECORDS_LIMIT:
+        raise InvalidInput("packets", packet, f"at most {RECORDS_LIMIT} in a pass", str(len(records)))
+    times = span.utc_ns([int(one["ticks"]) for one in records]).tolist()
+    return [{"utc": format_utc(time, 9), **one} for time, one in zip(times, records, strict=True)]
+
+
+def _labels(value: SeriesValue) -> dict[str, str]:
+    if value.type.is_boolean:
+        return {"0": "false", "1": "true"}
+    return {
+        str(code): label
+        for first, last, label in value.type.labels
+        if last - first < LABELS_LIMIT
+        for code in range(first, last + 1)
+    }

@@ -1,0 +1,331 @@
+"""Packets that a mission description defines: received, decoded, read as series, exported, decoded again."""
+
+import json
+import struct
+import warnings
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ground_service.app import create_app
+from ground_service.errors import InvalidInput, NotFound
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest import parameters as decoding
+from ground_service.ingest.service import Place, ingest_file
+from ground_service.missions.definitions import read_mission_file
+from ground_service.missions.model import mission_faults
+from ground_service.missions.service import add_mission, check_mission_file
+from ground_service.passes import series
+from ground_service.passes.parameters import export_packets, pass_parameters
+from ground_service.passes.service import define_pass, parameter_series, trend_series
+from ground_service.settings import Settings
+from ground_service.store import repository
+from ground_service.store.parameters import readable_decoding
+from lunar.timescales import parse_utc
+from tests.tmtc import foreign
+from tmtc.downlink import decode, encode_cadus
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    from fastapi.testclient import TestClient
+
+NS = 1_000_000_000
+START = parse_utc("2029-08-07T00:00:00Z")
+EPOCH_DAY = parse_utc("1958-01-01T00:00:00Z") // (86_400 * NS)
+CDS = (
+    '{ code = "cds", offset = 6, p_field = false, whole_octets = 2, fraction_octets = 2, '
+    'epoch = "1958-01-01T00:00:00Z", clock = "own" }'
+)
+DEFINED = f"[[packets]]\nname = 'bus'\napids = [100, 101]\npacket_checksum = 'none'\nxtce = ['bus.xml']\ntime = {CDS}\n"
+MISSION = "name = 'test'\nspacecraft = { id = 76 }\n"
+
+
+def mission(folder: Path, text: str = DEFINED, document: str = foreign.BUS) -> Path:
+    folder.mkdir(exist_ok=True)
+    (folder / "bus.xml").write_text(document, encoding="utf-8")
+    (folder / "mission.toml").write_text(MISSION + text, encoding="utf-8")
+    return folder / "mission.toml"
+
+
+def enter(ground: Ground, folder: Path, text: str = DEFINED) -> None:
+    add_mission(ground, read_mission_file(mission(folder, text)))
+
+
+def at(packet: bytes, second: float) -> bytes:
+    """The packet with this time, in seconds after `START`, in its CDS header."""
+    day, rest = divmod(START + round(second * 1e9), 86_400 * NS)
+    time = struct.pack(">HIH", day - EPOCH_DAY, rest // 1_000_000, rest // 1000 % 1000)
+    return packet[:6] + time + packet[14:]
+
+
+def bus_packets(count: int, seed: int = 1) -> list[bytes]:
+    """Housekeeping every second and an event every fourth second."""
+    rng = np.random.default_rng(seed)
+    packets = []
+    for k in range(count):
+        packets.append(at(foreign.housekeeping(rng, k), k))
+        if k % 4 == 0:
+            packets.append(at(foreign.event(rng, k // 4), k + 0.5))
+    return packets
+
+
+def downlink(folder: Path, packets: list[bytes], name: str = "bus.cadu") -> Path:
+    path = folder / name
+    path.write_bytes(encode_cadus(packets, spacecraft_id=76))
+    return path
+
+
+def define(ground: Ground, seconds: float = 600.0) -> int:
+    return define_pass(
+        ground, name="p", start_utc_ns=START, stop_utc_ns=START + round(seconds * 1e9), spacecraft_id=76
+    )
+
+
+def payload_packets(made: Any) -> list[bytes]:
+    found = decode((made.folder / "downlink.cadu").read_bytes())
+    return list(found.cut.packets(found.buffer))
+
+
+def interpreted(packets: list[bytes], tmp_path: Path) -> list[Any]:
+    """What space_packet_parser reads in the packets."""
+    import space_packet_parser
+
+    path = tmp_path / "interpreter.xml"
+    path.write_text(foreign.BUS, encoding="utf-8")
+    definition = space_packet_parser.load_xtce(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return [definition.parse_bytes(packet) for packet in packets]
+
+
+def test_packets_without_a_checksum_between_others_become_series(
+    either: Ground, tmp_path: Path, synthetic_pass: Any
+) -> None:
+    enter(either, tmp_path / "m")
+    own, bus = payload_packets(synthetic_pass), bus_packets(300)
+    mixed = [packet for pair in zip(own, bus, strict=False) for packet in pair]
+    mixed += own[len(bus) :] + bus[len(own) :]
+    result = ingest_file(either, downlink(tmp_path, mixed))
+    assert (result.packets, result.packets_new) == (len(mixed), len(mixed))
+    assert (result.crc_errors, result.octets_skipped, result.unknown) == (0, 0, 0)
+    found = parameter_series(either, define(either), "VOLTAGE", 1000)
+    housekeeping = [packet for packet in bus if packet[1] == foreign.APID_HOUSEKEEPING]
+    expected = [packet["VOLTAGE"] for packet in interpreted(housekeeping, tmp_path)]
+    assert found.unit == "V"
+    assert found.buckets.mean.tolist() == expected
+    assert found.buckets.start_utc_ns.tolist() == pytest.approx(
+        [START + k * NS for k in range(300)], abs=15_259
+    )
+    assert parameter_series(either, 1, "MODE", 1000).samples == 300  # codes
+    listed = pass_parameters(either, 1)
+    assert {one.packet: one.packets for one in listed.packets} == {
+        "Bare": 0,
+        "Dump": 0,
+        "Event": sum(p[14] < 200 for p in bus if p[1] == foreign.APID_EVENT),
+        "Housekeeping": 300,
+        "UrgentEvent": sum(p[14] >= 200 for p in bus if p[1] == foreign.APID_EVENT),
+    }
+    assert listed.outcomes == {"100": {"decoded": 300}, "101": {"decoded": 75}}
+
+
+def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(
+    ground: Ground, tmp_path: Path
+) -> None:
+    limits = (
+        "<DefaultAlarm><StaticAlarmRanges><WarningRange minInclusive='-1' maxInclusive='1000.5'/>"
+        "<CriticalRange maxExclusive='1020'/></StaticAlarmRanges></DefaultAlarm>"
+    )
+    kind = '<FloatParameterType name="VOLT"><UnitSet><Unit>V</Unit></UnitSet>'
+    assert kind in foreign.BUS
+    end = foreign.BUS.index("</FloatParameterType>", foreign.BUS.index(kind))
+    text = foreign.BUS[:end] + limits + foreign.BUS[end:]
+    add_mission(ground, read_mission_file(mission(tmp_path / "m", document=text)))
+    ingest_file(ground, downlink(tmp_path, bus_packets(4)))
+    listed = {one.name: one for one in pass_parameters(ground, define(ground)).parameters}
+    assert (listed["VOLTAGE"].warning, listed["VOLTAGE"].alarm) == ((-1.0, 1000.5), (None, 1020.0))
+    assert listed["MODE"].labels == {"0": "SAFE", "1": "NOMINAL", "7": "DETUMBLE"}
+    assert listed["ENABLED"].labels == {"0": "false", "1": "true"}
+    assert listed["Housekeeping.DAY"].packet == "Housekeeping"  # several containers have this one
+    assert listed["temperature_c"].source == "dictionary"
+    assert "TEXT" not in listed
+
+
+def test_a_series_has_least_greatest_and_mean_value_from_samples_and_from_rollups(
+    either: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    enter(either, tmp_path / "m")
+    bus = bus_packets(2000)
+    for part, piece in enumerate((bus[:900], bus[900:])):
+        ingest_file(either, downlink(tmp_path, piece, f"{part}.cadu"))
+    pass_id = define(either, 3000.0)
+    exact = parameter_series(either, pass_id, "RATE", 10)
+    housekeeping = [packet for packet in bus if packet[1] == foreign.APID_HOUSEKEEPING]
+    values = np.array([packet["RATE"] for packet in interpreted(housekeeping, tmp_path)])
+    assert exact.buckets.low.min() == values.min()
+    assert exact.buckets.high.max() == values.max()
+    assert np.average(exact.buckets.mean, weights=exact.buckets.count) == pytest.approx(values.mean())
+    monkeypatch.setattr(series, "FEW_ROWS", 10)
+    for coarse in (10**9, 0):  # from roll-ups, from stretches of samples
+        monkeypatch.setattr(series, "COARSE", coarse)
+        rolled = parameter_series(either, pass_id, "RATE", 11).buckets
+        assert int(rolled.count.sum()) == 2000
+        assert (rolled.low.min(), rolled.high.max()) == (values.min(), values.max())
+        assert np.average(rolled.mean, weights=rolled.count) == pytest.approx(values.mean())
+    assert trend_series(either, 76, "flight", "RATE", 11).samples == 2000
+
+
+def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_kept_as_unknown(
+    either: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(decoding, "BLOCK_PACKETS", 50)
+    declared = "[[packets]]\nname = 'bus'\napids = [100, 101]\npacket_checksum = 'none'\n"
+    enter(either, tmp_path / "m", declared)
+    result = ingest_file(either, downlink(tmp_path, bus_packets(100)))
+    assert (result.packets_new, result.unknown, result.octets_skipped) == (125, 125, 0)
+    pass_id = define(either)
+    with pytest.raises(NotFound):
+        parameter_series(either, pass_id, "VOLTAGE", 100)
+    enter(either, tmp_path / "m")
+    assert decoding.decode_declared(either, result.vehicle_id) == 125
+    assert parameter_series(either, pass_id, "VOLTAGE", 100).samples == 100
+    renamed = foreign.BUS.replace('"VOLTAGE"', '"BATTERY"')
+    add_mission(either, read_mission_file(mission(tmp_path / "m", document=renamed)))
+    blocks = 0
+    whole = decoding._next_block
+
+    def killed(*given: Any) -> Any:
+        nonlocal blocks
+        blocks += 1
+        if blocks == 2:
+            raise KeyboardInterrupt
+        return whole(*given)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(decoding, "_next_block", killed)
+        decoding.decode_declared(either, result.vehicle_id)
+    assert (
+        parameter_series(either, pass_id, "VOLTAGE", 100).samples == 100
+    )  # still as the earlier one decoded it
+    assert decoding.decode_declared(either, result.vehicle_id) == 75
+    assert parameter_series(either, pass_id, "BATTERY", 100).samples == 100
+    with pytest.raises(NotFound):
+        parameter_series(either, pass_id, "VOLTAGE", 100)
+    assert decoding.decode_declared(either, result.vehicle_id) == 0
+    with either.database.reading() as connection:
+        samples = connection.execute(repository.PARAMETER_SAMPLES.select()).all()
+        progress = readable_decoding(connection, result.vehicle_id)
+    assert len(samples) == 125
+    assert progress is not None and progress.counts == {"100": {"decoded": 100}, "101": {"decoded": 25}}
+
+
+def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(ground: Ground, tmp_path: Path) -> None:
+    enter(ground, tmp_path / "m")
+    octets = downlink(tmp_path, bus_packets(120)).read_bytes()
+    rng = np.random.default_rng(5)
+    cuts = [0, *sorted(rng.choice(len(octets), 11, replace=False).tolist()), len(octets)]
+    pieces = list(pairwise(cuts))
+    for index in rng.permutation(len(pieces)).tolist():
+        start, stop = pieces[index]
+        path = tmp_path / f"{index}.piece"
+        path.write_bytes(octets[start:stop])
+        ingest_file(ground, path, spacecraft_id=76, place=Place("s", start))
+    assert parameter_series(ground, define(ground), "VOLTAGE", 1000).samples == 120
+
+
+def test_a_bare_stream_without_checksums_is_read_in_windows(
+    ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ground_service.ingest.stream.WINDOW_OCTETS", 5_000)
+    enter(ground, tmp_path / "m")
+    path = tmp_path / "bare.packets"
+    path.write_bytes(b"".join(bus_packets(400)))
+    result = ingest_file(ground, path, spacecraft_id=76)
+    assert (result.packets_new, result.octets_skipped) == (500, 0)
+    assert parameter_series(ground, define(ground), "VOLTAGE", 1000).samples == 400
+
+
+def test_decoded_packets_of_a_pass_are_exported_with_utc(
+    ground: Ground, tmp_path: Path, synthetic_pass: Any
+) -> None:
+    enter(ground, tmp_path / "m")
+    ingest_file(ground, downlink(tmp_path, [*payload_packets(synthetic_pass), *bus_packets(20)]))
+    pass_id = define(ground, 86_400.0)
+    records = json.loads(export_packets(ground, pass_id, "Housekeeping", "json"))
+    assert [one["utc"][:23] for one in records] == [f"2029-08-07T00:00:{k:02d}.000" for k in range(20)]
+    assert {one["MODE"] for one in records} <= {"SAFE", "NOMINAL", "DETUMBLE"}
+    lines = export_packets(ground, pass_id, "Event", "csv").decode().splitlines()
+    assert lines[0].startswith("utc,packet,VERSION")
+    own = json.loads(export_packets(ground, pass_id, "navigation_state", "json"))
+    assert own and own[0]["packet"] == "navigation_state"
+    with pytest.raises(NotFound, match="packet"):
+        export_packets(ground, pass_id, "nothing", "csv")
+    assert export_packets(ground, pass_id, "Housekeeping", "parquet")[:4] == b"PAR1"
+
+
+def test_the_http_interface_gives_parameters_series_and_packets(tmp_path: Path) -> None:
+    with open_ground(tmp_path / "home") as ground:
+        enter(ground, tmp_path / "m")
+        ingest_file(ground, downlink(tmp_path, bus_packets(20)))
+        define(ground)
+    with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as client:
+        listed = client.get("/api/v1/passes/1/parameters").json()
+        assert "VOLTAGE" in {one["name"] for one in listed["parameters"]}
+        found = client.get("/api/v1/passes/1/telemetry/VOLTAGE").json()
+        assert (found["samples"], found["unit"]) == (20, "V")
+        answer = client.get("/api/v1/passes/1/packets/Housekeeping", params={"format": "csv"})
+        assert answer.headers["content-type"].startswith("text/csv")
+        assert len(answer.text.splitlines()) == 21
+        assert client.get("/api/v1/passes/1/packets/none").status_code == 404
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            DEFINED.replace("[100, 101]", "[100, 2047]"),
+            "packets.0.apids.1: expected less than or equal to 2046",
+        ),
+        (DEFINED.replace("'none'", "'maybe'"), "packets.0.packet_checksum: expected 'crc16' or 'none'"),
+        (
+            DEFINED.replace("whole_octets = 2", "whole_octets = 4"),
+            "packets.0.time: expected 2 or 3 octets of days",
+        ),
+        (DEFINED.replace("1958-01-01T00:00:00Z", "long ago"), "packets.0.time: expected an epoch such as"),
+        (DEFINED.replace("clock", "clok"), "packets.0.time.clok: expected 'clock', found unknown key 'clok'"),
+        (DEFINED + DEFINED.replace("'bus'", "'two'"), "each APID in one entry of packets, found 100"),
+        (DEFINED.replace("[100, 101]", "[160]"), "APIDs that the packet dictionary does not use, found 160"),
+    ],
+)
+def test_each_fault_of_a_declaration_is_one_line(tmp_path: Path, text: str, message: str) -> None:
+    found, faults = check_mission_file(mission(tmp_path, text))
+    assert found is None
+    assert len(faults) == 1, faults
+    assert message in faults[0]
+    assert "\n" not in faults[0]
+
+
+def test_each_faulty_document_is_one_line(tmp_path: Path) -> None:
+    two = DEFINED + DEFINED.replace("'bus'", "'two'").replace("[100, 101]", "[102]")
+    path = mission(tmp_path, two, foreign.BUS.replace("UnitSet", "UnitsSet"))
+    found, faults = check_mission_file(path)
+    assert found is None
+    assert [fault.split(": ")[0].split(", ")[-1] for fault in faults] == ["packets.0.xtce", "packets.1.xtce"]
+    assert "line 1" in faults[0] and "UnitsSet" in faults[0]
+    (tmp_path / "bus.xml").unlink()
+    with pytest.raises(InvalidInput, match=r"packets.0.xtce: expected the file .*bus\.xml"):
+        check_mission_file(path)
+    assert "expected texts of XTCE documents" in mission_faults(path.read_text())[0]
+
+
+def test_a_long_document_is_embedded_compressed(ground: Ground, tmp_path: Path) -> None:
+    padded = foreign.BUS.replace("<TelemetryMetaData>", "<TelemetryMetaData><!--" + "x" * 2_000_000 + "-->")
+    path = mission(tmp_path, DEFINED, padded)
+    octets = read_mission_file(path)
+    assert b"gzip:" in octets and len(octets) < 100_000
+    entered = add_mission(ground, octets)
+    assert add_mission(ground, read_mission_file(path)).id == entered.id
+    ingest_file(ground, downlink(tmp_path, bus_packets(5)))
+    assert parameter_series(ground, define(ground), "VOLTAGE", 100).samples == 5
