@@ -126,7 +126,9 @@ def embed_documents(text: str, folder: Path, source: str) -> str:
     named = False
     for index, one in enumerate(packets if isinstance(packets, list) else ()):
         documents = one.get("xtce") if isinstance(one, dict) else None
-        for place, entry in enumerate(documents if isinstance(documents, list) else ()):
+        if not isinstance(documents, list):
+            continue
+        for place, entry in enumerate(documents):
             if isinstance(entry, str) and not entry.lstrip().startswith(("<", XTCE_COMPRESSED)):
                 documents[place] = _embedded(folder / entry, source, f"packets.{index}.xtce")
                 named = True
