@@ -1,7 +1,7 @@
 import { finished, get, request, send } from "./api.js";
 import { chart, columns, solutionStyle } from "./charts.js";
 import { legendItem, moonMap, track } from "./moon.js";
-import { acting, byId, dictionary, element, figure, lengthText, notice, parameterName, seconds, show, stateMark, table, timeText, trouble, unitText } from "./page.js";
+import { acting, byId, dictionary, element, figure, lengthText, notice, parameterName, parameterOptions, seconds, show, stateMark, table, timeText, trouble, unitText } from "./page.js";
 
 const passId = Number(location.pathname.split("/").at(-1));
 const STATES = ["latitude_deg", "longitude_deg", "altitude_m"];
@@ -137,9 +137,19 @@ async function showStates(estimators) {
   if (!found.length) show("navigation", element("p", { class: "hint" }, "No navigation states of this pass have come."));
 }
 
+async function showParameters() {
+  const { parameters, packets } = await get(`passes/${passId}/parameters`);
+  show("parameter", parameterOptions(parameters));
+  byId("parameter").value = "temperature_c";
+  const link = (packet, format) => element("a", { href: `/api/v1/passes/${passId}/packets/${encodeURIComponent(packet)}?format=${format}`, download: `pass-${passId}-${packet}.${format}` }, format === "csv" ? "CSV" : "Parquet");
+  const columns = [["Packet", (row) => row.packet], ["Source", (row) => row.source], ["Packets", (row) => figure(row.packets), "num"], ["Files", (row) => element("span", {}, link(row.packet, "csv"), " ", link(row.packet, "parquet"))]];
+  if (packets.length) show("packets", table("Packets that the mission description defines", columns, packets, "None."));
+  await showParameter();
+}
+
 async function showParameter() {
   const name = byId("parameter").value;
-  const series = await get(`passes/${passId}/telemetry/${name}`, { max_points: 600 });
+  const series = await get(`passes/${passId}/telemetry/${encodeURIComponent(name)}`, { max_points: 600 });
   show("housekeeping");
   chart(byId("housekeeping"), parameterName(name, series.unit), unitText(series.unit), [{ label: parameterName(name, series.unit), ...columns(series.buckets, seconds) }], { group: "pass" });
 }
@@ -185,8 +195,6 @@ byId("make-report").addEventListener(
     await showLatestReport(reports);
   }),
 );
-byId("parameter").append(...dictionary.parameters.map((one) => element("option", { value: one.name }, parameterName(one.name, one.unit))));
-byId("parameter").value = dictionary.parameters.some((one) => one.name === "temperature_c") ? "temperature_c" : dictionary.parameters[0].name;
 byId("parameter").addEventListener("change", acting(showParameter));
 byId("only-alarms").addEventListener("change", showEvents);
 
@@ -212,7 +220,7 @@ async function load() {
       events = page.items;
       showEvents();
     }),
-    showParameter(),
+    showParameters(),
     showStates(dictionary.estimators),
   ]);
 }

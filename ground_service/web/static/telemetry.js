@@ -1,8 +1,8 @@
 import { get } from "./api.js";
 import { chart, columns } from "./charts.js";
-import { acting, byId, dictionary, element, figure, parameterName, seconds, show, timeText, trouble, unitText } from "./page.js";
+import { acting, byId, dictionary, element, figure, limitText, parameterName, parameterOptions, seconds, show, timeText, trouble, unitText } from "./page.js";
 
-const definition = Object.fromEntries(dictionary.parameters.map((one) => [one.name, one]));
+let definition = Object.fromEntries(dictionary.parameters.map((one) => [one.name, one]));
 
 function csv(series) {
   const lines = ["start,stop,count,min,max,mean,after_gap"];
@@ -14,22 +14,31 @@ function csv(series) {
 
 async function add() {
   const [passId, name] = [byId("pass").value, byId("parameter").value];
-  const series = await get(`passes/${passId}/telemetry/${name}`, { max_points: byId("points").value });
+  const series = await get(`passes/${passId}/telemetry/${encodeURIComponent(name)}`, { max_points: byId("points").value });
   const { box } = chart(byId("charts"), parameterName(name, series.unit), unitText(series.unit), [{ label: parameterName(name, series.unit), ...columns(series.buckets, seconds) }], { group: "telemetry" });
   const about = definition[name];
   const limits = [
-    about.warning ? `warning outside ${about.warning.join(" to ")}` : null,
-    about.alarm ? `alarm outside ${about.alarm.join(" to ")}` : null,
+    about.warning ? `warning ${limitText(about.warning)}` : null,
+    about.alarm ? `alarm ${limitText(about.alarm)}` : null,
+    Object.keys(about.labels).length ? Object.entries(about.labels).map(([code, label]) => `${code}: ${label}`).join(", ") : null,
   ].filter(Boolean);
   const last = series.buckets.at(-1);
   box.append(
     element(
       "p",
       { class: "hint" },
-      `${about.description}. ${figure(series.samples)} samples` + (last ? `, last ${figure(last.mean)} at ${timeText(last.stop)}` : "") + (limits.length ? `; ${limits.join(", ")}` : "") + ". ",
+      `${about.description ? `${about.description}. ` : ""}${figure(series.samples)} samples` + (last ? `, last ${figure(last.mean)} at ${timeText(last.stop)}` : "") + (limits.length ? `; ${limits.join(", ")}` : "") + ". ",
       element("a", { href: csv(series), download: `pass-${passId}-${name}.csv` }, "CSV"),
     ),
   );
+}
+
+async function chooseParameters() {
+  const wanted = byId("parameter").value;
+  const { parameters } = await get(`passes/${byId("pass").value}/parameters`);
+  definition = Object.fromEntries(parameters.map((one) => [one.name, one]));
+  show("parameter", parameterOptions(parameters));
+  if (wanted in definition) byId("parameter").value = wanted;
 }
 
 async function load() {
@@ -38,8 +47,8 @@ async function load() {
   const asked = Number(wanted.get("pass"));
   if (asked && !passes.items.some((one) => one.id === asked)) passes.items.unshift(await get(`passes/${asked}`));
   show("pass", passes.items.map((one) => element("option", { value: one.id }, `${one.name}, ${timeText(one.start)}`)));
-  show("parameter", dictionary.parameters.map((one) => element("option", { value: one.name }, parameterName(one.name, one.unit))));
   if (wanted.get("pass")) byId("pass").value = wanted.get("pass");
+  if (passes.items.length) await chooseParameters();
   if ("temperature_c" in definition) byId("parameter").value = "temperature_c";
   if (wanted.get("parameter") in definition) byId("parameter").value = wanted.get("parameter");
   if (passes.items.length) await add();
@@ -47,5 +56,6 @@ async function load() {
 }
 
 byId("choice").addEventListener("submit", acting(add));
+byId("pass").addEventListener("change", acting(chooseParameters));
 byId("clear").addEventListener("click", () => show("charts"));
 load().catch((error) => error.status === 401 || trouble(error));
