@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
@@ -155,3 +155,43 @@ class Trend(Entity):
         description="By least squares; null: too few samples"
     )
     limit_state: str = Field(description="Worst found: within, warning or alarm", examples=["within"])
+
+
+ExportFormat = Literal["json", "csv", "parquet"]
+
+
+class ParameterInfo(Entity):
+    """Parameter with a series."""
+
+    name: str = Field(
+        description="Name in addresses; with the packet where several packets have the parameter"
+    )
+    packet: str = Field(description="Packet, or XTCE container", examples=["housekeeping"])
+    source: str = Field(description="`dictionary`, or the name of the packets in the mission description")
+    description: str
+    unit: str
+    labels: dict[str, str] = Field(description="Names of codes")
+    warning: tuple[float | None, float | None] | None = Field(
+        description="Least and greatest value without warning"
+    )
+    alarm: tuple[float | None, float | None] | None = Field(
+        description="Least and greatest value without alarm"
+    )
+
+
+class PacketInfo(Entity):
+    """Packets of one kind in a pass."""
+
+    packet: str
+    source: str
+    packets: int = Field(description="Packets in the pass, by their on-board time")
+
+
+class PassParameters(Entity):
+    """Parameters of a pass, and the packets that the mission description defines."""
+
+    parameters: tuple[ParameterInfo, ...]
+    packets: tuple[PacketInfo, ...]
+    outcomes: dict[str, dict[str, int]] = Field(
+        description="Packets of the spacecraft by APID and outcome of decoding with the mission description"
+    )

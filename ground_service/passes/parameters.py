@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import Connection
 
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.missions import store as missions
 from ground_service.missions.definitions import DeclaredPackets, PacketDefinitions, packet_definitions
+from ground_service.passes.model import ExportFormat, PacketInfo, ParameterInfo, PassParameters
 from ground_service.passes.series import PARAMETERS, KindSamples, SampleSource
 from ground_service.passes.span import PassSpan, pass_span
 from ground_service.store import parameters as store
@@ -34,51 +34,6 @@ LABELS_LIMIT = 256
 
 RECORDS_LIMIT = 200_000
 """Largest number of packets in one export."""
-
-ExportFormat = Literal["json", "csv", "parquet"]
-
-
-class ParameterInfo(BaseModel):
-    """Parameter with a series."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    name: str = Field(
-        description="Name in addresses; with the packet where several packets have the parameter"
-    )
-    packet: str = Field(description="Packet, or XTCE container", examples=["housekeeping"])
-    source: str = Field(description="`dictionary`, or the name of the packets in the mission description")
-    description: str
-    unit: str
-    labels: dict[str, str] = Field(description="Names of codes")
-    warning: tuple[float | None, float | None] | None = Field(
-        description="Least and greatest value without warning"
-    )
-    alarm: tuple[float | None, float | None] | None = Field(
-        description="Least and greatest value without alarm"
-    )
-
-
-class PacketInfo(BaseModel):
-    """Packets of one kind in a pass."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    packet: str
-    source: str
-    packets: int = Field(description="Packets in the pass, by their on-board time")
-
-
-class PassParameters(BaseModel):
-    """Parameters of a pass, and the packets that the mission description defines."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    parameters: tuple[ParameterInfo, ...]
-    packets: tuple[PacketInfo, ...]
-    outcomes: dict[str, dict[str, int]] = Field(
-        description="Packets of the spacecraft by APID and outcome of decoding with the mission description"
-    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -30,14 +30,16 @@ from ground_service.ingest.service import FLOWN
 from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import get_job
-from ground_service.passes import service
+from ground_service.passes import parameters, service
 from ground_service.passes.model import (
     Completeness,
     Detection,
     Event,
+    ExportFormat,
     ParameterSeries,
     PassDefinition,
     PassDetail,
+    PassParameters,
     PassSummary,
     States,
     Trend,
@@ -45,10 +47,15 @@ from ground_service.passes.model import (
 from ground_service.passes.series import STATE_VALUES, series_document
 from ground_service.store import repository
 
+EXPORT_MEDIA: dict[ExportFormat, str] = {
+    "json": "application/json",
+    "csv": "text/csv; charset=utf-8",
+    "parquet": "application/vnd.apache.parquet",
+}
 UPLOAD_PATHS = (f"{API_PREFIX}/archives",)
 
 MaxPoints = Annotated[int, Query(ge=1, le=10_000, description="Most intervals of a series")]
-Parameter = Annotated[str, Path(max_length=64, examples=["temperature_c"])]
+Parameter = Annotated[str, Path(max_length=200, examples=["temperature_c"])]
 
 passes = operations("passes")
 
@@ -156,6 +163,29 @@ def list_events(
     """List the event reports of a pass, in time order."""
     items, total = service.list_events(ground, pass_id, limit=limit, offset=offset)
     return page_of(items, total, limit, offset)
+
+
+@passes.get("/passes/{pass_id}/parameters")
+def list_parameters(ground: GroundOf, _: Viewer, pass_id: PassId) -> PassParameters:
+    """List the parameters with series: of the payload, and of packets that the mission description defines."""
+    return parameters.pass_parameters(ground, pass_id)
+
+
+@passes.get(
+    "/passes/{pass_id}/packets/{packet}",
+    response_class=Response,
+    responses={200: {"content": {media: {} for media in EXPORT_MEDIA.values()}}},
+)
+def get_packets(
+    ground: GroundOf,
+    _: Viewer,
+    pass_id: PassId,
+    packet: Annotated[str, Path(max_length=200, description="Packet of the dictionary, or XTCE container")],
+    format: Annotated[ExportFormat, Query(description="Format of the file")] = "json",
+) -> Response:
+    """Return the decoded packets of one kind in a pass, in order of on-board time, with UTC."""
+    octets = parameters.export_packets(ground, pass_id, packet, format)
+    return Response(octets, media_type=EXPORT_MEDIA[format])
 
 
 @passes.get("/passes/{pass_id}/telemetry/{parameter}", response_model=ParameterSeries)

@@ -27,7 +27,14 @@ from ground_service.passes.model import (
 )
 from ground_service.passes.packet_accounting import packet_accounting
 from ground_service.passes.parameters import series_source
-from ground_service.passes.series import PARAMETERS, STATE_VALUES, KindSamples, Series, SeriesReading, series_document
+from ground_service.passes.series import (
+    PARAMETERS,
+    STATE_VALUES,
+    KindSamples,
+    Series,
+    SeriesReading,
+    series_document,
+)
 from ground_service.passes.span import PassSpan, pass_span
 from ground_service.passes.store import detection_frames, detection_samples, event_list
 from ground_service.passes.trends import trend_of
@@ -307,7 +314,9 @@ def vehicle_trends(ground: Ground, vehicle: int) -> list[Trend]:
 
 def _trends(connection: Connection, vehicle: int) -> list[Trend]:
     version = readable_version(connection, vehicle)
-    _, _, last = rollups.rolled_extent(connection, rollups.KINDS["housekeeping"][0], vehicle, version, 0, 0, LAST_TICKS)
+    _, _, last = rollups.rolled_extent(
+        connection, rollups.KINDS["housekeeping"][0], vehicle, version, 0, 0, LAST_TICKS
+    )
     if last == 0:
         return []
     first = max(last - (TREND_DAYS * 86_400 << 16), 0)
