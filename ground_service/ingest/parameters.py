@@ -80,7 +80,9 @@ def _next_block(connection: Connection, vehicle: int) -> int | None:
     definition = parameters.definition_id(connection, definitions.digest, mission_id)
     progress = parameters.decoding(connection, vehicle, definition)
     if progress is None:
-        progress = parameters.begin(connection, vehicle, definition)
+        earlier = _readable_definitions(connection, vehicle)
+        new = definitions.unchecked_apids - earlier.unchecked_apids
+        progress = parameters.begin(connection, vehicle, definition, read_again=bool(new))
     packets = parameters.packets_after(
         connection, vehicle, progress.decoded_to, definitions.apids, BLOCK_PACKETS
     )
@@ -94,6 +96,15 @@ def _next_block(connection: Connection, vehicle: int) -> int | None:
     stored = parameters.store_values(connection, vehicle, definition, samples)
     parameters.change(connection, vehicle, _with_counts(progress, packets.ids[-1], counts))
     return stored
+
+
+def _readable_definitions(connection: Connection, vehicle: int) -> PacketDefinitions:
+    """Return the packets of the definition that the values of a vehicle are read with."""
+    decoding = parameters.readable_decoding(connection, vehicle)
+    if decoding is None:
+        return PacketDefinitions("", ())
+    mission_id = parameters.mission_of_definition(connection, decoding.definition_id)
+    return packet_definitions(missions.get_mission(connection, mission_id))
 
 
 def _with_counts(progress: Decoding, decoded_to: int, counts: dict[int, dict[str, int]]) -> Decoding:

@@ -7,6 +7,7 @@ files or on how often they came. An ingest that was cut off can simply be run ag
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,7 @@ from ground_service.ingest.stream import (
 )
 from ground_service.jobs.service import OTHER_REQUEST, add_job
 from ground_service.missions.definitions import PacketDefinitions
-from ground_service.store import repository
+from ground_service.store import parameters, repository
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile, mapped_octets, read_blocks
 from tmtc.arrays import as_octets
@@ -315,6 +316,30 @@ def _read_piece(
         catch_up(ground, vehicle)
         decode_declared(ground, vehicle)
     return reading.result()
+
+
+def apply_definition(ground: Ground, vehicle: int) -> int:
+    """Decode a vehicle's packets with the newest mission description; return the number of samples.
+
+    Packets without a checksum that no earlier description declared are not stored yet: the raw files are read again.
+    """
+    stored = decode_declared(ground, vehicle)
+    with ground.database.reading() as connection:
+        to_read = parameters.ingests_to_read(connection, vehicle)
+    for ingest_id in to_read:
+        ground.check_stopping()
+        with suppress(InvalidInput, TmtcError):  # a file that is still no downlink
+            run_ingest(ground, ingest_id)
+    with ground.database.writing() as connection:
+        parameters.note_read(connection, vehicle)
+    return stored + decode_declared(ground, vehicle)
+
+
+def undecoded_vehicles(ground: Ground, spacecraft_id: int) -> list[int]:
+    """Return the vehicles of a spacecraft whose packets are not decoded with its newest mission description."""
+    with ground.database.reading() as connection:
+        definitions, _ = definitions_of_spacecraft(connection, spacecraft_id)
+        return parameters.undecoded(connection, spacecraft_id, definitions.digest)
 
 
 @dataclass(frozen=True, slots=True)

@@ -173,6 +173,8 @@ def _decoder(source: PacketSource) -> Decoder | None:
 
 @lru_cache(maxsize=16)
 def _compiled(sources: Sequence[PacketSource]) -> PacketDefinitions:
+    if not sources:
+        return PacketDefinitions("", ())
     stated = json.dumps([one.model_dump(mode="json", exclude_none=True) for one in sources], sort_keys=True)
     declared = []
     number = 0

@@ -372,7 +372,8 @@ class PacketDecoding(Base):
     """Decoding of the packets of a vehicle with one definition.
 
     Packets up to `decoded_to` are decoded. The values can be read when `complete` is 1: until then, those of an
-    earlier definition are read. `counts` contains numbers of packets by APID and outcome.
+    earlier definition are read. `counts` contains numbers of packets by APID and outcome. Raw files of ingests up to
+    `read_again_to` have to be read again, because the definition declares packets without a checksum; NULL: none.
     """
 
     __tablename__ = "packet_decodings"
@@ -380,6 +381,7 @@ class PacketDecoding(Base):
     definition_id: Mapped[int] = mapped_column(ForeignKey("packet_definitions.id"), primary_key=True)
     decoded_to: Mapped[int] = mapped_column(BigInteger)
     complete: Mapped[int] = mapped_column(Flag)
+    read_again_to: Mapped[int | None] = mapped_column(BigInteger)
     counts: Mapped[dict[str, Any]] = mapped_column(JSON)
 
 

@@ -75,8 +75,13 @@ def readable_decoding(connection: Connection, vehicle: int) -> Decoding | None:
     return None if row is None else _decoding(row)
 
 
-def begin(connection: Connection, vehicle: int, definition: int) -> Decoding:
-    """Begin decoding with a definition."""
+def begin(connection: Connection, vehicle: int, definition: int, *, read_again: bool) -> Decoding:
+    """Begin decoding with a definition; `read_again`: also read the raw files that came before it was stated."""
+    ingests, missions = repository.INGESTS, repository.MISSIONS
+    stated = select(missions.c.created_utc_ns).where(
+        missions.c.id == mission_of_definition(connection, definition)
+    )
+    last = select(func.max(ingests.c.id)).where(ingests.c.received_utc_ns < stated.scalar_subquery())
     repository.add(
         connection,
         _DECODINGS,
@@ -84,6 +89,7 @@ def begin(connection: Connection, vehicle: int, definition: int) -> Decoding:
         definition_id=definition,
         decoded_to=0,
         complete=0,
+        read_again_to=connection.execute(last).scalar() if read_again else None,
         counts={},
     )
     return Decoding(definition, 0, False, {})
@@ -96,6 +102,52 @@ def change(connection: Connection, vehicle: int, progress: Decoding) -> None:
         .where(_DECODINGS.c.vehicle_id == vehicle, _DECODINGS.c.definition_id == progress.definition_id)
         .values(decoded_to=progress.decoded_to, complete=int(progress.complete), counts=dict(progress.counts))
     )
+
+
+def ingests_to_read(connection: Connection, vehicle: int) -> list[int]:
+    """Return the ingests whose raw files have to be read again, oldest first."""
+    last = connection.execute(
+        select(func.max(_DECODINGS.c.read_again_to)).where(_DECODINGS.c.vehicle_id == vehicle)
+    ).scalar()
+    if last is None:
+        return []
+    ingests = repository.INGESTS
+    query = (
+        select(ingests.c.id)
+        .where(
+            ingests.c.id <= last,
+            ingests.c.state.in_(("done", "failed")),
+            (ingests.c.vehicle_id == vehicle) | ingests.c.vehicle_id.is_(None),
+        )
+        .order_by(ingests.c.id)
+    )
+    return [int(key) for key in connection.execute(query).scalars()]
+
+
+def note_read(connection: Connection, vehicle: int) -> None:
+    """Record that the raw files have been read again."""
+    connection.execute(
+        update(_DECODINGS)
+        .where(_DECODINGS.c.vehicle_id == vehicle, _DECODINGS.c.read_again_to.is_not(None))
+        .values(read_again_to=None)
+    )
+
+
+def undecoded(connection: Connection, spacecraft: int, digest: str) -> list[int]:
+    """Return the vehicles of a spacecraft that are not, or not only, decoded with a definition."""
+    vehicles = repository.VEHICLES
+    found = []
+    for vehicle in connection.execute(
+        select(vehicles.c.id).where(vehicles.c.ccsds_id == spacecraft)
+    ).scalars():
+        rows = connection.execute(
+            select(_DEFINITIONS.c.digest, _DECODINGS.c.complete, _DECODINGS.c.read_again_to)
+            .join(_DEFINITIONS, _DEFINITIONS.c.id == _DECODINGS.c.definition_id)
+            .where(_DECODINGS.c.vehicle_id == vehicle)
+        ).all()
+        if [tuple(row) for row in rows] != ([(digest, 1, None)] if digest else []):
+            found.append(int(vehicle))
+    return found
 
 
 def forget_others(connection: Connection, vehicle: int, definition: int | None) -> None:

@@ -25,6 +25,7 @@ from ground_service.events import (
     CorrelationChanged,
     EphemerisAdded,
     FollowUpFailed,
+    MissionAdded,
     PassEvaluated,
     ReceptionsEntered,
     TelemetryReceived,
@@ -32,6 +33,7 @@ from ground_service.events import (
     publish,
 )
 from ground_service.ground import Ground, open_ground
+from ground_service.ingest.service import undecoded_vehicles
 from ground_service.jobs.service import add_job
 from ground_service.missions.store import get_mission
 from ground_service.passes.span import pass_span
@@ -102,6 +104,13 @@ def _after_report(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
     yield "advance windows", PassEvaluated.of(logged).vehicle_id
 
 
+def _after_mission(ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
+    event = MissionAdded.of(logged)
+    if event.spacecraft_id is not None:
+        for vehicle in undecoded_vehicles(ground, event.spacecraft_id):
+            yield "decode", vehicle
+
+
 def _after_window(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
     event = WindowChanged.of(logged)
     if event.state == "downlinked":
@@ -116,6 +125,7 @@ FOLLOWING: Mapping[str, Callable[[Ground, LoggedEvent], Iterator[Work]]] = {
     CommandsSent.event_kind: _after_uplink,
     PassEvaluated.event_kind: _after_report,
     WindowChanged.event_kind: _after_window,
+    MissionAdded.event_kind: _after_mission,
 }
 """The work that follows an event, by its kind."""
 
@@ -151,11 +161,20 @@ def _report(ground: Ground, window_id: int, event: int) -> str | None:
         return add_job(connection, "report", {"pass_id": pass_id}, job_id=_job_id("report", pass_id, 0))
 
 
+def _decode(ground: Ground, vehicle: int, event: int) -> str:
+    """Add the job that decodes the packets of a vehicle with a new mission description."""
+    with ground.database.writing() as connection:
+        return add_job(
+            connection, "redecode", {"vehicle_id": vehicle}, job_id=_job_id("decode", vehicle, event)
+        )
+
+
 DOING: Mapping[str, Callable[[Ground, int, int], str | None]] = {
     "recorrelate": _recorrelate,
     "advance windows": _advance,
     "re-evaluate": _reevaluate,
     "report": _report,
+    "decode": _decode,
 }
 """Functions of the work in the order in which they run; each returns the id of a job to start, or None."""
 

@@ -25,7 +25,7 @@ from ground_service.evaluation.service import make_report, reevaluate
 from ground_service.events import JobChanged, publish
 from ground_service.ground import Ground
 from ground_service.ingest.redecode import catch_up, redecode_job_id, vehicles_behind
-from ground_service.ingest.service import run_ingest
+from ground_service.ingest.service import apply_definition, run_ingest
 from ground_service.jobs.service import FINISHED, enter_job
 from ground_service.passes.archive_zip import import_zip
 from ground_service.store import repository
@@ -68,7 +68,9 @@ def _archive(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict
 
 
 def _redecode(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[str, Any]:
-    return {"rows": catch_up(ground, int(arguments["vehicle_id"]))}
+    vehicle = int(arguments["vehicle_id"])
+    rows = catch_up(ground, vehicle)
+    return {"rows": rows + apply_definition(ground, vehicle)}
 
 
 def _replay(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:

@@ -600,6 +600,7 @@ def upgrade() -> None:
         sa.Column("definition_id", sa.Integer(), nullable=False),
         sa.Column("decoded_to", sa.BigInteger(), nullable=False),
         sa.Column("complete", sa.SmallInteger(), nullable=False),
+        sa.Column("read_again_to", sa.BigInteger(), nullable=True),
         sa.Column("counts", sa.JSON(), nullable=False),
         sa.ForeignKeyConstraint(
             ["definition_id"],

@@ -14,7 +14,7 @@ from ground_service.app import create_app
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest import parameters as decoding
-from ground_service.ingest.service import Place, ingest_file
+from ground_service.ingest.service import Place, ingest_file, undecoded_vehicles
 from ground_service.missions.definitions import read_mission_file
 from ground_service.missions.model import mission_faults
 from ground_service.missions.service import add_mission, check_mission_file
@@ -24,6 +24,7 @@ from ground_service.passes.service import define_pass, parameter_series, trend_s
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.parameters import readable_decoding
+from ground_service.worker.follow_up import follow_in_process
 from lunar.timescales import parse_utc
 from tests.tmtc import foreign
 from tmtc.downlink import decode, encode_cadus
@@ -219,6 +220,25 @@ def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_k
         progress = readable_decoding(connection, result.vehicle_id)
     assert len(samples) == 125
     assert progress is not None and progress.counts == {"100": {"decoded": 100}, "101": {"decoded": 25}}
+
+
+def test_a_revision_reads_raw_files_again_whose_packets_were_taken_for_damaged(
+    either: Ground, tmp_path: Path, synthetic_pass: Any
+) -> None:
+    own, bus = payload_packets(synthetic_pass), bus_packets(100)
+    mixed = [packet for pair in zip(own, bus, strict=False) for packet in pair]
+    result = ingest_file(either, downlink(tmp_path, mixed))
+    assert result.packets_new <= len(own) and result.crc_errors + result.octets_skipped > 0
+    follow_in_process(either)
+    enter(either, tmp_path / "m")  # the event of the revision has the job run
+    assert parameter_series(either, define(either), "VOLTAGE", 1000).samples == 100
+    assert undecoded_vehicles(either, 76) == []
+    with either.database.reading() as connection:
+        (job,) = repository.page(connection, repository.JOBS, kind="redecode").rows
+    assert job["state"] == "done"
+    enter(either, tmp_path / "m", DEFINED + "[evidence]\nseed = 1\n")  # the same packets
+    with either.database.reading() as connection:
+        assert repository.page(connection, repository.JOBS, kind="redecode").total == 1
 
 
 def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(ground: Ground, tmp_path: Path) -> None:
