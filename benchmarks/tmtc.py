@@ -185,7 +185,7 @@ def _xtce(octets: bytes, count: int) -> list[Any]:
     if _XTCE is None:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, "bench.xml")
-            path.write_text(format_xtce(DICTIONARY), encoding="utf-8")
+            path.write_text(format_xtce(DICTIONARY, unrolled=True), encoding="utf-8")
             _XTCE = space_packet_parser.load_xtce(path)
     return [_XTCE.parse_bytes(octets[62 * k : 62 * (k + 1)]) for k in range(count)]
 

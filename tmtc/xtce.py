@@ -1,10 +1,10 @@
 """The dictionary as XTCE 1.2, for exchange with other ground systems; nothing here runs on it.
 
-Only plain features are used, so that simple decoders read the same values: integers, floats, enumerations,
-polynomial calibrators, containers that inherit under comparisons. Repeated items are therefore written out one by
-one, each in a container that inherits from that of the item before if the count says so, and the checksum in a
-container that inherits when no more items come; repeated octets are one binary parameter. A code that means "not
-known" has no expression in XTCE: it is calibrated like any other and named in the description.
+Repeated items are an array whose size is the count in the packet, of aggregates, or of numbers if an item is one
+number; repeated octets are one binary parameter. Some decoders do not support arrays: for these, the unrolled form
+states every item as a parameter, in a container that inherits from that of the item before if the count says so, and
+the checksum in a container that inherits when no more items come. A code that means "not known" has no expression in
+XTCE: it is calibrated like any other and named in the description.
 
 References
 ----------
@@ -44,8 +44,8 @@ _SECONDARY = (
 _CHECKSUM = ("ERROR_CONTROL", 16, "CRC-16 of the packet")
 
 
-def format_xtce(dictionary: Dictionary = DICTIONARY) -> str:
-    """The XTCE document."""
+def format_xtce(dictionary: Dictionary = DICTIONARY, *, unrolled: bool = False) -> str:
+    """Return the XTCE document; `unrolled`: without arrays, which makes it about thirty times as long."""
     root = ET.Element(
         "SpaceSystem",
         {
@@ -58,7 +58,7 @@ def format_xtce(dictionary: Dictionary = DICTIONARY) -> str:
     )
     ET.SubElement(root, "LongDescription").text = f"Dictionary hash (SHA-256): {dictionary.hash}"
     ET.SubElement(root, "Header", {"version": str(dictionary.version), "validationStatus": "Released"})
-    _telemetry(root, dictionary)
+    _telemetry(root, dictionary, unrolled)
     _commands(root, dictionary)
     ET.indent(root, "  ")
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
@@ -69,7 +69,7 @@ def parameter_name(packet: str, field_name: str, index: int | None = None) -> st
     return f"{packet}_{field_name}" if index is None else f"{packet}_{field_name}_{index}"
 
 
-def _telemetry(root: ET.Element, dictionary: Dictionary) -> None:
+def _telemetry(root: ET.Element, dictionary: Dictionary, unrolled: bool) -> None:
     metadata = ET.SubElement(root, "TelemetryMetaData")
     types = ET.SubElement(metadata, "ParameterTypeSet")
     parameters = ET.SubElement(metadata, "ParameterSet")
@@ -97,11 +97,37 @@ def _telemetry(root: ET.Element, dictionary: Dictionary) -> None:
             _binary_type(types, f"{binary}_Type", parameter_name(d.name, d.group.count))
             _parameter(parameters, binary, f"{binary}_Type", "The octets")
             _entries(container, [*names, binary, "ERROR_CONTROL"])
-        else:
+        elif unrolled:
             _entries(container, names)
+        else:
+            _entries(container, [*names, _array(types, parameters, d), "ERROR_CONTROL"])
         _inherit(container, "PUSTelemetry", conditions)
-        if d.group is not None and not _is_octets(d):
+        if unrolled and d.group is not None and not _is_octets(d):
             _unrolled(types, parameters, containers, d)
+
+
+def _array(types: ET.Element, parameters: ET.Element, d: PacketDefinition) -> str:
+    """Add the array of the repeated items of a packet; return the name of its parameter."""
+    assert d.group is not None
+    name = parameter_name(d.name, d.group.name)
+    for f in d.group.fields:
+        _parameter_type(types, _type_name(d.name, f), f)
+    item = _type_name(d.name, d.group.fields[0])
+    if len(d.group.fields) > 1:
+        item = f"{name}_Item_Type"
+        members = ET.SubElement(ET.SubElement(types, "AggregateParameterType", {"name": item}), "MemberList")
+        for f in d.group.fields:
+            given = {"name": f.name, "typeRef": _type_name(d.name, f), "shortDescription": _description(f)}
+            ET.SubElement(members, "Member", given)
+    array = ET.SubElement(types, "ArrayParameterType", {"name": f"{name}_Type", "arrayTypeRef": item})
+    dimension = ET.SubElement(ET.SubElement(array, "DimensionList"), "Dimension")
+    ET.SubElement(ET.SubElement(dimension, "StartingIndex"), "FixedValue").text = "0"
+    last = ET.SubElement(ET.SubElement(dimension, "EndingIndex"), "DynamicValue")
+    count = {"parameterRef": parameter_name(d.name, d.group.count), "useCalibratedValue": "false"}
+    ET.SubElement(last, "ParameterInstanceRef", count)
+    ET.SubElement(last, "LinearAdjustment", {"slope": "1", "intercept": "-1"})
+    _parameter(parameters, name, f"{name}_Type", f"Repeated items of {d.name}")
+    return name
 
 
 def _unrolled(types: ET.Element, parameters: ET.Element, containers: ET.Element, d: PacketDefinition) -> None:

@@ -53,6 +53,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
     xtce = commands.add_parser("xtce", help="the dictionary as XTCE 1.2")
     xtce.add_argument("--out", type=Path, metavar="F", help="write there (default: standard output)")
+    xtce.add_argument(
+        "--unrolled", action="store_true", help="without arrays, for decoders that do not support them"
+    )
     add_json_flag(xtce)
     xtce.set_defaults(handler=run_xtce)
 
@@ -156,7 +159,7 @@ def run_icd(arguments: argparse.Namespace) -> int:
 def run_xtce(arguments: argparse.Namespace) -> int:
     from tmtc.xtce import format_xtce
 
-    return _document(arguments, format_xtce())
+    return _document(arguments, format_xtce(unrolled=arguments.unrolled))
 
 
 def _document(arguments: argparse.Namespace, text: str) -> int:

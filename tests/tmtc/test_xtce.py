@@ -10,13 +10,17 @@ from space_packet_parser.xtce.validation import validate_xtce
 
 from tmtc.dictionary import DICTIONARY
 from tmtc.schema import Field, PacketDefinition
+from tmtc.stream import whole_packets
 from tmtc.xtce import format_xtce, parameter_name
+from tmtc.xtce_decode import Decoder
+from tmtc.xtce_import import parse_xtce
 
 
 @pytest.fixture(scope="module")
 def document(tmp_path_factory):
+    """The unrolled form: the independent decoder does not support arrays."""
     path = tmp_path_factory.mktemp("xtce") / "linna.xml"
-    path.write_text(format_xtce(), encoding="utf-8")
+    path.write_text(format_xtce(unrolled=True), encoding="utf-8")
     return path
 
 
@@ -28,6 +32,67 @@ def decoder(document):
 def test_the_document_validates_against_the_schema_and_its_references_hold(document):
     result = validate_xtce(document, level="all", print_results=False, allow_schema_download=False)
     assert result.valid, result.errors
+
+
+def test_the_form_with_arrays_validates_against_the_schema_and_is_short(tmp_path):
+    text = format_xtce()
+    path = tmp_path / "arrays.xml"
+    path.write_text(text, encoding="utf-8")
+    result = validate_xtce(path, level="schema", print_results=False, allow_schema_download=False)
+    assert result.valid, result.errors
+    assert text.count("<SequenceContainer") == len(DICTIONARY.telemetry) + 2
+    assert len(text) < 300_000
+
+
+@pytest.mark.parametrize("definition", DICTIONARY.telemetry, ids=lambda d: d.name)
+def test_the_form_with_arrays_is_imported_to_equal_values_of_every_packet(definition):
+    rng = np.random.default_rng(18)
+    counts = [0, 1, 2, 40, 255] if definition.group else [0, 0, 0]
+    packets = [random_packet(definition, count, rng) for count in counts]
+    cut = whole_packets(np.array([len(packet) for packet in packets]))
+    found = Decoder(parse_xtce(format_xtce()), "CCSDSPacket").decode(b"".join(packets), cut)
+    assert found.counts()["decoded"] == len(packets)
+    (table,) = found.tables.values()
+    assert table.name == definition.name
+    assert not table.unread_bits.any()
+    columns = {
+        name: list(zip(column.to_list(), column.to_list(raw=True), strict=True))
+        for name, column in table.columns.items()
+    }
+    for row, octets in enumerate(packets):
+        ours = DICTIONARY.unpack_packet(octets)
+        assert columns["TIME_COARSE"][row][0] << 16 | columns["TIME_FINE"][row][0] == ours.ticks
+        assert columns["ERROR_CONTROL"][row][0] == int.from_bytes(octets[-2:], "big")
+        for f in definition.fields:
+            for k in range(f.size):
+                index = None if f.size == 1 else k + 1
+                value, raw = ours.values[f.name], ours.raw[f.name]
+                if index is not None:
+                    value, raw = value[k], raw[k]
+                assert_imported(columns[parameter_name(definition.name, f.name, index)][row], value, raw, f)
+        if definition.group is None:
+            continue
+        values, raws = columns[parameter_name(definition.name, definition.group.name)][row]
+        fields = definition.group.fields
+        if [f.type for f in fields] == ["u8"]:
+            assert values == bytes(ours.values["items"]["octet"].astype(np.uint8))
+            continue
+        assert len(values) == counts[row]
+        for f in fields:
+            for k in range(counts[row]):
+                pair = (values[k], raws[k]) if len(fields) == 1 else (values[k][f.name], raws[k][f.name])
+                assert_imported(pair, ours.values["items"][f.name][k], ours.raw["items"][f.name][k], f)
+
+
+def assert_imported(pair, value, raw, f: Field) -> None:
+    if f.labels:
+        assert pair == (f.label(raw), raw)
+    elif f.missing is not None and raw == f.missing:
+        assert pair[1] == raw
+    elif f.is_float and math.isnan(value):
+        assert math.isnan(pair[0])
+    else:
+        assert pair == (value, raw)
 
 
 def random_value(f: Field, rng: np.random.Generator):

@@ -24,7 +24,6 @@ from ground_service.passes.service import define_pass, parameter_series, trend_s
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.parameters import readable_decoding
-from ground_service.worker.follow_up import follow_in_process
 from lunar.timescales import parse_utc
 from tests.tmtc import foreign
 from tmtc.downlink import decode, encode_cadus
@@ -182,6 +181,7 @@ def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_k
     either: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(decoding, "BLOCK_PACKETS", 50)
+    either.database.listeners.clear()  # no job decodes
     declared = "[[packets]]\nname = 'bus'\napids = [100, 101]\npacket_checksum = 'none'\n"
     enter(either, tmp_path / "m", declared)
     result = ingest_file(either, downlink(tmp_path, bus_packets(100)))
@@ -229,7 +229,6 @@ def test_a_revision_reads_raw_files_again_whose_packets_were_taken_for_damaged(
     mixed = [packet for pair in zip(own, bus, strict=False) for packet in pair]
     result = ingest_file(either, downlink(tmp_path, mixed))
     assert result.packets_new <= len(own) and result.crc_errors + result.octets_skipped > 0
-    follow_in_process(either)
     enter(either, tmp_path / "m")  # the event of the revision has the job run
     assert parameter_series(either, define(either), "VOLTAGE", 1000).samples == 100
     assert undecoded_vehicles(either, 76) == []
