@@ -28,8 +28,8 @@ class ValueColumn:
 
     def take(self, index: IntArray) -> ValueColumn:
         """The rows of an index (m,)."""
-        raw = self.raw[index]
-        return ValueColumn(raw, raw if self.values is self.raw else self.values[index])
+        raw = self.raw.take(index)
+        return ValueColumn(raw, raw if self.values is self.raw else self.values.take(index))
 
     def to_list(self, raw: bool = False) -> list[Any]:
         """Python values, one for each row."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from operator import methodcaller
 from typing import Any
 
 import numpy as np
@@ -805,7 +806,8 @@ def _decoded_texts(
     if len(rows):
         pieces = _slices(run, starts[rows], sizes[rows]) if whole is None else whole[rows]
         try:
-            texts[rows] = _objects([piece.decode(charset) for piece in pieces.tolist()])
+            decode = bytes.decode if charset == "utf-8" else methodcaller("decode", charset)
+            texts[rows] = _objects(list(map(decode, pieces.tolist())))
         except UnicodeDecodeError:
             return None
     return texts
