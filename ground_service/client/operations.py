@@ -23,8 +23,10 @@ from ground_service.passes.model import (
     Completeness,
     Detection,
     Event,
+    ExportFormat,
     ParameterSeries,
     PassDetail,
+    PassParameters,
     PassSummary,
     States,
     Trend,
@@ -156,8 +158,16 @@ class Client(Connection):
             max_points=max_points,
         )
 
+    def list_parameters(self, pass_id: int) -> PassParameters:
+        """Return the parameters of a pass with series, and the packets that its mission description defines."""
+        return self._get(PassParameters, f"/passes/{pass_id}/parameters")
+
+    def get_packets(self, pass_id: int, packet: str, target: Path, *, kind: ExportFormat = "csv") -> None:
+        """Download the decoded packets of one kind in a pass into a file."""
+        self._download(f"/passes/{pass_id}/packets/{_part(packet)}", target, format=kind)
+
     def get_parameter(self, pass_id: int, parameter: str, *, max_points: int = 1000) -> ParameterSeries:
-        """Return the series of a housekeeping parameter of a pass."""
+        """Return the series of a parameter of a pass."""
         path = f"/passes/{pass_id}/telemetry/{_part(parameter)}"
         return self._get(ParameterSeries, path, max_points=max_points)
 
