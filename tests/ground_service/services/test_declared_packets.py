@@ -24,6 +24,7 @@ from ground_service.passes.service import define_pass, parameter_series, trend_s
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.parameters import readable_decoding
+from ground_service.worker.integrity import verify
 from lunar.timescales import parse_utc
 from tests.tmtc import foreign
 from tmtc.downlink import decode, encode_cadus
@@ -238,6 +239,17 @@ def test_a_revision_reads_raw_files_again_whose_packets_were_taken_for_damaged(
     enter(either, tmp_path / "m", DEFINED + "[evidence]\nseed = 1\n")  # the same packets
     with either.database.reading() as connection:
         assert repository.page(connection, repository.JOBS, kind="redecode").total == 1
+
+
+@pytest.mark.parametrize("deep", [False, True])
+def test_the_integrity_check_finds_packets_without_a_checksum_intact(
+    ground: Ground, tmp_path: Path, deep: bool
+) -> None:
+    enter(ground, tmp_path / "m")
+    ingest_file(ground, downlink(tmp_path, bus_packets(30)))
+    found = verify(ground, deep=deep)
+    assert (found.verdict, found.damaged) == ("intact", [])
+    assert found.checked["packets"] == 38
 
 
 def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(ground: Ground, tmp_path: Path) -> None:
