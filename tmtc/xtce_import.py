@@ -206,12 +206,17 @@ class _Importer:
         self.open: list[Node] = []
         self.parameters: dict[str, Parameter] = {}
         self.names = _column_names([(s.path, name) for s in self.systems for name in s.parameters])
+        self.container_names = _column_names([(s.path, name) for s in self.systems for name in s.containers])
+        self.owner = {id(node): (s, node) for s in self.systems for node in s.containers.values()}
+        self.bases: dict[int, int] = {}
+        self.followers: dict[int, list[int]] = {key: [] for key in self.owner}
+        self.included: set[int] = set()
+        self.parts: dict[int, tuple[Entry, ...]] = {}
+        self.sizes: dict[int, int] = {}
 
     def definition(self) -> Definition:
         """Everything, once every reference holds."""
-        owner = {id(node): (system, node) for system in self.systems for node in system.containers.values()}
-        bases: dict[int, int] = {}
-        followers: dict[int, list[int]] = {key: [] for key in owner}
+        owner, bases, followers = self.owner, self.bases, self.followers
         for key, (system, node) in owner.items():
             base = node.child("BaseContainer")
             if base is not None:
@@ -220,74 +225,10 @@ class _Importer:
                 bases[key] = id(found)
                 followers[id(found)].append(key)
         _check_chains(bases, {key: node for key, (_, node) in owner.items()})
-        included: set[int] = set()
         made: dict[int, Container] = {}
-        sizes: dict[int, int] = {}
-        names = _column_names([(system.path, name) for system in self.systems for name in system.containers])
-        parts: dict[int, tuple[Entry, ...]] = {}
-
-        def entries(key: int) -> tuple[Entry, ...]:
-            """Entries of a container; those of containers in it are made first."""
-            if key in parts:
-                return parts[key]
-            system, node = owner[key]
-            if node in self.open:
-                raise node.error(
-                    "containers that do not contain themselves", f"{node.attributes['name']!r} in itself"
-                )
-            _expect(
-                node, len(self.open) < MAX_TYPE_DEPTH, f"containers at most {MAX_TYPE_DEPTH} deep", "deeper"
-            )
-            self.open.append(node)
-            found, size = [], 0
-            listed = node.required("EntryList")
-            for element in listed.children:
-                if element.tag == "ContainerRefEntry":
-                    _, inner = self.find("containers", element.attribute("containerRef"), system, element)
-                    if id(inner) in bases or followers[id(inner)]:
-                        raise element.error(
-                            "a container without base and without containers that inherit from it",
-                            inner.attributes["name"],
-                        )
-                    included.add(id(inner))
-                    content = Container(
-                        names[owner[id(inner)][0].path, inner.attributes["name"]],
-                        f"{owner[id(inner)][0].path}/{inner.attributes['name']}",
-                        entries(id(inner)),
-                        False,
-                        None,
-                        (),
-                    )
-                    size += sizes[id(inner)]
-                    found.append(self.entry(element, content, system, ("containerRef",)))
-                else:
-                    parameter, count = self.parameter_entry(element, system)
-                    size += count
-                    found.append(self.entry(element, parameter, system, ("parameterRef",)))
-                _expect(node, size <= MAX_VALUES, f"at most {MAX_VALUES} values", "more")
-            self.open.pop()
-            sizes[key] = size
-            parts[key] = tuple(found)
-            return parts[key]
-
         for key in _children_first(followers, bases):
-            system, node = owner[key]
-            node.only(
-                (*_DESCRIPTION, "DefaultRateInStream", "RateInStreamSet", "EntryList", "BaseContainer"),
-                (*_NAMED, "abstract", "idlePattern", "sizeInBits"),
-            )
-            base = node.child("BaseContainer")
-            criteria = base.child("RestrictionCriteria") if base is not None else None
-            made[key] = Container(
-                name=names[system.path, node.attributes["name"]],
-                path=f"{system.path}/{node.attributes['name']}",
-                entries=entries(key),
-                abstract=_boolean(node, "abstract", False),
-                condition=None if criteria is None else self.condition(criteria, system),
-                children=tuple(made[follower] for follower in followers[key]),
-                description=node.attributes.get("shortDescription", ""),
-            )
-        roots = [key for key in owner if key not in bases and key not in included]
+            made[key] = self.container(key, tuple(made[follower] for follower in followers[key]))
+        roots = [key for key in owner if key not in bases and key not in self.included]
         if not roots:
             raise self.top[0].node.error("a container without a base", "none")
         for key in roots:
@@ -298,6 +239,65 @@ class _Importer:
             parameters={parameter.name: parameter for parameter in self.parameters.values()},
             containers={container.name: container for container in made.values()},
         )
+
+    def container(self, key: int, children: tuple[Container, ...]) -> Container:
+        """The container of an element, with those that continue it."""
+        system, node = self.owner[key]
+        node.only(
+            (*_DESCRIPTION, "DefaultRateInStream", "RateInStreamSet", "EntryList", "BaseContainer"),
+            (*_NAMED, "abstract", "idlePattern", "sizeInBits"),
+        )
+        base = node.child("BaseContainer")
+        criteria = base.child("RestrictionCriteria") if base is not None else None
+        return Container(
+            name=self.container_names[system.path, node.attributes["name"]],
+            path=f"{system.path}/{node.attributes['name']}",
+            entries=self.entries(key),
+            abstract=_boolean(node, "abstract", False),
+            condition=None if criteria is None else self.condition(criteria, system),
+            children=children,
+            description=node.attributes.get("shortDescription", ""),
+        )
+
+    def entries(self, key: int) -> tuple[Entry, ...]:
+        """Entries of a container; those of containers in it are made first."""
+        if key in self.parts:
+            return self.parts[key]
+        system, node = self.owner[key]
+        if node in self.open:
+            raise node.error(
+                "containers that do not contain themselves", f"{node.attributes['name']!r} in itself"
+            )
+        _expect(node, len(self.open) < MAX_TYPE_DEPTH, f"containers at most {MAX_TYPE_DEPTH} deep", "deeper")
+        self.open.append(node)
+        found, size = [], 0
+        for element in node.required("EntryList").children:
+            item: Parameter | Container
+            if element.tag == "ContainerRefEntry":
+                item, count = self.included_container(element, system)
+                reference = "containerRef"
+            else:
+                item, count = self.parameter_entry(element, system)
+                reference = "parameterRef"
+            size += count
+            found.append(self.entry(element, item, system, (reference,)))
+            _expect(node, size <= MAX_VALUES, f"at most {MAX_VALUES} values", "more")
+        self.open.pop()
+        self.sizes[key] = size
+        self.parts[key] = tuple(found)
+        return self.parts[key]
+
+    def included_container(self, element: Node, system: _System) -> tuple[Container, int]:
+        """The container of an entry and the number of its values."""
+        home, inner = self.find("containers", element.attribute("containerRef"), system, element)
+        key, name = id(inner), inner.attributes["name"]
+        if key in self.bases or self.followers[key]:
+            raise element.error("a container without base and without containers that inherit from it", name)
+        self.included.add(key)
+        content = Container(
+            self.container_names[home.path, name], f"{home.path}/{name}", self.entries(key), False, None, ()
+        )
+        return content, self.sizes[key]
 
     # references
 
