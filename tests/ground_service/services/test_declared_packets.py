@@ -5,7 +5,7 @@ import struct
 import warnings
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -24,6 +24,7 @@ from ground_service.passes.service import define_pass, parameter_series, trend_s
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.parameters import readable_decoding
+from ground_service.worker import follow_up
 from ground_service.worker.integrity import verify
 from lunar.timescales import parse_utc
 from tests.tmtc import foreign
@@ -182,7 +183,9 @@ def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_k
     either: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(decoding, "BLOCK_PACKETS", 50)
-    either.database.listeners.clear()  # no job decodes
+    monkeypatch.setitem(
+        cast(dict[str, Any], follow_up.DOING), "decode", lambda *_given: None
+    )  # no job decodes
     declared = "[[packets]]\nname = 'bus'\napids = [100, 101]\npacket_checksum = 'none'\n"
     enter(either, tmp_path / "m", declared)
     result = ingest_file(either, downlink(tmp_path, bus_packets(100)))
