@@ -13,9 +13,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from tmtc.arrays import IntArray
-from tmtc.schema import as_octets
-from tmtc.stream import Octets
+from tmtc.arrays import IntArray, Octets, as_octets
 
 _SECONDS_LIMIT = 1 << 40
 _DAYS_LIMIT = 100_000

@@ -27,9 +27,10 @@ from lunar.timescales import (
     tai_ns_from_utc_ns,
     ticks_from_utc_ns,
 )
+from tmtc.arrays import Octets
 from tmtc.cuc import NO_TICKS, TICKS_LIMIT
 from tmtc.packet_times import TimeCode, elapsed
-from tmtc.stream import Octets, PacketCut, whole_packets
+from tmtc.stream import PacketCut, whole_packets
 from tmtc.xtce_decode import VERDICTS
 from tmtc.xtce_series import series_matrix
 
