@@ -68,7 +68,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     train.set_defaults(handler=_train)
 
     export = verbs.add_parser("export", help="write the ONNX network of a run, checked against torch")
-    export.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or a checkpoint file")
+    export.add_argument(
+        "run", type=Path, metavar="RUN", help="folder of a run, a checkpoint file, or an exported network"
+    )
     export.add_argument("--out", type=Path, required=True, metavar="M.onnx")
     export.add_argument(
         "--dataset",
@@ -87,6 +89,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--classes-only",
         action="store_true",
         help="the paper's detector: class heatmaps and offsets, no sizes; flies as a build",
+    )
+    export.add_argument(
+        "--enlarge",
+        type=int,
+        choices=(0, 1, 2),
+        default=0,
+        help="make the network enlarge images so many times first (0: as it is)",
     )
     export.add_argument(
         "--test", action="store_true", help="score the test splits and write the figures into the model"
@@ -213,6 +222,7 @@ def _export(arguments: argparse.Namespace) -> int:
         {"training_note": arguments.note} if arguments.note else None,
         paper_classes=arguments.paper_classes,
         classes_only=arguments.classes_only,
+        enlarge=arguments.enlarge,
         test=arguments.test,
     )
     emit(arguments, figures)

@@ -42,6 +42,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="report also when the orbit would hit the ground without burns",
     )
+    propagate.add_argument(
+        "--count-within-deg",
+        type=_positive,
+        action="append",
+        default=[],
+        metavar="LAT",
+        help="count the states whose sub-satellite latitude is within this of the equator; may be repeated",
+    )
     add_json_flag(propagate)
     propagate.set_defaults(handler=run_propagate)
     configure_compare(commands)
@@ -80,6 +88,8 @@ def run_propagate(arguments: argparse.Namespace) -> int:
         f"propagated in {propagated - started:.2f} s, sampled and written in {wall_s - (propagated - started):.2f} s"
     )
     figures = _figures(orbit, states, wall_s)
+    if arguments.count_within_deg:
+        figures["states_within_deg"] = _states_within(orbit, states, arguments)
     figures["data"] = list(data.names()) or ["built-in gravity and IAU orientation only"]
     if arguments.free_drift:
         figures["free_drift"] = _impact_figures(free_impact(scenario, model, duration_s))
@@ -140,6 +150,21 @@ def _figures(orbit: Any, states: Any, wall_s: float) -> dict[str, Any]:
     }
 
 
+def _states_within(orbit: Any, states: Any, arguments: argparse.Namespace) -> dict[str, int]:
+    """Number of states within each latitude of the equator: frames of a camera with the step as its interval."""
+    import numpy as np
+
+    from lunar.frames import spherical_from_mcmf
+    from lunar.timescales import tdb_s_from_utc_ns
+
+    step_ns = arguments.step * 1e9
+    utc_ns = orbit.epoch_utc_ns + np.rint(np.arange(len(states)) * step_ns).astype(np.int64)
+    rotation = orbit.model.orientation.mcmf_from_icrf(np.asarray(tdb_s_from_utc_ns(utc_ns), dtype=np.float64))
+    latitude, _, _ = spherical_from_mcmf(np.einsum("nij,nj->ni", rotation, states[:, :3]))
+    within = np.abs(np.degrees(latitude))
+    return {f"{limit:g}": int(np.count_nonzero(within <= limit)) for limit in arguments.count_within_deg}
+
+
 def _elements(elements: Any) -> dict[str, float]:
     return {
         "semi_major_axis_km": elements.semi_major_axis_m / 1e3,
@@ -169,6 +194,10 @@ def _text(figures: dict[str, Any]) -> str:
         f"{figures['forces']}, orientation {figures['orientation']}",
         f"altitude mean {altitude['mean']:.2f} km, min {altitude['min']:.2f} km, max {altitude['max']:.2f} km",
         f"{len(burns)} burns, {figures['delta_v_total_m_s']:.2f} m/s",
+    ]
+    lines += [
+        f"{count} of {figures['states']} states within {limit} deg of the equator"
+        for limit, count in figures.get("states_within_deg", {}).items()
     ]
     lines += [
         f"  {burn['epoch']}  {burn['delta_v_m_s']:.3f} m/s at {burn['place']}: "

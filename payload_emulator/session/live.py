@@ -19,15 +19,16 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from lunar.catalogue import CraterCatalogue
+from lunar.errors import LunarError
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from lunar.timescales import format_utc
-from payload_emulator.errors import LinkError
+from payload_emulator.errors import LinkError, PayloadError
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.session.flying import (
     SPACECRAFT_ID,
@@ -42,7 +43,7 @@ from payload_emulator.session.flying import (
 from payload_emulator.session.instruments import InstrumentBench
 from payload_emulator.session.live_ports import Server
 from payload_emulator.session.spacecraft import Spacecraft
-from payload_emulator.session.world import World, exposures
+from payload_emulator.session.world import World, continued, exposures
 from payload_emulator.sim.board.link import LIGHT_S, Receiver, Transmitter, transmit
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import TmtcError
@@ -53,6 +54,10 @@ Signal = TypeVar("Signal")
 
 _NS = 1_000_000_000
 _POLL_S = 0.05
+
+CONTINUATION_S = 3_600.0
+"""Time flown on at once beyond the scenario's arc."""
+
 _BUFFER_LIMIT = 1 << 20
 _JPEG_QUALITY = 92
 _SHOWN_CRATERS = 200
@@ -251,20 +256,23 @@ class LivePayload:
     def _fly(self) -> None:
         operator = Operator(self.world) if self.has_operator else Nobody()
         frames = exposures(self.world, InstrumentBench(self.world).sample)
-        moments = timeline(self.world)
-        interval_ns = round(self.world.scenario.camera.frame_interval_s * _NS)
-        last = moments[-1]
+        pending = deque(timeline(self.world))
+        last = pending[-1]
         try:
             with selectors.DefaultSelector() as selector, self._served(selector):
-                pending = deque(moments)
                 before: Moment | None = None
                 while not self.stopping.is_set():
                     if not pending:
                         if self.stop_at_end:
                             return
-                        # The scenario is over, the machine is not: turns without frames go on.
-                        last = Moment(last.utc_ns + interval_ns, -1, last.sunlit, True, last.downlink_octets)
-                        pending.append(last)
+                        frames.close()
+                        number = self.world.frame_utc_ns.size
+                        pending.extend(self._beyond(last))
+                        last = pending[-1]
+                        if isinstance(operator, Operator):
+                            operator.world = self.world
+                        if self.world.frame_utc_ns.size > number:
+                            frames = exposures(self.world, InstrumentBench(self.world).sample, number)
                     moment = pending.popleft()
                     self._wait(selector, 0.0 if before is None else (moment.utc_ns - before.utc_ns) / _NS)
                     if self.stopping.is_set():
@@ -284,6 +292,32 @@ class LivePayload:
                     self._tell(flown)
         finally:
             frames.close()
+
+    def _beyond(self, last: Moment) -> list[Moment]:
+        """Fly on beyond the scenario's arc and return the moments after its last; turns without frames fill the gaps.
+
+        Where the orbit ends on the ground or in an ephemeris file, turns without frames are all that is left.
+        """
+        interval_ns = round(self.world.scenario.camera.frame_interval_s * _NS)
+        stop_utc_ns = last.utc_ns + round(CONTINUATION_S * _NS)
+        further: list[Moment] = []
+        try:
+            world = continued(self.world, (stop_utc_ns - self.world.truth.stop_utc_ns) / _NS + CONTINUATION_S)
+        except (LunarError, PayloadError) as error:
+            world = None
+            self._say({"kind": "error", "text": f"no images from here on: {error}"})
+        if world is not None:
+            known = self.world.frame_utc_ns.size
+            kept = world.frame_utc_ns[
+                (np.arange(world.frame_utc_ns.size) < known) | (world.frame_utc_ns <= stop_utc_ns)
+            ]
+            self.world, self.catalogue = replace(world, frame_utc_ns=kept), None
+            further = [one for one in timeline(self.world) if last.utc_ns < one.utc_ns <= stop_utc_ns]
+        taken = np.array([one.utc_ns for one in further], dtype=np.int64)
+        turns = np.arange(last.utc_ns + interval_ns, stop_utc_ns, interval_ns)
+        free = [int(t) for t in turns if not taken.size or np.abs(taken - t).min() >= interval_ns // 2]
+        idle = [Moment(t, -1, last.sunlit, True, last.downlink_octets) for t in free]
+        return sorted([*further, *idle], key=lambda one: one.utc_ns)
 
     @contextlib.contextmanager
     def _served(self, selector: selectors.BaseSelector) -> Iterator[None]:

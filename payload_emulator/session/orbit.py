@@ -105,8 +105,21 @@ def propagate_scenario(scenario: Scenario, model: ForceModel, duration_s: float)
             f"scenario {scenario.name}: expected orbital elements or a state to propagate, "
             f"found the ephemeris {scenario.orbit.oem}"
         )
-    epoch_tdb_s = tdb_s_from_utc_ns(scenario.epoch_utc_ns)
     state = initial_state_icrf(scenario, model.gm_m3_s2)
+    return propagate_from(scenario, model, scenario.epoch_utc_ns, state, duration_s)
+
+
+def propagate_from(
+    scenario: Scenario, model: ForceModel, epoch_utc_ns: int, state_icrf: FloatArray, duration_s: float
+) -> ScenarioOrbit:
+    """Return the orbit from a state (6,) in m and m/s, with the integrator and the burns of a scenario.
+
+    Raises
+    ------
+    ImpactError
+        The orbit hits the Moon.
+    """
+    epoch_tdb_s, state = tdb_s_from_utc_ns(epoch_utc_ns), state_icrf
     rule, integrator = scenario.maneuvers, scenario.dynamics.integrator
     maneuvers: tuple[Maneuver, ...] = ()
     if rule.enabled:
@@ -121,7 +134,7 @@ def propagate_scenario(scenario: Scenario, model: ForceModel, duration_s: float)
         )
     else:
         trajectory = propagate(epoch_tdb_s, state[:3], state[3:], duration_s, model, integrator=integrator)
-    return ScenarioOrbit(trajectory, maneuvers, model, scenario.epoch_utc_ns)
+    return ScenarioOrbit(trajectory, maneuvers, model, epoch_utc_ns)
 
 
 def free_impact(scenario: Scenario, model: ForceModel, duration_s: float) -> ImpactError | None:

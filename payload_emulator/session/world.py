@@ -21,6 +21,7 @@ from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.frames import Orientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.gravity import GravityField
 from lunar.lens import BrownCamera, pointed_camera_from_mcmf
+from lunar.maneuvers import Maneuver
 from lunar.oem import load_oem
 from lunar.propagation import ForceModel
 from lunar.third_bodies import sun_position_icrf_m
@@ -32,7 +33,7 @@ from lunar.timescales import (
     utc_ns_from_tdb_s,
 )
 from payload_emulator.errors import ScenarioError
-from payload_emulator.session.orbit import force_model, propagate_scenario
+from payload_emulator.session.orbit import force_model, propagate_from, propagate_scenario
 from payload_emulator.session.scenario import ReferenceSection, Scenario, WindowSection
 from payload_emulator.sim.orbit.disturbances import TrueBurn, changed, executed, turned_state
 from payload_emulator.sim.orbit.truth import (
@@ -43,6 +44,7 @@ from payload_emulator.sim.orbit.truth import (
     frame_times,
     perturbed,
     require_above_ground,
+    spliced,
 )
 from payload_emulator.sim.render.light import sun_direction_mcmf
 from payload_emulator.sim.render.photometry import Photometry
@@ -78,10 +80,15 @@ class World:
     scenario: Scenario
     truth: Truth
     terrain: TiledTerrain
-    gravity: GravityField
+    model: ForceModel
     burns: tuple[TrueBurn, ...]
     frame_utc_ns: IntArray
     data_names: tuple[str, ...]
+
+    @property
+    def gravity(self) -> GravityField:
+        """Gravity field of the true flight."""
+        return self.model.gravity
 
     @property
     def camera(self) -> PinholeCamera:
@@ -141,7 +148,6 @@ def build_world(scenario: Scenario, data: DataFolder) -> World:
         registration_north_east_m=scenario.terrain.registration_north_east_m,
     )
     model = force_model(scenario, data)
-    gravity = model.gravity
     truth, burns, windows = _fly_to_windows(scenario, model, terrain)
     interval_ns = round(scenario.camera.frame_interval_s * _NS)
     band_rad = _band_rad(scenario)
@@ -157,10 +163,57 @@ def build_world(scenario: Scenario, data: DataFolder) -> World:
     require_above_ground(truth, frame_utc_ns, terrain.height_m, _HIGHEST_GROUND_M)
     names = (
         *terrain.data_names,
-        f"gravity {gravity.name} to degree {model.degree}",
+        f"gravity {model.gravity.name} to degree {model.degree}",
         f"orientation {model.orientation.name}",
     )
-    return World(scenario, truth, terrain, gravity, burns, frame_utc_ns, names)
+    return World(scenario, truth, terrain, model, burns, frame_utc_ns, names)
+
+
+def continued(world: World, duration_s: float) -> World | None:
+    """Return the world flown on beyond its trajectory, with the frames of the added time; None for an OEM file.
+
+    The window's band of latitudes and its search still decide where frames are taken; its number of passes and its
+    duration do not. Frames begin two intervals after the last, so that they are an arc of their own.
+
+    Raises
+    ------
+    ImpactError
+        The orbit hits the Moon.
+    ScenarioError
+        The trajectory dips below the ground at a new frame.
+    """
+    scenario, truth, model = world.scenario, world.truth, world.model
+    if scenario.orbit.oem:
+        return None
+    joint_utc_ns = truth.stop_utc_ns
+    state = np.concatenate([part[0] for part in truth.states(joint_utc_ns)])
+    orbit = propagate_from(scenario, model, joint_utc_ns, state, duration_s)
+    burns = _executed(scenario, orbit.maneuvers)
+    stop_utc_ns = joint_utc_ns + round(duration_s * _NS)
+    breaks = (*truth.breaks_utc_ns, *(burn.utc_ns for burn in burns))
+    joint_tdb_s = float(tdb_s_from_utc_ns(joint_utc_ns))
+    longer = Truth(
+        spliced(truth.state_icrf, joint_tdb_s, orbit.trajectory.state),
+        truth.start_utc_ns,
+        stop_utc_ns,
+        truth.orientation,
+        breaks,
+    )
+    interval_ns = round(scenario.camera.frame_interval_s * _NS)
+    begin_utc_ns = int(world.frame_utc_ns[-1]) + 2 * interval_ns
+    windows = [(begin_utc_ns, stop_utc_ns)]
+    if scenario.window.search == "terrain":
+        crossings = _crossings(scenario, longer, world.terrain, begin_utc_ns)
+        windows = [(one.start_utc_ns, one.stop_utc_ns) for one in crossings if one.observable]
+    added = [
+        frame_times(longer, max(first, begin_utc_ns), last, interval_ns, _band_rad(scenario))
+        for first, last in windows
+    ]
+    frames = np.concatenate([world.frame_utc_ns, *added])
+    require_above_ground(
+        longer, frames[world.frame_utc_ns.size - 1 :], world.terrain.height_m, _HIGHEST_GROUND_M
+    )
+    return replace(world, truth=longer, burns=(*world.burns, *burns), frame_utc_ns=frames)
 
 
 def _one_arc_of(interval: int, frame_utc_ns: IntArray, step_ns: int) -> IntArray:
@@ -198,9 +251,9 @@ def no_instruments(utc_ns: int, camera_from_mcmf: FloatArray) -> Samples:
 
 
 def exposures(
-    world: World, sample: Callable[[int, FloatArray], Samples] = no_instruments
+    world: World, sample: Callable[[int, FloatArray], Samples] = no_instruments, first: int = 0
 ) -> Generator[Exposure]:
-    """Yield the frames of a world in time order, the next ones rendered while the payload works on this one.
+    """Yield the frames of a world from the `first` on in time order, rendered ahead while the payload works.
 
     One thread renders and samples the instruments, because a terrain serves one thread; a second lets the sensor take
     the picture of what the first has rendered.
@@ -222,8 +275,8 @@ def exposures(
                 scene = renderer.submit(prepared)
                 return sensor.submit(lambda: _exposed(world, *scene.result()))
 
-            pending = [begin(0)]
-            for number in range(world.frame_utc_ns.size):
+            pending = [begin(first)]
+            for number in range(first, world.frame_utc_ns.size):
                 if number + 1 < world.frame_utc_ns.size:
                     pending.append(begin(number + 1))
                 yield pending.pop(0).result()
@@ -443,8 +496,7 @@ def _propagate(scenario: Scenario, model: ForceModel, days: float) -> tuple[Trut
     duration_s = days * 86_400.0
     orbit = propagate_scenario(scenario, model, duration_s)
     stop_utc_ns = scenario.epoch_utc_ns + round(duration_s * _NS)
-    share, seed = scenario.maneuvers.execution_error_fraction, (scenario.seed, 2**36)
-    burns = tuple(executed(burn.utc_ns, burn.delta_v_icrf_m_s, share, seed) for burn in orbit.maneuvers)
+    burns = _executed(scenario, orbit.maneuvers)
     return (
         Truth(
             orbit.trajectory.state,
@@ -455,6 +507,11 @@ def _propagate(scenario: Scenario, model: ForceModel, days: float) -> tuple[Trut
         ),
         burns,
     )
+
+
+def _executed(scenario: Scenario, maneuvers: tuple[Maneuver, ...]) -> tuple[TrueBurn, ...]:
+    share, seed = scenario.maneuvers.execution_error_fraction, (scenario.seed, 2**36)
+    return tuple(executed(burn.utc_ns, burn.delta_v_icrf_m_s, share, seed) for burn in maneuvers)
 
 
 def _truth_of_ephemeris(ephemeris: Ephemeris, orientation: Orientation) -> Truth:

@@ -87,6 +87,33 @@ class Truth:
         return np.asarray(np.einsum("nij,nj->ni", rotation, position), dtype=np.float64)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Spliced:
+    """A trajectory of several arcs: up to each joint (TDB s, ascending) one function, after the last another."""
+
+    joints_tdb_s: tuple[float, ...]
+    arcs: tuple[Callable[[FloatArray], FloatArray], ...]
+
+    def __call__(self, tdb_s: FloatArray) -> FloatArray:
+        """Return states (n, 6) at times (n,)."""
+        number = np.searchsorted(np.array(self.joints_tdb_s), tdb_s, side="left")
+        states = np.empty((tdb_s.size, 6))
+        for k in np.unique(number):
+            states[number == k] = self.arcs[k](tdb_s[number == k])
+        return states
+
+
+def spliced(
+    before: Callable[[FloatArray], FloatArray],
+    joint_tdb_s: float,
+    after: Callable[[FloatArray], FloatArray],
+) -> Spliced:
+    """Return a trajectory that follows one function up to a joint and another one after it."""
+    if isinstance(before, Spliced):
+        return Spliced((*before.joints_tdb_s, joint_tdb_s), (*before.arcs, after))
+    return Spliced((joint_tdb_s,), (before, after))
+
+
 def frame_times(
     truth: Truth,
     start_utc_ns: int,

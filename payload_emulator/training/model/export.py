@@ -65,6 +65,7 @@ def export(
     *,
     paper_classes: bool = False,
     classes_only: bool = False,
+    enlarge: int = 0,
     test: bool = False,
 ) -> dict[str, Any]:
     """Write the ONNX network of a checkpoint; its parity with torch and its metadata come back.
@@ -72,7 +73,8 @@ def export(
     `paper_classes` keeps the class heatmaps of a network that has them; `classes_only` keeps only these and the
     offsets, as in the paper: the network flies with the median diameters of the data set's classes as a prior. `test`
     scores the test splits, source by source, at the thresholds fixed on validation, and writes the figures into the
-    model.
+    model. An exported network in place of a checkpoint gets new thresholds and corrections; `enlarge` makes it enlarge
+    images so many times first.
 
     Raises
     ------
@@ -81,8 +83,14 @@ def export(
         `PARITY_LIMIT`.
     """
     from payload_emulator.training.model.model import ExportedCraterNet
+    from payload_emulator.training.model.restore import enlarging, network_from_onnx
 
-    network, stored = load_network(checkpoint)
+    network, stored = (
+        network_from_onnx(checkpoint) if checkpoint.suffix == ".onnx" else load_network(checkpoint)
+    )
+    if enlarge:
+        network = enlarging(network, enlarge)
+        stored = stored | {"config": network.config.to_dict()}
     paper_classes = paper_classes or classes_only
     if paper_classes and network.heat_channels == 1:
         raise ModelError(

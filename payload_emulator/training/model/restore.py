@@ -9,6 +9,8 @@ outputs.
 from __future__ import annotations
 
 import json
+import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -59,6 +61,17 @@ def network_from_onnx(path: Path) -> tuple[CraterNet, dict[str, Any]]:
         "seconds": 60.0 * float(metadata.get("training_minutes", 0.0)),
     }
     return network.eval(), {"progress": progress, "config": config}
+
+
+def enlarging(network: CraterNet, factor: int) -> CraterNet:
+    """Return a network of the same weights that enlarges its image so many times; diameters stay in its pixels."""
+    larger = CraterNet(replace(network.config, enlarge=factor))
+    state = {name: value.clone() for name, value in network.state_dict().items()}
+    first = network.heat_channels + 2
+    state["head.bias"][first : first + 2] -= math.log(factor / network.config.enlarge)
+    larger.load_state_dict(state)
+    larger.eval()
+    return larger
 
 
 def count_statistics(network: CraterNet, feeder: Feeder, average: CraterNet, crops: int = _CROPS) -> None:

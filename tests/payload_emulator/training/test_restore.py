@@ -10,7 +10,7 @@ from payload_emulator.flight.models import load_shipped_model  # noqa: E402
 from payload_emulator.flight.vision.detector import OnnxDetector, decode  # noqa: E402
 from payload_emulator.training.model.export import keep_blocked, onnx_model  # noqa: E402
 from payload_emulator.training.model.model import CraterNet, ExportedCraterNet, ModelConfig  # noqa: E402
-from payload_emulator.training.model.restore import count_statistics, network_from_onnx  # noqa: E402
+from payload_emulator.training.model.restore import count_statistics, enlarging, network_from_onnx  # noqa: E402
 
 
 class Crops:
@@ -97,3 +97,17 @@ def test_a_peak_of_a_fine_map_lies_in_the_middle_of_its_cell() -> None:
     found = decode(heat, np.zeros((5, 256, 256), np.float32), 0.5, 2)
     # Cell 20 of two pixels covers pixels 40 and 41.
     assert (found.u_px[0], found.v_px[0]) == (pytest.approx(40.5), pytest.approx(20.5))
+
+
+def test_an_enlarging_copy_sees_the_enlarged_image_and_tells_pixels_of_the_image(shipped) -> None:
+    network, _ = network_from_onnx(shipped)
+    image = np.random.default_rng(5).standard_normal((1, 1, 128, 128)).astype(np.float32)
+    large = torch.nn.functional.interpolate(
+        torch.from_numpy(image), scale_factor=2.0, mode="bilinear", align_corners=False
+    ).numpy()
+    heat, geometry = outputs(enlarging(network, 2), image)
+    expected_heat, expected = outputs(network, large)
+    np.testing.assert_allclose(heat, expected_heat, atol=1e-5)
+    np.testing.assert_allclose(geometry[:, 2], expected[:, 2] - np.log(2.0), atol=1e-4)
+    np.testing.assert_allclose(geometry[:, 3], expected[:, 3] - np.log(2.0), atol=1e-4)
+    np.testing.assert_allclose(geometry[:, :2], expected[:, :2], atol=1e-4)
