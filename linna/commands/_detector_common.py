@@ -8,16 +8,25 @@ from pathlib import Path
 
 def add_model(parser: argparse.ArgumentParser) -> None:
     """Add --model."""
+    from payload_emulator.flight.models import NETWORKS
+
     parser.add_argument(
-        "--model", type=Path, default=None, metavar="M.onnx", help="instead of the shipped one"
+        "--model",
+        type=Path,
+        default=None,
+        metavar="M.onnx",
+        help=f"ONNX file or the name of a shipped network ({', '.join(NETWORKS)}); default: the first",
     )
 
 
 def model_octets(path: Path | None) -> bytes:
-    """The network of a file, or the shipped one."""
-    from payload_emulator.flight.models import load_shipped_model
+    """The network of a file, a shipped one by its name, or the default one."""
+    from payload_emulator.flight.models import DEFAULT_NETWORK, NETWORKS, load_shipped_model
 
-    return load_shipped_model() if path is None else path.read_bytes()
+    name = DEFAULT_NETWORK if path is None else str(path)
+    if name in NETWORKS:
+        return load_shipped_model(name)
+    return Path(name).read_bytes()
 
 
 def need_torch() -> None:

@@ -100,7 +100,7 @@ def new_spacecraft(world: World, loaded: LoadedPayload) -> Spacecraft:
         new_board(scenario.seed),
         int(world.frame_utc_ns[0]),
         tuple(parse_fault(text) for text in scenario.faults.events),
-        CatalogueDetector(world) if scenario.camera.images == "reduced" else None,
+        CatalogueDetector(scenario.seed) if scenario.camera.images == "reduced" else None,
     )
 
 

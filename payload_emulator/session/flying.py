@@ -90,18 +90,18 @@ class Flown:
 class CatalogueDetector:
     """In place of the network where no images are rendered: the craters in view, some missed, all a little off."""
 
-    world: World
+    seed: int
     _rng: np.random.Generator = field(init=False)
     _next: Detections = field(default_factory=no_detections)
 
     def __post_init__(self) -> None:
-        self._rng = np.random.default_rng((self.world.scenario.seed, 2**43))
+        self._rng = np.random.default_rng((self.seed, 2**43))
 
-    def show(self, exposure: Exposure) -> None:
+    def show(self, world: World, exposure: Exposure) -> None:
         """Prepare what is found in the next frame."""
-        _, uv, diameter_px = craters_in_view(self.world, exposure, _SMALLEST_PX)
+        _, uv, diameter_px = craters_in_view(world, exposure, _SMALLEST_PX)
         seen = self._rng.random(diameter_px.size) < _REDUCED_RECALL
-        camera = self.world.camera
+        camera = world.camera
         corner = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
         places, sizes = _REDUCED_DETECTOR.detect(uv[seen], diameter_px[seen], corner, self._rng)
         sigma = np.full(sizes.size, _REDUCED_DETECTOR.told_sigma_px)
@@ -331,7 +331,7 @@ def fly_moment(
 ) -> Flown:
     """Fly one moment; `by_hand` are telecommand packets that were received beside those of the operator."""
     if exposure is not None and isinstance(spacecraft.detector, CatalogueDetector):
-        spacecraft.detector.show(exposure)
+        spacecraft.detector.show(world, exposure)
     orders = receiver.take(operator.orders(moment, spacecraft.payload.mode)) + by_hand
     packets = spacecraft.step(
         moment.utc_ns,

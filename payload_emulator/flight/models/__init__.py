@@ -6,8 +6,11 @@ from importlib import resources
 
 DEFAULT_NETWORK = "craters"
 
-NETWORKS = {DEFAULT_NETWORK: "craters.onnx"}
-"""Files of the shipped networks by the names that scenarios use."""
+NETWORKS = {DEFAULT_NETWORK: "craters.onnx", "high-altitude": "high-altitude.onnx"}
+"""Files of the shipped networks by the names that scenarios use.
+
+`craters` is for 14 to 50 km, `high-altitude` for 50 to 160 km: it enlarges images twice before the first layer.
+"""
 
 
 def load_shipped_model(name: str = DEFAULT_NETWORK) -> bytes:

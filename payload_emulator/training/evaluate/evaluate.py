@@ -32,6 +32,7 @@ from payload_emulator.training.evaluate.localisation import against_rims
 from payload_emulator.training.evaluate.metrics import Scene, Thresholds, score
 from payload_emulator.training.evaluate.scoring import FrameDetections
 
+EVERY_DETECTION = 4_000  # a frame at 150 km shows some 1,000 craters of 5 to 30 km; on board fewer are kept
 SCORE_FLOOR = 0.10  # detections are kept down to this for curves; figures are given at the threshold
 _CLASS_DIAMETERS_M = (7_000.0, 12_000.0, 20_000.0)  # where a network does not tell its priors
 
@@ -118,7 +119,9 @@ def detect_by_class(detector: OnnxDetector, dataset: Dataset, frame: Frame) -> F
 
 def open_for_evaluation(model_octets: bytes) -> OnnxDetector:
     """The flight detector, kept down to `SCORE_FLOOR` so that curves can be drawn."""
-    return OnnxDetector(model_octets, DetectorParameters(score_threshold=SCORE_FLOOR, max_detections=400))
+    return OnnxDetector(
+        model_octets, DetectorParameters(score_threshold=SCORE_FLOOR, max_detections=EVERY_DETECTION)
+    )
 
 
 def run(
