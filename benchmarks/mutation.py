@@ -34,6 +34,7 @@ SOURCES = (
     "reports",
     "ground_service",
     "payload_emulator",
+    "studies",
     "linna",
     "db",
     "scenarios",
@@ -144,6 +145,15 @@ GROUPS = {
                 "landmark_map",
             )
         ),
+    ),
+    "flight": Group(
+        tuple(
+            str(file.relative_to(ROOT))
+            for file in sorted((ROOT / _FLIGHT).rglob("*.py"))
+            # Compiled code does not run mutated: mutmut renames functions, and numba compiles by name.
+            if "njit" not in file.read_text(encoding="utf-8")
+        ),
+        (_FLIGHT_TESTS,),
     ),
     "authorisation": Group(
         ("ground_service/access/service.py", "ground_service/access/security.py"),
