@@ -17,11 +17,9 @@ from typing import Any, TypeVar, overload
 os.environ.setdefault("NUMBA_SLP_VECTORIZE", "1")
 
 import numba
-from numba.core import cgutils, types
 from numba.core.dispatcher import Dispatcher
-from numba.extending import intrinsic
 
-__all__ = ["cgutils", "intrinsic", "njit", "prange", "types"]
+__all__ = ["njit", "prange"]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -47,6 +45,9 @@ def njit(function: Function | None = None, /, **options: Any) -> Any:
 
 def _stamp_with_callees(kernel: Any, source: Callable[..., Any]) -> None:
     """Make a cached kernel depend on the files of the kernels it may call, not on its own file alone.
+
+    This is the only place of the project that touches private parts of numba; tests/lunar/test_compile.py fails where
+    they have changed.
 
     Numba judges a cached kernel by the age of its own file. A kernel compiled in from another file would go on living
     in it after that file has changed, with arrays laid out for the new one.

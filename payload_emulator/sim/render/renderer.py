@@ -128,7 +128,9 @@ def render(
 def _render_grid(
     terrain: Terrain, camera: PinholeCamera, view: View, grid: TangentGrid, level: int, photometry: Photometry
 ) -> Rendering:
-    from payload_emulator.sim.render import kernels
+    from payload_emulator.sim.render._grid_kernel import Grid, Nodes, Tiles, block_peaks, sweep_shadows
+    from payload_emulator.sim.render._shade_kernel import Light, Surface, shade_pixels
+    from payload_emulator.sim.render._trace_kernel import Eye, trace_pixels, trace_shifted
 
     sunward = _sunward_grid(grid, view)
     # One patch for both grids: a second call could evict tiles of the first.
@@ -141,7 +143,7 @@ def _render_grid(
     if sunward is not None:
         shadow, distance = _incoming_shadow(grid, sunward, view, patch)
     lit = np.empty_like(heights)
-    kernels.sweep_shadows(
+    sweep_shadows(
         heights,
         shadow,
         distance,
@@ -156,36 +158,34 @@ def _render_grid(
         np.empty(shape, np.float32),
         np.empty(shape, np.float32),
     )
-    eye = np.ascontiguousarray(view.tangent_from_camera)
-    lens = (camera.focal_px, *camera.centre_px)
-    ground = (heights, kernels.block_peaks(heights), grid.x0_m, grid.y0_m, grid.texel_m)
-    shifts = pixel_shifts(camera) if isinstance(camera, BrownCamera) else (None, None)
-    if shifts[0] is None:
-        kernels.trace_pixels(*ground, view.altitude_m, eye, *lens, range_m)
-    else:
-        kernels.trace_shifted(*ground, view.altitude_m, eye, *lens, *shifts, range_m)
-    kernels.shade_pixels(
-        lit,
-        grid.x0_m,
-        grid.y0_m,
-        grid.texel_m,
+    place = Grid(grid.x0_m, grid.y0_m, grid.texel_m)
+    eye = Eye(
         view.altitude_m,
+        np.ascontiguousarray(view.tangent_from_camera),
+        camera.focal_px,
+        camera.centre_px[0],
+        camera.centre_px[1],
+    )
+    shift_u, shift_v = pixel_shifts(camera) if isinstance(camera, BrownCamera) else (None, None)
+    if shift_u is None or shift_v is None:
+        trace_pixels(heights, block_peaks(heights), place, eye, range_m)
+    else:
+        trace_shifted(heights, block_peaks(heights), place, eye, shift_u, shift_v, range_m)
+    shade_pixels(
+        lit,
+        place,
         eye,
-        *lens,
-        math.sin(view.sun_elevation_rad),
-        math.cos(view.sun_elevation_rad),
-        photometry.tables(),
-        photometry.law == "hapke",
-        *nodes,
-        patch.heights,
-        patch.albedo,
-        patch.table,
-        TILE_SHIFT,
-        TILE_SHIFT - ALBEDO_SHIFT,
-        MEAN_ALBEDO,
-        photometry.albedo_contrast,
-        shifts[0],
-        shifts[1],
+        Light(
+            math.sin(view.sun_elevation_rad),
+            math.cos(view.sun_elevation_rad),
+            photometry.tables(),
+            photometry.law == "hapke",
+        ),
+        Nodes(*nodes),
+        Tiles(patch.heights, patch.table, TILE_SHIFT),
+        Surface(patch.albedo, TILE_SHIFT - ALBEDO_SHIFT, MEAN_ALBEDO, photometry.albedo_contrast),
+        shift_u,
+        shift_v,
         radiance,
         mask,
         range_m,
@@ -353,12 +353,11 @@ def _grid_nodes(grid: TangentGrid, view: View, patch: TerrainPatch) -> tuple[Ima
 
 
 def _heights(grid: TangentGrid, nodes: tuple[Image, Image, Image, Image], patch: TerrainPatch) -> Image:
-    from payload_emulator.sim.render import kernels
+    from payload_emulator.sim.render._grid_kernel import Grid, Nodes, Tiles, fill_grid
 
     heights = np.empty((grid.rows, grid.columns), np.float32)
-    kernels.fill_grid(
-        heights, *nodes, patch.heights, patch.table, TILE_SHIFT, grid.x0_m, grid.y0_m, grid.texel_m
-    )
+    place = Grid(grid.x0_m, grid.y0_m, grid.texel_m)
+    fill_grid(heights, Nodes(*nodes), Tiles(patch.heights, patch.table, TILE_SHIFT), place)
     return heights
 
 
@@ -378,15 +377,13 @@ def _incoming_shadow(
     grid: TangentGrid, sunward: TangentGrid, view: View, patch: TerrainPatch
 ) -> tuple[Image, Image]:
     """Height of the shadow that falls on the grid's first row from ground nearer the Sun, and how far its caster is."""
-    from payload_emulator.sim.render import kernels
+    from payload_emulator.sim.render._grid_kernel import sweep_shadows
 
     heights = _heights(sunward, _grid_nodes(sunward, view, patch), patch)
     shadow = np.full(sunward.columns, NO_SHADOW_M, np.float32)
     distance = np.zeros(sunward.columns, np.float32)
     tangent, penumbra = math.tan(view.sun_elevation_rad), _penumbra(view.sun_elevation_rad)
-    kernels.sweep_shadows(
-        heights, shadow, distance, sunward.texel_m, tangent, penumbra, np.empty_like(heights)
-    )
+    sweep_shadows(heights, shadow, distance, sunward.texel_m, tangent, penumbra, np.empty_like(heights))
     places = (np.arange(grid.columns) * grid.texel_m + grid.y0_m - sunward.y0_m) / sunward.texel_m
     index = np.arange(sunward.columns)
     return (

@@ -149,7 +149,7 @@ def auto_exposure(radiance: Image, sensor: SensorModel) -> float:
 
 
 def _read_out(radiance: Image, sensor: SensorModel, rng: np.random.Generator) -> npt.NDArray[np.uint16]:
-    from payload_emulator.sim.render import kernels
+    from payload_emulator.sim.render._sensor_kernel import read_out
 
     signal = _blurred(np.asarray(radiance, dtype=np.float32), sensor.psf_sigma_px)
     height, width = signal.shape
@@ -166,7 +166,7 @@ def _read_out(radiance: Image, sensor: SensorModel, rng: np.random.Generator) ->
         signal *= _fixed_pattern(height, width, sensor.gain_mismatch)
     out = np.empty((height, width, 3), np.uint16)
     noise = rng.standard_normal((height, width, 3), dtype=np.float32)
-    kernels.read_out(
+    read_out(
         signal,
         noise,
         np.array(COLOUR, np.float32),

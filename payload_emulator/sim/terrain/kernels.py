@@ -7,14 +7,11 @@ Heights are metres above the map sphere.  A *grid pixel* is an area; its centre 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
-from lunar._compile import njit  # before numba: it sets how numba compiles
-
-from numba import types  # isort: skip
-from numba.extending import intrinsic  # isort: skip
+from lunar._compile import njit
+from lunar.arrays import Float32Array, FloatArray, Int32Array, IntArray
 
 PROFILE_REACH = 2.6
 """Distance from a crater's centre, in radii, at which its stamped profile ends."""
@@ -25,16 +22,16 @@ LATTICE_SHIFT = 32768.37
 
 @njit(fastmath=True, error_model="numpy", nogil=True)
 def add_noise(
-    out: Any,
-    cos_lat: Any,
-    sin_lat: Any,
-    cos_lon: Any,
-    sin_lon: Any,
-    frequency: Any,
-    amplitude: Any,
-    seed: Any,
-    gain: Any,
-) -> Any:
+    out: Float32Array,
+    cos_lat: FloatArray,
+    sin_lat: FloatArray,
+    cos_lon: FloatArray,
+    sin_lon: FloatArray,
+    frequency: float,
+    amplitude: float,
+    seed: int,
+    gain: Float32Array,
+) -> None:
     """Add one octave of gradient noise on the unit sphere: lattice cells per radian ``frequency``.
 
     The lattice lives in three dimensions, so the field has no seam at any meridian and no pinch at the poles;
@@ -91,50 +88,39 @@ def add_noise(
 
 
 @njit(fastmath=True, nogil=True)
-def _corner(h: Any, dx: Any, dy: Any, dz: Any) -> Any:
+def _corner(h: np.uint32, dx: np.float32, dy: np.float32, dz: np.float32) -> np.float32:
     """Dot product of a corner's hashed gradient with the way from it; 2.2 makes the rms of the noise about one."""
     h = _mixed(h)
     k = np.float32(2.2 / 511.5)
     return k * (_component(h, 0) * dx + _component(h, 10) * dy + _component(h, 20) * dz)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _mixed(context: Any, h: Any) -> Any:
-    """A well mixed hash of 32 bits.
-
-    Written for the compiler by hand: numba widens every operation on 32-bit integers to 64, which halves the lanes.
-    """
-
-    def build(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        (value,) = arguments
-        for shift, factor in ((15, 0x2C1B3C6D), (12, 0x297A2D39)):
-            value = builder.xor(value, builder.lshr(value, value.type(shift)))
-            value = builder.mul(value, value.type(factor))
-        return builder.xor(value, builder.lshr(value, value.type(15)))
-
-    return types.uint32(types.uint32), build
+@njit
+def _mixed(h: np.uint32) -> np.uint32:
+    """Return a well mixed hash of 32 bits: two rounds of exclusive or with a shift, times an odd number."""
+    h = np.uint32(h ^ np.uint32(h >> np.uint32(15)))
+    h = np.uint32(h * np.uint32(0x2C1B3C6D))
+    h = np.uint32(h ^ np.uint32(h >> np.uint32(12)))
+    h = np.uint32(h * np.uint32(0x297A2D39))
+    return np.uint32(h ^ np.uint32(h >> np.uint32(15)))
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _component(context: Any, h: Any, shift: Any) -> Any:
-    """Ten bits of a hash from ``shift`` up as a float from -511 to 512."""
-
-    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        value, _ = arguments
-        amount = signature.args[1].literal_value
-        bits = builder.and_(builder.lshr(value, value.type(amount)), value.type(1023))
-        real = context.get_value_type(types.float32)
-        return builder.fsub(builder.sitofp(bits, real), real(511.0))
-
-    if not isinstance(shift, types.IntegerLiteral):
-        return None
-    return types.float32(types.uint32, shift), build
+@njit
+def _component(h: np.uint32, shift: int) -> np.float32:
+    """Return ten bits of a hash from ``shift`` up as a float from -511 to 512."""
+    bits = np.uint32(h >> np.uint32(shift)) & np.uint32(1023)
+    return np.float32(np.int32(bits)) - np.float32(511.0)
 
 
 @njit(fastmath=True, error_model="numpy", nogil=True)
 def resample_cubic(
-    source: Any, first_row: Any, row_step: Any, first_column: Any, column_step: Any, out: Any
-) -> Any:
+    source: Float32Array,
+    first_row: float,
+    row_step: float,
+    first_column: float,
+    column_step: float,
+    out: Float32Array,
+) -> None:
     """Fill ``out`` with ``source`` at rows ``first_row + i * row_step`` (and likewise columns), Catmull-Rom.
 
     The caller leaves one source pixel before and two after the span asked for.
@@ -166,7 +152,7 @@ def resample_cubic(
 
 
 @njit(error_model="numpy", nogil=True)
-def smooth(values: Any, weights: Any) -> Any:
+def smooth(values: Float32Array, weights: Float32Array) -> Float32Array:
     """Rows and then columns of ``values`` under symmetric ``weights`` (2 n + 1); the outer n pixels are left.
 
     Terms are added in the order of the weights and rounded one by one, whatever the machine: no fast mathematics.
@@ -199,17 +185,17 @@ def smooth(values: Any, weights: Any) -> Any:
 
 @njit(fastmath=True, error_model="numpy", nogil=True)
 def stamp_craters(
-    out: Any,
-    latitude_rad: Any,
-    longitude_rad: Any,
-    crater_latitude: Any,
-    crater_longitude: Any,
-    radius_rad: Any,
-    depth_m: Any,
-    profile_row: Any,
-    wobble: Any,
-    profiles: Any,
-) -> Any:
+    out: Float32Array,
+    latitude_rad: FloatArray,
+    longitude_rad: FloatArray,
+    crater_latitude: FloatArray,
+    crater_longitude: FloatArray,
+    radius_rad: FloatArray,
+    depth_m: FloatArray,
+    profile_row: IntArray,
+    wobble: FloatArray,
+    profiles: Float32Array,
+) -> None:
     """Add craters to heights; centres and angular radii in radians, profiles of unit depth in rows.
 
     ``wobble`` (n, 4) holds cosine and sine amplitudes of the second and third harmonic of the rim's radius; craters
@@ -278,7 +264,14 @@ def stamp_craters(
 
 
 @njit(fastmath=True, error_model="numpy", nogil=True)
-def sample_pool(pool: Any, table: Any, shift: Any, rows: Any, columns: Any, out: Any) -> Any:
+def sample_pool(
+    pool: Float32Array,
+    table: Int32Array,
+    shift: int,
+    rows: FloatArray,
+    columns: FloatArray,
+    out: FloatArray | Float32Array,
+) -> None:
     """Fill ``out`` (n) with bilinear values at pool rows and columns (pixel coordinates within the patch)."""
     mask = (1 << shift) - 1
     for n in range(rows.size):
