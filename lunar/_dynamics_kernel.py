@@ -225,6 +225,122 @@ def _events(
 
 
 @njit(error_model="numpy", boundscheck=False, nogil=True)
+def _stage_place(
+    work: FloatArray,
+    k: FloatArray,
+    y: FloatArray,
+    a: FloatArray,
+    c: FloatArray,
+    stage: int,
+    signed: float,
+    nystrom: bool,
+) -> None:
+    """Put the position of a stage into ``work`` and, but for Nystrom's methods, its velocity into the rates ``k``."""
+    for d in range(6):
+        work[d] = 0.0
+    for j in range(stage):
+        for d in range(6):
+            work[d] += a[stage, j] * k[j, d]
+    for d in range(3):
+        if nystrom:
+            work[d] = y[d] + signed * (c[stage] * y[d + 3] + signed * work[d + 3])
+        else:
+            work[d] = y[d] + signed * work[d]
+            k[stage, d] = y[d + 3] + signed * work[d + 3]
+
+
+@njit(error_model="numpy", boundscheck=False, nogil=True)
+def _step_end(
+    new: FloatArray,
+    first: FloatArray,
+    second: FloatArray,
+    k: FloatArray,
+    y: FloatArray,
+    b: FloatArray,
+    error: FloatArray,
+    second_error: FloatArray,
+    signed: float,
+    rtol: float,
+    nystrom: bool,
+    two_estimates: bool,
+) -> float:
+    """Put the state at the end of a step into ``new`` and return its error over the tolerance.
+
+    With two estimates of the error these are combined (Hairer, Norsett, Wanner 1993, section II.10).
+    """
+    for d in range(6):
+        new[d] = first[d] = second[d] = 0.0
+    for i in range(len(second_error)):
+        for d in range(6):
+            row = d // 3
+            rate = k[i, d] if d > 2 or not nystrom else signed * k[i, d + 3]
+            new[d] += b[row, i] * rate
+            first[d] += error[row, i] * rate
+            second[d] += second_error[i] * rate
+    size_r = rtol * rtol * (y[0] * y[0] + y[1] * y[1] + y[2] * y[2])
+    size_v = rtol * rtol * (y[3] * y[3] + y[4] * y[4] + y[5] * y[5])
+    fine = coarse = 0.0
+    for d in range(6):
+        if nystrom and d < 3:
+            new[d] += y[d + 3]
+        new[d] = y[d] + signed * new[d]
+        size = size_r if d < 3 else size_v
+        fine += first[d] * first[d] / size
+        coarse += second[d] * second[d] / size
+    step = abs(signed)
+    if not two_estimates:
+        return step * math.sqrt(fine / 6.0)
+    if fine > 0.0:
+        return step * fine / math.sqrt(6.0 * (fine + 0.01 * coarse))
+    return 0.0
+
+
+@njit(error_model="numpy", boundscheck=False, nogil=True)
+def _keep_knot(
+    times: FloatArray,
+    states: FloatArray,
+    rates: FloatArray,
+    count: int,
+    t: float,
+    y: FloatArray,
+    k: FloatArray,
+) -> None:
+    times[count] = t
+    for d in range(6):
+        states[count, d] = y[d]
+    for d in range(3):
+        rates[count, d] = k[0, d + 3]
+
+
+@njit(error_model="numpy", boundscheck=False, nogil=True)
+def _back_to_knot(y: FloatArray, k: FloatArray, states: FloatArray, rates: FloatArray, knot: int) -> None:
+    """Put state and rates of a knot into ``y`` and stage 0."""
+    for d in range(3):
+        y[d] = states[knot, d]
+        y[d + 3] = k[0, d] = states[knot, d + 3]
+        k[0, d + 3] = rates[knot, d]
+
+
+@njit(error_model="numpy", boundscheck=False, nogil=True)
+def _seconds_to_periapsis(y: FloatArray, k: FloatArray) -> float:
+    """Return the time to the zero of the radial speed by a step of Newton's rule, from state and rates of a knot."""
+    rate = y[3] * y[3] + y[4] * y[4] + y[5] * y[5] + y[0] * k[0, 3] + y[1] * k[0, 4] + y[2] * k[0, 5]
+    seconds: float = -_radial(y) / rate
+    return seconds
+
+
+@njit(error_model="numpy", boundscheck=False, nogil=True)
+def _next_size(step: float, estimate: float, h: float, max_step: float, order: int, rejected: bool) -> float:
+    """Return the size of the next step from the error of the last one over the tolerance."""
+    factor = 0.9 * estimate ** (-1.0 / order) if estimate > 0.0 else 5.0
+    if estimate <= 1.0:
+        grown = step * min(1.0 if rejected else 5.0, max(0.2, factor))
+        # A step cut short at the end of the span says nothing against the size in use.
+        return min(max_step, grown if step >= 0.999 * h else max(h, grown))
+    return step * max(0.2, factor) if estimate == estimate else 0.1 * step
+
+
+@njit(error_model="numpy", boundscheck=False, nogil=True)
 def integrate(
     start_s: float,
     y0: FloatArray,
@@ -283,17 +399,7 @@ def integrate(
     status = REACHED
     rejected = known = False
     while True:
-        for d in range(6):
-            work[d] = 0.0
-        for j in range(stage):
-            for d in range(6):
-                work[d] += a[stage, j] * k[j, d]
-        for d in range(3):
-            if nystrom:
-                work[d] = y[d] + signed * (c[stage] * y[d + 3] + signed * work[d + 3])
-            else:
-                work[d] = y[d] + signed * work[d]
-                k[stage, d] = y[d + 3] + signed * work[d + 3]
+        _stage_place(work, k, y, a, c, stage, signed, nystrom)
         if not known:
             k[stage, 3], k[stage, 4], k[stage, 5] = force_acceleration(
                 t + c[stage] * signed, work[0], work[1], work[2], gravity, force, table, scratch, frame
@@ -301,17 +407,10 @@ def integrate(
             evaluations += 1
         known = False
         if stage == 0:
-            times[count] = t
-            for d in range(6):
-                states[count, d] = y[d]
-            for d in range(3):
-                rates[count, d] = k[0, d + 3]
+            _keep_knot(times, states, rates, count, t, y, k)
             wait = 0.0
             if status == EVENT:  # the dense output gave the time to some ms: Newton's rule on radial speed
-                rate = (
-                    y[3] * y[3] + y[4] * y[4] + y[5] * y[5] + y[0] * k[0, 3] + y[1] * k[0, 4] + y[2] * k[0, 5]
-                )
-                wait = -_radial(y) / rate
+                wait = _seconds_to_periapsis(y, k)
             elif count > 0:
                 status, fraction = _events(
                     times, states, rates, count - 1, sign, ground_m, event, event_radius_m, work
@@ -324,10 +423,7 @@ def integrate(
                 t = times[count - 1]
                 signed = t_new - t
                 step = abs(signed)
-                for d in range(3):
-                    y[d] = states[count - 1, d]
-                    y[d + 3] = k[0, d] = states[count - 1, d + 3]
-                    k[0, d + 3] = rates[count - 1, d]
+                _back_to_knot(y, k, states, rates, count - 1)
                 stage = 1
                 continue
             count += 1
@@ -339,36 +435,11 @@ def integrate(
             stage += 1
             continue
         else:
-            for d in range(6):
-                new[d] = first[d] = second[d] = 0.0
-            for i in range(stages):
-                for d in range(6):
-                    row = d // 3
-                    rate = k[i, d] if d > 2 or not nystrom else signed * k[i, d + 3]
-                    new[d] += b[row, i] * rate
-                    first[d] += error[row, i] * rate
-                    second[d] += second_error[i] * rate
-            size_r = rtol * rtol * (y[0] * y[0] + y[1] * y[1] + y[2] * y[2])
-            size_v = rtol * rtol * (y[3] * y[3] + y[4] * y[4] + y[5] * y[5])
-            fine = coarse = 0.0
-            for d in range(6):
-                if nystrom and d < 3:
-                    new[d] += y[d + 3]
-                new[d] = y[d] + signed * new[d]
-                size = size_r if d < 3 else size_v
-                fine += first[d] * first[d] / size
-                coarse += second[d] * second[d] / size
-            if not two_estimates:
-                estimate = step * math.sqrt(fine / 6.0)
-            elif fine > 0.0:
-                estimate = step * fine / math.sqrt(6.0 * (fine + 0.01 * coarse))
-            else:
-                estimate = 0.0
-            factor = 0.9 * estimate ** (-1.0 / error_order) if estimate > 0.0 else 5.0
+            estimate = _step_end(
+                new, first, second, k, y, b, error, second_error, signed, rtol, nystrom, two_estimates
+            )
+            h = _next_size(step, estimate, h, max_step_s, error_order, rejected)
             if estimate <= 1.0:
-                grown = step * min(1.0 if rejected else 5.0, max(0.2, factor))
-                # A step cut short at the end of the span says nothing against the size in use.
-                h = min(max_step_s, grown if step >= 0.999 * h else max(h, grown))
                 rejected = False
                 t = t_new
                 for d in range(6):
@@ -380,7 +451,6 @@ def integrate(
                 stage = 0
                 signed = 0.0
                 continue
-            h = step * max(0.2, factor) if estimate == estimate else 0.1 * step
             if h < 1e-6:
                 return count, TOO_SMALL, evaluations, h
             rejected = True

@@ -8,13 +8,11 @@ away by leaving its key out of a full file.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import tomllib
 from collections.abc import Mapping
 from enum import IntEnum
-from types import NoneType, UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any
 
 import numpy as np
 
@@ -22,11 +20,7 @@ from payload_emulator.errors import ParameterError
 from payload_emulator.flight.instruments import flight_instruments
 from payload_emulator.flight.payload import FlightParameters
 from payload_emulator.flight.vision.detector import DetectorParameters
-
-SHOWN = 80
-"""Largest number of characters of a wrong value in a message."""
-
-TYPE_WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
+from payload_emulator.session.typed_toml import TableFault, read_table, toml_text
 
 _SHARE = (0.0, 1.0)
 _COUNT = (1, math.inf)
@@ -90,8 +84,7 @@ def parse_parameters(
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ParameterError(source, "", "parameters (TOML)", str(error)) from None
-    changed: BuildParameters = _changed(flown, BuildParameters, table, source, "", dropped)
-    return changed
+    return _read(flown, table, source, dropped)
 
 
 def flat_parameters(parameters: BuildParameters) -> dict[str, Any]:
@@ -110,8 +103,7 @@ def with_values(
         for part in path:
             here = here.setdefault(part, {})
         here[last] = value
-    changed: BuildParameters = _changed(flown, BuildParameters, table, source, "")
-    return changed
+    return _read(flown, table, source, None)
 
 
 def _flat(value: Any, path: str) -> dict[str, Any]:
@@ -138,7 +130,7 @@ def _section(value: Any, path: str) -> list[str]:
         elif dataclasses.is_dataclass(inner):
             sections += _section(inner, name)
         elif inner is not None:
-            lines.append(f"{item.name} = {_toml(_plain(inner))}")
+            lines.append(f"{item.name} = {toml_text(_plain(inner))}")
     return (["", f"[{path}]", *lines] if lines else []) + sections
 
 
@@ -150,130 +142,79 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
-    if isinstance(value, list):
-        return "[" + ", ".join(_toml(item) for item in value) + "]"
-    return repr(value)
-
-
-def _changed(
-    value: Any, kind: type, table: Any, source: str, path: str, dropped: list[str] | None = None
-) -> Any:
-    """A dataclass with the fields that `table` names changed; created where there was none."""
-    if not isinstance(table, dict):
-        raise ParameterError(source, path, "a table", repr(table)[:SHOWN])
-    hints = get_type_hints(kind)
-    known = [item.name for item in dataclasses.fields(kind)]
-    values: dict[str, Any] = {}
-    for key, given in table.items():
-        place = f"{path}.{key}" if path else key
-        if key not in known and dropped is not None:
-            dropped.append(place)
-            continue
-        if key not in known:
-            close = difflib.get_close_matches(key, known, n=1)
-            expected = f"{close[0]} (nearest known key)" if close else f"one of {', '.join(known)}"
-            raise ParameterError(source, place, expected, "an unknown key")
-        values[key] = _converted(hints[key], getattr(value, key, None), given, source, place, dropped)
+def _read(
+    flown: BuildParameters, table: dict[str, Any], source: str, dropped: list[str] | None
+) -> BuildParameters:
+    """Return parameters with the values of a table."""
     try:
-        result = kind(**values) if value is None else dataclasses.replace(value, **values)
-    except TypeError:
-        raise ParameterError(source, path, f"all of {', '.join(known)}", ", ".join(table) or "none") from None
-    _refuse_crossed(result, values, source, path)
-    return result
+        return _changed(flown, table if dropped is None else _known(flown, table, "", dropped), dropped)
+    except TableFault as fault:
+        expected = f"{fault.nearest} (nearest known key)" if fault.nearest else fault.expected
+        raise ParameterError(source, fault.place, expected, fault.found) from None
+
+
+def _changed(flown: BuildParameters, table: dict[str, Any], dropped: list[str] | None) -> BuildParameters:
+    changed = read_table(BuildParameters, table, present=flown, bounds=_bounds)
+    _refuse_crossed(changed, table, "")
+    if changed.flight.instruments is flown.flight.instruments:
+        return changed
+    instruments = _instruments(flown.flight.instruments, changed.flight.instruments, dropped)
+    return dataclasses.replace(changed, flight=dataclasses.replace(changed.flight, instruments=instruments))
 
 
 def _instruments(
-    present: Mapping[str, Any], table: Any, source: str, path: str, dropped: list[str] | None
+    present: Mapping[str, Any], table: Mapping[str, Any], dropped: list[str] | None
 ) -> dict[str, Any]:
     """Return the parameters of installed instruments with those that `table` names changed or added."""
-    if not isinstance(table, dict):
-        raise ParameterError(source, path, "a table", repr(table)[:SHOWN])
     known, changed = flight_instruments(), dict(present)
     for name, given in table.items():
-        place = f"{path}.{name}"
+        place = f"flight.instruments.{name}"
         if name in known:
-            kind = known[name].parameters
-            changed[name] = _changed(changed.get(name, kind()), kind, given, source, place, dropped)
+            before = changed.get(name, known[name].parameters())
+            kept = given if dropped is None else _known(before, given, place, dropped)
+            changed[name] = read_table(known[name].parameters, kept, place, present=before, bounds=_bounds)
+            _refuse_crossed(changed[name], kept, place)
         elif dropped is not None:
             dropped.append(place)
         else:
             expected = f"one of {', '.join(known)}" if known else "no section: this build has no instruments"
-            raise ParameterError(source, place, expected, "an unknown instrument")
+            raise TableFault(place, expected, "an unknown instrument")
     return changed
 
 
-def _refuse_crossed(value: Any, changed: dict[str, Any], source: str, path: str) -> None:
-    """Refuse a lower limit of a section that lies above its upper limit.
+def _known(value: Any, table: Any, path: str, dropped: list[str]) -> Any:
+    """Return a table without the keys that a value's dataclass does not have, which go to `dropped`."""
+    if not isinstance(table, dict) or not dataclasses.is_dataclass(value):
+        return table
+    names = {item.name for item in dataclasses.fields(value)}
+    dropped += [f"{path}.{key}" if path else key for key in table if key not in names]
+    return {
+        key: _known(getattr(value, key), given, f"{path}.{key}" if path else key, dropped)
+        for key, given in table.items()
+        if key in names
+    }
+
+
+def _bounds(name: str) -> tuple[float, float]:
+    return RANGES.get(name, (0.0, math.inf))
+
+
+def _refuse_crossed(value: Any, table: Any, path: str) -> None:
+    """Refuse a lower limit that a table puts above its upper limit, in any section.
 
     Raises
     ------
-    ParameterError
+    TableFault
         A changed limit crosses its counterpart.
     """
-    for low_word, high_word in BOUND_WORDS:
-        for item in dataclasses.fields(value):
-            upper = item.name.replace(low_word, high_word)
-            if (
-                low_word not in item.name
-                or not hasattr(value, upper)
-                or not {item.name, upper} & set(changed)
-            ):
+    for key, given in table.items():
+        place = f"{path}.{key}" if path else key
+        if isinstance(given, dict) and dataclasses.is_dataclass(getattr(value, key)):
+            _refuse_crossed(getattr(value, key), given, place)
+        for low_word, high_word in BOUND_WORDS:
+            lower, upper = key.replace(high_word, low_word), key.replace(low_word, high_word)
+            if lower == upper or not (hasattr(value, lower) and hasattr(value, upper)):
                 continue
-            low, high = getattr(value, item.name), getattr(value, upper)
+            low, high = getattr(value, lower), getattr(value, upper)
             if low > high:
-                raise ParameterError(source, f"{path}.{item.name}", f"at most {upper} = {high!r}", repr(low))
-
-
-def _in_range(given: float, source: str, place: str) -> None:
-    """Refuse a number that is not finite or outside the range of its parameter.
-
-    Raises
-    ------
-    ParameterError
-        The number is not finite or out of range.
-    """
-    low, high = RANGES.get(place.rsplit(".", 1)[-1].partition("[")[0], (0.0, math.inf))
-    if not math.isfinite(given) or not low <= given <= high:
-        expected = f"a finite number from {low:g}" + (f" to {high:g}" if math.isfinite(high) else "")
-        raise ParameterError(source, place, expected, repr(given))
-
-
-def _converted(
-    hint: Any, present: Any, given: Any, source: str, place: str, dropped: list[str] | None = None
-) -> Any:
-    origin, inner = get_origin(hint), get_args(hint)
-    if origin is Mapping:
-        return _instruments(present or {}, given, source, place, dropped)
-    if origin in (Union, UnionType):
-        if given is None and NoneType in inner:
-            return None
-        (hint,) = (item for item in inner if item is not NoneType)
-        origin, inner = get_origin(hint), get_args(hint)
-    if dataclasses.is_dataclass(hint):
-        return _changed(present, hint, given, source, place, dropped)  # type: ignore[arg-type]
-    if origin is tuple:
-        if not isinstance(given, list):
-            raise ParameterError(source, place, "a list", repr(given)[:SHOWN])
-        kinds = [inner[0]] * len(given) if len(inner) == 2 and inner[1] is Ellipsis else list(inner)
-        if len(kinds) != len(given):
-            raise ParameterError(source, place, f"{len(kinds)} values", str(len(given)))
-        return tuple(
-            _converted(kind, None, item, source, f"{place}[{i}]", dropped)
-            for i, (kind, item) in enumerate(zip(kinds, given, strict=True))
-        )
-    if isinstance(hint, type) and issubclass(hint, IntEnum):
-        if given not in hint.__members__:
-            raise ParameterError(source, place, f"one of {', '.join(hint.__members__)}", repr(given)[:SHOWN])
-        return hint[given]
-    if hint is float and type(given) is int:
-        given = float(given)
-    if type(given) is not hint:
-        raise ParameterError(source, place, TYPE_WORDS.get(hint, str(hint)), repr(given)[:SHOWN])
-    if hint in (int, float):
-        _in_range(given, source, place)
-    return given
+                raise TableFault(place.replace(high_word, low_word), f"at most {upper} = {high!r}", repr(low))

@@ -8,16 +8,18 @@ places, with the paper's own split: a contiguous test arc, the rest shuffled (se
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import json
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from payload_emulator.errors import DatasetError
+from payload_emulator.session.typed_toml import TableFault, read_table
+
+T = TypeVar("T")
 
 SPLITS = ("train", "val", "test")
 PAPER_SPLIT = "80/15/5"
@@ -169,7 +171,6 @@ def load_recipe(path: Path) -> Recipe:
             f"{path}: dataset.source: expected at least one [[dataset.source]] table, found none"
         )
     settings = {key: value for key, value in table.items() if key != "source"}
-    _refuse_unknown(path, "dataset", settings, {f.name for f in fields(Recipe)} - {"sources"})
     for key in ("name", "seed"):
         if key not in settings:
             raise DatasetError(f"{path}: dataset.{key}: expected a value, found none")
@@ -177,12 +178,22 @@ def load_recipe(path: Path) -> Recipe:
         raise DatasetError(f"{path}: dataset.bits: expected 8 or 16, found {settings['bits']!r}")
     if settings.get("colour", "gray") not in COLOURS:
         raise DatasetError(f"{path}: dataset.colour: expected gray or rgb, found {settings['colour']!r}")
-    return Recipe(sources=tuple(_source(path, n, item) for n, item in enumerate(sources)), **settings)
+    empty = Recipe(str(settings["name"]), 0, tuple(_source(path, n, item) for n, item in enumerate(sources)))
+    return _read(path, "dataset", Recipe, settings, empty)
+
+
+def _read(path: Path, where: str, kind: type[T], table: object, present: T | None = None) -> T:
+    try:
+        return read_table(kind, table, present=present)
+    except TableFault as fault:
+        if not fault.known:
+            raise DatasetError(f"{path}: {where}: {fault}") from None
+        hint = f" (did you mean {fault.nearest!r}?)" if fault.nearest else ""
+        raise DatasetError(f"{path}: {where}: unknown key {fault.place!r}{hint}") from None
 
 
 def _source(path: Path, number: int, table: Mapping[str, Any]) -> Source:
     where = f"dataset.source {number + 1}"
-    _refuse_unknown(path, where, table, {f.name for f in fields(Source)})
     values = dict(table)
     for key in ("name", "split", "terrain", "share"):
         if key not in values:
@@ -210,31 +221,21 @@ def _source(path: Path, number: int, table: Mapping[str, Any]) -> Source:
         values["label_minimum_px"] = float(least)
     for key in ("boxes", "avoid"):
         if key in values:
-            values[key] = tuple(_box(path, f"{where}: {key}", item) for item in values[key])
-    if "seeds" in values:
-        values["seeds"] = tuple(int(seed) for seed in values["seeds"])
-    if "altitude_km" in values:
-        values["altitude_km"] = tuple(float(value) for value in values["altitude_km"])
-    if values.get("ephemeris"):
-        beside = path.parent / values["ephemeris"]
-        values["ephemeris"] = str(beside) if beside.exists() else values["ephemeris"]
-        for key in ("step_s", "days"):
-            if not values.get(key, 1.0) > 0.0:
-                raise DatasetError(f"{path}: {where}: {key}: expected more than 0, found {values[key]!r}")
-    return Source(**values)
+            values[key] = [_box(path, f"{where}: {key}", item) for item in values[key]]
+    source = _read(path, where, Source, values)
+    if not source.ephemeris:
+        return source
+    beside = path.parent / source.ephemeris
+    for key in ("step_s", "days"):
+        if not getattr(source, key) > 0.0:
+            raise DatasetError(f"{path}: {where}: {key}: expected more than 0, found {values[key]!r}")
+    return replace(source, ephemeris=str(beside)) if beside.exists() else source
 
 
-def _box(path: Path, where: str, item: object) -> Box:
+def _box(path: Path, where: str, item: object) -> dict[str, float]:
+    """Return the table of a box from its list of limits."""
     if not (
         isinstance(item, list) and len(item) == 4 and all(isinstance(value, (int, float)) for value in item)
     ):
         raise DatasetError(f"{path}: {where}: expected [west, east, south, north] in degrees, found {item!r}")
-    return Box(*(float(value) for value in item))
-
-
-def _refuse_unknown(path: Path, where: str, table: Mapping[str, Any], known: set[str]) -> None:
-    for key in table:
-        if key not in known:
-            close = difflib.get_close_matches(key, known, n=1)
-            hint = f" (did you mean {close[0]!r}?)" if close else ""
-            raise DatasetError(f"{path}: {where}: unknown key {key!r}{hint}")
+    return dict(zip((limit.name for limit in fields(Box)), item, strict=True))

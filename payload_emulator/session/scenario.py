@@ -6,22 +6,23 @@ Degrees, kilometres and seconds stand in the file and in these values' names; us
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar
 
 from lunar.errors import LunarError
 from lunar.timescales import parse_utc
 from payload_emulator.errors import ScenarioError
+from payload_emulator.session.typed_toml import TableFault, read_table, toml_text
 from payload_emulator.sim.board.faults import parse_fault
 from payload_emulator.sim.board.link import LinkSection
 from payload_emulator.sim.instruments import simulated_instruments
 from payload_emulator.sim.render.sensor import SensorModel
+
+T = TypeVar("T")
 
 SHIPPED = Path(__file__).resolve().parents[2] / "scenarios"
 
@@ -379,10 +380,14 @@ def parse_scenario(text: str, source: str = "scenario") -> Scenario:
         raise ScenarioError(f"{source}: key 'name' is missing, expected a short text")
     known = simulated_instruments()
     sections = {key: value for key, value in table.items() if key not in known}
-    installed = {
-        name: _build(known[name].settings, table[name], source, name) for name in known if name in table
+    if "instruments" in sections:
+        raise ScenarioError(
+            f"{source}: unknown key 'instruments'; each instrument has a section of its own name"
+        )
+    installed: dict[str, Any] = {
+        name: _read(known[name].settings, table[name], source, name) for name in known if name in table
     }
-    scenario: Scenario = dataclasses.replace(_build(Scenario, sections, source, ""), instruments=installed)
+    scenario = dataclasses.replace(_read(Scenario, sections, source), instruments=installed)
     _check(scenario, source)
     return scenario
 
@@ -399,7 +404,7 @@ def format_scenario(scenario: Scenario) -> str:
         elif dataclasses.is_dataclass(value):
             sections += _section(item.name, value)
         else:
-            lines.append(f"{item.name} = {_toml(value)}")
+            lines.append(f"{item.name} = {toml_text(value)}")
     return "\n".join(lines + sections) + "\n"
 
 
@@ -407,65 +412,28 @@ def _section(name: str, values: Any) -> list[str]:
     return [
         "",
         f"[{name}]",
-        *(f"{key.name} = {_toml(getattr(values, key.name))}" for key in dataclasses.fields(values)),
+        *(f"{key.name} = {toml_text(getattr(values, key.name))}" for key in dataclasses.fields(values)),
     ]
 
 
-def _toml(value: object) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n") + '"'
-    if isinstance(value, tuple):
-        return "[" + ", ".join(_toml(item) for item in value) + "]"
-    return repr(value)
-
-
-def _build(kind: type, table: Any, source: str, path: str) -> Any:
-    if not isinstance(table, dict):
-        raise ScenarioError(f"{source}: [{path}] must be a table, found {type(table).__name__}")
-    hints = get_type_hints(kind)
-    known = [item.name for item in dataclasses.fields(kind)]
-    if kind is Scenario:
+def _read(kind: type[T], table: object, source: str, path: str = "") -> T:
+    """Return a section, or the scenario, from its table; a fault becomes one line that names source and key."""
+    try:
+        return read_table(kind, table, path)
+    except TableFault as fault:
         # Instruments have sections of their own names.
-        known = [name for name in known if name != "instruments"] + list(simulated_instruments())
-    values: dict[str, Any] = {}
-    for key, value in table.items():
-        place = f"{path}.{key}" if path else key
-        if key not in known:
-            close = difflib.get_close_matches(key, known, n=1)
-            hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(known)}"
-            raise ScenarioError(f"{source}: unknown key '{place}'; {hint}")
-        values[key] = _convert(hints[key], value, source, place)
-    return kind(**values)
+        known = [name for name in fault.known if name != "instruments"]
+        if "." not in fault.place:
+            known += simulated_instruments() if known else []
+        if not fault.known:
+            raise ScenarioError(
+                f"{source}: {fault.place} must be {fault.expected}, found {fault.found}"
+            ) from None
+        nearest = TableFault(fault.place, "", "", known).nearest
+        hint = f"did you mean '{nearest}'?" if nearest else f"known keys: {', '.join(known)}"
+        raise ScenarioError(f"{source}: unknown key '{fault.place}'; {hint}") from None
 
 
-def _convert(hint: Any, value: Any, source: str, place: str) -> Any:
-    origin = get_origin(hint)
-    if dataclasses.is_dataclass(hint):
-        return _build(hint, value, source, place)  # type: ignore[arg-type]
-    if origin is Literal:
-        if value not in get_args(hint):
-            expected = ", ".join(repr(item) for item in get_args(hint))
-            raise ScenarioError(f"{source}: {place} must be one of {expected}, found {value!r}")
-        return value
-    if origin is tuple:
-        kind = get_args(hint)[0]
-        if not isinstance(value, list):
-            raise ScenarioError(f"{source}: {place} must be a list, found {value!r}")
-        return tuple(_convert(kind, item, source, f"{place}[{k}]") for k, item in enumerate(value))
-    if origin in (Union, UnionType):
-        raise TypeError(f"scenario field {place} has a union type, which the parser does not read")
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
-    if type(value) is not hint:
-        raise ScenarioError(f"{source}: {place} must be {_NAMES[hint]}, found {value!r}")
-    if hint is float and not math.isfinite(value):
-        raise ScenarioError(f"{source}: {place} must be finite, found {value!r}")
-    return value
-
-
-_NAMES = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
 ESTIMATORS = ("paper", "spherical", "anchored")
 
 LARGEST_REGISTRATION_M = 5_000.0

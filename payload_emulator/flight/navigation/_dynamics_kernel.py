@@ -140,6 +140,28 @@ def _advance(step_matrix: FloatArray, matrix: FloatArray, both_sides: bool, work
 
 
 @njit(error_model="numpy")
+def _add_noise(
+    noise: FloatArray,
+    axes: FloatArray,
+    length_s: float,
+    decay: float,
+    white_psd: FloatArray,
+    markov_sigma: FloatArray,
+) -> None:
+    """Add the process noise of a step: white acceleration integrated twice, and the renewed part of the Markov one."""
+    for i in range(3):
+        noise[6 + i, 6 + i] += markov_sigma[i] ** 2 * (1.0 - decay * decay)
+        for j in range(3):
+            density = 0.0
+            for k in range(3):
+                density += axes[i, k] * white_psd[k] * axes[j, k]
+            noise[i, j] += density * length_s**3 / 3.0
+            noise[i, 3 + j] += density * length_s**2 / 2.0
+            noise[3 + i, j] += density * length_s**2 / 2.0
+            noise[3 + i, 3 + j] += density * length_s
+
+
+@njit(error_model="numpy")
 def propagate_arc(
     start: FloatArray,
     duration_s: float,
@@ -215,15 +237,5 @@ def propagate_arc(
         _advance(step_matrix, total, False, work)
         _advance(step_matrix, noise, True, work)
         _axes(y, axes)
-        length = abs(h)
-        for i in range(3):
-            noise[6 + i, 6 + i] += markov_sigma[i] ** 2 * (1.0 - full * full)
-            for j in range(3):
-                density = 0.0
-                for k in range(3):
-                    density += axes[i, k] * white_psd[k] * axes[j, k]
-                noise[i, j] += density * length**3 / 3.0
-                noise[i, 3 + j] += density * length**2 / 2.0
-                noise[3 + i, j] += density * length**2 / 2.0
-                noise[3 + i, 3 + j] += density * length
+        _add_noise(noise, axes, abs(h), full, white_psd, markov_sigma)
     return y, total, noise

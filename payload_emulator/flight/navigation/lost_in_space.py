@@ -38,6 +38,10 @@ _CANDIDATES_COMBINED = 12
 _HEIGHT_BIN_M = 400.0
 # The vote leaves out places this far from any crater.
 _MARGIN_RAD = math.radians(3.0)
+# Largest natural logarithm of how much rarer a chance vote is than a true one: one detection decides nothing.
+_WEIGHT_LIMIT = 6.0
+# The gate of a fit for logarithms of diameters over that of the vote, which is narrow to cast few chance votes.
+_LOG_GATE_FACTOR = 1.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -314,7 +318,7 @@ def _voted(
     camera_from_enu: FloatArray,
 ) -> FloatArray:
     """Return the best places of the vote (MCMF), shape (n, 3), best first."""
-    from payload_emulator.flight.navigation._lost_kernel import vote
+    from payload_emulator.flight.navigation._vote_kernel import Blocks, Directions, SortedCraters, vote
 
     rays = camera.rays(uv)
     enu = rays @ camera_from_enu
@@ -324,7 +328,7 @@ def _voted(
     log_size = np.log(diameter_px / camera.focal_px * rays[:, 2] / np.cos(np.minimum(off_nadir, 1.5)))
     voters = max(8, parameters.votes // len(index))
     order = np.argsort(-diameter_px, kind="stable")[: min(voters, 250)]
-    south, north, west, width, _ = index.extent
+    south, north, west, width, area = index.extent
     low, high = parameters.minimum_altitude_m, parameters.maximum_altitude_m
     steps = math.ceil(math.log(high / low) / math.log1p(parameters.altitude_step)) + 1
     listed = np.zeros((parameters.places + 1, 4))
@@ -332,6 +336,14 @@ def _voted(
     # The widest parallel of the map: the equator where it holds it.
     widest = math.cos(max(south, -north, 0.0))
     smallest = math.sqrt((north - south) * width * widest / parameters.cells)
+    craters = SortedCraters(
+        index.bin_start,
+        index.bin_height_m,
+        index.log_diameter,
+        index.latitude_rad,
+        index.tangent,
+        index.longitude_rad,
+    )
     work = np.empty(0, dtype=np.uint16)
     for altitude_m in np.geomspace(low, high, steps):
         cell = max(0.5 * parameters.block_px * altitude_m / camera.focal_px / MOON_RADIUS_M, smallest)
@@ -343,22 +355,12 @@ def _voted(
         vote(
             MOON_RADIUS_M + float(altitude_m),
             MOON_RADIUS_M,
-            off_nadir[order],
-            azimuth[order],
-            log_size[order],
+            Directions(off_nadir[order], azimuth[order], log_size[order]),
             parameters.log_diameter_gate,
-            index.bin_start,
-            index.bin_height_m,
-            index.log_diameter,
-            index.latitude_rad,
-            index.tangent,
-            index.longitude_rad,
-            index.extent,
-            cell,
-            rows,
-            columns,
+            craters,
+            Blocks(south, west, area, cell, rows, columns),
             work,
-            6.0,
+            _WEIGHT_LIMIT,
             listed,
             parameters.places,
         )
@@ -383,26 +385,26 @@ def _fitted(
     camera_from_enu: FloatArray,
 ) -> Place | None:
     """Return a place fitted to the detections it explains, None where they are fewer than three."""
-    from payload_emulator.flight.navigation._lost_kernel import fit_place
+    from payload_emulator.flight.navigation._fit_kernel import Craters, Found, Gates, Image, fit_place
 
     landmarks = index.landmarks
     position, attitude, normal, pair, chance = fit_place(
         start,
         camera_from_enu,
-        camera.focal_px,
-        np.array(camera.centre_px),
-        0.5 * np.array([camera.width_px, camera.height_px], dtype=np.float64),
-        uv,
-        diameter_px,
-        sigma_px**2,
-        landmarks.latitude_rad,
-        landmarks.position_mcmf_m,
-        landmarks.diameter_m,
-        np.hypot(landmarks.sigma_m[:, 0], landmarks.sigma_m[:, 1]) / math.sqrt(2.0),
+        Image(
+            camera.focal_px,
+            np.array(camera.centre_px),
+            0.5 * np.array([camera.width_px, camera.height_px], dtype=np.float64),
+        ),
+        Found(uv, diameter_px, sigma_px**2),
+        Craters(
+            landmarks.latitude_rad,
+            landmarks.position_mcmf_m,
+            landmarks.diameter_m,
+            np.hypot(landmarks.sigma_m[:, 0], landmarks.sigma_m[:, 1]) / math.sqrt(2.0),
+        ),
         parameters.attitude_sigma_rad,
-        parameters.block_px,
-        parameters.gate,
-        1.25 * parameters.log_diameter_gate,
+        Gates(parameters.block_px, parameters.gate, _LOG_GATE_FACTOR * parameters.log_diameter_gate),
         MOON_RADIUS_M,
     )
     detection = np.flatnonzero(pair >= 0)

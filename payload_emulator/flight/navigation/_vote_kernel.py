@@ -1,0 +1,273 @@
+"""Compiled vote over places and altitudes of the search without a prior.
+
+Directions at the camera are east, north, up of the point below it; angles in rad, lengths in m.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lunar._compile import njit
+from lunar.arrays import FloatArray, IntArray
+
+_LISTED = 20_000
+"""Places whose score may pass the threshold at one altitude before the threshold is raised."""
+
+_LOWEST_THRESHOLD = 6
+_RAISE = 3
+_FULL_SCORE = 255
+"""Largest score of a place, and the detection that no place has had a vote of: both are eight bits."""
+
+_LARGEST_SINE = 0.98
+"""Craters under a larger sine are too close to the limb for their depth to be known."""
+
+_LARGEST_TANGENT, _LARGEST_ARC = 4.0, 0.2
+"""Bounds of tangent and arc within which the series of both arcs are off by less than 1e-4 rad, a tenth of a cell."""
+
+# Columns of the list of places: score, row and column of the block, distance from the Moon's centre. Row 0 holds the
+# number of places in the first column.
+SCORE, ROW, COLUMN, DISTANCE = range(4)
+
+
+class Directions(NamedTuple):
+    """Directions of detections (k,): off nadir, azimuth from north over east, logarithm of diameter over depth."""
+
+    off_nadir: FloatArray
+    azimuth: FloatArray
+    log_size: FloatArray
+
+
+class SortedCraters(NamedTuple):
+    """Craters sorted by bins of rim height and by diameter inside them.
+
+    Attributes
+    ----------
+    bin_start, bin_height
+        First crater of each bin (b + 1,) and its height (b,).
+    tangent
+        Of the latitude.
+    longitude
+        West of the map to west + 2 pi.
+    """
+
+    bin_start: IntArray
+    bin_height: FloatArray
+    log_diameter: FloatArray
+    latitude: FloatArray
+    tangent: FloatArray
+    longitude: FloatArray
+
+
+class Blocks(NamedTuple):
+    """Blocks over which votes are counted: south and west edge, area (sr), edge of a quarter block, rows, columns."""
+
+    south: float
+    west: float
+    area: float
+    cell: float
+    rows: int
+    columns: int
+
+
+@njit
+def vote(
+    distance_m: float,
+    radius_m: float,
+    seen: Directions,
+    gate: float,
+    craters: SortedCraters,
+    blocks: Blocks,
+    work: NDArray[np.uint16],
+    weight_limit: float,
+    listed: FloatArray,
+    kept: int,
+) -> int:
+    """Vote for places below a camera at one distance from the Moon's centre; return how many places are listed.
+
+    A crater seen under a known angle from a known altitude puts the camera on one place of the sphere. Each pair of
+    a detection and a crater whose size fits adds the detection's weight to the four overlapping blocks about that
+    place, once per detection. The weight is the logarithm of how much rarer a chance vote is than a true one.
+
+    Parameters
+    ----------
+    gate
+        Largest difference of the logarithms of diameters.
+    work
+        Work space of at least rows times columns, cleared here: score times 256 plus the detection that voted last.
+    listed
+        Places found so far, columns `SCORE` to `DISTANCE`, shape (n, 4). The best `kept` are kept.
+    """
+    board = work[: blocks.rows * blocks.columns].reshape(blocks.rows, blocks.columns)
+    board[:] = _FULL_SCORE
+    at = np.empty((_LISTED, 2), dtype=np.int64)
+    columns_per_rad = np.empty(blocks.rows)
+    for r in range(blocks.rows):
+        columns_per_rad[r] = math.cos(blocks.south + (r + 1.0) * blocks.cell) / blocks.cell
+    count, threshold = 0, _LOWEST_THRESHOLD
+    if int(listed[0, SCORE]) == kept:
+        threshold = max(threshold, int(listed[kept, SCORE]) + 1)
+    for i in range(seen.off_nadir.size):
+        weight = _weight(distance_m, radius_m, seen, i, gate, craters, blocks, weight_limit)
+        if weight < 1:
+            continue
+        for b in range(craters.bin_height.size):
+            gamma, wanted = _below_ground(distance_m, radius_m + craters.bin_height[b], seen, i)
+            if gamma < 0.0:
+                continue
+            first, stop = _fitting(craters, b, wanted, gate)
+            count, threshold = _cast(
+                board, at, count, threshold, weight, i, gamma, seen.azimuth[i], first, stop, craters, blocks,
+                columns_per_rad,
+            )  # fmt: skip
+    total = int(listed[0, SCORE])
+    for k in range(count):
+        value = float(int(board[at[k, 0], at[k, 1]]) >> 8)
+        total = _insert(listed, total, kept, value, float(at[k, 0]), float(at[k, 1]), distance_m)
+    listed[0, SCORE] = total
+    return total
+
+
+@njit
+def _below_ground(distance_m: float, radius_m: float, seen: Directions, i: int) -> tuple[float, float]:
+    """Return the arc from nadir to the ground a detection sees and the logarithm of its diameter there; -1 for none.
+
+    With the angle off nadir a, the distance d and the radius r: gamma = asin(d / r sin a) - a, depth = d - r cos gamma.
+    """
+    ratio = distance_m / radius_m
+    sine = math.sin(seen.off_nadir[i])
+    if ratio * sine >= _LARGEST_SINE or ratio <= 1.0:
+        return -1.0, 0.0
+    gamma = math.asin(ratio * sine) - seen.off_nadir[i]
+    depth = distance_m - radius_m * math.cos(gamma)
+    return gamma, seen.log_size[i] + math.log(depth)
+
+
+@njit
+def _fitting(craters: SortedCraters, b: int, wanted: float, gate: float) -> tuple[int, int]:
+    """Return the range of craters of a bin whose logarithm of diameter is within the gate of the wanted one."""
+    start = craters.bin_start[b]
+    piece = craters.log_diameter[start : craters.bin_start[b + 1]]
+    return start + np.searchsorted(piece, wanted - gate), start + np.searchsorted(piece, wanted + gate)
+
+
+@njit
+def _weight(
+    distance_m: float,
+    radius_m: float,
+    seen: Directions,
+    i: int,
+    gate: float,
+    craters: SortedCraters,
+    blocks: Blocks,
+    weight_limit: float,
+) -> int:
+    """Return the weight of each vote of a detection, from how many votes it casts; 0 where it casts none."""
+    votes = 0
+    for b in range(craters.bin_height.size):
+        gamma, wanted = _below_ground(distance_m, radius_m + craters.bin_height[b], seen, i)
+        if gamma >= 0.0:
+            first, stop = _fitting(craters, b, wanted, gate)
+            votes += stop - first
+    expected = votes * 4.0 * blocks.cell * blocks.cell / blocks.area
+    weight = round(2.0 * min(math.log(0.5 / max(expected, 1e-9)), weight_limit))
+    return weight if votes else 0
+
+
+@njit
+def _cast(
+    board: NDArray[np.uint16],
+    at: IntArray,
+    count: int,
+    threshold: int,
+    weight: int,
+    i: int,
+    gamma: float,
+    azimuth: float,
+    first: int,
+    stop: int,
+    craters: SortedCraters,
+    blocks: Blocks,
+    columns_per_rad: FloatArray,
+) -> tuple[int, int]:
+    """Cast the votes of a detection for some craters; return the number of listed blocks and the threshold."""
+    north = math.sin(gamma) * math.cos(azimuth)
+    east = math.sin(gamma) * math.sin(azimuth)
+    length = math.sqrt(math.cos(gamma) ** 2 + north * north)
+    turn = math.atan2(north, math.cos(gamma))
+    longer = 1.0 / length - 1.0
+    for j in range(first, stop):
+        tangent = craters.tangent[j]
+        t = east * math.sqrt(1.0 + tangent * tangent)
+        if abs(tangent) < _LARGEST_TANGENT and abs(t) < _LARGEST_ARC:
+            latitude = craters.latitude[j] + tangent * longer - turn
+            aside = t + t * t * t / 6.0
+        else:
+            s = math.sin(craters.latitude[j]) / length
+            if abs(s) >= 1.0 or abs(t) >= 1.0:
+                continue
+            latitude, aside = math.asin(s) - turn, math.asin(t)
+        row = math.floor((latitude - blocks.south) / blocks.cell)
+        if row < 1 or row >= blocks.rows:
+            continue
+        away = craters.longitude[j] - aside - blocks.west
+        for r in range(row - 1, row + 1):
+            column = math.floor(away * columns_per_rad[r])
+            if column < 1 or column >= blocks.columns:
+                continue
+            for c in range(column - 1, column + 1):
+                value = int(board[r, c])
+                if value & 255 == i:
+                    continue
+                before = value >> 8
+                now = min(before + weight, _FULL_SCORE)
+                board[r, c] = (now << 8) | i
+                if before < threshold <= now and count < _LISTED:
+                    at[count, 0], at[count, 1] = r, c
+                    count += 1
+                    if count == _LISTED:
+                        threshold += _RAISE
+                        count = _above(board, at, threshold)
+    return count, threshold
+
+
+@njit
+def _above(board: NDArray[np.uint16], at: IntArray, threshold: int) -> int:
+    """Keep the listed blocks whose score reaches a threshold; return their number."""
+    left = 0
+    for k in range(_LISTED):
+        if int(board[at[k, 0], at[k, 1]]) >> 8 >= threshold:
+            at[left] = at[k]
+            left += 1
+    return left
+
+
+@njit
+def _insert(
+    listed: FloatArray, total: int, kept: int, value: float, row: float, column: float, distance_m: float
+) -> int:
+    """Keep a list of the best places, rows 1 to `kept`, best first; neighbours on the same level count once."""
+    if total == kept and value <= listed[total, SCORE]:
+        return total
+    for k in range(1, total + 1):
+        if (
+            listed[k, DISTANCE] == distance_m
+            and abs(listed[k, ROW] - row) <= 2
+            and abs(listed[k, COLUMN] - column) <= 2
+        ):
+            if listed[k, SCORE] >= value:
+                return total
+            # The better neighbour takes the place of the worse.
+            for m in range(k, total):
+                listed[m] = listed[m + 1]
+            total -= 1
+            break
+    k = min(total + 1, kept)
+    while k > 1 and listed[k - 1, SCORE] < value:
+        listed[k] = listed[k - 1]
+        k -= 1
+    listed[k, SCORE], listed[k, ROW], listed[k, COLUMN], listed[k, DISTANCE] = value, row, column, distance_m
+    return min(total + 1, kept)
