@@ -21,6 +21,12 @@ from payload_emulator.flight.vision.detections import Detections
 
 # The ground falls away from a plane: towards the edges of the image depth exceeds altitude by up to a tenth.
 _SAG = 0.05
+# Two solutions farther apart than this many tolerances of a detection on the ground are different places.
+_SEPARATE_TOLERANCES = 3.0
+# Angle off nadir up to which craters are searched: beyond it ground and horizon are close, and the distance diverges.
+_LARGEST_CORNER_RAD = float(np.radians(70.0))
+# Factor by which the tolerance of a pair shrinks with every round of the fit.
+_SHRINK = 0.6
 
 SEARCHABLE_DETECTIONS = 3
 """Fewer detections than this can fix no place and altitude beyond what chance gives."""
@@ -108,7 +114,7 @@ def acquire(
     needed = _needed(votes, best, landmarks, camera, found, reach, tight_px, parameters)
     if best.detection.size < needed:
         return None
-    separation_m = 3.0 * tight_px * votes.altitude_m / camera.focal_px
+    separation_m = _SEPARATE_TOLERANCES * tight_px * votes.altitude_m / camera.focal_px
     for other in solutions[1:]:
         apart = float(np.linalg.norm(other.pose.position_icrf_m - best.pose.position_icrf_m))
         if apart > separation_m and other.detection.size >= best.detection.size - 1:
@@ -176,7 +182,7 @@ class _Votes:
         steps = int(np.ceil(np.log(high / low) / np.log1p(parameters.tolerance_px / edge_px))) + 1
         altitudes = np.geomspace(low, high, max(steps, 1))
         corner = np.arctan(edge_px / camera.focal_px)
-        ground = high * np.tan(min(corner, np.radians(70.0)))
+        ground = high * np.tan(min(corner, _LARGEST_CORNER_RAD))
         index = landmarks.near(up, (ground + reach) / MOON_RADIUS_M)
         rays = camera.rays(np.stack([found.u_px, found.v_px], axis=1))
         sight = rays @ pose.camera_from_icrf @ pose.mcmf_from_icrf.T
@@ -282,7 +288,7 @@ def _fit(
             position_icrf_m=current.position_icrf_m + change[:3],
             attitude_rad=current.attitude_rad + change[3:],
         )
-        tolerance = max(0.6 * tolerance, parameters.agreement_sigmas * float(np.median(sigma_px)))
+        tolerance = max(_SHRINK * tolerance, parameters.agreement_sigmas * float(np.median(sigma_px)))
     return Acquisition(detection.astype(np.int64), index, current, 0, 0)
 
 

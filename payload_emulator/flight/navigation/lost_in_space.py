@@ -42,6 +42,19 @@ _MARGIN_RAD = math.radians(3.0)
 _WEIGHT_LIMIT = 6.0
 # The gate of a fit for logarithms of diameters over that of the vote, which is narrow to cast few chance votes.
 _LOG_GATE_FACTOR = 1.25
+# Smallest cosine of latitude: near a pole a margin in longitude would otherwise grow without bound.
+_POLE_COSINE = 0.1
+# The repeatability of a detector is not better than this.
+_SMALLEST_SIGMA_PX = 0.3
+# Angle off nadir up to which the depth of the ground is taken from the direction.
+_LARGEST_OFF_NADIR_RAD = 1.5
+# A fit may end this far outside the altitudes that were voted on, which are steps.
+_ALTITUDE_SLACK = 1.25
+# Two places of one orbit: what relief and a bent track add to their sigmas, the number of sigmas, the share by which
+# the speed of an elliptical orbit differs from a circular one, and the radial speed at an eccentricity of 0.02.
+_TRACK_DOUBT_M, _DOUBT_SIGMAS, _SPEED_SHARE, _RADIAL_SPEED_M_S = 1_500.0, 3.0, 0.05, 33.0
+# Legs longer than this show the direction of flight, which two legs of an orbit share to this cosine.
+_SHORTEST_LEG_M, _LEG_COSINE = 5_000.0, 0.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +190,7 @@ def place_index(landmarks: LandmarkMap) -> PlaceIndex:
     west, width = _span(longitude)
     south = max(float(latitude.min(initial=0.0)) - _MARGIN_RAD, -0.5 * math.pi)
     north = min(float(latitude.max(initial=0.0)) + _MARGIN_RAD, 0.5 * math.pi)
-    stretch = _MARGIN_RAD / max(math.cos(max(abs(south), abs(north))), 0.1)
+    stretch = _MARGIN_RAD / max(math.cos(max(abs(south), abs(north))), _POLE_COSINE)
     west, width = west - stretch, min(width + 2.0 * stretch, 2.0 * math.pi)
     area = width * (math.sin(north) - math.sin(south))
     return PlaceIndex(
@@ -217,7 +230,7 @@ def candidate_places(
         usable = np.sort(usable[strongest])
     if usable.size < 3 or len(index) < 3:
         return []
-    chosen, sigma = found.select(usable), np.maximum(sigma_px[usable], 0.3)
+    chosen, sigma = found.select(usable), np.maximum(sigma_px[usable], _SMALLEST_SIGMA_PX)
     uv = np.stack([chosen.u_px, chosen.v_px], axis=1)
     places = _voted(uv, chosen.diameter_px, index, camera, parameters, camera_from_enu)
     fits = []
@@ -325,7 +338,9 @@ def _voted(
     off_nadir = np.arccos(np.clip(-enu[:, 2], -1.0, 1.0))
     azimuth = np.arctan2(enu[:, 0], enu[:, 1])
     # Depth below the camera over depth along the boresight is one for a camera that looks down.
-    log_size = np.log(diameter_px / camera.focal_px * rays[:, 2] / np.cos(np.minimum(off_nadir, 1.5)))
+    log_size = np.log(
+        diameter_px / camera.focal_px * rays[:, 2] / np.cos(np.minimum(off_nadir, _LARGEST_OFF_NADIR_RAD))
+    )
     voters = max(8, parameters.votes // len(index))
     order = np.argsort(-diameter_px, kind="stable")[: min(voters, 250)]
     south, north, west, width, area = index.extent
@@ -409,7 +424,8 @@ def _fitted(
     )
     detection = np.flatnonzero(pair >= 0)
     altitude_m = float(np.linalg.norm(position)) - MOON_RADIUS_M
-    inside = 0.8 * parameters.minimum_altitude_m < altitude_m < 1.25 * parameters.maximum_altitude_m
+    lowest_m = parameters.minimum_altitude_m / _ALTITUDE_SLACK
+    inside = lowest_m < altitude_m < _ALTITUDE_SLACK * parameters.maximum_altitude_m
     if detection.size < 3 or not inside:
         return None
     try:
@@ -492,7 +508,7 @@ def _one_orbit(chain: Sequence[tuple[int, Place]], frames: Sequence[LostFrame]) 
     for (a, first), (b, second) in pairwise(chain):
         elapsed_s = frames[b].elapsed_s - frames[a].elapsed_s
         apart_m = _distance_m(first, second)
-        doubt_m = 1_500.0 + 3.0 * float(np.hypot(first.sigma_m.max(), second.sigma_m.max()))
+        doubt_m = _TRACK_DOUBT_M + _DOUBT_SIGMAS * float(np.hypot(first.sigma_m.max(), second.sigma_m.max()))
         if elapsed_s <= 0.0:
             if apart_m > doubt_m:
                 return False
@@ -500,16 +516,15 @@ def _one_orbit(chain: Sequence[tuple[int, Place]], frames: Sequence[LostFrame]) 
         radius = float(np.linalg.norm(first.position_mcmf_m))
         expected_m = math.sqrt(GM_MOON_M3_S2 / radius) * elapsed_s
         climb_m = abs(radius - float(np.linalg.norm(second.position_mcmf_m)))
-        # Radial speed of an orbit of eccentricity 0.02: 33 m/s.
         if (
-            abs(apart_m - expected_m) > 0.05 * expected_m + doubt_m
-            or climb_m > 33.0 * elapsed_s + 2.0 * doubt_m
+            abs(apart_m - expected_m) > _SPEED_SHARE * expected_m + doubt_m
+            or climb_m > _RADIAL_SPEED_M_S * elapsed_s + 2.0 * doubt_m
         ):
             return False
     for k in range(len(chain) - 2):
         legs = [chain[k + 1 + j][1].position_mcmf_m - chain[k + j][1].position_mcmf_m for j in range(2)]
         lengths = [float(np.linalg.norm(leg)) for leg in legs]
-        if min(lengths) > 5_000.0 and legs[0] @ legs[1] < 0.9 * lengths[0] * lengths[1]:
+        if min(lengths) > _SHORTEST_LEG_M and legs[0] @ legs[1] < _LEG_COSINE * lengths[0] * lengths[1]:
             return False
     return True
 

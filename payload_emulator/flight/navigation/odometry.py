@@ -41,6 +41,10 @@ from tmtc.tables import AnchorTable
 PAPER_CLASSES = 3
 _NAN = float("nan")
 _GAUSS_NEWTON_STEPS = 6
+# Steps of the numerical derivatives: 1.7 m on the ground and 1 m of altitude, small against a pixel of 95 m and more.
+_DERIVATIVE_STEP_RAD, _DERIVATIVE_STEP_M = 1e-6, 1.0
+# A change of 0.2 mm on the ground ends the iteration.
+_CONVERGED_RAD = 1e-10
 # Poleward of this latitude a step in longitude means nothing; the state is held at it.
 _POLE_COSINE = 1e-6
 
@@ -270,7 +274,7 @@ def solve_spherical(
     unknowns = np.array(
         [latitude_rad + north / MOON_RADIUS_M, east / (MOON_RADIUS_M * cosine), later.altitude_m]
     )
-    steps = np.array([1e-6, 1e-6 / cosine, 1.0])
+    steps = np.array([_DERIVATIVE_STEP_RAD, _DERIVATIVE_STEP_RAD / cosine, _DERIVATIVE_STEP_M])
     columns = 2 if locked else 3
     for _ in range(_GAUSS_NEWTON_STEPS):
         predicted = _see(points, unknowns)
@@ -286,7 +290,7 @@ def solve_spherical(
             return None
         change = np.linalg.lstsq(jacobian, residual, rcond=None)[0]
         unknowns[:columns] += change
-        if abs(change[0]) < 1e-10 and abs(change[1]) * cosine < 1e-10:
+        if abs(change[0]) < _CONVERGED_RAD and abs(change[1]) * cosine < _CONVERGED_RAD:
             break
     return Motion(
         float(unknowns[1]) * MOON_RADIUS_M * cosine,
