@@ -5,7 +5,7 @@ The grid lies in the tangent frame of `renderer`: rows run away from the Sun, z 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,6 +35,9 @@ _WORK = 7 * LINE
 # Columns of its whole numbers: tile row, tile column, pixel within the tile.
 _TILE_ROW, _TILE_COLUMN, _PIXEL = (LINE * k for k in range(3))
 _PLACES = 3 * LINE
+
+INLINED: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "nogil": True, "inline": "always"}
+"""Options of functions that are part of a loop: compiled in one piece, sums are ordered as if written there."""
 
 
 class Grid(NamedTuple):

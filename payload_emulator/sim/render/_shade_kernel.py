@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lunar._compile import njit
 from lunar.arrays import Float32Array, Int32Array
 from lunar.constants import MOON_RADIUS_M
-from payload_emulator.sim.render._grid_kernel import LINE, NODE_STEP, Grid, Nodes, Tiles
+from payload_emulator.sim.render._grid_kernel import INLINED, LINE, NODE_STEP, Grid, Nodes, Tiles
 from payload_emulator.sim.render._trace_kernel import Eye
 
 # Columns of the work buffer of a row of pixels: depth along the boresight (then range), place in the tangent frame,
@@ -77,6 +77,19 @@ class Rays(NamedTuple):
     per_pixel: np.float32
 
 
+class Cells(NamedTuple):
+    """Camera on the grid (row, column), texels per metre, altitude; last row and column of nodes; lengths of rows."""
+
+    i0: np.float32
+    j0: np.float32
+    inverse: np.float32
+    altitude: np.float32
+    last_ni: np.int32
+    last_nj: np.int32
+    stride: np.int32
+    node_stride: np.int32
+
+
 @njit(fastmath=True, error_model="numpy", nogil=True)
 def shade_pixels(
     depth: Float32Array,
@@ -104,18 +117,35 @@ def shade_pixels(
     wide = radiance.shape[1]
     work = np.empty(_WORK, np.float32)
     places = np.empty(_PLACES, np.int32)
+    cells = Cells(
+        np.float32(-grid.x0_m / grid.texel_m),
+        np.float32(-grid.y0_m / grid.texel_m),
+        np.float32(1.0 / grid.texel_m),
+        np.float32(eye.altitude_m),
+        np.int32(nodes.row.shape[0] - 2),
+        np.int32(nodes.row.shape[1] - 2),
+        np.int32(depth.shape[1]),
+        np.int32(nodes.row.shape[1]),
+    )
     for v in range(radiance.shape[0]):
         rays = _rays_of(eye, v)
+        # One test for both shifts, which numba resolves when it compiles; `shift_v` is given with `shift_u`.
         # As in `_trace_kernel`: look-ups apart from arithmetic.
         for k in range(wide):
             work[k + _DEPTH] = range_m[v, k]
-        _place_row(work, places, rays, eye.altitude_m, grid, depth, nodes.row, shift_u, shift_v, v, wide)
+        if shift_u is None:
+            _place_row(work, places, rays, cells, wide)
+        else:
+            _place_shifted_row(work, places, rays, cells, wide, shift_u, shift_v, v)  # type: ignore[arg-type]
         _look_up_row(work, places, depth, nodes, tiles, surface, grid, wide)
-        _reflect_row(work, rays, light, shift_u, shift_v, v, wide)
+        if shift_u is None:
+            _reflect_row(work, rays, light, wide)
+        else:
+            _reflect_shifted_row(work, rays, light, wide, shift_u, shift_v, v)  # type: ignore[arg-type]
         _write_row(work, light, radiance, lit, range_m, v)
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(**INLINED)
 def _rays_of(eye: Eye, v: int) -> Rays:
     """Return the rays of a row of pixels."""
     rotation, focal = eye.tangent_from_camera, eye.focal_px
@@ -137,64 +167,69 @@ def _rays_of(eye: Eye, v: int) -> Rays:
     )
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
-def _place_row(
-    work: Float32Array,
-    places: Int32Array,
-    rays: Rays,
-    altitude: float,
-    grid: Grid,
-    depth: Float32Array,
-    node_row: Float32Array,
-    shift_u: Float32Array | None,
-    shift_v: Float32Array | None,
-    v: int,
-    wide: int,
-) -> None:
-    """Put the places that a row of pixels sees into the buffers: tangent frame, cell of the grid, cell of the nodes."""
-    ax, ay, az, bx, by, bz, cx, cy, cz, _, _, _ = rays
-    inverse = np.float32(1.0 / grid.texel_m)
-    i0 = np.float32(-grid.x0_m / grid.texel_m)
-    j0 = np.float32(-grid.y0_m / grid.texel_m)
-    high = np.float32(altitude)
-    last_ni = np.int32(node_row.shape[0] - 2)
-    last_nj = np.int32(node_row.shape[1] - 2)
-    stride = np.int32(depth.shape[1])
-    node_stride = np.int32(node_row.shape[1])
+@njit(**INLINED)
+def _place_row(work: Float32Array, places: Int32Array, rays: Rays, cells: Cells, wide: int) -> None:
+    """Put the places that a row of pixels sees into the buffers."""
+    ax, ay, az, bx, by, bz, _, _, _, _, _, _ = rays
     for k in range(wide):
         c = np.float32(k)
         t = max(work[k + _DEPTH], _ZERO)
-        if shift_u is None:
-            x = t * (ax * c + bx)
-            y = t * (ay * c + by)
-            z = high + t * (az * c + bz)
-        else:
-            c += shift_u[v, k]
-            d = shift_v[v, k]  # type: ignore[index]  # given with shift_u
-            x = t * (ax * c + cx * d + bx)
-            y = t * (ay * c + cy * d + by)
-            z = high + t * (az * c + cz * d + bz)
-        i = max(i0 + x * inverse, _ZERO)
-        j = max(j0 + y * inverse, _ZERO)
-        whole_i = np.int32(i)
-        whole_j = np.int32(j)
-        ni = min(np.int32(i * _SHARE), last_ni)
-        nj = min(np.int32(j * _SHARE), last_nj)
-        lean = z * _INVERSE_RADIUS
-        bend = (x * x + y * y) * _INVERSE_RADIUS * (_ONE - lean + lean * lean)
-        places[k + _CELL] = whole_i * stride + whole_j
-        places[k + _NODE] = ni * node_stride + nj
-        work[k + _X] = x
-        work[k + _Y] = y
-        work[k + _Z] = z
-        work[k + _ROW_PART] = i - np.float32(whole_i)
-        work[k + _COLUMN_PART] = j - np.float32(whole_j)
-        work[k + _NODE_ROW_PART] = i * _SHARE - np.float32(ni)
-        work[k + _NODE_COLUMN_PART] = j * _SHARE - np.float32(nj)
-        work[k + _HEIGHT] = z + _HALF * bend * (_ONE - _HALF * _HALF * bend * _INVERSE_RADIUS)
+        x = t * (ax * c + bx)
+        y = t * (ay * c + by)
+        z = cells.altitude + t * (az * c + bz)
+        _keep_place(work, places, cells, k, x, y, z)
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(**INLINED)
+def _place_shifted_row(
+    work: Float32Array,
+    places: Int32Array,
+    rays: Rays,
+    cells: Cells,
+    wide: int,
+    shift_u: Float32Array,
+    shift_v: Float32Array,
+    v: int,
+) -> None:
+    """Do as `_place_row` for a lens that shifts its pixels."""
+    ax, ay, az, bx, by, bz, cx, cy, cz, _, _, _ = rays
+    for k in range(wide):
+        c = np.float32(k)
+        t = max(work[k + _DEPTH], _ZERO)
+        c += shift_u[v, k]
+        d = shift_v[v, k]
+        x = t * (ax * c + cx * d + bx)
+        y = t * (ay * c + cy * d + by)
+        z = cells.altitude + t * (az * c + cz * d + bz)
+        _keep_place(work, places, cells, k, x, y, z)
+
+
+@njit(**INLINED)
+def _keep_place(
+    work: Float32Array, places: Int32Array, cells: Cells, k: int, x: np.float32, y: np.float32, z: np.float32
+) -> None:
+    """Put a place in the tangent frame into the buffers, with its cell of the grid and of the nodes, and its height."""
+    i = max(cells.i0 + x * cells.inverse, _ZERO)
+    j = max(cells.j0 + y * cells.inverse, _ZERO)
+    whole_i = np.int32(i)
+    whole_j = np.int32(j)
+    ni = min(np.int32(i * _SHARE), cells.last_ni)
+    nj = min(np.int32(j * _SHARE), cells.last_nj)
+    lean = z * _INVERSE_RADIUS
+    bend = (x * x + y * y) * _INVERSE_RADIUS * (_ONE - lean + lean * lean)
+    places[k + _CELL] = whole_i * cells.stride + whole_j
+    places[k + _NODE] = ni * cells.node_stride + nj
+    work[k + _X] = x
+    work[k + _Y] = y
+    work[k + _Z] = z
+    work[k + _ROW_PART] = i - np.float32(whole_i)
+    work[k + _COLUMN_PART] = j - np.float32(whole_j)
+    work[k + _NODE_ROW_PART] = i * _SHARE - np.float32(ni)
+    work[k + _NODE_COLUMN_PART] = j * _SHARE - np.float32(nj)
+    work[k + _HEIGHT] = z + _HALF * bend * (_ONE - _HALF * _HALF * bend * _INVERSE_RADIUS)
+
+
+@njit(**INLINED)
 def _look_up_row(
     work: Float32Array,
     places: Int32Array,
@@ -264,7 +299,7 @@ def _look_up_row(
         work[k + _ALBEDO] = _albedo(surface, tiles.table, tiles.shift, r, c)
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(**INLINED)
 def _differences(
     pool: Float32Array, table: Int32Array, shift: int, r: np.float32, c: np.float32
 ) -> tuple[np.float32, np.float32]:
@@ -301,7 +336,7 @@ def _differences(
     return along_row, along_column
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(**INLINED)
 def _albedo(surface: Surface, table: Int32Array, shift: int, r: np.float32, c: np.float32) -> np.float32:
     """Return the albedo at a place on the terrain (row, column of heights), bilinear, its contrast scaled."""
     albedo = surface.albedo
@@ -328,80 +363,128 @@ def _albedo(surface: Surface, table: Int32Array, shift: int, r: np.float32, c: n
     return value
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
-def _reflect_row(
+@njit(**INLINED)
+def _reflect_row(work: Float32Array, rays: Rays, light: Light, wide: int) -> None:
+    """Put sunlight, phase and the terms of the photometric law of a row of pixels into the buffer, and ranges."""
+    ax, ay, az, bx, by, bz, _, _, _, left, below_row, per_pixel = rays
+    square = np.float32(below_row * below_row + 1.0)
+    up = np.float32(light.sun_up)
+    flat = np.float32(light.sun_flat)
+    many = np.float32(light.law.shape[1] - 2)
+    for k in range(wide):
+        c = np.float32(k)
+        gx, gy, norm = _slope(work, k)
+        right = left + c * per_pixel
+        length = np.float32(math.sqrt(right * right + square))
+        reach = _ONE / length
+        vx = -(ax * c + bx) * reach
+        vy = -(ay * c + by) * reach
+        vz = -(az * c + bz) * reach
+        _reflect(work, k, gx, gy, norm, vx, vy, vz, length, up, flat, many)
+
+
+@njit(**INLINED)
+def _reflect_shifted_row(
     work: Float32Array,
     rays: Rays,
     light: Light,
-    shift_u: Float32Array | None,
-    shift_v: Float32Array | None,
-    v: int,
     wide: int,
+    shift_u: Float32Array,
+    shift_v: Float32Array,
+    v: int,
 ) -> None:
-    """Put sunlight, phase and the terms of the photometric law of a row of pixels into the buffer, and ranges.
+    """Do as `_reflect_row` for a lens that shifts its pixels."""
+    ax, ay, az, bx, by, bz, cx, cy, cz, left, below_row, per_pixel = rays
+    up = np.float32(light.sun_up)
+    flat = np.float32(light.sun_flat)
+    many = np.float32(light.law.shape[1] - 2)
+    for k in range(wide):
+        c = np.float32(k)
+        gx, gy, norm = _slope(work, k)
+        c += shift_u[v, k]
+        d = shift_v[v, k]
+        right = left + c * per_pixel
+        below = np.float32(below_row) + d * per_pixel
+        length = np.float32(math.sqrt(right * right + below * below + _ONE))
+        reach = _ONE / length
+        vx = -(ax * c + cx * d + bx) * reach
+        vy = -(ay * c + cy * d + by) * reach
+        vz = -(az * c + cz * d + bz) * reach
+        _reflect(work, k, gx, gy, norm, vx, vy, vz, length, up, flat, many)
+
+
+@njit(**INLINED)
+def _slope(work: Float32Array, k: int) -> tuple[np.float32, np.float32, np.float32]:
+    """Return the slopes of the ground in the tangent frame along x and y, and what makes its normal a unit vector."""
+    x = work[k + _X]
+    y = work[k + _Y]
+    z = work[k + _Z] * _INVERSE_RADIUS
+    gx = work[k + _SLOPE_X]
+    gy = work[k + _SLOPE_Y]
+    # The nodes hold places at fixed height; the ground's own rise moves the place a little.
+    lean = _ONE / (_ONE + (gx * x + gy * y) * _INVERSE_RADIUS)
+    stretch = _ONE + (work[k + _HEIGHT] * _INVERSE_RADIUS - z) * (_ONE - z)
+    steep = _INVERSE_RADIUS * (_ONE - z + z * z)
+    gx = gx * lean * stretch - x * steep
+    gy = gy * lean * stretch - y * steep
+    norm = _ONE / np.float32(math.sqrt(gx * gx + gy * gy + _ONE))
+    return gx, gy, norm
+
+
+@njit(**INLINED)
+def _reflect(
+    work: Float32Array,
+    k: int,
+    gx: np.float32,
+    gy: np.float32,
+    norm: np.float32,
+    vx: np.float32,
+    vy: np.float32,
+    vz: np.float32,
+    length: np.float32,
+    up: np.float32,
+    flat: np.float32,
+    many: np.float32,
+) -> None:
+    """Put sunlight, phase, terms of the law and range of a pixel into the buffer.
 
     With the cosines mu0 of incidence and mu of emission the terms are: Lambert, mu0; Lommel-Seeliger, mu0 / (mu0 + mu);
     multiple scattering, the latter times H(mu0) H(mu) with H(x) = (1 + 2 x) / (1 + 2 x gamma), gamma = sqrt(1 - w), w
     = 0.21.
 
+    Parameters
+    ----------
+    gx, gy, norm
+        Slopes of the ground, and the inverse length of its normal (-gx, -gy, 1).
+    vx, vy, vz
+        Unit vector to the camera.
+    length
+        Range over depth along the boresight.
+    many
+        Largest place in the tables of the law.
+
     References
     ----------
     Hapke (1981), Bidirectional reflectance spectroscopy 1: Theory, J. Geophys. Res. 86.
     """
-    ax, ay, az, bx, by, bz, cx, cy, cz, left, below_row, per_pixel = rays
-    up = np.float32(light.sun_up)
-    flat = np.float32(light.sun_flat)
-    many = np.float32(light.law.shape[1] - 2)
-    square = np.float32(below_row * below_row + 1.0)
-    for k in range(wide):
-        c = np.float32(k)
-        x = work[k + _X]
-        y = work[k + _Y]
-        z = work[k + _Z] * _INVERSE_RADIUS
-        gx = work[k + _SLOPE_X]
-        gy = work[k + _SLOPE_Y]
-        # The nodes hold places at fixed height; the ground's own rise moves the place a little.
-        lean = _ONE / (_ONE + (gx * x + gy * y) * _INVERSE_RADIUS)
-        stretch = _ONE + (work[k + _HEIGHT] * _INVERSE_RADIUS - z) * (_ONE - z)
-        steep = _INVERSE_RADIUS * (_ONE - z + z * z)
-        gx = gx * lean * stretch - x * steep
-        gy = gy * lean * stretch - y * steep
-        norm = _ONE / np.float32(math.sqrt(gx * gx + gy * gy + _ONE))
-        if shift_u is None:
-            right = left + c * per_pixel
-            length = np.float32(math.sqrt(right * right + square))
-            reach = _ONE / length
-            vx = -(ax * c + bx) * reach
-            vy = -(ay * c + by) * reach
-            vz = -(az * c + bz) * reach
-        else:
-            c += shift_u[v, k]
-            d = shift_v[v, k]  # type: ignore[index]  # given with shift_u
-            right = left + c * per_pixel
-            below = np.float32(below_row) + d * per_pixel
-            length = np.float32(math.sqrt(right * right + below * below + _ONE))
-            reach = _ONE / length
-            vx = -(ax * c + cx * d + bx) * reach
-            vy = -(ay * c + cy * d + by) * reach
-            vz = -(az * c + cz * d + bz) * reach
-        mu0 = (gx * flat + up) * norm
-        mu = max((vz - gx * vx - gy * vy) * norm, _SMALLEST_MU)
-        s = min(work[k + _RISE], _ONE)
-        sun = _HALF + s * (np.float32(0.75) - np.float32(0.25) * s * s)
-        sun = sun if (s > -_ONE and mu0 > _ZERO) else _ZERO
-        mu0 = max(mu0, _ZERO)
-        both = mu0 / (mu0 + mu)
-        h0 = (_ONE + _TWO * mu0) / (_ONE + _TWO * mu0 * _GAMMA)
-        h1 = (_ONE + _TWO * mu) / (_ONE + _TWO * mu * _GAMMA)
-        work[k + _SUN] = sun
-        work[k + _PHASE] = min(max((vz * up - vx * flat + _ONE) * _HALF, _ZERO), _ONE) * many
-        work[k + _LAMBERT] = mu0
-        work[k + _SEELIGER] = both
-        work[k + _MULTIPLE] = both * h0 * h1
-        work[k + _DEPTH] = work[k + _DEPTH] * length if work[k + _DEPTH] >= _ZERO else np.float32(np.nan)
+    mu0 = (gx * flat + up) * norm
+    mu = max((vz - gx * vx - gy * vy) * norm, _SMALLEST_MU)
+    s = min(work[k + _RISE], _ONE)
+    sun = _HALF + s * (np.float32(0.75) - np.float32(0.25) * s * s)
+    sun = sun if (s > -_ONE and mu0 > _ZERO) else _ZERO
+    mu0 = max(mu0, _ZERO)
+    both = mu0 / (mu0 + mu)
+    h0 = (_ONE + _TWO * mu0) / (_ONE + _TWO * mu0 * _GAMMA)
+    h1 = (_ONE + _TWO * mu) / (_ONE + _TWO * mu * _GAMMA)
+    work[k + _SUN] = sun
+    work[k + _PHASE] = min(max((vz * up - vx * flat + _ONE) * _HALF, _ZERO), _ONE) * many
+    work[k + _LAMBERT] = mu0
+    work[k + _SEELIGER] = both
+    work[k + _MULTIPLE] = both * h0 * h1
+    work[k + _DEPTH] = work[k + _DEPTH] * length if work[k + _DEPTH] >= _ZERO else np.float32(np.nan)
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(**INLINED)
 def _write_row(
     work: Float32Array,
     light: Light,

@@ -16,7 +16,7 @@ import numpy as np
 
 from lunar._compile import njit
 from lunar.arrays import Float32Array, FloatArray, Int32Array
-from payload_emulator.sim.render._grid_kernel import BLOCK_SHIFT, LINE, Grid
+from payload_emulator.sim.render._grid_kernel import BLOCK_SHIFT, INLINED, LINE, Grid
 
 CLOSE_TEXELS = 0.04
 """A clearance that ends the search for a hit: a hundredth of a pixel at the corners of a 120 degree picture."""
@@ -241,7 +241,7 @@ def trace_pixels(
             )  # fmt: skip
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(**INLINED)
 def _nadir_pixel(eye: Eye, high: int, wide: int) -> tuple[int, int]:
     """Return the pixel (u, v) below the camera, within the image; its middle where the camera looks elsewhere."""
     rotation = eye.tangent_from_camera
@@ -254,7 +254,7 @@ def _nadir_pixel(eye: Eye, high: int, wide: int) -> tuple[int, int]:
     return nadir_u, nadir_v
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(**INLINED)
 def _take_neighbours(
     work: Float32Array,
     inner: Float32Array,
@@ -288,7 +288,7 @@ def _take_neighbours(
             work[n_k + _NEIGHBOUR_Z] = inner_z[nearer]
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(**INLINED)
 def _line_of(eye: Eye, upright: bool, main: int, begin: int, inverse: float) -> Line:
     """Return the rays of a line of pixels, which runs along u in upright sectors and along v in the others."""
     rotation, focal = eye.tangent_from_camera, eye.focal_px
@@ -311,7 +311,7 @@ def _line_of(eye: Eye, upright: bool, main: int, begin: int, inverse: float) -> 
     )
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(**INLINED)
 def _newton_steps(
     work: Float32Array, places: Int32Array, heights: Float32Array, start: Start, line: Line, count: int
 ) -> None:
@@ -376,7 +376,7 @@ def _newton_steps(
             work[k + _T] = t + move
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(**INLINED)
 def _settle(
     depth_along: Float32Array,
     inner: Float32Array,
