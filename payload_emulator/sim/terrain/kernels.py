@@ -95,7 +95,7 @@ def _corner(h: np.uint32, dx: np.float32, dy: np.float32, dz: np.float32) -> np.
     return k * (_component(h, 0) * dx + _component(h, 10) * dy + _component(h, 20) * dz)
 
 
-@njit
+@njit(inline="always")  # compiled in one piece with the loop: calls would round otherwise
 def _mixed(h: np.uint32) -> np.uint32:
     """Return a well mixed hash of 32 bits: two rounds of exclusive or with a shift, times an odd number."""
     h = np.uint32(h ^ np.uint32(h >> np.uint32(15)))
@@ -105,7 +105,7 @@ def _mixed(h: np.uint32) -> np.uint32:
     return np.uint32(h ^ np.uint32(h >> np.uint32(15)))
 
 
-@njit
+@njit(inline="always")  # compiled in one piece with the loop: calls would round otherwise
 def _component(h: np.uint32, shift: int) -> np.float32:
     """Return ten bits of a hash from ``shift`` up as a float from -511 to 512."""
     bits = np.uint32(h >> np.uint32(shift)) & np.uint32(1023)
