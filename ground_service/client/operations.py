@@ -32,7 +32,7 @@ from ground_service.passes.model import (
     Trend,
 )
 from ground_service.planning.model import Imported, Plan, SearchResult, Window
-from ground_service.regression.model import Build, KeptArchive, Regression, RegressionSummary
+from ground_service.regression.model import Build, KeptArchive, Pruned, Regression, RegressionSummary
 from ground_service.timekeeping.model import Correlation, TimeReport
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.05, 2.0
@@ -388,6 +388,10 @@ class Client(Connection):
         """Register a payload build: a zip of build.toml and the files that it names."""
         return self._post(Build, "/builds", file)
 
+    def register_current_build(self) -> Build:
+        """Register the flight code that is installed with the service."""
+        return self._post(Build, "/builds/current")
+
     def list_kept_archives(self) -> list[KeptArchive]:
         """List the pass archives that are kept for regressions, oldest first."""
         return self._all(KeptArchive, "/regression-archives")
@@ -395,6 +399,15 @@ class Client(Connection):
     def keep_archive(self, file: Path, *, pinned: bool = False) -> KeptArchive:
         """Upload a zipped pass archive to keep it for regressions."""
         return self._post(KeptArchive, "/regression-archives", file, pinned=pinned)
+
+    def change_kept_archive(self, digest: str, *, pinned: bool) -> KeptArchive:
+        """Pin a kept archive, or permit its removal again."""
+        path = f"/regression-archives/{_part(digest)}"
+        return self._call(KeptArchive, "PATCH", path, body={"pinned": pinned})
+
+    def prune_kept_archives(self, *, unused_days: float) -> Pruned:
+        """Remove kept archives that are not pinned and were not used for a time."""
+        return self._post(Pruned, "/regression-archives/prune", {"unused_days": unused_days})
 
     def start_regression(self, request: Body, *, key: str | None = None) -> Job:
         """Start the jobs that compare a candidate build with a baseline over archives."""

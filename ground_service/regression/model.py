@@ -36,6 +36,24 @@ class KeptArchive(Entity):
     kept_since: UtcTime
 
 
+class ArchiveChange(Given):
+    """Change of a kept archive."""
+
+    pinned: bool = Field(description="Exempt the archive from removal")
+
+
+class PruneRequest(Given):
+    """Archives to remove."""
+
+    unused_days: float = Field(ge=0.0, le=36_500.0, description="Remove archives unused for this time")
+
+
+class Pruned(Entity):
+    """Archives that were removed."""
+
+    removed: list[str] = Field(description="Identities")
+
+
 class RegressionRequest(Given):
     """Builds to compare, and the archives to replay."""
 

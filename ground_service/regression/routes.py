@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import uuid
+from typing import Annotated
 
-from fastapi import Response
+from fastapi import Path, Response
 
 from ground_service.access.security import Operator, UploadOf, Viewer, idempotent_id
 from ground_service.access.service import Caller
@@ -27,11 +28,14 @@ from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import enter_jobs, get_job
 from ground_service.regression import archives as archive_service
-from ground_service.regression.builds import load_build, register_build
+from ground_service.regression.builds import CURRENT, load_build, register_build
 from ground_service.regression.jobs import missing_replays, prepared
 from ground_service.regression.model import (
+    ArchiveChange,
     Build,
     KeptArchive,
+    Pruned,
+    PruneRequest,
     Regression,
     RegressionRequest,
     RegressionSummary,
@@ -40,6 +44,8 @@ from ground_service.store import repository
 from ground_service.store.files import StoredFile
 
 UPLOAD_PATHS = (f"{API_PREFIX}/builds", f"{API_PREFIX}/regression-archives")
+
+Digest = Annotated[str, Path(pattern=r"^[0-9a-f]{64}$", description="Identity of the archive")]
 
 regressions = operations("regression")
 
@@ -62,6 +68,12 @@ async def add_build(upload: UploadOf, ground: GroundOf, caller: Operator) -> Bui
     return await upload.run(_register, ground, stored, caller)
 
 
+@regressions.post("/builds/current", status_code=201)
+def register_current_build(ground: GroundOf, caller: Operator) -> Build:
+    """Register the installed flight code with its own network and parameters."""
+    return _registered(ground, register_build(ground, load_build(CURRENT), actor=caller.name).digest)
+
+
 @regressions.get("/regression-archives")
 def list_kept_archives(ground: GroundOf, _: Viewer) -> list[KeptArchive]:
     """List the archives that are kept for replays, oldest first."""
@@ -81,6 +93,21 @@ async def keep_archive(upload: UploadOf, ground: GroundOf, _: Operator, pinned: 
             )
 
     return await upload.run(keep)
+
+
+@regressions.patch("/regression-archives/{digest}")
+def change_kept_archive(ground: GroundOf, _: Operator, digest: Digest, given: ArchiveChange) -> KeptArchive:
+    """Pin a kept archive, or permit its removal again."""
+    archive_service.pin_archive(ground, digest, given.pinned)
+    with ground.database.reading() as connection:
+        return _archive(repository.get(connection, repository.REGRESSION_ARCHIVES, digest, "archive"))
+
+
+@regressions.post("/regression-archives/prune")
+def prune_kept_archives(ground: GroundOf, _: Operator, given: PruneRequest) -> Pruned:
+    """Remove kept archives that are not pinned and were not used for a time."""
+    unused_for_ns = round(given.unused_days * 86_400e9)
+    return Pruned(removed=archive_service.let_go(ground, unused_for_ns=unused_for_ns))
 
 
 @regressions.post("/regressions", status_code=202, responses=problems(404))
@@ -155,8 +182,12 @@ def _register(ground: Ground, stored: StoredFile, caller: Caller) -> Build:
                 f"{caller.name}: expected the role admin to register a program, found {caller.role}"
             )
         register_build(ground, build, actor=caller.name)
+    return _registered(ground, build.digest)
+
+
+def _registered(ground: Ground, digest: str) -> Build:
     with ground.database.reading() as connection:
-        return _build(repository.get(connection, repository.BUILDS, build.digest, "build"))
+        return _build(repository.get(connection, repository.BUILDS, digest, "build"))
 
 
 def _count(row: repository.Row, outcome: str) -> int:

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import argparse
+import tempfile
+import zipfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from linna.commands._ground import add_service_options, open_service
+from linna.commands._ground import add_operator_options, add_service_options, ground_client, open_service
 from linna.output import add_json_flag, emit, log, progress
+
+if TYPE_CHECKING:
+    from ground_service.client import Client
+    from ground_service.regression.model import Build
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="what", metavar="COMMAND", required=True)
     run = commands.add_parser(
         "run",
-        help="fly archives with two builds and judge the candidate",
-        description="Fly archives with two builds and judge the candidate. Exit status: 0 pass, 1 fail, "
+        help="replay archives with two builds and judge the candidate",
+        description="Replay archives with two builds and judge the candidate. Exit status: 0 pass, 1 fail, "
         "3 inconclusive (too few frames, or a value is unknown), 2 bad usage or input.",
     )
     _archives(run)
@@ -31,12 +37,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     run.add_argument("--report", type=Path, metavar="FILE", help="write the report as HTML")
     _finish(run, _run)
     baseline = commands.add_parser(
-        "baseline", help="fly archives with one build; its figures with their confidence"
+        "baseline", help="replay archives with one build and show its metrics with confidence intervals"
     )
     _archives(baseline)
     baseline.add_argument("--build", default="current", metavar="BUILD", help="build (default: current)")
     _finish(baseline, _baseline)
-    suite = commands.add_parser("suite", help="write the small archived passes that builds are judged on")
+    suite = commands.add_parser("suite", help="write the pass archives of the regression suite")
     suite.add_argument("scenario", nargs="*", help="scenario files (default: the shipped suite)")
     suite.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the archives")
     suite.add_argument(
@@ -47,30 +53,37 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add_json_flag(suite)
     suite.set_defaults(handler=_suite)
-    bisect = commands.add_parser("bisect", help="find the change of model or parameters that moved a figure")
+    bisect = commands.add_parser(
+        "bisect", help="find the change of network or parameters that changed a metric"
+    )
     _archives(bisect)
     bisect.add_argument("--good", required=True, metavar="BUILD")
     bisect.add_argument("--bad", required=True, metavar="BUILD")
     bisect.add_argument("--figure", required=True, metavar="NAME", help="such as detector.recall")
     _finish(bisect, _bisect)
-    search = commands.add_parser("search", help="find the passes on which two builds differ most")
+    search = commands.add_parser("search", help="find the passes in which two builds differ most")
     _archives(search)
     search.add_argument("--build", required=True, metavar="BUILD")
     search.add_argument("--baseline", default="current", metavar="BUILD")
     search.add_argument("--top", type=int, default=10, metavar="N")
     _finish(search, _search)
-    archive = commands.add_parser("archive", help="archives that are kept to be flown again")
+    archive = commands.add_parser(
+        "archive", help="list, add, pin, pack or remove the archives kept for replays"
+    )
     archive.add_argument("action", choices=("list", "add", "pin", "unpin", "pack", "prune"))
     archive.add_argument("target", nargs="?", help="archive to add or pack; identity to pin or unpin")
     archive.add_argument("--out", type=Path, metavar="FILE", help="zip to write (pack)")
     archive.add_argument(
-        "--unused-days", type=float, default=90.0, help="prune what was not used for so long"
+        "--unused-days",
+        type=float,
+        default=90.0,
+        help="prune: remove archives that were not used for this time (default: 90)",
     )
-    _finish(archive, _archive)
+    _finish(archive, _archive, add_operator_options)
     build = commands.add_parser("build", help="register a build, or list those registered")
     build.add_argument("action", choices=("register", "list"))
     build.add_argument("file", nargs="?", help="build file")
-    _finish(build, _build)
+    _finish(build, _build, add_operator_options)
     sandbox = commands.add_parser(
         "sandbox", help="show which sandbox isolates builds here, or why builds are refused"
     )
@@ -85,13 +98,19 @@ def _archives(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         action="extend",
         metavar="ARCHIVE",
-        help="pass archives: folders, zips, folders of archives, or identities of kept ones",
+        help="pass archives: folders, zips, folders of archives, or identities of kept archives",
     )
-    parser.add_argument("--workers", type=int, metavar="N", help="replays at a time (default: one a core)")
+    parser.add_argument(
+        "--workers", type=int, metavar="N", help="simultaneous replays (default: one for each core)"
+    )
 
 
-def _finish(parser: argparse.ArgumentParser, handler: Callable[[argparse.Namespace], int]) -> None:
-    add_service_options(parser)
+def _finish(
+    parser: argparse.ArgumentParser,
+    handler: Callable[[argparse.Namespace], int],
+    add_options: Callable[[argparse.ArgumentParser], None] = add_service_options,
+) -> None:
+    add_options(parser)
     add_json_flag(parser)
     parser.set_defaults(handler=handler)
 
@@ -270,7 +289,7 @@ def _search(arguments: argparse.Namespace) -> int:
 
 
 def _archive(arguments: argparse.Namespace) -> int:
-    from ground_service.regression import archives as archives
+    from ground_service.regression import archives
     from linna.errors import UsageError
 
     if arguments.action in ("add", "pin", "unpin", "pack") and not arguments.target:
@@ -281,54 +300,75 @@ def _archive(arguments: argparse.Namespace) -> int:
         archives.pack_archive(Path(arguments.target), arguments.out)
         emit(arguments, {"archive": str(arguments.out)}, text=f"archive: {arguments.out}")
         return 0
-    with open_service(arguments) as ground:
-        removed: list[str] = []
+    removed: list[str] = []
+    with ground_client(arguments) as service:
         if arguments.action == "add":
-            archives.keep_archive(ground, Path(arguments.target))
+            with (
+                tempfile.TemporaryDirectory() as scratch,
+                archives.opened_archive(Path(arguments.target)) as folder,
+            ):
+                archives.check_archive(folder)
+                packed = Path(scratch) / f"{folder.name}.zip"
+                archives.pack_archive(folder, packed)
+                service.keep_archive(packed)
         elif arguments.action in ("pin", "unpin"):
-            archives.pin_archive(ground, arguments.target, arguments.action == "pin")
+            service.change_kept_archive(arguments.target, pinned=arguments.action == "pin")
         elif arguments.action == "prune":
-            removed = archives.let_go(ground, unused_for_ns=round(arguments.unused_days * 86_400e9))
-        rows = archives.kept_archives(ground)
-    shown = [
-        {key: row[key] for key in ("digest", "name", "frames", "octets")} | {"pinned": bool(row["pinned"])}
-        for row in rows
-    ]
+            removed = service.prune_kept_archives(unused_days=arguments.unused_days).removed
+        kept = service.list_kept_archives()
+    shown = {"digest", "name", "frames", "octets", "pinned"}
     lines = [
-        f"{row['digest'][:16]}  {row['frames']:5} frames  {row['octets'] / 1e6:8.1f} MB  {row['name']}"
-        f"{'  pinned' if row['pinned'] else ''}"
-        for row in shown
+        f"{one.digest[:16]}  {one.frames:5} frames  {one.octets / 1e6:8.1f} MB  {one.name}"
+        f"{'  pinned' if one.pinned else ''}"
+        for one in kept
     ]
-    emit(arguments, {"archives": shown, "removed": removed}, text="\n".join(lines) or "no archive is kept")
+    rows = [one.model_dump(mode="json", include=shown) for one in kept]
+    emit(arguments, {"archives": rows, "removed": removed}, text="\n".join(lines) or "no archive is kept")
     return 0
 
 
 def _build(arguments: argparse.Namespace) -> int:
-    from ground_service.regression.builds import build_of, registered_builds
     from linna.errors import UsageError
 
-    with open_service(arguments) as ground:
-        if arguments.action == "register":
-            if not arguments.file:
-                raise UsageError("regress build register: expected a build file, found none")
-            build = build_of(ground, arguments.file)
-            emit(
-                arguments,
-                {"digest": build.digest, "name": build.name, "version": build.version},
-                text=build.title,
-            )
-            return 0
-        rows = registered_builds(ground)
-    shown = [{key: row[key] for key in ("digest", "name", "version", "kind", "provenance")} for row in rows]
-    lines = [
-        f"{row['digest'][:16]}  {row['kind']:<8} {row['name']} {row['version']}".rstrip() for row in shown
-    ]
-    emit(arguments, {"builds": shown}, text="\n".join(lines) or "no build is registered")
+    if arguments.action == "register":
+        if not arguments.file:
+            raise UsageError("regress build register: expected a build file, found none")
+        with ground_client(arguments) as service:
+            build = _registered(service, arguments.file)
+        figures = build.model_dump(mode="json", include={"digest", "name", "version"})
+        emit(arguments, figures, text=_title(build))
+        return 0
+    with ground_client(arguments) as service:
+        builds = list(service.list_builds())
+    shown = {"digest", "name", "version", "kind", "provenance"}
+    lines = [f"{one.digest[:16]}  {one.kind:<8} {one.name} {one.version}".rstrip() for one in builds]
+    rows = [one.model_dump(mode="json", include=shown) for one in builds]
+    emit(arguments, {"builds": rows}, text="\n".join(lines) or "no build is registered")
     return 0
 
 
+def _title(build: Build) -> str:
+    return " ".join(part for part in (build.name, build.version, f"({build.digest[:12]})") if part)
+
+
+def _registered(service: Client, given: str) -> Build:
+    """Register a build file, or the flight code of the service ("current")."""
+    from ground_service.regression.builds import BUILD_FILE, CURRENT, load_build
+
+    if given == CURRENT:
+        return service.register_current_build()
+    build = load_build(given)
+    with tempfile.TemporaryDirectory() as scratch:
+        packed = Path(scratch) / "build.zip"
+        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as zipped:
+            zipped.write(build.file, BUILD_FILE)
+            for name, _ in build.files:
+                zipped.write(build.folder / name, name)
+        return service.add_build(packed)
+
+
 def _listed(given: list[str]) -> list[str]:
-    """Archives as given, folders of archives opened up."""
+    """Return the given archives, with the archives in place of a folder that contains several."""
     found = []
     for item in given:
         folder = Path(item)

@@ -239,6 +239,8 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
     mission.write_text(SHIPPED_MISSION)
     receptions = tmp_path / "receptions.csv"
     receptions.write_text("packet_ticks,sequence_count,received_utc\n1,1,2029-08-07T06:00:01.3Z\n")
+    build = tmp_path / "build.toml"
+    build.write_text('name = "exercise"\n')
     started: set[tuple[str, ...]] = set()
     outputs: list[list[tuple[Any, ...]]] = []
     with open_ground(tmp_path / "here") as ground:
@@ -315,6 +317,13 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
             ask("correlate", "run", "--spacecraft-id", 76)
             ask("correlate", "receptions", receptions, "--spacecraft-id", 76)
             ask("correlate", "receptions", mission, "--spacecraft-id", 76)
+            ask("regress", "archive", "add", synthetic_archive)
+            ask("regress", "archive", "pin", "0" * 64)
+            do("regress", "archive", "prune", "--unused-days", 1)
+            ask("regress", "archive", "list")
+            do("regress", "build", "register", build)
+            ask("regress", "build", "register", mission)
+            ask("regress", "build", "list")
             do("user", "add", "bob", "--role", "viewer")
             ask("user", "add", "bob", "--role", "viewer")
             ask("user", "add", "b/b", "--role", "viewer")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ from ground_service.access.service import add_user
 from ground_service.app import create_app
 from ground_service.regression.archives import pack_archive
 from ground_service.settings import Settings
+from linna.cli import run
 
 with warnings.catch_warnings():
     # It recommends another HTTP library than the installed one; both serve it.
@@ -122,3 +124,25 @@ def test_only_an_administrator_registers_a_program(
         for role, token in tokens.items()
     }
     assert found == {"viewer": 403, "operator": 403, "admin": 201}
+
+
+def test_commands_keep_pin_and_remove_archives(
+    make_flyable: Callable, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flown = make_flyable(frames=12, seed=52)
+
+    def archive(*words: str, status: int = 0) -> Any:
+        assert run(["regress", "archive", *words, "--home", str(tmp_path / "home"), "--json"]) == status
+        printed = capsys.readouterr()
+        return json.loads(printed.out) if status == 0 else printed.err
+
+    (kept,) = archive("add", str(flown.folder))["archives"]
+    assert (kept["frames"], kept["pinned"]) == (12, False)
+    assert archive("pin", kept["digest"])["archives"] == [{**kept, "pinned": True}]
+    assert archive("prune", "--unused-days", "0") == {"archives": [{**kept, "pinned": True}], "removed": []}
+    assert archive("unpin", kept["digest"])["archives"] == [kept]
+    assert archive("prune", "--unused-days", "1") == {"archives": [kept], "removed": []}
+    assert archive("prune", "--unused-days", "0") == {"archives": [], "removed": [kept["digest"]]}
+    assert archive("pin", kept["digest"], status=2) == f"linna: error: archive {kept['digest']}: not found\n"
+    (flown.folder / "catalogue.csv").write_text("damaged")
+    assert f"{flown.folder}, catalogue.csv" in archive("add", str(flown.folder), status=2)
