@@ -1,4 +1,4 @@
-"""The `linna` command: finds the group asked for, imports only that one, turns known errors into one line.
+"""The `linna` command: it imports only the module of the given group and reports known errors in one line.
 
 Exit status: 0 done, 1 a gate or requirement not met, 2 bad usage or bad input, 3 inconclusive, 130 interrupted.
 """
@@ -18,45 +18,48 @@ _THREAD_POLICY = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "NUMBA_SL
 
 # name -> (module, one line of help); the order is that of `linna --help`.
 GROUPS: dict[str, tuple[str, str]] = {
-    "demo": ("demo", "fly one observation window, downlink it, ingest it, write the report"),
+    "demo": ("demo", "emulate one observation window, ingest its downlink and write the report"),
     "emulate": ("emulate", "run the payload over a scenario and write a pass archive"),
-    "montecarlo": ("montecarlo", "many runs of anchored navigation: errors against claims"),
-    "replay": ("replay", "fly an archived pass again with a payload build"),
-    "regress": ("regress", "gate a payload build against a baseline over archived passes"),
+    "montecarlo": ("montecarlo", "Monte Carlo runs of anchored navigation: errors compared with covariances"),
+    "replay": ("replay", "replay an archived pass with a payload build"),
+    "regress": ("regress", "compare a payload build with a baseline over archived passes"),
     "orbit": ("orbit", "propagate, compare and interpolate ephemerides"),
-    "data": ("data", "the public data products: list, fetch, verify"),
+    "data": ("data", "list, fetch and verify the public data products"),
     "catalogue": ("catalogue", "crater catalogues: statistics and on-board curation"),
     "camera": ("camera", "camera studies (field of view)"),
-    "navigation": ("navigation", "navigation of several pass archives side by side"),
-    "identify": ("identify", "how often craters are found and taken for others"),
+    "navigation": ("navigation", "compare the navigation of several pass archives"),
+    "identify": ("identify", "rates of crater identification and of wrong identifications"),
     "render": ("render", "render one frame of a scenario"),
     "dataset": ("dataset", "build, check and summarise detector data sets"),
     "detector": ("detector", "train, export, evaluate and run the crater detector"),
-    "tm": ("tm", "decode and check telemetry; the dictionary as ICD and XTCE"),
-    "link": ("link", "link settings of a recorded downlink, with the evidence"),
-    "mission": ("mission", "mission descriptions: write, check, add, list, show"),
-    "ingest": ("ingest", "ingest downlink files or pass archives into the ground database"),
+    "tm": ("tm", "decode and check telemetry; export the dictionary as ICD and XTCE"),
+    "link": ("link", "determine the link settings of a recorded downlink, with the evidence"),
+    "mission": ("mission", "write, check, add, list and show mission descriptions"),
+    "ingest": ("ingest", "ingest downlink files, pass archives or live telemetry"),
     "pass": ("pass_", "list and show passes"),
     "report": ("report", "write the report of a pass"),
-    "correlate": ("correlate", "time correlation of a spacecraft: segments, residuals, run"),
-    "plan": ("plan", "observation windows: search, enter, approve, uplink, exchange"),
-    "trajectory": ("trajectory", "solutions of a pass as TUM files, absolute and relative errors"),
-    "command": ("command", "telecommands: queue, release, uplink, verification"),
-    "serve": ("serve", "run the ground service's HTTP API"),
+    "correlate": ("correlate", "time correlation of a spacecraft: segments, residuals, reception times"),
+    "plan": ("plan", "search, enter, approve, uplink and exchange observation windows"),
+    "trajectory": (
+        "trajectory",
+        "navigation solutions of a pass as TUM files, with absolute and relative errors",
+    ),
+    "command": ("command", "queue, release, uplink and verify telecommands"),
+    "serve": ("serve", "run the HTTP server of the ground service"),
     "worker": ("worker", "run a job worker of the ground service"),
     "runner": ("runner", "run payload builds for the ground service, in a separate container"),
-    "db": ("db", "the database: schema, backup, export and import"),
+    "db": ("db", "schema, backup, export and import of the database"),
     "verify": ("verify", "check the integrity of the archive: files, rows, packets, audit chain"),
-    "user": ("user", "users of the ground service and their tokens"),
-    "audit": ("audit", "the audit log: who did what, and the head of its hash chain"),
+    "user": ("user", "manage the users of the ground service and their tokens"),
+    "audit": ("audit", "list the audit log, and show the head of its hash chain"),
 }
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run one command line; the exit status comes back."""
+    """Run one command line and return the exit status."""
     try:
         return _run(arguments)
-    except BrokenPipeError:  # the reader of our output has left: nothing more to say
+    except BrokenPipeError:  # the reader of the output has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
 
@@ -145,5 +148,5 @@ def _overview() -> str:
         "commands:",
     ]
     lines += [f"  {name:<{width}}  {help_line}" for name, (_, help_line) in GROUPS.items()]
-    lines += ["", "linna COMMAND --help tells more; --version prints the version."]
+    lines += ["", "linna COMMAND --help describes a command; --version prints the version."]
     return "\n".join(lines)

@@ -20,6 +20,7 @@ from ground_service.ground import Ground
 from ground_service.http import problems
 from ground_service.http.requests import PlainText
 from ground_service.http.uploads import UploadPool
+from ground_service.jobs.dispatcher import Dispatcher
 from ground_service.routers import OPERATIONS
 from ground_service.store.events import Notify
 
@@ -27,24 +28,29 @@ LOCAL_URL = "http://localhost"
 LOCAL_UPLOADS = 2
 
 
-def local_client(ground: Ground, actor: str) -> Client:
+def local_client(ground: Ground, actor: str, *, background: bool = False) -> Client:
     """Return a client of an opened ground service, which it closes at the end.
 
-    It acts as administrator `actor`: who may open the database of this machine may do everything. Jobs are finished
-    when their request returns.
+    It acts as administrator `actor`: who may open the database of this machine may do everything.
+
+    Parameters
+    ----------
+    background
+        Run jobs in a thread, so that their progress can be followed; otherwise jobs are finished when their request
+        returns.
     """
-    return Client(LOCAL_URL, transport=LocalTransport(ground, actor))
+    return Client(LOCAL_URL, transport=LocalTransport(ground, actor, background=background))
 
 
-def local_app(ground: Ground, actor: str) -> ASGIApp:
+def local_app(ground: Ground, actor: str, dispatcher: Dispatcher) -> ASGIApp:
     """Return the operations of the API for callers in this process, all of whom act as administrator `actor`.
 
-    Nothing runs in the background, there are no limits for network callers, and errors are described completely.
+    There are no limits for network callers, and errors are described completely.
     """
     app = FastAPI()
     app.state.ground = ground
     app.state.local_caller = Caller(actor, "admin")
-    app.state.dispatcher = LocalDispatcher(ground)
+    app.state.dispatcher = dispatcher
     app.state.uploads = UploadPool(LOCAL_UPLOADS)
     app.state.upload_limit_octets = sys.maxsize
     app.state.operations = []
@@ -116,12 +122,14 @@ class FollowUpOnDemand:
 class LocalTransport(httpx.BaseTransport):
     """Requests to an application in this process. Request bodies are streamed, response bodies are held in memory."""
 
-    def __init__(self, ground: Ground, actor: str) -> None:
+    def __init__(self, ground: Ground, actor: str, *, background: bool = False) -> None:
         self._ground = ground
+        dispatcher = _background_dispatcher(ground) if background else LocalDispatcher(ground)
         ground.database.listeners.add(FollowUpOnDemand(ground))
-        self._asgi = httpx.ASGITransport(local_app(ground, actor))
+        self._asgi = httpx.ASGITransport(local_app(ground, actor, dispatcher))
         self._opened = ExitStack()
         self._opened.callback(ground.close)
+        self._opened.callback(dispatcher.close)
         self._portal = self._opened.enter_context(start_blocking_portal())
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
@@ -142,6 +150,12 @@ class LocalTransport(httpx.BaseTransport):
         response = await self._asgi.handle_async_request(passed)
         octets = await response.aread()
         return httpx.Response(response.status_code, headers=response.headers, stream=httpx.ByteStream(octets))
+
+
+def _background_dispatcher(ground: Ground) -> Dispatcher:
+    from ground_service.worker.dispatch import ThreadDispatcher
+
+    return ThreadDispatcher(ground)
 
 
 class _Blocks(httpx.AsyncByteStream):

@@ -407,11 +407,15 @@ class Client(Connection):
 
     def prune_kept_archives(self, *, unused_days: float) -> Pruned:
         """Remove kept archives that are not pinned and were not used for a time."""
-        return self._post(Pruned, "/regression-archives/prune", {"unused_days": unused_days})
+        return self._call(Pruned, "DELETE", "/regression-archives", query={"unused_days": unused_days})
 
     def start_regression(self, request: Body, *, key: str | None = None) -> Job:
         """Start the jobs that compare a candidate build with a baseline over archives."""
         return self._post(Job, "/regressions", request, key=key or new_key())
+
+    def start_analysis(self, request: Body, *, key: str | None = None) -> Job:
+        """Start the job that analyses builds without a verdict; its result is that of the analysis."""
+        return self._post(Job, "/analyses", request, key=key or new_key())
 
     def list_regressions(self) -> Listing[RegressionSummary]:
         """List verdicts, newest first."""

@@ -21,7 +21,17 @@ from ground_service.jobs.model import Job
 from ground_service.store import repository
 from ground_service.store.counters import hold
 
-KINDS = ("report", "ingest", "archive", "replay", "regression", "nightly", "redecode", "re-evaluation")
+KINDS = (
+    "report",
+    "ingest",
+    "archive",
+    "replay",
+    "regression",
+    "analysis",
+    "nightly",
+    "redecode",
+    "re-evaluation",
+)
 """Kinds of jobs; `worker.jobs` has a function for each."""
 
 FINISHED = ("done", "failed")
@@ -31,6 +41,7 @@ IDENTITY = {
     "archive": ("sha256",),
     "replay": ("archive", "build"),
     "regression": ("candidate", "baseline"),
+    "analysis": ("candidate", "baseline", "analysis"),
     "redecode": ("vehicle_id",),
     "re-evaluation": ("pass_id",),
 }

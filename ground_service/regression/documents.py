@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,98 @@ def regression_json(outcome: RegressionOutcome) -> dict[str, Any]:
     return result
 
 
-def regression_text(outcome: RegressionOutcome) -> str:
+@dataclass(frozen=True, slots=True)
+class StoredBuild:
+    """Build in a stored verdict."""
+
+    name: str
+    version: str
+    digest: str
+
+    @property
+    def title(self) -> str:
+        """Name, version and the beginning of the identity."""
+        return " ".join(part for part in (self.name, self.version, f"({self.digest[:12]})") if part)
+
+
+@dataclass(frozen=True, slots=True)
+class StoredPolicy:
+    """Policy in a stored verdict."""
+
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class StoredPass:
+    """Pass in a stored verdict."""
+
+    name: str
+    state: str
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class StoredVerdict:
+    """The part of a stored verdict that texts state."""
+
+    verdict: str
+    baseline: StoredBuild
+    candidate: StoredBuild
+    policy: StoredPolicy
+    gates: tuple[Gate, ...]
+    passes: tuple[StoredPass, ...]
+    remarks: tuple[str, ...]
+    frames_judged: int
+    frames_needed: int | None
+
+
+def stored_verdict(result: Mapping[str, Any]) -> StoredVerdict:
+    """Return the verdict of a JSON document of `regression_json`; null numbers become NaN."""
+
+    def number(value: float | None) -> float:
+        return math.nan if value is None else value
+
+    builds = [
+        StoredBuild(**{key: result[side][key] for key in ("name", "version", "digest")})
+        for side in ("baseline", "candidate")
+    ]
+    gates = tuple(
+        Gate(
+            name=gate["name"],
+            outcome=gate["outcome"],
+            baseline=number(gate["baseline"]),
+            candidate=number(gate["candidate"]),
+            margin=number(gate["margin"]),
+            limit=number(gate["limit"]),
+            unit=gate["unit"],
+            p_value=number(gate["p_value"]),
+            level=number(gate["level"]),
+            resolution=number(gate["resolution"]),
+            frames=gate["frames"],
+            frames_needed=gate["frames_needed"],
+            pass_name=gate["pass"] or "",
+            change_low=number(gate["change_bounds"][0]),
+            change_high=number(gate["change_bounds"][1]),
+            reason=gate["reason"] or "",
+            waived=gate["waived"] or "",
+        )
+        for gate in result["gates"]
+    )
+    passes = tuple(StoredPass(one["name"], one["state"], one["detail"]) for one in result["passes"])
+    return StoredVerdict(
+        result["verdict"],
+        builds[0],
+        builds[1],
+        StoredPolicy(result["policy"]["sha256"]),
+        gates,
+        passes,
+        tuple(result["remarks"]),
+        result["frames"],
+        result["frames_needed"],
+    )
+
+
+def regression_text(outcome: RegressionOutcome | StoredVerdict) -> str:
     """Return a summary for a terminal: verdict, failed and inconclusive gates, and the number of frames needed."""
     lines = [f"{outcome.candidate.title} against {outcome.baseline.title}: {outcome.verdict}"]
     for one in outcome.passes:
@@ -104,7 +196,7 @@ def gate_text(gate: Gate) -> str:
     return ", ".join(parts)
 
 
-def needed_text(outcome: RegressionOutcome) -> str:
+def needed_text(outcome: RegressionOutcome | StoredVerdict) -> str:
     """Return the number of frames and passes needed to decide every gate over the suite; empty if all are decided."""
     needed, frames = outcome.frames_needed, outcome.frames_judged
     judged = sum(one.state == "judged" for one in outcome.passes)
@@ -122,7 +214,7 @@ def _number(value: float) -> str:
     return f"{value:.4g}" if math.isfinite(value) else "unknown"
 
 
-def regression_junit(outcome: RegressionOutcome, finished_utc_ns: int) -> str:
+def regression_junit(outcome: RegressionOutcome | StoredVerdict, finished_utc_ns: int) -> str:
     """Return JUnit XML with a test case for every gate and every pass.
 
     Elements, their order and their attributes are valid in the schema of the Jenkins xUnit plugin (junit-10.xsd) and in

@@ -6,15 +6,23 @@ do at the same time is kept once.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 from ground_service.errors import InvalidInput
+from ground_service.evaluation.service import plain
 from ground_service.ground import Ground
 from ground_service.regression.archives import kept_archives
+from ground_service.regression.baseline import baseline_figures
 from ground_service.regression.builds import CURRENT, Build, load_build, register_build, registered_build
-from ground_service.regression.gates.policy import load_policy
+from ground_service.regression.model import Comparison
+from ground_service.regression.gates.policy import PolicyFile, load_policy, read_policy
+from ground_service.regression.search import bisect, differences
 from ground_service.regression.service import (
+    PassVerdict,
+    RegressionOutcome,
     do_replay,
     find_replay,
     is_done,
@@ -24,16 +32,20 @@ from ground_service.regression.service import (
 from ground_service.store import repository
 from ground_service.store.states import change_if
 
+log = logging.getLogger(__name__)
 
-def prepared(ground: Ground, candidate: str, baseline: str, archives: Sequence[str]) -> dict[str, Any]:
-    """Arguments of the job of a regression: identities of builds and archives that are there.
+
+def prepared(
+    ground: Ground, candidate: str, baseline: str, archives: Sequence[str], *, all_if_empty: bool = True
+) -> dict[str, Any]:
+    """Return the arguments of the job of a regression: identities of existing builds and archives.
 
     Parameters
     ----------
     candidate, baseline
         Identities of registered builds, or "current".
     archives
-        Identities of kept archives; all that are kept when empty.
+        Identities of kept archives; all that are kept when empty, unless `all_if_empty` is False.
 
     Raises
     ------
@@ -44,14 +56,21 @@ def prepared(ground: Ground, candidate: str, baseline: str, archives: Sequence[s
     for digest in archives:
         if digest not in kept:
             raise InvalidInput("archives", "", "identities of archives that are kept", digest[:64])
-    chosen = list(archives) or sorted(kept)
-    if not chosen:
+    chosen = list(archives) or (sorted(kept) if all_if_empty else [])
+    if all_if_empty and not chosen:
         raise InvalidInput("archives", "", "at least one archive that is kept", "none")
     return {
         "candidate": named_build(ground, candidate).digest,
         "baseline": named_build(ground, baseline).digest,
         "archives": chosen,
     }
+
+
+def compared(ground: Ground, given: Comparison) -> dict[str, Any]:
+    """Return the arguments of the job of a comparison."""
+    unusable = [one.model_dump() for one in given.unusable]
+    arguments = prepared(ground, given.candidate, given.baseline, given.archives, all_if_empty=not unusable)
+    return {**arguments, "unusable": unusable, "workers": given.workers}
 
 
 def named_build(ground: Ground, name: str) -> Build:
@@ -80,21 +99,56 @@ def replay_job(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> di
 
 def regression_job(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
     """A verdict; its id is that of the job."""
+    text = arguments.get("policy")
+    policy = load_policy() if text is None else read_policy(text.encode(), str(arguments["policy_name"]))
+    outcome = _outcome(ground, arguments, job_id, policy)
+    keep_regression(ground, outcome, regression_id=job_id)
+    return {"regression_id": job_id, "verdict": outcome.verdict}
 
+
+def analysis_job(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
+    """Run an analysis of builds (`AnalysisRequest`) and return what it found."""
+    policy = load_policy()
+    if arguments["analysis"] == "bisection":
+        for one in arguments["unusable"]:
+            raise InvalidInput("archives", "", "passes that both builds can fly", one["detail"])
+        found = bisect(
+            ground,
+            list(arguments["archives"]),
+            registered_build(ground, str(arguments["baseline"])),
+            registered_build(ground, str(arguments["candidate"])),
+            str(arguments["figure"]),
+            policy,
+            workers=arguments["workers"],
+            tell=lambda text: log.info("job %s: %s", job_id, text),
+        )
+        return asdict(found)
+    outcome = _outcome(ground, arguments, job_id, policy)
+    if arguments["analysis"] == "baseline":
+        return baseline_figures(outcome)
+    return {"passes": plain([asdict(one) for one in differences(outcome)])}
+
+
+def _outcome(
+    ground: Ground, arguments: Mapping[str, Any], job_id: str, policy: PolicyFile
+) -> RegressionOutcome:
     def progress(items: Any, total: int) -> Iterator[Any]:
         for number, item in enumerate(items, start=1):
             yield item
+            ground.check_stopping()
             share = 0.95 * number / total
             with ground.database.writing() as connection:
                 change_if(connection, repository.JOBS, job_id, {"state": "running"}, progress=share)
 
-    outcome = run_regression(
+    return run_regression(
         ground,
         list(arguments["archives"]),
         registered_build(ground, str(arguments["candidate"])),
         registered_build(ground, str(arguments["baseline"])),
-        load_policy(),
+        policy,
+        workers=arguments.get("workers"),
         progress=progress,
+        unusable=[
+            PassVerdict(one["name"], "", "unusable", one["detail"]) for one in arguments.get("unusable", ())
+        ],
     )
-    keep_regression(ground, outcome, regression_id=job_id)
-    return {"regression_id": job_id, "verdict": outcome.verdict}

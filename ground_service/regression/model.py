@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -42,19 +42,20 @@ class ArchiveChange(Given):
     pinned: bool = Field(description="Exempt the archive from removal")
 
 
-class PruneRequest(Given):
-    """Archives to remove."""
-
-    unused_days: float = Field(ge=0.0, le=36_500.0, description="Remove archives unused for this time")
-
-
 class Pruned(Entity):
     """Archives that were removed."""
 
     removed: list[str] = Field(description="Identities")
 
 
-class RegressionRequest(Given):
+class UnusableArchive(Given):
+    """Archive that could not be kept: it makes the verdict inconclusive."""
+
+    name: str = Field(max_length=300)
+    detail: str = Field(max_length=1000, description="Why it cannot be used")
+
+
+class Comparison(Given):
     """Builds to compare, and the archives to replay."""
 
     candidate: str = Field(
@@ -64,6 +65,34 @@ class RegressionRequest(Given):
     archives: list[Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]] = Field(
         default_factory=list, max_length=1000, description="Identities of kept archives; all when empty"
     )
+    unusable: list[UnusableArchive] = Field(
+        default_factory=list, max_length=1000, description="Archives that could not be kept"
+    )
+    workers: int | None = Field(
+        default=None,
+        ge=1,
+        le=256,
+        description="Simultaneous replays in one job; default: a job for each replay",
+    )
+
+
+class RegressionRequest(Comparison):
+    """Builds to compare, the archives to replay, and the policy of the gates."""
+
+    policy: str | None = Field(
+        default=None, max_length=200_000, description="Policy of the gates (TOML); default: the shipped one"
+    )
+    policy_name: str = Field(default="policy", max_length=300, description="Name of the policy in messages")
+
+
+class AnalysisRequest(Comparison):
+    """Builds to analyse without a verdict."""
+
+    analysis: Literal["baseline", "differences", "bisection"] = Field(
+        description="baseline: metrics of one build; differences: passes ordered by the difference of the builds; "
+        "bisection: the changes from baseline to candidate that changed a metric"
+    )
+    figure: str = Field(default="", max_length=100, description="Metric of a bisection")
 
 
 class Regression(Entity):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import uuid
 from typing import Annotated
 
-from fastapi import Path, Response
+from fastapi import Path, Query, Response
 
 from ground_service.access.security import Operator, UploadOf, Viewer, idempotent_id
 from ground_service.access.service import Caller
@@ -29,17 +29,18 @@ from ground_service.jobs.model import Job
 from ground_service.jobs.service import enter_jobs, get_job
 from ground_service.regression import archives as archive_service
 from ground_service.regression.builds import CURRENT, load_build, register_build
-from ground_service.regression.jobs import missing_replays, prepared
+from ground_service.regression.jobs import compared, missing_replays
 from ground_service.regression.model import (
+    AnalysisRequest,
     ArchiveChange,
     Build,
     KeptArchive,
     Pruned,
-    PruneRequest,
     Regression,
     RegressionRequest,
     RegressionSummary,
 )
+from ground_service.regression.gates.policy import read_policy
 from ground_service.store import repository
 from ground_service.store.files import StoredFile
 
@@ -103,10 +104,16 @@ def change_kept_archive(ground: GroundOf, _: Operator, digest: Digest, given: Ar
         return _archive(repository.get(connection, repository.REGRESSION_ARCHIVES, digest, "archive"))
 
 
-@regressions.post("/regression-archives/prune")
-def prune_kept_archives(ground: GroundOf, _: Operator, given: PruneRequest) -> Pruned:
+@regressions.delete("/regression-archives")
+def prune_kept_archives(
+    ground: GroundOf,
+    _: Operator,
+    unused_days: Annotated[
+        float, Query(ge=0.0, le=36_500.0, description="Remove archives unused for this time")
+    ],
+) -> Pruned:
     """Remove kept archives that are not pinned and were not used for a time."""
-    unused_for_ns = round(given.unused_days * 86_400e9)
+    unused_for_ns = round(unused_days * 86_400e9)
     return Pruned(removed=archive_service.let_go(ground, unused_for_ns=unused_for_ns))
 
 
@@ -121,12 +128,36 @@ def start_regression(
 ) -> Job:
     """Compare a candidate build with a baseline: a job for every missing replay, and one for the verdict."""
     identity = idempotent_id("regression", caller, idempotency_key) or uuid.uuid4().hex
-    arguments = prepared(ground, given.candidate, given.baseline, given.archives)
-    replays = {f"{one['archive']} {one['build']}": one for one in missing_replays(ground, arguments)}
+    if given.policy is not None:
+        read_policy(given.policy.encode(), given.policy_name)
+    arguments = {
+        **compared(ground, given),
+        "policy": given.policy,
+        "policy_name": given.policy_name,
+    }
+    missing = missing_replays(ground, arguments) if given.workers is None else []
+    replays = {f"{one['archive']} {one['build']}": one for one in missing}
     for job in enter_jobs(ground, replays, "regression", arguments, identity):
         dispatcher.start(job)
     response.headers["Location"] = f"{API_PREFIX}/regressions/{identity}"
     return get_job(ground, identity)
+
+
+@regressions.post("/analyses", status_code=202, responses=problems(404))
+def start_analysis(
+    response: Response,
+    ground: GroundOf,
+    caller: Operator,
+    dispatcher: DispatcherOf,
+    given: AnalysisRequest,
+    idempotency_key: IdempotencyKey = None,
+) -> Job:
+    """Analyse builds without a verdict; the result of the job is that of the analysis."""
+    arguments = {**compared(ground, given), "analysis": given.analysis, "figure": given.figure}
+    job_id = idempotent_id("analysis", caller, idempotency_key)
+    job = dispatcher.submit("analysis", arguments, job_id=job_id)
+    response.headers["Location"] = f"{API_PREFIX}/jobs/{job}"
+    return get_job(ground, job)
 
 
 @regressions.get("/regressions")

@@ -51,6 +51,7 @@ def run_regression(
     *,
     workers: int | None = None,
     progress: Progress | None = None,
+    unusable: Sequence[PassVerdict] = (),
 ) -> RegressionOutcome:
     """Fly archives with both builds, where that was not done before, and judge.
 
@@ -62,10 +63,12 @@ def run_regression(
         Replays at a time; every replay is a process of its own. Default: one for each core.
     progress
         Wraps the iteration over replays (items, total), for a progress bar.
+    unusable
+        Verdicts on further archives, which could not be kept.
     """
-    if not archives:
+    if not archives and not unusable:
         raise InvalidInput("archives", "", "at least one pass archive", "none")
-    kept = [_kept(ground, given) for given in archives]
+    kept = [*(_kept(ground, given) for given in archives), *unusable]
     usable = list(dict.fromkeys(one.digest for one in kept if isinstance(one, PassArchive)))
     shards = [(digest, build) for digest in usable for build in dict.fromkeys((baseline, candidate))]
     shards = [shard for shard in shards if not is_done(find_replay(ground, *shard))]

@@ -85,12 +85,19 @@ def _regression(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> di
     return regression_job(ground, arguments, job_id)
 
 
+def _analysis(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
+    from ground_service.regression.jobs import analysis_job
+
+    return analysis_job(ground, arguments, job_id)
+
+
 WORK: dict[str, Work] = {
     "report": _report,
     "ingest": _ingest,
     "archive": _archive,
     "replay": _replay,
     "regression": _regression,
+    "analysis": _analysis,
     "nightly": nightly,
     "redecode": _redecode,
     "re-evaluation": _reevaluate,

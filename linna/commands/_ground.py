@@ -39,13 +39,16 @@ def add_operator_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def ground_client(arguments: argparse.Namespace) -> Client:
-    """Return a client of the server that the options name, otherwise of the service of this machine."""
+def ground_client(arguments: argparse.Namespace, *, background: bool = False) -> Client:
+    """Return a client of the server that the options name, otherwise of the service of this machine.
+
+    On this machine, `background` lets jobs run in a thread while their progress is shown.
+    """
     server = server_of(arguments)
     if server is None:
         from ground_service.client.local import local_client
 
-        return local_client(_opened(arguments), str(arguments.actor or local_actor()))
+        return local_client(_opened(arguments), str(arguments.actor or local_actor()), background=background)
     from ground_service.client import Client
     from linna.errors import UsageError
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(metavar="ACTION", required=True)
-    upgrade = actions.add_parser("upgrade", help="bring the schema to this version")
+    upgrade = actions.add_parser("upgrade", help="upgrade the schema to this version")
     upgrade.set_defaults(handler=run_upgrade)
     granting = actions.add_parser(
         "grant", help="grant a database role the least privileges that the service needs"
@@ -27,7 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     downgrade.add_argument("revision", help="base, the only revision to downgrade to")
     downgrade.add_argument("--yes", action="store_true", help="confirm that everything is deleted")
     downgrade.set_defaults(handler=run_downgrade)
-    status = actions.add_parser("status", help="which revision the database has")
+    status = actions.add_parser("status", help="show the schema revision of the database")
     status.set_defaults(handler=run_status)
     saving = actions.add_parser("backup", help="write the whole service into a new folder, while it runs")
     saving.add_argument("--out", type=Path, required=True, metavar="DIR")
@@ -47,7 +47,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     for action in (exporting, importing):
         action.add_argument("file", type=Path)
     tidying = actions.add_parser("tidy", help="delete old feed messages and old finished jobs")
-    tidying.add_argument("--days", type=int, help="older than this (default: $LINNA_RETENTION_DAYS)")
+    tidying.add_argument(
+        "--days",
+        type=int,
+        help="delete what is older than this number of days (default: $LINNA_RETENTION_DAYS)",
+    )
     tidying.set_defaults(handler=run_tidy)
     decoding = actions.add_parser("redecode", help="decode the archive again with this version's dictionary")
     decoding.set_defaults(handler=run_redecode)

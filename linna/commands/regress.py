@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import argparse
+import os
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from linna.commands._ground import add_operator_options, add_service_options, ground_client, open_service
+from linna.commands._ground import add_operator_options, ground_client, server_of
 from linna.output import add_json_flag, emit, log, progress
+
+PROGRESS_STEP = 0.05
 
 if TYPE_CHECKING:
     from ground_service.client import Client
+    from ground_service.jobs.model import Job
     from ground_service.regression.model import Build
 
 
@@ -79,11 +83,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default=90.0,
         help="prune: remove archives that were not used for this time (default: 90)",
     )
-    _finish(archive, _archive, add_operator_options)
+    _finish(archive, _archive)
     build = commands.add_parser("build", help="register a build, or list those registered")
     build.add_argument("action", choices=("register", "list"))
     build.add_argument("file", nargs="?", help="build file")
-    _finish(build, _build, add_operator_options)
+    _finish(build, _build)
     sandbox = commands.add_parser(
         "sandbox", help="show which sandbox isolates builds here, or why builds are refused"
     )
@@ -108,44 +112,34 @@ def _archives(parser: argparse.ArgumentParser) -> None:
 def _finish(
     parser: argparse.ArgumentParser,
     handler: Callable[[argparse.Namespace], int],
-    add_options: Callable[[argparse.ArgumentParser], None] = add_service_options,
 ) -> None:
-    add_options(parser)
+    add_operator_options(parser)
     add_json_flag(parser)
     parser.set_defaults(handler=handler)
 
 
 def _run(arguments: argparse.Namespace) -> int:
     from ground_service.clock import utc_now_ns
-    from ground_service.regression.builds import build_of
-    from ground_service.regression.documents import (
-        regression_html,
-        regression_json,
-        regression_junit,
-        regression_text,
-    )
+    from ground_service.regression.documents import regression_junit, regression_text, stored_verdict
     from ground_service.regression.gates.policy import load_policy
-    from ground_service.regression.service import keep_regression, run_regression
+    from ground_service.regression.service import EXIT_STATUS
 
-    policy = load_policy(arguments.policy)
-    with open_service(arguments) as ground:
-        candidate, baseline = build_of(ground, arguments.build), build_of(ground, arguments.baseline)
-        outcome = run_regression(
-            ground,
-            _listed(arguments.archive),
-            candidate,
-            baseline,
-            policy,
-            workers=arguments.workers,
-            progress=_bar,
-        )
-        identity = keep_regression(ground, outcome)
-        if arguments.junit:
-            arguments.junit.write_text(regression_junit(outcome, utc_now_ns()), encoding="utf-8")
+    request: dict[str, Any] = {}
+    if arguments.policy is not None:
+        load_policy(arguments.policy)
+        text = arguments.policy.read_text(encoding="utf-8")
+        request = {"policy": text, "policy_name": str(arguments.policy)}
+    with ground_client(arguments, background=True) as service:
+        request |= _comparison(service, arguments, arguments.build, arguments.baseline)
+        job = service.wait(service.start_regression(request).id, progress=_percent())
+        found = service.get_regression(job.id)
         if arguments.report:
-            arguments.report.write_text(regression_html(ground, outcome, identity), encoding="utf-8")
-        emit(arguments, {"id": identity, **regression_json(outcome)}, text=regression_text(outcome))
-    return outcome.exit_status
+            service.get_regression_report(found.id, arguments.report)
+    verdict = stored_verdict(found.result)
+    if arguments.junit:
+        arguments.junit.write_text(regression_junit(verdict, utc_now_ns()), encoding="utf-8")
+    emit(arguments, {"id": found.id, **found.result}, text=regression_text(verdict))
+    return EXIT_STATUS[found.verdict]
 
 
 def _sandbox(arguments: argparse.Namespace) -> int:
@@ -177,20 +171,13 @@ def _sandbox(arguments: argparse.Namespace) -> int:
 
 
 def _baseline(arguments: argparse.Namespace) -> int:
-    from ground_service.regression.baseline import baseline_figures, baseline_text
-    from ground_service.regression.builds import build_of
-    from ground_service.regression.gates.policy import load_policy
-    from ground_service.regression.service import run_regression
+    from ground_service.regression.baseline import baseline_text
 
-    with open_service(arguments) as ground:
-        build = build_of(ground, arguments.build)
-        policy = load_policy()
-        outcome = run_regression(
-            ground, _listed(arguments.archive), build, build, policy, workers=arguments.workers, progress=_bar
-        )
-        figures = baseline_figures(outcome)
-        emit(arguments, figures, text=baseline_text(figures))
-    return 0 if all(one.state == "judged" for one in outcome.passes) else 2
+    with ground_client(arguments, background=True) as service:
+        request = _comparison(service, arguments, arguments.build, arguments.build)
+        figures = _analysed(service, {**request, "analysis": "baseline"})
+    emit(arguments, figures, text=baseline_text(figures))
+    return 2 if figures["not_flown"] else 0
 
 
 def _suite(arguments: argparse.Namespace) -> int:
@@ -222,70 +209,111 @@ def _suite(arguments: argparse.Namespace) -> int:
 
 
 def _bisect(arguments: argparse.Namespace) -> int:
-    from ground_service.regression.builds import build_of
-    from ground_service.regression.gates.policy import load_policy
-    from ground_service.regression.search import bisect
-
-    with open_service(arguments) as ground:
-        found = bisect(
-            ground,
-            _listed(arguments.archive),
-            build_of(ground, arguments.good),
-            build_of(ground, arguments.bad),
-            arguments.figure,
-            load_policy(),
-            workers=arguments.workers,
-            tell=log,
-        )
+    with ground_client(arguments, background=True) as service:
+        request = _comparison(service, arguments, arguments.bad, arguments.good)
+        found = _analysed(service, {**request, "analysis": "bisection", "figure": arguments.figure})
     lines = [
-        f"{found.figure}: {found.good:.6g} -> {found.bad:.6g}, {len(found.changes)} changes, {found.runs} builds"
+        f"{found['figure']}: {found['good']:.6g} -> {found['bad']:.6g}, {len(found['changes'])} changes, "
+        f"{found['runs']} builds"
     ]
-    lines += [f"  {' + '.join(item.changes)}: {item.value:.6g}" for item in found.culprits]
-    emit(
-        arguments,
-        {
-            "figure": found.figure,
-            "good": found.good,
-            "bad": found.bad,
-            "changes": list(found.changes),
-            "culprits": [{"changes": list(item.changes), "value": item.value} for item in found.culprits],
-            "runs": found.runs,
-        },
-        text="\n".join(lines),
-    )
+    lines += [f"  {' + '.join(item['changes'])}: {item['value']:.6g}" for item in found["culprits"]]
+    emit(arguments, found, text="\n".join(lines))
     return 0
 
 
 def _search(arguments: argparse.Namespace) -> int:
-    from dataclasses import asdict
-
-    from ground_service.regression.builds import build_of
-    from ground_service.regression.gates.policy import load_policy
-    from ground_service.regression.search import differences
-    from ground_service.regression.service import run_regression
-
-    with open_service(arguments) as ground:
-        outcome = run_regression(
-            ground,
-            _listed(arguments.archive),
-            build_of(ground, arguments.build),
-            build_of(ground, arguments.baseline),
-            load_policy(),
-            workers=arguments.workers,
-            progress=_bar,
-        )
-    found = differences(outcome)[: arguments.top]
+    with ground_client(arguments, background=True) as service:
+        request = _comparison(service, arguments, arguments.build, arguments.baseline)
+        found = _analysed(service, {**request, "analysis": "differences"})["passes"][: arguments.top]
     lines = [
-        f"{item.name}: {item.frames_changed} of {item.frames} frames changed, {item.craters_changed} craters, "
-        f"position error changed by {item.error_m:.1f} m"
+        f"{item['name']}: {item['frames_changed']} of {item['frames']} frames changed, "
+        f"{item['craters_changed']} craters, position error changed by {_metres(item['error_m'])}"
         for item in found
     ]
-    emit(
-        arguments,
-        {"passes": [asdict(item) for item in found]},
-        text="\n".join(lines) or "no pass was flown by both",
-    )
+    emit(arguments, {"passes": found}, text="\n".join(lines) or "no pass was processed by both builds")
     return 0
+
+
+def _comparison(
+    service: Client, arguments: argparse.Namespace, candidate: str, baseline: str
+) -> dict[str, Any]:
+    """Return a request to compare two builds over archives, which are uploaded if needed."""
+    workers = arguments.workers
+    if workers is None and server_of(arguments) is None:
+        workers = os.cpu_count() or 1
+    builds = {name: _identity(service, name) for name in (candidate, baseline)}
+    archives, unusable = _kept(service, _listed(arguments.archive))
+    return {
+        "candidate": builds[candidate],
+        "baseline": builds[baseline],
+        "archives": archives,
+        "unusable": unusable,
+        "workers": workers,
+    }
+
+
+def _identity(service: Client, given: str) -> str:
+    """Return the identity of a build by file, by "current", or by identity; a file is registered."""
+    is_file = Path(given).exists() or Path(given).suffix == ".toml"
+    return _registered(service, given).digest if is_file and given != "current" else given
+
+
+def _kept(service: Client, given: list[str]) -> tuple[list[str], list[dict[str, str]]]:
+    """Return the identities of archives, and those that cannot be used; archives that are not kept are uploaded."""
+    from ground_service.client.problems import InvalidRequest
+    from ground_service.errors import InvalidInput
+    from lunar.errors import LunarError
+
+    known = {one.digest for one in service.list_kept_archives()}
+    digests: list[str] = []
+    unusable: list[dict[str, str]] = []
+    for item in given:
+        path = Path(item)
+        try:
+            if path.exists():
+                digests.append(_upload(service, path, known))
+            elif item in known:
+                digests.append(item)
+            else:
+                raise InvalidInput(item, "", "a pass archive, or the identity of one that is kept", "neither")
+        except (InvalidInput, InvalidRequest, LunarError) as error:
+            unusable.append({"name": path.name, "detail": str(error)[:1000]})
+    return digests, unusable
+
+
+def _upload(service: Client, path: Path, known: set[str]) -> str:
+    """Check an archive, upload it if it is not kept, and return its identity."""
+    from ground_service.regression.archives import check_archive, opened_archive, pack_archive
+
+    with opened_archive(path) as folder, tempfile.TemporaryDirectory() as scratch:
+        digest = check_archive(folder).digest
+        if digest not in known:
+            packed = Path(scratch) / f"{folder.name}.zip"
+            pack_archive(folder, packed)
+            service.keep_archive(packed)
+            known.add(digest)
+        return digest
+
+
+def _analysed(service: Client, request: dict[str, Any]) -> dict[str, Any]:
+    return service.wait(service.start_analysis(request).id, progress=_percent()).result or {}
+
+
+def _percent() -> Callable[[Job], None]:
+    """Return a function that logs the progress of a job when it has changed."""
+    shown = 0.0
+
+    def show(job: Job) -> None:
+        nonlocal shown
+        if job.progress >= shown + PROGRESS_STEP and job.state == "running":
+            shown = job.progress
+            log(f"replays: {100 * shown:.0f} %")
+
+    return show
+
+
+def _metres(value: float | None) -> str:
+    return "an unknown distance" if value is None else f"{value:.1f} m"
 
 
 def _archive(arguments: argparse.Namespace) -> int:
@@ -303,14 +331,7 @@ def _archive(arguments: argparse.Namespace) -> int:
     removed: list[str] = []
     with ground_client(arguments) as service:
         if arguments.action == "add":
-            with (
-                tempfile.TemporaryDirectory() as scratch,
-                archives.opened_archive(Path(arguments.target)) as folder,
-            ):
-                archives.check_archive(folder)
-                packed = Path(scratch) / f"{folder.name}.zip"
-                archives.pack_archive(folder, packed)
-                service.keep_archive(packed)
+            _upload(service, Path(arguments.target), set())
         elif arguments.action in ("pin", "unpin"):
             service.change_kept_archive(arguments.target, pinned=arguments.action == "pin")
         elif arguments.action == "prune":
@@ -379,7 +400,3 @@ def _listed(given: list[str]) -> list[str]:
         else:
             found += [str(path) for path in (*inside, *packed)]
     return found
-
-
-def _bar(items: Iterable[Any], total: int) -> Any:
-    return progress(items, total, "replays", "replay")

@@ -18,9 +18,9 @@ ROLES = ("viewer", "operator", "admin")
 
 def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(metavar="ACTION", required=True)
-    adding = actions.add_parser("add", help="add a user and print the token, once")
+    adding = actions.add_parser("add", help="add a user and print the token, which cannot be printed again")
     adding.set_defaults(handler=add)
-    renewing = actions.add_parser("token", help="give a user a new token and revoke all earlier ones")
+    renewing = actions.add_parser("token", help="create a token for a user and revoke all earlier ones")
     renewing.add_argument("--keep", action="store_true", help="keep earlier tokens valid")
     renewing.set_defaults(handler=renew)
     ensuring = actions.add_parser(
@@ -45,7 +45,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         action.add_argument(
             "--days", type=float, metavar="D", help="validity of the token in days (default: unlimited)"
         )
-    listing = actions.add_parser("list", help="all users")
+    listing = actions.add_parser("list", help="list all users")
     listing.set_defaults(handler=list_all)
     showing = actions.add_parser("tokens", help="list the tokens without their secrets, newest first")
     showing.add_argument("name", nargs="?", help="only tokens of this user")

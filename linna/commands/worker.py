@@ -8,12 +8,16 @@ from linna.commands._ground import add_service_options, settings_of
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--concurrency", type=int, default=1, metavar="N", help="jobs at a time (default: 1)")
     parser.add_argument(
-        "--beat", action="store_true", help="enter the nightly job, too (one worker of a deployment has to)"
+        "--concurrency", type=int, default=1, metavar="N", help="simultaneous jobs (default: 1)"
     )
     parser.add_argument(
-        "--check", action="store_true", help="exit 0 when the worker of this machine answers, 1 when not"
+        "--beat",
+        action="store_true",
+        help="also enter the nightly job (required for exactly one worker of a deployment)",
+    )
+    parser.add_argument(
+        "--check", action="store_true", help="exit 0 if the worker of this machine responds, otherwise 1"
     )
     add_service_options(parser)
     parser.set_defaults(handler=run)

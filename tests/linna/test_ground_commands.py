@@ -3,6 +3,7 @@
 import argparse
 import importlib
 import json
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -324,6 +325,23 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
             do("regress", "build", "register", build)
             ask("regress", "build", "register", mission)
             ask("regress", "build", "list")
+            archives = ["--archive", synthetic_archive, tmp_path / "nothing"]
+            ask("regress", "run", *archives, "--build", "current")
+            ask("regress", "run", *archives, "--build", "0" * 64)
+            ask("regress", "run", *archives, "--build", "current", "--policy", mission)
+            ask("regress", "baseline", *archives)
+            ask(
+                "regress",
+                "bisect",
+                *archives,
+                "--good",
+                build,
+                "--bad",
+                "current",
+                "--figure",
+                "detector.recall",
+            )
+            ask("regress", "search", *archives, "--build", "current")
             do("user", "add", "bob", "--role", "viewer")
             ask("user", "add", "bob", "--role", "viewer")
             ask("user", "add", "b/b", "--role", "viewer")
@@ -363,4 +381,6 @@ def steady(value: Any) -> Any:
     random = {"token", "hint", "sha256", "previous_sha256", "report_id", "number"}
     if isinstance(value, dict):
         return {key: None if key in times | random else steady(item) for key, item in value.items()}
-    return [steady(item) for item in value] if isinstance(value, list) else value
+    if isinstance(value, list):
+        return [steady(item) for item in value]
+    return None if isinstance(value, str) and re.fullmatch("[0-9a-f]{32}", value) else value  # id of a job

@@ -7,7 +7,7 @@ import difflib
 import hashlib
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -89,14 +89,26 @@ def load_policy(path: Path | None = None) -> PolicyFile:
         The file is missing or not a valid policy; the message names the key.
     """
     where = path or SHIPPED
-    source = str(where)
     try:
         octets = where.read_bytes()
-        table = tomllib.loads(octets.decode("utf-8"))
     except FileNotFoundError:
-        raise InvalidInput(source, "", "a policy file (TOML)", "nothing there") from None
+        raise InvalidInput(str(where), "", "a policy file (TOML)", "nothing there") from None
     except OSError as error:
         raise storage_error(error, where) from None
+    read = read_policy(octets, str(where))
+    return read if path is not None else replace(read, name="shipped")
+
+
+def read_policy(octets: bytes, source: str) -> PolicyFile:
+    """Return the policy in the octets of a file.
+
+    Raises
+    ------
+    InvalidInput
+        The octets are not a valid policy; the message names the key.
+    """
+    try:
+        table = tomllib.loads(octets.decode("utf-8"))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InvalidInput(source, "", "a policy file (TOML)", str(error)) from None
     if table.get("schema_version") != SCHEMA_VERSION:
@@ -127,7 +139,7 @@ def load_policy(path: Path | None = None) -> PolicyFile:
             Waiver(item.gate, item.reason, item.until.isoformat(), item.pass_name) for item in read.waiver
         ),
     )
-    return PolicyFile(policy, hashlib.sha256(octets).hexdigest(), "shipped" if path is None else source)
+    return PolicyFile(policy, hashlib.sha256(octets).hexdigest(), source)
 
 
 def _rule(item: GateTable) -> GateRule:

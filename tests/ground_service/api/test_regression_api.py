@@ -13,6 +13,8 @@ import pytest
 
 from ground_service.access.service import add_user
 from ground_service.app import create_app
+from ground_service.client.local import local_client
+from ground_service.ground import open_ground
 from ground_service.regression.archives import pack_archive
 from ground_service.settings import Settings
 from linna.cli import run
@@ -145,4 +147,51 @@ def test_commands_keep_pin_and_remove_archives(
     assert archive("prune", "--unused-days", "0") == {"archives": [], "removed": [kept["digest"]]}
     assert archive("pin", kept["digest"], status=2) == f"linna: error: archive {kept['digest']}: not found\n"
     (flown.folder / "catalogue.csv").write_text("damaged")
-    assert f"{flown.folder}, catalogue.csv" in archive("add", str(flown.folder), status=2)
+    assert f"error: {flown.folder}/catalogue.csv: expected SHA-256" in archive(
+        "add", str(flown.folder), status=2
+    )
+
+
+def test_commands_compare_and_analyse_builds_over_archives(
+    make_flyable: Callable, make_build: Callable, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flown = make_flyable(frames=12, seed=53)
+    packets = {"synthetic pass 53": flown.packets}
+    good = make_build("good", packets)
+    broken = make_build("broken", packets, program="raise SystemExit(4)")
+
+    def regress(*words: object, status: int = 0) -> Any:
+        place = ["--archive", flown.folder, "--home", tmp_path / "home", "--workers", 1, "--json"]
+        assert run(["regress", *map(str, (*words, *place))]) == status
+        return json.loads(capsys.readouterr().out)
+
+    passed = regress("run", "--build", good, "--baseline", good)
+    assert (passed["verdict"], passed["frames"], [one["state"] for one in passed["passes"]]) == (
+        "pass", 12, ["judged"],
+    )  # fmt: skip
+    junit, page = tmp_path / "junit.xml", tmp_path / "page.html"
+    documents = ("--junit", junit, "--report", page)
+    failed = regress("run", "--build", broken, "--baseline", good, *documents, status=1)
+    assert failed["passes"][0]["state"] == "candidate failed"
+    assert '<property name="verdict" value="fail" />' in junit.read_text()
+    assert "Regression report" in page.read_text()
+    figures = regress("baseline", "--build", good)
+    assert figures["suite"] == figures["passes"][0]["figures"] != {}
+    assert figures["not_flown"] == []
+    assert regress("baseline", "--build", broken, status=2)["not_flown"][0]["name"] == "synthetic pass 53"
+    (found,) = regress("search", "--build", good, "--baseline", good)["passes"]
+    assert (found["name"], found["frames"], found["frames_changed"]) == ("synthetic pass 53", 12, 0)
+    unused = tmp_path / "unused"
+    both = regress("run", "--build", good, "--baseline", good, "--archive", unused, status=3)
+    assert [one["state"] for one in both["passes"]] == ["judged", "unusable"]
+    assert both["verdict"] == "inconclusive"
+    assert both["passes"][1]["detail"] == (
+        f"{unused}: expected a pass archive, or the identity of one that is kept, found neither"
+    )
+    with open_ground(tmp_path / "home") as ground:
+        jobs = list(local_client(ground, "ann").list_jobs())
+    assert {one.state for one in jobs} == {"done"}
+    assert {one.kind for one in jobs} == {
+        "regression",
+        "analysis",
+    }  # replays run within the job of the verdict
