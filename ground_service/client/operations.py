@@ -104,6 +104,12 @@ class Client(Connection):
 
     def import_archive(self, archive: Path) -> int:
         """Upload a pass archive (folder or zip), wait until it is imported, and return the id of the pass."""
+        try:
+            return self._import_archive(archive)
+        except JobFailed as error:
+            raise JobFailed(error.status, f"{archive}: {error}") from None
+
+    def _import_archive(self, archive: Path) -> int:
         if archive.is_file():
             return int(self._result(self.upload_archive(archive))["pass_id"])
         from ground_service.passes.archive_zip import zip_folder

@@ -46,8 +46,12 @@ def ground_client(arguments: argparse.Namespace, *, background: bool = False) ->
     """
     server = server_of(arguments)
     if server is None:
+        import logging
+
         from ground_service.client.local import local_client
 
+        # The error of a failed job is that of the command, which prints it.
+        logging.getLogger("ground_service.worker").setLevel(logging.ERROR)
         return local_client(_opened(arguments), str(arguments.actor or local_actor()), background=background)
     from ground_service.client import Client
     from linna.errors import UsageError

@@ -4,6 +4,8 @@ import argparse
 import importlib
 import json
 import re
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -204,6 +206,19 @@ def test_a_wrong_token_and_a_wrong_server_are_told_in_one_line(
     assert gone.startswith("linna: error: http://127.0.0.1:1: cannot be reached")
     odd = asked(capsys, "pass", "list", "--server", "ftp://x", status=2)
     assert "expected a URL such as" in odd
+
+
+def test_a_failed_job_is_reported_in_one_line_that_names_the_file(tmp_path: Path) -> None:
+    archive = tmp_path / "archive"
+    archive.mkdir()
+    (archive / "manifest.json").write_text("{}")
+    words = [sys.executable, "-m", "linna", "ingest", str(archive), "--home", str(tmp_path / "home")]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.splitlines() == [
+        f"ingesting {archive} ...",
+        f"linna: error: {archive}: manifest.json, schema_version: expected int, found None",
+    ]
 
 
 def ground_commands() -> set[tuple[str, ...]]:
