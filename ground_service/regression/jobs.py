@@ -17,12 +17,11 @@ from ground_service.ground import Ground
 from ground_service.regression.archives import kept_archives
 from ground_service.regression.baseline import baseline_figures
 from ground_service.regression.builds import CURRENT, Build, load_build, register_build, registered_build
-from ground_service.regression.model import Comparison
 from ground_service.regression.gates.policy import PolicyFile, load_policy, read_policy
+from ground_service.regression.model import Comparison
+from ground_service.regression.outcome import PassVerdict, RegressionOutcome
 from ground_service.regression.search import bisect, differences
 from ground_service.regression.service import (
-    PassVerdict,
-    RegressionOutcome,
     do_replay,
     find_replay,
     is_done,

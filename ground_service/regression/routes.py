@@ -29,6 +29,7 @@ from ground_service.jobs.model import Job
 from ground_service.jobs.service import enter_jobs, get_job
 from ground_service.regression import archives as archive_service
 from ground_service.regression.builds import CURRENT, load_build, register_build
+from ground_service.regression.gates.policy import read_policy
 from ground_service.regression.jobs import compared, missing_replays
 from ground_service.regression.model import (
     AnalysisRequest,
@@ -40,7 +41,6 @@ from ground_service.regression.model import (
     RegressionRequest,
     RegressionSummary,
 )
-from ground_service.regression.gates.policy import read_policy
 from ground_service.store import repository
 from ground_service.store.files import StoredFile
 

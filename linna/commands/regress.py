@@ -122,7 +122,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from ground_service.clock import utc_now_ns
     from ground_service.regression.documents import regression_junit, regression_text, stored_verdict
     from ground_service.regression.gates.policy import load_policy
-    from ground_service.regression.service import EXIT_STATUS
+    from ground_service.regression.outcome import EXIT_STATUS
 
     request: dict[str, Any] = {}
     if arguments.policy is not None:
