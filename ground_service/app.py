@@ -19,6 +19,7 @@ from ground_service.ground import ground_from_settings
 from ground_service.http import problems
 from ground_service.http.common import API_PREFIX
 from ground_service.http.limits import BodyLimit, HeadersAndTags, RateLimit, SharedBudgets
+from ground_service.http.openapi import DescribedApi
 from ground_service.http.origins import LOOPBACK, SameOrigin
 from ground_service.http.proxies import ForwardedHeaders, TrustedProxies
 from ground_service.http.requests import PlainText
@@ -100,7 +101,7 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
             if budgets is not None:
                 await budgets.close()
 
-    app = FastAPI(
+    app = DescribedApi(
         title="LINNA ground service",
         version="1",
         summary="Ingest, archive and evaluation of crater-based navigation",

@@ -21,7 +21,7 @@ from ground_service.access.model import (
 )
 from ground_service.access.security import Admin, Operator
 from ground_service.errors import InvalidInput
-from ground_service.http.common import GroundOf, Limit, Offset, RowId, page_of
+from ground_service.http.common import GroundOf, PagingOf, RowId
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations, problems
 from ground_service.http.times import GivenTime
@@ -81,13 +81,12 @@ def revoke_token(ground: GroundOf, caller: Admin, token_id: RowId) -> None:
 def list_audit(
     ground: GroundOf,
     _: Operator,
+    paging: PagingOf,
     actor: Words = None,
     action: Words = None,
     target: Words = None,
     since: GivenTime | None = None,
     until: Annotated[GivenTime | None, Query(description="UTC, RFC 3339; exclusive")] = None,
-    limit: Limit = 100,
-    offset: Offset = 0,
 ) -> PageOf[AuditEntry]:
     """List the audit entries, newest first: actor, time, action and target."""
     if since is not None and until is not None and since.utc_ns > until.utc_ns:
@@ -99,10 +98,10 @@ def list_audit(
         target=target,
         since_utc_ns=None if since is None else since.utc_ns,
         until_utc_ns=None if until is None else until.utc_ns,
-        limit=limit,
-        offset=offset,
+        limit=paging.limit,
+        offset=paging.offset,
     )
-    return page_of(found, total, limit, offset)
+    return paging.page(found, total)
 
 
 @access.get("/audit/head")

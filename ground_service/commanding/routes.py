@@ -15,12 +15,10 @@ from ground_service.commanding.receiver import uplink_state
 from ground_service.http.common import (
     GroundOf,
     Instance,
-    Limit,
-    Offset,
     OnceKey,
+    PagingOf,
     RowId,
     SpacecraftId,
-    page_of,
 )
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations, problems
@@ -33,15 +31,14 @@ telecommands = operations("telecommands")
 def list_telecommands(
     ground: GroundOf,
     _: Viewer,
+    paging: PagingOf,
     state: Annotated[
         Literal["queued", "carried", "released", "rejected", "sent"] | None, Query(description="Stored state")
     ] = None,
-    limit: Limit = 100,
-    offset: Offset = 0,
 ) -> PageOf[Telecommand]:
     """List the telecommands with their verification, newest first."""
-    views, total = commanding.list_commands(ground, state=state, limit=limit, offset=offset)
-    return page_of([view.telecommand for view in views], total, limit, offset)
+    views, total = commanding.list_commands(ground, state=state, limit=paging.limit, offset=paging.offset)
+    return paging.page([view.telecommand for view in views], total)
 
 
 @telecommands.post("/telecommands", status_code=201)

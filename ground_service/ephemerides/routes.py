@@ -9,7 +9,7 @@ from fastapi import Query
 from ground_service.access.security import Operator, UploadOf, Viewer
 from ground_service.ephemerides import service
 from ground_service.ephemerides.model import Ephemeris
-from ground_service.http.common import API_PREFIX, GroundOf, Limit, Name, Offset, page_of, upload_body
+from ground_service.http.common import API_PREFIX, GroundOf, Name, PagingOf, upload_body
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
 
@@ -18,7 +18,7 @@ UPLOAD_PATHS = (f"{API_PREFIX}/ephemerides",)
 ephemerides = operations("ephemerides")
 
 
-@ephemerides.post("/ephemerides", status_code=201, openapi_extra=upload_body("text/plain"))
+@ephemerides.post("/ephemerides", status_code=201, openapi_extra=upload_body("CCSDS OEM or STK .e file"))
 async def add_ephemeris(
     upload: UploadOf,
     ground: GroundOf,
@@ -36,9 +36,7 @@ async def add_ephemeris(
 
 
 @ephemerides.get("/ephemerides")
-def list_ephemerides(
-    ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Offset = 0
-) -> PageOf[Ephemeris]:
+def list_ephemerides(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[Ephemeris]:
     """List the reference ephemerides, newest first."""
-    items, total = service.list_ephemerides(ground, limit=limit, offset=offset)
-    return page_of(items, total, limit, offset)
+    items, total = service.list_ephemerides(ground, limit=paging.limit, offset=paging.offset)
+    return paging.page(items, total)

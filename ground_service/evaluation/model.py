@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from ground_service.http.model import Entity
 from ground_service.http.times import UtcTime
@@ -53,6 +53,81 @@ class Report(Entity):
     event: int | None = Field(description="Number of the event that caused the re-evaluation")
     previous: str | None = Field(description="The report before it")
     changes: list[ChangedFigure] | None
+
+
+class ClassFigures(Entity):
+    """Detector figures of one size class; null: not known."""
+
+    model_config = ConfigDict(serialize_by_alias=True)
+
+    size_class: int = Field(alias="class", description="0: 5-10 km, 1: 10-15 km, 2: 15-30 km, 3: 3-5 km")
+    expected: int
+    precision: float | None
+    recall: float | None
+    loc_px: float | None
+
+
+class DetectorFigures(Entity):
+    """Detector figures of a pass; null: not known."""
+
+    precision: float | None
+    recall: float | None
+    loc_px: float | None = Field(description="Localisation error")
+    per_class: list[ClassFigures]
+
+
+class NavigationFigures(Entity):
+    """3-D position error of a navigation solution; null: not known."""
+
+    median_3d_m: float | None
+    p68_3d_m: float | None
+    p95_3d_m: float | None
+    p99_3d_m: float | None
+    max_3d_m: float | None
+    drift_percent: float | None
+    end_of_pass_m: float | None
+
+
+class ErrorBudget(Entity):
+    """Part of the reference in the observed error of a navigation solution; null: not known."""
+
+    observed_rms_m: float | None
+    reference_rms_m: float | None
+    estimate_rms_m: float | None
+
+
+class RequirementFigures(Entity):
+    """A requirement of the mission description and whether the pass meets it."""
+
+    key: str = Field(examples=["accuracy.median"])
+    name: str = Field(examples=["median 3-D error"])
+    value: float | None = Field(description="null: unknown")
+    limit: float | None = Field(description="null: not stated in the mission description")
+    relation: str = Field(examples=["<="])
+    unit: str = Field(examples=["m"])
+    margin: float | None
+    status: str = Field(description="met, not met, unknown or not judged", examples=["met"])
+    note: str
+
+
+class PassFigures(Entity):
+    """Figures of an evaluated pass; null: not known."""
+
+    pass_id: int
+    frames: int | None
+    packets: int
+    packets_lost: int
+    packets_expected: int
+    detector: DetectorFigures
+    navigation: dict[str, NavigationFigures] = Field(description="By on-board estimator")
+    smoothed: dict[str, NavigationFigures] = Field(description="By smoothed estimator")
+    baselines: dict[str, NavigationFigures]
+    verdict: str
+    verdict_level: str = Field(examples=["good"])
+    requirements: list[RequirementFigures]
+    error_budget: dict[str, ErrorBudget]
+    evidence_level: str
+    data: list[str] = Field(description="Data sources")
 
 
 class ReportOverview(Entity):

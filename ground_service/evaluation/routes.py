@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import Query, Request, Response
 
 from ground_service.access.security import Operator, Viewer, idempotent_id
 from ground_service.errors import NotFound
 from ground_service.evaluation import service
-from ground_service.evaluation.model import Report, ReportOverview
+from ground_service.evaluation.model import PassFigures, Report, ReportOverview
 from ground_service.evaluation.report_overview import list_reports as reports_of_pass
 from ground_service.evaluation.report_overview import report_overview, report_row
 from ground_service.http.common import (
@@ -17,10 +17,8 @@ from ground_service.http.common import (
     GroundOf,
     IdempotencyKey,
     Key,
-    Limit,
-    Offset,
+    PagingOf,
     PassId,
-    page_of,
 )
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
@@ -35,9 +33,9 @@ evaluation = operations("reports")
 
 
 @evaluation.get("/passes/{pass_id}/summary")
-def evaluate_pass(ground: GroundOf, _: Viewer, pass_id: PassId) -> dict[str, Any]:
+def evaluate_pass(ground: GroundOf, _: Viewer, pass_id: PassId) -> PassFigures:
     """Evaluate a pass now: frames, packets, detector, navigation and baselines."""
-    return service.pass_summary(ground, pass_id)
+    return PassFigures.model_validate(service.pass_summary(ground, pass_id))
 
 
 @evaluation.post("/passes/{pass_id}/reports", status_code=202)
@@ -99,19 +97,16 @@ def preferred_kind(accept: str) -> str:
 
 
 @evaluation.get("/passes/{pass_id}/reports")
-def list_reports(
-    ground: GroundOf, _: Viewer, pass_id: PassId, limit: Limit = 100, offset: Offset = 0
-) -> PageOf[Report]:
+def list_reports(ground: GroundOf, _: Viewer, pass_id: PassId, paging: PagingOf) -> PageOf[Report]:
     """List the reports of a pass, newest first, with the changes that a re-evaluation made."""
-    items, total = reports_of_pass(ground, pass_id, limit=limit, offset=offset)
-    return page_of(items, total, limit, offset)
+    items, total = reports_of_pass(ground, pass_id, limit=paging.limit, offset=paging.offset)
+    return paging.page(items, total)
 
 
 @evaluation.get("/reports/{report_id}/summary")
-def get_report_summary(ground: GroundOf, _: Viewer, report_id: Key) -> dict[str, Any]:
+def get_report_summary(ground: GroundOf, _: Viewer, report_id: Key) -> PassFigures:
     """Return the figures of a report."""
-    summary: dict[str, Any] = report_row(ground, report_id)["summary"]
-    return summary
+    return PassFigures.model_validate(report_row(ground, report_id)["summary"])
 
 
 @evaluation.get("/reports/{report_id}/overview")

@@ -50,6 +50,15 @@ class PageOf(Entity, Generic[Item]):
     total: int = Field(description="Number of items in all pages", examples=[1])
     limit: int = Field(examples=[100])
     offset: int = Field(examples=[0])
+    next: str | None = Field(
+        default=None, description="Address of the next page", examples=["/api/v1/passes?limit=100&offset=100"]
+    )
+    previous: str | None = Field(default=None, description="Address of the previous page")
+
+    @classmethod
+    def model_parametrized_name(cls, params: tuple[Any, ...]) -> str:
+        """Return the name of the page of an entity, such as JobPage."""
+        return f"{params[0].__name__}Page"
 
     @classmethod
     def all_of(cls, items: list[Item]) -> Self:

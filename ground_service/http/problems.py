@@ -167,7 +167,10 @@ def install(app: FastAPI) -> None:
     async def invalid(request: Request, error: Exception) -> JSONResponse:
         assert isinstance(error, RequestValidationError)
         found = [
-            {"where": ".".join(str(part) for part in item["loc"]), "expected": item["msg"]}
+            {
+                "where": ".".join(str(part) for part in item["loc"]),
+                "expected": item["msg"].removeprefix("Value error, "),
+            }
             for item in error.errors()
         ]
         detail = "; ".join(f"{item['where']}: {item['expected']}" for item in found[:5])

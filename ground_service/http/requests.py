@@ -21,7 +21,6 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from ground_service.http.common import API_PREFIX, IDEMPOTENCY_HEADER, IF_MATCH_HEADER
-from ground_service.http.model import Problem
 from ground_service.http.origins import refuse
 from ground_service.http.problems import problem
 
@@ -89,8 +88,7 @@ def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return the description of error responses."""
     return {
         status: {
-            "model": Problem,
-            "content": {"application/problem+json": {}},
+            "content": {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}},
             "description": PROBLEMS[status],
         }
         for status in statuses
@@ -110,7 +108,7 @@ class StrictRoute(APIRoute):
         options["description"] = rest
         options["operation_id"] = endpoint.__name__
         dependant = get_dependant(path=path, call=endpoint)
-        upload = "requestBody" in (options.get("openapi_extra") or {})
+        upload = "requestBody" in (options.get("openapi_extra") or {}) and not dependant.body_params
         body = upload or bool(dependant.body_params)
         headers = header_names(dependant)
         derived = {

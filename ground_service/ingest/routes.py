@@ -13,11 +13,9 @@ from ground_service.http.common import (
     GroundOf,
     IdempotencyKey,
     Instance,
-    Limit,
     Name,
-    Offset,
+    PagingOf,
     RowId,
-    page_of,
     upload_body,
 )
 from ground_service.http.model import PageOf
@@ -32,7 +30,7 @@ UPLOAD_PATHS = (f"{API_PREFIX}/telemetry",)
 ingests = operations("telemetry")
 
 
-@ingests.post("/telemetry", status_code=202, openapi_extra=upload_body("application/octet-stream"))
+@ingests.post("/telemetry", status_code=202, openapi_extra=upload_body("CADUs or space packets"))
 async def upload_telemetry(
     response: Response,
     upload: UploadOf,
@@ -88,10 +86,10 @@ async def upload_telemetry(
 
 
 @ingests.get("/ingests")
-def list_ingests(ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Offset = 0) -> PageOf[Ingest]:
+def list_ingests(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[Ingest]:
     """List the ingests, newest first."""
-    items, total = listing.list_ingests(ground, limit=limit, offset=offset)
-    return page_of(items, total, limit, offset)
+    items, total = listing.list_ingests(ground, limit=paging.limit, offset=paging.offset)
+    return paging.page(items, total)
 
 
 @ingests.get("/ingests/{ingest_id}")

@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import Query
 
 from ground_service.access.security import Viewer
-from ground_service.http.common import GroundOf, Key, Limit, Offset, page_of
+from ground_service.http.common import GroundOf, Key, PagingOf
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
 from ground_service.jobs import service
@@ -20,13 +20,12 @@ jobs = operations("jobs")
 def list_jobs(
     ground: GroundOf,
     _: Viewer,
+    paging: PagingOf,
     kind: Annotated[str | None, Query(max_length=40, examples=["regression"])] = None,
-    limit: Limit = 100,
-    offset: Offset = 0,
 ) -> PageOf[Job]:
     """List the jobs, newest first; `kind` selects jobs of one kind."""
-    items, total = service.list_jobs(ground, kind=kind, limit=limit, offset=offset)
-    return page_of(items, total, limit, offset)
+    items, total = service.list_jobs(ground, kind=kind, limit=paging.limit, offset=paging.offset)
+    return paging.page(items, total)
 
 
 @jobs.get("/jobs/{job_id}")

@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import Body, Path, Query
 
 from ground_service.access.security import Operator, Viewer
-from ground_service.http.common import GroundOf, Limit, Name, Offset, page_of
+from ground_service.http.common import GroundOf, Name, PagingOf
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
 from ground_service.missions import service
@@ -15,17 +15,15 @@ from ground_service.missions.model import MissionDetail, MissionRevision
 
 missions = operations("missions")
 
-Text = Annotated[bytes, Body(media_type="text/plain", description="mission.toml")]
+Text = Annotated[bytes, Body(media_type="application/octet-stream", description="mission.toml")]
 Revision = Annotated[str, Path(pattern=r"^[0-9a-f]{8,64}$", description="Hash or its first digits")]
 
 
 @missions.get("/missions")
-def list_missions(
-    ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Offset = 0
-) -> PageOf[MissionRevision]:
+def list_missions(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[MissionRevision]:
     """List the revisions of mission descriptions, newest first."""
-    items, total = service.list_missions(ground, limit=limit, offset=offset)
-    return page_of(items, total, limit, offset)
+    items, total = service.list_missions(ground, limit=paging.limit, offset=paging.offset)
+    return paging.page(items, total)
 
 
 @missions.post("/missions", status_code=201)

@@ -14,13 +14,11 @@ from ground_service.http.common import (
     GroundOf,
     IdempotencyKey,
     Instance,
-    Limit,
     Name,
-    Offset,
     OnceKey,
+    PagingOf,
     PassId,
     SpacecraftId,
-    page_of,
     upload_body,
 )
 from ground_service.http.model import PageOf
@@ -60,7 +58,7 @@ Parameter = Annotated[str, Path(max_length=200, examples=["temperature_c"])]
 passes = operations("passes")
 
 
-@passes.post("/archives", status_code=202, openapi_extra=upload_body("application/zip"))
+@passes.post("/archives", status_code=202, openapi_extra=upload_body("Zip file of a pass archive"))
 async def upload_archive(
     response: Response,
     upload: UploadOf,
@@ -86,10 +84,10 @@ async def upload_archive(
 
 
 @passes.get("/passes")
-def list_passes(ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Offset = 0) -> PageOf[PassSummary]:
+def list_passes(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[PassSummary]:
     """List the passes, newest first."""
-    items, total = service.list_passes(ground, limit=limit, offset=offset)
-    return page_of(items, total, limit, offset)
+    items, total = service.list_passes(ground, limit=paging.limit, offset=paging.offset)
+    return paging.page(items, total)
 
 
 @passes.post("/passes", status_code=201)
@@ -133,12 +131,10 @@ def get_completeness(ground: GroundOf, _: Viewer, pass_id: PassId) -> Completene
 
 
 @passes.get("/passes/{pass_id}/detections")
-def list_detections(
-    ground: GroundOf, _: Viewer, pass_id: PassId, limit: Limit = 100, offset: Offset = 0
-) -> PageOf[Detection]:
+def list_detections(ground: GroundOf, _: Viewer, pass_id: PassId, paging: PagingOf) -> PageOf[Detection]:
     """List the detections of a pass, in time order."""
-    items, total = service.detections(ground, pass_id, limit=limit, offset=offset)
-    return page_of(items, total, limit, offset)
+    items, total = service.detections(ground, pass_id, limit=paging.limit, offset=paging.offset)
+    return paging.page(items, total)
 
 
 @passes.get("/passes/{pass_id}/states", response_model=States)
@@ -157,12 +153,10 @@ def get_states(
 
 
 @passes.get("/passes/{pass_id}/events")
-def list_events(
-    ground: GroundOf, _: Viewer, pass_id: PassId, limit: Limit = 100, offset: Offset = 0
-) -> PageOf[Event]:
+def list_events(ground: GroundOf, _: Viewer, pass_id: PassId, paging: PagingOf) -> PageOf[Event]:
     """List the event reports of a pass, in time order."""
-    items, total = service.list_events(ground, pass_id, limit=limit, offset=offset)
-    return page_of(items, total, limit, offset)
+    items, total = service.list_events(ground, pass_id, limit=paging.limit, offset=paging.offset)
+    return paging.page(items, total)
 
 
 @passes.get("/passes/{pass_id}/parameters")

@@ -14,11 +14,9 @@ from ground_service.http.common import (
     API_PREFIX,
     IF_MATCH_HEADER,
     GroundOf,
-    Limit,
-    Offset,
     OnceKey,
+    PagingOf,
     PassId,
-    page_of,
 )
 from ground_service.http.model import PageOf
 from ground_service.http.problems import PreconditionFailed
@@ -52,13 +50,12 @@ def search_windows(ground: GroundOf, _: Viewer, given: WindowSearch) -> SearchRe
 def list_windows(
     ground: GroundOf,
     _: Viewer,
+    paging: PagingOf,
     state: Annotated[WindowState | None, Query()] = None,
-    limit: Limit = 100,
-    offset: Offset = 0,
 ) -> PageOf[Window]:
     """List the planned windows, newest first."""
-    items, total = service.list_windows(ground, state=state, limit=limit, offset=offset)
-    return page_of(items, total, limit, offset)
+    items, total = service.list_windows(ground, state=state, limit=paging.limit, offset=paging.offset)
+    return paging.page(items, total)
 
 
 @planning.post("/windows", status_code=201, responses=problems(404))

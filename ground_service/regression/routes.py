@@ -16,9 +16,7 @@ from ground_service.http.common import (
     GroundOf,
     IdempotencyKey,
     Key,
-    Limit,
-    Offset,
-    page_of,
+    PagingOf,
     upload_body,
 )
 from ground_service.http.model import PageOf
@@ -52,14 +50,14 @@ regressions = operations("regression")
 
 
 @regressions.get("/builds")
-def list_builds(ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Offset = 0) -> PageOf[Build]:
+def list_builds(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[Build]:
     """List the registered builds, newest first."""
     with ground.database.reading() as connection:
-        page = repository.page(connection, repository.BUILDS, limit=limit, offset=offset)
-    return page_of([_build(row) for row in page.rows], page.total, limit, offset)
+        page = repository.page(connection, repository.BUILDS, limit=paging.limit, offset=paging.offset)
+    return paging.page([_build(row) for row in page.rows], page.total)
 
 
-@regressions.post("/builds", status_code=201, openapi_extra=upload_body("application/zip"))
+@regressions.post("/builds", status_code=201, openapi_extra=upload_body("Zip file of a build"))
 async def add_build(upload: UploadOf, ground: GroundOf, caller: Operator) -> Build:
     """Register a build: a zip with build.toml and the files that it names.
 
@@ -81,7 +79,9 @@ def list_kept_archives(ground: GroundOf, _: Viewer) -> list[KeptArchive]:
     return [_archive(row) for row in archive_service.kept_archives(ground)]
 
 
-@regressions.post("/regression-archives", status_code=201, openapi_extra=upload_body("application/zip"))
+@regressions.post(
+    "/regression-archives", status_code=201, openapi_extra=upload_body("Zip file of a pass archive")
+)
 async def keep_archive(upload: UploadOf, ground: GroundOf, _: Operator, pinned: bool = False) -> KeptArchive:
     """Keep a zipped pass archive for replays, after checking every hash in it."""
     stored = await upload.stored()
@@ -161,12 +161,10 @@ def start_analysis(
 
 
 @regressions.get("/regressions")
-def list_regressions(
-    ground: GroundOf, _: Viewer, limit: Limit = 100, offset: Offset = 0
-) -> PageOf[RegressionSummary]:
+def list_regressions(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[RegressionSummary]:
     """List the verdicts, newest first."""
     with ground.database.reading() as connection:
-        page = repository.page(connection, repository.REGRESSIONS, limit=limit, offset=offset)
+        page = repository.page(connection, repository.REGRESSIONS, limit=paging.limit, offset=paging.offset)
     items = [
         RegressionSummary(
             id=row["id"],
@@ -182,7 +180,7 @@ def list_regressions(
         )
         for row in page.rows
     ]
-    return page_of(items, page.total, limit, offset)
+    return paging.page(items, page.total)
 
 
 @regressions.get("/regressions/{regression_id}")

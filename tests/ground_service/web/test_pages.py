@@ -71,6 +71,7 @@ def test_every_library_that_is_served_comes_with_its_licence(service):
     _, body, _ = ask(service.url + "/licences")
     assert b"Permission is hereby granted" in body  # uPlot, MIT
     assert b"Redistribution and use in source and binary forms" in body  # Leaflet, BSD-2-Clause
+    assert b"Apache License" in body  # Swagger UI
 
 
 def test_the_map_needs_the_albedo_product(service):

@@ -1,0 +1,136 @@
+"""Description of the HTTP API: names, summaries, errors, times, page links and query keys of all operations."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Iterator
+from datetime import datetime, timedelta
+from typing import Any
+
+import pytest
+
+from ground_service.app import create_app
+from ground_service.http.requests import ALWAYS
+from ground_service.http.times import UtcTime
+from ground_service.passes.service import define_pass
+from ground_service.settings import Settings
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    from fastapi.testclient import TestClient
+
+VERBS = {
+    "add", "change", "define", "delete", "enter", "evaluate", "export", "get", "import", "keep", "list", "reject",
+    "release", "request", "revoke", "run", "search", "start", "take", "uplink", "upload",
+}  # fmt: skip
+SUMMARY_VERBS = {
+    "Add", "Change", "Compare", "Count", "Create", "Define", "Delete", "Disable", "Evaluate", "Export", "Import",
+    "Ingest", "Keep", "List", "Queue", "Register", "Reject", "Release", "Request", "Return", "Revoke", "Run",
+    "Search", "Show", "Take",
+}  # fmt: skip
+TAGS = {
+    "access", "ephemerides", "jobs", "missions", "passes", "planning", "regression", "reports", "telecommands",
+    "telemetry", "time",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    with TestClient(create_app(Settings(home=tmp_path_factory.mktemp("api"), rate_limit_per_s=0))) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def operations(client: TestClient) -> list[tuple[str, str, dict[str, Any]]]:
+    paths = client.get("/api/v1/openapi.json").json()["paths"]
+    return [(method, path, one) for path, methods in paths.items() for method, one in methods.items()]
+
+
+def test_operations_are_named_by_a_verb_and_a_noun(operations: list[Any]) -> None:
+    ids = [one["operationId"] for _, _, one in operations]
+    assert len(ids) > 60 and len(set(ids)) == len(ids)
+    for identity in ids:
+        assert re.fullmatch(r"[a-z]+(_[a-z]+)+", identity) and identity.split("_")[0] in VERBS, identity
+        assert "view" not in identity.split("_"), identity
+
+
+def test_summaries_begin_with_a_verb_and_fit_on_a_line(operations: list[Any]) -> None:
+    for method, path, one in operations:
+        summary = one["summary"]
+        assert summary.split()[0] in SUMMARY_VERBS, (method, path, summary)
+        assert len(summary) <= 110 and not summary.endswith("."), summary
+        assert len(one["tags"]) == 1 and one["tags"][0] in TAGS
+
+
+def test_operations_that_only_read_declare_no_errors_of_writing(operations: list[Any]) -> None:
+    for method, path, one in operations:
+        declared = {int(status) for status in one["responses"]}
+        assert set(ALWAYS) <= declared, path
+        assert (404 in declared) >= ("{" in path), path
+        assert (400 in declared) == (413 in declared) == ("requestBody" in one), path
+        if method == "get":
+            assert not declared & {400, 409, 412, 413, 415, 507}, path
+        else:
+            assert 507 in declared, path
+
+
+def test_successful_responses_have_a_type(operations: list[Any]) -> None:
+    for method, path, one in operations:
+        (status,) = [status for status in one["responses"] if status.startswith("2")]
+        for media, content in one["responses"][status].get("content", {}).items():
+            if media == "application/json" and path != "/api/v1/reports/{report_id}":
+                schema = content["schema"]
+                assert "$ref" in schema or "$ref" in schema.get("items", {}), (method, path, schema)
+
+
+def test_every_operation_refuses_unknown_query_keys(client: TestClient, operations: list[Any]) -> None:
+    for method, path, _ in operations:
+        answer = client.request(method, re.sub(r"\{\w+\}", "1", path), params={"unknown_key": "1"})
+        assert answer.status_code == 422, (method, path, answer.text)
+        assert "unknown_key" in answer.json()["detail"], answer.text
+
+
+def test_times_are_read_by_the_date_types_of_python(client: TestClient) -> None:
+    ground = client.app.state.ground  # type: ignore[attr-defined]
+    start = 1_880_777_100_123_456_789
+    key = define_pass(ground, name="p", start_utc_ns=start, stop_utc_ns=start + 10**9, spacecraft_id=76)
+    shown = client.get(f"/api/v1/passes/{key}").json()
+    read = datetime.fromisoformat(shown["start"])
+    assert read.utcoffset() == timedelta(0) and read.microsecond == 123_456
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}Z", shown["start"])
+    assert UtcTime(start).utc_ns == start and UtcTime(start).datetime == read
+
+
+def test_an_impossible_time_is_answered_with_the_expected_form(client: TestClient) -> None:
+    given = {"name": "p", "start": "tomorrow", "stop": "2029-08-07T06:37:00Z", "spacecraft_id": 76}
+    answer = client.post("/api/v1/passes", json=given)
+    assert answer.status_code == 422
+    assert answer.json()["detail"] == (
+        "body.start: expected a time such as 2029-08-07T06:00:00Z, found 'tomorrow'"
+    )
+
+
+def test_pages_of_a_list_link_to_each_other(client: TestClient) -> None:
+    ground = client.app.state.ground  # type: ignore[attr-defined]
+    for number in range(5):
+        define_pass(ground, name=f"w{number}", start_utc_ns=0, stop_utc_ns=10**9, spacecraft_id=77)
+    total = client.get("/api/v1/passes").json()["total"]
+    address: str | None = "/api/v1/passes?limit=2"
+    found: list[int] = []
+    previous = None
+    while address is not None:
+        page = client.get(address).json()
+        assert page["previous"] == previous
+        found += [one["id"] for one in page["items"]]
+        previous = f"/api/v1/passes?limit=2&offset={page['offset']}"
+        address = page["next"]
+    assert len(found) == len(set(found)) == total >= 5
+
+
+def test_links_keep_the_filter_of_a_list(client: TestClient) -> None:
+    for number in range(2):
+        client.post("/api/v1/telecommands", json={"name": "test_connection", "spacecraft_id": 76 + number})
+    page = client.get("/api/v1/telecommands?state=queued&limit=1").json()
+    assert page["next"] == "/api/v1/telecommands?state=queued&limit=1&offset=1"
+    assert client.get(page["next"]).json()["next"] is None

@@ -1,0 +1,42 @@
+"""The API page in Chromium: operations are shown and called under the content security policy."""
+
+from playwright.sync_api import expect
+
+from ground_service.access.service import add_user
+from ground_service.ground import open_ground
+
+
+def test_the_api_page_shows_and_calls_operations_without_console_errors(page):
+    said = []
+    page.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
+    page.goto("/docs")
+    shown = page.locator(".opblock")
+    expect(shown.first).to_be_visible()
+    described = page.request.get("/api/v1/openapi.json").json()["paths"]
+    assert shown.count() == sum(len(methods) for methods in described.values())
+    page.locator("#operations-passes-list_passes .opblock-summary-control").click()
+    page.locator("#operations-passes-list_passes .try-out__btn").click()
+    page.locator("#operations-passes-list_passes .execute").click()
+    answer = page.locator("#operations-passes-list_passes .live-responses-table .response-col_status").last
+    expect(answer).to_contain_text("200")
+    assert said == []
+
+
+def test_the_api_page_uses_the_token_of_the_signed_in_user(browser, serve, console, tmp_path):
+    with open_ground(tmp_path / "home") as ground:
+        token = add_user(ground, "ann", "viewer")
+    running = serve(tmp_path / "home", tmp_path / "serve.log", console.port)
+    context = browser.new_context(base_url=running.url)
+    try:
+        page = context.new_page()
+        page.goto("/licences")
+        page.evaluate("token => sessionStorage.setItem('linna-token', token)", token)
+        page.goto("/docs#/passes/list_passes")
+        page.locator("#operations-passes-list_passes .try-out__btn").click()
+        with page.expect_response("**/api/v1/passes*") as answered:
+            page.locator("#operations-passes-list_passes .execute").click()
+        assert answered.value.status == 200
+        assert answered.value.request.headers["authorization"] == f"Bearer {token}"
+    finally:
+        context.close()
+        running.stop()
