@@ -118,6 +118,19 @@ def _allowed(app: FastAPI, request: Request) -> list[str]:
     return sorted(methods)
 
 
+def _expected(fault: dict[str, Any]) -> str:
+    """Return what was expected of a part of a request, and what was found."""
+    if fault["type"] == "missing":
+        return "expected a value, found none"
+    if fault["type"] == "extra_forbidden":
+        return "expected no such field"
+    message = str(fault["msg"]).removeprefix("Value error, ")
+    value = fault.get("input")
+    if "found" in message or not isinstance(value, (str, int, float, bool)):
+        return message
+    return f"{message}, found {str(value)[:40]!r}"
+
+
 def install(app: FastAPI) -> None:
     """Make the application answer every error with a problem document."""
 
@@ -167,10 +180,7 @@ def install(app: FastAPI) -> None:
     async def invalid(request: Request, error: Exception) -> JSONResponse:
         assert isinstance(error, RequestValidationError)
         found = [
-            {
-                "where": ".".join(str(part) for part in item["loc"]),
-                "expected": item["msg"].removeprefix("Value error, "),
-            }
+            {"where": ".".join(str(part) for part in item["loc"]), "expected": _expected(item)}
             for item in error.errors()
         ]
         detail = "; ".join(f"{item['where']}: {item['expected']}" for item in found[:5])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 from fastapi import Path, Query, Response
+from fastapi.responses import JSONResponse
 
 from ground_service.access.idempotency import once
 from ground_service.access.security import Operator, UploadOf, Viewer, idempotent_id
@@ -191,7 +192,7 @@ def get_parameter(
     return Response(document, media_type="application/json")
 
 
-@passes.get("/spacecraft/{spacecraft_id}/telemetry/{parameter}")
+@passes.get("/spacecraft/{spacecraft_id}/telemetry/{parameter}", response_model=ParameterSeries)
 def get_trend(
     ground: GroundOf,
     _: Viewer,
@@ -201,7 +202,7 @@ def get_trend(
     start: GivenTime | None = None,
     stop: GivenTime | None = None,
     max_points: MaxPoints = 1000,
-) -> ParameterSeries:
+) -> Response:
     """Return the series of a housekeeping parameter of a spacecraft over an interval; by default over all."""
     found = service.trend_series(
         ground,
@@ -212,7 +213,7 @@ def get_trend(
         start_utc_ns=None if start is None else start.utc_ns,
         stop_utc_ns=None if stop is None else stop.utc_ns,
     )
-    return ParameterSeries.model_validate(series_document(found))
+    return JSONResponse(series_document(found))
 
 
 @passes.get("/spacecraft/{spacecraft_id}/trends")

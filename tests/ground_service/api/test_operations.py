@@ -111,6 +111,37 @@ def test_an_impossible_time_is_answered_with_the_expected_form(client: TestClien
     )
 
 
+@pytest.mark.parametrize(
+    ("change", "detail"),
+    [
+        (
+            {"spacecraft_id": 1024},
+            "body.spacecraft_id: Input should be less than or equal to 1023, found '1024'",
+        ),
+        ({"spacecraft": 76}, "body.spacecraft: expected no such field"),
+        ({"name": None}, "body.name: Input should be a valid string"),
+        ({"start": 5}, "body.start: expected a time such as 2029-08-07T06:00:00Z, found '5'"),
+        ({"start": "1815-12-10"}, "body.start: expected a time between 1970 and 2130, found '1815-12-10'"),
+    ],
+)
+def test_a_fault_is_answered_with_what_was_expected_and_found(
+    client: TestClient, change: dict[str, Any], detail: str
+) -> None:
+    given = {
+        "name": "p",
+        "start": "2029-08-07T06:00:00Z",
+        "stop": "2029-08-07T06:37:00Z",
+        "spacecraft_id": 76,
+    }
+    answer = client.post("/api/v1/passes", json=given | change)
+    assert (answer.status_code, answer.json()["detail"]) == (422, detail)
+    del given["name"]
+    assert (
+        client.post("/api/v1/passes", json=given).json()["detail"]
+        == "body.name: expected a value, found none"
+    )
+
+
 def test_pages_of_a_list_link_to_each_other(client: TestClient) -> None:
     ground = client.app.state.ground  # type: ignore[attr-defined]
     for number in range(5):
