@@ -90,11 +90,6 @@ class Connection:
     def _call(self, model: type[Model], method: str, path: str, **request: Any) -> Model:
         return self._validated(TypeAdapter(model), self._octets(method, path, **request))
 
-    def _document(self, path: str) -> dict[str, Any]:
-        """Return a JSON object without a model."""
-        adapter: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
-        return self._validated(adapter, self._octets("GET", path))
-
     def _items(
         self, model: type[Item], path: str, body: Mapping[str, Any] | None = None, **query: Value
     ) -> list[Item]:

@@ -15,7 +15,7 @@ from ground_service.client.problems import JobFailed
 from ground_service.commanding.model import Telecommand, UplinkState
 from ground_service.ephemerides.model import Ephemeris
 from ground_service.errors import InvalidInput
-from ground_service.evaluation.model import Report, ReportOverview
+from ground_service.evaluation.model import PassFigures, Report, ReportOverview
 from ground_service.ingest.model import Ingest, IngestAccepted
 from ground_service.jobs.model import Job
 from ground_service.missions.model import MissionDetail, MissionRevision
@@ -136,9 +136,9 @@ class Client(Connection):
         """Return a pass with its manifest and the ids of its reports."""
         return self._get(PassDetail, f"/passes/{pass_id}")
 
-    def evaluate_pass(self, pass_id: int) -> dict[str, Any]:
+    def evaluate_pass(self, pass_id: int) -> PassFigures:
         """Evaluate a pass now and return its metrics."""
-        return self._document(f"/passes/{pass_id}/summary")
+        return self._get(PassFigures, f"/passes/{pass_id}/summary")
 
     def get_completeness(self, pass_id: int) -> Completeness:
         """Return the received and missing packets of a pass."""
@@ -219,9 +219,9 @@ class Client(Connection):
         """Download a report into a file."""
         self._download(f"/reports/{_part(report_id)}", target, format=kind)
 
-    def get_report_summary(self, report_id: str) -> dict[str, Any]:
+    def get_report_summary(self, report_id: str) -> PassFigures:
         """Return the metrics of a report."""
-        return self._document(f"/reports/{_part(report_id)}/summary")
+        return self._get(PassFigures, f"/reports/{_part(report_id)}/summary")
 
     def get_report_overview(self, report_id: str, *, max_points: int = 600) -> ReportOverview:
         """Return verdict, headline metrics and error series of a report."""

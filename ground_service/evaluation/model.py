@@ -110,6 +110,32 @@ class RequirementFigures(Entity):
     note: str
 
 
+class ResidualFigures(Entity):
+    """Residuals of a measurement of an instrument; null: not known."""
+
+    label: str
+    unit: str
+    samples: int
+    mean: float | None
+    rms: float | None
+    p95_absolute: float | None
+    normalised_square: float | None
+
+
+class InstrumentFigures(Entity):
+    """Use of an optional instrument on board; the last four counts add up to the samples."""
+
+    name: str
+    title: str
+    frames: int
+    samples: int
+    used: int
+    gated: int = Field(description="Refused by the gate")
+    no_data: int = Field(description="No value from the instrument")
+    no_model: int = Field(description="Value that the estimator could not predict")
+    residuals: list[ResidualFigures]
+
+
 class PassFigures(Entity):
     """Figures of an evaluated pass; null: not known."""
 
@@ -126,6 +152,7 @@ class PassFigures(Entity):
     verdict_level: str = Field(examples=["good"])
     requirements: list[RequirementFigures]
     error_budget: dict[str, ErrorBudget]
+    instruments: dict[str, InstrumentFigures] = Field(default_factory=dict)
     evidence_level: str
     data: list[str] = Field(description="Data sources")
 

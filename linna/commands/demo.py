@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
         "archive": str(archive),
         "pass_id": pass_id,
         "frames": emulated["frames"],
-        **summary,
+        **summary.model_dump(mode="json"),
         "wall_s": round(time.monotonic() - started, 2),
         "data": emulated["data"],
     }

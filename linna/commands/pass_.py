@@ -41,7 +41,7 @@ def list_passes(arguments: argparse.Namespace) -> int:
 
 def show_pass(arguments: argparse.Namespace) -> int:
     with ground_client(arguments) as service:
-        figures = service.evaluate_pass(arguments.pass_id)
+        figures = service.evaluate_pass(arguments.pass_id).model_dump(mode="json")
     emit(arguments, figures, text=describe(figures))
     return 0
 

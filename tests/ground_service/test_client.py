@@ -388,7 +388,7 @@ def test_every_operation_of_the_api_has_a_method_of_its_name_with_its_path_keys_
         assert ("requestBody" in operation) == bool(request.headers.get("content-type")), path
         success = next(found for code, found in operation["responses"].items() if code.startswith("2"))
         schema = json.dumps(success.get("content", {}).get("application/json", {}).get("schema", {}))
-        found = re.search(r"schemas/(?:PageOf_)?([A-Za-z]+)", schema)
+        found = re.search(r"schemas/([A-Za-z]+?)(?:Page)?\"", schema)
         returned = str(inspect.signature(method).return_annotation)
         assert (found is None) == (returned in ("None", "Uplink", "dict[str, Any]")), path
         assert found is None or re.search(rf"\b{found[1]}\b", returned), path
