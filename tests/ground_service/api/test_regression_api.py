@@ -106,7 +106,14 @@ def test_a_verdict_that_is_not_there_is_not_found(client: TestClient) -> None:
 
 
 def test_the_list_of_verdicts_is_empty_at_first(client: TestClient) -> None:
-    assert client.get(f"{V1}/regressions").json() == {"items": [], "total": 0, "limit": 100, "offset": 0}
+    assert client.get(f"{V1}/regressions").json() == {
+        "items": [],
+        "total": 0,
+        "limit": 100,
+        "offset": 0,
+        "next": None,
+        "previous": None,
+    }
 
 
 def test_something_else_than_a_zip_is_no_build(client: TestClient) -> None:
