@@ -78,10 +78,10 @@ def test_operations_that_only_read_declare_no_errors_of_writing(operations: list
 def test_successful_responses_have_a_type(operations: list[Any]) -> None:
     for method, path, one in operations:
         (status,) = [status for status in one["responses"] if status.startswith("2")]
-        for media, content in one["responses"][status].get("content", {}).items():
-            if media == "application/json" and path != "/api/v1/reports/{report_id}":
-                schema = content["schema"]
-                assert "$ref" in schema or "$ref" in schema.get("items", {}), (method, path, schema)
+        content = one["responses"][status].get("content", {})
+        if list(content) == ["application/json"]:  # documents in several media types are files
+            schema = content["application/json"]["schema"]
+            assert "$ref" in schema or "$ref" in schema.get("items", {}), (method, path, schema)
 
 
 def test_every_operation_refuses_unknown_query_keys(client: TestClient, operations: list[Any]) -> None:
