@@ -125,10 +125,34 @@ class CompletenessSeries:
 
 
 @dataclass(frozen=True, slots=True)
+class ReceptionQuality:
+    """Link quality of one file that a station received; None where unknown.
+
+    `station` and `source` (of the link settings) are empty if they are not stated. `bit_error_rate` is that of the
+    codewords that could be corrected and of the markers, a lower bound. `lock_losses` counts frames that do not follow
+    the previous one at the usual distance. `octets_other` belong to no frame and to no record of the station.
+    """
+
+    station: str
+    source: str
+    ambiguous: bool
+    frames: int
+    frames_good: int
+    symbols_corrected: int
+    bit_error_rate: float | None
+    lock_losses: int
+    octets: int
+    octets_other: int
+    first_utc_ns: int | None = None
+    last_utc_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class PacketAccounting:
     """Octet accounting of the downlink of a pass; None where a count was not computed.
 
-    ``lost`` and ``lost_at_edges`` are the sums over application processes.
+    ``lost`` and ``lost_at_edges`` are the sums over application processes. ``receptions`` are the files with frames
+    that may contain packets of the pass.
     """
 
     packets: int
@@ -142,6 +166,7 @@ class PacketAccounting:
     symbols_corrected: int | None = None
     lost_at_edges: int | None = None
     octets: int | None = None
+    receptions: tuple[ReceptionQuality, ...] = ()
     by_apid: Mapping[int, ApidAccounting] = field(default_factory=dict)
     completeness: CompletenessSeries | None = None
 

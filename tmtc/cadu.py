@@ -134,6 +134,7 @@ def synchronise(
     period: int,
     tolerance: int = DEFAULT_TOLERANCE,
     verify: Verify | None = None,
+    record_octets: int = 0,
 ) -> CaduSync:
     """Return the CADUs of `period` octets in `octets`; markers with up to `tolerance` wrong bits are accepted.
 
@@ -141,8 +142,10 @@ def synchronise(
     ----------
     verify
         Returns which CADUs have a valid code or checksum; isolated frames are accepted by it.
+    record_octets
+        Octets that the station inserts between two CADUs: the header and trailer of its records.
     """
-    return _Synchroniser(octets, period, tolerance, verify).run()
+    return _Synchroniser(octets, period, tolerance, verify, 8 * (period + record_octets)).run()
 
 
 @dataclass(slots=True)
@@ -153,25 +156,26 @@ class _Synchroniser:
     period: int
     tolerance: int
     verify: Verify | None
+    usual: int
     starts: list[IntArray] = field(default_factory=list)
 
     def run(self) -> CaduSync:
         """Return the CADUs of the stream."""
         length = 8 * self.period
         last = 8 * self.octets.size - length
-        spacing = length
-        position = self._search(0, 0, (length,))
+        spacing = self.usual
+        position = self._search(0, 0, (spacing,))
         while position is not None and position <= last:
             count = self._in_lock(position, spacing)
-            if count == 1 and spacing != length:
-                spacing = length
+            if count == 1 and spacing != self.usual:
+                spacing = self.usual
                 count = self._in_lock(position, spacing)
             self.starts.append(position + spacing * np.arange(count, dtype=np.int64))
             final = position + spacing * (count - 1)
             expected = final + spacing
             if expected > last + (spacing - length):
                 break
-            found = self._search(final + 1, final + length, (spacing, length))
+            found = self._search(final + 1, final + length, (spacing, self.usual, length))
             if found is None or found > last:
                 # no other marker follows: keep the frame expected here; its code or checksum decides whether it is
                 # valid
@@ -184,7 +188,7 @@ class _Synchroniser:
                     self.starts.append(expected + spacing * np.arange(missing, dtype=np.int64))
             else:
                 distance = found - final
-                spacing = distance if length <= distance < 2 * length else length
+                spacing = distance if length <= distance < 2 * length else self.usual
             position = found
         return self._result()
 

@@ -67,6 +67,8 @@ class Client(Connection):
         instance: str = "flight",
         stream: str | None = None,
         offset: int = 0,
+        station: str = "",
+        link: str | None = None,
         key: str | None = None,
     ) -> IngestAccepted:
         """Upload a downlink, or a piece of one cut at any octet."""
@@ -80,6 +82,8 @@ class Client(Connection):
             instance=instance,
             stream=stream,
             offset=None if stream is None else offset,
+            station=station or None,
+            link=link,
         )
 
     def list_ingests(self) -> Listing[Ingest]:

@@ -48,6 +48,8 @@ class Piece:
     stream: str
     position: int
     links_tried: int | None
+    station: str = ""
+    link: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

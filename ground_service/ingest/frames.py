@@ -42,7 +42,8 @@ _BATCH = 512
 class FrameBlock:
     """Corrected frames (n, frame_length) of CADUs at known offsets, `good` (n,) if codes and checksums are valid.
 
-    `corrected` (n,) is the number of corrected symbols.
+    `corrected` (n,) is the number of corrected symbols, `wrong_bits` (n,) that of corrected bits, and
+    `codewords_lost` (n,) that of codewords with too many errors.
     """
 
     settings: LinkSettings
@@ -51,6 +52,8 @@ class FrameBlock:
     header: TmFrameHeaders
     good: NDArray[np.bool_]
     corrected: IntArray
+    wrong_bits: IntArray
+    codewords_lost: IntArray
 
     def of(self, spacecraft_id: int) -> NDArray[np.bool_]:
         """Return which frames (n,) are good frames of a spacecraft."""
@@ -68,6 +71,8 @@ class FrameBlock:
             frame_headers(frames),
             self.good[one],
             self.corrected[one],
+            self.wrong_bits[one],
+            self.codewords_lost[one],
         )
 
     def spacecraft(self) -> list[int]:
@@ -105,7 +110,7 @@ def frames_of(cadus: OctetArray, offsets: IntArray, settings: LinkSettings) -> F
     n = offsets.size
     frames = np.empty((n, settings.frame_length), dtype=np.uint8)
     good = np.ones(n, dtype=np.bool_)
-    corrected = np.zeros(n, dtype=np.int64)
+    corrected, wrong_bits, lost = (np.zeros(n, dtype=np.int64) for _ in range(3))
     for first in range(0, n, _BATCH):
         part = slice(first, min(first + _BATCH, n))
         blocks = randomise(np.ascontiguousarray(cadus[part, ASM_LENGTH:]), settings.randomiser)
@@ -116,12 +121,14 @@ def frames_of(cadus: OctetArray, offsets: IntArray, settings: LinkSettings) -> F
             frames[part] = repaired.frames
             good[part] = (repaired.corrected >= 0).all(axis=1)
             corrected[part] = np.where(repaired.corrected > 0, repaired.corrected, 0).sum(axis=1)
+            wrong_bits[part] = repaired.wrong_bits
+            lost[part] = np.count_nonzero(repaired.corrected < 0, axis=1)
     if settings.checksum and n:
         usable = np.flatnonzero(good)
         good[usable[~frame_checksums_hold(frames[usable])]] = False
     header = frame_headers(frames)
     good &= header.version == 0
-    return FrameBlock(settings, offsets, frames, header, good, corrected)
+    return FrameBlock(settings, offsets, frames, header, good, corrected, wrong_bits, lost)
 
 
 def control_words(block: FrameBlock, spacecraft_id: int) -> NDArray[np.uint32]:
@@ -162,6 +169,7 @@ class ChannelReader:
 
     dictionary: Dictionary
     unchecked_apids: UncheckedApids = all_checked
+    error_control: bool = True
     edges: list[ChannelEdge] = field(default_factory=list)
     packets: int = 0
     crc_errors: int = 0
@@ -186,7 +194,12 @@ class ChannelReader:
                 filled += len(octets)
         buffer = b"".join(bytes(part) for part in parts)
         used = np.array(segments, dtype=np.int64).reshape(-1, 2)
-        cut = cut_packets(buffer, segments=used, unchecked_apids=self.unchecked_apids(spacecraft_id))
+        cut = cut_packets(
+            buffer,
+            segments=used,
+            error_control=self.error_control,
+            unchecked_apids=self.unchecked_apids(spacecraft_id),
+        )
         self.packets += int(np.count_nonzero(cut.crc_ok))
         self.crc_errors += cut.crc_errors
         self.octets_unused += _not_in_packets(used, cut)

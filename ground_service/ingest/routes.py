@@ -52,6 +52,21 @@ async def upload_telemetry(
     offset: Annotated[
         int | None, Query(ge=0, lt=1 << 62, description="Offset of the piece in `stream`, in octets")
     ] = None,
+    station: Annotated[
+        str,
+        Query(
+            max_length=64,
+            pattern=r"^[^\x00-\x1f\x7f]*$",
+            description="Station that received the octets, as named in the mission description",
+        ),
+    ] = "",
+    link: Annotated[
+        str | None,
+        Query(
+            max_length=200,
+            description="Link settings, used without evidence, such as `frame_length=1115,coding=rs,checksum=true`",
+        ),
+    ] = None,
     idempotency_key: IdempotencyKey = None,
 ) -> IngestAccepted:
     """Ingest a downlink, or a piece of one cut at any octet.
@@ -75,6 +90,8 @@ async def upload_telemetry(
             spacecraft_id=spacecraft_id,
             instance=instance,
             place=place,
+            station=station,
+            link=link,
             job_id=job_id,
         )
         dispatcher.start(job)

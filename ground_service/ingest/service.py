@@ -23,6 +23,7 @@ from ground_service.ingest.frames import ChannelEdge, is_checked
 from ground_service.ingest.joining import Joiner
 from ground_service.ingest.packets import PacketBatch
 from ground_service.ingest.parameters import decode_declared, definitions_of_spacecraft
+from ground_service.ingest.reception import ExpectedLink, expected_link, remember_link
 from ground_service.ingest.redecode import catch_up
 from ground_service.ingest.store import store_batch
 from ground_service.ingest.stream import (
@@ -54,7 +55,10 @@ FLOWN = "flight"
 Progress = Callable[[float], None]
 
 
-DEFAULT_LINKS = (Link(LinkSettings()), Link(LinkSettings(checksum=False)))
+LEAST_GOOD_FRAMES = 2
+"""Smallest number of good frames from which their link settings are remembered."""
+
+DEFAULT_LINKS = (Link(LinkSettings().explicit), Link(LinkSettings(checksum=False).explicit))
 """Links that are tried for an unknown spacecraft if a piece is too small to determine its link."""
 
 
@@ -73,7 +77,8 @@ class IngestResult:
     `packets_joined` is the number of packets completed with earlier files, `frames_joined` that of frames.
     `octets_pending` cannot be used yet: they wait for the octets before or after them. `first_ticks` and
     `last_ticks` are the earliest and the latest on-board time of the complete packets in the file, None without any.
-    `vehicle_ids` are the vehicles whose packets it contains. `uplink` contains a `tmtc.clcw.UplinkSeen` for each
+    `vehicle_ids` are the vehicles whose packets it contains. `reception` is the link quality with the sections of the
+    file and the origin of their settings; None for bare packets. `uplink` contains a `tmtc.clcw.UplinkSeen` for each
     spacecraft and telecommand channel reported in the frames.
     """
 
@@ -96,6 +101,7 @@ class IngestResult:
     first_ticks: int | None = None
     last_ticks: int | None = None
     vehicle_ids: tuple[int, ...] = ()
+    reception: dict[str, Any] | None = None
     uplink: tuple[dict[str, Any], ...] = ()
 
 
@@ -107,6 +113,8 @@ def ingest_file(
     instance: str = FLOWN,
     name: str | None = None,
     place: Place | None = None,
+    station: str = "",
+    link: str | None = None,
 ) -> IngestResult:
     """Archive a downlink file and store its content.
 
@@ -119,6 +127,10 @@ def ingest_file(
         Instance of the spacecraft to which the telemetry belongs.
     place
         Position of the file in its stream; None: joined by order of arrival and by content.
+    station
+        Name of the station in the mission description; empty: not stated.
+    link
+        Link settings as text (`LinkSettings.parse`), used without evidence; None: not stated.
 
     Raises
     ------
@@ -129,7 +141,14 @@ def ingest_file(
         raise InvalidInput(str(path), "", "a downlink file", "a folder" if path.is_dir() else "nothing there")
     stored = ground.files.put_file(path)
     return ingest_stored(
-        ground, stored, spacecraft_id=spacecraft_id, instance=instance, name=name or path.name, place=place
+        ground,
+        stored,
+        spacecraft_id=spacecraft_id,
+        instance=instance,
+        name=name or path.name,
+        place=place,
+        station=station,
+        link=link,
     )
 
 
@@ -141,6 +160,8 @@ def ingest_stored(
     instance: str = FLOWN,
     name: str,
     place: Place | None = None,
+    station: str = "",
+    link: str | None = None,
 ) -> IngestResult:
     """Store what is in an archived downlink file; see `ingest_file`."""
     with ground.database.writing() as connection:
@@ -151,6 +172,8 @@ def ingest_stored(
             spacecraft_id=spacecraft_id,
             instance=instance,
             place=place,
+            station=station,
+            link=link,
             state="running",
         )
     return _run(ground, ingest_id)
@@ -164,9 +187,13 @@ def add_ingest(
     spacecraft_id: int | None = None,
     instance: str = FLOWN,
     place: Place | None = None,
+    station: str = "",
+    link: str | None = None,
     state: str = "queued",
 ) -> int:
     """Add an ingest of an archived file, within the caller's transaction; return its id."""
+    if link is not None:
+        _check_link(link)
     now = utc_now_ns()
     repository.register_file(connection, stored, "downlink", name, now)
     ingest_id = int(
@@ -192,9 +219,18 @@ def add_ingest(
             stream=place.stream if place is not None else "",
             position=place.offset if place is not None else ingest_id,
             links_tried=None,
+            station=station,
+            link=link,
         ),
     )
     return ingest_id
+
+
+def _check_link(text: str) -> None:
+    try:
+        LinkSettings.parse(text)
+    except TmtcError as error:
+        raise InvalidInput("telemetry", "link", "link settings", str(error)) from error
 
 
 def enter_ingest(
@@ -205,6 +241,8 @@ def enter_ingest(
     spacecraft_id: int | None,
     instance: str,
     place: Place | None = None,
+    station: str = "",
+    link: str | None = None,
     job_id: str | None = None,
 ) -> tuple[int, str]:
     """Add an archived file and the job that ingests it in one transaction; return their ids, also if the job exists.
@@ -221,7 +259,14 @@ def enter_ingest(
             if known is not None:
                 return _known_ingest(connection, known, stored, spacecraft_id, instance), job_id
         ingest_id = add_ingest(
-            connection, stored, name, spacecraft_id=spacecraft_id, instance=instance, place=place
+            connection,
+            stored,
+            name,
+            spacecraft_id=spacecraft_id,
+            instance=instance,
+            place=place,
+            station=station,
+            link=link,
         )
         arguments = {"ingest_id": ingest_id, "spacecraft_id": spacecraft_id, "instance": instance}
         return ingest_id, add_job(connection, "ingest", arguments, job_id=job_id)
@@ -371,6 +416,9 @@ class _Reading:
         self.new = self.unknown = 0
         self.ticks: list[int] = []
         self.accounting = LinkAccounting(octets=piece.octets, octets_skipped=piece.octets)
+        self.expected = ExpectedLink()
+        self.ambiguous = False
+        self.sections: list[Reach] = []
 
     def _definitions(self, spacecraft: int) -> PacketDefinitions:
         """Return the packets that the mission description of a spacecraft declares."""
@@ -387,6 +435,7 @@ class _Reading:
         while True:
             with self.ground.database.reading() as connection:
                 known = edges.known_links(connection, self.piece.scope)
+                self.expected = expected_link(connection, self.piece)
             reaches = self._reaches(known)
             if reaches:
                 self._read_reaches(reaches, known)
@@ -415,23 +464,38 @@ class _Reading:
         InvalidInput
             If the file has frames whose coding is unknown.
         """
-        candidates = [*known, *(link for link in DEFAULT_LINKS if link not in known)]
+        expected = [Link(one) for one in (*self.expected.mission, *self.expected.remembered)]
+        candidates = list(dict.fromkeys([*expected, *known, *DEFAULT_LINKS]))
         octets = mapped_octets(self.ground.files.path(self.piece.file_sha256))
         try:
             unchecked = frozenset[int]()
             if self.spacecraft_id is not None:
                 unchecked = self._unchecked_apids(self.spacecraft_id)
-            reaches, _ = reaches_of(octets, candidates, unchecked_apids=unchecked)
+            reaches, plan = reaches_of(
+                octets,
+                candidates,
+                stated=self.expected.stated,
+                error_control=self.expected.error_control,
+                unchecked_apids=unchecked,
+            )
         except UnknownCoding as error:
             source = _name(self.ground, self.piece.file_sha256)
             raise InvalidInput(source, "", error.expected, error.found) from error
+        self.ambiguous = plan is not None and plan.ambiguous
         return reaches
 
     def _read_reaches(self, reaches: Sequence[Reach], known: list[Link]) -> None:
         """Read the sections of the file and store their packets and edges."""
         self.accounting = LinkAccounting()
+        self.sections = list(reaches)
         for reach in reaches:
-            reader = DownlinkReader(reach, self.spacecraft_id, unchecked_apids=self._unchecked_apids)
+            reader = DownlinkReader(
+                reach,
+                self.spacecraft_id,
+                record=self.expected.record,
+                error_control=self.expected.error_control,
+                unchecked_apids=self._unchecked_apids,
+            )
             last = self._store_batches(reader)
             with self.ground.database.writing() as connection:
                 self._store(connection, last)
@@ -439,6 +503,11 @@ class _Reading:
                 self.joiner.keep_edges(connection, reach.link, reader.edges)
                 self._learn(connection, reach.link, known, None)
             self.accounting.add(reader.accounting)
+            settings = reach.link.settings
+            if settings is not None and reader.accounting.quality.frames_good >= LEAST_GOOD_FRAMES:
+                with self.ground.database.writing() as connection:
+                    vehicles = sorted(self.vehicles.values())
+                    remember_link(connection, self.piece, vehicles, settings, utc_now_ns())
 
     def _learn(self, connection: Connection, link: Link, known: list[Link], links_tried: int | None) -> None:
         edges.note_read(connection, self.piece.ingest_id, links_tried)
@@ -559,11 +628,32 @@ class _Reading:
             first_ticks=self.ticks[0] if self.ticks else None,
             last_ticks=self.ticks[-1] if self.ticks else None,
             vehicle_ids=tuple(sorted(self.vehicles.values())),
+            reception=self._reception(),
             uplink=tuple(
                 {"spacecraft_id": spacecraft_id, **asdict(seen)}
                 for (spacecraft_id, _), seen in sorted(found.uplink.items())
             ),
         )
+
+    def _reception(self) -> dict[str, Any] | None:
+        """Return the link quality, the sections of the file and the origin of their settings."""
+        framed = [(one, one.link.settings) for one in self.sections if one.link.settings is not None]
+        if not framed:
+            return None
+        return {
+            "station": self.piece.station,
+            **self.accounting.quality.describe(),
+            "ambiguous": self.ambiguous,
+            "sections": [
+                {
+                    "start": one.start,
+                    "stop": one.stop,
+                    "source": self.expected.source_of(settings),
+                    **settings.describe(),
+                }
+                for one, settings in framed
+            ],
+        }
 
 
 def _name(ground: Ground, sha256: str) -> str:

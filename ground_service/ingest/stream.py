@@ -26,6 +26,7 @@ from ground_service.ingest.frames import (
     read_frames,
 )
 from ground_service.ingest.packets import PacketBatch, batch_of_cut
+from ground_service.ingest.quality import NO_RECORD, LinkQuality, RecordFormat
 from lunar.arrays import IntArray, OctetArray
 from tmtc import cadu
 from tmtc.arrays import as_octets
@@ -41,7 +42,7 @@ from tmtc.link_plan import LinkPlan
 from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH
 from tmtc.randomiser import randomise
 from tmtc.schema import Dictionary
-from tmtc.stream import cut_packets
+from tmtc.stream import PacketCut, cut_packets
 
 WINDOW_OCTETS = 2 << 20
 """Octets decoded and stored at a time: large enough to spread the cost of a transaction, small against memory:
@@ -87,6 +88,7 @@ class LinkAccounting:
     frames: int = 0
     frames_bad: int = 0
     symbols_corrected: int = 0
+    quality: LinkQuality = field(default_factory=LinkQuality)
     uplink: dict[tuple[int, int], UplinkSeen] = field(default_factory=dict)
     """Telecommand channels by spacecraft and number, as the frames show them."""
 
@@ -99,6 +101,7 @@ class LinkAccounting:
         self.frames += later.frames
         self.frames_bad += later.frames_bad
         self.symbols_corrected += later.symbols_corrected
+        self.quality.add(later.quality)
         for key, seen in later.uplink.items():
             self.uplink[key] = self.uplink[key].followed_by(seen, 1) if key in self.uplink else seen
 
@@ -128,6 +131,10 @@ class DownlinkReader:
         spacecraft id.
     unchecked_apids
         APIDs of each spacecraft whose packets do not end with a checksum.
+    record
+        Octets of the station around each CADU.
+    error_control
+        Whether packets end with a checksum.
     """
 
     def __init__(
@@ -137,6 +144,8 @@ class DownlinkReader:
         dictionary: Dictionary = DICTIONARY,
         window_octets: int = WINDOW_OCTETS,
         unchecked_apids: UncheckedApids = all_checked,
+        record: RecordFormat = NO_RECORD,
+        error_control: bool = True,
     ) -> None:
         self.accounting = LinkAccounting()
         self.reach = reach
@@ -144,7 +153,10 @@ class DownlinkReader:
         self._spacecraft_id = spacecraft_id
         self._dictionary = dictionary
         self._window_octets = window_octets
-        self._channels = ChannelReader(dictionary, unchecked_apids)
+        self._record = record
+        self._error_control = error_control
+        self._next_bit: int | None = None
+        self._channels = ChannelReader(dictionary, unchecked_apids, error_control)
         self._unchecked = all_checked(0) if spacecraft_id is None else unchecked_apids(spacecraft_id)
         self._last_words: dict[int, NDArray[np.uint32]] = {}
         self._believed: set[int] = set()
@@ -164,6 +176,7 @@ class DownlinkReader:
         settings = self.reach.link.settings
         for block, final in _last_marked(_rebuffered(blocks, self._window_octets)):
             self.accounting.octets += len(block)
+            self.accounting.quality.octets += len(block)
             if settings is None:
                 rest, batch = self._packets(rest + block, final)
                 yield batch
@@ -175,7 +188,10 @@ class DownlinkReader:
 
     def _packets(self, window: bytes, final: bool) -> tuple[bytes, PacketBatch]:
         """Return the remaining octets and the packets of a window of bare packets."""
-        cut = cut_packets(window, final=final, unchecked_apids=self._unchecked)
+        if self._error_control:
+            cut = cut_packets(window, final=final, unchecked_apids=self._unchecked)
+        else:
+            cut = _cut_unchecked(window, final)
         if not self._located and (len(cut) or final):
             self._located = True
             head = int(cut.skipped[0, 1]) if len(cut.skipped) and cut.skipped[0, 0] == 0 else 0
@@ -197,10 +213,12 @@ class DownlinkReader:
         length = settings.cadu_length
         stream = np.concatenate((self._held, window))
         base, context = self._position - self._held.size, self._context
-        sync = cadu.synchronise(stream, length, verify=proof_of(stream, settings))
+        prove = proof_of(stream, settings)
+        sync = cadu.synchronise(stream, length, verify=prove, record_octets=self._record.octets)
         truncated = int(np.count_nonzero(sync.truncated >= context))
         sync = sync.take(np.flatnonzero(sync.offsets >= context))
         offsets, cadus = sync.offsets, cadu.cadu_octets(stream, sync)
+        self._note_lock(stream, sync, base, length)
         if not self._located and offsets.size and not sync.start_bits[0] & 7:
             before = _led_back(stream, int(offsets[0]), settings)
             offsets = np.concatenate((before, offsets))
@@ -216,6 +234,9 @@ class DownlinkReader:
         accounting.frames += offsets.size
         accounting.frames_bad += offsets.size - own + truncated
         accounting.symbols_corrected += int(block.corrected.sum())
+        self._note_errors(
+            block, int(sync.marker_errors[block.good[offsets.size - sync.offsets.size :]].sum())
+        )
         end = int(offsets[-1]) + length if offsets.size else context
         if first_found:
             self._located = True
@@ -231,6 +252,36 @@ class DownlinkReader:
         accounting.octets_skipped += int(end - context - offsets.size * length)
         self._held, self._context = stream[kept_from:].copy(), end - kept_from
         self._position = base + stream.size
+
+    def _note_lock(self, stream: OctetArray, sync: cadu.CaduSync, base: int, length: int) -> None:
+        """Count the CADUs of a window that are not where the lock expects them, and read their reception times."""
+        quality = self.accounting.quality
+        quality.frames_inverted += int(np.count_nonzero(sync.inverted))
+        quality.octets_records += sync.offsets.size * self._record.octets
+        quality.add_times(self._record.times_utc_ns(stream, sync.offsets))
+        if sync.start_bits.size:
+            starts = sync.start_bits + 8 * base
+            expected = starts[:-1] + 8 * (length + self._record.octets)
+            if self._next_bit is not None:
+                quality.lock_losses += int(starts[0] != self._next_bit)
+            quality.lock_losses += int(np.count_nonzero(starts[1:] != expected))
+            self._next_bit = int(starts[-1]) + 8 * (length + self._record.octets)
+
+    def _note_errors(self, block: FrameBlock, marker_bits: int) -> None:
+        """Count the frames and corrected errors of a window; `marker_bits`: wrong bits in markers of good frames."""
+        quality, code = self.accounting.quality, block.settings.code
+        good = int(np.count_nonzero(block.good))
+        depth = 0 if code is None else code.interleave
+        words, lost = depth * block.offsets.size, int(block.codewords_lost.sum())
+        bits = 0 if code is None else 8 * code.block_length // depth
+        quality.frames += block.offsets.size
+        quality.frames_good += good if is_checked(block.settings) else 0
+        quality.codewords += words
+        quality.codewords_lost += lost
+        quality.symbols_corrected += int(block.corrected.sum())
+        quality.wrong_bits += int(block.wrong_bits.sum()) + marker_bits
+        quality.checked_bits += (words - lost) * bits + cadu.MARKER_BITS * good
+        quality.octets_frames += block.offsets.size * block.settings.cadu_length
 
     def _wanted(self, block: FrameBlock) -> list[int]:
         """Return the spacecraft whose frames are used."""
@@ -299,6 +350,7 @@ def reaches_of(
     stated: LinkSettings | None = None,
     dictionary: Dictionary = DICTIONARY,
     unchecked_apids: frozenset[int] = frozenset(),
+    error_control: bool = True,
 ) -> tuple[list[Reach], LinkPlan | None]:
     """Return the sections of a stream and the plan they follow from; no sections without sufficient evidence.
 
@@ -312,6 +364,8 @@ def reaches_of(
         Settings that are used without evidence.
     unchecked_apids
         APIDs whose packets do not end with a checksum, in a stream of bare packets.
+    error_control
+        Whether packets end with a checksum.
 
     Raises
     ------
@@ -320,17 +374,17 @@ def reaches_of(
     """
     size = int(octets.size)
     if stated is not None:
-        return [Reach(Link(stated), 0, size, size)], None
+        return [Reach(Link(stated.explicit), 0, size, size)], None
     expected = [link.settings for link in known if link.settings is not None]
     try:
-        plan = plan_of(octets, expected, dictionary=dictionary)
+        plan = plan_of(octets, expected, dictionary=dictionary, error_control=error_control)
     except UnknownCoding:
         if size >= _CERTAIN_OCTETS:
             raise
         return [], None
     if plan.sections:
-        return [Reach(Link(one.settings), one.start, one.stop, size) for one in plan.sections], plan
-    if _has_packets(octets, BARE in known):
+        return [Reach(Link(one.settings.explicit), one.start, one.stop, size) for one in plan.sections], plan
+    if _has_packets(octets, BARE in known, error_control):
         return [Reach(BARE, 0, size, size)], plan
     if unchecked_apids:
         cut = cut_packets(octets[:WINDOW_OCTETS], unchecked_apids=unchecked_apids)
@@ -340,8 +394,31 @@ def reaches_of(
     return [], plan
 
 
-def _has_packets(octets: OctetArray, is_known: bool) -> bool:
+def _cut_unchecked(window: bytes, final: bool) -> PacketCut:
+    """Return the packets without error control of a window, as far as the octets behind confirm them."""
+    cut = cut_packets(window, error_control=False)
+    if final:
+        return cut
+    border = len(window) - 2 * PACKET_MAX_LENGTH
+    starts = cut.offsets[cut.crc_ok & (cut.offsets <= border)]
+    consumed = int(starts[-1]) if starts.size else 0
+    whole = cut.offsets < consumed
+    return PacketCut(
+        cut.offsets[whole],
+        cut.lengths[whole],
+        cut.crc_ok[whole],
+        cut.skipped[cut.skipped[:, 1] <= consumed],
+        cut.idle[cut.idle[:, 1] <= consumed],
+        consumed,
+    )
+
+
+def _has_packets(octets: OctetArray, is_known: bool, error_control: bool) -> bool:
     """Return whether a stream contains bare packets; `is_known`: bare packets have been received before."""
+    if not error_control:
+        window = octets[:WINDOW_OCTETS]
+        cut = cut_packets(window, error_control=False)
+        return 2 * int(cut.lengths[cut.crc_ok].sum()) > window.size
     for start in range(0, octets.size, WINDOW_OCTETS):
         window = octets[start : start + WINDOW_OCTETS + PACKET_MAX_LENGTH]
         cut = cut_packets(window)

@@ -71,8 +71,8 @@ class DictionarySection(Section):
     hash: str | None = None
 
 
-class Link(Section):
-    """Settings of the telemetry link; `frame_checksum` is the frame error control field (FECF)."""
+class FrameSettings(Section):
+    """Settings of frames; `frame_checksum` is the frame error control field (FECF)."""
 
     frame_length: int | None = None
     coding: Literal["rs", "none"] | None = None
@@ -81,9 +81,47 @@ class Link(Section):
     rs_errors: int | None = None
     dual_basis: bool | None = None
     frame_checksum: bool | None = None
+
+
+class Station(FrameSettings):
+    """Records of a ground station, and settings of its link that differ from those of the spacecraft.
+
+    Attributes
+    ----------
+    header_octets, trailer_octets
+        Octets before and after each CADU.
+    time_code, time_offset
+        Reception time in the header, from this octet on: "cds" (16-bit days from 1958-01-01, 32-bit milliseconds) or
+        "unix_ns" (64-bit nanoseconds from 1970-01-01), both UTC and most significant octet first.
+    """
+
+    header_octets: Annotated[int, Field(ge=0, le=1024)] | None = None
+    trailer_octets: Annotated[int, Field(ge=0, le=1024)] | None = None
+    time_code: Literal["cds", "unix_ns"] | None = None
+    time_offset: Annotated[int, Field(ge=0, le=1024)] | None = None
+
+    @model_validator(mode="after")
+    def _time_in_header(self) -> Station:
+        if (self.time_code is None) != (self.time_offset is None):
+            raise ValueError("time_code and time_offset together, found one of them")
+        if self.time_code is not None and self.time_offset is not None:
+            end = self.time_offset + (6 if self.time_code == "cds" else 8)
+            if end > (self.header_octets or 0):
+                raise ValueError(
+                    f"a header of at least {end} octets for its time, found {self.header_octets or 0}"
+                )
+        return self
+
+
+StationName = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f]*$")]
+
+
+class Link(FrameSettings):
+    """Settings of the telemetry link, by station where they differ."""
+
     packet_checksum: Literal["crc16", "none"] | None = None
     virtual_channels: Annotated[tuple[int, ...], Array] | None = None
-    record_formats: dict[str, str] | None = None
+    stations: dict[StationName, Station] | None = None
 
 
 class Time(Section):
@@ -474,6 +512,9 @@ def _unknown_keys(kind: type[BaseModel], table: Any, source: str, path: str) -> 
                 )
         elif isinstance(field.annotation, type) and issubclass(field.annotation, Section):
             yield from _unknown_keys(field.annotation, value, source, place)
+        elif kind is Link and key == "stations" and isinstance(value, dict):
+            for name, station in value.items():
+                yield from _unknown_keys(Station, station, source, f"{place}.{name}")
 
 
 def _fault(source: str, error: Any) -> InvalidInput:

@@ -9,7 +9,14 @@ from sqlalchemy import Connection, select, update
 from sqlalchemy.exc import IntegrityError
 
 from ground_service.errors import NotFound
-from ground_service.missions.model import Approval, Mission, MissionDetail, MissionRevision, parse_mission
+from ground_service.missions.model import (
+    Approval,
+    Link,
+    Mission,
+    MissionDetail,
+    MissionRevision,
+    parse_mission,
+)
 from ground_service.store import repository
 
 MISSIONS = repository.MISSIONS
@@ -91,6 +98,19 @@ def list_revisions(connection: Connection, *, limit: int, offset: int) -> tuple[
     """Return a page of the revisions, newest first, and the total number."""
     page = repository.page(connection, MISSIONS, limit=limit, offset=offset)
     return [_revision(row, _document(row)) for row in page.rows], page.total
+
+
+def links_in_force(connection: Connection, ccsds_id: int | None) -> dict[int, Link]:
+    """Return the links that the newest descriptions of a spacecraft, or of all, state, by spacecraft."""
+    query = select(MISSIONS.c.ccsds_id).where(MISSIONS.c.ccsds_id.is_not(None)).distinct()
+    if ccsds_id is not None:
+        query = query.where(MISSIONS.c.ccsds_id == ccsds_id)
+    found = {}
+    for spacecraft in sorted(int(one) for one in connection.execute(query).scalars()):
+        key = newest_of_spacecraft(connection, spacecraft)
+        if key is not None:
+            found[spacecraft] = get_mission(connection, key).link
+    return found
 
 
 def newest_of_spacecraft(connection: Connection, ccsds_id: int) -> int | None:

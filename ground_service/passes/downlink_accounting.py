@@ -19,6 +19,7 @@ from lunar.arrays import BoolArray, IntArray
 from tmtc.arrays import Octets
 from tmtc.cuc import NO_TICKS
 from tmtc.downlink import FRAME_FOREIGN, FRAME_GOOD, DownlinkDecode, decode
+from tmtc.link_plan import LinkPlan, LinkSection
 
 DIGEST_OCTETS = 16
 
@@ -76,15 +77,18 @@ class RawAccount:
     crc_errors: dict[int, int]
 
 
-def read_raw(octets: Octets, spacecraft_id: int | None) -> RawFile:
+def read_raw(octets: Octets, spacecraft_id: int | None, sections: Sequence[LinkSection] = ()) -> RawFile:
     """Return the content of a raw file for one spacecraft.
+
+    `sections` are those of its ingest; without any, they follow from the file.
 
     Raises
     ------
     LinkFormatError
         If the file has frames with an unknown coding.
     """
-    found = decode(octets, spacecraft_id=spacecraft_id)
+    plan = LinkPlan(tuple(sections), None, has_regular_markers=True) if sections else None
+    found = decode(octets, spacecraft_id=spacecraft_id, plan=plan)
     starts, good = found.cut.offsets, found.cut.crc_ok
     ticks = np.full(len(found.cut), NO_TICKS, dtype=np.int64)
     rows = np.flatnonzero(good)

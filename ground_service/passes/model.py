@@ -66,6 +66,23 @@ class ApidCompleteness(Entity):
     crc_errors: int | None = Field(description="Received with a wrong checksum; null: not computed")
 
 
+class Reception(Entity):
+    """Link quality of one received file; null: unknown."""
+
+    station: str = Field(examples=["madrid"], description="Empty: not stated")
+    source: str = Field(description="Origin of the link settings: stated, mission, remembered or proposed")
+    ambiguous: bool = Field(description="Other link settings have equal support")
+    frames: int
+    frames_good: int
+    symbols_corrected: int
+    bit_error_rate: float | None = Field(description="Of what could be corrected, a lower bound")
+    lock_losses: int
+    octets: int
+    octets_other: int = Field(description="Octets outside frames and station records")
+    first_received: UtcTime | None
+    last_received: UtcTime | None
+
+
 class Completeness(Entity):
     """Received and missing packets of a pass; null: not computed."""
 
@@ -80,14 +97,20 @@ class Completeness(Entity):
     frames: int | None
     frames_bad: int | None
     symbols_corrected: int | None
+    receptions: list[Reception]
     by_apid: list[ApidCompleteness]
 
     @classmethod
     def of_accounting(cls, found: PacketAccounting) -> Completeness:
         """Return the entity of a packet accounting."""
         by_apid = [ApidCompleteness.of(asdict(one), apid=apid) for apid, one in sorted(found.by_apid.items())]
-        names = set(cls.model_fields) - {"by_apid"}
-        return cls(**{name: getattr(found, name) for name in names}, by_apid=by_apid)
+        receptions = [
+            Reception.of(asdict(one), first_received=one.first_utc_ns, last_received=one.last_utc_ns)
+            for one in found.receptions
+        ]
+        names = set(cls.model_fields) - {"by_apid", "receptions"}
+        figures = {name: getattr(found, name) for name in names}
+        return cls(**figures, receptions=receptions, by_apid=by_apid)
 
 
 class Detection(Entity):

@@ -7,7 +7,7 @@ with on-board times in the pass (`processing.downlink_accounting`); other passes
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Any
 
@@ -20,9 +20,11 @@ from ground_service.passes.downlink_accounting import RawAccount, RawFile, accou
 from ground_service.passes.span import PassSpan
 from ground_service.store import repository
 from ground_service.store.files import FileArchive
-from reports.values import ApidAccounting, CompletenessSeries, PacketAccounting
+from reports.values import ApidAccounting, CompletenessSeries, PacketAccounting, ReceptionQuality
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import APID_DETECTIONS, DICTIONARY
+from tmtc.link import LinkSettings
+from tmtc.link_plan import LinkSection
 
 IntArray = NDArray[np.int64]
 
@@ -79,6 +81,7 @@ def packet_accounting(
         symbols_corrected=None if raw is None else raw.symbols_corrected,
         lost_at_edges=None if edges is None else sum(apid.lost_at_edges or 0 for apid in by_apid.values()),
         octets=None if raw is None else raw.octets,
+        receptions=_receptions(connection, span),
         by_apid=by_apid,
         completeness=_completeness(record, span, headers["ticks"], lost),
     )
@@ -88,15 +91,40 @@ def _raw_account(files: FileArchive, connection: Connection, span: PassSpan) -> 
     """Return sums over the raw files of the vehicle; None without files, or if one is too large."""
     vehicle = repository.get(connection, repository.VEHICLES, span.vehicle, "vehicle")
     found = []
-    for sha256, octets in _raw_files(connection, span):
-        if octets > RAW_LIMIT_OCTETS:
+    for one in _raw_files(connection, span):
+        if one.octets > RAW_LIMIT_OCTETS:
             return None
-        found.append(_raw_file(files, sha256, int(vehicle["ccsds_id"])))
+        found.append(_raw_file(files, one.sha256, int(vehicle["ccsds_id"]), one.sections))
     return account_raw(found, span.start_ticks, span.stop_ticks) if found else None
 
 
-def _raw_files(connection: Connection, span: PassSpan) -> list[tuple[str, int]]:
-    """Return hashes and sizes of the ingested files that may contain data of the pass, ordered by hash."""
+@dataclass(frozen=True, slots=True)
+class _Ingested:
+    """Ingested file: its size, the sections of its link settings, and its reception if it has frames."""
+
+    sha256: str
+    octets: int
+    sections: tuple[LinkSection, ...]
+    reception: Mapping[str, Any] | None
+
+
+def _receptions(connection: Connection, span: PassSpan) -> tuple[ReceptionQuality, ...]:
+    """Return the link quality of the files of the pass, by station and hash."""
+    names = {one.name for one in fields(ReceptionQuality)}
+    found = [one for one in _raw_files(connection, span) if one.reception is not None]
+    found.sort(key=lambda one: (str((one.reception or {})["station"]), one.sha256))
+    return tuple(
+        ReceptionQuality(
+            source=", ".join(sorted({section["source"] for section in reception["sections"]})),
+            **{name: value for name, value in reception.items() if name in names},
+        )
+        for one in found
+        if (reception := one.reception) is not None
+    )
+
+
+def _raw_files(connection: Connection, span: PassSpan) -> list[_Ingested]:
+    """Return the ingested files that may contain data of the pass, each once, ordered by hash."""
     ingests, stored = repository.INGESTS, repository.FILES
     query = (
         select(ingests.c.file_sha256, stored.c.octets, ingests.c.accounting)
@@ -108,20 +136,37 @@ def _raw_files(connection: Connection, span: PassSpan) -> list[tuple[str, int]]:
         )
         .order_by(ingests.c.file_sha256)
     )
-    chosen: dict[str, int] = {}
+    chosen: dict[str, _Ingested] = {}
     for sha256, octets, accounting in connection.execute(query):
         if span.vehicle not in accounting.get("vehicle_ids", (span.vehicle,)):
             continue
         first, last = accounting.get("first_ticks"), accounting.get("last_ticks")
         if first is None or last is None or (first <= span.stop_ticks and last >= span.start_ticks):
-            chosen[sha256] = int(octets)
-    return list(chosen.items())
+            reception = accounting.get("reception")
+            chosen[sha256] = _Ingested(sha256, int(octets), _sections(reception), reception)
+    return list(chosen.values())
+
+
+def _sections(reception: Mapping[str, Any] | None) -> tuple[LinkSection, ...]:
+    names = {one.name for one in fields(LinkSettings)}
+    return tuple(
+        LinkSection(
+            section["start"],
+            section["stop"],
+            LinkSettings(
+                **{name: value for name, value in section.items() if name in names and value is not None}
+            ),
+        )
+        for section in (reception or {}).get("sections", ())
+    )
 
 
 @lru_cache(maxsize=32)
-def _raw_file(files: FileArchive, sha256: str, spacecraft_id: int) -> RawFile:
+def _raw_file(
+    files: FileArchive, sha256: str, spacecraft_id: int, sections: tuple[LinkSection, ...]
+) -> RawFile:
     """Return the content of a raw file; cached, because the file of a hash never changes."""
-    return read_raw(files.get(sha256), spacecraft_id)
+    return read_raw(files.get(sha256), spacecraft_id, sections)
 
 
 @dataclass(frozen=True, slots=True)

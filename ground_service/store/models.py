@@ -116,7 +116,8 @@ class Piece(Base):
     Pieces of one `scope` (instance of the spacecraft) can be joined. `spacecraft_id` selects the frames of
     one spacecraft; NULL: those of every spacecraft. `stream` and `position` (octets from its start) are stated by the
     sender. Otherwise, `stream` is empty and `position` is the number of the ingest, so that successive ingests are
-    adjacent. `links_tried` is the number of known links of the scope that could not read it; NULL if one could.
+    adjacent. `station` (empty: not stated) and `link` (text of the settings, NULL: not stated) are those of the sender.
+    `links_tried` is the number of known links of the scope that could not read it; NULL if one could.
     `packets_stored` counts the new packets that the ingest added to the archive, `packets_joined` those of them that
     were joined with other pieces, and `samples_stored` their samples, over all attempts of the ingest.
     """
@@ -134,9 +135,24 @@ class Piece(Base):
     stream: Mapped[str] = mapped_column(String(200))
     position: Mapped[int] = mapped_column(BigInteger)
     links_tried: Mapped[int | None] = mapped_column(Integer)
+    station: Mapped[str] = mapped_column(String(64))
+    link: Mapped[str | None] = mapped_column(String(200))
     packets_stored: Mapped[int] = mapped_column(BigInteger, default=0)
     packets_joined: Mapped[int] = mapped_column(BigInteger, default=0)
     samples_stored: Mapped[int] = mapped_column(BigInteger, default=0)
+
+
+class GoodLink(Base):
+    """Link settings under which a spacecraft was received by a station; the newest row is used first."""
+
+    __tablename__ = "good_links"
+    __table_args__ = (Index("ix_good_links_newest", "vehicle_id", "station", "id"),)
+    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"))
+    station: Mapped[str] = mapped_column(String(64))
+    settings: Mapped[dict[str, Any]] = mapped_column(JSON)
+    ingest_id: Mapped[int] = mapped_column(ForeignKey("ingests.id"))
+    since_utc_ns: Mapped[int] = mapped_column(BigInteger)
 
 
 class KnownLink(Base):

@@ -230,6 +230,8 @@ def _ingest_again(
             pieces.c.spacecraft_id,
             pieces.c.stream,
             pieces.c.position,
+            pieces.c.station,
+            pieces.c.link,
         )
         .outerjoin(pieces, pieces.c.ingest_id == ingests.c.id)
         .outerjoin(vehicles, vehicles.c.id == ingests.c.vehicle_id)
@@ -244,7 +246,8 @@ def _ingest_again(
     for row in connection.execute(query).mappings().all():
         ground.check_stopping()
         place = Place(row["stream"], row["position"]) if row["stream"] else None
-        key = (row["file_sha256"], row["ccsds_id"], row["instance"], row["spacecraft_id"], place)
+        reception = (row["station"] or "", row["link"])
+        key = (row["file_sha256"], row["ccsds_id"], row["instance"], row["spacecraft_id"], place, reception)
         if row["state"] not in INGESTED:
             found.skip("unfinished ingests")
             continue
@@ -276,7 +279,14 @@ def _ingest_one(scratch: Ground, stored: StoredFile, row: Any, place: Place | No
         except GroundError:
             spacecraft = int(row["ccsds_id"])  # bare packets carry no spacecraft id
     ingest_stored(
-        scratch, stored, name=str(row["name"]), spacecraft_id=spacecraft, instance=instance, place=place
+        scratch,
+        stored,
+        name=str(row["name"]),
+        spacecraft_id=spacecraft,
+        instance=instance,
+        place=place,
+        station=row["station"] or "",
+        link=row["link"],
     )
 
 

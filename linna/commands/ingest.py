@@ -45,6 +45,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--offset", type=int, metavar="N", help="offset of the first file in --stream, octets (default: 0)"
     )
+    parser.add_argument(
+        "--station",
+        default="",
+        metavar="NAME",
+        help="station that received the files, as in the mission description",
+    )
+    parser.add_argument(
+        "--link",
+        metavar="SETTINGS",
+        help="link settings, used without evidence, such as frame_length=1115,coding=rs,randomiser=legacy,"
+        "checksum=true (default: mission description, last good settings, or the evidence of the file)",
+    )
     add_operator_options(parser)
     add_json_flag(parser)
     parser.set_defaults(handler=run)
@@ -80,6 +92,8 @@ def run(arguments: argparse.Namespace) -> int:
                 instance=arguments.instance,
                 stream=arguments.stream,
                 offset=offset,
+                station=arguments.station,
+                link=arguments.link,
             )
             kept = (
                 "packets", "packets_new", "crc_errors", "octets_skipped", "octets_pending", "frames_bad",

@@ -205,6 +205,7 @@ def _read(arguments: argparse.Namespace, dictionary: Dictionary | None = None) -
     from linna.errors import UsageError
     from tmtc.dictionary import DICTIONARY
     from tmtc.downlink import decode
+    from tmtc.errors import UnknownCoding
     from tmtc.link import LinkSettings
 
     octets = arguments.file.read_bytes()
@@ -218,13 +219,16 @@ def _read(arguments: argparse.Namespace, dictionary: Dictionary | None = None) -
     if arguments.no_frame_checksum:
         chosen["checksum"] = False
     settings = LinkSettings(**chosen) if chosen else None
-    decoded = decode(
-        octets,
-        settings=settings,
-        spacecraft_id=arguments.spacecraft_id,
-        dictionary=DICTIONARY if dictionary is None else dictionary,
-        error_control=not arguments.no_error_control,
-    )
+    try:
+        decoded = decode(
+            octets,
+            settings=settings,
+            spacecraft_id=arguments.spacecraft_id,
+            dictionary=DICTIONARY if dictionary is None else dictionary,
+            error_control=not arguments.no_error_control,
+        )
+    except UnknownCoding as error:
+        raise UsageError(f"{arguments.file}: expected {error.expected}, found {error.found}") from error
     if not decoded.packets and not decoded.frame_count:
         raise UsageError(
             f"{arguments.file}: expected CADUs or space packets, found none in its {len(octets)} octets"

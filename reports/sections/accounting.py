@@ -8,7 +8,7 @@ from reports.document import Block, Column, Facts, Heading, Paragraph, Picture, 
 from reports.figures import accounting
 from reports.sections.common import PassView, arc_words
 from reports.text import NOT_A_VALUE, computed_text, count_text, duration_text, percent_text, utc_text
-from reports.values import FrameAccounting
+from reports.values import FrameAccounting, ReceptionQuality
 
 _MOST_GAPS = 40
 
@@ -24,6 +24,44 @@ def _frame_steps(count: FrameAccounting) -> list[tuple[str, int]]:
         ("in the downlink", count.downlinked),
     )
     return [(name, n) for name, n in steps if n is not None]
+
+
+def _link_quality(receptions: tuple[ReceptionQuality, ...]) -> Table:
+    return Table(
+        "Link quality by reception.",
+        (
+            Column("station", numeric=False),
+            Column("first frame", numeric=False),
+            Column("last frame", numeric=False),
+            Column("frames"),
+            Column("good"),
+            Column("symbols corrected"),
+            Column("bit error rate"),
+            Column("lock losses"),
+            Column("octets"),
+            Column("outside frames"),
+            Column("link settings", numeric=False),
+        ),
+        tuple(
+            (
+                one.station or "not stated",
+                NOT_A_VALUE if one.first_utc_ns is None else utc_text(one.first_utc_ns),
+                NOT_A_VALUE if one.last_utc_ns is None else utc_text(one.last_utc_ns),
+                count_text(one.frames),
+                count_text(one.frames_good),
+                count_text(one.symbols_corrected),
+                NOT_A_VALUE if one.bit_error_rate is None else f"{one.bit_error_rate:.1e}",
+                count_text(one.lock_losses),
+                count_text(one.octets),
+                count_text(one.octets_other),
+                one.source + (", ambiguous" if one.ambiguous else ""),
+            )
+            for one in receptions
+        ),
+        note="Each row is one received file that may contain packets of the pass. The bit error rate is that of the "
+        "codewords that could be corrected, a lower bound. Lock losses are frames that do not follow the previous "
+        "one at the usual distance. Times are those of the station's records.",
+    )
 
 
 def frames_and_packets(view: PassView) -> list[Block]:
@@ -137,6 +175,8 @@ def frames_and_packets(view: PassView) -> list[Block]:
                 "are counted in the raw files over the on-board time of the pass.",
             )
         )
+    if packets.receptions:
+        blocks.append(_link_quality(packets.receptions))
     if report.gaps:
         blocks.append(
             Table(

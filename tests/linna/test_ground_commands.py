@@ -399,3 +399,17 @@ def steady(value: Any) -> Any:
     if isinstance(value, list):
         return [steady(item) for item in value]
     return None if isinstance(value, str) and re.fullmatch("[0-9a-f]{32}", value) else value  # id of a job
+
+
+def test_an_unusable_file_does_not_keep_the_others_from_being_ingested(
+    capsys: pytest.CaptureFixture[str], downlink: Path, tmp_path: Path
+) -> None:
+    noise = tmp_path / "noise.cadu"
+    noise.write_bytes(bytes(range(256)) * 80)
+    home = ["--home", tmp_path / "home"]
+    again = tmp_path / "again.cadu"
+    again.write_bytes(downlink.read_bytes())
+    assert run([*map(str, ["ingest", downlink, noise, again, *home]), "--json"]) == 2
+    first, bad, last = json.loads(capsys.readouterr().out)["ingested"]
+    assert "noise.cadu" in bad["error"]
+    assert first["packets"] == last["packets"] > 0 and last["packets_new"] == 0

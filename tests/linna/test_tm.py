@@ -3,9 +3,11 @@
 import csv
 import json
 
+import numpy as np
 import pytest
 
 from linna.cli import run
+from tmtc.cadu import ASM
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 from tmtc.packets import PacketSequencer
@@ -108,6 +110,16 @@ def test_a_file_without_telemetry_is_refused_in_one_line(tmp_path, capsys, conte
         error
         == f"linna: error: {path}: expected CADUs or space packets, found none in its {len(content)} octets\n"
     )
+
+
+def test_frames_of_an_unknown_coding_are_refused_with_the_name_of_the_file(tmp_path, capsys):
+    noise = np.random.default_rng(3).integers(0, 256, (30, 700), dtype=np.uint8)
+    noise[:, :4] = np.frombuffer(ASM, dtype=np.uint8)
+    (tmp_path / "odd.cadu").write_bytes(noise.tobytes())
+    for command in (["tm", "check"], ["tm", "decode"]):
+        assert run([*command, str(tmp_path / "odd.cadu")]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "odd.cadu" in line and "700 octets apart" in line
 
 
 def test_a_missing_file_is_refused_in_one_line(tmp_path, capsys):

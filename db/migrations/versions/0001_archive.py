@@ -469,6 +469,8 @@ def upgrade() -> None:
         sa.Column("stream", sa.String(length=200), nullable=False),
         sa.Column("position", sa.BigInteger(), nullable=False),
         sa.Column("links_tried", sa.Integer(), nullable=True),
+        sa.Column("station", sa.String(length=64), nullable=False),
+        sa.Column("link", sa.String(length=200), nullable=True),
         sa.Column("packets_stored", sa.BigInteger(), nullable=False),
         sa.Column("packets_joined", sa.BigInteger(), nullable=False),
         sa.Column("samples_stored", sa.BigInteger(), nullable=False),
@@ -479,6 +481,21 @@ def upgrade() -> None:
     op.create_index(op.f("ix_pieces_file_sha256"), "pieces", ["file_sha256"])
     op.create_index("ix_pieces_place", "pieces", ["scope", "stream", "position"])
     op.create_index("ix_pieces_unread", "pieces", ["scope", "links_tried"])
+    op.create_table(
+        "good_links",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("vehicle_id", sa.Integer(), nullable=False),
+        sa.Column("station", sa.String(length=64), nullable=False),
+        sa.Column("settings", sa.JSON(), nullable=False),
+        sa.Column("ingest_id", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=False),
+        sa.Column("since_utc_ns", sa.BigInteger(), nullable=False),
+        sa.ForeignKeyConstraint(["ingest_id"], ["ingests.id"], name=op.f("fk_good_links_ingest_id_ingests")),
+        sa.ForeignKeyConstraint(
+            ["vehicle_id"], ["vehicles.id"], name=op.f("fk_good_links_vehicle_id_vehicles")
+        ),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_good_links")),
+    )
+    op.create_index("ix_good_links_newest", "good_links", ["vehicle_id", "station", "id"])
     op.create_table(
         "known_links",
         sa.Column("id", sa.Integer(), nullable=False),
@@ -745,6 +762,7 @@ def downgrade() -> None:
     op.drop_table("command_counters")
     op.drop_table("stream_edges")
     op.drop_table("known_links")
+    op.drop_table("good_links")
     op.drop_table("pieces")
     op.drop_table("receptions")
     op.drop_table("ingests")

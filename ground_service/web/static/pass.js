@@ -108,6 +108,24 @@ function showCompleteness(found) {
       rows,
       "No packet of this pass has come.",
     ),
+    table(
+      "Link quality by reception",
+      [
+        ["Station", (row) => row.station || "not stated"],
+        ["First frame", (row) => row.first_received ?? "unknown"],
+        ["Last frame", (row) => row.last_received ?? "unknown"],
+        ["Frames", (row) => figure(row.frames), "num"],
+        ["Good", (row) => figure(row.frames_good), "num"],
+        ["Symbols corrected", (row) => figure(row.symbols_corrected), "num"],
+        ["Bit error rate", (row) => (row.bit_error_rate === null ? "unknown" : row.bit_error_rate.toExponential(1)), "num"],
+        ["Lock losses", (row) => figure(row.lock_losses), "num"],
+        ["Octets", (row) => figure(row.octets), "num"],
+        ["Outside frames", (row) => figure(row.octets_other), "num"],
+        ["Link settings", (row) => row.source + (row.ambiguous ? ", ambiguous" : "")],
+      ],
+      found.receptions,
+      "No frames of this pass have been received.",
+    ),
   );
 }
 

@@ -1,0 +1,234 @@
+"""Link settings of ingests: stated, of the mission description, remembered or proposed; station records; quality."""
+
+import itertools
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import select
+
+from benchmarks.downlink import (
+    OTHER_SPACECRAFT,
+    SHORT,
+    SPACECRAFT,
+    cadus,
+    can_be_read,
+    packets_of,
+    telemetry,
+    two_receivers,
+    two_spacecraft,
+    with_bit_errors,
+    without_error_control,
+)
+from ground_service.access.audit_log import list_entries
+from ground_service.errors import InvalidInput
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest.service import IngestResult, ingest_file
+from ground_service.missions.service import add_mission
+from ground_service.store import repository
+from ground_service.store.canonical import archive_hash
+from tmtc.link import LinkSettings
+
+NS = 1_000_000_000
+START = 1_900_000_000 * NS
+HEADER = 16
+
+MISSION = """
+schema_version = 1
+name = "selenita"
+[spacecraft]
+id = 76
+[link]
+frame_length = 1115
+coding = "rs"
+randomiser = "legacy"
+frame_checksum = true
+[link.stations.madrid]
+header_octets = 16
+trailer_octets = 4
+time_code = "unix_ns"
+time_offset = 8
+[link.stations.canberra]
+frame_length = 892
+interleave = 4
+randomiser = "long"
+"""
+
+
+def ingest(ground: Ground, folder: Path, octets: bytes, **options: Any) -> IngestResult:
+    path = folder / "downlink.bin"
+    path.write_bytes(octets)
+    return ingest_file(ground, path, **options)
+
+
+def section(result: IngestResult) -> dict[str, Any]:
+    assert result.reception is not None
+    (one,) = result.reception["sections"]
+    return dict(one)
+
+
+def stored(ground: Ground, spacecraft: int = SPACECRAFT) -> set[bytes]:
+    table = repository.PACKETS
+    with ground.database.reading() as connection:
+        vehicle = repository.vehicle_id(connection, spacecraft, "flight")
+        rows = connection.execute(select(table.c.octets).where(table.c.vehicle_id == vehicle))
+        return {bytes(row) for row in rows.scalars()}
+
+
+def recorded(rows: np.ndarray) -> bytes:
+    """CADUs in records with a header that holds the reception time, and a trailer."""
+    rng = np.random.default_rng(5)
+    parts = []
+    for number, row in enumerate(rows):
+        parts += [rng.bytes(8), struct.pack(">Q", START + number * NS), row.tobytes(), rng.bytes(4)]
+    return b"".join(parts)
+
+
+def test_settings_come_from_the_mission_then_from_the_last_good_ones_and_else_from_the_file(
+    ground: Ground, tmp_path: Path
+) -> None:
+    rows = cadus(30)
+    assert section(ingest(ground, tmp_path, rows[:10].tobytes()))["source"] == "proposed"
+    assert section(ingest(ground, tmp_path, rows[10:20].tobytes()))["source"] == "remembered"
+    add_mission(ground, MISSION.encode())
+    assert section(ingest(ground, tmp_path, rows[20:].tobytes()))["source"] == "mission"
+
+
+def test_good_settings_are_remembered_once_by_station_and_audited(ground: Ground, tmp_path: Path) -> None:
+    rows = cadus(30)
+    for station, part in (("", rows[:10]), ("", rows[10:20]), ("madrid", rows[20:])):
+        ingest(ground, tmp_path, part.tobytes(), station=station)
+    with ground.database.reading() as connection:
+        kept = connection.execute(select(repository.GOOD_LINKS).order_by(repository.GOOD_LINKS.c.id)).all()
+    assert [row.station for row in kept] == ["", "madrid"]
+    assert {row.settings["frame_length"] for row in kept} == {1115}
+    entries, _ = list_entries(ground, limit=10, offset=0)
+    assert [one.action for one in entries].count("remember link settings") == 2
+
+
+def test_frames_that_no_code_can_repair_are_not_remembered(ground: Ground, tmp_path: Path) -> None:
+    result = ingest(ground, tmp_path, with_bit_errors(cadus(60), 1e-2, 0).tobytes())
+    assert result.packets == 0 and result.frames_bad > 50
+    with ground.database.reading() as connection:
+        assert connection.execute(select(repository.GOOD_LINKS)).all() == []
+
+
+def test_stated_settings_are_used_without_evidence_and_wrong_ones_are_refused(
+    ground: Ground, tmp_path: Path
+) -> None:
+    octets = cadus(30).tobytes()
+    right = "frame_length=1115,coding=rs,randomiser=legacy,checksum=true"
+    wrong = ingest(ground, tmp_path, octets, link=right.replace("legacy", "long"))
+    assert (wrong.packets, section(wrong)["source"]) == (0, "stated")
+    assert ingest(ground, tmp_path, octets, link=right).packets == len(telemetry(30))
+    for text in ("frame_length=many", "colour=red", "coding=turbo", "frame_length=3"):
+        with pytest.raises(InvalidInput, match="link"):
+            ingest(ground, tmp_path, octets, link=text)
+
+
+def test_a_station_may_have_settings_of_its_own(ground: Ground, tmp_path: Path) -> None:
+    add_mission(ground, MISSION.encode())
+    settings = LinkSettings(frame_length=892, interleave=4, randomiser="long")
+    result = ingest(ground, tmp_path, cadus(30, 1, settings).tobytes(), station="canberra")
+    assert (section(result)["source"], section(result)["frame_length"]) == ("mission", 892)
+
+
+def test_settings_that_contradict_the_mission_are_proposed_from_the_file(
+    ground: Ground, tmp_path: Path
+) -> None:
+    add_mission(ground, MISSION.encode())
+    settings = LinkSettings(frame_length=1024, coding="none")
+    result = ingest(ground, tmp_path, cadus(30, 1, settings).tobytes())
+    assert (section(result)["source"], result.packets) == ("proposed", len(telemetry(30, 1, settings)))
+
+
+def test_a_remembered_link_of_another_spacecraft_does_not_spoil_frames_with_a_checksum(
+    ground: Ground, tmp_path: Path
+) -> None:
+    other = LinkSettings(checksum=False)
+    ingest(ground, tmp_path, cadus(30, 1, other, OTHER_SPACECRAFT).tobytes())
+    result = ingest(ground, tmp_path, cadus(30).tobytes())
+    assert section(result)["checksum"] is True and result.packets == len(telemetry(30))
+
+
+def test_records_of_a_station_give_reception_times_and_their_octets_are_accounted_for(
+    ground: Ground, tmp_path: Path
+) -> None:
+    add_mission(ground, MISSION.encode())
+    rows = with_bit_errors(cadus(60), 2e-3, 3)
+    octets = recorded(rows)
+    result = ingest(ground, tmp_path, octets, station="madrid")
+    quality = result.reception
+    assert quality is not None
+    n = len(rows)
+    assert result.packets == len(packets_of(can_be_read(rows, LinkSettings()), telemetry(60), LinkSettings()))
+    assert (quality["first_utc_ns"], quality["last_utc_ns"]) == (START, START + (n - 1) * NS)
+    assert (quality["octets_frames"], quality["octets_records"], quality["octets_other"]) == (
+        n * 1279,
+        n * 20,
+        0,
+    )
+    assert (quality["frames"], quality["lock_losses"], quality["station"]) == (n, 0, "madrid")
+
+
+def test_the_bit_error_rate_is_estimated_from_the_corrected_bits(ground: Ground, tmp_path: Path) -> None:
+    quality = ingest(ground, tmp_path, with_bit_errors(cadus(SHORT), 2e-3, 3).tobytes()).reception
+    assert quality is not None and quality["codewords_lost"] == 0
+    # of 4e6 bits 8,200 are wrong: one standard deviation is 1.1 %
+    assert quality["bit_error_rate"] == pytest.approx(2e-3, rel=0.05)
+    assert quality["symbols_corrected"] > 7_000
+
+
+def test_lost_bits_and_inverted_frames_are_lock_losses(ground: Ground, tmp_path: Path) -> None:
+    bits = np.unpackbits(cadus(30).reshape(-1))
+    rows = np.packbits(np.delete(bits, [9 * 8 * 1279 + 4000]))
+    quality = ingest(ground, tmp_path, rows.tobytes()).reception
+    assert quality is not None and quality["lock_losses"] == 1 and quality["frames_inverted"] == 0
+    quality = ingest(ground, tmp_path, (255 - cadus(30)).tobytes()).reception
+    assert quality is not None and quality["frames_inverted"] == len(cadus(30))
+
+
+def test_packets_without_error_control_are_read_if_the_mission_says_so(
+    ground: Ground, tmp_path: Path
+) -> None:
+    capture = without_error_control()
+    with pytest.raises(InvalidInput):
+        ingest(ground, tmp_path, capture.files[0], spacecraft_id=SPACECRAFT)
+    text = 'schema_version = 1\nname = "foreign"\n[spacecraft]\nid = 76\n[link]\npacket_checksum = "none"\n'
+    add_mission(ground, text.encode())
+    result = ingest(ground, tmp_path, capture.files[0], spacecraft_id=SPACECRAFT)
+    assert (result.packets, result.octets_skipped) == (7200, 0)
+    assert stored(ground) == capture.packets[SPACECRAFT]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_receptions_of_two_stations_are_merged_in_any_order_and_split(
+    ground: Ground, tmp_path: Path, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    stream = two_receivers(one_file=False)
+    pieces = []
+    for station, octets in zip(("madrid-x", "goldstone"), stream.files, strict=True):
+        cuts = [0, *sorted(rng.integers(0, len(octets), 2).tolist()), len(octets)]
+        pieces += [(station, octets[a:b]) for a, b in itertools.pairwise(cuts) if b > a]
+    for k in rng.permutation(len(pieces)).tolist():
+        ingest(ground, tmp_path, pieces[k][1], station=pieces[k][0])
+    assert stored(ground) == stream.packets[SPACECRAFT]
+
+
+def test_two_spacecraft_have_the_same_archives_whatever_the_split(tmp_path: Path) -> None:
+    stream = two_spacecraft()
+    hashes = set()
+    for cut in (0, 1279 * 301, 400_001):
+        ground = open_ground(tmp_path / str(cut))
+        for part in (stream.files[0][cut:], stream.files[0][:cut]):
+            if part:
+                ingest(ground, tmp_path, part)
+        assert {one: stored(ground, one) for one in stream.packets} == stream.packets
+        with ground.database.reading() as connection:
+            vehicles = [repository.vehicle_id(connection, one, "flight") for one in sorted(stream.packets)]
+            hashes.add(tuple(archive_hash(connection, vehicle) for vehicle in vehicles))
+        ground.close()
+    assert len(hashes) == 1
