@@ -73,6 +73,13 @@ def _crc(buffer: RecordArray, start: int, stop: int, tables: RecordArray) -> int
 
 
 @njit
+def checksums_hold(rows: RecordArray, tables: RecordArray, holds: RecordArray) -> None:
+    """Write whether the last two octets of each row (n, length) are the checksum of those before."""
+    for n in range(rows.shape[0]):
+        holds[n] = _crc(rows[n], 0, rows.shape[1], tables) == 0
+
+
+@njit
 def length_at(buffer: RecordArray, p: int, stop: int, packet_type: int, longest: int) -> int:
     """Octets of the packet whose header stands at `p`, or 0 where no such header can stand."""
     if stop - p < 7 or (buffer[p] >> 4) != packet_type:

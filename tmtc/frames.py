@@ -10,12 +10,13 @@ synchronisation flag, packet order flag (1 each), segment length id 11 (2), firs
 
 from __future__ import annotations
 
+import functools
 import struct
 from dataclasses import dataclass
 
 import numpy as np
 
-from tmtc.arrays import BoolArray, IntArray, OctetArray
+from tmtc.arrays import BoolArray, IntArray, OctetArray, RecordArray
 from tmtc.crc import CRC_LENGTH, crc16
 from tmtc.errors import FrameError, TruncatedPacket, ValueRefused
 
@@ -132,8 +133,21 @@ def frame_checksums_hold(frames: OctetArray) -> BoolArray:
     """Whether the last two octets of each frame (n, length) are the checksum of those before."""
     if frames.shape[1] <= CRC_LENGTH:
         return np.zeros(frames.shape[0], dtype=np.bool_)
-    rows = np.ascontiguousarray(frames)
-    return np.fromiter((crc16(row.data) == 0 for row in rows), dtype=np.bool_, count=rows.shape[0])
+    from tmtc import _cutting  # numba is imported only where it is used
+
+    holds = np.empty(frames.shape[0], dtype=np.bool_)
+    rows = np.ascontiguousarray(frames).view()
+    rows.flags.writeable = False  # one compiled variant for frames of every origin
+    _cutting.checksums_hold(rows, checksum_tables(), holds)
+    return holds
+
+
+@functools.cache
+def checksum_tables() -> RecordArray:
+    """Return the tables of the checksum (see `_cutting.crc_tables`)."""
+    from tmtc import _cutting
+
+    return _cutting.crc_tables()
 
 
 def append_frame_checksums(frames: OctetArray) -> None:

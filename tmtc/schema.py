@@ -450,6 +450,26 @@ def gather(octets: OctetArray, starts: IntArray, dtype: np.dtype[Any]) -> Record
     return windows[starts].view(dtype)
 
 
+def _gather_items(
+    octets: OctetArray, starts: IntArray, counts: IntArray, dtype: np.dtype[Any]
+) -> tuple[RecordArray, IntArray]:
+    """Return the `counts` (n,) items of `dtype` from each of `starts` (n,), and the index of the start of each."""
+    from tmtc import _gathering  # numba is imported only where it is used
+
+    total = int(counts.sum())
+    result = np.empty(total * dtype.itemsize, dtype=np.uint8)
+    owner = np.empty(total, dtype=np.int64)
+    _gathering.copy_items(_readable(octets), starts, counts, dtype.itemsize, result, owner)
+    return result.view(dtype), owner
+
+
+def _readable(octets: OctetArray) -> OctetArray:
+    """Return a read-only view: one compiled variant serves octets of every origin."""
+    view = octets.view()
+    view.flags.writeable = False
+    return view
+
+
 def _checked_header(octets: bytes, packet_type: int) -> Any:
     primary = unpack_primary_header(octets)
     if len(octets) < primary.packet_length:
@@ -587,14 +607,9 @@ class _Compiled:
         if group:
             assert self.item_dtype is not None
             counts = raw[group.count].astype(np.int64)
-            first = np.cumsum(counts) - counts
-            # position of item k of packet i: starts[i] + data + (k - first[i]) * length
-            origin = starts + (definition.base_length - CRC_LENGTH) - first * definition.item_length
-            owner = np.repeat(np.arange(rows.size, dtype=np.int64), counts)
-            where = np.arange(owner.size, dtype=np.int64)
-            where *= definition.item_length
-            where += np.repeat(origin, counts)
-            items_raw, items = _columns(group.fields, gather(octets, where, self.item_dtype))
+            data = starts + (definition.base_length - CRC_LENGTH)
+            found, owner = _gather_items(octets, data, counts, self.item_dtype)
+            items_raw, items = _columns(group.fields, found)
         return Table(
             name=definition.name,
             packet_index=rows,

@@ -291,3 +291,10 @@ def test_a_day_of_passes_stays_under_eight_megabytes() -> None:
     page = Page(text)
     assert page.left_open == [] and page.references <= set(page.ids)
     assert "One hour of it" in page.text
+
+
+def test_the_link_quality_of_each_reception_is_a_row_of_the_page(whole_page: str) -> None:
+    start = whole_page.index("Link quality by reception")
+    table = whole_page[start : whole_page.index("</table>", start)]
+    assert "madrid" in table and "2.5e-05" in table
+    assert "not stated" in table and "proposed, ambiguous" in table

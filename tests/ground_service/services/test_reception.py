@@ -27,8 +27,11 @@ from ground_service.errors import InvalidInput
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import IngestResult, ingest_file
 from ground_service.missions.service import add_mission
+from ground_service.passes.model import Completeness
+from ground_service.passes.service import completeness, define_pass
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
+from lunar.timescales import utc_ns_from_ticks
 from tmtc.link import LinkSettings
 
 NS = 1_000_000_000
@@ -232,3 +235,30 @@ def test_two_spacecraft_have_the_same_archives_whatever_the_split(tmp_path: Path
             hashes.add(tuple(archive_hash(connection, vehicle) for vehicle in vehicles))
         ground.close()
     assert len(hashes) == 1
+
+
+def test_the_link_quality_of_both_stations_is_shown_with_the_merged_packets_of_the_pass(
+    ground: Ground, tmp_path: Path
+) -> None:
+    add_mission(ground, MISSION.encode())
+    stream = two_receivers(one_file=False)
+    for station, octets in zip(("madrid", "goldstone"), stream.files, strict=True):
+        rows = np.frombuffer(octets, dtype=np.uint8).reshape(-1, 1279)
+        ingest(ground, tmp_path, recorded(rows) if station == "madrid" else octets, station=station)
+    start, stop = (utc_ns_from_ticks(ticks) for ticks in (0, 10_000 << 16))
+    key = define_pass(
+        ground, name="both", start_utc_ns=start, stop_utc_ns=stop, spacecraft_id=SPACECRAFT, instance="flight"
+    )
+    found = completeness(ground, key)
+    goldstone, madrid = found.receptions
+    assert found.packets == stream.true
+    assert (goldstone.station, madrid.station) == ("goldstone", "madrid")
+    assert (goldstone.first_utc_ns, madrid.first_utc_ns) == (None, START)
+    assert [one.frames for one in found.receptions] == [
+        len(stream.files[1]) // 1279,
+        len(stream.files[0]) // 1279,
+    ]
+    assert found.frames == sum(one.frames for one in found.receptions)
+    assert {one.source for one in found.receptions} == {"mission"}
+    told = Completeness.of_accounting(found).receptions
+    assert [one.station for one in told] == ["goldstone", "madrid"]
