@@ -66,8 +66,8 @@ GROUPS = {
     "accounting": Group(
         ("ground_service/ingest/core.py", "ground_service/passes/downlink_accounting.py", "tmtc/sequence.py"),
         (
-            f"{_GROUND_TESTS}/processing/test_sequence.py",
-            f"{_GROUND_TESTS}/processing/test_downlink_accounting.py",
+            f"{_GROUND_TESTS}/ingest/test_sequence.py",
+            f"{_GROUND_TESTS}/passes/test_downlink_accounting.py",
             "tests/tmtc/test_sequence.py",
         ),
     ),
@@ -104,18 +104,18 @@ GROUPS = {
                     "trajectory",
                 )
             ),
-            f"{_GROUND_TESTS}/services/test_golden_reports.py",
+            f"{_GROUND_TESTS}/evaluation/test_golden_reports.py",
         ),
     ),
     "smoother": Group(
         ("ground_service/evaluation/navigation/smoother.py",),
-        (f"{_GROUND_TESTS}/processing/test_smoother.py",),
+        (f"{_GROUND_TESTS}/evaluation/test_smoother.py",),
     ),
     "gates": Group(
         ("ground_service/regression/gates/core.py", "ground_service/regression/gates/statistics.py"),
         (
-            f"{_GROUND_TESTS}/processing/test_regression_gates.py",
-            f"{_GROUND_TESTS}/processing/test_regression_statistics.py",
+            f"{_GROUND_TESTS}/regression/test_regression_gates.py",
+            f"{_GROUND_TESTS}/regression/test_regression_statistics.py",
         ),
     ),
     "filter": Group(
@@ -158,9 +158,9 @@ GROUPS = {
     "authorisation": Group(
         ("ground_service/access/service.py", "ground_service/access/security.py"),
         (
-            f"{_GROUND_TESTS}/services/test_users.py",
-            f"{_GROUND_TESTS}/api/test_access.py",
-            f"{_GROUND_TESTS}/api/test_security.py",
+            f"{_GROUND_TESTS}/access/test_users.py",
+            f"{_GROUND_TESTS}/access/test_access.py",
+            f"{_GROUND_TESTS}/access/test_security.py",
         ),
     ),
     "commanding": Group(
@@ -170,8 +170,8 @@ GROUPS = {
             f"{_FLIGHT}/onboard/commanding.py",
         ),
         (
-            f"{_GROUND_TESTS}/services/test_commanding.py",
-            f"{_GROUND_TESTS}/processing/test_verification.py",
+            f"{_GROUND_TESTS}/commanding/test_commanding.py",
+            f"{_GROUND_TESTS}/commanding/test_verification.py",
             f"{_FLIGHT_TESTS}/test_commanding.py",
         ),
     ),

@@ -14,7 +14,7 @@ from ground_service.evaluation.instruments import instrument_reports
 from reports.document import Absent, Table
 from reports.sections.instruments import instruments
 from reports.values import InstrumentReport, PassReport, ResidualStatistics
-from tests.ground_service.processing.test_pass_evaluation import inputs
+from tests.ground_service.evaluation.test_pass_evaluation import inputs
 from tmtc.instruments import InstrumentTelemetry, Residual, sample_packet
 from tmtc.schema import Dictionary, Field
 from tmtc.stream import cut_packets
