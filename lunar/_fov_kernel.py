@@ -1,4 +1,4 @@
-"""Compiled search of the craters that come first into a widening field of view."""
+"""Compiled search for the first craters that enter a widening field of view."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ def first_craters_in_view(
     band_rad: float,
     count: int,
 ) -> tuple[FloatArray, IntArray]:
-    """Return tangents (n, count), ascending, of the half field of view that takes craters into a square image.
+    """Return ascending tangents (n, count) of the half field of view at which craters enter a square image.
 
-    With them come the rows (n, count) of ``crater``, -1 and an infinite tangent where the horizon holds fewer.
-    ``distance_ratio`` (n,) is the distance from the centre of the Moon in radii; ``keys`` (m,) ascend as latitude
-    band times 2 pi plus longitude, with unit vectors ``crater`` (m, 3) in the same order.
+    The second array holds the rows (n, count) of these craters in ``crater``. If fewer craters are within the horizon,
+    the remaining rows are -1 and their tangents infinite. ``distance_ratio`` (n,) is the distance from the centre of
+    the Moon in lunar radii. ``keys`` (m,) are ascending values of latitude band times 2 pi plus longitude; the unit
+    vectors ``crater`` (m, 3) have the same order.
     """
     two_pi = 2.0 * math.pi
     tangents = np.full((len(latitude_rad), count), np.inf)
@@ -43,7 +44,7 @@ def first_craters_in_view(
         if low > -math.pi / 2 and high < math.pi / 2:
             half_width = math.asin(min(1.0, math.sin(horizon) / cp))
         west, east = lon - half_width, lon + half_width
-        # The span may reach over the 0/360 meridian: a second piece, empty otherwise.
+        # A span across the 0/360 deg meridian has a second piece, which is empty otherwise.
         begin, end, begin_2, end_2 = west, east, 0.0, -1.0
         if half_width >= math.pi:
             begin, end = 0.0, two_pi

@@ -1,7 +1,7 @@
 """Crater catalogues as arrays, with a spatial index, size classes and the published file formats.
 
-Latitude and longitude are of the mean-Earth frame, in rad; longitudes are kept as 0..2 pi.  Heights are of
-the rim above the sphere of `MOON_RADIUS_M`.  NaN stands for what a catalogue does not say.
+Latitude and longitude are in the mean-Earth frame, in rad; longitudes are in 0..2 pi.  Heights are those of the rim
+above the sphere of radius `MOON_RADIUS_M`.  NaN marks values that a catalogue does not give.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from lunar.frames import mcmf_from_spherical
 TWO_PI = 2.0 * math.pi
 
 CLASS_LIMITS_M = (5_000.0, 10_000.0, 15_000.0, 30_000.0)
-"""Limits of the paper's size classes 0, 1 and 2; each holds its lower limit, the last also its upper."""
+"""Limits of the paper's size classes 0, 1 and 2; each includes its lower limit, the last also its upper limit."""
 
 NAVIGATION_CLASS = 3
 NAVIGATION_MINIMUM_M = 3_000.0
-"""Craters of 3 to 5 km serve navigation only and form class 3."""
+"""Craters of 3 to 5 km are used for navigation only and form class 3."""
 
 PAPER_CLASS_COUNTS = (58_649, 12_830, 7_908)
 """Craters of 5-10, 10-15 and 15-30 km over the whole Moon (the paper, section V-B.2)."""
 
 MARIA = (
-    (18.4, -57.4, 1700.0),  # Oceanus Procellarum, as one disc like the others
+    (18.4, -57.4, 1700.0),  # Oceanus Procellarum, approximated by one disc
     (32.8, -15.6, 1100.0),  # Imbrium
     (28.0, 17.5, 670.0),  # Serenitatis
     (8.5, 31.4, 870.0),  # Tranquillitatis
@@ -64,10 +64,11 @@ MARIA = (
 """Latitude and east longitude in deg and diameter in km of the maria (IAU gazetteer, rounded)."""
 
 MARE_DENSITY_RATIO = 0.045
-"""Craters of 5-30 km in maria per one in highlands of the same area, for the synthetic catalogue.
+"""Ratio of the density of 5-30 km craters in maria to that in highlands, for the synthetic catalogue.
 
-LU1319381 has between 0.01 (Fecunditatis) and 0.15 (Procellarum).  With this value the chance of three craters in a
-footprint of 120 deg from the paper's orbit is that of LU1319381 completed to the paper's class counts (0.92).
+LU1319381 has between 0.01 (Fecunditatis) and 0.15 (Procellarum).  With this value, the probability of three
+craters in a footprint of 120 deg from the paper's orbit equals that of LU1319381 completed to the paper's class counts
+(0.92).
 """
 
 OWN_COLUMNS = ("id", "latitude_deg", "longitude_deg", "diameter_m", "rim_height_m", "depth_m", "complete")
@@ -77,9 +78,9 @@ BAND_RAD = math.radians(1.0)
 
 @dataclass(frozen=True, eq=False)
 class CraterCatalogue:
-    """Craters as arrays of one length; ``complete`` is True where the source holds all of the region.
+    """Craters as arrays of equal length; ``complete`` is True where the source covers the region completely.
 
-    Not slotted: the index is built on first use and kept.
+    Not slotted, because the index is built on first use and cached.
     """
 
     ids: IntArray
@@ -96,7 +97,7 @@ class CraterCatalogue:
 
     @cached_property
     def position_mcmf_m(self) -> FloatArray:
-        """Return the centres at rim height, (n, 3); on the sphere where the height is not known."""
+        """Return the centres at rim height, (n, 3); on the sphere if the height is unknown."""
         return mcmf_from_spherical(
             self.latitude_rad, self.longitude_rad, np.nan_to_num(self.rim_height_m, nan=0.0)
         )
@@ -176,7 +177,7 @@ def size_class(diameter_m: ArrayLike) -> NDArray[np.int8]:
     edges = np.array([NAVIGATION_MINIMUM_M, *CLASS_LIMITS_M])
     edges[-1] = np.nextafter(edges[-1], np.inf)
     classes = np.array([-1, NAVIGATION_CLASS, 0, 1, 2, -1], dtype=np.int8)
-    # NaN sorts last, into the class of what is too large: -1.
+    # NaN sorts last, so its class is -1, as for diameters above the last limit.
     return np.asarray(classes[np.searchsorted(edges, diameter, side="right")])
 
 
@@ -197,7 +198,7 @@ def make_catalogue(
     depth_m: ArrayLike | None = None,
     complete: ArrayLike | bool = True,
 ) -> CraterCatalogue:
-    """Return a catalogue of arrays (n,), with running ids and NaN heights and depths where none are given."""
+    """Return a catalogue of arrays (n,), with consecutive ids and NaN heights and depths unless given."""
     latitude = np.asarray(latitude_rad, dtype=np.float64)
     n = len(latitude)
     unknown = np.full(n, np.nan)
@@ -216,7 +217,7 @@ def make_catalogue(
 def paper_density_catalogue(seed: int, uniform: bool = False) -> CraterCatalogue:
     """Return a synthetic catalogue of the paper's class counts, with few craters in the maria unless ``uniform``.
 
-    Places are random over the sphere; diameters follow N(>D) ~ D^-2 inside each class.
+    Positions are random over the sphere; diameters follow N(>D) ~ D^-2 inside each class.
     """
     rng = np.random.Generator(np.random.PCG64(seed))
     mare = np.radians([(latitude, longitude) for latitude, longitude, _ in MARIA])
@@ -240,13 +241,13 @@ def paper_density_catalogue(seed: int, uniform: bool = False) -> CraterCatalogue
 def completed_to_paper(catalogue: CraterCatalogue, seed: int) -> CraterCatalogue:
     """Return the complete craters of 5-30 km of a catalogue, with random ones up to the paper's class counts added.
 
-    The added craters lie in the tiles of 30 x 30 degrees in which the catalogue has no complete crater, where it is
-    silent; they have the ids -1, -2, ...
+    The added craters lie in the tiles of 30 x 30 degrees in which the catalogue has no complete crater. Their ids are
+    -1, -2, ...
 
     Raises
     ------
     LunarError
-        Where no tile is empty, or a class already has more craters than the paper's catalogue.
+        If no tile is empty, or if a class already has more craters than the paper's catalogue.
     """
     in_range = catalogue.complete & (size_class(catalogue.diameter_m) >= 0)
     known = catalogue.select(in_range & (catalogue.diameter_m >= CLASS_LIMITS_M[0]))
@@ -258,7 +259,8 @@ def completed_to_paper(catalogue: CraterCatalogue, seed: int) -> CraterCatalogue
     if np.any(missing < 0) or not np.any(empty):
         raise LunarError(
             f"{catalogue.source}: expected a catalogue with empty tiles and at most {PAPER_CLASS_COUNTS} craters "
-            f"of the three classes, found {np.count_nonzero(empty)} and {tuple(class_counts(known).tolist())}"
+            f"of the three classes, found {np.count_nonzero(empty)} empty tiles and "
+            f"{tuple(class_counts(known).tolist())} craters"
         )
     rng = np.random.Generator(np.random.PCG64(seed))
     diameter_m = _class_diameters_m(rng, missing.tolist())
@@ -286,7 +288,7 @@ def _class_diameters_m(rng: np.random.Generator, counts: Sequence[int]) -> Float
 def _random_places(
     rng: np.random.Generator, n: int, accepted: Callable[[FloatArray, FloatArray], BoolArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return n latitudes and longitudes, uniform over the part of the sphere that is accepted."""
+    """Return n latitudes and longitudes, uniform over the accepted part of the sphere."""
     latitude_rad, longitude_rad = np.empty(0), np.empty(0)
     while len(latitude_rad) < n:
         latitude, longitude = np.arcsin(rng.uniform(-1.0, 1.0, n)), rng.uniform(0.0, TWO_PI, n)
@@ -304,16 +306,16 @@ def _tile(latitude_rad: FloatArray, longitude_rad: FloatArray) -> IntArray:
 
 
 def load_catalogue(path: Path | str) -> CraterCatalogue:
-    """Return the craters of a CSV file (plain or gzip), recognised by its columns.
+    """Return the craters of a CSV file (plain or gzip), whose format is identified by its columns.
 
-    Known are LU1319381 (``longitude_deg, latitude_deg, diameter_m, depth_m``), the composite of several
+    Supported are LU1319381 (``longitude_deg, latitude_deg, diameter_m, depth_m``), the composite of several
     sources (``diameter_km, source, tile_complete``), Robbins (``lat, lon, diam`` in km, or as published with
-    ``LAT_CIRC_IMG, LON_CIRC_IMG, DIAM_CIRC_IMG``) and our own.  Exact repetitions of a crater are kept once.
+    ``LAT_CIRC_IMG, LON_CIRC_IMG, DIAM_CIRC_IMG``) and the LINNA format.  Exact duplicates are removed.
 
     Raises
     ------
     DataFileError
-        Where the file cannot be read, its columns are not known, or a value is no number or out of range.
+        If the file cannot be read, its columns are unknown, or a value is not a number or out of range.
     """
     path = Path(path)
     columns = _read_columns(path)
@@ -330,12 +332,12 @@ def load_catalogue(path: Path | str) -> CraterCatalogue:
 
 
 def save_catalogue(catalogue: CraterCatalogue, path: Path | str) -> None:
-    """Write our own CSV: id, latitude_deg, longitude_deg, diameter_m, rim_height_m, depth_m, complete."""
+    """Write a CSV in the LINNA format: id, latitude_deg, longitude_deg, diameter_m, rim_height_m, depth_m, complete."""
     Path(path).write_text(format_catalogue(catalogue), encoding="ascii", newline="\n")
 
 
 def format_catalogue(catalogue: CraterCatalogue) -> str:
-    """Return our own CSV text; angles to 1e-9 deg (30 um on the ground), lengths to 1 mm, unknown empty."""
+    """Return CSV in the LINNA format; angles to 1e-9 deg (30 um on the ground), lengths to 1 mm, unknown empty."""
     rows = zip(
         catalogue.ids.tolist(),
         np.degrees(catalogue.latitude_rad).tolist(),
@@ -374,15 +376,15 @@ def _read_columns(path: Path) -> dict[str, list[str]]:
         found = error.strerror or str(error)
         raise DataFileError(path, "", "a crater catalogue in CSV, plain or gzip", found) from None
     except (EOFError, ValueError, csv.Error, zlib.error) as error:
-        raise DataFileError(path, "", "a whole CSV or gzip file", str(error)) from None
+        raise DataFileError(path, "", "a complete CSV or gzip file", str(error)) from None
     if lines is not None:
-        # Without quotes a plain split does, five times quicker than the csv module.
+        # Without quotes, a plain split is sufficient and five times as fast as the csv module.
         lines = [line for line in text.replace("\r", "").split("\n") if line]
         header = lines[0].split(",") if lines else []
         widths = [line.count(",") + 1 for line in lines]
         wanted = [k for k, name in enumerate(header) if name.strip() in _KNOWN_COLUMNS]
         if 2 * len(wanted) < len(header):
-            # Of a wide table (Robbins has 21 columns and 1.3 million rows) only what is used is taken apart.
+            # Parse only the required columns of a wide table (Robbins: 21 columns, 1.3 million rows).
             _check_widths(path, widths, len(header))
             return _some_columns(header, lines[1:], wanted)
         flat = ",".join(lines[1:]).split(",") if len(lines) > 1 else []
@@ -404,7 +406,7 @@ def _check_widths(path: Path, widths: list[int], expected: int) -> None:
 
 
 def _some_columns(header: list[str], lines: list[str], wanted: list[int]) -> dict[str, list[str]]:
-    """Columns of a table by name; those not wanted are named and left empty."""
+    """Return the columns of a table by name; columns that are not required are empty."""
     columns: dict[str, list[str]] = {name.strip(): [] for name in header}
     last = max(wanted, default=0) + 1
     for line in lines:
@@ -521,5 +523,5 @@ def _without_repetitions(catalogue: CraterCatalogue) -> CraterCatalogue:
     same = np.ones(len(order) - 1, dtype=np.bool_)
     for column in columns:
         same &= np.diff(column[order]) == 0.0
-    # The sort is stable, so the first of equal rows stays.
+    # The sort is stable, so the first of equal rows is kept.
     return catalogue.select(np.delete(np.arange(len(order)), order[1:][same])) if np.any(same) else catalogue

@@ -16,7 +16,7 @@ from lunar.timescales import format_utc
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EphemerisDifference:
-    """Second minus first ephemeris at ``samples`` epochs; ``rms_rtn_m`` holds radial, transverse, normal."""
+    """Difference (second minus first) at ``samples`` epochs; ``rms_rtn_m`` is radial, transverse, normal."""
 
     max_m: float
     rms_m: float
@@ -30,12 +30,12 @@ class EphemerisDifference:
 def compare(first: Ephemeris, second: Ephemeris, utc_ns: ArrayLike | None = None) -> EphemerisDifference:
     """Return the difference at epochs (n,), or at the states of the first that the second covers.
 
-    Velocities are differenced in inertial axes and then turned: they are no rates of the positions.
+    Velocities are differenced in inertial axes and then rotated. They are not the rates of ``position_rtn_m``.
 
     Raises
     ------
     EphemerisCoverageError
-        Where the two share no epoch, or a given epoch is not covered by both.
+        If the ephemerides have no common epoch, or do not both cover a given epoch.
     """
     if utc_ns is None:
         epochs = first.utc_ns[second.covers(first.utc_ns)]

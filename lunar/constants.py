@@ -1,11 +1,11 @@
-"""Physical constants, each with its origin.  SI units."""
+"""Physical constants in SI units, each with its source."""
 
 from __future__ import annotations
 
 import math
 
 MOON_RADIUS_M = 1_737_400.0
-"""Radius of the sphere that lunar maps, height models and altitudes refer to (IAU WGCCRE 2009 and 2015)."""
+"""Radius of the reference sphere of lunar maps, height models and altitudes (IAU WGCCRE 2009 and 2015)."""
 
 GM_MOON_M3_S2 = 4.902_800_066e12
 """Gravitational parameter of the Moon (JPL DE430 and DE431; Folkner et al. 2014, IPN PR 42-196)."""

@@ -1,4 +1,4 @@
-"""Which of the public data products are present in a folder, and the models to use with them.
+"""Public data products present in a data folder, and the default models for them.
 
 A folder is laid out as ``gravity/ kernels/ craters/ dem/ albedo/ photometry/``; any part may be absent.
 """
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class DataFolder:
-    """Paths of the data products found under ``root``; None or an empty tuple for what is absent."""
+    """Paths of the data products found under ``root``; None or an empty tuple for absent products."""
 
     root: Path | None = None
     gravity: Path | None = None
@@ -58,12 +58,12 @@ class DataFolder:
 
 
 def find_data(path: Path | str | None) -> DataFolder:
-    """Return what is present under ``path``; the empty folder for None.
+    """Return the data products found under ``path``; no products for None.
 
     Raises
     ------
     DataFileError
-        Where ``path`` is given and is no folder.
+        If ``path`` is given and is not a folder.
     """
     if path is None:
         return DataFolder()
@@ -93,14 +93,14 @@ def find_data(path: Path | str | None) -> DataFolder:
 
 
 def default_orientation(data: DataFolder) -> Orientation:
-    """Return the DE421 orientation where its file is present, else the IAU series."""
+    """Return the DE421 orientation if its file is present, otherwise the IAU series."""
     if data.orientation_bpc is None:
         return IauOrientation()
     return load_orientation(data.orientation_bpc, data.orientation_tf)
 
 
 def default_gravity(data: DataFolder) -> GravityField:
-    """Return the GRAIL field where its file is present, else the built-in low-degree field."""
+    """Return the GRAIL field if its file is present, otherwise the built-in low-degree field."""
     from lunar.gravity import builtin_gravity, load_gravity
 
     return builtin_gravity() if data.gravity is None else load_gravity(data.gravity)

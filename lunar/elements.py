@@ -1,7 +1,7 @@
-"""Keplerian elements and states, in whatever inertial frame the caller uses for both.
+"""Keplerian elements and state vectors, both in the same inertial frame, which the caller chooses.
 
-Scenarios give elements in the MCI frame (IAU Moon equator and node of date); `icrf_state_from_elements` reads them
-there.  Elements are osculating: those of the two-body orbit with the same position and velocity.
+Scenarios give elements in the MCI frame (IAU Moon equator and node of date); `icrf_state_from_elements` converts
+them to ICRF.  Elements are osculating: those of the two-body orbit with the same position and velocity.
 
 References
 ----------
@@ -46,12 +46,12 @@ def state_from_elements(elements: Elements, gm_m3_s2: float) -> tuple[FloatArray
     Raises
     ------
     OrbitError
-        Where the elements are not those of an ellipse.
+        If the elements do not describe an ellipse.
     """
     a, e = elements.semi_major_axis_m, elements.eccentricity
     if not (math.isfinite(a) and a > 0.0 and 0.0 <= e < 1.0 and 0.0 <= elements.inclination_rad <= math.pi):
         raise OrbitError(
-            "elements: expected a semi-major axis over 0, an eccentricity from 0 to below 1 and an inclination from 0 "
+            "elements: expected a semi-major axis above 0, an eccentricity from 0 to below 1 and an inclination from 0 "
             f"to 180 deg, found {a / 1e3:g} km, {e:g}, {math.degrees(elements.inclination_rad):g} deg"
         )
     p = a * (1.0 - e * e)
@@ -77,12 +77,12 @@ def state_from_elements(elements: Elements, gm_m3_s2: float) -> tuple[FloatArray
 def elements_from_state(position_m: ArrayLike, velocity_m_s: ArrayLike, gm_m3_s2: float) -> Elements:
     """Return the osculating elements of a bound state.
 
-    Angles are in 0..2 pi.  An equatorial orbit has its node along x; a circular one its perilune at the node.
+    Angles are in 0..2 pi.  The node of an equatorial orbit is along x; the perilune of a circular orbit is at the node.
 
     Raises
     ------
     OrbitError
-        Where the state is not that of an ellipse.
+        If the state does not describe an ellipse.
     """
     r = np.asarray(position_m, dtype=np.float64)
     v = np.asarray(velocity_m_s, dtype=np.float64)

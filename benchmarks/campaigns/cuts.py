@@ -1,11 +1,11 @@
-"""Campaign of random cuts of one downlink at any octet, in any order, with repetitions: all archives must be equal.
+"""Campaign that ingests a downlink split at random octets: the archives of all splits must be equal.
 
     python -m benchmarks.campaigns.cuts [--splits 1000] [--kind cadus|packets|both] [--seed S] [--json]
 
 Every split cuts the downlink at random octets into 2 to `--pieces` pieces, ingests them in order or shuffled, with or
 without repetitions, and compares the hash of the archive with that of the downlink ingested as a whole. `--placed`
-tells the ingest where each piece stands; no piece is shorter than `--smallest` octets. Exit status 1 where an archive
-differs.
+passes the position of each piece to the ingest. No piece is shorter than `--smallest` octets. The exit status is 1 if
+an archive differs.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def main() -> int:
     parser.add_argument("--packets", type=int, default=200)
     parser.add_argument("--pieces", type=int, default=24)
     parser.add_argument("--smallest", type=int, default=1, help="octets of the shortest piece")
-    parser.add_argument("--placed", action="store_true", help="tell where each piece stands")
+    parser.add_argument("--placed", action="store_true", help="pass the position of each piece to the ingest")
     parser.add_argument("--orders", nargs="+", choices=ORDERS, default=ORDERS)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", action="store_true")

@@ -14,7 +14,7 @@ from ground_service.errors import Forbidden, NotAuthorised
 from ground_service.http.limits import VERIFIED_CALLER
 from ground_service.http.uploads import Upload, UploadPool
 
-_bearer = HTTPBearer(auto_error=False, description="Token given out by 'linna user add'")
+_bearer = HTTPBearer(auto_error=False, description="Token issued by 'linna user add'")
 
 
 def caller_of(
@@ -37,7 +37,7 @@ def caller_of(
 
 
 def requires(role: str) -> Callable[..., Coroutine[Any, Any, Caller]]:
-    """Return a dependency that refuses callers without this role or a higher one."""
+    """Return a dependency that rejects callers without this role or a higher one."""
 
     async def check(caller: Annotated[Caller, Depends(caller_of)]) -> Caller:
         if not caller.may(role):
@@ -63,7 +63,7 @@ UploadOf = Annotated[Upload, Depends(upload_of)]
 
 
 def idempotent_id(what: str, caller: Caller, key: str | None) -> str | None:
-    """Return the id of the job that belongs to an idempotency key of this caller."""
+    """Return the job id for an idempotency key of this caller; None without a key."""
     if key is None:
         return None
     return hashlib.sha256(f"{caller.name}\0{what}\0{key}".encode()).hexdigest()[:32]

@@ -1,4 +1,4 @@
-"""Client of a ground service in this process: the same operations, without a server."""
+"""In-process client of the ground service, without a server."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ LOCAL_UPLOADS = 2
 
 
 def local_client(ground: Ground, actor: str, *, background: bool = False) -> Client:
-    """Return a client of an opened ground service, which it closes at the end.
+    """Return a client of an open ground service; closing the client closes the ground service.
 
-    It acts as administrator `actor`: who may open the database of this machine may do everything.
+    The client acts as administrator `actor`, because access to the local database implies full access.
 
     Parameters
     ----------
     background
-        Run jobs in a thread, so that their progress can be followed; otherwise jobs are finished when their request
+        Run jobs in a thread, so that their progress can be followed; otherwise each job finishes before its request
         returns.
     """
     return Client(LOCAL_URL, transport=LocalTransport(ground, actor, background=background))
 
 
 def local_app(ground: Ground, actor: str, dispatcher: Dispatcher) -> ASGIApp:
-    """Return the operations of the API for callers in this process, all of whom act as administrator `actor`.
+    """Return the ASGI application of the API for in-process callers, who act as administrator `actor`.
 
-    There are no limits for network callers, and errors are described completely.
+    There are no network limits, and error messages are complete.
     """
     app = FastAPI()
     app.state.ground = ground
@@ -60,7 +60,7 @@ def local_app(ground: Ground, actor: str, dispatcher: Dispatcher) -> ASGIApp:
 
 
 class OperationsOnDemand:
-    """Application that includes a router when the first request for one of its operations arrives."""
+    """ASGI application that includes a router on the first request for one of its operations."""
 
     def __init__(self, app: FastAPI) -> None:
         self._app = app
@@ -80,19 +80,19 @@ class OperationsOnDemand:
 
 
 class LocalDispatcher:
-    """Finishes every job before its request returns."""
+    """Dispatcher that finishes every job before its request returns."""
 
     def __init__(self, ground: Ground) -> None:
         self._ground = ground
 
     def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
-        """Enter a job and finish it."""
+        """Submit a job and run it to completion."""
         from ground_service.worker.dispatch import InlineDispatcher
 
         return InlineDispatcher(self._ground).submit(kind, arguments, job_id=job_id)
 
     def start(self, job_id: str) -> None:
-        """Finish a job that was entered already."""
+        """Run a submitted job to completion."""
         from ground_service.worker.dispatch import InlineDispatcher
 
         InlineDispatcher(self._ground).start(job_id)
@@ -105,7 +105,7 @@ class LocalDispatcher:
 
 
 class FollowUpOnDemand:
-    """Follow-up work of events in this process, imported with the first event."""
+    """In-process follow-up work of events; its code is imported on the first event."""
 
     def __init__(self, ground: Ground) -> None:
         self._ground = ground
@@ -120,7 +120,7 @@ class FollowUpOnDemand:
 
 
 class LocalTransport(httpx.BaseTransport):
-    """Requests to an application in this process. Request bodies are streamed, response bodies are held in memory."""
+    """HTTPX transport to an in-process application, with streamed request bodies and response bodies in memory."""
 
     def __init__(self, ground: Ground, actor: str, *, background: bool = False) -> None:
         self._ground = ground
@@ -136,7 +136,7 @@ class LocalTransport(httpx.BaseTransport):
         try:
             return self._portal.call(self._exchange, request)
         except KeyboardInterrupt:
-            self._ground.stopping.set()  # a job ends between two transactions
+            self._ground.stopping.set()  # a job stops between two transactions
             raise
 
     def close(self) -> None:
@@ -159,7 +159,7 @@ def _background_dispatcher(ground: Ground) -> Dispatcher:
 
 
 class _Blocks(httpx.AsyncByteStream):
-    """Blocks of a request body, each read when the application asks for it."""
+    """Blocks of a request body, read on demand."""
 
     def __init__(self, stream: httpx.SyncByteStream) -> None:
         self._blocks: Iterator[bytes] = iter(stream)

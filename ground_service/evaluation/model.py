@@ -44,14 +44,14 @@ class ChangedFigure(Entity):
 
 
 class Report(Entity):
-    """Report of a pass. The last three values are those of a re-evaluation, null for a report on request."""
+    """Report of a pass; `event`, `previous` and `changes` are null unless a re-evaluation created the report."""
 
     id: str
     pass_id: int
     created: UtcTime
     mission_revision: str | None = Field(description="Revision of the mission description of the evaluation")
     event: int | None = Field(description="Number of the event that caused the re-evaluation")
-    previous: str | None = Field(description="The report before it")
+    previous: str | None = Field(description="Id of the preceding report")
     changes: list[ChangedFigure] | None
 
 

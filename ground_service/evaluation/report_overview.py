@@ -1,4 +1,4 @@
-"""What a page shows of a report: its verdict, its figures, and its error series made short."""
+"""Overview of a report for the web pages: verdict, headline figures and downsampled error series."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ _TEXTS = ("title", "verdict", "verdict_level", "evidence_level", "created_utc", 
 
 
 def report_overview(ground: Ground, report_id: str, max_points: int) -> ReportOverview:
-    """The head of a report and, per navigation solution, its 3-D error in at most `max_points` stretches.
+    """Return the header of a report and the 3-D error of each navigation solution in at most `max_points` intervals.
 
-    Columns of one series have one length: seconds of UTC at the middle of each stretch, least, greatest and mean
-    error in metres, and whether a silence lies before the stretch.
+    The columns of a series have equal length: UTC in seconds at the middle of each interval, minimum, maximum and mean
+    error in metres, and whether a gap precedes the interval.
 
     Raises
     ------
     NotFound
-        If there is no such report, or it has no JSON document.
+        If the report does not exist or has no JSON document.
     """
     row = report_row(ground, report_id)
     if row["json_sha256"] is None:
@@ -49,7 +49,7 @@ def list_reports(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tu
     Raises
     ------
     NotFound
-        If there is no such pass.
+        If the pass does not exist.
     """
     with ground.database.reading() as connection:
         repository.get(connection, repository.PASSES, pass_id, "pass")
@@ -71,7 +71,7 @@ def list_reports(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tu
 
 @lru_cache(maxsize=64)
 def _overview(files: FileArchive, sha256: str, max_points: int) -> dict[str, Any]:
-    """The document of a hash never changes, so neither does what was made of it."""
+    """Return the overview of a stored document; documents never change, so results are cached."""
     document = json.loads(files.get(sha256))
     return {
         **{name: document.get(name) for name in _TEXTS},

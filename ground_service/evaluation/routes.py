@@ -47,7 +47,7 @@ def request_report(
     pass_id: PassId,
     idempotency_key: IdempotencyKey = None,
 ) -> Job:
-    """Request a report of a pass; a job makes it."""
+    """Request a report of a pass; a job creates it."""
     get_pass(ground, pass_id)
     job_id = dispatcher.submit(
         "report", {"pass_id": pass_id}, job_id=idempotent_id(f"report {pass_id}", caller, idempotency_key)
@@ -81,7 +81,7 @@ def get_report(
 
 
 def preferred_kind(accept: str) -> str:
-    """Return the kind of document that an Accept header prefers; JSON if it does not say."""
+    """Return the document format that an Accept header prefers; JSON without a preference."""
     best, weight = "json", 0.0
     for part in accept.split(","):
         media, *parameters = (piece.strip() for piece in part.split(";"))

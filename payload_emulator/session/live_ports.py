@@ -35,7 +35,7 @@ class Client:
     number
         Consecutive number of the connection; unlike a descriptor, it is never reused.
     unsent
-        Octets that were not sent yet.
+        Octets that are not sent yet.
     """
 
     number: int
@@ -92,7 +92,7 @@ class Server:
             self._selector = None
 
     def serve(self, client: Client | None, events: int) -> None:
-        """Handle an event of the listener (None) or of a client, which may have been dropped meanwhile."""
+        """Handle an event of the listener (None) or of a client, which may already have been dropped."""
         if client is None:
             self._accept()
             return
@@ -117,7 +117,7 @@ class Server:
         self.ended(client.number)
 
     def close(self) -> None:
-        """Close the port and all connections, after a last attempt to deliver unsent octets."""
+        """Close the port and all connections, after a final attempt to deliver unsent octets."""
         self.detach()
         due = time.monotonic() + _CLOSE_S
         for client in list(self.clients.values()):
@@ -132,7 +132,7 @@ class Server:
         try:
             connection, _ = self.listener.accept()
         except OSError:
-            return  # the client has disconnected, or descriptors are exhausted: the next event tries again
+            return  # the client has disconnected, or no descriptor is free: retry on the next event
         assert self._selector is not None
         if len(self.clients) >= CLIENT_LIMIT:
             connection.close()

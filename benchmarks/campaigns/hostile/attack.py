@@ -1,9 +1,9 @@
-"""A payload build that tries to take over the service; a test fixture, run only inside the sandbox.
+"""Payload build that attacks the service: a test fixture that runs only in the sandbox.
 
-`attack.py KIND ARCHIVE OUT` reads `targets.json` beside it: the strongest position for an attacker, who knows every
-path, port and process of the service. KIND `explore` makes all attempts that a program survives and writes
-`downlink.packets`: JSON, name → [succeeded, what was seen]. The other kinds make one attempt each, whose success the
-campaign judges from outside.
+`attack.py KIND ARCHIVE OUT` reads `targets.json` from its own folder. The file lists every path, port and process of
+the service, which is the worst case for the defence. KIND `explore` makes all attempts that do not end the process and
+writes the results to `downlink.packets` as JSON: name → [succeeded, observation]. Each other kind makes one attempt,
+and the campaign checks its effect from outside.
 """
 
 import contextlib
@@ -46,7 +46,7 @@ RESULTS: dict = {}
 
 
 def attempt(name, action):
-    """Record an attempt; it succeeded if the action returned something true."""
+    """Record an attempt; it succeeds if the action returns a true value."""
     try:
         seen = action()
     except (OSError, ValueError, MemoryError, RuntimeError, subprocess.SubprocessError) as error:
@@ -253,7 +253,7 @@ def set_namespace(process, kind):
 
 
 def foreign_signal(process):
-    """Send a signal to process 1; permitted in a process namespace without effect, the campaign checks for effects."""
+    """Send a signal to a process. For process 1 of a namespace it is ignored; the campaign checks for effects."""
     if process == 1:
         os.kill(1, 9)
         time.sleep(0.05)
@@ -344,7 +344,7 @@ def much_kernel_memory():
     return total > 256 << 20 and f"{total >> 20} MiB"
 
 
-# Attempts of their own
+# Single attempts
 
 
 def leave_files():
@@ -368,7 +368,7 @@ def finish():
 
 
 def disk_fill():
-    """Fill every writable folder with files of permitted size, and wait for a second."""
+    """Fill every writable folder with files of permitted size, and wait for one second."""
     wanted, written, made = TARGETS["folder_mib"] * 2, 0, []
     for place in (OUT, "/tmp", os.environ["HOME"], "/dev/shm", "/var/tmp", "/run", "/var/lib"):
         number = 0
@@ -391,7 +391,7 @@ def disk_fill():
 
 
 def memory_bomb():
-    """Start several processes that exceed the memory limit only together."""
+    """Start processes that exceed the memory limit together but not individually."""
     for _ in range(8):
         if os.fork() == 0:
             held = bytearray(TARGETS["memory_mib"] * 6 << 17)
@@ -429,7 +429,7 @@ def outlive():
 
 
 def daemon():
-    """Start such daemons, and end immediately with status 0."""
+    """Start the daemons of `outlive`, and exit immediately with status 0."""
     finish()
     if os.fork() == 0:
         outlive()
@@ -458,7 +458,7 @@ def sparse_out():
 
 
 def swap_out():
-    """Replace the output repeatedly by a link to a secret while the launcher copies it."""
+    """Repeatedly replace the output with a link to a secret while the launcher copies it."""
     name = OUT / "downlink.packets"
     finish()
     if os.fork() == 0:

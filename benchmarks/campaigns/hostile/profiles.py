@@ -2,8 +2,8 @@
 
     python -m benchmarks.campaigns.hostile.profiles PROFILE [--keep PATH ...] -- COMMAND ...
 
-Without a container engine: `runner` makes what the engine would, as docker-compose.yml describes the service, from
-namespaces, a read-only root and the engine's system call filter. All profiles but `user` need root.
+No container engine is needed: `runner` reproduces the restrictions of docker-compose.yml with namespaces, a read-only
+root and the engine's system call filter. All profiles except `user` need root.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PROFILES = {
     "root": "root, as on a laptop",
     "uid 10001": "user 10001, as a service without a container",
     "image": "user 10001, no capability, no-new-privileges: the image as compose runs it",
-    "no unshare": "the same, and the engine's filter refuses namespaces",
+    "no unshare": "as `image`, and the engine's filter denies namespaces",
     "runner": "user 0 with SETUID, SETGID and KILL, no network, read-only root, the engine's filter",
 }
 SERVICE_UID = 10_001
@@ -32,7 +32,7 @@ TMP_MIB = 256
 
 
 def enter(profile: str, keep: Sequence[Path], exchange: Path | None = None) -> None:
-    """Apply a profile to this process, with `keep` accessible for every user."""
+    """Apply a profile to this process, and make the `keep` paths accessible to every user."""
     if profile in ("user", "root"):
         return
     kernel.unshare(kernel.CLONE_NEWNS)
@@ -51,7 +51,7 @@ def enter(profile: str, keep: Sequence[Path], exchange: Path | None = None) -> N
         os.setgroups([])
         os.setresgid(SERVICE_UID, SERVICE_UID, SERVICE_UID)
         os.setresuid(SERVICE_UID, SERVICE_UID, SERVICE_UID)
-    # a change of the user cancels it
+    # A change of user resets the parent-death signal, so it is set afterwards.
     kernel.die_with_parent()
     if profile != "uid 10001":
         kernel.forbid_new_privileges()
@@ -86,7 +86,7 @@ def become_container(exchange: Path) -> None:
 
 
 def reveal(paths: Sequence[Path]) -> None:
-    """Make paths accessible although their parent folders are closed to others, in this mount namespace only."""
+    """Make paths accessible to every user regardless of their parent folders, in this mount namespace only."""
     closed: dict[Path, list[Path]] = {}
     for path in dict.fromkeys(path.resolve() for path in paths):
         for parent in reversed(path.parents):

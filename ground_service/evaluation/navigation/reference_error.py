@@ -1,7 +1,7 @@
 """Contribution of the reference to observed errors: its covariance in the NEES, and the error budget.
 
 The reference is assumed independent of the estimate: observed covariance = estimate + reference. This holds for a
-filter whose initial state has no more influence, not for odometry that is reset to the anchor ephemeris.
+filter whose initial state no longer has any influence, but not for odometry that is reset to the anchor ephemeris.
 """
 
 from __future__ import annotations

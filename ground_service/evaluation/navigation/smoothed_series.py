@@ -1,4 +1,4 @@
-"""Smoothed orbit of a pass as a series of the report, in addition to its filter."""
+"""Smoothed orbit of a pass as a navigation series of the report."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SMOOTHER_DEGREE = 100
 def smoother_model(
     gravity: GravityField, orientation: Orientation, burns: tuple[CommandedBurn, ...]
 ) -> SmootherModel:
-    """What the ground knows of the motion, with a field to the degree that it holds."""
+    """Return the smoother's model of the motion, with gravity to `SMOOTHER_DEGREE` or the degree of the field."""
     degree = min(SMOOTHER_DEGREE, gravity.degree)
     return SmootherModel(
         ForceModel(gravity, orientation, degree), white_psd_m2_s3=omission_psd_m2_s3(degree), burns=burns
@@ -52,7 +52,9 @@ def smoothed_series(
     reported
         Positions reported by the same filter.
     track
-        Reference at the times of `filtered`; `path_m` (n,) is the ground path to each.
+        Reference at the times of `filtered`.
+    path_m
+        Length of the ground path up to each time (n,).
     reference_covariance_m2
         Covariance of the reference (3, 3), R/T/N, which the NEES adds to that of the estimate.
     """

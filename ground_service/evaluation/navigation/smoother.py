@@ -1,9 +1,9 @@
-"""Smoothing of the on-board filter after the fact: each state corrected by everything that was seen later.
+"""Rauch-Tung-Striebel smoother of the states of the on-board filter.
 
-The downlinked states and covariances of the filter are run through backwards with the recursion of Rauch, Tung and
-Striebel. Dynamics are the ground's own: a gravity field with Earth and Sun, an empirical acceleration that decays (the
-last three numbers of a state), white acceleration for what the field leaves out, and burns as commanded. Errors that a
-whole session shares (a catalogue displaced, a camera tilted) are in the filter's covariance and stay in the smoothed.
+The recursion runs backwards over the downlinked states and covariances of the filter. The ground uses its own dynamics:
+a gravity field with Earth and Sun, an empirical acceleration that decays exponentially (the last three elements of a
+state), white acceleration for the gravity that the field omits, and commanded burns. Errors common to a whole session
+(a catalogue offset, a camera misalignment) are part of the filter's covariance and remain in the smoothed covariance.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ from lunar.timescales import tdb_s_from_utc_ns
 
 SIZE = 9
 _POSITION, _VELOCITY, _ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)
-# A filtered state this far from what the one before it leads to (chi-square, 9 degrees of freedom: 1e-17 by chance)
-# follows on something that the ground was not told of: the orbit is smoothed on either side of it.
+# Limit of the squared Mahalanobis distance between a filtered state and its prediction from the preceding state (9
+# degrees of freedom: exceeded by chance with a probability of 1e-17). A larger distance indicates an event unknown to
+# the ground, so the segments before and after it are smoothed separately.
 _BROKEN = 100.0
-# Over a minute the axes of the orbit turn by 3 degrees: the empirical acceleration, 1e-6 m/s^2, is held in them.
+# The R/T/N axes rotate by 3 degrees per minute: within a step, the empirical acceleration (1e-6 m/s^2) is constant.
 _LONGEST_STEP_S = 60.0
 
 
@@ -35,7 +36,7 @@ class FilterStates:
     Attributes
     ----------
     utc_ns
-        Shape (n,).
+        Time tags, shape (n,).
     state
         Position (m) and velocity (m/s), Moon-centred ICRF, empirical acceleration (m/s^2; R, T, N), shape (n, 9).
     covariance
@@ -54,7 +55,7 @@ class FilterStates:
         return len(self.utc_ns)
 
     def select(self, which: NDArray[np.bool_]) -> FilterStates:
-        """The states of a mask."""
+        """Return the states that a mask selects."""
         degrees = None if self.innovation_degrees is None else self.innovation_degrees[which]
         return FilterStates(self.utc_ns[which], self.state[which], self.covariance[which], degrees)
 
@@ -67,14 +68,14 @@ class FilterStates:
 
     @property
     def sigma_rtn_m(self) -> FloatArray:
-        """Standard deviations of the position (n, 3): radial, transverse, normal."""
+        """Return the standard deviations of the position (n, 3): radial, transverse, normal."""
         variance = np.einsum("nii->ni", self.position_covariance_rtn_m2)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CommandedBurn:
-    """An impulsive burn as commanded: ICRF, with one sigma per axis of its execution."""
+    """Commanded impulsive burn: delta-v in ICRF and execution error per axis (1 sigma)."""
 
     utc_ns: int
     delta_v_m_s: FloatArray
@@ -83,18 +84,18 @@ class CommandedBurn:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmootherModel:
-    """What the ground knows of the motion.
+    """Force model and process noise of the smoother.
 
     Attributes
     ----------
     forces
         Gravity field with Earth and Sun.
     white_psd_m2_s3
-        Spectral density of white acceleration, R, T, N: gravity beyond the degree of the field.
+        Power spectral density of the white acceleration (R, T, N), for gravity above the degree of the field.
     markov_sigma_m_s2, correlation_s
-        Standard deviation and memory of the empirical acceleration.
+        Standard deviation (R, T, N) and correlation time of the empirical acceleration.
     burns
-        In time order.
+        Commanded burns in time order.
     """
 
     forces: ForceModel
@@ -105,10 +106,10 @@ class SmootherModel:
 
 
 def smooth(filtered: FilterStates, model: SmootherModel) -> FilterStates:
-    """The states given everything that was seen, before and after.
+    """Return the states estimated from all measurements, earlier and later.
 
-    Where a state does not follow on the one before it (a jump of the clock, a restart, an uncommanded burn), the
-    stretches on either side are smoothed alone.
+    Where a state does not follow from the preceding one (clock jump, restart, uncommanded burn), the segments before
+    and after it are smoothed separately.
 
     References
     ----------
@@ -141,7 +142,7 @@ def _turned(matrices: FloatArray) -> FloatArray:
 def _carried(
     state: FloatArray, from_utc_ns: IntArray, to_utc_ns: IntArray, model: SmootherModel
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """States (n, 9), transitions (n, 9, 9) and process noise (n, 9, 9) from each of n instants to a later one."""
+    """Return states (n, 9), transition matrices and process noise (n, 9, 9 each), propagated over n intervals."""
     state = state.copy()
     total = np.tile(np.eye(SIZE), (len(state), 1, 1))
     noise = np.zeros((len(state), SIZE, SIZE))
@@ -169,9 +170,9 @@ def _carried(
 def _legs(
     from_utc_ns: int, to_utc_ns: int, start_s: float, burns: tuple[CommandedBurn, ...]
 ) -> list[tuple[float, float, CommandedBurn | None]]:
-    """Start (TDB seconds), length (s) and the burn at the end, if any, of every step from one instant to a later.
+    """Return start (TDB seconds), length (s) and final burn, if any, of every integration step of an interval.
 
-    ``start_s`` is the first instant in TDB seconds.
+    ``start_s`` is the start of the interval in TDB seconds.
     """
     legs: list[tuple[float, float, CommandedBurn | None]] = []
     at = from_utc_ns
@@ -190,7 +191,7 @@ def _legs(
 def _step(
     state: FloatArray, tdb_s: FloatArray, step_s: FloatArray, model: SmootherModel
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """States (n, 9) after steps of their own (n,), with transitions and process noise (n, 9, 9)."""
+    """Return states (n, 9) after one step each (n,), with transition matrices and process noise (n, 9, 9 each)."""
     position, velocity = np.empty((len(state), 3)), np.empty((len(state), 3))
     transition = np.zeros((len(state), SIZE, SIZE))
     for row, (one, start, length) in enumerate(zip(state, tdb_s.tolist(), step_s.tolist(), strict=True)):
@@ -217,7 +218,7 @@ def _step(
 
 
 def _divided(left: FloatArray, covariance: FloatArray) -> FloatArray:
-    """left covariance^-1 of stacks, scaled so that metres and micrometres per second squared are of one size."""
+    """Return left @ covariance^-1 of stacked matrices, scaled for elements that differ by orders of magnitude."""
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 1e-30))
     correlation = covariance / (scale[:, :, None] * scale[:, None, :])
     solved = np.linalg.solve(correlation, _turned(left / scale[:, None, :]))

@@ -1,4 +1,4 @@
-"""Metrics of a build over passes: each a ratio of sums or a percentile over frames."""
+"""Metrics of a build over passes. Each metric is a ratio of sums or a percentile over frames."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from ground_service.regression.gates.statistics import weighted_quantile, weight
 from lunar.arrays import FloatArray
 
 LATENCY_LEVEL = 0.25
-"""Of CPU times the lower quartile over the frames is taken: whatever else the machine does only ever adds."""
+"""Level of the percentile of CPU times: the lower quartile, because other load on the machine only increases them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ratio:
-    """Ratio of two sums over frames, (n,) each; NaN in the numerator leaves a frame out.
+    """Ratio of two sums over frames, (n,) each; NaN in the numerator excludes a frame.
 
     Attributes
     ----------
@@ -31,12 +31,12 @@ class Ratio:
     counts: bool
 
     def value(self, weights: FloatArray) -> FloatArray:
-        """Value for each row of weights (b, n)."""
+        """Return the value for each row of weights (b, n)."""
         return weighted_ratio(self.numerator, self.denominator, weights)
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Frames (n,) that have a value."""
+        """Return the mask (n,) of the frames that have a value."""
         return np.isfinite(self.numerator)
 
 
@@ -48,12 +48,12 @@ class Percentile:
     level: float
 
     def value(self, weights: FloatArray) -> FloatArray:
-        """Value for each row of weights (b, n)."""
+        """Return the value for each row of weights (b, n)."""
         return weighted_quantile(self.values, self.level, weights)
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Frames (n,) that have a value."""
+        """Return the mask (n,) of the frames that have a value."""
         return np.isfinite(self.values)
 
 
@@ -67,13 +67,13 @@ class Figure:
     Attributes
     ----------
     name, unit
-        As in policies and verdicts.
+        Name and unit in policies and verdicts.
     higher_is_better
         Direction of improvement.
     relative
         Whether a change counts as a ratio (lengths, times) or as a difference (shares, pixels).
     sample
-        What the metric is computed from.
+        Function that returns the sample of the metric.
     """
 
     name: str
@@ -83,7 +83,7 @@ class Figure:
     sample: Callable[[PassFrames], Sample]
 
     def compute(self, frames: PassFrames, weights: FloatArray) -> FloatArray:
-        """Value for each row of weights (b, n)."""
+        """Return the value for each row of weights (b, n)."""
         return self.sample(frames).value(weights)
 
 
@@ -146,7 +146,7 @@ def figures_of(passes: Sequence[PassFrames]) -> tuple[Figure, ...]:
 
 
 def outcome_shares(frames: PassFrames) -> dict[str, dict[str, float]]:
-    """Share of frames of every outcome, by estimator."""
+    """Return the share of frames of every outcome, by estimator."""
     shares: dict[str, dict[str, float]] = {}
     for name, estimator in frames.estimators.items():
         known = [outcome for outcome in estimator.outcome if outcome]
@@ -190,7 +190,7 @@ def same_telemetry(first: PassFrames, second: PassFrames) -> bool:
 
 
 def joined(passes: Sequence[PassFrames]) -> PassFrames:
-    """The frames of some passes one after another; what a pass lacks is NaN there."""
+    """Return the concatenated frames of several passes; values that a pass does not have are NaN."""
     if len(passes) == 1:
         return passes[0]
 
