@@ -194,7 +194,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=100.0, help="requests a second")
     parser.add_argument("--seconds", type=float, default=20.0, help="of requests")
     parser.add_argument("--stream-mb", type=int, default=2000, help="size of the downlink that streams in")
-    parser.add_argument("--database-url", help="an empty PostgreSQL database; default: a server of its own")
+    parser.add_argument("--database-url", help="an empty PostgreSQL database; default: a temporary server")
     parser.add_argument(
         "--only", nargs="+", choices=PARTS, default=PARTS, metavar="PART", help=" ".join(PARTS)
     )

@@ -195,7 +195,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--edges", type=int, default=100_000)
     parser.add_argument("--pieces", type=int, default=40)
-    parser.add_argument("--postgresql", action="store_true", help="on a PostgreSQL server of its own")
+    parser.add_argument("--postgresql", action="store_true", help="use a temporary PostgreSQL server")
     parser.add_argument("--workers", action="store_true", help="measure the rate of one and of two workers")
     given = parser.parse_args()
     if given.workers:

@@ -1,4 +1,4 @@
-"""The report of a campaign: many passes beside one another."""
+"""Report of a campaign: comparison of many passes."""
 
 from __future__ import annotations
 

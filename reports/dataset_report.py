@@ -55,7 +55,7 @@ def dataset_document(report: DatasetReport) -> Document:
         blocks.append(
             Picture(
                 "places",
-                "Where the frames lie, by part. The test part is to be a region of its own, never trained on.",
+                "Positions of the frames by part. The test part must be a separate region, not used for training.",
                 "Map of the frames by part.",
                 3.9,
                 lambda c: dataset.draw_places(c, places, report.terrain),
@@ -114,7 +114,7 @@ def _classes(report: DatasetReport) -> list[Block]:
         for c in report.classes
     )
     table = Table(
-        "Labels by size class, beside those of the paper's data set.",
+        "Labels by size class, compared with those of the paper's data set.",
         (
             Column("class", numeric=False),
             *(Column(p, group="labels by part") for p in parts),

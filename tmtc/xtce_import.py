@@ -174,13 +174,13 @@ def _system(node: Node, parent: _System | None) -> _System:
                 _expect(
                     element,
                     key not in found,
-                    "a name of its own",
+                    "a unique name",
                     f"one taken at line {found[key].line if key in found else 0}",
                 )
                 found[key] = element
     for inner in node.all("SpaceSystem"):
         child = _system(inner, system)
-        _expect(inner, child.name not in system.systems, "a name of its own", f"a second {child.name!r}")
+        _expect(inner, child.name not in system.systems, "a unique name", f"a second {child.name!r}")
         system.systems[child.name] = child
     return system
 
@@ -450,7 +450,7 @@ class _Importer:
         for member in listed.children:
             member.only(_DESCRIPTION, (*_NAMED, "typeRef", "initialValue"))
             name = member.attribute("name")
-            _expect(member, name not in members, "a name of its own", "a second one")
+            _expect(member, name not in members, "a unique name", "a second one")
             owner, found = self.find("types", member.attribute("typeRef"), system, member)
             members[name] = self.type(owner, found)
             values += self.values[id(found)]

@@ -441,7 +441,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--postgresql", action="store_true", help="on a PostgreSQL server of its own")
+    parser.add_argument("--postgresql", action="store_true", help="use a temporary PostgreSQL server")
     parser.add_argument("--quick", action="store_true", help="without ingesting the raw files again")
     parser.add_argument(
         "--single", action="store_true", help="one damage to each copy (default: at most one of each kind)"

@@ -128,7 +128,7 @@ def ensure_user(ground: Ground, name: str, role: str, token: str, *, actor: str 
             raise Conflict(f"user {name}: expected state active, found {user['state']}")
         known = repository.find(connection, repository.TOKENS, token_sha256=hashed)
         if known is not None and (user is None or known["user_id"] != user["id"]):
-            raise Conflict(f"user {name}: expected a token of its own, found that of another user")
+            raise Conflict(f"user {name}: expected a unique token, found that of another user")
         if known is not None and known["revoked_utc_ns"] is not None:
             raise Conflict(f"user {name}: expected a token in force, found one that was revoked")
         if user is not None:

@@ -430,9 +430,9 @@ def _file_hash(build_file: Path, name: str) -> str:
     path = build_file.parent / name
     inside = not Path(name).is_absolute() and path.resolve().is_relative_to(build_file.parent.resolve())
     if not inside:
-        raise InvalidInput(str(build_file), name, "a file beside the build file", "one elsewhere")
+        raise InvalidInput(str(build_file), name, "a file in the folder of the build file", "one elsewhere")
     if not path.is_file():
-        raise InvalidInput(str(build_file), name, "a file beside the build file", "nothing there")
+        raise InvalidInput(str(build_file), name, "a file in the folder of the build file", "nothing there")
     return _hash_of(path)
 
 

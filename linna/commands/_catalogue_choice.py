@@ -1,4 +1,4 @@
-"""The crater catalogue that a command works with: a file, a public one or a synthetic one."""
+"""Choice of the crater catalogue of a command: a file, a public catalogue or a synthetic one."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ if TYPE_CHECKING:
 
 SYNTHETIC = ("paper-density", "paper-density-synthetic", "paper-density-uniform")
 CATALOGUE_HELP = (
-    "catalogue (CSV, plain or gzip), or paper-density: the paper's class counts, from the real catalogue at hand "
-    "completed with random craters where it is silent (paper-density-synthetic: all random, few in the maria; "
-    "paper-density-uniform: all random); default: the catalogue of the data at hand"
+    "catalogue (CSV, plain or gzip), or paper-density: the paper's class counts, from the available real catalogue, "
+    "with random craters in its empty tiles (paper-density-synthetic: all random, few in the maria; "
+    "paper-density-uniform: all random); default: the most complete catalogue of the data folder"
 )
 
 
 def open_catalogue(name: str | None, seed: int) -> CraterCatalogue:
     """Return the catalogue of a file or of one of `SYNTHETIC`; without a name, the most complete available one.
 
-    The paper's density comes from the real catalogue, completed with random craters where it is silent, or is all
-    synthetic where none is available.
+    The catalogue of the paper's density is the real catalogue with random craters in its empty tiles, or entirely
+    synthetic if no real catalogue is available.
     """
     from linna.data import data_folder
     from lunar.catalogue import completed_to_paper, load_catalogue, paper_density_catalogue

@@ -40,13 +40,13 @@ def _list(arguments: argparse.Namespace) -> int:
 
     root = _root(arguments)
     rows = survey(root, PRODUCTS)
-    lines = [f"data folder: {root}{'' if root.is_dir() else ' (not there)'}"]
+    lines = [f"data folder: {root}{'' if root.is_dir() else ' (does not exist)'}"]
     for row in rows:
         have = f"{row['files_present']} of {row['files']}" if row["files"] else "none known"
         own = f", {row['files_of_its_own']} other files of it" if row["files_of_its_own"] else ""
         lines += [
             f"\n{row['name']}: {row['title']}",
-            f"  files at hand: {have}{own}; to fetch: {_size(row['octets'])}; "
+            f"  available files: {have}{own}; to download: {_size(row['octets'])}; "
             f"checksums: {', '.join(row['checksums']) or 'unknown'}",
             f"  licence: {row['licence']}",
             f"  cite: {row['citation']}",

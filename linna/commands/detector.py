@@ -59,7 +59,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=int,
         choices=(1, 2),
         default=1,
-        help="the network enlarges images so many times, for high altitudes; --crop counts pixels before that",
+        help="factor by which the network enlarges images, for high altitudes; --crop is in pixels before enlargement",
     )
     train.add_argument(
         "--replicas", type=int, default=0, help="threads that train side by side (0: one per core)"
@@ -95,7 +95,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=int,
         choices=(0, 1, 2),
         default=0,
-        help="make the network enlarge images so many times first (0: as it is)",
+        help="factor by which the network first enlarges images (0: factor of the network)",
     )
     export.add_argument(
         "--test", action="store_true", help="score the test splits and write the figures into the model"
@@ -127,7 +127,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         nargs=2,
         default=(0.0, 0.0),
         metavar=("EAST_M", "NORTH_M"),
-        help="of the terrain in the pictures beside the table (default: 0 0)",
+        help="offset of the terrain in the images from the table (default: 0 0)",
     )
     evaluate.add_argument("--report", type=Path, default=None, metavar="F.html", help="write one HTML report")
     evaluate.add_argument("--run", type=Path, default=None, help="training run whose curves the report shows")

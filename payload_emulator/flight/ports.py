@@ -1,7 +1,7 @@
 """Interfaces of the payload with the board it runs on and with the spacecraft (Fig. 1 of the paper).
 
-Frames, attitude, time and telecommands come through `Payload.step`; everything else through a `Board`. All that
-crosses is arrays, counts and octets, so that nothing of a simulated truth can.
+Frames, attitude, time and telecommands come through `Payload.step`; everything else through a `Board`. Only
+arrays, counts and octets cross these interfaces, so that no simulated truth can.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SETTINGS_OCTETS = 64 << 10
 
 
 class ResetCause(IntEnum):
-    """Why the processor started: a register of the board."""
+    """Cause of the last processor start, from a register of the board."""
 
     power_on = 0
     commanded = 1
@@ -32,7 +32,7 @@ class ResetCause(IntEnum):
 
 
 class Stage(IntEnum):
-    """What the processor is busy with; the board's counter is read at every change."""
+    """Current task of the processor; the board's counter is read at every change."""
 
     idle = 0
     commands = 1
@@ -50,14 +50,14 @@ class Load(IntEnum):
 
 
 class Board(Protocol):
-    """What flight software finds around itself.
+    """Hardware interface of the flight software.
 
     Attributes
     ----------
     reset_cause
-        A `ResetCause`.
+        Value of `ResetCause`.
     store, settings
-        Non-volatile memory for packets and for settings, uint8, kept through resets.
+        Non-volatile memory for packets and for settings, uint8, retained over resets.
     """
 
     reset_cause: int
@@ -65,49 +65,49 @@ class Board(Protocol):
     settings: Memory
 
     def sensors(self) -> FloatArray:
-        """Readings in the order of `SENSORS` (EPS, thermistors), NaN where one is dead."""
+        """Return readings in the order of `SENSORS` (EPS, thermistors); NaN for a failed sensor."""
         ...
 
     def switch(self, loads: int) -> None:
-        """Power the loads whose bits are set, and no others (EPS)."""
+        """Switch on the loads whose bits are set, and switch off all others (EPS)."""
         ...
 
     def enter(self, stage: int) -> int:
-        """Begin a stage; the processor's time counter in nanoseconds."""
+        """Begin a stage; return the processor's time counter in nanoseconds."""
         ...
 
     def memory_octets(self) -> int:
-        """Working memory in use."""
+        """Return the octets of working memory in use."""
         ...
 
     def uptime_ticks(self) -> int:
-        """Free-running counter of 2^-16 s since power-on, -1 where the board has none."""
+        """Return the free-running counter of 2^-16 s since power-on; -1 if the board has none."""
         ...
 
     def downlink_octets(self) -> int:
-        """Octets of packets that TM/TC takes now; 0 without a link."""
+        """Return the octets of packets that TM/TC accepts now; 0 without a link."""
         ...
 
     def load(self, region: int, octets: bytes) -> Memory:
-        """Put octets into working memory; the memory itself comes back, so that it can be checked."""
+        """Write octets to working memory; return the memory itself, so that it can be checked."""
         ...
 
     def read_table(self, number: int) -> bytes:
-        """A table or model from non-volatile memory, empty where there is none."""
+        """Return a table or model from non-volatile memory; empty if there is none."""
         ...
 
     def write_table(self, number: int, octets: bytes) -> None:
-        """Keep a table or model in non-volatile memory."""
+        """Store a table or model in non-volatile memory."""
         ...
 
     def request_reset(self, cause: int) -> None:
-        """Start the processor anew once this step is over."""
+        """Restart the processor at the end of this step."""
         ...
 
 
 @dataclass(slots=True, eq=False)
 class BareBoard:
-    """A board without a simulation behind it: steady sensors, no counters, a link that takes everything."""
+    """Board without a simulation: constant sensor readings, no counters and an unlimited link."""
 
     reset_cause: int = ResetCause.power_on
     store: Memory = field(default_factory=lambda: np.zeros(STORE_OCTETS, dtype=np.uint8))

@@ -1,4 +1,4 @@
-"""What all sections of a pass report share: the value, its time axis, its colours, and why things are missing."""
+"""Common parts of the sections of a pass report: values, time axis, colours and reasons for missing items."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from reports.text import hash_text
 from reports.values import ODOMETRY_OUTCOMES, NavigationSeries, PassReport, TimeSpan
 
 _USUAL_REASON = {
-    "verdict": "nobody has judged this pass",
-    "headline": "no figure was computed",
+    "verdict": "the pass has no verdict",
+    "headline": "no headline figure was computed",
     "accounting": "the frames of the pass were not counted",
-    "packets": "no account of the downlink came with the pass",
+    "packets": "the pass has no packet accounting",
     "reference": "no reference ephemeris covers the pass",
     "navigation": "no navigation telemetry was received",
-    "error": "no state that came down has a number and a reference to compare it with",
-    "outcomes": "no estimator reported what its matcher did",
-    "detector": "detections, catalogue and reference orbit were not all at hand",
+    "error": "no downlinked state has both values and a reference",
+    "outcomes": "no estimator reported matching outcomes",
+    "detector": "detections, catalogue or reference orbit are not available",
     "gallery": "the pass has no images on the ground",
     "worst_frames": "the pass has no images on the ground",
     "craters": "no catalogue was given for the map",
@@ -37,7 +37,7 @@ _USUAL_REASON = {
 
 @dataclass(frozen=True, slots=True)
 class PassView:
-    """A pass report with what all its sections share."""
+    """Pass report with the values that its sections share."""
 
     report: PassReport
     time: TimeScale
@@ -60,12 +60,12 @@ class PassView:
         return tuple(s for s in self.report.navigation if np.isfinite(s.error_rtn_m).any())
 
     def absent(self, field: str, what: str) -> Absent:
-        """The block that says that a section is not available."""
+        """Return the block for a section that is not available."""
         why = self.report.not_available.get(field) or _USUAL_REASON.get(field, "not given")
         return Absent(what, why)
 
     def no_error(self) -> Absent:
-        """The block that says why no error can be shown."""
+        """Return the block with the reason why no error is available."""
         if not self.report.navigation:
             return self.absent("navigation", "Navigation")
         return self.absent("error" if self.report.reference else "reference", "Position error")

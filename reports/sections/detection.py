@@ -1,4 +1,4 @@
-"""The detector: scores beside the paper's, bias, curves, galleries."""
+"""Detector sections: scores compared with the paper's, bias, curves and galleries."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from reports.values import ClassScore, DetectorScore, GalleryFrame
 
 
 def detector_table(score: DetectorScore) -> Table:
-    """Scores by class beside the paper's."""
+    """Return the scores by class, compared with the paper's."""
     rows: list[tuple[Cell | str, ...]] = []
 
     def row(s: ClassScore, strong: bool) -> tuple[Cell | str, ...]:
@@ -38,7 +38,7 @@ def detector_table(score: DetectorScore) -> Table:
     if score.micro is not None:
         rows.append(row(score.micro, True))
     return Table(
-        f"Detection by size class, beside the {SOURCE}.",
+        f"Detection by size class, compared with the {SOURCE}.",
         (
             Column("class", numeric=False),
             Column("expected", group="craters"),

@@ -48,7 +48,7 @@ class Judged(Protocol):
 
 
 def about(report: Judged, *facts: tuple[str, str]) -> tuple[tuple[str, str], ...]:
-    """Facts under the title, those that are known."""
+    """Return the known facts for the header."""
     known = (*facts, ("for", report.generated_for), ("made", report.created_utc))
     return tuple((name, value) for name, value in known if value)
 
@@ -59,7 +59,7 @@ def judgement(report: Judged, *, counts_only: bool = False) -> list[Block]:
     if report.verdict:
         blocks.append(Verdict(report.verdict[0].upper() + report.verdict[1:], report.verdict_level))
     else:
-        blocks.append(absent(report, "verdict", "Verdict", "nobody has judged this"))
+        blocks.append(absent(report, "verdict", "Verdict", "there is no verdict"))
     if report.headline:
         blocks.append(
             Headline(
@@ -72,12 +72,12 @@ def judgement(report: Judged, *, counts_only: bool = False) -> list[Block]:
 
 
 def absent(report: Judged, field: str, what: str, usual: str) -> Absent:
-    """The block that says that something is not available."""
+    """Return the block for an item that is not available."""
     return Absent(what, report.not_available.get(field) or usual)
 
 
 def missing_and_remarks(report: Judged) -> list[Block]:
-    """What the report does not show, and what its makers add."""
+    """Return the list of missing items and the remarks."""
     blocks: list[Block] = []
     if report.not_available:
         blocks.append(Heading("What this report does not show", 3))
@@ -90,7 +90,7 @@ def missing_and_remarks(report: Judged) -> list[Block]:
 
 
 def provenance_and_data(report: Judged) -> list[Block]:
-    """Where the figures come from and what they rest on."""
+    """Return the provenance of the figures and their data sources."""
     blocks: list[Block] = [Heading("Provenance and data")]
     if evidence_number(report.evidence_level) is not None:
         blocks.append(

@@ -139,11 +139,11 @@ def test_an_empty_pass_says_what_is_missing_and_why() -> None:
     page = Page(render_html(PassReport(title="Nothing", pass_id="p0")))
     assert page.left_open == []
     for what, why in (
-        ("Verdict", "nobody has judged this"),
+        ("Verdict", "there is no verdict"),
         ("Navigation", "no navigation telemetry was received"),
         ("Frame accounting", "the frames of the pass were not counted"),
-        ("Packet accounting", "no account of the downlink came with the pass"),
-        ("Matcher outcomes", "no estimator reported what its matcher did"),
+        ("Packet accounting", "the pass has no packet accounting"),
+        ("Matcher outcomes", "no estimator reported matching outcomes"),
         ("Altitude against the reference", "no reference ephemeris covers the pass"),
         ("Ground track", "no reference ephemeris covers the pass"),
         ("Gallery of detections", "the pass has no images on the ground"),
@@ -242,7 +242,8 @@ def test_series_of_nothing_but_nan_are_dashes_not_numbers() -> None:
         render_html(PassReport("NaN", "p3", navigation=(one,), reference=track, headline=headline))
     ).text
     assert text.count("not available") >= 4
-    assert text.count("Position error not available: no state that came down has a number") == 2
+    absent = "Position error not available: no downlinked state has both values and a reference"
+    assert text.count(absent) == 2
     assert "Altitude of the reference; no estimate of it came down." in text
     assert "nan" not in text.lower().replace("nan ", "", 1).split("pass report")[-1]
 

@@ -116,8 +116,8 @@ def test_octets_of_other_encodings_are_read():
         (document(U8, {"a": "u8"}, container("P", ["a"], "Q")), "the name of a container, found 'Q'"),
         (document(U8, {"a": "u8"}, PLAIN + container("Q", [], "P", comparison("b", 1))), "found 'b'"),
         (document(U8, {"a": "u8"}, PLAIN + container("Q", [], "P", comparison("a.x", 1))), "member of 'u8', found 'x'"),
-        (document(U8 + U8, {"a": "u8"}, PLAIN), "a name of its own"),
-        (document(U8, {"a": "u8"}, PLAIN + PLAIN), "a name of its own"),
+        (document(U8 + U8, {"a": "u8"}, PLAIN), "a unique name"),
+        (document(U8, {"a": "u8"}, PLAIN + PLAIN), "a unique name"),
         (
             document(U8, {"a": "u8", "b": "u8"}, PLAIN + container("Q", ["b"], "P", comparison("b", 1))),
             "parameters that stand before, found 'b'",

@@ -1,4 +1,4 @@
-"""The part of the interface control document that is about the payload itself: ports, modes, parameters, faults."""
+"""Payload part of the interface control document: ports, modes, parameters and faults."""
 
 from __future__ import annotations
 
@@ -14,28 +14,31 @@ _PORTS = {
     "EPS": (("sensors", "switch"), "power in, switched loads"),
     "ADCS and OBDH": (("uptime_ticks",), "attitude and time; see also the arguments of a step"),
     "TM/TC": (("downlink_octets",), "telemetry out, telecommands in; see also the arguments of a step"),
-    "Processor": (("enter", "memory_octets", "load", "request_reset"), "the board the software runs on"),
-    "Non-volatile memory": (("read_table", "write_table"), "besides the attributes `store` and `settings`"),
+    "Processor": (("enter", "memory_octets", "load", "request_reset"), "the board that runs the software"),
+    "Non-volatile memory": (
+        ("read_table", "write_table"),
+        "in addition to the attributes `store` and `settings`",
+    ),
 }
 
 _STEP = """\
 # Interface control document: the payload in its spacecraft
 
-The interfaces of Fig. 1 of the paper. All that crosses them is arrays, counts and octets.
+The interfaces of Fig. 1 of the paper. Only arrays, counts and octets cross them.
 
 ## A step
 
 The spacecraft calls `Payload.step(image, attitude, clock_ticks, telecommand_octets, instruments)` for every frame, and
-now and then without one; telemetry packets come back. The last argument may be left out.
+occasionally without an image. It returns telemetry packets. The last argument is optional.
 
 | argument | from | content |
 |---|---|---|
-| image | camera | (H, W) or (H, W, 3), unsigned integers or fractions; without pixels: the camera gave none |
+| image | camera | (H, W) or (H, W, 3), unsigned integers or fractions; no pixels if the camera delivered no image |
 | attitude | ADCS | seven f64: q_wxyz of camera from ICRF, unit Sun vector in the camera frame; NaN where absent |
 | clock_ticks | OBDH | on-board time of the image, 2^-16 s |
-| telecommand_octets | TM/TC | telecommand packets that came since the step before, one after another |
-| instruments | instruments | by name, samples since the frame before, f64 (n, k); see "Instruments" |
-| returned | TM/TC | telemetry packets, no more than `downlink_octets` in all |
+| telecommand_octets | TM/TC | telecommand packets received since the preceding step, concatenated |
+| instruments | instruments | by name, samples since the preceding frame, f64 (n, k); see "Instruments" |
+| returned | TM/TC | telemetry packets, at most `downlink_octets` in total |
 """
 
 # Fault, events, reaction.
@@ -53,7 +56,7 @@ _FAULTS = (
     (
         "no attitude",
         "attitude_missing",
-        "the frame is worked on by the odometries only",
+        "only the odometry estimators process the frame",
     ),
     (
         "detector too slow",
@@ -61,14 +64,14 @@ _FAULTS = (
         "its detections are not used; `detector_failures` in a row: safe",
     ),
     (
-        "detector throws",
+        "detector raises an exception",
         "detector_error",
         "the frame is not used; `detector_failures` in a row: safe",
     ),
     (
         "estimate cannot be inverted",
         "estimator_error",
-        "the estimator begins again from its tables",
+        "the estimator restarts from its tables",
     ),
     (
         "filter diverges",
@@ -76,7 +79,7 @@ _FAULTS = (
         "the search for craters is widened until it is found again",
     ),
     (
-        "processor stands still",
+        "processor hangs",
         "watchdog_reset",
         "reset by the watchdog; the observation is resumed; `watchdog_limit` within an hour: safe",
     ),
@@ -84,7 +87,7 @@ _FAULTS = (
         "bits of model, parameters or tables change",
         "model_hash_mismatch, parameters_hash_mismatch, catalogue_hash_mismatch, "
         "anchor_table_hash_mismatch, table_hash_mismatch",
-        "restored from the kept copy (memory_repaired); where that is damaged too: memory_unrepairable, safe",
+        "restored from the backup copy (memory_repaired); if it is also damaged: memory_unrepairable, safe",
     ),
     (
         "bits of the packet store change",
@@ -94,12 +97,12 @@ _FAULTS = (
     (
         "packet store full",
         "store_overwritten, storage_full",
-        "the oldest of its class is overwritten, or the newest refused (`store_overwrite`)",
+        "the oldest of its class is overwritten, or the newest is rejected (`store_overwrite`)",
     ),
     (
         "reset",
         "boot, state_recovered",
-        "settings, schedule, sequence counts and unsent packets go on; a wanted reset ends in standby",
+        "settings, schedule, sequence counts and unsent packets are retained; a requested reset ends in standby",
     ),
     (
         "settings lost",
@@ -109,7 +112,7 @@ _FAULTS = (
     (
         "clock jumps",
         "clock_jump",
-        "housekeeping begins anew; activities passed over expire (activity_expired)",
+        "housekeeping restarts; skipped activities expire (activity_expired)",
     ),
     (
         "bus voltage low",
@@ -132,23 +135,23 @@ _PRODUCTS = """\
 ## Large data products
 
 Thumbnail (table 6): frame number (u32), on-board time (u64), rows (u16), columns (u16), then the gray levels (u8, row
-by row) compressed by zlib. Landmark map (table 7): for every crater that was used, by identity: identity (u32), frames
+by row) compressed by zlib. Landmark map (table 7): for every crater used, sorted by identity: identity (u32), frames
 that used it (u16).
 """
 
 
 def format_interfaces() -> str:
-    """The document, in Markdown."""
+    """Return the payload part of the document in Markdown."""
     return "\n".join(
         [_STEP, *_instruments(), *_ports(), *_modes(), *_parameters(), *_store(), _PRODUCTS, *_faults()]
     )
 
 
 def _instruments() -> list[str]:
-    """Columns of the samples of each optional instrument."""
+    """Return the columns of the samples of each optional instrument."""
     lines = [
         "## Instruments\n",
-        "Optional. A row per sample in order of time, up to the time of the frame; the packet of the same name reports "
+        "Optional. One row per sample in time order, up to the time of the frame. The packet of the same name reports "
         "their use.\n",
         "| instrument | columns | gives attitude |\n|---|---|---|",
     ]
@@ -178,14 +181,14 @@ def _modes() -> list[str]:
     head = " | ".join(mode.name for mode in PayloadMode)
     lines = [
         "## Modes\n",
-        "By telecommand or schedule; fault reactions lead to safe or standby from anywhere.\n",
+        "By telecommand or schedule; fault reactions lead to safe or standby from any mode.\n",
         f"| from \\ to | {head} |\n|---|---|---|---|---|",
     ]
     for present in PayloadMode:
         cells = ["yes" if wanted in TRANSITIONS[present] else "no" for wanted in PayloadMode]
         lines.append(f"| {present.name} | {' | '.join(cells)} |")
     lines.append(
-        f"\nTelecommands and functions that not every mode allows:\n\n| | {head} |\n|---|---|---|---|---|"
+        f"\nTelecommands and functions that are not allowed in every mode:\n\n| | {head} |\n|---|---|---|---|---|"
     )
     for name, modes in ALLOWED.items():
         cells = ["yes" if mode in modes else "no" for mode in PayloadMode]
@@ -197,7 +200,7 @@ def _modes() -> list[str]:
 def _parameters() -> list[str]:
     lines = [
         "## Parameters\n",
-        "| number | name | unit | least | greatest | default | |\n|---|---|---|---|---|---|---|",
+        "| number | name | unit | minimum | maximum | default | |\n|---|---|---|---|---|---|---|",
     ]
     lines += [_parameter(parameter) for parameter in PARAMETERS]
     return [*lines, ""]
@@ -222,5 +225,5 @@ def _store() -> list[str]:
 
 
 def _faults() -> list[str]:
-    lines = ["## Faults and what is done about them\n", "| fault | event | reaction |\n|---|---|---|"]
+    lines = ["## Faults and reactions\n", "| fault | event | reaction |\n|---|---|---|"]
     return [*lines, *(f"| {' | '.join(row)} |" for row in _FAULTS), ""]

@@ -328,7 +328,7 @@ def _locked(folder: Path) -> Iterator[None]:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise DatasetError(
-                f"{folder}: expected a folder that nobody writes to, found another build under way"
+                f"{folder}: expected a folder that no other build uses, found a build in progress"
             ) from None
         yield
     finally:

@@ -1,4 +1,4 @@
-"""Whether a data set on disk is whole: every file there, unchanged and readable."""
+"""Integrity check of a data set on disk: every file exists, is unchanged and can be read."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from payload_emulator.training.data.finishing import index_digest
 
 
 def check(folder: Path) -> list[str]:
-    """What is wrong with a data set: missing or damaged files, one line each; empty when it is whole.
+    """Return the missing or damaged files of a data set, one line each; empty if the data set is intact.
 
-    Files are compared with the hashes taken when they were written; data sets made before those of images and metadata
-    were kept are checked for readable files.
+    Files are compared with their recorded hashes. In older data sets without hashes of images and metadata, the images
+    must be readable and the metadata files must exist.
 
     Raises
     ------
     DatasetError
-        There is no data set, or an unfinished one.
+        If the data set does not exist or is unfinished.
     """
     try:
         index: dict[str, Any] = json.loads((folder / "dataset.json").read_text(encoding="utf-8"))
@@ -31,7 +31,7 @@ def check(folder: Path) -> list[str]:
         raise DatasetError(f"{folder}: expected a data set (dataset.json), found {found}") from None
     except (OSError, ValueError) as error:
         return [
-            f"{folder / 'dataset.json'}: expected a JSON object, found: {error}; build again to make it anew"
+            f"{folder / 'dataset.json'}: expected a JSON object, found: {error}; build again to replace it"
         ]
     return list(_problems(folder, index))
 
@@ -40,11 +40,11 @@ def _problems(folder: Path, index: dict[str, Any]) -> Iterator[str]:
     if "sha256" in index and index["sha256"] != index_digest(index):
         yield f"{folder / 'dataset.json'}: expected content of SHA-256 {index['sha256']}, found other; build again"
     for name, expected in sorted(index.get("files", {}).items()):
-        yield from _against(folder / name, expected, "build again to make it anew")
+        yield from _against(folder / name, expected, "build again to replace it")
     frames = 0
     for name, expected in sorted(index["shards"].items()):
         path = folder / "shards" / f"{name}.npz"
-        damage = list(_against(path, expected, "delete it and build again to make its frames anew"))
+        damage = list(_against(path, expected, "delete it and build again to replace its frames"))
         yield from damage
         if damage and not path.is_file():
             continue
@@ -63,7 +63,7 @@ def _problems(folder: Path, index: dict[str, Any]) -> Iterator[str]:
 
 
 def _frames(folder: Path, index: dict[str, Any], shard: str, labels: ShardLabels) -> Iterator[str]:
-    cure = f"delete shards/{shard}.npz and build again to make it anew"
+    cure = f"delete shards/{shard}.npz and build again to replace it"
     size = int(index["camera"]["height_px"]), int(index["camera"]["width_px"])
     for k, number in enumerate(labels.frames["number"].astype(int)):
         image = folder / "images" / f"{number:06d}.png"

@@ -1,9 +1,8 @@
-"""Trainable network out of an exported one: weights of the ONNX file, and statistics of its normalisation counted anew.
+"""Conversion of an exported ONNX network into a trainable one, with recomputed normalisation statistics.
 
-The export folds every batch normalisation into the convolution before it. A folded network cannot be trained further
-as it stands: its normalisation would begin with statistics of zero and one. `network_from_onnx` gives the layers the
-folded values, `count_statistics` rewrites each normalisation as that of the data it sees, without a change of the
-outputs.
+The export folds every batch normalisation into the preceding convolution. A folded network cannot be trained further
+directly, because its normalisation would start with a mean of zero and a variance of one. `network_from_onnx` loads the
+folded weights, and `count_statistics` recomputes the statistics of each normalisation without changing the outputs.
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ _CROPS = 64
 
 
 def network_from_onnx(path: Path) -> tuple[CraterNet, dict[str, Any]]:
-    """The network of an exported ONNX file, and a document as a checkpoint has it (steps and minutes of training).
+    """Return the network of an exported ONNX file, and its training progress and configuration as in a checkpoint.
 
     Raises
     ------
     ModelError
-        The file is no export of this project's network.
+        If the file is not an export of this project's network.
     """
     import onnx
     from onnx import numpy_helper
@@ -64,7 +63,7 @@ def network_from_onnx(path: Path) -> tuple[CraterNet, dict[str, Any]]:
 
 
 def enlarging(network: CraterNet, factor: int) -> CraterNet:
-    """Return a network of the same weights that enlarges its image so many times; diameters stay in its pixels."""
+    """Return a network of the same weights that enlarges images by a factor; diameters are in original pixels."""
     larger = CraterNet(replace(network.config, enlarge=factor))
     state = {name: value.clone() for name, value in network.state_dict().items()}
     first = network.heat_channels + 2
@@ -75,7 +74,7 @@ def enlarging(network: CraterNet, factor: int) -> CraterNet:
 
 
 def count_statistics(network: CraterNet, feeder: Feeder, average: CraterNet, crops: int = _CROPS) -> None:
-    """Write every normalisation as that of the first crops of a run; outputs in evaluation mode stay the same."""
+    """Compute the normalisation statistics from the first crops of a run; evaluation outputs do not change."""
     layers = [layer for layer in network.modules() if isinstance(layer, nn.BatchNorm2d)]
     sums = {layer: torch.zeros(3, layer.num_features, dtype=torch.float64) for layer in layers}
 
@@ -109,7 +108,7 @@ def count_statistics(network: CraterNet, feeder: Feeder, average: CraterNet, cro
 
 
 def _fill(network: CraterNet, stored: dict[str, Tensor]) -> None:
-    """Give the layers of a network the values of folded convolutions."""
+    """Load the values of folded convolutions into the layers of a network."""
     state = network.state_dict()
     for name, layer in network.named_modules():
         if isinstance(layer, nn.Conv2d):

@@ -366,7 +366,7 @@ def test_two_users_of_a_deployment_have_tokens_of_their_own(ground: Ground, exis
     ensure_user(ground, "ann", "viewer", SECRET)
     if exists:
         add_user(ground, "bob", "viewer")
-    with pytest.raises(Conflict, match="user bob: expected a token of its own, found that of another user"):
+    with pytest.raises(Conflict, match="user bob: expected a unique token, found that of another user"):
         ensure_user(ground, "bob", "admin", SECRET)
     assert authenticate(ground, SECRET).name == "ann"
     assert [one.name for one in list_users(ground)] == (["ann", "bob"] if exists else ["ann"])

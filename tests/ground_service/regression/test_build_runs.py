@@ -160,11 +160,11 @@ def test_a_run_goes_into_a_new_folder_only(fly, tmp_path: Path) -> None:
         ('name = "x"\ncomand = []', "comand: expected one of"),
         (
             'name = "x"\nmodel = "../../etc/passwd"',
-            "expected a file beside the build file, found one elsewhere",
+            "expected a file in the folder of the build file, found one elsewhere",
         ),
         (
             'name = "x"\nmodel = "gone.onnx"',
-            "gone.onnx: expected a file beside the build file, found nothing",
+            "gone.onnx: expected a file in the folder of the build file, found nothing",
         ),
         ('name = "x"\n[limits]\nwall_s = -1', "limits.wall_s: expected a whole number above 0"),
         ('name = "x"\nschema_version = 9', "schema_version: expected 1, found 9"),
