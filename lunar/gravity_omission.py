@@ -131,7 +131,7 @@ def _at_reference(mean: Densities, scale_height_m: float) -> Densities:
 
 
 def omission_psd_m2_s3(degree: int) -> Densities:
-    """Spectral density of the white acceleration that stands for the omitted one: radial, transverse, normal."""
+    """Return the spectral density (R, T, N) of the white acceleration that represents the omitted gravity."""
     degrees = sorted(_OMITTED_M2_S3)
     r, t, n = (
         float(np.exp(np.interp(degree, degrees, [np.log(_OMITTED_M2_S3[known][axis]) for known in degrees])))

@@ -3,7 +3,7 @@
 PayloadError
 ├── ScenarioError      a scenario file, or what it asks for, is not usable
 ├── TerrainError       a terrain source is missing, damaged or does not cover the place asked for
-├── RendererError      a renderer is not installed, or cannot render what is asked for
+├── RendererError      a renderer is not installed, or cannot render the request
 ├── ModelError         a detector model is not the one that flight expects
 ├── ParameterError     a parameter file cannot be read
 ├── RecordError        an archived pass cannot be flown again
@@ -26,7 +26,7 @@ class TerrainError(PayloadError):
 
 
 class RendererError(PayloadError):
-    """A renderer is not installed, failed, or cannot render what is asked for."""
+    """Renderer that is not installed, failed, or cannot render the request."""
 
 
 class ModelError(PayloadError):

@@ -243,7 +243,7 @@ def _total(answer: Any, have: int) -> int:
 
 
 def _unpack(file: ProductFile, archive: Path) -> Path:
-    """The member of a fetched ZIP file, beside it."""
+    """Extract the member of a downloaded ZIP file into the same folder."""
     out = archive.with_name(f"{Path(file.path).name}.partial")
     try:
         with zipfile.ZipFile(archive) as bundle:

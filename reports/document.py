@@ -88,7 +88,7 @@ class Bullets:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A figure: how it is drawn, what it shows (caption), what a reader who cannot see it is told (alt)."""
+    """Figure with its drawing function, caption and text alternative (alt)."""
 
     key: str
     caption: str

@@ -1,4 +1,4 @@
-"""Figures that the LINNA paper prints, shown beside ours.
+"""Figures published in the LINNA paper, for comparison.
 
 References
 ----------

@@ -31,7 +31,7 @@ def quantiles(values: FloatArray, levels: tuple[float, ...] = QUANTILES) -> tupl
 
 
 def completed(series: NavigationSeries) -> NavigationStatistics:
-    """The statistics of a series, those that nobody filled computed from its error vectors."""
+    """Return the statistics of a series; missing ones are computed from its error vectors."""
     given = series.statistics
     length = error_3d_m(series.error_rtn_m)
     finite = length[np.isfinite(length)]
@@ -113,7 +113,7 @@ def containment(error: FloatArray, sigma: FloatArray, factor: float = 3.0) -> fl
 
 
 def cumulative(values: FloatArray, points: int = 300) -> tuple[FloatArray, FloatArray]:
-    """Values and the share of samples not above them, at no more than so many points."""
+    """Return values and the share of samples not above them, at a limited number of points."""
     ordered = np.sort(values[np.isfinite(values)])
     if not len(ordered):
         return ordered, ordered

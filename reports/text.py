@@ -66,7 +66,7 @@ def number_text(value: float | None, decimals: int) -> str:
 
 
 def significant_text(value: float | int | str | None, digits: int = 3) -> str:
-    """A number with so many significant digits, never in powers of ten between 1e-3 and 1e7; text stays text."""
+    """Format a number with given significant digits, never in powers of ten between 1e-3 and 1e7; text stays text."""
     if value is None:
         return NOT_A_VALUE
     if isinstance(value, str):

@@ -416,7 +416,7 @@ class InstrumentReport:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PayloadMap:
-    """The map of craters that the payload made itself, beside the ground's catalogue.
+    """Crater map made by the payload, compared with the ground's catalogue.
 
     ``mapped_again`` were mapped on a later pass too, ``used`` served in fixes, in ``pairs`` of ``pairs_of_all``
     detections. ``catalogued`` are known to the catalogue: ``offset_m`` and ``sigma_m`` (k, 2) are landmark minus
@@ -558,7 +558,7 @@ class CampaignPass:
 
 @dataclass(frozen=True, slots=True)
 class CampaignReport:
-    """Many passes beside one another: trend, by build, by altitude, by light."""
+    """Comparison of many passes: trend, and by build, altitude and illumination."""
 
     title: str
     campaign_id: str

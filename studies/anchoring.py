@@ -26,7 +26,7 @@ BOUNDED_M = 5_000.0
 
 @dataclass(frozen=True, slots=True)
 class SizeScore:
-    """Error of a run with so many craters on board.
+    """Error of a run with a given number of craters on board.
 
     Attributes
     ----------

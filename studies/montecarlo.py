@@ -255,7 +255,7 @@ def fly(case: NavigationCase, seed: int) -> NavigationRun:
 
 
 def fly_many(case: NavigationCase, seeds: Sequence[int], workers: int | None = None) -> list[NavigationRun]:
-    """Return the runs of some seeds, in their order, on several processes where more than one is asked for."""
+    """Return the runs of some seeds, in their order, in several processes if more than one is requested."""
     workers = min(len(seeds), workers or os.cpu_count() or 1)
     if workers <= 1:
         return [fly(case, seed) for seed in seeds]

@@ -11,6 +11,6 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 
 
 def njit(function: _F) -> _F:
-    """Compile on the first call and cache the result beside the module."""
+    """Compile on the first call and cache the result next to the module."""
     compiled: _F = numba.njit(cache=True, nogil=True)(function)
     return compiled

@@ -52,7 +52,7 @@ def split(
 
 @dataclass(slots=True)
 class LargeDataReceiver:
-    """Puts parts together, whatever the order in which they come and however often.
+    """Reassembly of parts received in any order, with duplicates.
 
     Unfinished transfers are kept up to `most_octets` in all; beyond that the one begun first is given up.
     """

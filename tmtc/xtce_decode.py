@@ -314,7 +314,7 @@ class _Rows:
         return len(self.packet)
 
     def narrowed(self, keep: BoolArray) -> _Rows:
-        """The rows to keep, as rows of their own."""
+        """Return the selected rows, with these rows as their parent."""
         index = np.flatnonzero(keep)
         return _Rows(self.packet[index], self.at[index], self, index)
 
@@ -379,7 +379,7 @@ class _Run:
         return rows.narrowed(good)
 
     def room(self, rows: _Rows, bits: int | IntArray) -> BoolArray:
-        """Whether so many bits are left."""
+        """Return whether enough bits are left."""
         enough: BoolArray = self.end(rows) - rows.at >= bits
         return enough
 

@@ -66,7 +66,7 @@ PATIENCE_S = 300.0
 
 @dataclass(slots=True)
 class Transcript:
-    """What the operators type, and what they are told."""
+    """Operator inputs and the responses to them."""
 
     where: list[str]
     tokens: dict[str, str]

@@ -99,7 +99,7 @@ RESETS = ("initialization", "time_gap", "manual_step", "safety_timeout")
 
 PERFECT_START = "propagate-only, perfect start"
 PERFECT_START_M = 1.0
-"""A start state this close to the reference is as good as the reference: no baseline of its own."""
+"""A start state this close to the reference is equivalent to it, so it gives no separate baseline."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -61,7 +61,7 @@ _TRENDS = (
 
 
 class ImageShelf(Mapping[int, NDArray[np.uint8]]):
-    """Images kept with a pass, read from the archive when they are asked for."""
+    """Archived images of a pass, read from the archive on demand."""
 
     def __init__(self, files: FileArchive, sha256_by_frame: Mapping[int, str]) -> None:
         self._files = files

@@ -64,7 +64,7 @@ def add_job(
     Raises
     ------
     Conflict
-        If the id stands for a job that does something else.
+        If the id belongs to a different job.
     """
     if kind not in KINDS:
         raise InvalidInput("job", "kind", " or ".join(KINDS), kind)
@@ -110,7 +110,7 @@ def enter_jobs(
     Raises
     ------
     Conflict
-        If the id stands for a job that does something else.
+        If the id belongs to a different job.
     """
     with ground.database.writing() as connection:
         hold(connection, f"job {job_id}")

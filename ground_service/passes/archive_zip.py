@@ -177,7 +177,7 @@ def _root(folder: Path) -> Path:
 
 
 def zip_folder(folder: Path) -> Path:
-    """The files of a folder as a zip file of its own, not shrunk; the caller removes it."""
+    """Return an uncompressed zip file of the files of a folder; the caller removes it."""
     descriptor, name = tempfile.mkstemp(suffix=".zip")
     os.close(descriptor)
     try:

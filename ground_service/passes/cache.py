@@ -1,4 +1,4 @@
-"""Answers about the archive that are asked for again and again, kept until something that could change them is new."""
+"""Cache of repeated archive queries, invalidated by new data that can change the results."""
 
 from __future__ import annotations
 

@@ -247,7 +247,7 @@ def check_out(ground: Ground, digest: str, folder: Path) -> PassArchive:
 
 
 def pin_archive(ground: Ground, digest: str, pinned: bool) -> None:
-    """Keep an archive whatever its age, or let retention have it."""
+    """Exclude an archive from retention, or include it again."""
     with ground.database.writing() as connection:
         if not change_if(connection, repository.REGRESSION_ARCHIVES, digest, {}, pinned=int(pinned)):
             raise NotFound("archive", digest)

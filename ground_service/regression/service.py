@@ -60,7 +60,7 @@ def run_regression(
     archives
         Folders and zips, or identities of archives that are kept.
     workers
-        Replays at a time; every replay is a process of its own. Default: one for each core.
+        Number of parallel replays, each in a separate process. Default: one for each core.
     progress
         Wraps the iteration over replays (items, total), for a progress bar.
     unusable

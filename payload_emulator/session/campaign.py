@@ -167,7 +167,7 @@ def fly_case(world: World, loaded: LoadedPayload, case: Case, seed: int) -> Resu
 def _detection(
     faults: tuple[Fault, ...], case: Case, events: list[tuple[float, str]], mode: PayloadMode
 ) -> float | None:
-    """Seconds from the first fault to the first event that tells of it; without faults 0 if nothing was told."""
+    """Return seconds from the first fault to its event; None without one. Without faults: None if safe, else 0."""
     if not faults:
         return None if mode is PayloadMode.safe else 0.0
     began_s = min(fault.at_s for fault in faults)

@@ -138,7 +138,7 @@ def propagate_from(
 
 
 def free_impact(scenario: Scenario, model: ForceModel, duration_s: float) -> ImpactError | None:
-    """Where and when the orbit hits the Moon if nobody burns, None if it does not within the span."""
+    """Return place and time of the impact without burns; None without an impact within the span."""
     state = initial_state_icrf(scenario, model.gm_m3_s2)
     try:
         propagate(tdb_s_from_utc_ns(scenario.epoch_utc_ns), state[:3], state[3:], duration_s, model)

@@ -124,7 +124,7 @@ def check_parameters(path: Path) -> None:
 
 
 def names_command(path: Path) -> bool:
-    """Whether a build file names a program of its own instead of a network and parameters."""
+    """Return whether a build file names a program instead of a network and parameters."""
     return "command" in _build_table(path)
 
 

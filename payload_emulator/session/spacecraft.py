@@ -63,7 +63,7 @@ class ProcessorHang(BaseException):
 
 @dataclass(slots=True)
 class BreakableDetector:
-    """A detector that fails when it is told to."""
+    """Detector that fails on command."""
 
     detector: Detector
     throws: bool = False

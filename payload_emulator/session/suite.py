@@ -61,7 +61,7 @@ def suite_scenarios(
 def write_suite(
     scenarios: Sequence[Scenario], data: DataFolder, out: Path, *, progress: Progress | None = None
 ) -> list[SuitePass]:
-    """Emulate every scenario into an archive of its own, all frames kept; an archive that is there is left alone."""
+    """Emulate every scenario into a separate archive with all frames; existing archives are not changed."""
     written = []
     for scenario in scenarios:
         folder = out / scenario.name

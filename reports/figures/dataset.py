@@ -45,7 +45,7 @@ def draw_class_shares(canvas: Canvas, classes: Sequence[ClassCount]) -> None:
 
 
 def histogram_height_in(count: int) -> float:
-    """Height of a sheet for so many histograms."""
+    """Return the height of a sheet for a number of histograms."""
     return -(-count // HISTOGRAM_COLUMNS) * (_PANEL_IN + 0.72) + 0.05
 
 

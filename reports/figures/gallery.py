@@ -59,7 +59,7 @@ def _fitted(caption: str, width_in: float) -> str:
 
 
 def gallery_height_in(count: int, columns: int, width_in: float) -> float:
-    """Height of a sheet that holds so many frames."""
+    """Return the height of a sheet for a number of frames."""
     gap, head = 0.14, 0.44
     size = (width_in - gap * (columns - 1)) / columns
     rows = -(-count // columns)

@@ -17,7 +17,7 @@ _SUFFIXES = {"°C": "c", "V": "v", "W": "w", "KiB": "kib", "‰": "permille"}
 
 
 def housekeeping_height_in(count: int) -> float:
-    """Height of a sheet for so many parameters."""
+    """Return the height of a sheet for a number of parameters."""
     rows = -(-count // COLUMNS)
     return rows * (_PANEL_IN + 0.42) + 0.42
 

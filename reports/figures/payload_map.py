@@ -1,4 +1,4 @@
-"""The payload's own map beside the catalogue."""
+"""Map made by the payload, compared with the catalogue."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def draw_svg(key: str, width_in: float, height_in: float, draw: Callable[[Canvas
     Parameters
     ----------
     key : name of the figure in its page, which makes its ids unique
-    label : what a reader who cannot see it is told
+    label : text alternative
     """
     from matplotlib.figure import Figure
 

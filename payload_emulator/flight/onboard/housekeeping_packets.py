@@ -31,7 +31,7 @@ def send_structure(machine: Machine, number: int) -> None:
 
 
 def send_large_data(machine: Machine, table: str, octets: bytes) -> None:
-    """Send octets in parts, under a transaction number of their own."""
+    """Send octets in parts, under a separate transaction number."""
     parts = split(
         octets,
         transaction=machine.transaction,

@@ -118,7 +118,7 @@ class Machine:
         return self.memory.hash_of(MODEL_NUMBER) or self.model_hash
 
     def quantities(self) -> dict[str, float]:
-        """The data pool: whatever housekeeping can tell, by name."""
+        """Return the data pool: all housekeeping parameters by name."""
         volts, amperes, board_c, camera_c = self.board.sensors().tolist()
         observer, store = self.observer, self.store
         return {

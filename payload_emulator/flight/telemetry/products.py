@@ -45,7 +45,7 @@ def unpack_thumbnail(octets: bytes) -> tuple[int, int, OctetArray]:
 
 
 def map_octets(sightings: Mapping[int, int]) -> bytes:
-    """The landmark map of how often each crater was used."""
+    """Return the octets of the landmark map: how many frames used each crater."""
     rows = np.array(
         [(crater, min(count, 0xFFFF)) for crater, count in sorted(sightings.items())], dtype=_LANDMARK
     )
@@ -53,6 +53,6 @@ def map_octets(sightings: Mapping[int, int]) -> bytes:
 
 
 def unpack_map(octets: bytes) -> dict[int, int]:
-    """Frames that used each crater."""
+    """Return the number of frames that used each crater."""
     rows = np.frombuffer(octets, dtype=_LANDMARK)
     return dict(zip(rows["crater_id"].tolist(), rows["frames"].tolist(), strict=True))

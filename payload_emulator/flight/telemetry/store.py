@@ -241,7 +241,7 @@ class PacketStore:
         return gone
 
     def scrub(self, records: int) -> int:
-        """Check the next so many records; how many were damaged, and are gone."""
+        """Check a number of records; return how many were damaged and removed."""
         before = self.damaged
         every = [(ring, record) for ring in self._rings for record in ring.records if record.alive]
         for k in range(min(records, len(every))):

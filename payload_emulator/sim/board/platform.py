@@ -154,7 +154,7 @@ class SimulatedBoard:
         self.memory, self._stage, self._loads = {}, 0, 0
 
     def flip(self, memory: Memory, bits: int, rng: np.random.Generator) -> None:
-        """Change so many bits of a memory, anywhere in it."""
+        """Change a number of bits at random positions of a memory."""
         for at in rng.integers(0, 8 * memory.size, bits).tolist():
             memory[at >> 3] ^= 0x80 >> (at & 7)
 

@@ -77,7 +77,7 @@ def _write_coco(folder: Path, recipe: Recipe, shards: Sequence[str]) -> dict[str
 
 
 class _CocoFile:
-    """A COCO object that grows beside its place: annotations as they come, then the images."""
+    """COCO file written to a temporary file: annotations as they arrive, then the images."""
 
     def __init__(self, path: Path, recipe: Recipe) -> None:
         self.path = path

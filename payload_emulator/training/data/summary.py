@@ -1,4 +1,4 @@
-"""What is in a data set: frames by split and source, crater instances by class, the paper's beside them."""
+"""Summary of a data set: frames by split and source, and crater instances by class, compared with the paper's."""
 
 from __future__ import annotations
 

@@ -237,7 +237,7 @@ def evidence_level(frames: Sequence[Frame]) -> str:
 
 
 def format_figures(figures: dict[str, Any]) -> str:
-    """The figures as a short table beside the paper's."""
+    """Return a short table of the figures and those of the paper."""
     lines = [
         f"{figures['frames']} frames of {', '.join(figures['sources'])}; evidence level {figures['level']}; "
         f"threshold {figures['threshold']:.2f} (fixed on validation)",

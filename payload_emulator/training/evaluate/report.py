@@ -186,7 +186,7 @@ def _groups(figures: dict[str, Any]) -> tuple[ScoreGroup, ...]:
     def span(row: dict[str, Any]) -> str:
         return f"{row['low']:g}–{row['high']:g}"
 
-    rule = "Strict scores drawn; the table gives the ignore-aware ones beside them."
+    rule = "Strict scores drawn; the table also gives the ignore-aware scores."
     on_board = {
         "threshold": figures["threshold"],
         "strict": figures["micro"],
