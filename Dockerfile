@@ -6,8 +6,8 @@ FROM ${PYTHON_IMAGE} AS build
 ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
 RUN python -m venv /opt/linna
 WORKDIR /src
-COPY requirements/runtime.txt requirements/postgres.txt requirements/
-RUN /opt/linna/bin/pip install -r requirements/runtime.txt -r requirements/postgres.txt
+COPY requirements/runtime.txt requirements/postgres.txt requirements/parquet.txt requirements/
+RUN /opt/linna/bin/pip install -r requirements/runtime.txt -r requirements/postgres.txt -r requirements/parquet.txt
 COPY pyproject.toml README.md LICENSE ./
 COPY lunar lunar
 COPY tmtc tmtc

@@ -9,7 +9,8 @@ TmtcError
 ├── FrameError            a transfer frame that cannot be built or read
 ├── TableError            an uploaded table (anchor ephemeris, catalogue, gravity) is damaged or of another kind
 ├── LinkFormatError       a stream whose framing cannot be told, or settings that contradict each other
-└── DefinitionError       an imported packet definition that is damaged, contradicts itself or is not supported
+├── DefinitionError       an imported packet definition that is damaged, contradicts itself or is not supported
+└── MissingLibrary        a file format whose optional library is not installed
 """
 
 from __future__ import annotations
@@ -78,3 +79,11 @@ class UnknownCoding(LinkFormatError):
 
 class DefinitionError(TmtcError):
     """An imported packet definition that is damaged, contradicts itself or uses what is not supported."""
+
+
+class MissingLibrary(TmtcError):
+    """A file format whose optional library is not installed."""
+
+    def __init__(self, what: str, library: str, extra: str) -> None:
+        self.library = library
+        super().__init__(f"{what}: expected the library {library}, found none; install {extra}")

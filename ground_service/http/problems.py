@@ -30,7 +30,7 @@ from ground_service.errors import (
 )
 from lunar.errors import LunarError
 from reports.errors import ReportError
-from tmtc.errors import TmtcError
+from tmtc.errors import MissingLibrary, TmtcError
 
 log = logging.getLogger(__name__)
 
@@ -46,6 +46,7 @@ STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (StorageFull, 507, "no space left"),
     (StorageReadOnly, 503, "read-only"),
     (StoreError, 503, "store unavailable"),
+    (MissingLibrary, 501, "missing library"),
     (TmtcError, 422, "invalid telemetry"),
     (LunarError, 422, "invalid input"),
     (ReportError, 500, "report failed"),
