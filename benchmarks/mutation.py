@@ -77,7 +77,7 @@ GROUPS = {
             "ground_service/evaluation/navigation/reference_error.py",
             "ground_service/evaluation/detection/viewing.py",
         ),
-        tuple(f"{_GROUND_TESTS}/processing/test_{name}.py" for name in ("verdict", "viewing")),
+        tuple(f"{_GROUND_TESTS}/evaluation/test_{name}.py" for name in ("verdict", "viewing")),
     ),
     "evaluation": Group(
         (
@@ -91,7 +91,7 @@ GROUPS = {
         ),
         (
             *(
-                f"{_GROUND_TESTS}/processing/test_{name}.py"
+                f"{_GROUND_TESTS}/evaluation/test_{name}.py"
                 for name in (
                     "pass_evaluation",
                     "worst_frames",

@@ -47,6 +47,7 @@ from ground_service.access.service import add_user
 from ground_service.commanding.service import enter_command, release_command
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
+from ground_service.missions.service import add_mission
 from ground_service.passes.service import define_pass
 from ground_service.planning.service import WindowEntry, add_window
 from ground_service.store.audit import GUARD_NAMES
@@ -73,6 +74,7 @@ class Harm:
 
 def fill(ground: Ground, folder: Path, packets: int) -> None:
     """Fill an archive with telemetry, and with rows of every table as the program writes them."""
+    add_mission(ground, f"name = 'damage'\nspacecraft = {{ id = {SPACECRAFT} }}\n".encode())
     (folder / "mixed.cadu").write_bytes(mixed_downlink(packets))
     (folder / "rest.cadu").write_bytes(_rest_of_the_dictionary())
     for name in ("mixed.cadu", "rest.cadu"):
