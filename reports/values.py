@@ -396,6 +396,18 @@ class ResidualStatistics:
 
 
 @dataclass(frozen=True, slots=True)
+class QuantityStatistics:
+    """Values of a quantity that an instrument measured; NaN without samples."""
+
+    label: str
+    unit: str
+    samples: int
+    minimum: float
+    mean: float
+    maximum: float
+
+
+@dataclass(frozen=True, slots=True)
 class InstrumentReport:
     """Use of an optional instrument on board.
 
@@ -412,6 +424,7 @@ class InstrumentReport:
     no_data: int
     no_model: int
     residuals: tuple[ResidualStatistics, ...] = ()
+    quantities: tuple[QuantityStatistics, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from lunar.arrays import FloatArray
-from reports.values import InstrumentReport, ResidualStatistics
+from reports.values import InstrumentReport, QuantityStatistics, ResidualStatistics
 from tmtc.instruments import SAMPLE_STATUSES, InstrumentTelemetry, Residual, instrument_telemetry
-from tmtc.schema import Table
+from tmtc.schema import Field, Table
 
 _CODES = {name: code for code, name in SAMPLE_STATUSES}
 
@@ -54,6 +54,26 @@ def _report(instrument: InstrumentTelemetry, table: Table) -> InstrumentReport:
             )
             for one in instrument.residuals
         ),
+        quantities=tuple(
+            _quantity(field, np.asarray(table.items[field.name], dtype=np.float64))
+            for field in instrument.sample_fields
+            if field.name in instrument.quantities
+        ),
+    )
+
+
+def _quantity(field: Field, values: FloatArray) -> QuantityStatistics:
+    values = values[np.isfinite(values)]
+    if not values.size:
+        nan = float("nan")
+        return QuantityStatistics(field.description, field.unit, 0, nan, nan, nan)
+    return QuantityStatistics(
+        field.description,
+        field.unit,
+        int(values.size),
+        float(np.min(values)),
+        float(np.mean(values)),
+        float(np.max(values)),
     )
 
 

@@ -22,13 +22,24 @@ from ground_service.store import repository, rollups
 from ground_service.timekeeping.core import utc_ns_of_ticks
 from lunar.arrays import FloatArray, IntArray
 from lunar.timescales import format_utc, ticks_from_utc_ns
+from tmtc.cuc import onboard_ticks
 from tmtc.dictionary import DICTIONARY
 from tmtc.export import Record, format_records, packet_records
+from tmtc.instruments import APID_INSTRUMENTS, instrument_telemetry
+from tmtc.schema import Field
 from tmtc.stream import cut_packets, whole_packets
 from tmtc.xtce_records import format_xtce_records, xtce_records
 from tmtc.xtce_series import SeriesValue
 
 OWN_PACKET = "housekeeping"
+INSTRUMENT_FIELDS = {
+    f"{one.name}.{field.name}": (one.name, field)
+    for one in instrument_telemetry()
+    for field in one.sample_fields
+    if field.size == 1
+}
+"""Packet and field of the parameters of optional instruments, by their names in addresses."""
+
 LABELS_LIMIT = 256
 """Largest number of codes of one name that are listed."""
 
@@ -131,6 +142,50 @@ class DeclaredSamples:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class InstrumentSamples:
+    """Samples of one field of an optional instrument, decoded from the stored packets; they have no roll-ups."""
+
+    packet: str
+    field: str
+    version: int
+    part: int = 0
+
+    @property
+    def code(self) -> int:
+        """Code of the kind in the roll-ups, which has none."""
+        return rollups.INSTRUMENTS_CODE
+
+    def index(self, name: str) -> int:
+        """Return the place of a value in the roll-ups."""
+        raise LookupError(name)
+
+    def arrays(
+        self, connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int, names: tuple[str, ...]
+    ) -> dict[str, NDArray[Any]]:
+        """Return ``ticks`` and values (n,) between two on-board times, in order of time."""
+        octets = repository.packet_octets(connection, vehicle, APID_INSTRUMENTS, start_ticks, stop_ticks)
+        tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=(self.packet,))
+        if self.packet not in tables:
+            return {"ticks": np.zeros(0, dtype=np.int64), **{name: np.zeros(0) for name in names}}
+        items = tables[self.packet].items
+        ticks = onboard_ticks(items["sample_ticks"])
+        order = np.argsort(ticks, kind="stable")
+        return {"ticks": ticks[order], **dict.fromkeys(names, items[self.field][order])}
+
+    def aggregates(
+        self,
+        connection: Connection,
+        vehicle: int,
+        start_ticks: int,
+        stop_ticks: int,
+        name: str,
+        width_ticks: int,
+    ) -> FloatArray:
+        """Return stretches of a value; without roll-ups a series is never long."""
+        raise LookupError(name)
+
+
 def pass_parameters(ground: Ground, pass_id: int) -> PassParameters:
     """Return the parameters of a pass.
 
@@ -165,21 +220,24 @@ def pass_parameters(ground: Ground, pass_id: int) -> PassParameters:
 
 
 def own_parameters() -> tuple[ParameterInfo, ...]:
-    """Return the parameters of our housekeeping."""
+    """Return the parameters of our housekeeping and of the optional instruments."""
     fields = DICTIONARY.packet(OWN_PACKET).fields
-    return tuple(
-        ParameterInfo(
-            name=field.name,
-            packet=OWN_PACKET,
-            source="dictionary",
-            description=field.description,
-            unit=field.unit,
-            labels={str(code): label for code, label in field.labels},
-            warning=field.warning,
-            alarm=field.alarm,
-        )
-        for field in fields
-        if field.name in PARAMETERS
+    return (
+        *(_own_info(field.name, OWN_PACKET, field) for field in fields if field.name in PARAMETERS),
+        *(_own_info(name, packet, field) for name, (packet, field) in INSTRUMENT_FIELDS.items()),
+    )
+
+
+def _own_info(name: str, packet: str, field: Field) -> ParameterInfo:
+    return ParameterInfo(
+        name=name,
+        packet=packet,
+        source="dictionary",
+        description=field.description,
+        unit=field.unit,
+        labels={str(code): label for code, label in field.labels},
+        warning=field.warning,
+        alarm=field.alarm,
     )
 
 
@@ -232,6 +290,9 @@ def series_source(
     if parameter in PARAMETERS:
         unit = DICTIONARY.packet(OWN_PACKET).field(parameter).unit
         return KindSamples(OWN_PACKET, span.dictionary_version), span, parameter, unit
+    if parameter in INSTRUMENT_FIELDS:
+        packet, field = INSTRUMENT_FIELDS[parameter]
+        return InstrumentSamples(packet, field.name, span.dictionary_version), span, parameter, field.unit
     found = declared_reading(connection, span.vehicle)
     one = None if found is None else found.parameters.get(parameter)
     if found is None or one is None:

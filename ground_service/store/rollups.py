@@ -40,6 +40,9 @@ KINDS: dict[str, tuple[int, str | None, tuple[str, ...]]] = {
 PARAMETERS_CODE = 3
 """Code of the values of packets that mission descriptions define; their parts are the numbers of their containers."""
 
+INSTRUMENTS_CODE = 4
+"""Code of the samples of optional instruments, which have no roll-ups."""
+
 LEVELS = 7
 BASE_TICKS = 64 << 16
 """The shortest buckets are 64 s long, the longest 4^6 times that: three days."""

@@ -7,7 +7,7 @@ import math
 from reports.document import Block, Column, Heading, Table
 from reports.sections.common import PassView
 from reports.text import count_text, percent_text
-from reports.values import ResidualStatistics
+from reports.values import QuantityStatistics, ResidualStatistics
 
 _UNKNOWN = "unknown"
 
@@ -28,14 +28,19 @@ def instruments(view: PassView) -> list[Block]:
             percent_text(one.no_model, one.samples),
         )
         for one in found
+        if one.residuals
     )
     residuals = tuple(
         (f"{one.title}: {residual.label}", count_text(residual.samples), *_numbers(residual))
         for one in found
         for residual in one.residuals
     )
-    return [
-        heading,
+    measured = tuple(
+        (f"{one.title}: {quantity.label}", count_text(quantity.samples), *_range(quantity))
+        for one in found
+        for quantity in one.quantities
+    )
+    tables = (
         Table(
             "Samples of the optional instruments, as the payload reported their use.",
             (
@@ -62,7 +67,24 @@ def instruments(view: PassView) -> list[Block]:
             residuals,
             note="The last column is the mean of (residual / predicted sigma)\u00b2, 1 for a consistent estimator.",
         ),
-    ]
+        Table(
+            "Measured quantities.",
+            (
+                Column("quantity", numeric=False),
+                Column("samples"),
+                Column("minimum"),
+                Column("mean"),
+                Column("maximum"),
+            ),
+            measured,
+        ),
+    )
+    return [heading, *(table for table in tables if table.rows)]
+
+
+def _range(quantity: QuantityStatistics) -> tuple[str, str, str]:
+    form = f",.4g {quantity.unit}"
+    return (_text(quantity.minimum, form), _text(quantity.mean, form), _text(quantity.maximum, form))
 
 
 def _numbers(residual: ResidualStatistics) -> tuple[str, str, str, str]:

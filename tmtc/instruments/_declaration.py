@@ -46,6 +46,8 @@ class InstrumentTelemetry:
         Name of the instrument, of its packet and of its section in scenarios.
     since
         Version of the dictionary that added the packet.
+    quantities
+        Names of the sample fields whose statistics a report shows. All sample fields are parameters with a series.
     """
 
     name: str
@@ -53,6 +55,14 @@ class InstrumentTelemetry:
     since: int
     packet: PacketDefinition
     residuals: tuple[Residual, ...]
+    quantities: tuple[str, ...] = ()
+
+    @property
+    def sample_fields(self) -> tuple[Field, ...]:
+        """Fields of a sample after its time and status."""
+        group = self.packet.group
+        fields = () if group is None else group.fields
+        return tuple(one for one in fields if one.name not in ("sample_ticks", "sample_status"))
 
 
 def sample_packet(

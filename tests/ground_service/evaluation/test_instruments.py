@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from ground_service.evaluation.core import evaluate_pass, summary_of
 from ground_service.evaluation.instruments import instrument_reports
 from reports.document import Absent, Table
 from reports.sections.instruments import instruments
-from reports.values import InstrumentReport, PassReport, ResidualStatistics
+from reports.values import InstrumentReport, PassReport, QuantityStatistics, ResidualStatistics
 from tests.ground_service.evaluation.test_pass_evaluation import inputs
 from tmtc.instruments import InstrumentTelemetry, Residual, sample_packet
 from tmtc.schema import Dictionary, Field
@@ -75,6 +76,25 @@ def test_samples_are_counted_by_status_and_only_used_ones_have_residuals() -> No
     assert angle.rms == pytest.approx(math.sqrt(5.0) * 1e-5 * arcsec)
     assert angle.p95_absolute == pytest.approx(2.9e-5 * arcsec)
     assert angle.normalised_square == pytest.approx(5.0)
+
+
+def test_the_range_of_a_declared_quantity_is_taken_over_all_known_samples(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        module, "instrument_telemetry", lambda: (replace(SEXTANT, residuals=(), quantities=("angle",)),)
+    )
+    (found,) = instrument_reports(tables([[(3, 1.0, 0.0), (1, math.nan, 0.0)], [(0, 4.0, 0.0)]]))
+    assert found.residuals == ()
+    assert found.quantities == (QuantityStatistics("Residual", "rad", 2, 1.0, 2.5, 4.0),)
+    (none,) = instrument_reports(tables([[(2, math.nan, 0.0)]]))
+    assert none.quantities[0].samples == 0
+    _, table = section(found, none)
+    assert isinstance(table, Table)
+    assert table.rows == (
+        ("sextant: Residual", "2", "1 rad", "2.5 rad", "4 rad"),
+        ("sextant: Residual", "0", "unknown", "unknown", "unknown"),
+    )
 
 
 def test_without_packets_or_samples_there_is_no_report() -> None:
