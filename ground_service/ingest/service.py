@@ -502,12 +502,11 @@ class _Reading:
                 self.joiner.keep_channel_edges(connection, reader.take_channel_edges())
                 self.joiner.keep_edges(connection, reach.link, reader.edges)
                 self._learn(connection, reach.link, known, None)
-            self.accounting.add(reader.accounting)
-            settings = reach.link.settings
-            if settings is not None and reader.accounting.quality.frames_good >= LEAST_GOOD_FRAMES:
-                with self.ground.database.writing() as connection:
+                settings = reach.link.settings
+                if settings is not None and reader.accounting.quality.frames_good >= LEAST_GOOD_FRAMES:
                     vehicles = sorted(self.vehicles.values())
                     remember_link(connection, self.piece, vehicles, settings, utc_now_ns())
+            self.accounting.add(reader.accounting)
 
     def _learn(self, connection: Connection, link: Link, known: list[Link], links_tried: int | None) -> None:
         edges.note_read(connection, self.piece.ingest_id, links_tried)
