@@ -352,12 +352,12 @@ def evaluate(desk: Transcript, api: Client, window: int, folder: Path) -> dict[s
     commands = Counter(one.state for one in api.list_telecommands())
     return {
         "window": done.state,
-        "frames": summary["frames"],
+        "frames": summary.frames,
         "frames_planned": done.predicted["frames"],
-        "packets": summary["packets"],
-        "packets_lost": summary["packets_lost"],
+        "packets": summary.packets,
+        "packets_lost": summary.packets_lost,
         "telecommands": dict(commands),
-        "median_error_m": {name: row["median_3d_m"] for name, row in summary["navigation"].items()},
+        "median_error_m": {name: row.median_3d_m for name, row in summary.navigation.items()},
         "report": sorted(path.name for path in (folder / "report").iterdir()),
     }
 
