@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+import struct
 import sys
 import tempfile
 import time
@@ -53,12 +54,15 @@ from ground_service.planning.service import WindowEntry, add_window
 from ground_service.store.audit import GUARD_NAMES
 from ground_service.store.models import Base
 from ground_service.worker.integrity import Verification, verify
+from lunar.timescales import parse_utc
+from tests.tmtc import foreign
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
 from tmtc.packets import PacketSequencer
 
 SPACECRAFT = 76
 NS = 1_000_000_000
+DECLARED_APID, DECLARED_PACKETS = 100, 8
 CHANGES = ("changed", "removed", "put in")
 
 
@@ -74,10 +78,11 @@ class Harm:
 
 def fill(ground: Ground, folder: Path, packets: int) -> None:
     """Fill an archive with telemetry, and with rows of every table as the program writes them."""
-    add_mission(ground, f"name = 'damage'\nspacecraft = {{ id = {SPACECRAFT} }}\n".encode())
+    add_mission(ground, _mission().encode())
     (folder / "mixed.cadu").write_bytes(mixed_downlink(packets))
     (folder / "rest.cadu").write_bytes(_rest_of_the_dictionary())
-    for name in ("mixed.cadu", "rest.cadu"):
+    (folder / "declared.cadu").write_bytes(_declared_packets())
+    for name in ("mixed.cadu", "rest.cadu", "declared.cadu"):
         ingest_file(ground, folder / name)
     define_pass(
         ground,
@@ -98,6 +103,36 @@ def fill(ground: Ground, folder: Path, packets: int) -> None:
         for table in Base.metadata.sorted_tables:
             if connection.execute(select(*table.primary_key.columns).limit(1)).first() is None:
                 connection.execute(insert(table), [_invented(connection, table)])
+
+
+def _mission() -> str:
+    """Return a mission description that declares packets of one APID with their XTCE definition."""
+    values = {"DAY": "U16", "MILLISECOND": "U32", "MICROSECOND": "U16", "VALUE": "F32"}
+    definition = foreign.document(
+        foreign.HEADER_TYPES + foreign.floating("F32", 32),
+        {**foreign.HEADER_PARAMETERS, **values},
+        foreign.HEADER_CONTAINER
+        + foreign.container(
+            "Status", list(values), "CCSDSPacket", foreign.comparison("PKT_APID", DECLARED_APID)
+        ),
+    )
+    return (
+        f"name = 'damage'\nspacecraft = {{ id = {SPACECRAFT} }}\n"
+        f"[[packets]]\nname = 'bus'\napids = [{DECLARED_APID}]\npacket_checksum = 'none'\n"
+        f"xtce = ['''{definition}''']\n"
+        "[packets.time]\ncode = 'cds'\noffset = 6\np_field = false\nwhole_octets = 2\nfraction_octets = 2\n"
+        "epoch = '1958-01-01T00:00:00Z'\nclock = 'own'\n"
+    )
+
+
+def _declared_packets() -> bytes:
+    """Return a downlink of packets that the mission description declares, one each second."""
+    packets = []
+    for k in range(DECLARED_PACKETS):
+        day, rest = divmod(START + k * NS - parse_utc("1958-01-01T00:00:00Z"), 86_400 * NS)
+        octets = struct.pack(">HIHf", day, rest // 1_000_000, rest // 1_000 % 1_000, 0.5 * k)
+        packets.append(foreign.space_packet(DECLARED_APID, octets, k))
+    return encode_cadus(packets, spacecraft_id=SPACECRAFT)
 
 
 def _rest_of_the_dictionary() -> bytes:
@@ -364,7 +399,7 @@ class PostgresCopies:
             yield ground
 
 
-SOURCES = frozenset({"files", "ingests", "vehicles"})
+SOURCES = frozenset({"files", "ingests", "missions", "vehicles"})
 """Tables that select what is ingested again; combined with damaged values, their damage would hide that damage."""
 
 ALONE = frozenset({"row_digests", "audit_head", "files on disk"})

@@ -252,7 +252,64 @@ def test_the_integrity_check_finds_packets_without_a_checksum_intact(
     ingest_file(ground, downlink(tmp_path, bus_packets(30)))
     found = verify(ground, deep=deep)
     assert (found.verdict, found.damaged) == ("intact", [])
-    assert found.checked["packets"] == 38
+    assert (found.checked["packets"], found.checked["parameter_samples"]) == (38, 38)
+    assert found.unchecked == {}
+
+
+SAMPLES = repository.PARAMETER_SAMPLES
+
+
+@pytest.mark.parametrize("deep", [False, True])
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"values": bytes(8)}, "values of its packet"),
+        ({"container": 77}, "raw data do not give"),
+        ({"ticks": SAMPLES.c.ticks + 1}, "raw data do not give"),
+        ({"packet_id": 999}, "raw data do not give"),
+        ({"definition_id": 5}, "unknown definition"),
+        ({"vehicle_id": 9}, "unknown vehicle"),
+        (None, "expected this row"),
+    ],
+)
+def test_the_integrity_check_finds_a_damaged_sample(
+    either: Ground, tmp_path: Path, changes: dict[str, Any] | None, reason: str, deep: bool
+) -> None:
+    enter(either, tmp_path / "m")
+    ingest_file(either, downlink(tmp_path, bus_packets(8)))
+    with either.database.writing() as connection:
+        (row, *_) = connection.execute(SAMPLES.select().order_by(SAMPLES.c.ticks)).mappings()
+        here = (SAMPLES.c.ticks == row["ticks"]) & (SAMPLES.c.packet_id == row["packet_id"])
+        change = SAMPLES.delete() if changes is None else SAMPLES.update().values(changes)
+        assert connection.execute(change.where(here)).rowcount == 1
+    found = [one for one in verify(either, deep=deep).damaged if one.kind == "parameter_samples"]
+    assert reason in " ".join(one.reason for one in found)
+
+
+def test_the_integrity_check_does_not_expect_samples_of_packets_that_are_not_yet_decoded(
+    either: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(cast(dict[str, Any], follow_up.DOING), "decode", lambda *_given: None)
+    enter(either, tmp_path / "m")
+    result = ingest_file(either, downlink(tmp_path, bus_packets(10)))
+    renamed = foreign.BUS.replace('"VOLTAGE"', '"BATTERY"')
+    add_mission(either, read_mission_file(mission(tmp_path / "m", document=renamed)))
+    found = verify(either, deep=True)
+    assert found.damaged == []
+    assert found.unchecked == {
+        "values decoded with an earlier mission description": 13,
+        "packets not yet decoded to rows of parameter_samples": 13,
+    }
+    monkeypatch.setattr(decoding, "BLOCK_PACKETS", 5)
+    with either.database.writing() as connection:
+        assert decoding._next_block(connection, result.vehicle_id) == 5
+    found = verify(either)
+    assert found.damaged == []
+    assert found.checked["parameter_samples"] == 5
+    assert found.unchecked["packets not yet decoded to rows of parameter_samples"] == 8
+    decoding.decode_declared(either, result.vehicle_id)
+    found = verify(either, deep=True)
+    assert (found.damaged, found.unchecked, found.checked["parameter_samples"]) == ([], {}, 13)
 
 
 def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(ground: Ground, tmp_path: Path) -> None:
