@@ -59,9 +59,9 @@ class PassView:
     def with_error(self) -> tuple[NavigationSeries, ...]:
         return tuple(s for s in self.report.navigation if np.isfinite(s.error_rtn_m).any())
 
-    def absent(self, field: str, what: str) -> Absent:
-        """Return the block for a section that is not available."""
-        why = self.report.not_available.get(field) or _USUAL_REASON.get(field, "not given")
+    def absent(self, field: str, what: str, usual: str = "") -> Absent:
+        """Return the block for a section that is not available; `usual` is the reason if the report states none."""
+        why = self.report.not_available.get(field) or usual or _USUAL_REASON.get(field, "not given")
         return Absent(what, why)
 
     def no_error(self) -> Absent:
