@@ -37,12 +37,13 @@ def parquet_octets(columns: Mapping[str, Sequence[object]]) -> bytes:
 
 def _array(pyarrow: Any, values: Sequence[object]) -> Any:
     known = [value for value in values if value is not None]
-    if known and all(isinstance(value, (int, np.integer)) for value in known):
-        whole = [int(str(value)) for value in known]
+    whole = [int(value) for value in known if isinstance(value, (int, np.integer))]  # also truth values
+    if known and len(whole) == len(known):
+        column = [int(value) if isinstance(value, (int, np.integer)) else None for value in values]
         if max(whole) < _INT64_LIMIT:
-            return pyarrow.array(values, type=pyarrow.int64())
+            return pyarrow.array(column, type=pyarrow.int64())
         if min(whole) >= 0:
-            return pyarrow.array(values, type=pyarrow.uint64())
+            return pyarrow.array(column, type=pyarrow.uint64())
     elif known and all(isinstance(value, (int, float, np.integer, np.floating)) for value in known):
         return pyarrow.array(values, type=pyarrow.float64())
     return pyarrow.array([None if value is None else str(value) for value in values], type=pyarrow.string())

@@ -398,7 +398,7 @@ class Client(Connection):
         """Register a payload build: a zip of build.toml and the files that it names."""
         return self._post(Build, "/builds", file)
 
-    def register_current_build(self) -> Build:
+    def add_current_build(self) -> Build:
         """Register the flight code that is installed with the service."""
         return self._post(Build, "/builds/current")
 
@@ -416,7 +416,7 @@ class Client(Connection):
         return self._call(KeptArchive, "PATCH", path, body={"pinned": pinned})
 
     def prune_kept_archives(self, *, unused_days: float) -> Pruned:
-        """Remove kept archives that are not pinned and were not used for a time."""
+        """Delete kept archives that are not pinned and were not used for a time."""
         return self._call(Pruned, "DELETE", "/regression-archives", query={"unused_days": unused_days})
 
     def start_regression(self, request: Body, *, key: str | None = None) -> Job:

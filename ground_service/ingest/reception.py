@@ -15,7 +15,7 @@ from sqlalchemy import Connection, select
 from ground_service.access.service import audit
 from ground_service.ingest.edge_store import Piece
 from ground_service.ingest.quality import NO_RECORD, RecordFormat
-from ground_service.missions.model import FrameSettings, Link, Station
+from ground_service.missions.model import FrameSettings, Link, StationLink
 from ground_service.missions.store import links_in_force
 from ground_service.store import repository
 from tmtc.link import LinkSettings
@@ -93,11 +93,11 @@ def settings_of(link: Link, station: str) -> LinkSettings | None:
     return LinkSettings(**values).explicit
 
 
-def _station(link: Link, station: str) -> Station | None:
+def _station(link: Link, station: str) -> StationLink | None:
     return (link.stations or {}).get(station)
 
 
-def _record(station: Station) -> RecordFormat:
+def _record(station: StationLink) -> RecordFormat:
     return RecordFormat(
         station.header_octets or 0,
         station.trailer_octets or 0,

@@ -83,7 +83,7 @@ class FrameSettings(Section):
     frame_checksum: bool | None = None
 
 
-class Station(FrameSettings):
+class StationLink(FrameSettings):
     """Records of a ground station, and settings of its link that differ from those of the spacecraft.
 
     Attributes
@@ -101,7 +101,7 @@ class Station(FrameSettings):
     time_offset: Annotated[int, Field(ge=0, le=1024)] | None = None
 
     @model_validator(mode="after")
-    def _time_in_header(self) -> Station:
+    def _time_in_header(self) -> StationLink:
         if (self.time_code is None) != (self.time_offset is None):
             raise ValueError("time_code and time_offset together, found one of them")
         if self.time_code is not None and self.time_offset is not None:
@@ -121,7 +121,7 @@ class Link(FrameSettings):
 
     packet_checksum: Literal["crc16", "none"] | None = None
     virtual_channels: Annotated[tuple[int, ...], Array] | None = None
-    stations: dict[StationName, Station] | None = None
+    stations: dict[StationName, StationLink] | None = None
 
 
 class Time(Section):
@@ -514,7 +514,7 @@ def _unknown_keys(kind: type[BaseModel], table: Any, source: str, path: str) -> 
             yield from _unknown_keys(field.annotation, value, source, place)
         elif kind is Link and key == "stations" and isinstance(value, dict):
             for name, station in value.items():
-                yield from _unknown_keys(Station, station, source, f"{place}.{name}")
+                yield from _unknown_keys(StationLink, station, source, f"{place}.{name}")
 
 
 def _fault(source: str, error: Any) -> InvalidInput:

@@ -68,7 +68,7 @@ async def add_build(upload: UploadOf, ground: GroundOf, caller: Operator) -> Bui
 
 
 @regressions.post("/builds/current", status_code=201)
-def register_current_build(ground: GroundOf, caller: Operator) -> Build:
+def add_current_build(ground: GroundOf, caller: Operator) -> Build:
     """Register the installed flight code with its own network and parameters."""
     return _registered(ground, register_build(ground, load_build(CURRENT), actor=caller.name).digest)
 
@@ -112,7 +112,7 @@ def prune_kept_archives(
         float, Query(ge=0.0, le=36_500.0, description="Remove archives unused for this time")
     ],
 ) -> Pruned:
-    """Remove kept archives that are not pinned and were not used for a time."""
+    """Delete kept archives that are not pinned and were not used for a time."""
     unused_for_ns = round(unused_days * 86_400e9)
     return Pruned(removed=archive_service.let_go(ground, unused_for_ns=unused_for_ns))
 

@@ -377,7 +377,7 @@ def _registered(service: Client, given: str) -> Build:
     from ground_service.regression.builds import BUILD_FILE, CURRENT, load_build
 
     if given == CURRENT:
-        return service.register_current_build()
+        return service.add_current_build()
     build = load_build(given)
     with tempfile.TemporaryDirectory() as scratch:
         packed = Path(scratch) / "build.zip"

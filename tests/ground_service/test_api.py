@@ -300,6 +300,7 @@ MATRIX = [
     ("GET", "/passes/1/events", "viewer"),
     ("GET", "/passes/1/telemetry/power_w", "viewer"),
     ("GET", "/passes/1/parameters", "viewer"),
+    ("GET", "/passes/1/reports", "viewer"),
     ("GET", "/passes/1/packets/housekeeping", "viewer"),
     ("POST", "/passes/1/reports", "operator"),
     ("GET", "/spacecraft/76/telemetry/power_w", "viewer"),

@@ -99,6 +99,12 @@ def test_parquet_columns_keep_values_and_gaps():
     assert [str(field.type) for field in table.schema] == ["int64", "double", "string"]
 
 
+def test_parquet_writes_truth_values_as_integers():
+    assert read_parquet(parquet_octets({"b": [True, None, np.True_.item(), False]})).to_pydict() == {
+        "b": [1, None, 1, 0]
+    }
+
+
 def test_parquet_without_rows_keeps_its_columns():
     assert read_parquet(parquet_octets({"n": [], "t": []})).column_names == ["n", "t"]
 

@@ -152,7 +152,7 @@ def test_a_dead_worker_is_said_in_one_line(tmp_path, monkeypatch):
 def test_two_builds_do_not_write_to_one_folder(tmp_path):
     steps = build(RECIPE, tmp_path / "set", 3, find_data(None))
     assert next(steps) == (0, 4)
-    with pytest.raises(DatasetError, match="found another build under way"):
+    with pytest.raises(DatasetError, match="found a build in progress"):
         next(build(RECIPE, tmp_path / "set", 3, find_data(None)))
     steps.close()
     assert next(build(RECIPE, tmp_path / "set", 3, find_data(None))) == (0, 4)
