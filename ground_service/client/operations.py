@@ -411,11 +411,11 @@ class Client(Connection):
         return self._post(KeptArchive, "/regression-archives", file, pinned=pinned)
 
     def change_kept_archive(self, digest: str, *, pinned: bool) -> KeptArchive:
-        """Pin a kept archive, or permit its removal again."""
+        """Change whether a kept archive is pinned."""
         path = f"/regression-archives/{_part(digest)}"
         return self._call(KeptArchive, "PATCH", path, body={"pinned": pinned})
 
-    def prune_kept_archives(self, *, unused_days: float) -> Pruned:
+    def delete_kept_archives(self, *, unused_days: float) -> Pruned:
         """Delete kept archives that are not pinned and were not used for a time."""
         return self._call(Pruned, "DELETE", "/regression-archives", query={"unused_days": unused_days})
 

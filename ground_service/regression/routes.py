@@ -98,14 +98,14 @@ async def keep_archive(upload: UploadOf, ground: GroundOf, _: Operator, pinned: 
 
 @regressions.patch("/regression-archives/{digest}")
 def change_kept_archive(ground: GroundOf, _: Operator, digest: Digest, given: ArchiveChange) -> KeptArchive:
-    """Pin a kept archive, or permit its removal again."""
+    """Change whether a kept archive is pinned."""
     archive_service.pin_archive(ground, digest, given.pinned)
     with ground.database.reading() as connection:
         return _archive(repository.get(connection, repository.REGRESSION_ARCHIVES, digest, "archive"))
 
 
 @regressions.delete("/regression-archives")
-def prune_kept_archives(
+def delete_kept_archives(
     ground: GroundOf,
     _: Operator,
     unused_days: Annotated[

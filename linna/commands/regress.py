@@ -335,7 +335,7 @@ def _archive(arguments: argparse.Namespace) -> int:
         elif arguments.action in ("pin", "unpin"):
             service.change_kept_archive(arguments.target, pinned=arguments.action == "pin")
         elif arguments.action == "prune":
-            removed = service.prune_kept_archives(unused_days=arguments.unused_days).removed
+            removed = service.delete_kept_archives(unused_days=arguments.unused_days).removed
         kept = service.list_kept_archives()
     shown = {"digest", "name", "frames", "octets", "pinned"}
     lines = [
