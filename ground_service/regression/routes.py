@@ -152,7 +152,7 @@ def start_analysis(
     given: AnalysisRequest,
     idempotency_key: IdempotencyKey = None,
 ) -> Job:
-    """Analyse builds without a verdict; the result of the job is that of the analysis."""
+    """Run an analysis of builds as a job; its result has no verdict."""
     arguments = {**compared(ground, given), "analysis": given.analysis, "figure": given.figure}
     job_id = idempotent_id("analysis", caller, idempotency_key)
     job = dispatcher.submit("analysis", arguments, job_id=job_id)
