@@ -115,13 +115,17 @@ def _kernels(field: GravityField) -> None:
 
 
 @njit
-def _vector_sums(packed, scratch, blocks, degrees, step, rounds):  # type: ignore[no-untyped-def]
+def _vector_sums(
+    packed: np.ndarray, scratch: np.ndarray, blocks: int, degrees: int, step: float, rounds: int
+) -> None:
     for _ in range(rounds):
         _gravity_kernel.sums(packed, 4, scratch, blocks, degrees, 0.6, -0.7, step, step * step)
 
 
 @njit
-def _plain_sums(packed, scratch, blocks, degrees, step, rounds):  # type: ignore[no-untyped-def]
+def _plain_sums(
+    packed: np.ndarray, scratch: np.ndarray, blocks: int, degrees: int, step: float, rounds: int
+) -> None:
     for _ in range(rounds):
         _gravity_kernel.plain_sums(packed, 4, scratch, blocks, degrees, 0.6, -0.7, step, step * step)
 

@@ -703,10 +703,10 @@ def _split_where_damaged(buffer: OctetArray, segments: IntArray, run: IntArray, 
     border = -(-(ranges[:, 0] + 1) // zone)
     # not at the end of the run, where there is nothing to split
     parted = border[(border * zone < ranges[:, 1]) & (border < run.size)]
-    begins_anew = np.zeros(run.size, dtype=np.int64)
-    begins_anew[parted] = 1
-    begins_anew[1:] |= np.diff(run) != 0
-    return np.cumsum(begins_anew)
+    begins = np.zeros(run.size, dtype=np.int64)
+    begins[parted] = 1
+    begins[1:] |= np.diff(run) != 0
+    return np.cumsum(begins)
 
 
 def _complete(

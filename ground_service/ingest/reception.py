@@ -65,7 +65,7 @@ def describe(settings: LinkSettings) -> dict[str, Any]:
 
 def expected_link(connection: Connection, piece: Piece) -> ExpectedLink:
     """Return what is known of the link of a piece."""
-    links = links_in_force(connection, piece.spacecraft_id)
+    links = links_in_force(connection, piece.spacecraft_id, piece.scope)
     found = [settings_of(link, piece.station) for link in links.values()]
     stations = [station for link in links.values() if (station := _station(link, piece.station))]
     remembered = [*good_links(connection, piece, piece.station), *good_links(connection, piece, None)]

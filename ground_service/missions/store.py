@@ -100,8 +100,11 @@ def list_revisions(connection: Connection, *, limit: int, offset: int) -> tuple[
     return [_revision(row, _document(row)) for row in page.rows], page.total
 
 
-def links_in_force(connection: Connection, ccsds_id: int | None) -> dict[int, Link]:
-    """Return the links that the newest descriptions of a spacecraft, or of all, state, by spacecraft."""
+def links_in_force(connection: Connection, ccsds_id: int | None, instance: str) -> dict[int, Link]:
+    """Return the links that the descriptions in force of a spacecraft, or of all, state, by spacecraft.
+
+    The instance of an archive has the description that came with the archive.
+    """
     query = select(MISSIONS.c.ccsds_id).where(MISSIONS.c.ccsds_id.is_not(None)).distinct()
     if ccsds_id is not None:
         query = query.where(MISSIONS.c.ccsds_id == ccsds_id)
@@ -110,6 +113,20 @@ def links_in_force(connection: Connection, ccsds_id: int | None) -> dict[int, Li
         key = newest_of_spacecraft(connection, spacecraft)
         if key is not None:
             found[spacecraft] = get_mission(connection, key).link
+    passes, vehicles = repository.PASSES, repository.VEHICLES
+    archived = (
+        select(vehicles.c.ccsds_id, passes.c.mission_id)
+        .join(vehicles, vehicles.c.id == passes.c.vehicle_id)
+        .where(
+            vehicles.c.instance == instance,
+            passes.c.archive_digest.is_not(None),
+            passes.c.mission_id.is_not(None),
+        )
+        .order_by(passes.c.id)
+    )
+    for spacecraft, key in connection.execute(archived):
+        if ccsds_id in (None, spacecraft):
+            found[int(spacecraft)] = get_mission(connection, int(key)).link
     return found
 
 

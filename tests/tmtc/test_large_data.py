@@ -46,7 +46,7 @@ def test_order_and_repetition_do_not_matter_and_missing_parts_are_named():
     assert receiver.octets_kept == 0 and receiver.missing(3) == []
 
 
-def test_a_number_that_is_used_again_for_another_table_begins_anew():
+def test_a_number_that_is_used_again_for_another_table_begins_again():
     old = list(through_packets(split(IMAGE, transaction=3, table="thumbnail", part_length=5000)))
     new = list(through_packets(split(IMAGE[::-1], transaction=3, table="landmark_map", part_length=5000)))
     assert receive([old[0], *new]) == [LargeData(3, 7, IMAGE[::-1])]

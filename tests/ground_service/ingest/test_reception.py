@@ -27,6 +27,8 @@ from ground_service.errors import InvalidInput
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import IngestResult, ingest_file
 from ground_service.missions.service import add_mission
+from ground_service.missions.store import links_in_force
+from ground_service.passes.archive_import import import_archive
 from ground_service.passes.model import Completeness
 from ground_service.passes.service import completeness, define_pass
 from ground_service.store import repository
@@ -97,6 +99,19 @@ def test_settings_come_from_the_mission_then_from_the_last_good_ones_and_else_fr
     assert section(ingest(ground, tmp_path, rows[10:20].tobytes()))["source"] == "remembered"
     add_mission(ground, MISSION.encode())
     assert section(ingest(ground, tmp_path, rows[20:].tobytes()))["source"] == "mission"
+
+
+def test_an_archive_is_read_with_the_settings_of_its_own_mission(ground: Ground, make_pass: Any) -> None:
+    """The description of the archive holds for its instance only, not for the spacecraft in flight."""
+    archive = make_pass(mission=MISSION)
+    pass_id = import_archive(ground, archive.folder)
+    with ground.database.reading() as connection:
+        (accounting,) = connection.execute(select(repository.INGESTS.c.accounting)).scalars()
+        vehicle = repository.get(connection, repository.PASSES, pass_id, "pass")["vehicle_id"]
+        instance = repository.get(connection, repository.VEHICLES, vehicle, "vehicle")["instance"]
+        assert set(links_in_force(connection, SPACECRAFT, instance)) == {SPACECRAFT}
+        assert links_in_force(connection, SPACECRAFT, "flight") == {}
+    assert {one["source"] for one in accounting["reception"]["sections"]} == {"mission"}
 
 
 def test_good_settings_are_remembered_once_by_station_and_audited(ground: Ground, tmp_path: Path) -> None:

@@ -213,7 +213,7 @@ def test_packets_damaged_in_the_store_are_found_told_and_never_sent(observing: A
 
 
 @pytest.mark.parametrize("jump_s", [3_600.0, 5.0, -5.0, -3_600.0])
-def test_a_clock_that_jumps_is_told_and_housekeeping_begins_anew(observing: Any, jump_s: float) -> None:
+def test_a_clock_that_jumps_is_told_and_housekeeping_begins_again(observing: Any, jump_s: float) -> None:
     observing.skew_ticks += round(jump_s * 65_536)
     packets = observing.step()
     jumps = [v["value_1"] for v in observing.named(packets, "event_medium")]

@@ -65,7 +65,7 @@ def test_a_full_class_overwrites_its_oldest_and_leaves_the_others_alone() -> Non
     assert kept.take(1 << 20) == [packet(0), *(packet(k) for k in range(3, room + 3))]
 
 
-def test_a_class_that_is_full_to_the_last_octet_begins_anew() -> None:
+def test_a_class_that_is_full_to_the_last_octet_begins_again() -> None:
     # Four packets of 29 octets and their headers fill the class of the most important packets exactly.
     kept = store(round(4 * (29 + HEADER) / SHARES[0]))
     packets = [packet(k) for k in range(9)]

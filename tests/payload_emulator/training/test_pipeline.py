@@ -77,7 +77,7 @@ def test_the_same_command_again_does_nothing_twice(job, made, monkeypatch):
     assert as_json(make_model(job)) == as_json(made)
 
 
-def test_a_stage_made_from_other_things_is_made_anew(job, made, monkeypatch):
+def test_a_stage_made_from_other_things_is_made_again(job, made, monkeypatch):
     asked = []
 
     def refuse(checkpoint, out, *_, **__):
