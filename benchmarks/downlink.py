@@ -335,6 +335,7 @@ def ingested(stream: Stream) -> Found:
     from ground_service.ground import open_ground
     from ground_service.ingest.service import ingest_file
     from ground_service.store import repository
+    from ground_service.store.vehicles import vehicle_id
 
     bare = SPACECRAFT if not stream.error_control else None
     with tempfile.TemporaryDirectory() as folder:
@@ -351,7 +352,7 @@ def ingested(stream: Stream) -> Found:
         table = repository.PACKETS
         with ground.database.reading() as connection:
             for spacecraft, packets in stream.packets.items():
-                vehicle = repository.vehicle_id(connection, spacecraft, "flight")
+                vehicle = vehicle_id(connection, spacecraft, "flight")
                 rows = connection.execute(select(table.c.octets).where(table.c.vehicle_id == vehicle))
                 mine = {bytes(row) for row in rows.scalars()}
                 found += len(mine & packets)

@@ -25,9 +25,10 @@ from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.ingest.store import store_samples
 from ground_service.passes.service import define_pass, state_series
-from ground_service.store import repository
+from ground_service.store import telemetry
 from ground_service.store.database import prepare_database
 from ground_service.store.rollups import STATE_VALUES
+from ground_service.store.vehicles import vehicle_id
 from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
@@ -115,7 +116,7 @@ def states(rows: int, queries: int = 40) -> dict[str, Any]:
     ticks_a_row = 6_554  # ten a second
     with tempfile.TemporaryDirectory() as folder, open_ground(Path(folder)) as ground:
         with ground.database.writing() as connection:
-            vehicle = repository.vehicle_id(connection, 76, "flight")
+            vehicle = vehicle_id(connection, 76, "flight")
         first = int(ticks_from_utc_ns(START))
         rng = np.random.default_rng(1)
         for start in range(0, rows, STATE_BLOCK):
@@ -159,7 +160,7 @@ def states(rows: int, queries: int = 40) -> dict[str, Any]:
         with ground.database.reading() as connection:
             clock = time.perf_counter()
             stop = first + rows // 10 * ticks_a_row
-            repository.sample_arrays(
+            telemetry.sample_arrays(
                 connection,
                 "navigation_states",
                 vehicle,

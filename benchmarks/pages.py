@@ -25,8 +25,8 @@ import numpy as np
 
 from ground_service.ground import open_ground
 from ground_service.passes.service import define_pass
-from ground_service.store import repository
 from ground_service.store.rollups import HOUSEKEEPING_VALUES, add_to_rollups
+from ground_service.store.vehicles import vehicle_id
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tmtc.dictionary import DICTIONARY
 
@@ -79,7 +79,7 @@ def seed(home: Path, passes: int, rows: int) -> None:
         first = int(ticks_from_utc_ns(START))
         for begin in range(0, rows, _CHUNK):
             with ground.database.writing() as connection:
-                vehicle = repository.vehicle_id(connection, SPACECRAFT, "flown")
+                vehicle = vehicle_id(connection, SPACECRAFT, "flown")
                 _housekeeping(connection, vehicle, first, begin, min(_CHUNK, rows - begin))
 
 

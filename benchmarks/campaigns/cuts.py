@@ -29,6 +29,7 @@ from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import Place, ingest_file
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
+from ground_service.store.vehicles import vehicle_id
 from tmtc.downlink import decode
 
 SPACECRAFT = 76
@@ -90,7 +91,7 @@ def hash_of(
             place=Place("campaign", start) if placed else None,
         )
     with ground.database.writing() as connection:
-        vehicle = repository.vehicle_id(connection, SPACECRAFT, instance)
+        vehicle = vehicle_id(connection, SPACECRAFT, instance)
         packets = repository.page(connection, repository.PACKETS, limit=1, vehicle_id=vehicle).total
         return archive_hash(connection, vehicle), packets
 

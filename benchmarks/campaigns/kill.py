@@ -45,6 +45,7 @@ from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.store import audit, repository
 from ground_service.store.canonical import archive_hash
+from ground_service.store.vehicles import vehicle_id
 from ground_service.worker.integrity import verify
 from lunar.timescales import format_utc
 
@@ -98,7 +99,7 @@ def contents(ground: Ground) -> tuple[str, list[bytes]]:
     """The hash of the archive and the digests of its packets."""
     table = repository.PACKETS
     with ground.database.reading() as connection:
-        vehicle = repository.vehicle_id(connection, SPACECRAFT, "flight")
+        vehicle = vehicle_id(connection, SPACECRAFT, "flight")
         digests = connection.execute(select(table.c.digest).where(table.c.vehicle_id == vehicle)).scalars()
         return archive_hash(connection, vehicle), [bytes(digest) for digest in digests]
 

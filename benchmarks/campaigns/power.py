@@ -37,6 +37,7 @@ from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
+from ground_service.store.vehicles import vehicle_id
 
 SPACECRAFT = 76
 SECTOR_OCTETS = 512
@@ -359,7 +360,7 @@ def check(folder: Path, pieces: list[bytes], acknowledged: list[str], expected: 
                     (folder / "piece").write_bytes(octets)
                     ingest_file(ground, folder / "piece")
                 with ground.database.writing() as connection:
-                    vehicle = repository.vehicle_id(connection, SPACECRAFT, "flight")
+                    vehicle = vehicle_id(connection, SPACECRAFT, "flight")
                     if archive_hash(connection, vehicle) != expected:
                         return "the archive differs after the rest was ingested"
     except Exception as error:  # any error means that the archive is not usable
@@ -380,7 +381,7 @@ def campaign(cuts: int, pieces: int, packets: int, seed: int, resumed: int = 10)
         folder = Path(name)
         operations = record(folder, parts)
         with open_ground(folder / "home") as ground, ground.database.writing() as connection:
-            expected = archive_hash(connection, repository.vehicle_id(connection, SPACECRAFT, "flight"))
+            expected = archive_hash(connection, vehicle_id(connection, SPACECRAFT, "flight"))
         wanted = Counter(rng.randrange(len(operations)) for _ in range(cuts))
         disk, acknowledged = Disk(), []
         for number, operation in enumerate(operations):

@@ -28,6 +28,7 @@ from ground_service.missions.store import approval_in_force, in_force
 from ground_service.store import repository
 from ground_service.store.counters import lock_spacecraft, next_telecommand
 from ground_service.store.states import TELECOMMAND, change_if, move, move_all
+from ground_service.store.vehicles import vehicle_id
 from ground_service.text import REASON_LIMIT, require_line
 from tmtc.dictionary import DICTIONARY
 from tmtc.effects import CommandEffect, effect_of
@@ -70,7 +71,7 @@ def enter_command(
         If the dictionary has no such command, or refuses its arguments.
     """
     with ground.database.writing() as connection:
-        vehicle = repository.vehicle_id(connection, spacecraft_id, instance)
+        vehicle = vehicle_id(connection, spacecraft_id, instance)
         return _add(connection, vehicle, name, arguments, "queued", actor, timeout_s)
 
 
@@ -178,7 +179,7 @@ def take_uplink(
     """
     table = TELECOMMAND.table
     with ground.database.writing() as connection:
-        vehicle = repository.vehicle_id(connection, spacecraft_id, instance)
+        vehicle = vehicle_id(connection, spacecraft_id, instance)
         lock_spacecraft(connection, vehicle)
         sent = {"sent_utc_ns": utc_now_ns(), "sent_after_ticks": _newest_ticks(connection, vehicle)}
         mine = [table.c.vehicle_id == vehicle, table.c.state == "released"]

@@ -11,6 +11,7 @@ from ground_service.ground import Ground
 from ground_service.store import repository
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile
+from ground_service.store.stored_files import register_file
 from lunar.ephemeris_files import load_ephemeris
 from lunar.errors import LunarError
 
@@ -33,7 +34,7 @@ def add_ephemeris(
     now = utc_now_ns()
     with ground.database.writing() as connection:
         hold(connection, f"ephemeris {stored.sha256}")
-        repository.register_file(connection, stored, "ephemeris", name, now)
+        register_file(connection, stored, "ephemeris", name, now)
         known = repository.find(
             connection, repository.EPHEMERIDES, file_sha256=stored.sha256, precedence=precedence, name=name
         )

@@ -20,6 +20,7 @@ from ground_service.events import PassEvaluated, publish
 from ground_service.ground import Ground
 from ground_service.store import repository
 from ground_service.store.files import make_durable_folder, replace_durably
+from ground_service.store.stored_files import register_file
 from lunar.timescales import format_utc
 from reports.document import evidence_number
 from reports.values import PassReport
@@ -95,7 +96,7 @@ def make_report(
     summary = _summary(report, pass_id)
     with ground.database.writing() as connection:
         for kind, file in stored.items():
-            repository.register_file(connection, file, "report", f"report of pass {pass_id} ({kind})", now)
+            register_file(connection, file, "report", f"report of pass {pass_id} ({kind})", now)
         record = repository.get(connection, repository.PASSES, pass_id, "pass")
         added = repository.add_new(
             connection,

@@ -33,7 +33,7 @@ from ground_service.passes.samples import (
 )
 from ground_service.passes.span import PassSpan, pass_span
 from ground_service.passes.store import code_labels, detection_samples, event_list
-from ground_service.store import repository
+from ground_service.store import repository, telemetry
 from ground_service.store.codec import unpack_filter_states, unpack_identifications
 from ground_service.store.files import FileArchive
 from lunar.catalogue import CraterCatalogue, load_catalogue
@@ -188,7 +188,7 @@ def navigation_samples(connection: Connection, span: PassSpan) -> tuple[Navigati
 
 def filter_states(connection: Connection, span: PassSpan) -> FilterStates | None:
     """Return the estimates of the navigation filter with their covariances, in time order; None without any."""
-    rows = repository.samples(
+    rows = telemetry.samples(
         connection,
         "filter_states",
         span.vehicle,
@@ -212,7 +212,7 @@ def filter_states(connection: Connection, span: PassSpan) -> FilterStates | None
 
 def identification_samples(connection: Connection, span: PassSpan) -> IdentificationSamples | None:
     """Which crater each used detection was taken for, in time order; None where nothing came down about it."""
-    rows = repository.samples(
+    rows = telemetry.samples(
         connection,
         "identifications",
         span.vehicle,
@@ -235,7 +235,7 @@ def identification_samples(connection: Connection, span: PassSpan) -> Identifica
 
 def landmark_reports(connection: Connection, span: PassSpan) -> MappedCraters:
     """Every report of a crater that the payload mapped itself, in time order, out of the packets."""
-    octets = repository.packet_octets(
+    octets = telemetry.packet_octets(
         connection, span.vehicle, APID_DETECTIONS, span.start_ticks, span.stop_ticks
     )
     tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=("landmarks",))
@@ -244,7 +244,7 @@ def landmark_reports(connection: Connection, span: PassSpan) -> MappedCraters:
 
 def reported_instruments(connection: Connection, span: PassSpan) -> tuple[InstrumentReport, ...]:
     """Return the statistics of the optional instruments of the payload, out of the packets."""
-    octets = repository.packet_octets(
+    octets = telemetry.packet_octets(
         connection, span.vehicle, APID_INSTRUMENTS, span.start_ticks, span.stop_ticks
     )
     names = tuple(one.name for one in instrument_telemetry())
@@ -353,7 +353,7 @@ def _columns(
     connection: Connection, kind: str, span: PassSpan, names: Sequence[str]
 ) -> dict[str, NDArray[Any]]:
     """Samples as arrays: whole numbers as int64, all else as float64 with NaN for NULL."""
-    return repository.sample_arrays(
+    return telemetry.sample_arrays(
         connection, kind, span.vehicle, span.start_ticks, span.stop_ticks, span.dictionary_version, names
     )
 
@@ -388,7 +388,7 @@ def _housekeeping(connection: Connection, span: PassSpan) -> tuple[HousekeepingP
 
 def _cpu_percent(connection: Connection, span: PassSpan, cadence_s: float | None) -> float | None:
     """Return the largest processor time of a step over the cadence, in percent of one core; None if unknown."""
-    octets = repository.packet_octets(
+    octets = telemetry.packet_octets(
         connection, span.vehicle, APID_PERFORMANCE, span.start_ticks, span.stop_ticks
     )
     table = DICTIONARY.unpack_many(octets, cut_packets(octets), only=("performance",)).get("performance")

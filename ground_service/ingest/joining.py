@@ -42,7 +42,7 @@ from ground_service.ingest.packets import batch_of_cut
 from ground_service.ingest.redecode import note_dictionary
 from ground_service.ingest.store import store_batch
 from ground_service.ingest.stream import BARE, Link
-from ground_service.store import repository
+from ground_service.store.vehicles import vehicle_id
 from tmtc import reed_solomon
 from tmtc.arrays import as_octets
 from tmtc.cadu import ASM_LENGTH, DEFAULT_TOLERANCE
@@ -132,7 +132,7 @@ class Joiner:
     def vehicle(self, connection: Connection, spacecraft: int) -> int:
         """Return the vehicle id of a spacecraft; create it if it is new."""
         if spacecraft not in self.vehicles:
-            vehicle = repository.vehicle_id(connection, spacecraft, self.piece.scope)
+            vehicle = vehicle_id(connection, spacecraft, self.piece.scope)
             note_dictionary(connection, vehicle)
             self.vehicles[spacecraft] = vehicle
         return self.vehicles[spacecraft]

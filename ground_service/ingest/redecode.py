@@ -18,6 +18,7 @@ from ground_service.ingest.packets import batch_of_cut
 from ground_service.ingest.store import store_samples
 from ground_service.store import repository
 from ground_service.store.rollups import forget_rollups
+from ground_service.store.vehicles import decoded_version
 from tmtc.dictionary import DICTIONARY
 from tmtc.schema import Dictionary
 from tmtc.stream import whole_packets
@@ -158,4 +159,4 @@ def _block(connection: Connection, row: repository.Row, dictionary: Dictionary) 
 
 def readable_version(connection: Connection, vehicle: int) -> int:
     """The dictionary version that a vehicle is to be read in: an older one until all is decoded with this one."""
-    return repository.decoded_version(connection, vehicle, DICTIONARY.version)
+    return decoded_version(connection, vehicle, DICTIONARY.version)

@@ -42,6 +42,7 @@ from ground_service.missions.definitions import PacketDefinitions
 from ground_service.store import parameters, repository
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile, mapped_octets, read_blocks
+from ground_service.store.stored_files import register_file
 from tmtc.arrays import as_octets
 from tmtc.cuc import NO_TICKS
 from tmtc.dictionary import DICTIONARY
@@ -195,7 +196,7 @@ def add_ingest(
     if link is not None:
         _check_link(link)
     now = utc_now_ns()
-    repository.register_file(connection, stored, "downlink", name, now)
+    register_file(connection, stored, "downlink", name, now)
     ingest_id = int(
         repository.add(
             connection,

@@ -20,6 +20,8 @@ from ground_service.missions.store import ARCHIVE_ACTOR
 from ground_service.store import repository
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile
+from ground_service.store.stored_files import register_file
+from ground_service.store.vehicles import SPACECRAFT_ID_MAX, vehicle_id
 from ground_service.text import require_line
 from ground_service.timekeeping.recorrelation import enter_receptions, read_receptions
 from lunar.catalogue import load_catalogue
@@ -128,9 +130,9 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
             f"{manifest['schema_version']} of a newer version",
         )
     require_line(manifest["pass_name"], str(path), "pass_name")
-    if not 0 <= manifest["spacecraft_id"] <= repository.SPACECRAFT_ID_MAX:
+    if not 0 <= manifest["spacecraft_id"] <= SPACECRAFT_ID_MAX:
         found = str(manifest["spacecraft_id"])[:40]
-        raise InvalidInput(str(path), "spacecraft_id", f"0 to {repository.SPACECRAFT_ID_MAX}", found)
+        raise InvalidInput(str(path), "spacecraft_id", f"0 to {SPACECRAFT_ID_MAX}", found)
     return manifest, hashlib.sha256(octets).hexdigest()
 
 
@@ -244,9 +246,9 @@ def _register(
         if existing is not None:
             return int(existing["id"])
         for name, file in stored.items():
-            repository.register_file(connection, file, Path(name).stem, name, now)
+            register_file(connection, file, Path(name).stem, name, now)
         for number, file in images.items():
-            repository.register_file(connection, file, "frame", f"frame {number}", now)
+            register_file(connection, file, "frame", f"frame {number}", now)
         ephemeris_id = None
         if reference is not None:
             ephemeris_id = repository.add(
@@ -266,9 +268,7 @@ def _register(
             repository.add(
                 connection,
                 repository.PASSES,
-                vehicle_id=repository.vehicle_id(
-                    connection, manifest["spacecraft_id"], instance_of(manifest, digest)
-                ),
+                vehicle_id=vehicle_id(connection, manifest["spacecraft_id"], instance_of(manifest, digest)),
                 name=manifest["pass_name"],
                 start_utc_ns=start_utc_ns,
                 stop_utc_ns=stop_utc_ns,

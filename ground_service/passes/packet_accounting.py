@@ -18,7 +18,7 @@ from sqlalchemy import Connection, select
 from ground_service.ingest.core import Gap, account_sequence
 from ground_service.passes.downlink_accounting import RawAccount, RawFile, account_raw, read_raw
 from ground_service.passes.span import PassSpan
-from ground_service.store import repository
+from ground_service.store import repository, telemetry
 from ground_service.store.files import FileArchive
 from reports.values import ApidAccounting, CompletenessSeries, PacketAccounting, ReceptionQuality
 from tmtc.cuc import TICKS_PER_SECOND
@@ -42,7 +42,7 @@ def packet_accounting(
     files: FileArchive, connection: Connection, record: Mapping[str, Any], span: PassSpan
 ) -> PacketAccounting:
     """Return the packet and octet accounting of a pass."""
-    headers = repository.packet_headers(connection, span.vehicle, span.start_ticks, span.stop_ticks)
+    headers = telemetry.packet_headers(connection, span.vehicle, span.start_ticks, span.stop_ticks)
     raw = _raw_account(files, connection, span)
     names = _apid_names()
     by_apid: dict[int, ApidAccounting] = {}
@@ -187,7 +187,7 @@ class _Images:
 def _images(connection: Connection, record: Mapping[str, Any], span: PassSpan) -> _Images:
     def columns(kind: str, *names: str, after_ticks: int = 0) -> dict[str, list[Any]]:
         stop = span.stop_ticks + after_ticks
-        return repository.samples(
+        return telemetry.samples(
             connection, kind, span.vehicle, span.start_ticks, stop, span.dictionary_version, names
         )
 

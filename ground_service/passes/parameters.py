@@ -18,7 +18,7 @@ from ground_service.passes.model import ExportFormat, PacketInfo, ParameterInfo,
 from ground_service.passes.series import PARAMETERS, KindSamples, SampleSource
 from ground_service.passes.span import PassSpan, pass_span
 from ground_service.store import parameters as store
-from ground_service.store import repository, rollups
+from ground_service.store import repository, rollups, telemetry
 from ground_service.timekeeping.core import utc_ns_of_ticks
 from lunar.arrays import FloatArray, IntArray
 from lunar.timescales import format_utc, ticks_from_utc_ns
@@ -164,7 +164,7 @@ class InstrumentSamples:
         self, connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int, names: tuple[str, ...]
     ) -> dict[str, NDArray[Any]]:
         """Return ``ticks`` and values (n,) between two on-board times, in order of time."""
-        octets = repository.packet_octets(connection, vehicle, APID_INSTRUMENTS, start_ticks, stop_ticks)
+        octets = telemetry.packet_octets(connection, vehicle, APID_INSTRUMENTS, start_ticks, stop_ticks)
         tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=(self.packet,))
         if self.packet not in tables:
             return {"ticks": np.zeros(0, dtype=np.int64), **{name: np.zeros(0) for name in names}}
@@ -355,7 +355,7 @@ def export_packets(ground: Ground, pass_id: int, packet: str, kind: ExportFormat
 
 def _own_records(connection: Connection, span: PassSpan, packet: str) -> list[Record]:
     apid = DICTIONARY.packet(packet).apid
-    octets = repository.packet_octets(connection, span.vehicle, apid, span.start_ticks, span.stop_ticks)
+    octets = telemetry.packet_octets(connection, span.vehicle, apid, span.start_ticks, span.stop_ticks)
     tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=(packet,))
     records = packet_records(tables)
     if len(records) > RECORDS_LIMIT:

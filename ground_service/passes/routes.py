@@ -44,7 +44,7 @@ from ground_service.passes.model import (
     Trend,
 )
 from ground_service.passes.series import STATE_VALUES, series_document
-from ground_service.store import repository
+from ground_service.store.stored_files import register_file
 
 EXPORT_MEDIA: dict[ExportFormat, str] = {
     "json": "application/json",
@@ -75,7 +75,7 @@ async def upload_archive(
 
     def enter() -> Job:
         with ground.database.writing() as connection:
-            repository.register_file(connection, stored, "archive", name, utc_now_ns())
+            register_file(connection, stored, "archive", name, utc_now_ns())
         job = dispatcher.submit("archive", {"sha256": stored.sha256, "name": name}, job_id=job_id)
         return get_job(ground, job)
 

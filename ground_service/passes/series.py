@@ -19,7 +19,7 @@ from ground_service.passes.core import (
     join,
 )
 from ground_service.passes.span import PassSpan
-from ground_service.store import repository, rollups
+from ground_service.store import rollups, telemetry
 from ground_service.store.rollups import HOUSEKEEPING_VALUES as PARAMETERS
 from ground_service.store.rollups import STATE_VALUES
 from ground_service.timekeeping.core import IDEAL_CLOCK, utc_ns_of_ticks
@@ -72,7 +72,7 @@ class SampleSource(Protocol):
         name: str,
         width_ticks: int,
     ) -> FloatArray:
-        """Return stretches of a value as `repository.sample_aggregates` does."""
+        """Return stretches of a value as `telemetry.sample_aggregates` does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +97,7 @@ class KindSamples:
     ) -> dict[str, NDArray[Any]]:
         """Return ``ticks`` and values (n,) between two on-board times."""
         columns = ("ticks", *names)
-        return repository.sample_arrays(
+        return telemetry.sample_arrays(
             connection, self.kind, vehicle, start_ticks, stop_ticks, self.version, columns, **self._equal
         )
 
@@ -112,7 +112,7 @@ class KindSamples:
     ) -> FloatArray:
         """Return stretches of a value, aggregated by the database."""
         where = (vehicle, start_ticks, stop_ticks, self.version)
-        return repository.sample_aggregates(connection, self.kind, *where, name, width_ticks, **self._equal)
+        return telemetry.sample_aggregates(connection, self.kind, *where, name, width_ticks, **self._equal)
 
     @property
     def _equal(self) -> dict[str, int]:

@@ -39,6 +39,7 @@ from ground_service.passes.span import PassSpan, pass_span
 from ground_service.passes.store import detection_frames, detection_samples, event_list
 from ground_service.passes.trends import trend_of
 from ground_service.store import repository, rollups
+from ground_service.store.vehicles import vehicle_id
 from ground_service.text import require_line
 from ground_service.timekeeping.core import ticks_of_utc_ns
 from ground_service.timekeeping.store import load_correlations
@@ -103,7 +104,7 @@ def define_pass(
             repository.add(
                 connection,
                 repository.PASSES,
-                vehicle_id=repository.vehicle_id(connection, spacecraft_id, instance),
+                vehicle_id=vehicle_id(connection, spacecraft_id, instance),
                 name=name,
                 start_utc_ns=start_utc_ns,
                 stop_utc_ns=stop_utc_ns,

@@ -14,7 +14,7 @@ from ground_service.passes.samples import (
     no_detections,
 )
 from ground_service.passes.span import PassSpan
-from ground_service.store import repository
+from ground_service.store import telemetry
 from ground_service.store.codec import unpack_detections
 from ground_service.timekeeping.core import utc_ns_of_ticks
 from lunar.arrays import IntArray
@@ -28,7 +28,7 @@ _SEVERITIES = {1: "info", 2: "low", 3: "medium", 4: "high"}
 
 def detection_samples(connection: Connection, span: PassSpan) -> DetectionSamples:
     """Detections of every frame, in time order; of two reports on one image the first by content counts."""
-    rows = repository.samples(
+    rows = telemetry.samples(
         connection,
         "detections",
         span.vehicle,
@@ -77,7 +77,7 @@ def _first_reports(rows: Mapping[str, list[Any]]) -> list[int]:
 
 def detection_frames(connection: Connection, span: PassSpan) -> tuple[IntArray, IntArray]:
     """On-board time of every frame (n,), ascending, and where its detections begin among all of the span (n + 1,)."""
-    rows = repository.samples(
+    rows = telemetry.samples(
         connection,
         "detections",
         span.vehicle,
@@ -100,7 +100,7 @@ def code_labels(labels: Mapping[int, str], codes: NDArray[Any]) -> tuple[str, ..
 def event_list(connection: Connection, span: PassSpan) -> tuple[PassEvent, ...]:
     """Event reports of a pass, in time order."""
     names = ("ticks", "severity", "event_id", "frame_number", "value_1", "value_2")
-    rows = repository.samples(
+    rows = telemetry.samples(
         connection, "events", span.vehicle, span.start_ticks, span.stop_ticks, span.dictionary_version, names
     )
     labels = DICTIONARY.labels("event_info", "event_id")

@@ -14,6 +14,7 @@ from ground_service.planning.model import Plan, PlanWindow, WindowEntry
 from ground_service.planning.service import insert_window
 from ground_service.store import repository
 from ground_service.store.counters import lock_spacecraft
+from ground_service.store.vehicles import vehicle_id
 
 
 def export_plan(ground: Ground) -> Plan:
@@ -65,7 +66,7 @@ def import_plan(ground: Ground, entries: Sequence[PlanWindow], *, actor: str) ->
     with ground.database.writing() as connection:
         # Lock all spacecraft of the plan in a fixed order, so that simultaneous imports do not deadlock.
         for spacecraft_id, instance in sorted({(one.spacecraft_id, one.instance) for one in entries}):
-            vehicle = repository.vehicle_id(connection, spacecraft_id, instance)
+            vehicle = vehicle_id(connection, spacecraft_id, instance)
             vehicles = repository.VEHICLES.c.id
             connection.execute(
                 select(vehicles).where(vehicles == vehicle).with_for_update(read=True, key_share=True)
@@ -104,7 +105,7 @@ def _known(connection: Connection, window: WindowEntry) -> int | None:
     row = repository.find(
         connection,
         repository.WINDOWS,
-        vehicle_id=repository.vehicle_id(connection, window.spacecraft_id, window.instance),
+        vehicle_id=vehicle_id(connection, window.spacecraft_id, window.instance),
         name=window.name,
         start_utc_ns=window.start_utc_ns,
         stop_utc_ns=window.stop_utc_ns,

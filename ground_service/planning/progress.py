@@ -19,7 +19,7 @@ from ground_service.ingest.core import account_sequence
 from ground_service.ingest.redecode import readable_version
 from ground_service.missions import store as missions
 from ground_service.planning.window_states import WindowFacts, state_of
-from ground_service.store import repository
+from ground_service.store import repository, telemetry
 from ground_service.store.counters import lock_spacecraft
 from ground_service.store.states import change_if
 from ground_service.timekeeping.core import TimeCorrelation, ticks_of_utc_ns
@@ -86,7 +86,7 @@ def _facts(
     vehicle = row["vehicle_id"]
     start = ticks_of_utc_ns(row["start_utc_ns"] - MARGIN_NS, correlations)
     stop = ticks_of_utc_ns(row["stop_utc_ns"] + MARGIN_NS, correlations)
-    events = repository.samples(
+    events = telemetry.samples(
         connection, "events", vehicle, start, stop, readable_version(connection, vehicle), ("event_id",)
     )["event_id"]
     commands = [
@@ -99,7 +99,7 @@ def _facts(
         ).mappings()
     ]
     frames = _frames(connection, vehicle, start, stop)
-    headers = repository.packet_headers(connection, vehicle, start, stop) if frames else None
+    headers = telemetry.packet_headers(connection, vehicle, start, stop) if frames else None
     reported = row["pass_id"] is not None and (
         repository.find(connection, repository.REPORTS, pass_id=row["pass_id"]) is not None
     )

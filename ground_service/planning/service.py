@@ -35,6 +35,7 @@ from ground_service.planning.window_states import COMMITTED, PlannedSpan, span_c
 from ground_service.store import repository
 from ground_service.store.counters import lock_spacecraft
 from ground_service.store.states import TELECOMMAND, change_if, move_all
+from ground_service.store.vehicles import vehicle_id
 from ground_service.text import REASON_LIMIT, require_line
 from ground_service.timekeeping.core import ticks_of_utc_ns
 from ground_service.timekeeping.store import load_correlations
@@ -138,7 +139,7 @@ def add_window(ground: Ground, entry: WindowEntry, *, actor: str) -> Window:
 def insert_window(ground: Ground, connection: Connection, entry: WindowEntry, *, actor: str) -> Window:
     """Add a window as `add_window` does, within the caller's transaction."""
     _check_entry(entry)
-    vehicle = repository.vehicle_id(connection, entry.spacecraft_id, entry.instance)
+    vehicle = vehicle_id(connection, entry.spacecraft_id, entry.instance)
     lock_spacecraft(connection, vehicle)
     values = _assessed(ground, connection, vehicle, 0, entry, "draft")
     now = utc_now_ns()

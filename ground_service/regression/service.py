@@ -36,6 +36,7 @@ from ground_service.regression.outcome import KeptReplay, PassVerdict, Regressio
 from ground_service.regression.replay_samples import PassContext, ReadDownlink, pass_context, read_downlink
 from ground_service.regression.runner import PERFORMANCE
 from ground_service.store import repository
+from ground_service.store.stored_files import register_file
 from lunar.errors import LunarError
 from lunar.timescales import format_utc
 
@@ -222,7 +223,7 @@ def keep_regression(ground: Ground, outcome: RegressionOutcome, *, regression_id
     html = ground.files.put_octets(regression_html(ground, outcome, identity).encode())
     now = utc_now_ns()
     with ground.database.writing() as connection:
-        repository.register_file(connection, html, "report", f"regression {identity}", now)
+        register_file(connection, html, "report", f"regression {identity}", now)
         added = repository.add_new(  # a stored verdict is not replaced
             connection,
             repository.REGRESSIONS,

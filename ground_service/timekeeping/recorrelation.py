@@ -25,6 +25,7 @@ from ground_service.http.times import time_of
 from ground_service.missions.stations import STATIONS
 from ground_service.missions.store import mission_of_vehicle
 from ground_service.store import repository
+from ground_service.store.vehicles import vehicle_id
 from ground_service.timekeeping.core import CorrelationFit, clock_runs, fit_correlation, utc_ns_of_ticks
 from ground_service.timekeeping.store import load_correlations
 from lunar.arrays import IntArray
@@ -146,7 +147,7 @@ def enter_receptions(
         key = (report.ticks, report.sequence_count, report.station)
         first[key] = min(first.get(key, report.earth_utc_ns), report.earth_utc_ns)
     with ground.database.writing() as connection:
-        vehicle = lock_vehicle(connection, repository.vehicle_id(connection, spacecraft_id, instance))
+        vehicle = lock_vehicle(connection, vehicle_id(connection, spacecraft_id, instance))
         rows = connection.execute(select(table).where(table.c.vehicle_id == vehicle)).mappings()
         known = {(r["ticks"], r["sequence_count"], r["station"]): r["earth_utc_ns"] for r in rows}
         new = [

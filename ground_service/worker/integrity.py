@@ -27,6 +27,7 @@ from ground_service.ingest.service import FLOWN, Place, ingest_stored
 from ground_service.ingest.store import store_batch
 from ground_service.store import audit, repository, row_digests
 from ground_service.store.files import FileArchive, StoredFile, read_blocks
+from ground_service.store.vehicles import vehicle_id
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import TmtcError
 from tmtc.packets import PRIMARY_HEADER_LENGTH
@@ -320,7 +321,7 @@ def _decode_again(connection: Connection, scratch: Ground, found: _Findings) -> 
         vehicle, last = int(row["id"]), 0
         try:
             with scratch.database.writing() as writing:
-                copy = repository.vehicle_id(writing, row["ccsds_id"], row["instance"])
+                copy = vehicle_id(writing, row["ccsds_id"], row["instance"])
         except InvalidInput as error:
             found.damage("vehicles", vehicle, str(error))
             continue

@@ -19,6 +19,7 @@ from ground_service.ingest.redecode import redecode
 from ground_service.ingest.service import ingest_file
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
+from ground_service.store.vehicles import vehicle_id
 from tmtc.dictionary import DICTIONARY
 
 KILLS = 4
@@ -40,7 +41,7 @@ with open_ground(Path(sys.argv[1])) as ground:
 
 def hash_of(ground: Ground) -> str:
     with ground.database.reading() as connection:
-        return archive_hash(connection, repository.vehicle_id(connection, 76, "flight"))
+        return archive_hash(connection, vehicle_id(connection, 76, "flight"))
 
 
 def rows_of(ground: Ground, version: int) -> dict[str, int]:

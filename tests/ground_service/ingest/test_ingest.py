@@ -22,6 +22,7 @@ from ground_service.ingest.service import Place, ingest_file
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
 from ground_service.store.database import prepare_database
+from ground_service.store.vehicles import vehicle_id
 from tmtc.crc import append_crc
 from tmtc.downlink import encode_cadus
 
@@ -36,7 +37,7 @@ def ingest(ground: Ground, octets: bytes, folder: Path, name: str = "downlink.bi
 
 def archive(ground: Ground) -> str:
     with ground.database.reading() as connection:
-        return archive_hash(connection, repository.vehicle_id(connection, SPACECRAFT, "flight"))
+        return archive_hash(connection, vehicle_id(connection, SPACECRAFT, "flight"))
 
 
 def rows(ground: Ground, table: Any) -> int:
@@ -132,7 +133,7 @@ def test_two_spacecraft_in_one_file_have_archives_of_their_own(
     assert result.packets_new == len(packets) + 20 and result.frames_bad == 0
     assert archive(ground) == expected
     with ground.database.reading() as connection:
-        other = repository.vehicle_id(connection, 33, "flight")
+        other = vehicle_id(connection, 33, "flight")
         stored = repository.page(connection, repository.PACKETS, vehicle_id=other)
     assert stored.total == 20
 
@@ -220,7 +221,7 @@ def test_pieces_are_joined_whether_or_not_their_spacecraft_is_stated(
     assert archive(ground) == expected
     other = repository.PACKETS
     with ground.database.reading() as connection:
-        vehicle = repository.vehicle_id(connection, SPACECRAFT + 1, "flight")
+        vehicle = vehicle_id(connection, SPACECRAFT + 1, "flight")
         count = select(func.count()).select_from(other).where(other.c.vehicle_id == vehicle)
         assert connection.execute(count).scalar_one() == (len(packets) if bare else 0)
 

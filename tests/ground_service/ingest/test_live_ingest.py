@@ -15,13 +15,13 @@ from ground_service.ground import Ground
 from ground_service.ingest import live as live_ingest
 from ground_service.ingest.live import Spool, WatchedFolder, follow_tcp
 from ground_service.ingest.service import ingest_file
-from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
+from ground_service.store.vehicles import vehicle_id
 
 
 def hash_of(ground: Ground) -> str:
     with ground.database.reading() as connection:
-        return archive_hash(connection, repository.vehicle_id(connection, 76, "flight"))
+        return archive_hash(connection, vehicle_id(connection, 76, "flight"))
 
 
 @pytest.fixture

@@ -33,6 +33,7 @@ from ground_service.passes.model import Completeness
 from ground_service.passes.service import completeness, define_pass
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
+from ground_service.store.vehicles import vehicle_id
 from lunar.timescales import utc_ns_from_ticks
 from tmtc.link import LinkSettings
 
@@ -77,7 +78,7 @@ def section(result: IngestResult) -> dict[str, Any]:
 def stored(ground: Ground, spacecraft: int = SPACECRAFT) -> set[bytes]:
     table = repository.PACKETS
     with ground.database.reading() as connection:
-        vehicle = repository.vehicle_id(connection, spacecraft, "flight")
+        vehicle = vehicle_id(connection, spacecraft, "flight")
         rows = connection.execute(select(table.c.octets).where(table.c.vehicle_id == vehicle))
         return {bytes(row) for row in rows.scalars()}
 
@@ -246,7 +247,7 @@ def test_two_spacecraft_have_the_same_archives_whatever_the_split(tmp_path: Path
                 ingest(ground, tmp_path, part)
         assert {one: stored(ground, one) for one in stream.packets} == stream.packets
         with ground.database.reading() as connection:
-            vehicles = [repository.vehicle_id(connection, one, "flight") for one in sorted(stream.packets)]
+            vehicles = [vehicle_id(connection, one, "flight") for one in sorted(stream.packets)]
             hashes.add(tuple(archive_hash(connection, vehicle) for vehicle in vehicles))
         ground.close()
     assert len(hashes) == 1

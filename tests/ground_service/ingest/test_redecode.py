@@ -20,6 +20,7 @@ from ground_service.passes.service import define_pass, events, parameter_series,
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.canonical import archive_hash
+from ground_service.store.vehicles import vehicle_id
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode
 
@@ -37,7 +38,7 @@ def fill_with_the_old(home: Path, made: Any) -> None:
     found = decode((made.folder / "downlink.cadu").read_bytes())
     with open_ground(home) as ground:
         with ground.database.writing() as connection:
-            vehicle = repository.vehicle_id(connection, 76, "flight")
+            vehicle = vehicle_id(connection, 76, "flight")
             store_batch(connection, vehicle, batch_of_cut(found.buffer, found.cut, OLD, 76))
             repository.change(connection, repository.VEHICLES, vehicle, decoded_version=OLD.version)
         define_pass(

@@ -22,6 +22,7 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.passes.service import define_pass
 from ground_service.passes.span import pass_span
 from ground_service.store import repository
+from ground_service.store.vehicles import vehicle_id
 from tmtc.dictionary import DICTIONARY, dictionary_version
 from tmtc.downlink import encode_cadus
 from tmtc.stream import cut_packets
@@ -145,7 +146,7 @@ def test_what_version_2_decoded_is_decoded_again_to_the_same_states(tmp_path: Pa
     octets = b"".join(anchored_packets(made, 2))
     with open_ground(tmp_path / "home") as ground:
         with ground.database.writing() as connection:
-            vehicle = repository.vehicle_id(connection, SPACECRAFT, "flight")
+            vehicle = vehicle_id(connection, SPACECRAFT, "flight")
             batch = batch_of_cut(octets, cut_packets(octets), dictionary_version(2), SPACECRAFT)
             store_batch(connection, vehicle, batch)
             repository.change(connection, repository.VEHICLES, vehicle, decoded_version=2)

@@ -11,9 +11,9 @@ from ground_service.ground import Ground
 from ground_service.ingest.store import store_samples
 from ground_service.passes import series
 from ground_service.passes.service import trend_series
-from ground_service.store import repository
 from ground_service.store.models import Rollup
 from ground_service.store.rollups import BASE_TICKS, HOUSEKEEPING_VALUES, STATE_VALUES, build_rollups
+from ground_service.store.vehicles import vehicle_id
 from tmtc.dictionary import DICTIONARY
 
 SECOND = 1 << 16
@@ -44,7 +44,7 @@ def states(seed: int = 1) -> dict[str, Any]:
 
 def stored(ground: Ground, columns: dict[str, Any], batches: list[np.ndarray]) -> int:
     with ground.database.writing() as connection:
-        vehicle = repository.vehicle_id(connection, 76, "flight")
+        vehicle = vehicle_id(connection, 76, "flight")
         for batch in batches:
             chosen = {name: column[batch] for name, column in columns.items() if name != "packet"}
             chosen["packet"] = np.arange(len(batch))

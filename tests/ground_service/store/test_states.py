@@ -15,11 +15,12 @@ from ground_service.ground import Ground
 from ground_service.store import repository
 from ground_service.store.counters import hold, next_telecommand
 from ground_service.store.states import JOB, TELECOMMAND, change_if, move, move_all
+from ground_service.store.vehicles import vehicle_id
 
 
 def add_command(ground: Ground, state: str = "queued") -> int:
     with ground.database.writing() as connection:
-        vehicle = repository.vehicle_id(connection, 76, "flight")
+        vehicle = vehicle_id(connection, 76, "flight")
         return int(
             repository.add(
                 connection,
@@ -108,7 +109,7 @@ def test_a_row_is_added_once(either: Ground) -> None:
 
 def test_counters_give_every_number_once_to_transactions_at_the_same_time(either: Ground) -> None:
     with either.database.writing() as connection:
-        vehicles = [repository.vehicle_id(connection, number, "flight") for number in (1, 2)]
+        vehicles = [vehicle_id(connection, number, "flight") for number in (1, 2)]
 
     def count(vehicle: int) -> int:
         with either.database.writing() as connection:
@@ -121,7 +122,7 @@ def test_counters_give_every_number_once_to_transactions_at_the_same_time(either
 
 def test_a_number_that_was_not_used_is_given_again(either: Ground) -> None:
     with either.database.writing() as connection:
-        vehicle = repository.vehicle_id(connection, 1, "flight")
+        vehicle = vehicle_id(connection, 1, "flight")
     with pytest.raises(RuntimeError), either.database.writing() as connection:
         next_telecommand(connection, vehicle)
         raise RuntimeError("the transaction fails")

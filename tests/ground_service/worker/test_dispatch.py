@@ -18,6 +18,7 @@ from ground_service.ingest.service import enter_ingest, ingest_file
 from ground_service.ingest.stream import DownlinkReader
 from ground_service.store import files, repository
 from ground_service.store.canonical import archive_hash
+from ground_service.store.vehicles import vehicle_id
 from ground_service.worker import dispatch
 from ground_service.worker.dispatch import ThreadDispatcher
 
@@ -36,7 +37,7 @@ def small_windows(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def hash_of(ground: Ground) -> str:
     with ground.database.reading() as connection:
-        return archive_hash(connection, repository.vehicle_id(connection, 76, "flight"))
+        return archive_hash(connection, vehicle_id(connection, 76, "flight"))
 
 
 def job_of(ground: Ground, job: str) -> dict[str, Any]:

@@ -28,6 +28,7 @@ from ground_service.store.database import (
     schema_revisions,
 )
 from ground_service.store.models import Base
+from ground_service.store.vehicles import vehicle_id
 from ground_service.worker.app import run_worker, worker_answers
 from ground_service.worker.dispatch import dispatcher_for
 from ground_service.worker.jobs import _lock_key, run_job
@@ -94,7 +95,7 @@ def test_the_archive_is_the_same_as_on_sqlite(
         assert first.packets_new == first.packets == len(synthetic_pass.packets)
         assert again.packets_new == 0
         with one.database.reading() as connection:
-            vehicle = repository.vehicle_id(connection, SPACECRAFT, "flight")
+            vehicle = vehicle_id(connection, SPACECRAFT, "flight")
             hashes.append(archive_hash(connection, vehicle))
     assert hashes[0] == hashes[1]
 

@@ -1,0 +1,150 @@
+"""SQL of stored packets and of the samples that the dictionary decodes from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection, func, select
+from sqlalchemy.sql import Select
+
+from ground_service.store.repository import PACKETS, SAMPLES
+from lunar.arrays import IntArray
+
+
+def packet_headers(
+    connection: Connection, vehicle: int, start_ticks: int | None = None, stop_ticks: int | None = None
+) -> dict[str, IntArray]:
+    """APID, on-board time and sequence count of the stored packets of a vehicle, by APID and time."""
+    query = select(PACKETS.c.apid, PACKETS.c.ticks, PACKETS.c.sequence_count).where(
+        PACKETS.c.vehicle_id == vehicle
+    )
+    if start_ticks is not None:
+        query = query.where(PACKETS.c.ticks >= start_ticks)
+    if stop_ticks is not None:
+        query = query.where(PACKETS.c.ticks <= stop_ticks)
+    query = query.order_by(PACKETS.c.apid, PACKETS.c.ticks, PACKETS.c.sequence_count, PACKETS.c.digest)
+    rows = np.array([tuple(row) for row in connection.execute(query)], dtype=np.int64).reshape(-1, 3)
+    return {"apid": rows[:, 0], "ticks": rows[:, 1], "sequence_count": rows[:, 2]}
+
+
+def packet_octets(
+    connection: Connection, vehicle: int, apid: int, start_ticks: int, stop_ticks: int
+) -> bytes:
+    """The stored packets of one APID between two on-board times (both included), end to end in order of time."""
+    query = (
+        select(PACKETS.c.octets)
+        .where(
+            PACKETS.c.vehicle_id == vehicle,
+            PACKETS.c.apid == apid,
+            PACKETS.c.ticks >= start_ticks,
+            PACKETS.c.ticks <= stop_ticks,
+        )
+        .order_by(PACKETS.c.ticks, PACKETS.c.sequence_count, PACKETS.c.digest)
+    )
+    return b"".join(bytes(octets) for (octets,) in connection.execute(query))
+
+
+def samples(
+    connection: Connection,
+    kind: str,
+    vehicle: int,
+    start_ticks: int,
+    stop_ticks: int,
+    dictionary_version: int,
+    columns: Sequence[str],
+    **equal: int,
+) -> dict[str, list[Any]]:
+    """Columns of the samples of one kind between two on-board times (both included), in order of time.
+
+    `equal` keeps only rows whose columns have these values.
+    """
+    query = _samples(kind, vehicle, start_ticks, stop_ticks, dictionary_version, columns, equal)
+    rows = connection.execute(query).all()
+    return {name: [row[i] for row in rows] for i, name in enumerate(columns)}
+
+
+def sample_arrays(
+    connection: Connection,
+    kind: str,
+    vehicle: int,
+    start_ticks: int,
+    stop_ticks: int,
+    dictionary_version: int,
+    columns: Sequence[str],
+    **equal: int,
+) -> dict[str, NDArray[Any]]:
+    """As `samples`, as arrays: whole numbers as int64, all else as float64 with NaN for what is not known."""
+    query = _samples(kind, vehicle, start_ticks, stop_ticks, dictionary_version, columns, equal)
+    with connection.execute(query) as result:
+        # Plain tuples of the driver: they need no translation, and rows as objects would take most of the time.
+        rows = result.cursor.fetchall()
+    # Whole numbers are below 2^53, so that float64 holds them.
+    values = np.array(rows, dtype=np.float64).reshape(-1, len(columns))
+    table = SAMPLES[kind]
+    return {
+        name: values[:, i].astype(np.int64 if table.c[name].type.python_type is int else np.float64)
+        for i, name in enumerate(columns)
+    }
+
+
+def sample_aggregates(
+    connection: Connection,
+    kind: str,
+    vehicle: int,
+    start_ticks: int,
+    stop_ticks: int,
+    dictionary_version: int,
+    name: str,
+    width_ticks: int,
+    **equal: int,
+) -> NDArray[np.float64]:
+    """One value of the samples, put together by the database in stretches of a length, in order of time (n, 7).
+
+    First and last on-board time, samples, known ones among them, and the sum, the least and the greatest of those (NaN
+    where there is none).
+    """
+    table = SAMPLES[kind]
+    ticks, value = table.c.ticks, table.c[name]
+    query = (
+        _samples(kind, vehicle, start_ticks, stop_ticks, dictionary_version, (), equal)
+        .with_only_columns(
+            func.min(ticks),
+            func.max(ticks),
+            func.count(),
+            func.count(value),
+            func.sum(value),
+            func.min(value),
+            func.max(value),
+        )
+        .group_by(ticks // width_ticks)
+        .order_by(None)
+        .order_by(func.min(ticks))
+    )
+    rows = [tuple(row) for row in connection.execute(query)]
+    return np.array(rows, dtype=np.float64).reshape(-1, 7)
+
+
+def _samples(
+    kind: str,
+    vehicle: int,
+    start_ticks: int,
+    stop_ticks: int,
+    dictionary_version: int,
+    columns: Sequence[str],
+    equal: dict[str, int],
+) -> Select[Any]:
+    table = SAMPLES[kind]
+    return (
+        select(*(table.c[name] for name in columns))
+        .where(
+            table.c.vehicle_id == vehicle,
+            table.c.dictionary_version == dictionary_version,
+            table.c.ticks >= start_ticks,
+            table.c.ticks <= stop_ticks,
+            *(table.c[name] == value for name, value in equal.items()),
+        )
+        .order_by(table.c.ticks, table.c.packet_id)
+    )

@@ -1,0 +1,102 @@
+"""SQL of vehicles: spacecraft in one instance, a domain of time and sequence counts each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sqlalchemy import Connection, select
+from sqlalchemy.exc import IntegrityError
+
+from ground_service.errors import InvalidInput, NotFound
+from ground_service.store import repository
+from ground_service.text import require_line
+
+SPACECRAFT_ID_MAX = 1023
+"""Largest spacecraft id: a transfer frame has ten bits for it (CCSDS 132.0-B)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Vehicle:
+    """A spacecraft in one instance: see `models.Vehicle`."""
+
+    id: int
+    ccsds_id: int
+    instance: str
+    decoded_version: int | None
+    redecoding_version: int | None
+    redecoded_to: int | None
+    redecode_until: int | None
+
+
+def get_vehicle(connection: Connection, vehicle: int, kind: str = "vehicle") -> Vehicle:
+    """Return a vehicle.
+
+    Raises
+    ------
+    NotFound
+        There is none; `kind` names it in the message.
+    """
+    return Vehicle(**repository.get(connection, repository.VEHICLES, vehicle, kind))
+
+
+def find_vehicle(connection: Connection, ccsds_id: int, instance: str) -> Vehicle:
+    """Return the vehicle of a spacecraft in one instance.
+
+    Raises
+    ------
+    NotFound
+        There is none.
+    """
+    row = repository.find(connection, repository.VEHICLES, ccsds_id=ccsds_id, instance=instance)
+    if row is None:
+        raise NotFound("spacecraft", f"{ccsds_id} ({instance})")
+    return Vehicle(**row)
+
+
+def all_vehicles(connection: Connection) -> list[Vehicle]:
+    """Return all vehicles."""
+    return [Vehicle(**row) for row in connection.execute(select(repository.VEHICLES)).mappings()]
+
+
+def lock_vehicle(connection: Connection, vehicle: int) -> Vehicle:
+    """Return a vehicle, locked until the transaction ends.
+
+    The lock waits for the transactions that store its packets, and keeps others out.
+    """
+    table = repository.VEHICLES
+    row = connection.execute(select(table).where(table.c.id == vehicle).with_for_update()).mappings().first()
+    if row is None:
+        raise NotFound("vehicle", vehicle)
+    return Vehicle(**row)
+
+
+def vehicle_id(connection: Connection, ccsds_id: int, instance: str) -> int:
+    """Return the vehicle id of a spacecraft in one instance; create it if it is new.
+
+    Raises
+    ------
+    InvalidInput
+        If the id does not fit a transfer frame, or the instance is not a printable line.
+    """
+    if isinstance(ccsds_id, bool) or not 0 <= ccsds_id <= SPACECRAFT_ID_MAX:
+        raise InvalidInput("spacecraft", "id", f"0 to {SPACECRAFT_ID_MAX}", str(ccsds_id)[:40])
+    require_line(instance, "spacecraft", "instance")
+    found = repository.find(connection, repository.VEHICLES, ccsds_id=ccsds_id, instance=instance)
+    if found is not None:
+        return int(found["id"])
+    try:
+        with connection.begin_nested():
+            return int(repository.add(connection, repository.VEHICLES, ccsds_id=ccsds_id, instance=instance))
+    except IntegrityError:
+        again = repository.find(connection, repository.VEHICLES, ccsds_id=ccsds_id, instance=instance)
+        if again is None:
+            raise
+        return int(again["id"])
+
+
+def decoded_version(connection: Connection, vehicle: int, newest: int) -> int:
+    """The dictionary version to read a vehicle in: the newest that all of its packets are decoded with."""
+    found = connection.execute(
+        select(repository.VEHICLES.c.decoded_version).where(repository.VEHICLES.c.id == vehicle)
+    ).scalar()
+    return newest if found is None else int(found)
