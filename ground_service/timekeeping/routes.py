@@ -10,13 +10,12 @@ from ground_service.ingest.service import FLOWN
 from ground_service.timekeeping.model import Correlation, Receptions, TimePoints, TimeReport
 from ground_service.timekeeping.recorrelation import enter_receptions, received_reports
 from ground_service.timekeeping.service import (
+    TimePoint,
     correlate_again,
     correlate_spacecraft,
     spacecraft_correlations,
     spacecraft_time_reports,
-    time_points,
 )
-from ground_service.timekeeping.store import correlation_of
 
 timekeeping = operations("time")
 
@@ -26,8 +25,7 @@ def list_correlations(
     ground: GroundOf, _: Viewer, spacecraft_id: SpacecraftId, instance: Instance = FLOWN
 ) -> PageOf[Correlation]:
     """List all time correlations of a spacecraft, newest first."""
-    rows = spacecraft_correlations(ground, spacecraft_id, instance)
-    return PageOf.all_of([correlation_of(row) for row in rows])
+    return PageOf.all_of(spacecraft_correlations(ground, spacecraft_id, instance))
 
 
 @timekeeping.post("/spacecraft/{spacecraft_id}/correlations", status_code=201)
@@ -39,9 +37,11 @@ def add_correlations(
     instance: Instance = FLOWN,
 ) -> PageOf[Correlation]:
     """Add time reports and correlate on-board time with UTC from them; the correlations then in force."""
-    points = time_points([vars(point) for point in given.points])
-    rows = correlate_spacecraft(ground, spacecraft_id, instance, points, actor=caller.name)
-    return PageOf.all_of([correlation_of(row) for row in rows])
+    points = [
+        TimePoint(one.ticks, one.received.utc_ns, round(one.light_time_s * 1e9), one.boot_count)
+        for one in given.points
+    ]
+    return PageOf.all_of(correlate_spacecraft(ground, spacecraft_id, instance, points, actor=caller.name))
 
 
 @timekeeping.post("/spacecraft/{spacecraft_id}/correlations/run")
@@ -52,8 +52,7 @@ def run_correlation(
 
     It returns the correlations then in force. New telemetry, receptions and ephemerides are correlated automatically.
     """
-    rows = correlate_again(ground, spacecraft_id, instance, actor=caller.name)
-    return PageOf.all_of([correlation_of(row) for row in rows])
+    return PageOf.all_of(correlate_again(ground, spacecraft_id, instance, actor=caller.name))
 
 
 @timekeeping.post("/spacecraft/{spacecraft_id}/receptions", status_code=201)
@@ -66,8 +65,7 @@ def add_receptions(
 ) -> PageOf[Correlation]:
     """Add Earth reception times of time reports; the correlations then in force."""
     reports = received_reports([vars(one) for one in given.receptions])
-    rows = enter_receptions(ground, spacecraft_id, instance, reports, actor=caller.name)
-    return PageOf.all_of([correlation_of(row) for row in rows])
+    return PageOf.all_of(enter_receptions(ground, spacecraft_id, instance, reports, actor=caller.name))
 
 
 @timekeeping.get("/spacecraft/{spacecraft_id}/time-reports")
@@ -75,5 +73,4 @@ def list_time_reports(
     ground: GroundOf, _: Viewer, spacecraft_id: SpacecraftId, instance: Instance = FLOWN
 ) -> PageOf[TimeReport]:
     """List the received time reports with their light time and residuals."""
-    rows = spacecraft_time_reports(ground, spacecraft_id, instance)
-    return PageOf.all_of([TimeReport.of(row) for row in rows])
+    return PageOf.all_of(spacecraft_time_reports(ground, spacecraft_id, instance))

@@ -40,7 +40,8 @@ from ground_service.passes.span import pass_span
 from ground_service.planning.progress import advance_windows
 from ground_service.store import events, repository
 from ground_service.store.events import LoggedEvent
-from ground_service.timekeeping.recorrelation import recorrelate, vehicles_with_receptions
+from ground_service.timekeeping.recorrelation import recorrelate
+from ground_service.timekeeping.store import vehicles_with_receptions
 from ground_service.worker.jobs import run_job
 from lunar.datafolder import DataFolder
 
@@ -82,7 +83,9 @@ def _after_correlation(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
 
 def _after_ephemeris(ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
     event = EphemerisAdded.of(logged)
-    for vehicle in vehicles_with_receptions(ground, event.start_utc_ns, event.stop_utc_ns):
+    with ground.database.reading() as connection:
+        vehicles = vehicles_with_receptions(connection, event.start_utc_ns, event.stop_utc_ns)
+    for vehicle in vehicles:
         yield "recorrelate", vehicle
     table = repository.PASSES
     query = select(table.c.id).where(

@@ -135,8 +135,8 @@ def test_the_ground_finds_the_time_of_every_frame_from_time_reports(
         key = import_archive(ground, out)
         found = load_pass_inputs(ground, key).detections
         lines = in_force(ground, 1)
-    assert [line["boot_count"] for line in lines] == [1, 2]
-    assert lines[1]["drift_ppb"] == pytest.approx(-3000.0, abs=200.0)
+    assert [line.boot_count for line in lines] == [1, 2]
+    assert lines[1].drift_ppb == pytest.approx(-3000.0, abs=200.0)
     nearest = np.abs(found.utc_ns[:, None] - true[None, :, 1]).min(axis=1)
     # 0.4 s off without the correlation; a tick is 15 us, and the first line is carried on to the boot.
     assert nearest.max() < 1_000_000

@@ -15,6 +15,7 @@ from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
 from ground_service.passes.service import define_pass, events
 from ground_service.timekeeping import recorrelation
+from ground_service.timekeeping.model import Correlation
 from ground_service.timekeeping.recorrelation import (
     ReceivedReport,
     enter_receptions,
@@ -100,12 +101,12 @@ def ingest(ground: Ground, folder: Path, octets: bytes, name: str = "d.cadu") ->
     return vehicle
 
 
-def receive(ground: Ground, reports: list[ReceivedReport]) -> list[dict[str, Any]]:
+def receive(ground: Ground, reports: list[ReceivedReport]) -> list[Correlation]:
     return enter_receptions(ground, SPACECRAFT, "flight", reports, actor="ann")
 
 
-def content(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [{k: v for k, v in row.items() if k not in ("id", "created_utc_ns")} for row in rows]
+def content(rows: list[Correlation]) -> list[dict[str, Any]]:
+    return [row.model_dump(exclude={"id", "created"}) for row in rows]
 
 
 def test_every_boot_gets_its_line_and_every_derived_time_names_it(
@@ -113,13 +114,11 @@ def test_every_boot_gets_its_line_and_every_derived_time_names_it(
 ) -> None:
     vehicle = ingest(ground, tmp_path, spacecraft.downlink())
     rows = receive(ground, spacecraft.reports)
-    assert [row["boot_count"] for row in rows] == [7, 8]
-    assert [row["points"] for row in rows] == [15, 15]
+    assert [row.boot_count for row in rows] == [7, 8]
+    assert [row.points for row in rows] == [15, 15]
     for row in rows:
-        assert row["drift_ppb"] == pytest.approx(
-            -3000.0, abs=20.0
-        )  # a tick (15 us) over 14 minutes is 18 ppb
-        assert row["residual_rms_ns"] < 15_259
+        assert row.drift_ppb == pytest.approx(-3000.0, abs=20.0)  # a tick (15 us) over 14 minutes is 18 ppb
+        assert row.residual_rms_ns < 15_259
     key = define_pass(
         ground,
         name="p",
@@ -129,10 +128,10 @@ def test_every_boot_gets_its_line_and_every_derived_time_names_it(
     )
     found = events(ground, key)
     np.testing.assert_allclose([event.utc_ns for event in found], spacecraft.sent, atol=20_000)
-    assert [event.correlation_id for event in found] == [rows[0]["id"]] * 15 + [rows[1]["id"]] * 15
+    assert [event.correlation_id for event in found] == [rows[0].id] * 15 + [rows[1].id] * 15
     left = residuals(ground, vehicle)
     assert len(left) == REPORTS
-    assert max(abs(one["residual_ns"]) for one in left) < 20_000
+    assert max(abs(one.residual_ns) for one in left) < 20_000
 
 
 def test_the_order_of_telemetry_and_receptions_does_not_matter(
@@ -189,7 +188,7 @@ def test_what_an_operator_entered_stays_until_asked_otherwise(
 ) -> None:
     vehicle = ingest(ground, tmp_path, spacecraft.downlink())
     correlate(ground, vehicle, [TimePoint(clock(START, 0), START, 0)])
-    assert [row["points"] for row in receive(ground, spacecraft.reports)] == [1]
+    assert [row.points for row in receive(ground, spacecraft.reports)] == [1]
     assert len(correlate_again(ground, SPACECRAFT, "flight", actor="ann")) == 2
 
 
@@ -204,7 +203,7 @@ def test_an_earlier_reception_of_the_same_report_counts(
     for order in itertools.permutations([spacecraft.reports, played_back]):
         for reports in order:
             rows = receive(ground, reports)
-    assert [row["reference_utc_ns"] for row in rows] == pytest.approx(
+    assert [row.reference_utc_ns for row in rows] == pytest.approx(
         [spacecraft.sent[7], spacecraft.sent[22]], abs=20_000
     )
 
@@ -219,10 +218,10 @@ def test_a_new_reference_ephemeris_gives_new_light_times(
     earth = np.asarray(earth_position_icrf_m(np.asarray(tdb_s_from_utc_ns(times))))
     distance = np.linalg.norm(earth, axis=1, keepdims=True)
     far_side = -earth / distance * 3.0 * MOON_RADIUS_M
-    before = [one["light_time_s"] for one in residuals(ground, vehicle)]
+    before = [one.light_time_s for one in residuals(ground, vehicle)]
     save_oem(ephemeris_from_states(times, far_side, np.zeros_like(far_side)), tmp_path / "far.oem")
     add_ephemeris(ground, ground.files.put_file(tmp_path / "far.oem"), name="far")
-    after = [one["light_time_s"] for one in residuals(ground, vehicle)]
+    after = [one.light_time_s for one in residuals(ground, vehicle)]
     # From the Moon's centre to three radii behind it, as seen from the Earth.
     np.testing.assert_allclose(np.array(after) - before, 3.0 * MOON_RADIUS_M / SPEED_OF_LIGHT_M_S, atol=1e-5)
     assert len(in_force(ground, vehicle)) == 2

@@ -35,7 +35,7 @@ def test_times_of_samples_follow_the_correlation_in_force(ground: Ground, synthe
     assert (ideal.correlation_id, moved.correlation_id) == (0, 1)
     correlate(ground, vehicle, points)
     record = correlations_on_record(ground, vehicle)
-    assert [(row["id"], row["superseded"]) for row in record] == [(2, 0), (1, 1)]
+    assert [(row.id, row.in_force) for row in record] == [(2, True), (1, False)]
 
 
 def test_every_boot_has_a_line_of_its_own(ground: Ground, synthetic_pass: Any) -> None:
