@@ -1,10 +1,69 @@
-"""The wall clock of the service, in the one form it is stored in."""
+"""Clocks of the service: the wall clock, and the mission time, which a simulated mission sets.
+
+The wall clock counts for leases, time-outs, tokens and the audit log. The mission time counts for everything that
+depends on the time at the spacecraft: contacts, plans, windows and the delays of automation. Outside of simulations it
+is the wall clock.
+"""
 
 from __future__ import annotations
 
+import mmap
+import struct
+import threading
 import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+_INSTANT = struct.Struct("<q")
 
 
 def utc_now_ns() -> int:
     """Nanoseconds since 1970-01-01T00:00:00 UTC."""
     return time.time_ns()
+
+
+@dataclass(slots=True)
+class _Source:
+    read: Callable[[], int] = field(default=utc_now_ns)
+
+
+_mission = _Source()
+
+
+def mission_now_ns() -> int:
+    """Mission time: nanoseconds since 1970-01-01T00:00:00 UTC, the wall clock where no simulation sets it."""
+    return _mission.read()
+
+
+def set_mission_clock(read: Callable[[], int] | None = None) -> None:
+    """Take the mission time of this process from a function; None: from the wall clock."""
+    _mission.read = utc_now_ns if read is None else read
+
+
+@dataclass(slots=True, eq=False)
+class ClockFile:
+    """Mission time in a file of eight octets (int64 nanoseconds, little-endian), shared between processes.
+
+    The wall clock is read until the file exists and holds a time.
+    """
+
+    path: Path
+    _map: mmap.mmap | None = None
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def read(self) -> int:
+        """Return the time in the file."""
+        if self._map is None:
+            self._open()
+        if self._map is None:
+            return utc_now_ns()
+        return int(_INSTANT.unpack_from(self._map)[0]) or utc_now_ns()
+
+    def _open(self) -> None:
+        with self._lock:
+            try:
+                with self.path.open("rb") as file:
+                    self._map = mmap.mmap(file.fileno(), _INSTANT.size, access=mmap.ACCESS_READ)
+            except (OSError, ValueError):  # not written yet
+                self._map = None

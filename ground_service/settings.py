@@ -59,6 +59,11 @@ class Settings(BaseSettings):
     data: Path | None = Field(
         default=None, description="Folder of the public data products (gravity, kernels)"
     )
+    clock_file: Path | None = Field(
+        default=None,
+        description="File with the mission time of a simulated mission, written by `linna emulate --continuous`; "
+        "default: the wall clock",
+    )
     host: str = Field(default="127.0.0.1", description="Address that the HTTP server binds to")
     port: int = Field(default=8042, ge=0, le=65535, description="Port of the HTTP server")
     live_console: str | None = Field(

@@ -83,8 +83,22 @@ class FrameSettings(Section):
     frame_checksum: bool | None = None
 
 
+def _span(text: str) -> str:
+    start, _, stop = text.partition("/")
+    try:
+        forwards = parse_utc(start) < parse_utc(stop)
+    except TimeFormatError as error:
+        raise ValueError(f"START/STOP in UTC: {error}") from None
+    if not forwards:
+        raise ValueError("START/STOP with a stop after the start")
+    return text
+
+
+Span = Annotated[str, AfterValidator(_span)]
+
+
 class StationLink(FrameSettings):
-    """Records of a ground station, and settings of its link that differ from those of the spacecraft.
+    """Place of a ground station, its records, and settings of its link that differ from those of the spacecraft.
 
     Attributes
     ----------
@@ -93,12 +107,33 @@ class StationLink(FrameSettings):
     time_code, time_offset
         Reception time in the header, from this octet on: "cds" (16-bit days from 1958-01-01, 32-bit milliseconds) or
         "unix_ns" (64-bit nanoseconds from 1970-01-01), both UTC and most significant octet first.
+    latitude_deg, longitude_deg, height_m
+        WGS 84, longitude to the east.
+    minimum_elevation_deg
+        Lowest elevation at which the station works.
+    downlink_bps, uplink_bps
+        Rates, bits of packets in a second.
+    outages
+        Spans without contacts, such as ``2029-08-10T00:00:00Z/2029-08-10T06:00:00Z``.
     """
 
+    latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None
+    longitude_deg: Annotated[float, Field(ge=-180.0, le=360.0)] | None = None
+    height_m: Annotated[float, Field(ge=-500.0, le=9000.0)] | None = None
+    minimum_elevation_deg: Annotated[float, Field(ge=0.0, lt=90.0)] | None = None
+    downlink_bps: Positive | None = None
+    uplink_bps: Positive | None = None
+    outages: Annotated[tuple[Span, ...], Array] | None = None
     header_octets: Annotated[int, Field(ge=0, le=1024)] | None = None
     trailer_octets: Annotated[int, Field(ge=0, le=1024)] | None = None
     time_code: Literal["cds", "unix_ns"] | None = None
     time_offset: Annotated[int, Field(ge=0, le=1024)] | None = None
+
+    @model_validator(mode="after")
+    def _whole_place(self) -> StationLink:
+        if (self.latitude_deg is None) != (self.longitude_deg is None):
+            raise ValueError("latitude_deg and longitude_deg together, found one of them")
+        return self
 
     @model_validator(mode="after")
     def _time_in_header(self) -> StationLink:

@@ -78,7 +78,12 @@ def settings_of(arguments: argparse.Namespace, **given: object) -> Settings:
     """Return the settings of the deployment, overridden by the command line."""
     from ground_service.settings import load_settings
 
-    return load_settings(home=getattr(arguments, "home", None), **given)
+    settings = load_settings(home=getattr(arguments, "home", None), **given)
+    if settings.clock_file is not None:
+        from ground_service.clock import ClockFile, set_mission_clock
+
+        set_mission_clock(ClockFile(settings.clock_file).read)
+    return settings
 
 
 def open_service(arguments: argparse.Namespace) -> Ground:

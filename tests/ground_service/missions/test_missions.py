@@ -382,3 +382,30 @@ def _manifest_again(folder: Path) -> None:
     manifest = json.loads((folder / "manifest.json").read_text())
     del manifest["files"]
     write_manifest(folder, manifest)
+
+
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ("latitude_deg = 40.4", "latitude_deg and longitude_deg together"),
+        ('outages = ["2029-08-10T06:00:00Z/2029-08-10T00:00:00Z"]', "a stop after the start"),
+        ('outages = ["tomorrow"]', "START/STOP in UTC"),
+        ("latitude_deg = 95.0\nlongitude_deg = 0.0", "latitude_deg"),
+    ],
+)
+def test_an_impossible_place_or_outage_of_a_station_is_refused(keys: str, expected: str) -> None:
+    with pytest.raises(InvalidInput, match=expected):
+        parse_mission(f'schema_version = 1\nname = "m"\n[link.stations.madrid]\n{keys}\n')
+
+
+def test_place_rates_and_outages_of_a_station_are_read() -> None:
+    text = (
+        'schema_version = 1\nname = "m"\n[link.stations.madrid]\nlatitude_deg = 40.43\nlongitude_deg = -4.25\n'
+        "height_m = 840.0\nminimum_elevation_deg = 10.0\ndownlink_bps = 64000.0\nuplink_bps = 4000.0\n"
+        'outages = ["2029-08-10T00:00:00Z/2029-08-10T06:00:00Z"]\n'
+    )
+    stations = parse_mission(text).link.stations
+    assert stations is not None
+    madrid = stations["madrid"]
+    assert (madrid.latitude_deg, madrid.longitude_deg, madrid.uplink_bps) == (40.43, -4.25, 4000.0)
+    assert madrid.outages == ("2029-08-10T00:00:00Z/2029-08-10T06:00:00Z",)
