@@ -115,6 +115,62 @@ class MissionAdded(Event):
     spacecraft_id: int | None = None
 
 
+class LinkChanged(Event):
+    """The state of a link to a ground station changed."""
+
+    event_kind = "link"
+    link: str
+    state: str
+    reason: str | None = None
+
+
+class ContactStarted(Event):
+    """The first telemetry of a contact of a vehicle was received over a link; times are mission time."""
+
+    event_kind = "contact started"
+    contact_id: int
+    link: str
+    station: str
+    vehicle_id: int
+    start_utc_ns: int
+
+
+class ContactEnded(Event):
+    """A contact has ended, and the telemetry received in it is in the archive."""
+
+    event_kind = "contact ended"
+    contact_id: int
+    link: str
+    station: str
+    vehicle_id: int
+    start_utc_ns: int
+    stop_utc_ns: int
+    octets: int
+    telecommands: int
+
+
+class ContactMissed(Event):
+    """No telemetry was received in a predicted contact."""
+
+    event_kind = "contact missed"
+    contact_id: int
+    link: str
+    station: str
+    vehicle_id: int
+    start_utc_ns: int
+    stop_utc_ns: int
+    reason: str
+
+
+class PlanChanged(Event):
+    """The planner added windows for a standing request, or replaced failed ones."""
+
+    event_kind = "plan"
+    request_id: int
+    windows_added: tuple[int, ...]
+    windows_failed: tuple[int, ...] = ()
+
+
 class JobChanged(Event):
     """A job was added, started or has ended."""
 

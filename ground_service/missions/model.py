@@ -16,7 +16,7 @@ from typing import Annotated, Any, Final, Literal, get_args
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from ground_service.errors import InvalidInput
-from ground_service.http.model import Entity
+from ground_service.http.model import Entity, InstanceName
 from ground_service.http.times import UtcTime
 from lunar.errors import TimeFormatError
 from lunar.timescales import parse_utc
@@ -348,6 +348,79 @@ class Approval(Section):
         return self
 
 
+LinkName = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+
+
+class StationConnection(Section):
+    """Connection of the service to a ground station: telemetry in, telecommands out.
+
+    Attributes
+    ----------
+    kind
+        "tcp": the service connects to ports of the station. "file": the station shares folders with the service.
+    station
+        Name in `link.stations`, with the records and the place of the station.
+    downlink, uplink
+        ``HOST:PORT`` of a TCP connection, or the absolute path of a folder.
+    send
+        "automatic": released telecommands are sent in the next contact. "manual": on request only.
+    acknowledge
+        The service returns the number of durably stored octets on the telemetry connection.
+    silence_s
+        A contact has ended when no telemetry was received for this time.
+    """
+
+    name: LinkName
+    kind: Literal["tcp", "file"]
+    station: StationName | None = None
+    instance: InstanceName = "flight"
+    downlink: str | None = None
+    uplink: str | None = None
+    format: Literal["cltu", "packets"] = "cltu"
+    send: Literal["automatic", "manual"] = "automatic"
+    reconnect: bool = True
+    acknowledge: bool = False
+    silence_s: Annotated[float, Field(ge=1.0, le=86_400.0)] = 60.0
+
+    @model_validator(mode="after")
+    def _addresses(self) -> StationConnection:
+        if self.downlink is None and self.uplink is None:
+            raise ValueError("downlink, uplink or both, found neither")
+        for key in ("downlink", "uplink"):
+            value = getattr(self, key)
+            if value is None:
+                continue
+            host, _, port = value.rpartition(":")
+            if self.kind == "tcp" and not (
+                host and port.isascii() and port.isdigit() and 0 < int(port) < 65536
+            ):
+                raise ValueError(f"{key} as HOST:PORT, found {value[:80]!r}")
+            if self.kind == "file" and not value.startswith("/"):
+                raise ValueError(f"{key} as the absolute path of a folder, found {value[:80]!r}")
+        if self.kind == "file" and self.downlink == self.uplink:
+            raise ValueError("different folders for downlink and uplink, found one for both")
+        return self
+
+
+class SpacecraftResources(Section):
+    """Resources of the spacecraft for the plan; values that are not stated are those of the request or the defaults.
+
+    Attributes
+    ----------
+    observe_hours_per_day
+        Largest duration of observation windows that begin within 24 hours.
+    """
+
+    storage_mib: Positive | None = None
+    downlink_kbit_s: Positive | None = None
+    battery_wh: Positive | None = None
+    generation_w: NotNegative | None = None
+    idle_w: NotNegative | None = None
+    observing_w: NotNegative | None = None
+    minimum_battery: Share | None = None
+    observe_hours_per_day: Annotated[float, Field(gt=0.0, le=24.0)] | None = None
+
+
 class PacketTime(Section):
     """Time code in the secondary header of packets.
 
@@ -433,7 +506,19 @@ class Mission(Section):
     requirements: Requirements = Requirements()
     automation: Automation = Automation()
     approval: Approval = Approval()
+    resources: SpacecraftResources = SpacecraftResources()
+    links: Annotated[tuple[StationConnection, ...], Array] | None = None
     packets: Annotated[tuple[PacketSource, ...], Array] | None = None
+
+    @model_validator(mode="after")
+    def _links_once(self) -> Mission:
+        names = [one.name for one in self.links or ()]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"each name of links once, found {name!r} again")
+        if names and self.spacecraft.id is None:
+            raise ValueError("a spacecraft id with links, found none")
+        return self
 
     @model_validator(mode="after")
     def _apids_once(self) -> Mission:
@@ -522,6 +607,7 @@ def _read(text: str, source: str) -> Mission | list[InvalidInput]:
 
 _INNER: dict[tuple[str, str], type[Section]] = {
     ("Mission", "packets"): PacketSource,
+    ("Mission", "links"): StationConnection,
     ("PacketSource", "time"): PacketTime,
 }
 """Sections in lists and optional sections, by the section that has them."""

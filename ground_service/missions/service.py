@@ -91,7 +91,24 @@ def add_mission(
                 raise Forbidden(
                     f"{source}: changes which telecommands need a second person; expected an administrator"
                 )
+        _check_link_names(connection, mission, source)
         return store.detail(connection, enter(connection, mission, text, actor=actor))
+
+
+def _check_link_names(connection: Connection, mission: Mission, source: str) -> None:
+    """Refuse names of links that the description of another spacecraft uses."""
+    mine = {one.name for one in mission.links or ()}
+    if not mine:
+        return
+    for spacecraft, other in store.missions_in_force(connection).items():
+        taken = mine.intersection(one.name for one in other.links or ())
+        if spacecraft != mission.spacecraft.id and taken:
+            raise InvalidInput(
+                source,
+                "links",
+                "names that no other spacecraft uses",
+                f"{min(taken)!r} of spacecraft {spacecraft}",
+            )
 
 
 def _persons(approval: Approval) -> tuple[frozenset[str], frozenset[str]]:

@@ -105,14 +105,7 @@ def links_in_force(connection: Connection, ccsds_id: int | None, instance: str) 
 
     The instance of an archive has the description that came with the archive.
     """
-    query = select(MISSIONS.c.ccsds_id).where(MISSIONS.c.ccsds_id.is_not(None)).distinct()
-    if ccsds_id is not None:
-        query = query.where(MISSIONS.c.ccsds_id == ccsds_id)
-    found = {}
-    for spacecraft in sorted(int(one) for one in connection.execute(query).scalars()):
-        key = newest_of_spacecraft(connection, spacecraft)
-        if key is not None:
-            found[spacecraft] = get_mission(connection, key).link
+    found = {key: mission.link for key, mission in missions_in_force(connection, ccsds_id).items()}
     passes, vehicles = repository.PASSES, repository.VEHICLES
     archived = (
         select(vehicles.c.ccsds_id, passes.c.mission_id)
@@ -127,6 +120,19 @@ def links_in_force(connection: Connection, ccsds_id: int | None, instance: str) 
     for spacecraft, key in connection.execute(archived):
         if ccsds_id in (None, spacecraft):
             found[int(spacecraft)] = get_mission(connection, int(key)).link
+    return found
+
+
+def missions_in_force(connection: Connection, ccsds_id: int | None = None) -> dict[int, Mission]:
+    """Return the descriptions in force of a spacecraft, or of all, by spacecraft."""
+    query = select(MISSIONS.c.ccsds_id).where(MISSIONS.c.ccsds_id.is_not(None)).distinct()
+    if ccsds_id is not None:
+        query = query.where(MISSIONS.c.ccsds_id == ccsds_id)
+    found = {}
+    for spacecraft in sorted(int(one) for one in connection.execute(query).scalars()):
+        key = newest_of_spacecraft(connection, spacecraft)
+        if key is not None:
+            found[spacecraft] = get_mission(connection, key)
     return found
 
 
