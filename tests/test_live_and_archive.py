@@ -140,7 +140,7 @@ def write_archive(folder: Path, octets: bytes, reference: Path, mission: str, wi
         "start_utc": format_utc(FIRST),
         "stop_utc": format_utc(LAST),
         "cadence_s": window.cadence_s,
-        "frames_expected": window.predicted["frames"],
+        "frames_expected": window.predicted.frames,
         "files": {name: {"sha256": sha256} for name, sha256 in files.items()},
     }
     (folder / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")

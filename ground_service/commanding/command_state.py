@@ -92,3 +92,10 @@ def command_view(connection: Connection, row: repository.Row) -> CommandView:
             utc_now_ns(),
         )
     return CommandView(row, vehicle["ccsds_id"], vehicle["instance"], fate)
+
+
+def views_of_window(connection: Connection, window_id: int) -> list[CommandView]:
+    """Return the telecommands of a window that were not rejected."""
+    table = repository.TELECOMMANDS
+    query = select(table).where(table.c.window_id == window_id, table.c.state != "rejected")
+    return [command_view(connection, dict(row)) for row in connection.execute(query).mappings()]

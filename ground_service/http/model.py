@@ -24,7 +24,7 @@ class Entity(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     @classmethod
-    def of(cls, row: Mapping[str, Any], **values: Any) -> Self:
+    def of(cls, row: Mapping[Any, Any], **values: Any) -> Self:
         """Return the entity of a database row: columns by field name, times without `_utc_ns`.
 
         `values` are fields that are not columns, or replace them.

@@ -24,6 +24,7 @@ Time = Annotated[GivenTime, AfterValidator(lambda time: UtcTime(time.utc_ns // 1
 WindowState = Literal[
     "draft", "approved", "uplinked", "executing", "executed", "downlinked", "processed", "failed"
 ]
+Decision = Literal["draft", "approved", "failed"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,7 +264,7 @@ class WindowChange(Given):
     stop: Time | None = None
     cadence_s: Finite | None = Field(default=None, ge=0.1, le=3600.0)
     predecessor_id: int | None = Field(default=None, ge=1, le=2**31 - 1)
-    state: Literal["draft", "approved", "failed"] | None = Field(default=None, examples=["approved"])
+    state: Decision | None = Field(default=None, examples=["approved"])
     reason: str | None = Field(default=None, max_length=500, pattern=LINE_PATTERN_JSON)
 
     def changes(self) -> dict[str, Any]:
@@ -276,6 +277,48 @@ class WindowChange(Given):
             for name, value in given.items()
             if value is not None or name == "predecessor_id"
         }
+
+
+class PlannedResources(Entity):
+    """Resources that a window was assessed with."""
+
+    storage_octets: int
+    downlink_bit_s: float
+    battery_wh: float
+    generation_w: float
+    idle_w: float
+    observing_w: float
+    estimators: int
+    detections_per_frame: float
+
+
+class WindowPrediction(Entity):
+    """Prediction of a window; the conditions are unknown if no reference ephemeris covers it."""
+
+    frames: int | None = None
+    resources: PlannedResources | None = None
+    start: UtcTime | None = None
+    stop: UtcTime | None = None
+    altitude_km: Span | None = None
+    sun_elevation_deg: Span | None = None
+    latitude_deg: Span | None = None
+    sunlit_share: float | None = None
+    craters_per_frame: Span | None = None
+    mare_share: float | None = None
+    data_octets: int | None = None
+    energy_wh: float | None = None
+    battery_minimum: float | None = None
+    storage_peak_octets: int | None = None
+    downlinked_by: UtcTime | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class AssessedWindow:
+    """Requested window without conflicts, and its prediction."""
+
+    entry: WindowEntry
+    data_octets: int
+    predicted: WindowPrediction
 
 
 class Window(Entity):
@@ -294,12 +337,37 @@ class Window(Entity):
     ephemeris_id: int | None
     pass_id: int | None = Field(description="The pass of its telemetry, once received")
     data_octets: int
-    predicted: dict[str, Any]
+    predicted: WindowPrediction
     telecommands: list[int]
     version: int
     created_by: str
     created: UtcTime
     changed: UtcTime
+
+
+class WindowRecord(Window):
+    """A window with the fields that only the service uses."""
+
+    vehicle_id: int
+    mission_id: int | None
+    decision: Decision
+    edited_by: str
+    decided_by: str | None
+
+    def entry(self) -> WindowEntry:
+        """Return the request of the window."""
+        resources = self.predicted.resources
+        return WindowEntry(
+            name=self.name,
+            start_utc_ns=self.start.utc_ns,
+            stop_utc_ns=self.stop.utc_ns,
+            cadence_s=self.cadence_s,
+            spacecraft_id=self.spacecraft_id,
+            instance=self.instance,
+            predecessor_id=self.predecessor_id,
+            ephemeris_id=self.ephemeris_id,
+            resources=Resources() if resources is None else Resources(**resources.model_dump()),
+        )
 
 
 class PlanWindow(Given):

@@ -1,0 +1,79 @@
+"""SQL of reference ephemerides."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sqlalchemy import Connection, select
+
+from ground_service.ephemerides.model import Ephemeris
+from ground_service.store import repository
+from ground_service.store.files import StoredFile
+from lunar import ephemeris
+
+EPHEMERIDES = repository.EPHEMERIDES
+
+
+def add_ephemeris(
+    connection: Connection,
+    stored: StoredFile,
+    content: ephemeris.Ephemeris,
+    *,
+    name: str,
+    precedence: int,
+    now_utc_ns: int,
+) -> Ephemeris:
+    """Add the ephemeris of an archived file."""
+    key = repository.add(
+        connection,
+        EPHEMERIDES,
+        file_sha256=stored.sha256,
+        name=name,
+        object_name=content.segments[0].object_name,
+        frame=content.segments[0].frame,
+        start_utc_ns=content.start_utc_ns,
+        stop_utc_ns=content.stop_utc_ns,
+        states=sum(len(segment.utc_ns) for segment in content.segments),
+        precedence=precedence,
+        created_utc_ns=now_utc_ns,
+    )
+    return get_ephemeris(connection, key)
+
+
+def find_ephemeris(connection: Connection, *, sha256: str, precedence: int, name: str) -> Ephemeris | None:
+    """Return the entry of a file with this precedence and name; None without any."""
+    found = repository.find(connection, EPHEMERIDES, file_sha256=sha256, precedence=precedence, name=name)
+    return None if found is None else _ephemeris(found)
+
+
+def get_ephemeris(connection: Connection, ephemeris_id: int) -> Ephemeris:
+    """Return an ephemeris.
+
+    Raises
+    ------
+    NotFound
+        There is no such ephemeris.
+    """
+    return _ephemeris(repository.get(connection, EPHEMERIDES, ephemeris_id, "ephemeris"))
+
+
+def list_ephemerides(connection: Connection, *, limit: int, offset: int) -> tuple[list[Ephemeris], int]:
+    """Return a page of the ephemerides, newest first, and the total number."""
+    page = repository.page(connection, EPHEMERIDES, limit=limit, offset=offset)
+    return [_ephemeris(row) for row in page.rows], page.total
+
+
+def covering_ephemerides(connection: Connection, start_utc_ns: int, stop_utc_ns: int) -> list[Ephemeris]:
+    """Return the ephemerides that overlap an interval, by precedence, then the newest first."""
+    table = EPHEMERIDES.c
+    query = (
+        select(EPHEMERIDES)
+        .where(table.start_utc_ns <= stop_utc_ns, table.stop_utc_ns >= start_utc_ns)
+        .order_by(table.precedence.desc(), table.id.desc())
+    )
+    return [_ephemeris(row) for row in connection.execute(query).mappings()]
+
+
+def _ephemeris(row: Mapping[Any, Any]) -> Ephemeris:
+    return Ephemeris.of(row, sha256=row["file_sha256"])

@@ -1,0 +1,271 @@
+"""SQL of planned windows."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+from sqlalchemy import Connection, func, or_, select
+from sqlalchemy.sql import Select
+
+from ground_service.commanding.store import ids_of_windows
+from ground_service.errors import NotFound
+from ground_service.ingest.redecode import readable_version
+from ground_service.planning.core import Commitment
+from ground_service.planning.model import AssessedWindow, Window, WindowEntry, WindowRecord
+from ground_service.planning.window_states import COMMITTED, PlannedSpan
+from ground_service.store import repository, telemetry
+from ground_service.store.counters import lock_spacecraft
+from ground_service.store.states import change_if
+
+WINDOWS, VEHICLES = repository.WINDOWS, repository.VEHICLES
+
+_REPORTS = ("housekeeping", "events", "verifications")
+_SCIENCE = ("detections", "navigation_states", "frame_outcomes")
+
+AnyWindow = TypeVar("AnyWindow", bound=Window)
+
+
+def add_window(
+    connection: Connection,
+    vehicle: int,
+    assessed: AssessedWindow,
+    *,
+    mission_id: int | None,
+    actor: str,
+    now_utc_ns: int,
+) -> int:
+    """Add a draft; return its id."""
+    return int(
+        repository.add(
+            connection,
+            WINDOWS,
+            vehicle_id=vehicle,
+            decision="draft",
+            state="draft",
+            mission_id=mission_id,
+            version=1,
+            created_by=actor,
+            edited_by=actor,
+            created_utc_ns=now_utc_ns,
+            changed_utc_ns=now_utc_ns,
+            **columns_of(assessed),
+        )
+    )
+
+
+def columns_of(assessed: AssessedWindow) -> dict[str, Any]:
+    """Return the columns of an assessed request."""
+    entry = assessed.entry
+    return {
+        "name": entry.name,
+        "start_utc_ns": entry.start_utc_ns,
+        "stop_utc_ns": entry.stop_utc_ns,
+        "cadence_s": entry.cadence_s,
+        "predecessor_id": entry.predecessor_id,
+        "ephemeris_id": entry.ephemeris_id,
+        "data_octets": assessed.data_octets,
+        "predicted": assessed.predicted.model_dump(mode="json", exclude_unset=True),
+    }
+
+
+def change_window(connection: Connection, found: WindowRecord, **columns: Any) -> bool:
+    """Change columns of a window unless its version, state or pass has changed since; return whether it was changed."""
+    unchanged = {"version": found.version, "state": found.state, "pass_id": found.pass_id}
+    return change_if(connection, WINDOWS, found.id, unchanged, **columns)
+
+
+def lock_plan(connection: Connection, vehicle: int) -> None:
+    """Lock the plan of a vehicle until the transaction ends, and keep the vehicle from being deleted."""
+    key = VEHICLES.c.id
+    connection.execute(select(key).where(key == vehicle).with_for_update(read=True, key_share=True))
+    lock_spacecraft(connection, vehicle)
+
+
+def delete_window(connection: Connection, window_id: int) -> None:
+    """Delete a window."""
+    connection.execute(WINDOWS.delete().where(WINDOWS.c.id == window_id))
+
+
+def get_window(connection: Connection, window_id: int) -> Window:
+    """Return a window.
+
+    Raises
+    ------
+    NotFound
+        There is no such window.
+    """
+    return _one(connection, window_id, Window)
+
+
+def get_record(connection: Connection, window_id: int) -> WindowRecord:
+    """Return a window as `get_window` does, with the fields of the service."""
+    return _one(connection, window_id, WindowRecord)
+
+
+def list_windows(
+    connection: Connection, *, state: str | None, limit: int, offset: int
+) -> tuple[list[Window], int]:
+    """Return a page of the windows, newest first, and the total number."""
+    matching = [] if state is None else [WINDOWS.c.state == state]
+    total = connection.execute(select(func.count()).select_from(WINDOWS).where(*matching)).scalar_one()
+    order = (WINDOWS.c.created_utc_ns.desc(), WINDOWS.c.id.desc())
+    query = _joined().where(*matching).order_by(*order).limit(limit).offset(offset)
+    return _windows(connection, query, Window), int(total)
+
+
+def planned_windows(connection: Connection) -> list[Window]:
+    """Return all windows that have not failed, in order of time."""
+    query = _joined().where(WINDOWS.c.state != "failed").order_by(WINDOWS.c.start_utc_ns, WINDOWS.c.id)
+    return _windows(connection, query, Window)
+
+
+def open_windows(connection: Connection, vehicle: int) -> list[WindowRecord]:
+    """Return the approved windows of a vehicle that are not processed, in order of time."""
+    query = _joined().where(
+        WINDOWS.c.vehicle_id == vehicle, WINDOWS.c.decision == "approved", WINDOWS.c.state != "processed"
+    )
+    return _windows(connection, query.order_by(WINDOWS.c.start_utc_ns), WindowRecord)
+
+
+def find_same(connection: Connection, vehicle: int, entry: WindowEntry) -> int | None:
+    """Return the id of a window of a vehicle with this name and span; None without any."""
+    row = repository.find(
+        connection,
+        WINDOWS,
+        vehicle_id=vehicle,
+        name=entry.name,
+        start_utc_ns=entry.start_utc_ns,
+        stop_utc_ns=entry.stop_utc_ns,
+    )
+    return None if row is None else int(row["id"])
+
+
+def follower_of(connection: Connection, window_id: int) -> int | None:
+    """Return the id of a window that a window is the predecessor of; None without any."""
+    row = repository.find(connection, WINDOWS, predecessor_id=window_id)
+    return None if row is None else int(row["id"])
+
+
+def neighbours(connection: Connection, vehicle: int, entry: WindowEntry) -> list[PlannedSpan]:
+    """Return the committed windows of a vehicle that overlap a request, and its predecessor."""
+    query = select(WINDOWS.c.id, WINDOWS.c.start_utc_ns, WINDOWS.c.stop_utc_ns, WINDOWS.c.state).where(
+        WINDOWS.c.vehicle_id == vehicle,
+        or_(
+            WINDOWS.c.state.in_(COMMITTED)
+            & (WINDOWS.c.start_utc_ns < entry.stop_utc_ns)
+            & (WINDOWS.c.stop_utc_ns > entry.start_utc_ns),
+            WINDOWS.c.id == entry.predecessor_id,
+        ),
+    )
+    return [PlannedSpan(*row) for row in connection.execute(query)]
+
+
+def commitments(
+    connection: Connection, spacecraft_id: int | None, instance: str, *, without: int = 0
+) -> list[Commitment]:
+    """Return the windows of a spacecraft, except one, whose data are or will be on board."""
+    query = (
+        select(WINDOWS.c.start_utc_ns, WINDOWS.c.stop_utc_ns, WINDOWS.c.data_octets)
+        .join(VEHICLES, VEHICLES.c.id == WINDOWS.c.vehicle_id)
+        .where(
+            VEHICLES.c.ccsds_id == spacecraft_id,
+            VEHICLES.c.instance == instance,
+            WINDOWS.c.id != without,
+            WINDOWS.c.state.in_([state for state in COMMITTED if state != "downlinked"]),
+        )
+    )
+    return [Commitment(*row) for row in connection.execute(query)]
+
+
+def add_pass(connection: Connection, window: WindowRecord, mission_id: int | None, now_utc_ns: int) -> int:
+    """Add the pass of the telemetry of a window; return its id."""
+    return int(
+        repository.add(
+            connection,
+            repository.PASSES,
+            vehicle_id=window.vehicle_id,
+            name=window.name,
+            start_utc_ns=window.start.utc_ns,
+            stop_utc_ns=window.stop.utc_ns,
+            archive_digest=None,
+            manifest={
+                "window_id": window.id,
+                "cadence_s": window.cadence_s,
+                "frames_expected": window.predicted.frames,
+            },
+            ephemeris_id=window.ephemeris_id,
+            catalogue_sha256=None,
+            attitude_sha256=None,
+            mission_id=mission_id,
+            created_utc_ns=now_utc_ns,
+        )
+    )
+
+
+def catalogue_of_pass(connection: Connection, pass_id: int) -> str | None:
+    """Return the SHA-256 of the crater catalogue of a pass; None without any."""
+    sha256: str | None = repository.get(connection, repository.PASSES, pass_id, "pass")["catalogue_sha256"]
+    return sha256
+
+
+def has_report(connection: Connection, pass_id: int) -> bool:
+    """Return whether a pass has a report."""
+    return repository.find(connection, repository.REPORTS, pass_id=pass_id) is not None
+
+
+def event_ids(connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int) -> set[int]:
+    """Return the numbers of the events that were reported in a span."""
+    version = readable_version(connection, vehicle)
+    found = telemetry.samples(connection, "events", vehicle, start_ticks, stop_ticks, version, ("event_id",))
+    return set(found["event_id"])
+
+
+def received_frames(connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int) -> int:
+    """Return the number of images of a span in the science packet with the most of them."""
+    counts = []
+    for kind in _SCIENCE:
+        table = repository.SAMPLES[kind]
+        query = select(func.count(func.distinct(table.c.ticks))).where(
+            *_readable(connection, kind, vehicle), table.c.ticks.between(start_ticks, stop_ticks)
+        )
+        counts.append(int(connection.execute(query).scalar_one()))
+    return max(counts)
+
+
+def has_reports_between(connection: Connection, vehicle: int, after_ticks: int, until_ticks: int) -> bool:
+    """Return whether the payload reported after a time until another (included); a bound excludes wild clocks."""
+    for kind in _REPORTS:
+        ticks = repository.SAMPLES[kind].c.ticks
+        query = select(ticks).where(
+            *_readable(connection, kind, vehicle), ticks > after_ticks, ticks <= until_ticks
+        )
+        if connection.execute(query.limit(1)).first() is not None:
+            return True
+    return False
+
+
+def _readable(connection: Connection, kind: str, vehicle: int) -> tuple[Any, ...]:
+    table = repository.SAMPLES[kind]
+    return (
+        table.c.vehicle_id == vehicle,
+        table.c.dictionary_version == readable_version(connection, vehicle),
+    )
+
+
+def _joined() -> Select[Any]:
+    return select(WINDOWS, VEHICLES.c.ccsds_id.label("spacecraft_id"), VEHICLES.c.instance).join(
+        VEHICLES, VEHICLES.c.id == WINDOWS.c.vehicle_id
+    )
+
+
+def _one(connection: Connection, window_id: int, kind: type[AnyWindow]) -> AnyWindow:
+    found = _windows(connection, _joined().where(WINDOWS.c.id == window_id), kind)
+    if not found:
+        raise NotFound("window", window_id)
+    return found[0]
+
+
+def _windows(connection: Connection, query: Select[Any], kind: type[AnyWindow]) -> list[AnyWindow]:
+    rows = connection.execute(query).mappings().all()
+    telecommands = ids_of_windows(connection, [row["id"] for row in rows])
+    return [kind.of(row, telecommands=telecommands[row["id"]]) for row in rows]
