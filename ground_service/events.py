@@ -188,6 +188,17 @@ class LimitsBroken(Event):
     broken: list[dict[str, Any]]
 
 
+class AlarmChanged(Event):
+    """An alarm was raised, acknowledged, shelved, unshelved or cleared."""
+
+    event_kind = "alarm"
+    id: int
+    vehicle_id: int
+    name: str
+    severity: str
+    state: str
+
+
 class FollowUpFailed(Event):
     """Follow-up work of events failed and is not repeated."""
 

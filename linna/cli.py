@@ -44,6 +44,7 @@ GROUPS: dict[str, tuple[str, str]] = {
         "trajectory",
         "navigation solutions of a pass as TUM files, with absolute and relative errors",
     ),
+    "alarm": ("alarm", "list, acknowledge and shelve alarms"),
     "command": ("command", "queue, release, uplink and verify telecommands"),
     "serve": ("serve", "run the HTTP server of the ground service"),
     "worker": ("worker", "run a job worker of the ground service"),

@@ -10,6 +10,7 @@ from typing import Any, Literal
 from urllib.parse import quote
 
 from ground_service.access.model import AuditEntry, AuditHead, Token, User, UserWithToken
+from ground_service.alarms.model import Alarm, AlarmDetail
 from ground_service.client.connection import Body, Connection, Listing, new_key
 from ground_service.client.problems import JobFailed
 from ground_service.commanding.model import Telecommand, UplinkState
@@ -438,6 +439,38 @@ class Client(Connection):
     def get_regression_report(self, regression_id: str, target: Path) -> None:
         """Download the report of a regression (HTML) into a file."""
         self._download(f"/regressions/{_part(regression_id)}/report", target)
+
+    # Alarms
+
+    def list_alarms(
+        self,
+        *,
+        states: Sequence[str] = (),
+        severity: str | None = None,
+        spacecraft_id: int | None = None,
+        instance: str | None = None,
+    ) -> Listing[Alarm]:
+        """List alarms, open ones first; no states: in any state."""
+        return self._list(
+            Alarm,
+            "/alarms",
+            state=list(states) or None,
+            severity=severity,
+            spacecraft_id=spacecraft_id,
+            instance=instance,
+        )
+
+    def get_alarm(self, alarm_id: int) -> AlarmDetail:
+        """Return an alarm with its history."""
+        return self._get(AlarmDetail, f"/alarms/{alarm_id}")
+
+    def acknowledge_alarm(self, alarm_id: int, *, comment: str = "") -> AlarmDetail:
+        """Acknowledge an alarm; it is cleared when its condition has ended as well."""
+        return self._post(AlarmDetail, f"/alarms/{alarm_id}/acknowledge", {"comment": comment})
+
+    def shelve_alarm(self, alarm_id: int, until: str, *, comment: str = "") -> AlarmDetail:
+        """Suppress an alarm until a time (RFC 3339); a time in the past ends this."""
+        return self._post(AlarmDetail, f"/alarms/{alarm_id}/shelve", {"until": until, "comment": comment})
 
     # Jobs
 

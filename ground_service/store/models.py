@@ -645,6 +645,57 @@ class LoggedEventRow(Base):
     payload: Mapped[dict[str, Any]] = mapped_column(JSON)
 
 
+class AlarmRecord(Base):
+    """Alarm of a vehicle (see `alarms.core`); `open` is 1 until the alarm is cleared, then NULL.
+
+    A cause (`source` and `name`) has at most one open alarm. `active`: the newest telemetry has the condition.
+    """
+
+    __tablename__ = "alarms"
+    __table_args__ = (
+        UniqueConstraint("vehicle_id", "source", "name", "open"),
+        Index("ix_alarms_newest", "open", "last_ticks"),
+    )
+    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
+    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"))
+    source: Mapped[str] = mapped_column(String(16))
+    name: Mapped[str] = mapped_column(String(64))
+    open: Mapped[int | None] = mapped_column(Flag)
+    severity: Mapped[int] = mapped_column(SmallInteger)
+    state: Mapped[str] = mapped_column(String(16))
+    active: Mapped[int] = mapped_column(Flag)
+    count: Mapped[int] = mapped_column(BigInteger)
+    value: Mapped[float | None] = mapped_column(Double)
+    first_ticks: Mapped[int] = mapped_column(BigInteger)
+    last_ticks: Mapped[int] = mapped_column(BigInteger)
+    raised_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    acknowledged_by: Mapped[str | None] = mapped_column(String(64))
+    acknowledged_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
+    shelved_by: Mapped[str | None] = mapped_column(String(64))
+    shelved_until_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
+    cleared_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
+
+
+class AlarmChangeRecord(Base):
+    """Change in the life of an alarm."""
+
+    __tablename__ = "alarm_changes"
+    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
+    alarm_id: Mapped[int] = mapped_column(ForeignKey("alarms.id"), index=True)
+    utc_ns: Mapped[int] = mapped_column(BigInteger)
+    actor: Mapped[str] = mapped_column(String(64))
+    change: Mapped[str] = mapped_column(String(16))
+    comment: Mapped[str] = mapped_column(Text)
+
+
+class AlarmPosition(Base):
+    """Last packet of a vehicle that has been examined for alarms."""
+
+    __tablename__ = "alarm_positions"
+    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"), primary_key=True, autoincrement=False)
+    packet_id: Mapped[int] = mapped_column(BigInteger)
+
+
 class EventPosition(Base):
     """Number of the last event that a consumer has handled."""
 

@@ -19,6 +19,7 @@ from pathlib import Path
 from pydantic import ValidationError
 from sqlalchemy import Connection, select
 
+from ground_service.alarms.service import examine_packets
 from ground_service.errors import PASSING, public_text
 from ground_service.events import (
     CommandsSent,
@@ -62,6 +63,7 @@ Start = Callable[[str], object]
 def _after_telemetry(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
     event = TelemetryReceived.of(logged)
     yield "recorrelate", event.vehicle_id
+    yield "alarms", event.vehicle_id
     yield "advance windows", event.vehicle_id
     if event.first_ticks is not None and event.last_ticks is not None:
         with _ground.database.reading() as connection:
@@ -137,6 +139,10 @@ def _recorrelate(ground: Ground, vehicle: int, _event: int) -> None:
     recorrelate(ground, vehicle)
 
 
+def _alarms(ground: Ground, vehicle: int, _event: int) -> None:
+    examine_packets(ground, vehicle)
+
+
 def _advance(ground: Ground, vehicle: int, _event: int) -> None:
     advance_windows(ground, vehicle)
 
@@ -174,6 +180,7 @@ def _decode(ground: Ground, vehicle: int, event: int) -> str:
 
 DOING: Mapping[str, Callable[[Ground, int, int], str | None]] = {
     "recorrelate": _recorrelate,
+    "alarms": _alarms,
     "advance windows": _advance,
     "re-evaluate": _reevaluate,
     "report": _report,

@@ -21,17 +21,17 @@ with warnings.catch_warnings():
     from fastapi.testclient import TestClient
 
 VERBS = {
-    "add", "change", "define", "delete", "enter", "evaluate", "export", "get", "import", "keep", "list", "reject",
-    "release", "request", "revoke", "run", "search", "start", "take", "uplink", "upload",
+    "acknowledge", "add", "change", "define", "delete", "enter", "evaluate", "export", "get", "import", "keep", "list",
+    "reject", "release", "request", "revoke", "run", "search", "shelve", "start", "take", "uplink", "upload",
 }  # fmt: skip
 SUMMARY_VERBS = {
-    "Add", "Change", "Compare", "Count", "Create", "Define", "Delete", "Disable", "Evaluate", "Export", "Import",
-    "Ingest", "Keep", "List", "Queue", "Register", "Reject", "Release", "Request", "Return", "Revoke", "Run",
-    "Search", "Show", "Take",
+    "Acknowledge", "Add", "Change", "Compare", "Count", "Create", "Define", "Delete", "Disable", "Evaluate", "Export",
+    "Import", "Ingest", "Keep", "List", "Queue", "Register", "Reject", "Release", "Request", "Return", "Revoke", "Run",
+    "Search", "Show", "Suppress", "Take",
 }  # fmt: skip
 TAGS = {
-    "access", "ephemerides", "jobs", "missions", "passes", "planning", "regression", "reports", "telecommands",
-    "telemetry", "time",
+    "access", "alarms", "ephemerides", "jobs", "missions", "passes", "planning", "regression", "reports",
+    "telecommands", "telemetry", "time",
 }  # fmt: skip
 
 

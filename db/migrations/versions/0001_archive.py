@@ -482,6 +482,54 @@ def upgrade() -> None:
     op.create_index("ix_pieces_place", "pieces", ["scope", "stream", "position"])
     op.create_index("ix_pieces_unread", "pieces", ["scope", "links_tried"])
     op.create_table(
+        "alarms",
+        sa.Column("id", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=False),
+        sa.Column("vehicle_id", sa.Integer(), nullable=False),
+        sa.Column("source", sa.String(length=16), nullable=False),
+        sa.Column("name", sa.String(length=64), nullable=False),
+        sa.Column("open", sa.SmallInteger(), nullable=True),
+        sa.Column("severity", sa.SmallInteger(), nullable=False),
+        sa.Column("state", sa.String(length=16), nullable=False),
+        sa.Column("active", sa.SmallInteger(), nullable=False),
+        sa.Column("count", sa.BigInteger(), nullable=False),
+        sa.Column("value", sa.Double(), nullable=True),
+        sa.Column("first_ticks", sa.BigInteger(), nullable=False),
+        sa.Column("last_ticks", sa.BigInteger(), nullable=False),
+        sa.Column("raised_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("acknowledged_by", sa.String(length=64), nullable=True),
+        sa.Column("acknowledged_utc_ns", sa.BigInteger(), nullable=True),
+        sa.Column("shelved_by", sa.String(length=64), nullable=True),
+        sa.Column("shelved_until_utc_ns", sa.BigInteger(), nullable=True),
+        sa.Column("cleared_utc_ns", sa.BigInteger(), nullable=True),
+        sa.ForeignKeyConstraint(["vehicle_id"], ["vehicles.id"], name=op.f("fk_alarms_vehicle_id_vehicles")),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_alarms")),
+        sa.UniqueConstraint(
+            "vehicle_id", "source", "name", "open", name=op.f("uq_alarms_vehicle_id_source_name_open")
+        ),
+    )
+    op.create_index("ix_alarms_newest", "alarms", ["open", "last_ticks"])
+    op.create_table(
+        "alarm_changes",
+        sa.Column("id", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=False),
+        sa.Column("alarm_id", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=False),
+        sa.Column("utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("actor", sa.String(length=64), nullable=False),
+        sa.Column("change", sa.String(length=16), nullable=False),
+        sa.Column("comment", sa.Text(), nullable=False),
+        sa.ForeignKeyConstraint(["alarm_id"], ["alarms.id"], name=op.f("fk_alarm_changes_alarm_id_alarms")),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_alarm_changes")),
+    )
+    op.create_index(op.f("ix_alarm_changes_alarm_id"), "alarm_changes", ["alarm_id"])
+    op.create_table(
+        "alarm_positions",
+        sa.Column("vehicle_id", sa.Integer(), autoincrement=False, nullable=False),
+        sa.Column("packet_id", sa.BigInteger(), nullable=False),
+        sa.ForeignKeyConstraint(
+            ["vehicle_id"], ["vehicles.id"], name=op.f("fk_alarm_positions_vehicle_id_vehicles")
+        ),
+        sa.PrimaryKeyConstraint("vehicle_id", name=op.f("pk_alarm_positions")),
+    )
+    op.create_table(
         "good_links",
         sa.Column("id", sa.Integer(), nullable=False),
         sa.Column("vehicle_id", sa.Integer(), nullable=False),
@@ -763,6 +811,9 @@ def downgrade() -> None:
     op.drop_table("stream_edges")
     op.drop_table("known_links")
     op.drop_table("good_links")
+    op.drop_table("alarm_positions")
+    op.drop_table("alarm_changes")
+    op.drop_table("alarms")
     op.drop_table("pieces")
     op.drop_table("receptions")
     op.drop_table("ingests")

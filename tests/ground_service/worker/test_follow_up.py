@@ -120,6 +120,8 @@ def test_equal_work_of_several_events_is_done_once_and_in_order(ground: Ground, 
     assert recorded.done == [
         ("recorrelate", 5),
         ("recorrelate", 7),
+        ("alarms", 5),
+        ("alarms", 7),
         ("advance windows", 5),
         ("advance windows", 7),
     ]

@@ -1,0 +1,59 @@
+"""HTTP operations on alarms."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import Query
+
+from ground_service.access.security import Operator, Viewer
+from ground_service.alarms import service
+from ground_service.alarms.model import Acknowledgement, Alarm, AlarmDetail, AlarmState, Severity, Shelving
+from ground_service.http.common import GroundOf, Instance, PagingOf, RowId
+from ground_service.http.model import PageOf
+from ground_service.http.requests import operations
+
+alarms = operations("alarms")
+
+
+@alarms.get("/alarms")
+def list_alarms(
+    ground: GroundOf,
+    _: Viewer,
+    paging: PagingOf,
+    state: Annotated[list[AlarmState] | None, Query(description="Default: any state")] = None,
+    severity: Severity | None = None,
+    spacecraft_id: Annotated[int | None, Query(ge=0, le=1023)] = None,
+    instance: Instance | None = None,
+) -> PageOf[Alarm]:
+    """List the alarms of all spacecraft, open ones first and the latest first."""
+    items, total = service.list_alarms(
+        ground,
+        states=list(state or []),
+        severity=severity,
+        spacecraft_id=spacecraft_id,
+        instance=instance,
+        limit=paging.limit,
+        offset=paging.offset,
+    )
+    return paging.page(items, total)
+
+
+@alarms.get("/alarms/{alarm_id}")
+def get_alarm(ground: GroundOf, _: Viewer, alarm_id: RowId) -> AlarmDetail:
+    """Show an alarm with its history."""
+    return service.get_alarm(ground, alarm_id)
+
+
+@alarms.post("/alarms/{alarm_id}/acknowledge")
+def acknowledge_alarm(
+    ground: GroundOf, caller: Operator, alarm_id: RowId, given: Acknowledgement
+) -> AlarmDetail:
+    """Acknowledge an alarm. It is cleared when its condition has ended as well."""
+    return service.acknowledge_alarm(ground, alarm_id, given.comment, actor=caller.name)
+
+
+@alarms.post("/alarms/{alarm_id}/shelve")
+def shelve_alarm(ground: GroundOf, caller: Operator, alarm_id: RowId, given: Shelving) -> AlarmDetail:
+    """Suppress an alarm until a time; a time in the past ends this."""
+    return service.shelve_alarm(ground, alarm_id, given.until.utc_ns, given.comment, actor=caller.name)
