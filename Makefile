@@ -58,8 +58,8 @@ $(VENV)/.terrain: requirements/terrain.txt $(VENV)/.runtime
 	$(PIP) --no-compile -r requirements/terrain.txt
 	touch $@
 
-$(VENV)/.dev: requirements/dev.txt requirements/train.txt requirements/postgres.txt requirements/parquet.txt $(VENV)/.runtime $(VENV)/.terrain
-	$(PIP) -r requirements/runtime.txt -r requirements/postgres.txt -r requirements/parquet.txt -r requirements/train.txt -r requirements/dev.txt
+$(VENV)/.dev: requirements/dev.txt requirements/train.txt requirements/postgres.txt requirements/parquet.txt requirements/exports.txt $(VENV)/.runtime $(VENV)/.terrain
+	$(PIP) -r requirements/runtime.txt -r requirements/postgres.txt -r requirements/parquet.txt -r requirements/exports.txt -r requirements/train.txt -r requirements/dev.txt
 	touch $@
 
 $(VENV)/.bench: requirements/bench.txt $(VENV)/.dev

@@ -1,24 +1,45 @@
-"""Ephemeris files of either format: CCSDS OEM or STK."""
+"""Ephemeris files: CCSDS OEM (keyword notation or XML), STK, or Horizons tables, also compressed.
+
+SPICE kernels are binary and read by `lunar.spice`, outside of the server.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from lunar.ephemeris import Ephemeris, read_text
+from lunar.compressed import read_expanded
+from lunar.ephemeris import Ephemeris
 from lunar.errors import DataFileError
+from lunar.horizons import is_horizons, parse_horizons
 from lunar.oem import parse_oem
+from lunar.oem_xml import parse_oem_xml
 from lunar.stk import parse_stk
+
+EXPECTED = "a CCSDS OEM, STK .e or Horizons ephemeris"
+SPK_MARK = b"DAF/SPK"
+_FIRST = "CCSDS_OEM_VERS, stk.v., XML or a Horizons table"
 
 
 def load_ephemeris(path: Path | str) -> Ephemeris:
-    """Return the ephemeris in a CCSDS OEM (KVN) or STK ``.e`` file, distinguished by content.
+    """Return the ephemeris in a file, whose format is determined by its content.
+
+    The formats are CCSDS OEM in keyword notation or XML, STK ``.e``, and CSV vector tables of JPL Horizons; the file
+    may be compressed with gzip, or in a zip archive of one file.
 
     Raises
     ------
     DataFileError
-        Where the file is neither, or says something that cannot be.
+        Where the file is none of them, or says something that cannot be.
     """
-    text = read_text(path, "a CCSDS OEM or STK .e ephemeris")
+    octets = read_expanded(path, EXPECTED)
+    if octets.startswith(SPK_MARK):
+        raise DataFileError(path, "", EXPECTED, "a SPICE kernel; convert it with 'linna orbit convert'")
+    try:
+        text = octets.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise DataFileError(path, f"octet {error.start}", EXPECTED, "octets that are no text") from None
+    if text.lstrip()[:1] == "<":
+        return parse_oem_xml(octets, source=str(path))
     for line in text.split("\n", 50)[:50]:
         word = line.strip()
         if word.startswith("CCSDS_OEM_VERS"):
@@ -26,5 +47,16 @@ def load_ephemeris(path: Path | str) -> Ephemeris:
         if word.lower().startswith("stk.v"):
             return parse_stk(text, source=str(path))
         if word and not word.startswith(("COMMENT", "#")):
-            raise DataFileError(path, "first line", "CCSDS_OEM_VERS or stk.v.", repr(word[:40]))
-    raise DataFileError(path, "first line", "CCSDS_OEM_VERS or stk.v.", "nothing")
+            if is_horizons(text):
+                return parse_horizons(text, source=str(path))
+            raise DataFileError(path, "first line", _FIRST, repr(word[:40]))
+    raise DataFileError(path, "first line", _FIRST, "nothing")
+
+
+def is_spk(path: Path | str) -> bool:
+    """Return whether a file is a SPICE kernel of orbits; False where it cannot be read."""
+    try:
+        with Path(path).open("rb") as stream:
+            return stream.read(len(SPK_MARK)) == SPK_MARK
+    except OSError:
+        return False

@@ -7,6 +7,7 @@ LunarError
 ├── UnknownFrameError        a reference frame or centre that cannot be converted
 ├── EphemerisError           states that form no ephemeris, or that a file format cannot hold
 ├── EphemerisCoverageError   an epoch outside the span of an ephemeris or orientation, or inside a gap of it
+├── MissingLibrary           an optional library is not installed
 ├── LensError                a distortion under which some pixels have no unique ray
 └── OrbitError               elements or states that are not an orbit about the Moon
     └── ImpactError          the orbit intersects the ground, with epoch and place
@@ -33,6 +34,15 @@ class DataFileError(LunarError):
         self.found = found
         place = f"{path}: {where}" if where else str(path)
         super().__init__(f"{place}: expected {expected}, found {found}")
+
+
+class MissingLibrary(LunarError):
+    """A library that is an optional dependency is not installed."""
+
+    def __init__(self, what: str, library: str, extra: str) -> None:
+        self.library = library
+        self.extra = extra
+        super().__init__(f"{what}: expected the library {library}, found none; install {extra}")
 
 
 class LensError(LunarError):

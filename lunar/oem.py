@@ -11,9 +11,8 @@ CCSDS 502.0-B-1 (2004), 502.0-B-2 (2009) and 502.0-B-3 (2023), Orbit Data Messag
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
@@ -28,9 +27,10 @@ from lunar.ephemeris import (
     EphemerisSegment,
     read_text,
 )
-from lunar.errors import DataFileError, TimeFormatError, UnknownFrameError, UnknownTimeSystemError
+from lunar.errors import DataFileError, UnknownFrameError, UnknownTimeSystemError
 from lunar.frames import ICRF_NAMES, J2000_NAMES, icrf_from_j2000
-from lunar.timescales import NS, TIME_SYSTEMS, format_utc, from_utc_ns, parse_utc, to_utc_ns
+from lunar.kvn import Lines, comment_lines, epoch_texts, is_number, numbered_lines
+from lunar.timescales import TIME_SYSTEMS, format_utc, from_utc_ns, to_utc_ns
 
 VERSIONS = ("1.0", "2.0", "3.0")
 CENTRES = ("MOON",)
@@ -83,7 +83,11 @@ def parse_oem(text: str, source: str = "OEM text") -> Ephemeris:
     UnknownFrameError, UnknownTimeSystemError
         Where axes, centre or time scale are none that can be converted.
     """
-    reader = _Lines(text, source)
+    return parse_oem_lines(Lines(numbered_lines(text), source))
+
+
+def parse_oem_lines(reader: Lines) -> Ephemeris:
+    """Return the ephemeris in the lines of an OEM in keyword notation; raises as `parse_oem`."""
     header, comments = _read_header(reader)
     segments = []
     while reader.peek() is not None:
@@ -93,7 +97,7 @@ def parse_oem(text: str, source: str = "OEM text") -> Ephemeris:
     for k, (earlier, later) in enumerate(pairwise(segments), start=2):
         if later.start_utc_ns < earlier.stop_utc_ns:
             expected = f"a start at or after {format_utc(earlier.stop_utc_ns)}, the end of the segment before"
-            raise DataFileError(source, f"segment {k}", expected, format_utc(later.start_utc_ns))
+            raise DataFileError(reader.source, f"segment {k}", expected, format_utc(later.start_utc_ns))
     return Ephemeris(tuple(segments), header["ORIGINATOR"], comments)
 
 
@@ -107,7 +111,7 @@ def format_oem(
     """
     created = ephemeris.start_utc_ns if creation_utc_ns is None else creation_utc_ns
     lines = ["CCSDS_OEM_VERS = 2.0"]
-    lines += _comment_lines(ephemeris.comments)
+    lines += comment_lines(ephemeris.comments)
     lines += [
         f"CREATION_DATE = {format_utc(created).rstrip('Z')}",
         f"ORIGINATOR = {ephemeris.originator}",
@@ -118,60 +122,7 @@ def format_oem(
     return "\n".join(lines) + "\n"
 
 
-@dataclass(slots=True)
-class _Lines:
-    """The lines of a text that are not blank, with their numbers, and the place reached."""
-
-    text: str
-    source: str
-    numbered: list[tuple[int, str]] = field(init=False)
-    at: int = 0
-
-    def __post_init__(self) -> None:
-        stripped = enumerate(map(str.strip, self.text.splitlines()), start=1)
-        self.numbered = [item for item in stripped if item[1]]
-
-    def peek(self) -> str | None:
-        return self.numbered[self.at][1] if self.at < len(self.numbered) else None
-
-    def take(self) -> str:
-        line = self.peek()
-        if line is None:
-            raise self.error("more lines", "the end of the file")
-        self.at += 1
-        return line
-
-    def number(self, at: int | None = None) -> int:
-        """Return the line number of the line last taken, or of index ``at``."""
-        index = self.at - 1 if at is None else at
-        return self.numbered[min(max(index, 0), len(self.numbered) - 1)][0] if self.numbered else 1
-
-    def error(self, expected: str, found: str, at: int | None = None) -> DataFileError:
-        return DataFileError(self.source, f"line {self.number(at)}", expected, found)
-
-    def comments(self) -> Iterator[str]:
-        while (line := self.peek()) is not None and line.split(None, 1)[0] == "COMMENT":
-            self.at += 1
-            yield line[7:].strip()
-
-    def keyword(self, allowed: Iterable[str]) -> tuple[str, str]:
-        line = self.take()
-        key, equals, value = line.partition("=")
-        key, value = key.strip().upper(), value.strip()
-        if not equals or key not in allowed:
-            raise self.error(f"one of {', '.join(allowed)}", repr(line[:60]))
-        if not value:
-            raise self.error(f"a value of {key}", "nothing")
-        return key, value
-
-    def epoch(self, value: str, time_system: str, at: int | None = None) -> int:
-        try:
-            return int(to_utc_ns(parse_utc(value), time_system))
-        except TimeFormatError:
-            raise self.error("an epoch like 2029-08-07T00:00:00.000", repr(value), at) from None
-
-
-def _read_header(reader: _Lines) -> tuple[dict[str, str], tuple[str, ...]]:
+def _read_header(reader: Lines) -> tuple[dict[str, str], tuple[str, ...]]:
     comments: list[str] = []
     header: dict[str, str] = {}
     first = reader.peek()
@@ -195,7 +146,7 @@ def _read_header(reader: _Lines) -> tuple[dict[str, str], tuple[str, ...]]:
     return header, tuple(comments)
 
 
-def _read_segment(reader: _Lines) -> EphemerisSegment:
+def _read_segment(reader: Lines) -> EphemerisSegment:
     line = reader.take()
     if line != "META_START":
         raise reader.error("META_START", repr(line[:60]))
@@ -245,7 +196,7 @@ def _read_segment(reader: _Lines) -> EphemerisSegment:
     )
 
 
-def _read_metadata(reader: _Lines) -> tuple[list[str], dict[str, str], dict[str, int]]:
+def _read_metadata(reader: Lines) -> tuple[list[str], dict[str, str], dict[str, int]]:
     """Return comments, values and line indices of the keywords up to META_STOP."""
     comments: list[str] = []
     meta: dict[str, str] = {}
@@ -265,7 +216,7 @@ def _read_metadata(reader: _Lines) -> tuple[list[str], dict[str, str], dict[str,
     return comments, meta, where
 
 
-def _degree(reader: _Lines, meta: dict[str, str], where: dict[str, int], method: str) -> int:
+def _degree(reader: Lines, meta: dict[str, str], where: dict[str, int], method: str) -> int:
     if "INTERPOLATION_DEGREE" not in meta:
         if "INTERPOLATION" in meta and method != "LINEAR":
             raise reader.error("INTERPOLATION_DEGREE with INTERPOLATION", "none", where["INTERPOLATION"])
@@ -276,7 +227,7 @@ def _degree(reader: _Lines, meta: dict[str, str], where: dict[str, int], method:
     return int(text)
 
 
-def _read_states(reader: _Lines, system: str) -> tuple[IntArray, FloatArray, int]:
+def _read_states(reader: Lines, system: str) -> tuple[IntArray, FloatArray, int]:
     """Return epochs (n,), states (n, 6 or 9) in km and the line index of the first."""
     begin = reader.at
     end = begin
@@ -307,7 +258,7 @@ def _read_states(reader: _Lines, system: str) -> tuple[IntArray, FloatArray, int
                 )
                 raise reader.error(expected, f"{count} values", begin + k)
             for token in row.split()[1:]:
-                if not _is_number(token):
+                if not is_number(token):
                     raise reader.error("a number", repr(token), begin + k)
         raise reader.error("states of numbers", "others", begin)
     numbers = table["state"]
@@ -317,7 +268,7 @@ def _read_states(reader: _Lines, system: str) -> tuple[IntArray, FloatArray, int
     return to_utc_ns(_epochs(reader, table["epoch"], begin), system), numbers, begin
 
 
-def _epochs(reader: _Lines, texts: NDArray[np.str_], begin: int) -> IntArray:
+def _epochs(reader: Lines, texts: NDArray[np.str_], begin: int) -> IntArray:
     # numpy reads calendar dates in one go; other notations and faults go through the slow reader, which names the line.
     if np.all(np.strings.endswith(texts, "Z")):
         texts = np.strings.rstrip(texts, "Z")
@@ -329,7 +280,7 @@ def _epochs(reader: _Lines, texts: NDArray[np.str_], begin: int) -> IntArray:
     )
 
 
-def _check_epochs(reader: _Lines, utc_ns: IntArray, times: dict[str, int], begin: int) -> None:
+def _check_epochs(reader: Lines, utc_ns: IntArray, times: dict[str, int], begin: int) -> None:
     late = np.flatnonzero(np.diff(utc_ns) <= 0)
     if late.size:
         k = int(late[0])
@@ -362,7 +313,7 @@ def _check_epochs(reader: _Lines, utc_ns: IntArray, times: dict[str, int], begin
         )
 
 
-def _read_covariances(reader: _Lines, system: str, segment_frame: str) -> Iterator[Covariance]:
+def _read_covariances(reader: Lines, system: str, segment_frame: str) -> Iterator[Covariance]:
     """Yield the covariances of the block that the next line opens, if it opens one."""
     trailing = list(reader.comments())
     del trailing  # Comments after the states belong to nothing that is kept.
@@ -386,7 +337,7 @@ def _read_covariances(reader: _Lines, system: str, segment_frame: str) -> Iterat
         values: list[float] = []
         for row in range(1, 7):
             tokens = reader.take().split()
-            if len(tokens) != row or not all(map(_is_number, tokens)):
+            if len(tokens) != row or not all(map(is_number, tokens)):
                 raise reader.error(f"{row} numbers of row {row} of a covariance", repr(" ".join(tokens)[:60]))
             values += map(float, tokens)
         matrix = np.zeros((6, 6))
@@ -394,26 +345,14 @@ def _read_covariances(reader: _Lines, system: str, segment_frame: str) -> Iterat
         yield Covariance(epoch, frame, 1e6 * (matrix + np.tril(matrix, -1).T))
 
 
-def _is_number(token: str) -> bool:
-    try:
-        float(token)
-    except ValueError:
-        return False
-    return True
-
-
-def _comment_lines(comments: Iterable[str]) -> list[str]:
-    return [f"COMMENT {line}".rstrip() for comment in comments for line in (comment.splitlines() or [""])]
-
-
 def _segment_lines(segment: EphemerisSegment, system: str) -> list[str]:
     if system not in TIME_SYSTEMS:
         raise UnknownTimeSystemError(system, TIME_SYSTEMS)
     counts = from_utc_ns(segment.utc_ns, system)
-    texts = _epoch_texts(counts)
+    texts = epoch_texts(counts)
     lines = [
         "META_START",
-        *_comment_lines(segment.comments),
+        *comment_lines(segment.comments),
         f"OBJECT_NAME = {segment.object_name}",
         f"OBJECT_ID = {segment.object_id or segment.object_name}",
         f"CENTER_NAME = {segment.centre}",
@@ -424,7 +363,7 @@ def _segment_lines(segment: EphemerisSegment, system: str) -> list[str]:
     if segment.useable_start_utc_ns is not None or segment.useable_stop_utc_ns is not None:
         # Some readers want both or none.
         useable = from_utc_ns(np.array([segment.start_utc_ns, segment.stop_utc_ns]), system)
-        first, last = (_epoch_texts(useable[k : k + 1])[0] for k in (0, 1))
+        first, last = (epoch_texts(useable[k : k + 1])[0] for k in (0, 1))
         lines += [f"USEABLE_START_TIME = {first}", f"USEABLE_STOP_TIME = {last}"]
     lines += [
         f"STOP_TIME = {texts[-1]}",
@@ -439,17 +378,8 @@ def _segment_lines(segment: EphemerisSegment, system: str) -> list[str]:
     if segment.covariances:
         lines += ["", "COVARIANCE_START"]
         for covariance in segment.covariances:
-            lines.append(f"EPOCH = {_epoch_texts(from_utc_ns(np.array([covariance.utc_ns]), system))[0]}")
+            lines.append(f"EPOCH = {epoch_texts(from_utc_ns(np.array([covariance.utc_ns]), system))[0]}")
             lines.append(f"COV_REF_FRAME = {covariance.frame}")
             lines += [" ".join(f"{v:.15e}" for v in covariance.matrix[k, : k + 1] / 1e6) for k in range(6)]
         lines.append("COVARIANCE_STOP")
     return [*lines, ""]
-
-
-def _epoch_texts(counts: IntArray) -> list[str]:
-    """Return calendar texts, with three decimals where that is exact for all of them and else nine."""
-    unit = "ms" if np.all(counts % (NS // 1000) == 0) else "ns"
-    return [
-        str(text)
-        for text in np.datetime_as_string(counts.astype("datetime64[ns]").astype(f"datetime64[{unit}]"))
-    ]

@@ -235,7 +235,7 @@ class Client(Connection):
     # Reference ephemerides
 
     def add_ephemeris(self, file: Path, *, name: str | None = None, precedence: int = 0) -> Ephemeris:
-        """Upload a reference ephemeris (OEM or STK .e)."""
+        """Upload a reference ephemeris (OEM in text or XML, STK .e or Horizons CSV)."""
         return self._post(Ephemeris, "/ephemerides", file, name=name or file.name, precedence=precedence)
 
     def list_ephemerides(self) -> Listing[Ephemeris]:

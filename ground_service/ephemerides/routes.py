@@ -13,12 +13,17 @@ from ground_service.http.common import API_PREFIX, GroundOf, Name, PagingOf, upl
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
 
+EPHEMERIS_FILE = "CCSDS OEM (text or XML), STK .e or Horizons CSV file; also as .gz or .zip"
 UPLOAD_PATHS = (f"{API_PREFIX}/ephemerides",)
 
 ephemerides = operations("ephemerides")
 
 
-@ephemerides.post("/ephemerides", status_code=201, openapi_extra=upload_body("CCSDS OEM or STK .e file"))
+@ephemerides.post(
+    "/ephemerides",
+    status_code=201,
+    openapi_extra=upload_body(EPHEMERIS_FILE),
+)
 async def add_ephemeris(
     upload: UploadOf,
     ground: GroundOf,
@@ -26,7 +31,7 @@ async def add_ephemeris(
     name: Name = "reference",
     precedence: Annotated[int, Query(ge=-1000, le=1000)] = 0,
 ) -> Ephemeris:
-    """Add a reference ephemeris: a CCSDS OEM or an STK .e file as the body."""
+    """Add a reference ephemeris: OEM (text or XML), STK .e or Horizons CSV as the body, also compressed."""
     stored = await upload.stored()
 
     def add() -> Ephemeris:

@@ -19,7 +19,7 @@ from lunar.errors import LunarError
 def add_ephemeris(
     ground: Ground, stored: StoredFile, *, name: str, precedence: int = 0, actor: str = "local"
 ) -> Ephemeris:
-    """Enter an archived OEM or STK file as a reference ephemeris; the same file again gives the same entry.
+    """Enter an archived ephemeris file as a reference ephemeris; the same file again gives the same entry.
 
     Raises
     ------
@@ -30,7 +30,7 @@ def add_ephemeris(
         ephemeris = load_ephemeris(stored.path)
     except LunarError as error:
         reason = str(error).replace(str(stored.path), name)
-        raise InvalidInput("ephemeris", "", "a CCSDS OEM or STK .e file", reason) from None
+        raise InvalidInput("ephemeris", "", "a CCSDS OEM, STK .e or Horizons file", reason) from None
     now = utc_now_ns()
     with ground.database.writing() as connection:
         hold(connection, f"ephemeris {stored.sha256}")

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from linna.output import add_json_flag, emit
+
+if TYPE_CHECKING:
+    from lunar.ephemeris import Ephemeris
 
 
 def configure_compare(commands: Any) -> None:
     """Add `compare` to the subparsers of `linna orbit`."""
     compare = commands.add_parser("compare", help="difference of two ephemerides on common epochs")
-    compare.add_argument("a", type=Path, metavar="A", help="OEM or STK .e file; its orbit gives the axes")
-    compare.add_argument("b", type=Path, metavar="B", help="OEM or STK .e file")
+    compare.add_argument("a", type=Path, metavar="A", help="ephemeris file; its orbit gives the axes")
+    compare.add_argument("b", type=Path, metavar="B", help="ephemeris file (OEM, STK .e, Horizons CSV)")
     compare.add_argument(
         "--step", type=float, metavar="S", help="seconds between epochs (default: the states of A)"
     )
@@ -28,7 +32,9 @@ def configure_compare(commands: Any) -> None:
 def configure_interpolate(commands: Any) -> None:
     """Add `interpolate` to the subparsers of `linna orbit`."""
     interpolate = commands.add_parser("interpolate", help="states of an ephemeris at given UTC epochs")
-    interpolate.add_argument("ephemeris", type=Path, metavar="F", help="OEM or STK .e file")
+    interpolate.add_argument(
+        "ephemeris", type=Path, metavar="F", help="ephemeris file (OEM, STK .e, Horizons CSV)"
+    )
     interpolate.add_argument(
         "--epochs", required=True, metavar="FILE", help="UTC epochs, one a line (- reads standard input)"
     )
@@ -39,7 +45,7 @@ def configure_interpolate(commands: Any) -> None:
 def configure_stats(commands: Any) -> None:
     """Add `stats` to the subparsers of `linna orbit`."""
     stats = commands.add_parser("stats", help="altitudes, passes and period of an ephemeris")
-    stats.add_argument("ephemeris", type=Path, metavar="F", help="OEM or STK .e file")
+    stats.add_argument("ephemeris", type=Path, metavar="F", help="ephemeris file (OEM, STK .e, Horizons CSV)")
     stats.add_argument(
         "--step", type=float, metavar="S", help="seconds between epochs (default: the states of the file)"
     )
@@ -50,10 +56,18 @@ def configure_stats(commands: Any) -> None:
 
 def configure_convert(commands: Any) -> None:
     """Add `convert` to the subparsers of `linna orbit`."""
-    convert = commands.add_parser("convert", help="an ephemeris as OEM, STK .e, CSV or TUM")
-    convert.add_argument("ephemeris", type=Path, metavar="F", help="OEM or STK .e file")
+    convert = commands.add_parser("convert", help="an ephemeris as OEM, SPK, STK .e, CSV or TUM")
     convert.add_argument(
-        "--out", required=True, type=Path, metavar="FILE", help="ending in .oem, .e, .csv or .tum"
+        "ephemeris",
+        type=Path,
+        metavar="F",
+        help="OEM (text or XML), STK .e, Horizons CSV (all also as .gz or .zip), or SPK",
+    )
+    convert.add_argument(
+        "--out", required=True, type=Path, metavar="FILE", help="ending in .oem, .xml, .bsp, .e, .csv or .tum"
+    )
+    convert.add_argument(
+        "--spice-id", type=int, metavar="N", help="SPICE number of the spacecraft in an SPK, such as -85"
     )
     convert.add_argument(
         "--step", type=float, metavar="S", help="seconds between states (default: the states of the file)"
@@ -209,13 +223,17 @@ def run_convert(arguments: argparse.Namespace) -> int:
     from linna.errors import UsageError
     from lunar.datafolder import default_orientation
     from lunar.ephemeris import ephemeris_from_states
-    from lunar.ephemeris_files import load_ephemeris
+    from lunar.ephemeris_files import is_spk, load_ephemeris
     from lunar.oem import format_oem
+    from lunar.oem_xml import format_oem_xml
+    from lunar.spice import READ_STEP_S, load_spk, spk_octets
     from lunar.stk import format_stk
     from lunar.tabular import format_csv, format_tum
 
-    writers = {
+    writers: dict[str, Callable[[Ephemeris], str | bytes]] = {
         ".oem": format_oem,
+        ".xml": format_oem_xml,
+        ".bsp": lambda states: spk_octets(states, _spice_id(arguments)),
         ".e": format_stk,
         ".csv": lambda states: format_csv(states, default_orientation(data_folder())),
         ".tum": format_tum,
@@ -223,21 +241,32 @@ def run_convert(arguments: argparse.Namespace) -> int:
     out: Path = arguments.out
     if out.suffix.lower() not in writers:
         raise UsageError(f"--out: expected a name ending in {', '.join(writers)}, found {out.name!r}")
-    ephemeris = load_ephemeris(arguments.ephemeris)
+    if is_spk(arguments.ephemeris):
+        ephemeris = load_spk(arguments.ephemeris, arguments.spice_id, arguments.step or READ_STEP_S)
+    else:
+        ephemeris = load_ephemeris(arguments.ephemeris)
     epochs = _epochs(arguments.step, ephemeris)
     if epochs is not None:
         name = ephemeris.segments[0].object_name
         ephemeris = ephemeris_from_states(epochs, *ephemeris.at(epochs), object_name=name)
-    text = writers[out.suffix.lower()](ephemeris)
+    written = writers[out.suffix.lower()](ephemeris)
     part = out.with_name(out.name + ".part")
     try:
-        part.write_text(text, encoding="utf-8", newline="\n")
+        part.write_bytes(written if isinstance(written, bytes) else written.encode())
         os.replace(part, out)
     finally:
         part.unlink(missing_ok=True)
     figures = {"out": str(out), "states": len(ephemeris.utc_ns), "segments": len(ephemeris.segments)}
     emit(arguments, figures, text=f"{figures['states']} states -> {out}")
     return 0
+
+
+def _spice_id(arguments: argparse.Namespace) -> int:
+    from linna.errors import UsageError
+
+    if arguments.spice_id is None:
+        raise UsageError("--spice-id: expected the SPICE number of the spacecraft, such as -85, found none")
+    return int(arguments.spice_id)
 
 
 def _epochs(step_s: float | None, ephemeris: Any) -> Any:

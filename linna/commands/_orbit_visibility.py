@@ -14,7 +14,9 @@ def configure_visibility(commands: Any) -> None:
     visibility = commands.add_parser(
         "visibility", help="eclipses, nights, occultations and station contacts of an ephemeris"
     )
-    visibility.add_argument("ephemeris", type=Path, metavar="F", help="OEM or STK .e file")
+    visibility.add_argument(
+        "ephemeris", type=Path, metavar="F", help="ephemeris file (OEM, STK .e, Horizons CSV)"
+    )
     visibility.add_argument(
         "--station",
         action="append",

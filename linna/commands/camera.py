@@ -14,7 +14,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     study = commands.add_parser(
         "fov-study", help="probability of craters in the footprint over the field of view"
     )
-    study.add_argument("--ephemeris", required=True, type=Path, metavar="F", help="OEM or STK .e file")
+    study.add_argument(
+        "--ephemeris",
+        required=True,
+        type=Path,
+        metavar="F",
+        help="ephemeris file (OEM, STK .e, Horizons CSV)",
+    )
     study.add_argument(
         "--catalogue",
         metavar="F",

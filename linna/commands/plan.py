@@ -18,7 +18,7 @@ RANGE = ("MIN", "MAX")
 
 def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(metavar="ACTION", required=True)
-    ephemeris = actions.add_parser("ephemeris", help="add a reference ephemeris (OEM or STK .e)")
+    ephemeris = actions.add_parser("ephemeris", help="add a reference ephemeris (OEM, STK .e, Horizons CSV)")
     ephemeris.add_argument("file", type=Path)
     ephemeris.add_argument("--name")
     ephemeris.add_argument("--precedence", type=int, default=0)

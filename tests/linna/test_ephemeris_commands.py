@@ -107,20 +107,33 @@ def test_stats_summarise_an_ephemeris_and_draw_it(oem_path, tmp_path, capsys):
     assert "<svg" in plot.read_text()
 
 
-@pytest.mark.parametrize("ending", [".oem", ".e", ".csv", ".tum"])
+@pytest.mark.parametrize("ending", [".oem", ".xml", ".e", ".csv", ".tum"])
 def test_an_ephemeris_converts_to_every_format(oem_path, tmp_path, capsys, ending):
     out = tmp_path / f"converted{ending}"
     assert run_json(capsys, "orbit", "convert", oem_path, "--out", out)["states"] == 2881
-    if ending in (".oem", ".e"):
+    if ending in (".oem", ".xml", ".e"):
         assert run_json(capsys, "orbit", "compare", oem_path, out)["max_m"] < 1e-5
     else:
         assert len(out.read_text().splitlines()) == 2881 + (ending == ".csv")
     assert [path.name for path in tmp_path.glob("*.part")] == []
 
 
+def test_an_ephemeris_goes_through_spice_and_back(oem_path, tmp_path, capsys):
+    kernel, back = tmp_path / "orbit.bsp", tmp_path / "back.oem"
+    run_json(capsys, "orbit", "convert", oem_path, "--out", kernel, "--spice-id", "-85")
+    run_json(capsys, "orbit", "convert", kernel, "--out", back, "--spice-id", "-85", "--step", "30")
+    # A float64 of seconds is good to 0.2 mm at orbital speed.
+    assert run_json(capsys, "orbit", "compare", oem_path, back)["max_m"] < 1e-3
+
+
+def test_a_kernel_without_the_number_of_the_spacecraft_is_one_line(oem_path, tmp_path, capsys):
+    line = error_line(capsys, "orbit", "convert", oem_path, "--out", tmp_path / "orbit.bsp")
+    assert "--spice-id: expected the SPICE number of the spacecraft, such as -85, found none" in line
+
+
 def test_a_conversion_to_an_unknown_format_is_one_line(oem_path, tmp_path, capsys):
-    line = error_line(capsys, "orbit", "convert", oem_path, "--out", tmp_path / "orbit.xml")
-    assert "expected a name ending in .oem, .e, .csv, .tum, found 'orbit.xml'" in line
+    line = error_line(capsys, "orbit", "convert", oem_path, "--out", tmp_path / "orbit.json")
+    assert "expected a name ending in .oem, .xml, .bsp, .e, .csv, .tum, found 'orbit.json'" in line
 
 
 @pytest.mark.parametrize("command", [("orbit", "stats"), ("orbit", "compare")])

@@ -223,12 +223,15 @@ def test_overlapping_segments_and_no_segments_are_refused():
 def test_a_file_of_neither_format_is_refused(tmp_path, text):
     path = tmp_path / "orbit.txt"
     path.write_text(text)
-    with pytest.raises(DataFileError, match=r"orbit\.txt: first line: expected CCSDS_OEM_VERS or stk\.v\."):
+    with pytest.raises(
+        DataFileError,
+        match=r"orbit\.txt: first line: expected CCSDS_OEM_VERS, stk\.v\., XML or a Horizons table",
+    ):
         load_ephemeris(path)
 
 
 def test_missing_and_binary_files_are_refused(tmp_path):
     (tmp_path / "binary").write_bytes(bytes(range(256)))
     for name in ("binary", "missing"):
-        with pytest.raises(DataFileError, match=f"{name}.*expected a CCSDS OEM or STK"):
+        with pytest.raises(DataFileError, match=f"{name}.*expected a CCSDS OEM, STK .e or Horizons"):
             load_ephemeris(tmp_path / name)

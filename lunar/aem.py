@@ -1,0 +1,244 @@
+"""CCSDS Attitude Ephemeris Message of quaternions in keyword notation: reads versions 1.0 and 2.0, writes 1.0.
+
+A message gives the rotation from a reference frame A to a frame B of the spacecraft.  Here a quaternion is
+``q_wxyz``, Hamilton's, with v_B = q v_A q*; the standard's is its conjugate (the matrix of the standard turns
+coordinates from A to B with the opposite sign of the vector part).
+
+References
+----------
+CCSDS 504.0-B-1 (2008) and 504.0-B-2 (2024), Attitude Data Messages, section 4 and annex on quaternions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lunar.arrays import FloatArray, IntArray
+from lunar.ephemeris import read_text
+from lunar.errors import EphemerisError, UnknownTimeSystemError
+from lunar.kvn import Lines, comment_lines, epoch_texts, is_number, numbered_lines
+from lunar.timescales import TIME_SYSTEMS, format_utc, from_utc_ns
+
+VERSIONS = ("1.0", "2.0")
+UNIT_TOLERANCE = 1e-3
+"""Accepted deviation of a quaternion from unit length: attitude reports have few digits."""
+
+CAMERA_FRAME = "INSTRUMENT_1"
+"""Name of the camera axes in messages; SANA registers INSTRUMENT_n for instruments."""
+
+_HEADER_KEYS = ("CCSDS_AEM_VERS", "CLASSIFICATION", "CREATION_DATE", "ORIGINATOR", "MESSAGE_ID")
+_MANDATORY = (
+    "OBJECT_NAME",
+    "OBJECT_ID",
+    "REF_FRAME_A",
+    "REF_FRAME_B",
+    "TIME_SYSTEM",
+    "START_TIME",
+    "STOP_TIME",
+    "ATTITUDE_TYPE",
+)
+_META_KEYS = (
+    *_MANDATORY,
+    "CENTER_NAME",
+    "ATTITUDE_DIR",
+    "QUATERNION_TYPE",
+    "USEABLE_START_TIME",
+    "USEABLE_STOP_TIME",
+    "INTERPOLATION_METHOD",
+    "INTERPOLATION_DEGREE",
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AttitudeSegment:
+    """Attitudes of one span.
+
+    Attributes
+    ----------
+    utc_ns, q_wxyz
+        Epochs (n,), ascending, and unit quaternions (n, 4) that turn vectors from ``frame_a`` to ``frame_b``.
+    """
+
+    utc_ns: IntArray
+    q_wxyz: FloatArray
+    frame_a: str = "ICRF"
+    frame_b: str = CAMERA_FRAME
+    object_name: str = "SELENITA"
+    object_id: str = "SELENITA"
+    time_system: str = "UTC"
+    comments: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.utc_ns) == 0:
+            raise EphemerisError("an attitude segment: expected at least one attitude, found none")
+        if self.q_wxyz.shape != (len(self.utc_ns), 4):
+            raise EphemerisError(
+                f"an attitude segment: expected quaternions ({len(self.utc_ns)}, 4), found {self.q_wxyz.shape}"
+            )
+
+
+def load_aem(path: Path | str) -> tuple[AttitudeSegment, ...]:
+    """Return the segments of an AEM file; raises as `parse_aem`."""
+    return parse_aem(read_text(path, "a CCSDS AEM"), source=str(path))
+
+
+def parse_aem(text: str, source: str = "AEM text") -> tuple[AttitudeSegment, ...]:
+    """Return the segments in the text of an AEM; ``source`` names it in errors.
+
+    Raises
+    ------
+    DataFileError
+        Where the text is cut short or says something that cannot be, with its line.
+    UnknownTimeSystemError
+        Where the time scale is none that can be converted.
+    """
+    reader = Lines(numbered_lines(text), source)
+    _read_header(reader)
+    segments: list[AttitudeSegment] = []
+    while reader.peek() is not None:
+        segments.append(_read_segment(reader))
+        start = int(segments[-1].utc_ns[0])
+        if len(segments) > 1 and start < (end := int(segments[-2].utc_ns[-1])):
+            raise reader.error(f"attitudes at or after {format_utc(end)}", format_utc(start))
+    if not segments:
+        raise reader.error("META_START", "the end of the file")
+    return tuple(segments)
+
+
+def format_aem(
+    segments: tuple[AttitudeSegment, ...], *, originator: str = "LINNA", creation_utc_ns: int | None = None
+) -> str:
+    """Return AEM 1.0 text, quaternions with the scalar last; CREATION_DATE is the first epoch unless given."""
+    created = int(segments[0].utc_ns[0]) if creation_utc_ns is None else creation_utc_ns
+    lines = [
+        "CCSDS_AEM_VERS = 1.0",
+        f"CREATION_DATE = {format_utc(created).rstrip('Z')}",
+        f"ORIGINATOR = {originator}",
+        "",
+    ]
+    for one in segments:
+        texts = epoch_texts(np.asarray(from_utc_ns(one.utc_ns, one.time_system)))
+        lines += [
+            "META_START",
+            *comment_lines(one.comments),
+            f"OBJECT_NAME = {one.object_name}",
+            f"OBJECT_ID = {one.object_id}",
+            "CENTER_NAME = MOON",
+            f"REF_FRAME_A = {one.frame_a}",
+            f"REF_FRAME_B = {one.frame_b}",
+            "ATTITUDE_DIR = A2B",
+            f"TIME_SYSTEM = {one.time_system}",
+            f"START_TIME = {texts[0]}",
+            f"STOP_TIME = {texts[-1]}",
+            "ATTITUDE_TYPE = QUATERNION",
+            "QUATERNION_TYPE = LAST",
+            "META_STOP",
+            "",
+            "DATA_START",
+        ]
+        vector_last = (one.q_wxyz * [1.0, -1.0, -1.0, -1.0])[:, [1, 2, 3, 0]].tolist()
+        row = "%s %.12f %.12f %.12f %.12f"
+        lines += [row % (text, *values) for text, values in zip(texts, vector_last, strict=True)]
+        lines += ["DATA_STOP", ""]
+    return "\n".join(lines)
+
+
+def _read_header(reader: Lines) -> None:
+    first = reader.peek()
+    if first is None or not first.startswith("CCSDS_AEM_VERS"):
+        raise reader.error("CCSDS_AEM_VERS = 1.0 or 2.0", "nothing" if first is None else repr(first[:40]), 0)
+    seen: set[str] = set()
+    while True:
+        for _ in reader.comments():
+            pass
+        line = reader.peek()
+        if line is None or line == "META_START":
+            break
+        key, value = reader.keyword(_HEADER_KEYS)
+        if key in seen:
+            raise reader.error(f"{key} once", "it again")
+        if key == "CCSDS_AEM_VERS" and value not in VERSIONS:
+            raise reader.error(f"an AEM version out of {', '.join(VERSIONS)}", repr(value))
+        seen.add(key)
+
+
+def _read_segment(reader: Lines) -> AttitudeSegment:
+    line = reader.take()
+    if line != "META_START":
+        raise reader.error("META_START", repr(line[:60]))
+    comments: list[str] = []
+    meta: dict[str, str] = {}
+    while True:
+        comments += reader.comments()
+        if reader.peek() == "META_STOP":
+            reader.take()
+            break
+        key, value = reader.keyword(_META_KEYS)
+        if key in meta:
+            raise reader.error(f"{key} once", "it again")
+        meta[key] = value
+    missing = [key for key in _MANDATORY if key not in meta]
+    if missing:
+        raise reader.error(f"{missing[0]} before META_STOP", "none")
+    system = meta["TIME_SYSTEM"].upper()
+    if system not in TIME_SYSTEMS:
+        raise UnknownTimeSystemError(meta["TIME_SYSTEM"], TIME_SYSTEMS, reader.source)
+    first, inverse = _notation(reader, meta)
+    utc_ns, numbers = _read_quaternions(reader, system)
+    q_wxyz = numbers if first else numbers[:, [3, 0, 1, 2]]
+    if not inverse:
+        q_wxyz = q_wxyz * [1.0, -1.0, -1.0, -1.0]
+    q_wxyz = q_wxyz / np.linalg.norm(q_wxyz, axis=1, keepdims=True)
+    return AttitudeSegment(
+        utc_ns,
+        q_wxyz,
+        meta["REF_FRAME_A"],
+        meta["REF_FRAME_B"],
+        meta["OBJECT_NAME"],
+        meta["OBJECT_ID"],
+        system,
+        tuple(comments),
+    )
+
+
+def _notation(reader: Lines, meta: dict[str, str]) -> tuple[bool, bool]:
+    """Return whether the scalar comes first, and whether the rotation is that from B to A."""
+    kind = meta["ATTITUDE_TYPE"].upper()
+    if kind != "QUATERNION":
+        raise reader.error("ATTITUDE_TYPE = QUATERNION", repr(meta["ATTITUDE_TYPE"]))
+    order = meta.get("QUATERNION_TYPE", "LAST").upper()
+    if order not in ("FIRST", "LAST"):
+        raise reader.error("QUATERNION_TYPE = FIRST or LAST", repr(order))
+    direction = meta.get("ATTITUDE_DIR", "A2B").upper()
+    if direction not in ("A2B", "B2A"):
+        raise reader.error("ATTITUDE_DIR = A2B or B2A", repr(direction))
+    return order == "FIRST", direction == "B2A"
+
+
+def _read_quaternions(reader: Lines, system: str) -> tuple[IntArray, FloatArray]:
+    for _ in reader.comments():
+        pass
+    line = reader.take()
+    if line != "DATA_START":
+        raise reader.error("DATA_START", repr(line[:60]))
+    epochs: list[int] = []
+    rows: list[list[float]] = []
+    while (line := reader.take()) != "DATA_STOP":
+        if line.startswith("COMMENT"):
+            continue
+        epoch, *values = line.split()
+        if len(values) != 4 or not all(map(is_number, values)):
+            raise reader.error("an epoch and a quaternion of 4 numbers", repr(line[:60]))
+        numbers = [float(value) for value in values]
+        if not abs(float(np.linalg.norm(numbers)) - 1.0) <= UNIT_TOLERANCE:
+            raise reader.error("a quaternion of unit length", repr(line[:60]))
+        epochs.append(reader.epoch(epoch, system))
+        if len(epochs) > 1 and epochs[-1] <= epochs[-2]:
+            raise reader.error(f"an epoch after {format_utc(epochs[-2])}", format_utc(epochs[-1]))
+        rows.append(numbers)
+    if not rows:
+        raise reader.error("at least one attitude", "none")
+    return np.array(epochs, dtype=np.int64), np.array(rows)

@@ -1,0 +1,75 @@
+"""Files that may be compressed: gzip, or a zip archive with one file, expanded to a bounded size."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from pathlib import Path
+
+from lunar.errors import DataFileError
+
+EXPANDED_LIMIT_OCTETS = 256 << 20
+"""Largest size of an expanded file: a year of states each minute is 70 MB of text."""
+
+_GZIP = b"\x1f\x8b"
+_ZIP = b"PK\x03\x04"
+
+
+def read_expanded(path: Path | str, expected: str, limit_octets: int = EXPANDED_LIMIT_OCTETS) -> bytes:
+    """Return the octets of a file, expanded if it is compressed with gzip or in a zip archive of one file.
+
+    Raises
+    ------
+    DataFileError
+        If the file cannot be read, the compression is damaged, or the expanded file is larger than the limit.
+    """
+    try:
+        octets = Path(path).read_bytes()
+    except OSError as error:
+        raise DataFileError(path, "", expected, error.strerror or str(error)) from None
+    if octets.startswith(_GZIP):
+        return _gunzipped(octets, path, limit_octets)
+    if octets.startswith(_ZIP):
+        return _unzipped(octets, path, limit_octets)
+    return octets
+
+
+def _gunzipped(octets: bytes, path: Path | str, limit_octets: int) -> bytes:
+    parts: list[bytes] = []
+    size = 0
+    rest = octets
+    while rest:
+        stream = zlib.decompressobj(wbits=31)
+        try:
+            part = stream.decompress(rest, limit_octets - size + 1)
+        except zlib.error as error:
+            raise DataFileError(path, "", "a gzip file", f"damaged data ({error})") from None
+        size += len(part)
+        if size > limit_octets:
+            raise _too_large(path, limit_octets)
+        if not stream.eof:
+            raise DataFileError(path, "", "a complete gzip file", "one that is cut short")
+        parts.append(part)
+        rest = stream.unused_data.lstrip(b"\0")
+    return b"".join(parts)
+
+
+def _unzipped(octets: bytes, path: Path | str, limit_octets: int) -> bytes:
+    try:
+        with zipfile.ZipFile(io.BytesIO(octets)) as archive:
+            files = [one for one in archive.infolist() if not one.is_dir()]
+            if len(files) != 1:
+                raise DataFileError(path, "", "a zip archive of one file", f"{len(files)} files")
+            with archive.open(files[0]) as stream:
+                # Read no more than the limit, whatever size the archive states.
+                expanded = stream.read(limit_octets + 1)
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        raise DataFileError(path, "", "a zip archive", f"damaged data ({error})") from None
+    if len(expanded) > limit_octets:
+        raise _too_large(path, limit_octets)
+    return expanded
+
+
+def _too_large(path: Path | str, limit_octets: int) -> DataFileError:
+    return DataFileError(path, "", f"at most {limit_octets >> 20} MiB when expanded", "more")

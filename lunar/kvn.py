@@ -1,0 +1,94 @@
+"""Keyword notation (KVN) of CCSDS navigation messages: lines, keywords, comments and epochs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from lunar.arrays import IntArray
+from lunar.errors import DataFileError, TimeFormatError
+from lunar.timescales import NS, parse_utc, to_utc_ns
+
+
+def numbered_lines(text: str) -> list[tuple[int, str]]:
+    """Return the lines of a text that are not blank, stripped, with their line numbers."""
+    return [item for item in enumerate(map(str.strip, text.splitlines()), start=1) if item[1]]
+
+
+@dataclass(slots=True)
+class Lines:
+    """Lines of a message that are not blank, with their line numbers in the file, and the place reached."""
+
+    numbered: list[tuple[int, str]]
+    source: str
+    at: int = 0
+
+    def peek(self) -> str | None:
+        """Return the next line, None at the end."""
+        return self.numbered[self.at][1] if self.at < len(self.numbered) else None
+
+    def take(self) -> str:
+        """Return the next line and pass it."""
+        line = self.peek()
+        if line is None:
+            raise self.error("more lines", "the end of the file")
+        self.at += 1
+        return line
+
+    def number(self, at: int | None = None) -> int:
+        """Return the line number of the line last taken, or of index ``at``."""
+        index = self.at - 1 if at is None else at
+        return self.numbered[min(max(index, 0), len(self.numbered) - 1)][0] if self.numbered else 1
+
+    def error(self, expected: str, found: str, at: int | None = None) -> DataFileError:
+        """Return an error at the line last taken, or at index ``at``."""
+        return DataFileError(self.source, f"line {self.number(at)}", expected, found)
+
+    def comments(self) -> Iterator[str]:
+        """Yield the comments here and pass them."""
+        while (line := self.peek()) is not None and line.split(None, 1)[0] == "COMMENT":
+            self.at += 1
+            yield line[7:].strip()
+
+    def keyword(self, allowed: Iterable[str]) -> tuple[str, str]:
+        """Return the next line as a keyword with its value."""
+        line = self.take()
+        key, equals, value = line.partition("=")
+        key, value = key.strip().upper(), value.strip()
+        if not equals or key not in allowed:
+            raise self.error(f"one of {', '.join(allowed)}", repr(line[:60]))
+        if not value:
+            raise self.error(f"a value of {key}", "nothing")
+        return key, value
+
+    def epoch(self, value: str, time_system: str, at: int | None = None) -> int:
+        """Return ``utc_ns`` of an epoch in a time system."""
+        try:
+            return int(to_utc_ns(parse_utc(value), time_system))
+        except TimeFormatError:
+            raise self.error("an epoch like 2029-08-07T00:00:00.000", repr(value), at) from None
+
+
+def is_number(token: str) -> bool:
+    """Return whether a text is a number."""
+    try:
+        float(token)
+    except ValueError:
+        return False
+    return True
+
+
+def comment_lines(comments: Iterable[str]) -> list[str]:
+    """Return the COMMENT lines of comments."""
+    return [f"COMMENT {line}".rstrip() for comment in comments for line in (comment.splitlines() or [""])]
+
+
+def epoch_texts(counts: IntArray) -> list[str]:
+    """Return calendar texts, with three decimals where that is exact for all of them and else nine."""
+    unit = "ms" if np.all(counts % (NS // 1000) == 0) else "ns"
+    return [
+        str(text)
+        for text in np.datetime_as_string(counts.astype("datetime64[ns]").astype(f"datetime64[{unit}]"))
+    ]

@@ -1,0 +1,408 @@
+"""CCSDS AEM, OPM, TDM and OEM in XML; and ephemerides of Horizons and in compressed files."""
+
+import gzip
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import oem as independent
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from lxml import etree
+
+from lunar.aem import AttitudeSegment, format_aem, parse_aem
+from lunar.compressed import read_expanded
+from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment
+from lunar.ephemeris_files import load_ephemeris
+from lunar.errors import DataFileError, EphemerisError, UnknownFrameError
+from lunar.frames import matrix_from_quaternion
+from lunar.oem import format_oem
+from lunar.oem_xml import format_oem_xml, parse_oem_xml
+from lunar.opm import format_opm
+from lunar.tdm import Sightings, format_tdm
+from lunar.timescales import NS, from_utc_ns, parse_utc
+
+START = parse_utc("2029-08-07T00:00:00")
+
+
+def ephemeris() -> Ephemeris:
+    rng = np.random.default_rng(1)
+    matrix = rng.normal(size=(6, 6))
+    first = EphemerisSegment(
+        START + np.arange(5) * 60 * NS,
+        rng.normal(size=(5, 3)) * 1e6,
+        rng.normal(size=(5, 3)) * 1e3,
+        comments=("before the burn & after <start>",),
+        covariances=(
+            Covariance(START, "RTN", matrix @ matrix.T),
+            Covariance(START + 60 * NS, "RTN", 2.0 * matrix @ matrix.T),
+        ),
+    )
+    second = EphemerisSegment(
+        START + np.arange(4, 9) * 60 * NS + 123_456_789,
+        rng.normal(size=(5, 3)) * 1e6,
+        rng.normal(size=(5, 3)) * 1e3,
+        time_system="TDB",
+        interpolation="LAGRANGE",
+        degree=5,
+        useable_start_utc_ns=START + 300 * NS,
+    )
+    return Ephemeris((first, second), "TEST", ("two arcs",))
+
+
+def assert_same(found: Ephemeris, expected: Ephemeris) -> None:
+    assert (found.originator, found.comments) == (expected.originator, expected.comments)
+    assert len(found.segments) == len(expected.segments)
+    for one, other in zip(found.segments, expected.segments, strict=True):
+        assert np.abs(one.utc_ns - other.utc_ns).max() <= 1
+        np.testing.assert_allclose(one.position_m, other.position_m, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(one.velocity_m_s, other.velocity_m_s, rtol=0, atol=1e-9)
+        for name in ("centre", "frame", "object_name", "object_id", "time_system", "interpolation", "degree"):
+            assert getattr(one, name) == getattr(other, name), name
+        assert one.comments == other.comments
+        for mine, theirs in zip(one.covariances, other.covariances, strict=True):
+            assert (mine.utc_ns, mine.frame) == (theirs.utc_ns, theirs.frame)
+            np.testing.assert_allclose(mine.matrix, theirs.matrix, rtol=1e-12)
+
+
+# OEM in XML
+
+
+def test_oem_in_xml_is_read_as_it_was_written() -> None:
+    assert_same(parse_oem_xml(format_oem_xml(ephemeris()).encode()), ephemeris())
+
+
+@pytest.mark.filterwarnings("ignore:ERFA function")
+def test_another_reader_gives_the_same_states_from_xml(tmp_path: Path) -> None:
+    path = tmp_path / "orbit.xml"
+    expected = ephemeris()
+    path.write_text(format_oem_xml(Ephemeris(expected.segments[:1])))
+    segment = next(iter(independent.OrbitEphemerisMessage.open(path)))
+    np.testing.assert_allclose(
+        [one.position for one in segment.states], expected.segments[0].position_m / 1e3
+    )
+    np.testing.assert_allclose(
+        [one.velocity for one in segment.states], expected.segments[0].velocity_m_s / 1e3
+    )
+    assert len(segment.covariances) == 2
+    np.testing.assert_allclose(
+        segment.covariances[1].matrix, expected.segments[0].covariances[1].matrix / 1e6
+    )
+
+
+@pytest.mark.filterwarnings("ignore:ERFA function")
+def test_oem_of_another_writer_in_xml_is_read(tmp_path: Path) -> None:
+    source, path = tmp_path / "orbit.oem", tmp_path / "orbit.xml"
+    expected = Ephemeris(ephemeris().segments[:1])
+    source.write_text(format_oem(expected))
+    independent.OrbitEphemerisMessage.convert(source, path, "xml")
+    found = load_ephemeris(path)
+    np.testing.assert_allclose(found.segments[0].position_m, expected.segments[0].position_m, atol=1e-3)
+    np.testing.assert_array_equal(found.segments[0].utc_ns, expected.segments[0].utc_ns)
+
+
+def test_a_wrapped_message_with_a_name_space_is_read() -> None:
+    plain = format_oem_xml(ephemeris()).partition("\n")[2]
+    wrapped = f'<ndm:ndm xmlns:ndm="urn:ccsds:schema:ndmxml">{plain}</ndm:ndm>'
+    assert_same(parse_oem_xml(wrapped.encode()), ephemeris())
+
+
+def test_elements_are_in_the_order_of_the_standard() -> None:
+    tree = etree.fromstring(format_oem_xml(ephemeris()).encode())
+    assert (tree.tag, tree.get("id"), tree.get("version")) == ("oem", "CCSDS_OEM_VERS", "2.0")
+    assert [one.tag for one in tree] == ["header", "body"]
+    segment = tree.find("body/segment")
+    assert [one.tag for one in segment] == ["metadata", "data"]
+    assert [one.tag for one in segment.find("metadata") if one.tag != "COMMENT"] == [
+        "OBJECT_NAME", "OBJECT_ID", "CENTER_NAME", "REF_FRAME", "TIME_SYSTEM", "START_TIME", "STOP_TIME",
+        "INTERPOLATION", "INTERPOLATION_DEGREE",
+    ]  # fmt: skip
+    assert [one.tag for one in segment.find("data/stateVector")] == [
+        "EPOCH", "X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT",
+    ]  # fmt: skip
+    assert [one.tag for one in segment.find("data/covarianceMatrix")][:6] == [
+        "EPOCH", "COV_REF_FRAME", "CX_X", "CY_X", "CY_Y", "CZ_X",
+    ]  # fmt: skip
+
+
+LAUGHS = """<?xml version="1.0"?>
+<!DOCTYPE oem [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]>
+<oem id="CCSDS_OEM_VERS" version="2.0"><header><ORIGINATOR>&b;</ORIGINATOR></header></oem>"""
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda text: LAUGHS, r"line 2: expected XML without a document type, found <!DOCTYPE oem>"),
+        (lambda text: text[:700], r"line \d+: expected well-formed XML, found"),
+        (lambda text: text.replace('units="km"', 'units="m"', 1), r"line \d+: expected units='km' of X, found 'm'"),
+        (lambda text: text.replace("<ORIGINATOR>TEST</ORIGINATOR>", ""), "expected ORIGINATOR in the header"),
+        (lambda text: text.replace('version="2.0"', 'version="9"'), r"line 2: expected an OEM version .*found '9'"),
+        (lambda text: text.replace("<Z_DOT", "<Z_TOD").replace("/Z_DOT", "/Z_TOD"), "expected <Z_DOT> with one value"),
+        (lambda text: "<a>" * 20 + "</a>" * 20, "expected"),
+    ],
+)  # fmt: skip
+def test_faults_of_xml_are_named_with_their_line(change, message) -> None:  # type: ignore[no-untyped-def] # a lambda
+    text = change(format_oem_xml(ephemeris()))
+    with pytest.raises(DataFileError, match=message):
+        parse_oem_xml(text.encode(), "orbit.xml")
+
+
+def test_an_error_in_a_state_names_the_line_of_the_xml() -> None:
+    lines = format_oem_xml(ephemeris()).splitlines()
+    where = next(k for k, line in enumerate(lines) if line.startswith("<stateVector>"))
+    lines[where + 1] = lines[where + 1].replace("T00:01", "T00:61")
+    with pytest.raises(DataFileError, match=f"line {where + 2}: expected an epoch"):
+        parse_oem_xml("\n".join(lines).encode())
+
+
+# Compressed files
+
+
+def zipped(*contents: bytes) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for number, content in enumerate(contents):
+            archive.writestr(f"{number}.oem", content)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize("compress", [gzip.compress, zipped])
+def test_compressed_oem_is_read(tmp_path: Path, compress) -> None:  # type: ignore[no-untyped-def] # two functions
+    path = tmp_path / "orbit"
+    for text in (format_oem(ephemeris()), format_oem_xml(ephemeris())):
+        path.write_bytes(compress(text.encode()))
+        np.testing.assert_allclose(
+            load_ephemeris(path).segments[0].position_m, ephemeris().segments[0].position_m, atol=1e-6
+        )
+
+
+def test_two_gzip_members_are_one_file(tmp_path: Path) -> None:
+    path = tmp_path / "two"
+    path.write_bytes(gzip.compress(b"one ") + gzip.compress(b"two"))
+    assert read_expanded(path, "text") == b"one two"
+
+
+@pytest.mark.parametrize(
+    ("octets", "message"),
+    [
+        (gzip.compress(bytes(5 << 20)), "expected at most 1 MiB when expanded, found more"),
+        (gzip.compress(bytes(900_000)) * 2, "expected at most 1 MiB when expanded, found more"),
+        (zipped(bytes(5 << 20)), "expected at most 1 MiB when expanded, found more"),
+        (gzip.compress(bytes(1000))[:-12], "expected a complete gzip file, found one that is cut short"),
+        (b"\x1f\x8bnonsense", "expected a gzip file, found damaged data"),
+        (zipped(b"a", b"b"), "expected a zip archive of one file, found 2 files"),
+        (zipped(b"hello")[:-30], "expected a zip archive, found damaged data"),
+    ],
+)
+def test_faults_of_compressed_files_are_named(tmp_path: Path, octets: bytes, message: str) -> None:
+    path = tmp_path / "orbit.gz"
+    path.write_bytes(octets)
+    with pytest.raises(DataFileError, match=rf"orbit\.gz: {message}"):
+        read_expanded(path, "an ephemeris", 1 << 20)
+
+
+# AEM
+
+
+def attitudes(count: int = 6) -> AttitudeSegment:
+    q = np.random.default_rng(4).normal(size=(count, 4))
+    return AttitudeSegment(
+        START + np.arange(count) * 15 * NS,
+        q / np.linalg.norm(q, axis=1, keepdims=True),
+        comments=("star tracker",),
+    )
+
+
+def standard_matrix(q1: float, q2: float, q3: float, qc: float) -> np.ndarray:
+    """The direction cosine matrix from frame A to frame B of the annex of CCSDS 504.0-B."""
+    return np.array(
+        [
+            [q1**2 - q2**2 - q3**2 + qc**2, 2 * (q1 * q2 + q3 * qc), 2 * (q1 * q3 - q2 * qc)],
+            [2 * (q1 * q2 - q3 * qc), -(q1**2) + q2**2 - q3**2 + qc**2, 2 * (q2 * q3 + q1 * qc)],
+            [2 * (q1 * q3 + q2 * qc), 2 * (q2 * q3 - q1 * qc), -(q1**2) - q2**2 + q3**2 + qc**2],
+        ]
+    )
+
+
+def test_quaternions_of_an_aem_are_those_of_the_standard() -> None:
+    text = format_aem((attitudes(),))
+    rows = text.partition("DATA_START\n")[2].partition("\nDATA_STOP")[0].splitlines()
+    for row, q_wxyz in zip(rows, attitudes().q_wxyz, strict=True):
+        numbers = [float(token) for token in row.split()[1:]]
+        np.testing.assert_allclose(standard_matrix(*numbers), matrix_from_quaternion(q_wxyz), atol=1e-11)
+
+
+@given(count=st.integers(1, 20), second=st.integers(0, 10**9))
+def test_an_aem_is_read_as_it_was_written(count: int, second: int) -> None:
+    one = attitudes(count)
+    one = AttitudeSegment(one.utc_ns + second, one.q_wxyz, object_name="A", object_id="2029-001A")
+    (found,) = parse_aem(format_aem((one,)))
+    np.testing.assert_array_equal(found.utc_ns, one.utc_ns)
+    np.testing.assert_allclose(found.q_wxyz, one.q_wxyz, atol=1e-11)
+    assert (found.frame_a, found.frame_b, found.object_id) == ("ICRF", "INSTRUMENT_1", "2029-001A")
+
+
+def test_order_and_direction_of_quaternions_are_as_stated() -> None:
+    text = format_aem((attitudes(),))
+    lines = []
+    for line in text.splitlines():
+        fields = line.split()
+        if len(fields) == 5 and fields[0][0].isdigit():
+            epoch, a, b, c, w = fields
+            line = f"{epoch} {w} {-float(a)} {-float(b)} {-float(c)}"
+        lines.append(line.replace("LAST", "FIRST").replace("A2B", "B2A"))
+    (found,) = parse_aem("\n".join(lines))
+    np.testing.assert_allclose(found.q_wxyz, attitudes().q_wxyz, atol=1e-11)
+
+
+def test_version_2_without_order_and_direction_is_read() -> None:
+    text = format_aem((attitudes(),)).replace("CCSDS_AEM_VERS = 1.0", "CCSDS_AEM_VERS = 2.0")
+    text = text.replace("ATTITUDE_DIR = A2B\n", "").replace("QUATERNION_TYPE = LAST\n", "")
+    np.testing.assert_allclose(parse_aem(text)[0].q_wxyz, attitudes().q_wxyz, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("CCSDS_AEM_VERS = 1.0", "CCSDS_OEM_VERS = 2.0", "line 1: expected CCSDS_AEM_VERS"),
+        (
+            "CCSDS_AEM_VERS = 1.0",
+            "CCSDS_AEM_VERS = 7.0",
+            "expected an AEM version out of 1.0, 2.0, found '7.0'",
+        ),
+        ("ATTITUDE_TYPE = QUATERNION", "ATTITUDE_TYPE = EULER_ANGLE", "expected ATTITUDE_TYPE = QUATERNION"),
+        ("DATA_STOP", "", "expected more lines, found the end of the file"),
+        ("REF_FRAME_B = INSTRUMENT_1\n", "", "expected REF_FRAME_B before META_STOP, found none"),
+        ("T00:00:15.000 ", "T00:00:15.000 7 ", "line 22: expected an epoch and a quaternion of 4 numbers"),
+        ("T00:00:30.000 ", "T00:00:15.000 ", "line 23: expected an epoch after 2029-08-07T00:00:15"),
+        ("T00:00:15.000 ", "T00:00:15.000 9", "line 22: expected a quaternion of unit length"),
+    ],
+)
+def test_faults_of_an_aem_are_named_with_their_line(old: str, new: str, message: str) -> None:
+    text = format_aem((attitudes(),))
+    assert old in text
+    with pytest.raises(DataFileError, match=message):
+        parse_aem(text.replace(old, new))
+
+
+def test_an_empty_attitude_segment_is_refused() -> None:
+    with pytest.raises(EphemerisError, match="expected at least one attitude, found none"):
+        AttitudeSegment(np.zeros(0, dtype=np.int64), np.zeros((0, 4)))
+
+
+# OPM and TDM
+
+
+def test_opm_holds_the_state_at_the_epoch() -> None:
+    expected = ephemeris()
+    epoch = START + 60 * NS
+    text = format_opm(expected, epoch)
+    pairs = dict(line.split(" = ") for line in text.splitlines() if line)
+    assert pairs["CCSDS_OPM_VERS"] == "2.0"
+    assert (pairs["CENTER_NAME"], pairs["REF_FRAME"], pairs["TIME_SYSTEM"]) == ("MOON", "ICRF", "UTC")
+    assert pairs["EPOCH"] == "2029-08-07T00:01:00.000"
+    position = [float(pairs[key].removesuffix(" [km]")) for key in ("X", "Y", "Z")]
+    velocity = [float(pairs[key].removesuffix(" [km/s]")) for key in ("X_DOT", "Y_DOT", "Z_DOT")]
+    np.testing.assert_allclose(1e3 * np.array(position), expected.at(epoch)[0], atol=1e-6)
+    np.testing.assert_allclose(1e3 * np.array(velocity), expected.at(epoch)[1], atol=1e-9)
+
+
+def test_tdm_gives_right_ascension_and_declination() -> None:
+    directions = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [1.0, 1.0, np.sqrt(2.0)]])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    text = format_tdm([Sightings("CRATER_17", START + np.arange(3) * NS, directions)], "SELENITA")
+    assert "PARTICIPANT_1 = SELENITA\nPARTICIPANT_2 = CRATER_17\nMODE = SEQUENTIAL\nPATH = 2,1\n" in text
+    rows = [
+        line.split() for line in text.splitlines() if line.startswith("ANGLE_") and "T" in line.split()[2]
+    ]
+    assert [row[0] for row in rows] == ["ANGLE_1", "ANGLE_2"] * 3
+    assert [float(row[3]) for row in rows] == pytest.approx([0.0, 0.0, 270.0, 0.0, 45.0, 45.0])
+
+
+def test_a_tdm_without_sightings_is_refused() -> None:
+    with pytest.raises(EphemerisError, match="expected at least one sighting, found none"):
+        format_tdm([], "SELENITA")
+
+
+# Horizons
+
+HORIZONS = """*******************************************************************************
+ Revised: Jan 26, 2022             Lunar Reconnaissance Orbiter              -85
+*******************************************************************************
+Target body name: LRO (spacecraft) (-85)          {source: LRO_merged}
+Center body name: Moon (301)                      {source: DE441}
+Center-site name: BODY CENTER
+*******************************************************************************
+Output units    : KM-S
+Output type     : GEOMETRIC cartesian states
+Reference frame : ICRF
+*******************************************************************************
+            JDTDB,            Calendar Date (TDB),      X,      Y,      Z,     VX,     VY,     VZ,
+*******************************************************************************
+$$SOE
+2462355.500000000, A.D. 2029-Aug-07 00:00:00.0000,  1.768000000000000E+03, 0.0E+00,-1.5E+01, 1.0E-01, 1.6E+00, 2.0E-01,
+2462355.500694444, A.D. 2029-Aug-07 00:01:00.0000,  1.765000000000000E+03, 9.0E+01,-1.6E+01, 1.1E-01, 1.5E+00, 2.1E-01,
+$$EOE
+*******************************************************************************
+"""
+
+
+def test_a_horizons_table_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "lro.csv"
+    path.write_text(HORIZONS)
+    segment = load_ephemeris(path).segments[0]
+    assert segment.object_name == "LRO"
+    # TDB is 69.184 s ahead of UTC, but for the 1.7 ms of its periodic part.
+    offset = from_utc_ns(segment.utc_ns, "TDB") - (START + np.array([0, 60]) * NS)
+    assert np.abs(offset).max() <= 1
+    np.testing.assert_allclose(segment.position_m[0], [1.768e6, 0.0, -15e3])
+    np.testing.assert_allclose(segment.velocity_m_s[1], [110.0, 1500.0, 210.0])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "error", "message"),
+    [
+        (
+            "Moon (301) ",
+            "Earth (399) ",
+            DataFileError,
+            r"Center body name: expected Moon \(301\), found Earth \(399\)",
+        ),
+        ("KM-S", "AU-D", DataFileError, "line 8: expected Output units of KM-S, M-S, KM-D, found 'AU-D'"),
+        (
+            ": ICRF",
+            ": Ecliptic of J2000.0",
+            UnknownFrameError,
+            "line 10: expected a reference frame out of ICRF",
+        ),
+        ("$$EOE", "", DataFileError, r"expected a table between \$\$SOE and \$\$EOE, found 1 of the marks"),
+        ("00:01:00", "00:00:00", DataFileError, "line 16: expected an epoch after 2029-08-06T23:58:50"),
+        ("9.0E+01", "nan", DataFileError, "line 16: expected finite numbers"),
+        ("9.0E+01", "ninety", DataFileError, "line 16: expected a date like .* and six numbers"),
+        (" VZ,", " LT,", DataFileError, "columns: expected a column VZ, found none"),
+        (
+            "Calendar Date (TDB)",
+            "Date",
+            DataFileError,
+            r"columns: expected columns with Calendar Date \(TDB\)",
+        ),
+    ],
+)
+def test_faults_of_a_horizons_table_are_named(
+    tmp_path: Path, old: str, new: str, error: type[Exception], message: str
+) -> None:
+    path = tmp_path / "lro.csv"
+    assert old in HORIZONS
+    path.write_text(HORIZONS.replace(old, new))
+    with pytest.raises(error, match=message):
+        load_ephemeris(path)
+
+
+def test_an_spk_is_referred_to_the_converter(tmp_path: Path) -> None:
+    path = tmp_path / "orbit.bsp"
+    path.write_bytes(b"DAF/SPK " + bytes(100))
+    with pytest.raises(DataFileError, match="found a SPICE kernel; convert it with 'linna orbit convert'"):
+        load_ephemeris(path)

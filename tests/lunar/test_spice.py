@@ -1,0 +1,186 @@
+"""SPICE kernels, read back with SPICE itself."""
+
+import builtins
+from pathlib import Path
+
+import numpy as np
+import pytest
+import spiceypy
+
+from lunar.camera import PinholeCamera
+from lunar.ephemeris import Ephemeris, EphemerisSegment
+from lunar.errors import DataFileError, EphemerisError, MissingLibrary
+from lunar.frames import matrix_from_quaternion
+from lunar.spice import (
+    ClockLine,
+    camera_id,
+    ck_octets,
+    et_from_utc_ns,
+    format_fk,
+    format_ik,
+    format_sclk,
+    load_spk,
+    spacecraft_id,
+    spk_octets,
+    utc_ns_from_et,
+)
+from lunar.timescales import NS, TICKS_PER_SECOND, parse_utc, ticks_from_utc_ns
+from tests.lunar.spice_pool import kernels
+
+START = parse_utc("2029-08-07T00:00:00")
+CRAFT = spacecraft_id(76)
+
+
+def circular(seconds: np.ndarray, turn: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    radius, rate = 1.768e6, 9.4e-4
+    angle = rate * seconds + turn
+    zero = np.zeros_like(angle)
+    position = radius * np.stack([np.cos(angle), 0.6 * np.sin(angle), 0.8 * np.sin(angle)], axis=1)
+    velocity = radius * rate * np.stack([-np.sin(angle), 0.6 * np.cos(angle), 0.8 * np.cos(angle)], axis=1)
+    return position, velocity + zero[:, None]
+
+
+def arc(first_s: int, last_s: int, step_s: int = 60, **fields: object) -> EphemerisSegment:
+    seconds = np.arange(first_s, last_s + 1, step_s)
+    return EphemerisSegment(START + seconds * NS, *circular(seconds.astype(float)), **fields)  # type: ignore[arg-type] # fields of the segment
+
+
+def test_ephemeris_time_is_that_of_spice(tmp_path: Path) -> None:
+    texts = [
+        "2016-12-31T23:59:59.5",
+        "2017-01-01T00:00:00",
+        "2029-08-07T12:34:56.789012",
+        "2035-02-03T00:00:00",
+    ]
+    utc_ns = np.array([parse_utc(text) for text in texts])
+    with kernels(tmp_path) as spice:
+        expected = [spice.str2et(text) for text in texts]
+    # One unit of a float64 of 1e9 s is 0.12 us.
+    np.testing.assert_allclose(et_from_utc_ns(utc_ns), expected, rtol=0, atol=3e-7)
+    assert np.abs(utc_ns_from_et(np.array(expected)) - utc_ns).max() <= 300
+
+
+@pytest.mark.parametrize(("interpolation", "degree"), [("HERMITE", 7), ("LAGRANGE", 9), ("LINEAR", 1)])
+def test_spk_gives_the_states_of_the_ephemeris(tmp_path: Path, interpolation: str, degree: int) -> None:
+    ephemeris = Ephemeris((arc(0, 7200, interpolation=interpolation, degree=degree),))
+    asked = START + np.arange(0, 7200 * NS, 13 * NS + 7_000_001)
+    position, velocity = ephemeris.at(asked)
+    with kernels(tmp_path, orbit=spk_octets(ephemeris, CRAFT)) as spice:
+        states = 1e3 * np.array([spice.spkgeo(CRAFT, et, "J2000", 301)[0] for et in et_from_utc_ns(asked)])
+    # 0.3 us of a float64 of seconds at 1.7 km/s are 0.5 mm. Windows of SPICE may lie one state to the side.
+    np.testing.assert_allclose(states[:, :3], position, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(states[:, 3:], velocity, rtol=0, atol=1e-5)
+
+
+def test_spk_keeps_the_segments_and_their_useable_intervals(tmp_path: Path) -> None:
+    burn = START + 1800 * NS
+    before = arc(0, 2400, useable_stop_utc_ns=burn)
+    seconds = np.arange(1200, 3601, 60)
+    after = EphemerisSegment(
+        START + seconds * NS, *circular(seconds.astype(float), 1e-3), useable_start_utc_ns=burn
+    )
+    ephemeris = Ephemeris((before, after))
+    with kernels(tmp_path, orbit=spk_octets(ephemeris, CRAFT)) as spice:
+        for seconds_after in (-1, 1):
+            epoch = burn + seconds_after * NS
+            state, _ = spice.spkgeo(CRAFT, float(et_from_utc_ns(epoch)), "J2000", 301)
+            np.testing.assert_allclose(1e3 * state[:3], ephemeris.at(epoch)[0], rtol=0, atol=1e-3)
+        with pytest.raises(spiceypy.utils.exceptions.SpiceyError):
+            spice.spkgeo(CRAFT, float(et_from_utc_ns(START + 3700 * NS)), "J2000", 301)
+
+
+def test_spk_of_lone_states_is_refused() -> None:
+    with pytest.raises(EphemerisError, match="expected a segment of at least two states, found none"):
+        spk_octets(Ephemeris((arc(0, 0),)), CRAFT)
+
+
+def test_spk_is_read_as_the_ephemeris_it_came_from(tmp_path: Path) -> None:
+    ephemeris = Ephemeris((arc(0, 7200),))
+    path = tmp_path / "orbit.bsp"
+    path.write_bytes(spk_octets(ephemeris, CRAFT))
+    read = load_spk(path)
+    assert read.segments[0].object_name == str(CRAFT)
+    asked = read.utc_ns[1:-1]
+    np.testing.assert_allclose(read.at(asked)[0], ephemeris.at(asked)[0], rtol=0, atol=2e-3)
+    between = asked[:-1] + 29 * NS
+    np.testing.assert_allclose(read.at(between)[0], ephemeris.at(between)[0], rtol=0, atol=2e-3)
+    with pytest.raises(DataFileError, match=rf"expected body -5, found bodies {CRAFT}"):
+        load_spk(path, -5)
+
+
+def test_a_file_that_is_no_spk_is_refused_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "orbit.bsp"
+    path.write_bytes(b"DAF/SPK " + bytes(2000))
+    with pytest.raises(DataFileError, match=r"orbit\.bsp: expected an SPK, found") as caught:
+        load_spk(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_ck_clock_and_frame_turn_vectors_as_the_attitudes_do(tmp_path: Path) -> None:
+    utc_ns = START + np.arange(0, 600, 15) * NS
+    ticks = ticks_from_utc_ns(utc_ns)
+    rng = np.random.default_rng(3)
+    start = rng.normal(size=4)
+    q_wxyz = start + 0.01 * np.arange(len(ticks))[:, None] * rng.normal(size=4)
+    q_wxyz /= np.linalg.norm(q_wxyz, axis=1, keepdims=True)
+    q_wxyz[7] *= -1.0
+    clock = format_sclk([ClockLine(int(ticks[0]) - 1000 * TICKS_PER_SECOND, START - 1000 * NS)], CRAFT)
+    with kernels(
+        tmp_path,
+        clock=clock,
+        attitude=ck_octets(ticks, q_wxyz, CRAFT, gap_ticks=20 * TICKS_PER_SECOND),
+        frame=format_fk(CRAFT, "Selenita"),
+    ) as spice:
+        assert spice.bodn2c("SELENITA") == CRAFT
+        for k in range(len(ticks)):
+            found = spice.pxform("J2000", "SELENITA_CAMERA", float(et_from_utc_ns(utc_ns[k])))
+            # 2 us between the clocks turn by less than 1e-8 rad here.
+            np.testing.assert_allclose(found, matrix_from_quaternion(q_wxyz[k]), rtol=0, atol=1e-7)
+        middle = spice.pxform("J2000", "SELENITA_CAMERA", float(et_from_utc_ns(utc_ns[4] + 7 * NS)))
+        assert np.allclose(middle @ middle.T, np.eye(3))
+        outside = float(et_from_utc_ns(int(utc_ns[-1]) + 60 * NS))
+        with pytest.raises(spiceypy.utils.exceptions.SpiceyError):
+            spice.pxform("J2000", "SELENITA_CAMERA", outside)
+
+
+def test_clock_of_two_correlations_shows_each_from_its_start(tmp_path: Path) -> None:
+    fast = 1.0 + 5e-6
+    ticks = int(ticks_from_utc_ns(START))
+    lines = [
+        ClockLine(ticks, START + 250_000_000),
+        ClockLine(ticks + 3600 * TICKS_PER_SECOND, START + 3601 * NS, fast),
+    ]
+    with kernels(tmp_path, clock=format_sclk(lines, CRAFT)) as spice:
+        for clock_s, real_s in ((1800, 1800.25), (3600, 3601.0), (7200, 3601.0 + 3600 * fast)):
+            et = spice.sct2e(CRAFT, float(ticks + clock_s * TICKS_PER_SECOND))
+            # Rates have 15 decimals, and a float64 of seconds 0.1 us.
+            assert et == pytest.approx(float(et_from_utc_ns(START + round(real_s * NS))), abs=5e-7)
+
+
+def test_field_of_view_is_that_of_the_camera(tmp_path: Path) -> None:
+    camera = PinholeCamera()
+    number = camera_id(CRAFT)
+    with kernels(
+        tmp_path, camera=format_ik(camera, CRAFT, "SELENITA"), frame=format_fk(CRAFT, "SELENITA")
+    ) as spice:
+        shape, frame, boresight, count, corners = spice.getfov(number, 8)
+    assert (shape, frame, count) == ("POLYGON", "SELENITA_CAMERA", 4)
+    np.testing.assert_array_equal(boresight, [0.0, 0.0, 1.0])
+    # 120 degrees between the edges of the image.
+    angle = np.degrees(np.arctan2(corners[:, 0], corners[:, 2]))
+    assert np.ptp(angle) == pytest.approx(120.0, abs=1e-9)
+
+
+def test_without_spiceypy_one_line_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = builtins.__import__
+
+    def without(name: str, *rest: object) -> object:
+        if name == "spiceypy":
+            raise ImportError(name)
+        return usual(name, *rest)  # type: ignore[arg-type] # as called
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(
+        MissingLibrary, match=r"expected the library spiceypy, found none; install linna\[spice\]"
+    ):
+        spk_octets(Ephemeris((arc(0, 600),)), CRAFT)
