@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import json
 import os
 import sys
 from collections.abc import Callable, Sequence
 
 from linna import __version__
+from linna.parser import BadUsage, LinnaParser, colored, colors_wanted
 
 # Threads of numerical libraries that spin while they wait make two busy cores ten times slower: wait passively.
 _THREAD_POLICY = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "NUMBA_SLP_VECTORIZE": "1"}
@@ -24,6 +26,7 @@ GROUPS: dict[str, tuple[str, str]] = {
     "replay": ("replay", "replay an archived pass with a payload build"),
     "regress": ("regress", "compare a payload build with a baseline over archived passes"),
     "orbit": ("orbit", "propagate, compare and interpolate ephemerides"),
+    "paper": ("paper", "every figure and table of the LINNA paper, next to the values of the paper"),
     "data": ("data", "list, fetch and verify the public data products"),
     "catalogue": ("catalogue", "crater catalogues: statistics and on-board curation"),
     "camera": ("camera", "camera studies (field of view)"),
@@ -52,6 +55,7 @@ GROUPS: dict[str, tuple[str, str]] = {
     "db": ("db", "schema, backup, export and import of the database"),
     "verify": ("verify", "check the integrity of the archive: files, rows, packets, audit chain"),
     "user": ("user", "manage the users of the ground service and their tokens"),
+    "completion": ("completion", "complete commands, options and scenario names in a shell"),
     "audit": ("audit", "list the audit log, and show the head of its hash chain"),
 }
 
@@ -68,32 +72,42 @@ def run(arguments: Sequence[str]) -> int:
 def _run(arguments: Sequence[str]) -> int:
     for name, value in _THREAD_POLICY.items():
         os.environ.setdefault(name, value)
+    if "_ARGCOMPLETE" in os.environ:
+        from linna.completion import complete
+
+        complete(GROUPS)
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(_overview())
+        print(colored(_overview()) if colors_wanted() else _overview())
         return 0 if arguments else 2
     if arguments[0] == "--version":
         print(f"linna {__version__}")
         return 0
     group = arguments[0]
     if group not in GROUPS:
-        print(f"linna: error: unknown command '{group}'{_nearest(group)}; see linna --help", file=sys.stderr)
-        return 2
+        return _refused(f"unknown command '{group}'{_nearest(group)}; see linna --help", arguments)
     module_name, help_line = GROUPS[group]
     module = importlib.import_module(f"linna.commands.{module_name}")
-    parser = argparse.ArgumentParser(prog=f"linna {group}", description=help_line)
+    parser = LinnaParser(prog=f"linna {group}", description=help_line[0].upper() + help_line[1:])
     module.configure(parser)
     try:
         namespace = parser.parse_args(list(arguments[1:]))
-    except SystemExit as stop:  # argparse has printed its line already
+    except SystemExit as stop:  # --help
         return int(stop.code or 0)
+    except BadUsage as fault:
+        sys.stderr.write(fault.usage)
+        return _refused(str(fault), arguments, fault.command)
     handler = getattr(namespace, "handler", None)
     if handler is None:
         parser.print_usage(sys.stderr)
         return 2
-    return _guarded(handler, namespace)
+    return _guarded(handler, namespace, arguments)
 
 
-def _guarded(handler: Callable[[argparse.Namespace], int | None], namespace: argparse.Namespace) -> int:
+def _guarded(
+    handler: Callable[[argparse.Namespace], int | None],
+    namespace: argparse.Namespace,
+    arguments: Sequence[str],
+) -> int:
     try:
         return int(handler(namespace) or 0)
     except KeyboardInterrupt:
@@ -102,11 +116,18 @@ def _guarded(handler: Callable[[argparse.Namespace], int | None], namespace: arg
     except BrokenPipeError:
         raise
     except OSError as error:
-        print(f"linna: error: {_one_line(_os_message(error))}", file=sys.stderr)
-        return 2
+        return _refused(_os_message(error), arguments)
     except _known_errors() as error:
-        print(f"linna: error: {_one_line(str(error))}", file=sys.stderr)
-        return 2
+        return _refused(str(error), arguments)
+
+
+def _refused(message: str, arguments: Sequence[str], command: str = "linna") -> int:
+    """Print an error as one line on stderr, with --json also as one JSON object on stdout; return the status 2."""
+    line = _one_line(message)
+    print(f"{command}: error: {line}", file=sys.stderr)
+    if "--json" in arguments:
+        print(json.dumps({"error": line, "status": 2}))
+    return 2
 
 
 def _known_errors() -> tuple[type[Exception], ...]:

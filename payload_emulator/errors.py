@@ -13,6 +13,22 @@ PayloadError
 """
 
 
+def install_hint(extra: str) -> str:
+    """Return how an optional part of the project is installed in this environment.
+
+    A checkout has a Makefile; an environment without pip is served by another interpreter's pip.
+    """
+    import importlib.util
+    import sys
+    from pathlib import Path
+
+    root = Path(__file__).resolve().parents[1]
+    if (root / "Makefile").is_file() and (root / "pyproject.toml").is_file():
+        return "make install-dev"
+    pip = "pip" if importlib.util.find_spec("pip") else f"python3 -m pip --python {sys.executable}"
+    return f"{pip} install 'linna[{extra}]'"
+
+
 class PayloadError(Exception):
     """Base of every error that the payload emulator raises on purpose; the text is one line for a user."""
 

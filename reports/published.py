@@ -2,8 +2,8 @@
 
 References
 ----------
-"AI-Based Navigation for Lunar Satellites in VLLO", Table II (detection on its test set) and Section V-B (labels of its
-data set).
+"AI-Based Navigation for Lunar Satellites in VLLO", Table I (orbit), Table II (detection on its test set), Section V-B
+(altitudes, catalogue, labels of its data set) and Section VII (images of its session).
 """
 
 from __future__ import annotations
@@ -29,4 +29,15 @@ TABLE_II = {
 LABEL_SHARES = {0: 72.8, 1: 16.9, 2: 10.3}
 LABELS = {0: 956_110, 1: 221_860, 2: 135_098}
 FRAMES = 51_924
+TABLE_I = {
+    "Semi-major axis": "1768.180 km",
+    "Eccentricity": "0.006908",
+    "Inclination": "89.076°",
+    "RAAN": "3.164°",
+    "Argument of perilune": "333.604°",
+    "True anomaly": "8.882°",
+}
+ALTITUDE_KM = {"mean": 30.8, "min": 14.0, "max": 48.6}
+CATALOGUE = (58_649, 12_830, 7_908)
+SESSION_FRAMES = 5_196
 SOURCE = "LINNA paper, Table II"

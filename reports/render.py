@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from reports.errors import UnknownReportKind
 from reports.json_form import to_json
+from reports.paper_values import PaperReport
 from reports.values import CampaignReport, DatasetReport, DetectorReport, PassReport, RegressionReport
 
 if TYPE_CHECKING:
@@ -84,5 +85,9 @@ def _document(report: Any) -> Document:
             from reports.dataset_report import dataset_document
 
             return dataset_document(report)
+        case PaperReport():
+            from reports.paper_report import paper_document
+
+            return paper_document(report)
         case _:
             raise UnknownReportKind(type(report).__name__)

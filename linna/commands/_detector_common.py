@@ -40,9 +40,10 @@ def need_torch() -> None:
     import importlib.util
 
     from linna.errors import UsageError
+    from payload_emulator.errors import install_hint
 
     if importlib.util.find_spec("torch") is None:
-        raise UsageError("training needs torch: install the extra 'train' (pip install 'linna[train]')")
+        raise UsageError(f"training needs torch: {install_hint('train')}")
 
 
 def restart_for_training() -> None:

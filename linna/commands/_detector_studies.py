@@ -188,13 +188,14 @@ def _quantise(arguments: argparse.Namespace) -> int:
 
     from linna.errors import UsageError
     from linna.output import emit
+    from payload_emulator.errors import install_hint
     from payload_emulator.training.data.dataset import Dataset
     from payload_emulator.training.evaluate.evaluate import evaluate
     from payload_emulator.training.model.bench import beside
     from payload_emulator.training.model.quantise import quantise
 
     if importlib.util.find_spec("onnx") is None:
-        raise UsageError("quantisation needs onnx: install the extra 'train' (pip install 'linna[train]')")
+        raise UsageError(f"quantisation needs onnx: {install_hint('train')}")
     datasets = [Dataset(folder) for folder in arguments.dataset]
     octets = model_octets(arguments.model)
     small = quantise(octets, datasets)

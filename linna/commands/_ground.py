@@ -8,6 +8,8 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from linna.output import log
+
 if TYPE_CHECKING:
     from ground_service.client import Client
     from ground_service.ground import Ground
@@ -62,8 +64,14 @@ def ground_client(arguments: argparse.Namespace, *, background: bool = False) ->
 
 
 def server_of(arguments: argparse.Namespace) -> str | None:
-    """Return the URL of the server that the options or the environment name; None for this machine."""
-    return arguments.server or (None if arguments.home else os.environ.get("LINNA_SERVER")) or None
+    """Return the URL of the server that the options or the environment name; None for this machine.
+
+    --home is stronger than $LINNA_SERVER; a warning tells that the server is not used.
+    """
+    named = os.environ.get("LINNA_SERVER")
+    if arguments.home and named and not arguments.server:
+        log(f"linna: warning: --home {arguments.home} is used, LINNA_SERVER={named} is not")
+    return arguments.server or (None if arguments.home else named) or None
 
 
 def local_actor() -> str:

@@ -14,7 +14,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
     verbs = parser.add_subparsers(title="verbs", required=True)
     build = verbs.add_parser("build", help="render frames with labels; resumes an unfinished data set")
-    build.add_argument("recipe", type=Path, metavar="SCENARIO", help="TOML with a [dataset] table")
+    build.add_argument(
+        "recipe",
+        type=Path,
+        metavar="SCENARIO",
+        help="TOML with a [dataset] table, or the name of a shipped scenario",
+    )
     build.add_argument("--out", type=Path, required=True, metavar="DIR")
     build.add_argument("--frames", type=int, required=True, metavar="N")
     build.add_argument(

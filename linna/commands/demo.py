@@ -51,17 +51,50 @@ def run(arguments: argparse.Namespace) -> int:
         pass_id = service.import_archive(archive)
         report_id = service.make_report(pass_id)
         summary = service.get_report_summary(report_id)
+        spacecraft_id = service.get_pass(pass_id).spacecraft_id
     figures = {
         "report": str(home.absolute() / "reports" / f"pass-{pass_id}" / "report.html"),
         "archive": str(archive),
         "pass_id": pass_id,
+        "spacecraft_id": spacecraft_id,
         "frames": emulated["frames"],
         **summary.model_dump(mode="json"),
         "wall_s": round(time.monotonic() - started, 2),
         "data": emulated["data"],
     }
-    emit(arguments, figures, text=describe(figures))
+    emit(
+        arguments,
+        figures,
+        text=describe(figures) + "\n\nnext steps:\n" + "\n".join(next_steps(arguments, figures)),
+    )
     return 0
+
+
+def next_steps(arguments: argparse.Namespace, figures: dict[str, Any]) -> list[str]:
+    """The rest of the tour with the result of this run: serve, plan, send, report."""
+    import shutil
+    import sys
+
+    linna = "linna" if shutil.which("linna") else sys.argv[0]
+    home = arguments.out / "ground"
+    spacecraft, day = figures["spacecraft_id"], "2029-08-20"
+    steps = (
+        (f"serve --home {home}", "pages at http://127.0.0.1:8042/, Ctrl-C ends"),
+        (
+            f"plan add --home {home} --spacecraft-id {spacecraft} --start {day}T01:00:00Z --stop {day}T01:20:00Z "
+            "--approve",
+            "plan an observation window",
+        ),
+        (
+            f"plan uplink 1 --home {home} --out {arguments.out / 'window.cltu'}",
+            "send its telecommands to a file",
+        ),
+        (
+            f"report {figures['pass_id']} --home {home} --out {arguments.out / 'report'}",
+            "report as HTML, PDF, JSON",
+        ),
+    )
+    return [f"  {linna} {command}\n      # {purpose}" for command, purpose in steps]
 
 
 def describe(figures: dict[str, Any]) -> str:

@@ -34,6 +34,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     adding.add_argument("--name", default="observation")
     adding.add_argument("--cadence-s", type=float, default=15.0)
     adding.add_argument("--after", type=int, metavar="ID", help="window that must precede this one")
+    adding.add_argument("--approve", action="store_true", help="approve the window as well")
     adding.set_defaults(handler=add)
     listing = actions.add_parser("list", help="list planned windows, newest first")
     listing.add_argument("--limit", type=int, default=100)
@@ -49,6 +50,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     ):
         one = actions.add_parser(name, help=text)
         one.add_argument("window_id", type=int, metavar="ID")
+        if name == "uplink":
+            one.add_argument(
+                "--out",
+                type=Path,
+                metavar="FILE",
+                help="write all released telecommands as CLTUs; they count as sent",
+            )
         if name == "fail":
             one.add_argument("--reason", required=True)
         one.set_defaults(handler=handler, action=name)
@@ -142,6 +150,8 @@ def add(arguments: argparse.Namespace) -> int:
     }
     with ground_client(arguments) as service:
         window = service.add_window(request)
+        if arguments.approve:
+            window = service.change_window(window.id, {"state": "approved"})
     return _show(arguments, window)
 
 
@@ -178,6 +188,11 @@ def delete(arguments: argparse.Namespace) -> int:
 def uplink(arguments: argparse.Namespace) -> int:
     with ground_client(arguments) as service:
         released = service.uplink_window(arguments.window_id)
+        if arguments.out is not None:
+            window = service.get_window(arguments.window_id)
+            arguments.out.parent.mkdir(parents=True, exist_ok=True)
+            with arguments.out.open("wb") as file:
+                file.write(service.take_uplink(window.spacecraft_id, instance=window.instance).octets)
     lines = [f"telecommand {one.id} ({one.name}): {one.state}" for one in released]
     telecommands = [one.model_dump(mode="json") for one in released]
     emit(arguments, {"window_id": arguments.window_id, "telecommands": telecommands}, text="\n".join(lines))

@@ -22,7 +22,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "renderer, side by side with figures of how they agree. Sheets take the epochs named, or --views frames "
         "spread over the scenario's observation windows."
     )
-    parser.add_argument("scenario", type=Path, metavar="SCENARIO", help="scenario file (TOML)")
+    parser.add_argument(
+        "scenario", type=Path, metavar="SCENARIO", help="scenario file, or the name of a shipped one"
+    )
     parser.add_argument(
         "--epoch",
         action="append",

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from payload_emulator.errors import DatasetError
+from payload_emulator.session.scenario import shipped_file
 from payload_emulator.session.typed_toml import TableFault, read_table
 
 T = TypeVar("T")
@@ -149,13 +150,16 @@ def procedural_recipe(seed: int = 1) -> Recipe:
 
 
 def load_recipe(path: Path) -> Recipe:
-    """Recipe of a TOML file; a file without a `[dataset]` table (a plain scenario) gives the procedural recipe.
+    """Recipe of a TOML file, or of a shipped scenario by its name.
+
+    A file without a `[dataset]` table (a plain scenario) gives the procedural recipe.
 
     Raises
     ------
     DatasetError
         With the file, the key, what was expected and what was found.
     """
+    path = shipped_file(path)
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

@@ -347,6 +347,16 @@ class Scenario:
         return dataclasses.replace(self, navigation=navigation, seed=self.seed if seed is None else seed)
 
 
+def shipped_file(path: Path) -> Path:
+    """Return the file of a shipped scenario for its bare name; other paths as they are."""
+    shipped = SHIPPED / f"{path.name}.toml"
+    return (
+        shipped
+        if not path.is_file() and path.name == str(path) and not path.suffix and shipped.is_file()
+        else path
+    )
+
+
 def load_scenario(path: Path | str) -> Scenario:
     """The scenario in a TOML file; a bare name means one of those shipped (`scenarios/NAME.toml`).
 
@@ -355,9 +365,7 @@ def load_scenario(path: Path | str) -> Scenario:
     ScenarioError
         The file is missing, no TOML, has unknown keys, values of a wrong type or an impossible orbit.
     """
-    where = Path(path)
-    if not where.is_file() and where.suffix == "" and (SHIPPED / f"{where.name}.toml").exists():
-        where = SHIPPED / f"{where.name}.toml"
+    where = shipped_file(Path(path))
     try:
         text = where.read_text(encoding="utf-8")
     except FileNotFoundError:

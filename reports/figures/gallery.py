@@ -49,7 +49,7 @@ def draw_gallery(canvas: Canvas, frames: Sequence[GalleryFrame], columns: int) -
             fontsize="small",
             color=color("muted"),
         )
-        _draw_frame(canvas, sheet, left, top - head - size, size, frame)
+        draw_frame(canvas, sheet, left, top - head - size, size, frame)
 
 
 def _fitted(caption: str, width_in: float) -> str:
@@ -66,9 +66,10 @@ def gallery_height_in(count: int, columns: int, width_in: float) -> float:
     return rows * (size + head) + (rows - 1) * gap
 
 
-def _draw_frame(
+def draw_frame(
     canvas: Canvas, sheet: Axes, left: float, bottom: float, size: float, frame: GalleryFrame
 ) -> None:
+    """One frame with its marks, ``size`` inches wide, at a place of a sheet whose data units are inches."""
     from matplotlib.patches import Rectangle
 
     height, width = frame.image.shape[:2]

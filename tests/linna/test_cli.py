@@ -1,11 +1,18 @@
 """The command line's shell: help, unknown commands, errors as one line."""
 
+import json
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from linna import cli
+from linna import cli, completion
+from linna.parser import REQUIRED, LinnaParser, all_commands
+from payload_emulator.errors import install_hint
+from payload_emulator.session.recipe import load_recipe, procedural_recipe
+from payload_emulator.session.scenario import load_scenario
 
 
 def linna(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -49,3 +56,86 @@ def test_a_missing_scenario_is_one_line_and_exit_2(capsys: pytest.CaptureFixture
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     assert "no such scenario file" in lines[0]
+
+
+def test_every_command_has_a_description_and_states_required_options() -> None:
+    for group in cli.GROUPS:
+        top = completion.command_parser(cli.GROUPS, group)
+        for name, parser in all_commands(top):
+            if name.split()[1] != group:
+                continue
+            assert parser.description, name
+            text = " ".join(parser.format_help().split())
+            for action in parser._actions:
+                if action.required and action.option_strings:
+                    assert f"{REQUIRED}" in text, f"{name} {action.option_strings[0]}"
+                    assert (action.help or "").endswith(REQUIRED), f"{name} {action.option_strings[0]}"
+
+
+def test_errors_are_a_json_object_with_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["plan", "add", "--json"]) == 2
+    captured = capsys.readouterr()
+    assert json.loads(captured.out) == {
+        "error": "the following arguments are required: --start, --stop, --spacecraft-id",
+        "status": 2,
+    }
+    assert cli.run(["emulate", "no-such-scenario", "--out", "nowhere", "--json"]) == 2
+    assert "no such scenario file" in json.loads(capsys.readouterr().out)["error"]
+    assert cli.run(["plan", "add"]) == 2
+    assert capsys.readouterr().out == ""
+
+
+def test_help_is_colored_only_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    parser = LinnaParser(prog="linna test")
+    parser.add_argument("--out", required=True, help="folder")
+    assert "\x1b[" not in parser.format_help()
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    assert "\x1b[36m--out\x1b[0m" in parser.format_help()
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert "\x1b[" not in parser.format_help()
+
+
+def completions(line: str, tmp_path: Path) -> set[str]:
+    found = tmp_path / "completions"
+    environment = os.environ | {
+        "_ARGCOMPLETE": "1",
+        "_ARGCOMPLETE_IFS": "\n",
+        "_ARGCOMPLETE_STDOUT_FILENAME": str(found),
+        "COMP_LINE": line,
+        "COMP_POINT": str(len(line)),
+    }
+    subprocess.run([sys.executable, "-m", "linna"], env=environment, check=False)
+    return {word.strip() for word in found.read_text().split("\n")}
+
+
+def test_a_shell_completes_commands_options_and_scenarios(tmp_path: Path) -> None:
+    assert {"plan", "pass", "paper"} <= completions("linna p", tmp_path)
+    assert "--campaign" in completions("linna emulate --c", tmp_path)
+    assert {"paper-day", "paper-dataset"} <= completions("linna emulate paper", tmp_path)
+    assert "paper-dataset" in completions("linna dataset build paper", tmp_path)
+
+
+def test_a_warning_tells_which_of_home_and_server_is_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("LINNA_SERVER", "http://ground:8042")
+    assert cli.run(["pass", "list", "--home", str(tmp_path)]) == 0
+    warning = f"linna: warning: --home {tmp_path} is used, LINNA_SERVER=http://ground:8042 is not"
+    assert capsys.readouterr().err.count(warning) == 1
+
+
+def test_commands_accept_names_of_shipped_scenarios() -> None:
+    assert load_recipe(Path("selenita")).name == procedural_recipe(20290807).name
+    assert load_recipe(Path("paper-dataset")).name == "paper"
+    assert load_scenario(Path("paper-day")).name == "paper-day"
+
+
+def test_installation_hints_fit_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert install_hint("train") == "make install-dev"  # a checkout
+    monkeypatch.setattr("payload_emulator.errors.__file__", str(tmp_path / "payload_emulator" / "errors.py"))
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert install_hint("train") == f"python3 -m pip --python {sys.executable} install 'linna[train]'"
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: object())
+    assert install_hint("train") == "pip install 'linna[train]'"

@@ -19,7 +19,7 @@ import numpy as np
 
 from lunar.arrays import BoolArray, FloatArray
 from lunar.constants import MOON_RADIUS_M
-from payload_emulator.errors import TerrainError
+from payload_emulator.errors import TerrainError, install_hint
 from payload_emulator.sim.terrain.tiles import Heights
 
 CHUNK_PIXELS = 1024
@@ -175,7 +175,7 @@ def _open_header(path: Path, heights: bool) -> tuple[tuple[float, float, float],
         import rasterio
     except ImportError:
         raise TerrainError(
-            f"{path}: expected rasterio, which reads height rasters, found it not installed (pip install rasterio)"
+            f"{path}: expected rasterio, which reads height rasters, found it not installed: {install_hint('terrain')}"
         ) from None
 
     try:

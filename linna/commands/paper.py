@@ -1,0 +1,96 @@
+"""`linna paper`: every figure and table of the LINNA paper made with this system, in one document."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+from linna.output import add_json_flag, emit, log, progress
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Produce Figs. 3 to 10 and Tables I and II of the LINNA paper with this system, next to the paper's values, "
+        "and the same with the estimators of this system: DIR/paper.html, paper.pdf and paper.json. Finished steps are "
+        "kept in DIR; the same command continues an interrupted run."
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder of the document and its steps"
+    )
+    parser.add_argument("--quick", action="store_true", help="3 hours and few images instead of 24 hours")
+    parser.add_argument(
+        "--hours", type=float, metavar="H", help="length of the session (default: 24; quick: 3)"
+    )
+    parser.add_argument(
+        "--model",
+        type=Path,
+        metavar="M.onnx",
+        help="class-only network made elsewhere (linna detector export --classes-only) instead of training one",
+    )
+    add_json_flag(parser)
+    parser.set_defaults(handler=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    import importlib.util
+
+    from linna.data import data_folder
+    from linna.errors import UsageError
+
+    if arguments.hours is not None and not 0.5 <= arguments.hours <= 240.0:
+        raise UsageError(f"--hours: expected 0.5 to 240, found {arguments.hours:g}")
+    if arguments.model is not None and not arguments.model.is_file():
+        raise UsageError(f"--model: expected a file, found none at {arguments.model}")
+    if arguments.model is None and importlib.util.find_spec("torch") is not None:
+        from linna.commands._detector_common import restart_for_training
+
+        restart_for_training()
+    from reports.paper_report import paper_index
+    from reports.render import render_pages
+    from studies.paper import make_paper
+
+    started = time.monotonic()
+    data = data_folder()
+    report = make_paper(_workshop(arguments, data), quick=arguments.quick)
+    html, pdf = render_pages(report)
+    out: Path = arguments.out
+    (out / "paper.html").write_text(html, encoding="utf-8")
+    (out / "paper.pdf").write_bytes(pdf)
+    figures: dict[str, Any] = {
+        "report": str(out / "paper.html"),
+        "pdf": str(out / "paper.pdf"),
+        **paper_index(report),
+        "quick": report.quick,
+        "not_available": dict(report.not_available),
+        "data": list(report.data_sources),
+    }
+    from linna.output import as_json
+
+    (out / "paper.json").write_text(as_json(figures) + "\n", encoding="utf-8")
+    figures["wall_s"] = round(time.monotonic() - started, 1)
+    emit(arguments, figures, text=_text(figures))
+    return 0
+
+
+def _workshop(arguments: argparse.Namespace, data: Any) -> Any:
+    from dataclasses import replace
+
+    from studies.paper_steps import QUICK, Effort, Workshop
+
+    effort = QUICK if arguments.quick else Effort()
+    if arguments.hours is not None:
+        effort = replace(effort, hours=arguments.hours)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    return Workshop(
+        arguments.out, data, effort, arguments.model, log,
+        lambda items, total: progress(items, total, "frames", "frame"),
+    )  # fmt: skip
+
+
+def _text(figures: dict[str, Any]) -> str:
+    lines = [f"{len(figures['figures'])} figures, {len(figures['tables'])} tables; {figures['wall_s']:.0f} s"]
+    lines += [f"{row['subject']}: {row['here']} (paper: {row['paper']})" for row in figures["differences"]]
+    lines += [f"not available: {name}: {why}" for name, why in figures["not_available"].items()]
+    return "\n".join([*lines, f"document: {figures['report']}, {figures['pdf']}"])

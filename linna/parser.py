@@ -1,0 +1,80 @@
+"""Parser of the command line: descriptions for every command, required options marked, colours on a terminal."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import sys
+from typing import Any, NoReturn
+
+_HEADING = re.compile(r"^(\w[\w ]*:)", re.MULTILINE)
+_OPTION = re.compile(r"(?<![\w-])(--?[a-zA-Z][\w-]*)")
+_BOLD, _CYAN, _RESET = "\x1b[1m", "\x1b[36m", "\x1b[0m"
+REQUIRED = "(required)"
+
+
+class BadUsage(Exception):
+    """Arguments that the parser refuses, with the usage line of the command."""
+
+    def __init__(self, command: str, message: str, usage: str) -> None:
+        super().__init__(message)
+        self.command = command
+        self.usage = usage
+
+
+class LinnaFormatter(argparse.HelpFormatter):
+    """Help layout that marks required options."""
+
+    def _format_action(self, action: argparse.Action) -> str:
+        if action.required and action.option_strings and REQUIRED not in (action.help or ""):
+            action.help = f"{action.help or ''} {REQUIRED}".strip()
+        return super()._format_action(action)
+
+
+class LinnaParser(argparse.ArgumentParser):
+    """Argument parser of all commands; errors are raised as `BadUsage`."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        options.setdefault("formatter_class", LinnaFormatter)
+        super().__init__(*arguments, **options)
+        self.register("action", "parsers", _Subcommands)
+
+    def format_help(self) -> str:
+        """Return the help text, in colours if stdout is a terminal."""
+        text = super().format_help()
+        return colored(text) if colors_wanted() else text
+
+    def error(self, message: str) -> NoReturn:
+        raise BadUsage(self.prog, message, self.format_usage())
+
+
+class _Subcommands(argparse._SubParsersAction):  # type: ignore[type-arg]  # generic in the stubs only
+    """Subcommands whose one line of help is also their description."""
+
+    def add_parser(self, name: str, **options: Any) -> Any:
+        help_line = options.get("help")
+        if help_line and "description" not in options:
+            options["description"] = help_line[0].upper() + help_line[1:]
+        return super().add_parser(name, **options)
+
+
+def colors_wanted() -> bool:
+    """True if stdout is a terminal that shows colours and the user has not switched them off."""
+    return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+
+
+def colored(text: str) -> str:
+    """Return help text with bold headings and coloured options."""
+    with_options = _OPTION.sub(lambda m: f"{_CYAN}{m.group(1)}{_RESET}", text)
+    return _HEADING.sub(lambda m: f"{_BOLD}{m.group(1)}{_RESET}", with_options)
+
+
+def all_commands(parser: argparse.ArgumentParser) -> list[tuple[str, argparse.ArgumentParser]]:
+    """Return every command below a parser with its full name, in the order of its help."""
+    found: list[tuple[str, argparse.ArgumentParser]] = []
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for one in action.choices.values():
+                found += [(one.prog, one), *all_commands(one)]
+    return found
