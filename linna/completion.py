@@ -41,9 +41,9 @@ def command_parser(groups: Mapping[str, tuple[str, str]], group: str) -> argpars
 
 def script(shell: str) -> str:
     """Return the text that a shell reads to complete `linna` commands."""
-    import argcomplete
+    from argcomplete.shell_integration import shellcode
 
-    return str(argcomplete.shellcode(["linna"], shell=shell))
+    return str(shellcode(["linna"], shell=shell))
 
 
 def _add_scenario_names(parser: argparse.ArgumentParser) -> None:

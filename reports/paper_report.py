@@ -32,10 +32,9 @@ def paper_document(report: PaperReport) -> Document:
         Paragraph(
             "Every figure and table of the paper's experiment follows under the number that it has in the paper, with "
             "the paper's values, the values of this system and their evidence level. The first part uses the paper's "
-            "own method. The second part repeats it with the estimators of this system."
+            "own method. The second part repeats it with the estimators of this system. A table at the end explains "
+            "every difference."
         ),
-        Heading("Differences from the paper"),
-        *_differences(report),
         Heading("Orbit and camera (Table I, Section V-B)"),
         *_orbit(report),
         *_fov(report),
@@ -55,6 +54,7 @@ def paper_document(report: PaperReport) -> Document:
             Heading("State estimation (Figs. 7 to 10)"),
             absent(report, "sessions", "Sessions", "not flown"),
         ]
+    blocks += [Heading("Differences from the paper"), *_differences(report)]
     blocks += [*missing_and_remarks(report), *provenance_and_data(report)]
     return Document("The paper's figures", report.title, report.identity, about(report), tuple(blocks))
 

@@ -30,6 +30,11 @@ from studies.paper_steps import Workshop
 
 CLASS_ONLY = "class-only network"
 SHIPPED_NETWORK = "shipped network"
+_METHODS = {
+    "own": "the paper’s method",
+    "ours": "the filter of this system",
+    "unseen": "the same over real terrain never used in training",
+}
 _LABELS = ("5–10 km", "10–15 km", "15–30 km")
 
 
@@ -74,7 +79,9 @@ def make_paper(shop: Workshop, *, quick: bool, created_utc: str = "") -> PaperRe
             "class 2).",
             _level(shop),
         ),
-        dataset=DatasetCounts(samples["frames"], _three(samples["instances"]), ", ".join(samples["data"])),
+        dataset=DatasetCounts(
+            samples["frames"], _three(samples["instances"]), "GLD100" if shop.real else "procedural Moon"
+        ),
         detectors=detectors,
         sessions=sessions,
         differences=differences(month, classes, _fov(curves), samples["frames"], detectors, sessions, shop),
@@ -259,10 +266,10 @@ def _verdict(sessions: Sequence[PaperSession]) -> str:
         best = session.series[0]
         figures = completed(best)
         words.append(
-            f"{best.name} ({'paper’s method' if session.own_method else session.key}): median "
-            f"{length_text(figures.median_3d_m)}"
+            f"{_METHODS[session.key]}: median {length_text(figures.median_3d_m)} (evidence level "
+            f"{session.level.split(' ')[0]})"
         )
-    return "Position error of the sessions. " + "; ".join(words) + "."
+    return f"Position error: {'; '.join(words)}."
 
 
 def _headline(
@@ -279,7 +286,7 @@ def _headline(
         one = session.series[0]
         median = completed(one).median_3d_m
         figures.append(
-            HeadlineFigure(f"Median error, {one.name}", median, "m", session.heading[:38], session.level)
+            HeadlineFigure(f"Median error, {one.name}", median, "m", _METHODS[session.key], session.level)
         )
     return tuple(figures)
 

@@ -20,6 +20,7 @@ from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import (
     CraterCatalogue,
     class_counts,
+    completed_to_paper,
     load_catalogue,
     paper_density_catalogue,
 )
@@ -158,6 +159,12 @@ def open_catalogue(shop: Workshop) -> CraterCatalogue:
     return paper_density_catalogue(1) if shop.catalogue_path is None else load_catalogue(shop.catalogue_path)
 
 
+def paper_density(shop: Workshop) -> CraterCatalogue:
+    """A catalogue with the paper's class counts: the real one with random craters in its empty tiles, or synthetic."""
+    path = shop.data.catalogue_lu
+    return paper_density_catalogue(1) if path is None else completed_to_paper(load_catalogue(path), 1)
+
+
 def field_of_view(shop: Workshop) -> dict[str, Any]:
     """The paper's study of the field of view over the month's orbit."""
 
@@ -170,7 +177,7 @@ def field_of_view(shop: Workshop) -> dict[str, Any]:
         )
         within = np.abs(track.latitude_rad) <= math.radians(60.0)
         position = mcmf_from_spherical(track.latitude_rad, track.longitude_rad, track.altitude_m)
-        study = study_field_of_view(position[within], open_catalogue(shop))
+        study = study_field_of_view(position[within], paper_density(shop))
         return {
             "fov_deg": study.fov_deg.tolist(),
             "probability": {str(n): values.tolist() for n, values in study.probability_at_least.items()},
@@ -179,7 +186,11 @@ def field_of_view(shop: Workshop) -> dict[str, Any]:
             "source": study.source,
         }
 
-    return dict(shop.step("fov", {"days": shop.effort.days, "step_s": shop.effort.fov_step_s}, make))
+    return dict(
+        shop.step(
+            "fov", {"days": shop.effort.days, "step_s": shop.effort.fov_step_s, "density": "paper"}, make
+        )
+    )
 
 
 def classes(shop: Workshop) -> tuple[FloatArray, tuple[int, int, int], str]:
@@ -198,7 +209,11 @@ def region(shop: Workshop) -> dict[str, Any]:
         from payload_emulator.sim.render.renderer import render
         from payload_emulator.sim.terrain.opening import open_terrain
 
-        terrain = open_terrain("raster" if shop.real else "procedural", shop.data, 1)
+        terrain = (
+            open_terrain("raster", shop.data, 1, sharpen=False)
+            if shop.real
+            else open_terrain("procedural", shop.data, 1)
+        )
         latitude, longitude = (math.radians(v) for v in VAVILOV_DEG)
         position = mcmf_from_spherical(latitude, longitude, VAVILOV_ALTITUDE_M)
         up = position / np.linalg.norm(position)
@@ -216,7 +231,7 @@ def region(shop: Workshop) -> dict[str, Any]:
 
     if not path.is_file():
         (shop.out / "steps" / "region.json").unlink(missing_ok=True)
-    return dict(shop.step("region", {"version": 1}, make))
+    return dict(shop.step("region", {"place": VAVILOV_DEG, "altitude_m": VAVILOV_ALTITUDE_M}, make))
 
 
 def sample_dataset(shop: Workshop) -> dict[str, Any]:
@@ -303,10 +318,14 @@ def class_only_network(shop: Workshop, dataset: Path) -> Path | None:
 def evaluation(
     shop: Workshop, name: str, octets: bytes, dataset: Path, paper_classes: bool
 ) -> dict[str, Any]:
-    """Scores of a network on the test split; its gallery goes to `gallery-NAME.npz`."""
+    """Scores of a network on the test frames of the highest evidence level available.
+
+    The gallery goes to `gallery-NAME.npz`.
+    """
     import hashlib
 
     path = shop.out / f"gallery-{name}.npz"
+    source = "real-strip" if shop.real else "procedural-world"
 
     def make() -> dict[str, Any]:
         from payload_emulator.training.evaluate.evaluate import open_for_evaluation, run, summary
@@ -314,9 +333,15 @@ def evaluation(
 
         detector, sets = open_for_evaluation(octets), [Dataset(dataset)]
         scored = run(
-            detector, sets, "test", "", None, lambda f: shop.progress(f, len(f)), paper_classes=paper_classes
+            detector,
+            sets,
+            "test",
+            source,
+            None,
+            lambda f: shop.progress(f, len(f)),
+            paper_classes=paper_classes,
         )
-        figures = summary(detector, sets, scored, "test", "")
+        figures = summary(detector, sets, scored, "test", source)
         gallery = detector_report(detector, scored, figures).gallery[:GALLERY_FRAMES]
         save_gallery(path, gallery)
         kept = ("frames", "level", "per_class", "micro", "data")
@@ -324,7 +349,11 @@ def evaluation(
 
     if not path.is_file():
         (shop.out / "steps" / f"evaluation of {name}.json").unlink(missing_ok=True)
-    made_from = {"model": hashlib.sha256(octets).hexdigest(), "labels": Dataset(dataset).digest}
+    made_from = {
+        "model": hashlib.sha256(octets).hexdigest(),
+        "labels": Dataset(dataset).digest,
+        "source": source,
+    }
     return dict(shop.step(f"evaluation of {name}", made_from, make))
 
 

@@ -1,0 +1,101 @@
+"""`linna paper` end to end in small: every step, a second run that repeats none, and reasons without torch."""
+
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from linna import cli
+from lunar.datafolder import find_data
+from studies import paper_steps
+from studies.paper_steps import Effort, Workshop
+
+SMALL = Effort(
+    hours=0.5,
+    unseen_passes=1,
+    sample_frames=20,
+    method_frames=20,
+    training_steps=1,
+    days=1.0,
+    fov_step_s=600.0,
+)
+
+
+@pytest.fixture(scope="module")
+def document(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], list[str]]:
+    out = tmp_path_factory.mktemp("paper") / "paper"
+    lines: list[str] = []
+    with pytest.MonkeyPatch.context() as patch:
+        find_spec = importlib.util.find_spec
+        patch.setattr(
+            importlib.util, "find_spec", lambda name, *a: None if name == "torch" else find_spec(name, *a)
+        )
+        patch.setattr(paper_steps, "QUICK", SMALL)
+        patch.setattr("linna.commands.paper.log", lines.append)
+        patch.delenv("LINNA_DATA", raising=False)
+        patch.setenv("XDG_DATA_HOME", str(out.parent))
+        assert cli.run(["paper", "--quick", "--out", str(out)]) == 0
+        first = len(lines)
+        assert cli.run(["paper", "--quick", "--out", str(out)]) == 0
+    return out, json.loads((out / "paper.json").read_text()), lines[first:]
+
+
+def test_the_document_has_the_figures_tables_and_differences(
+    document: tuple[Path, dict[str, Any], list[str]],
+) -> None:
+    out, index, _ = document
+    assert (out / "paper.pdf").read_bytes().startswith(b"%PDF")
+    assert {
+        "fov",
+        "classes",
+        "region",
+        "samples",
+        "ours-outcomes",
+        "ours-ground",
+        "ours-altitude",
+        "ours-simulator",
+    } <= {figure["key"] for figure in index["figures"]}
+    assert index["tables"][-1]["columns"] == ["subject", "paper", "this system", "reason"]
+    images = next(row for row in index["differences"] if row["subject"] == "Images of the session")
+    assert "5" in images["paper"] and "0.5 h" in images["here"] and "32.5 h" in images["reason"]
+
+
+def test_a_second_run_repeats_no_step(document: tuple[Path, dict[str, Any], list[str]]) -> None:
+    assert document[2] and all(line.endswith(": already done") for line in document[2])
+
+
+def test_without_torch_the_document_says_what_it_lacks(
+    document: tuple[Path, dict[str, Any], list[str]],
+) -> None:
+    assert "torch" in document[1]["not_available"]["sessions"]
+    assert not [figure for figure in document[1]["figures"] if figure["key"].startswith("own-")]
+
+
+def test_without_data_every_level_is_that_of_the_procedural_moon(
+    document: tuple[Path, dict[str, Any], list[str]],
+) -> None:
+    levels = {figure["key"]: figure["level"] for figure in document[1]["figures"]}
+    assert all(level.startswith(("level 1", "level 2")) for level in levels.values()), levels
+
+
+def test_a_step_is_done_again_when_what_it_is_made_from_changes(tmp_path: Path) -> None:
+    calls: list[int] = []
+
+    def make() -> int:
+        calls.append(len(calls))
+        return len(calls)
+
+    shop = Workshop(tmp_path, find_data(None), SMALL, None, lambda _: None, lambda items, total: iter(items))
+    assert [
+        shop.step("one", {"a": 1}, make),
+        shop.step("one", {"a": 1}, make),
+        shop.step("one", {"a": 2}, make),
+    ] == [1, 1, 2]
+
+
+def test_hours_out_of_range_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["paper", "--out", str(tmp_path / "p"), "--hours", "0"]) == 2
+    assert capsys.readouterr().err == "linna: error: --hours: expected 0.5 to 240, found 0\n"
+    assert not (tmp_path / "p").exists()
