@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from tmtc.codes import EVENTS
 from tmtc.dictionary import DICTIONARY
 from tmtc.effects import EFFECTS
+from tmtc.event_texts import EVENT_TEXTS
 from tmtc.packets import TYPE_TELEMETRY
 from tmtc.schema import Dictionary, Field, PacketDefinition
 
@@ -115,6 +117,7 @@ def format_icd(dictionary: Dictionary = DICTIONARY) -> str:
         for d in definitions:
             lines += _packet(d)
     lines += _effects()
+    lines += _events()
     lines += _enumerations(dictionary)
     return "\n".join(lines)
 
@@ -191,6 +194,15 @@ def _effects() -> list[str]:
     )
     lines.append("| telecommand | effect | reason |\n|---|---|---|")
     lines += [f"| {one.subject} | {one.effect} | {one.reason} |" for one in EFFECTS.values()]
+    lines.append("")
+    return lines
+
+
+def _events() -> list[str]:
+    lines = ["## Values of events\n", "| event | value_1 | value_2 |\n|---|---|---|"]
+    for _, name in EVENTS:
+        values = EVENT_TEXTS[name].values if name in EVENT_TEXTS else ()
+        lines.append(f"| {' | '.join((name, *values, '', '')[:3])} |")
     lines.append("")
     return lines
 

@@ -22,6 +22,7 @@ from reports.values import (
     PassEvent,
 )
 from tmtc.dictionary import DICTIONARY
+from tmtc.event_texts import event_text
 
 _SEVERITIES = {1: "info", 2: "low", 3: "medium", 4: "high"}
 
@@ -110,7 +111,12 @@ def event_list(connection: Connection, span: PassSpan) -> tuple[PassEvent, ...]:
             utc_ns=int(utc),
             severity=_SEVERITIES.get(rows["severity"][i], str(rows["severity"][i])),
             name=labels.get(rows["event_id"][i], str(rows["event_id"][i])),
-            detail=_event_detail(rows["frame_number"][i], rows["value_1"][i], rows["value_2"][i]),
+            detail=_event_detail(
+                labels.get(rows["event_id"][i], ""),
+                rows["frame_number"][i],
+                rows["value_1"][i],
+                rows["value_2"][i],
+            ),
             correlation_id=int(correlation_ids[i]),
         )
         for i, utc in enumerate(utc_ns)
@@ -118,7 +124,6 @@ def event_list(connection: Connection, span: PassSpan) -> tuple[PassEvent, ...]:
     return tuple(sorted(events, key=lambda event: (event.utc_ns, event.name, event.detail)))
 
 
-def _event_detail(frame_number: int, *values: float | None) -> str:
-    known = [value for value in values if value is not None]
-    given = ", ".join(f"{value:.0f}" if float(value).is_integer() else f"{value:.6g}" for value in known)
-    return f"frame {frame_number}: {given}" if given else f"frame {frame_number}"
+def _event_detail(name: str, frame_number: int, *values: float | None) -> str:
+    text = event_text(name, *values)
+    return f"frame {frame_number}: {text}" if text else f"frame {frame_number}"
