@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from pydantic import Field
 
+from ground_service.commanding.core import STAGES, CommandFate
 from ground_service.http.model import Entity, Given, InstanceName, SpacecraftNumber
 from ground_service.http.times import UtcTime
 from ground_service.text import LINE_PATTERN_JSON
+from tmtc.codes import FAILURES
+
+_FAILURES = dict(FAILURES)
 
 
 class CommandEntry(Given):
@@ -63,6 +68,83 @@ class Telecommand(Entity):
     window_id: int | None = Field(description="The planned window that it belongs to")
     carrier_id: int | None = Field(description="The telecommand that carries it into the on-board schedule")
     reports: list[CommandReport]
+
+
+class CommandRecord(Entity):
+    """Row of a telecommand; `state` is the stored state: queued, carried, released, rejected or sent."""
+
+    id: int
+    vehicle_id: int
+    name: str
+    arguments: dict[str, Any]
+    state: str
+    critical: bool
+    timeout_s: int
+    requested_by: str
+    created_utc_ns: int
+    decided_by: str | None
+    decided_utc_ns: int | None
+    reason: str | None
+    sequence_count: int | None
+    request_id: int | None
+    octets: bytes | None
+    sent_utc_ns: int | None
+    sent_after_ticks: int | None
+    timeout_noted_utc_ns: int | None
+    window_id: int | None
+    carrier_id: int | None
+    mission_id: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class CommandOctets:
+    """Sequence count and octets of a released telecommand, which never change."""
+
+    sequence_count: int
+    octets: bytes
+
+    @property
+    def request_id(self) -> int:
+        """The first four octets, which name the telecommand in verification reports."""
+        return int.from_bytes(self.octets[:4], "big")
+
+
+@dataclass(frozen=True, slots=True)
+class CommandView:
+    """A telecommand and its verification; `fate` is None before it is sent."""
+
+    record: CommandRecord
+    spacecraft_id: int
+    instance: str
+    fate: CommandFate | None
+
+    @property
+    def state(self) -> str:
+        """The verification state if the telecommand was sent, else the stored state."""
+        return self.record.state if self.fate is None else self.fate.state
+
+    @property
+    def telecommand(self) -> Telecommand:
+        """The telecommand as an entity."""
+        return Telecommand.of(
+            dict(self.record),
+            spacecraft_id=self.spacecraft_id,
+            instance=self.instance,
+            state=self.state,
+            timed_out=self.fate is not None and self.fate.timed_out,
+            requested=self.record.created_utc_ns,
+            reports=[
+                CommandReport(
+                    stage=STAGES.get(report.subtype, str(report.subtype)),
+                    ticks=report.ticks,
+                    step=report.step,
+                    failure=None
+                    if report.failure_code is None
+                    else _FAILURES.get(report.failure_code, str(report.failure_code)),
+                )
+                for report in (() if self.fate is None else self.fate.reports)
+            ],
+        )
 
 
 class UplinkChannel(Entity):

@@ -11,7 +11,6 @@ from ground_service.access.idempotency import once
 from ground_service.access.security import Operator, Viewer
 from ground_service.commanding import service as commanding
 from ground_service.commanding.model import CommandEntry, Rejection, Telecommand, UplinkState
-from ground_service.commanding.receiver import uplink_state
 from ground_service.http.common import (
     GroundOf,
     Instance,
@@ -97,7 +96,7 @@ def get_uplink_state(
     ground: GroundOf, _: Viewer, spacecraft_id: SpacecraftId, instance: Instance = FLOWN
 ) -> UplinkState:
     """Return the state of a telecommand receiver, from the control words of the newest telemetry."""
-    return uplink_state(ground, spacecraft_id, instance)
+    return commanding.uplink_state(ground, spacecraft_id, instance)
 
 
 @telecommands.post(

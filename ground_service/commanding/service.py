@@ -13,22 +13,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import BigInteger, Connection, cast, func, select
+from sqlalchemy import Connection
 
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
+from ground_service.commanding import store
 from ground_service.commanding.approval import DEFAULT_POLICY, ApprovalPolicy
-from ground_service.commanding.command_state import CommandView, command_view
+from ground_service.commanding.model import CommandOctets, CommandRecord, CommandView, UplinkState
 from ground_service.errors import Conflict, InvalidInput
 from ground_service.events import CommandsSent, CommandStateChanged, publish
 from ground_service.ground import Ground
-from ground_service.ingest.redecode import readable_version
 from ground_service.ingest.service import FLOWN
 from ground_service.missions.store import approval_in_force, in_force
-from ground_service.store import repository
 from ground_service.store.counters import lock_spacecraft, next_telecommand
-from ground_service.store.states import TELECOMMAND, change_if, move, move_all
-from ground_service.store.vehicles import vehicle_id
+from ground_service.store.vehicles import find_vehicle, get_vehicle, vehicle_id
 from ground_service.text import REASON_LIMIT, require_line
 from tmtc.dictionary import DICTIONARY
 from tmtc.effects import CommandEffect, effect_of
@@ -95,7 +93,7 @@ def add_released(
     """
     _require_approval(connection, vehicle, name, arguments, approval)
     key = _add(connection, vehicle, name, arguments, "queued", actor, timeout_s, window_id)
-    _release(connection, repository.get(connection, TELECOMMAND.table, key, TELECOMMAND.kind), actor)
+    _release(connection, store.get_record(connection, key), actor)
     return key
 
 
@@ -116,20 +114,19 @@ def add_scheduled(
     The telecommand inside has a sequence count and a row of its own, so that the reports about it are found.
     """
     _require_approval(connection, vehicle, name, arguments, approval)
-    issued = _issued(connection, vehicle, name, arguments, actor)
-    octets = bytes(issued["octets"])
-    inner = _add(connection, vehicle, name, arguments, "carried", actor, timeout_s, window_id, **issued)
+    issued = _issued(connection, vehicle, name, arguments)
+    inner = _add(connection, vehicle, name, arguments, "carried", actor, timeout_s, window_id, issued)
     outer = add_released(
         connection,
         vehicle,
         "insert_activity",
-        {"release_ticks": release_ticks, "items": [{"octet": octet} for octet in octets]},
+        {"release_ticks": release_ticks, "items": [{"octet": octet} for octet in issued.octets]},
         actor=actor,
         timeout_s=timeout_s,
         window_id=window_id,
         approval=approval,
     )
-    repository.change(connection, repository.TELECOMMANDS, inner, carrier_id=outer)
+    store.set_carrier(connection, inner, outer)
     return outer
 
 
@@ -144,16 +141,15 @@ def release_command(ground: Ground, command_id: int, *, actor: str) -> None:
         If it is critical and was entered by the same person.
     """
     with ground.database.writing() as connection:
-        row = repository.get(connection, repository.TELECOMMANDS, command_id, TELECOMMAND.kind)
-        if row["state"] == "queued" and row["critical"] and row["requested_by"] == actor:
-            effect = effect_of(
-                DICTIONARY, row["name"], row["arguments"], _packed(row["name"], row["arguments"], 0)
-            )
+        record = store.get_record(connection, command_id)
+        if record.state == "queued" and record.critical and record.requested_by == actor:
+            packed = _packed(record.name, record.arguments, 0)
+            effect = effect_of(DICTIONARY, record.name, record.arguments, packed)
             raise Conflict(
-                f"telecommand {command_id} ({row['name']}): critical; expected a person other than {actor} "
+                f"telecommand {command_id} ({record.name}): critical; expected a person other than {actor} "
                 f"to release it ({effect.effect}: {effect.reason})"
             )
-        _release(connection, row, actor)
+        _release(connection, record, actor)
 
 
 def reject_command(ground: Ground, command_id: int, *, actor: str, reason: str) -> None:
@@ -166,7 +162,7 @@ def reject_command(ground: Ground, command_id: int, *, actor: str, reason: str) 
     """
     require_line(reason, "telecommand", "reason", REASON_LIMIT)
     with ground.database.writing() as connection:
-        _decide(connection, command_id, "rejected", actor, reason=reason)
+        store.reject(connection, command_id, actor=actor, reason=reason, now_utc_ns=utc_now_ns())
         _note(connection, actor, "reject", command_id, "rejected", {"reason": reason})
 
 
@@ -177,21 +173,16 @@ def take_uplink(
 
     Each command is returned exactly once, also to concurrent callers.
     """
-    table = TELECOMMAND.table
     with ground.database.writing() as connection:
         vehicle = vehicle_id(connection, spacecraft_id, instance)
         lock_spacecraft(connection, vehicle)
-        sent = {"sent_utc_ns": utc_now_ns(), "sent_after_ticks": _newest_ticks(connection, vehicle)}
-        mine = [table.c.vehicle_id == vehicle, table.c.state == "released"]
-        rows = move_all(connection, TELECOMMAND, mine, "sent", **sent)
-        rows.sort(key=lambda row: (row["decided_utc_ns"], row["id"]))
-        ids = [int(row["id"]) for row in rows]
-        move_all(connection, TELECOMMAND, [table.c.carrier_id.in_(ids)], "sent", **sent)
+        records = store.send_released(connection, vehicle, utc_now_ns())
+        ids = [record.id for record in records]
         for command_id in ids:
             _note(connection, actor, "send", command_id, "sent", {})
         if ids:
             publish(connection, CommandsSent(vehicle_id=vehicle, telecommands=tuple(ids)))
-    packets = [bytes(row["octets"]) for row in rows]
+    packets = [record.octets for record in records if record.octets is not None]
     stream = UplinkEncoder(spacecraft_id).encode(packets) if framed else b"".join(packets)
     return stream, ids
 
@@ -201,51 +192,49 @@ def note_timeouts(ground: Ground, since_utc_ns: int, until_utc_ns: int) -> list[
 
     Each timeout is recorded once, also with concurrent processes. Later verification reports are still accepted.
     """
-    table = TELECOMMAND.table
-    due = table.c.sent_utc_ns + cast(table.c.timeout_s, BigInteger) * 1_000_000_000
     with ground.database.reading() as connection:
-        rows = connection.execute(
-            select(table).where(
-                table.c.state == "sent",
-                table.c.timeout_noted_utc_ns.is_(None),
-                due >= since_utc_ns,
-                due < until_utc_ns,
-            )
-        ).mappings()
-        views = [command_view(connection, dict(row)) for row in rows.all()]
-    overdue = [view for view in views if view.fate is not None and view.fate.timed_out]
+        views = store.views_of_unnoted_timeouts(connection, since_utc_ns, until_utc_ns, utc_now_ns())
     noted = []
-    for view in overdue:
-        command_id = int(view.row["id"])
+    for view in views:
+        if view.fate is None or not view.fate.timed_out:
+            continue
+        command_id = view.record.id
         with ground.database.writing() as connection:
-            if change_if(
-                connection,
-                table,
-                command_id,
-                {"timeout_noted_utc_ns": None},
-                timeout_noted_utc_ns=utc_now_ns(),
-            ):
-                detail = {"state": view.state, "timeout_s": view.row["timeout_s"]}
+            if store.note_timeout(connection, command_id, utc_now_ns()):
+                detail = {"state": view.state, "timeout_s": view.record.timeout_s}
                 _note(connection, _SERVICE, _TIME_OUT, command_id, "timed out", detail)
                 noted.append(command_id)
     return noted
 
 
 def get_command(ground: Ground, command_id: int) -> CommandView:
-    """A telecommand as it stands now."""
+    """Return a telecommand and its verification."""
     with ground.database.reading() as connection:
-        row = repository.get(connection, repository.TELECOMMANDS, command_id, "telecommand")
-        return command_view(connection, row)
+        return store.get_view(connection, command_id, utc_now_ns())
 
 
 def list_commands(
     ground: Ground, *, state: str | None = None, limit: int = 100, offset: int = 0
 ) -> tuple[list[CommandView], int]:
-    """Telecommands, the newest first; `state` keeps those in one stored state (queued, released, rejected, sent)."""
-    equal: dict[str, Any] = {"state": state} if state is not None else {}
+    """Return a page of the telecommands, newest first, and the total number; `state` is the stored state."""
     with ground.database.reading() as connection:
-        page = repository.page(connection, repository.TELECOMMANDS, limit=limit, offset=offset, **equal)
-        return [command_view(connection, row) for row in page.rows], page.total
+        return store.list_views(connection, utc_now_ns(), state=state, limit=limit, offset=offset)
+
+
+def uplink_state(ground: Ground, spacecraft_id: int, instance: str) -> UplinkState:
+    """Return the telecommand channels of a spacecraft as the ingest that was entered last shows them.
+
+    Telemetry that is ingested late counts as new: `received` states its time of reception.
+
+    Raises
+    ------
+    NotFound
+        There is no such spacecraft.
+    """
+    with ground.database.reading() as connection:
+        find_vehicle(connection, spacecraft_id, instance)
+        channels = store.newest_channels(connection, spacecraft_id, instance)
+    return UplinkState(spacecraft_id=spacecraft_id, instance=instance, channels=channels)
 
 
 def _add(
@@ -257,65 +246,41 @@ def _add(
     actor: str,
     timeout_s: int,
     window_id: int | None = None,
-    **issued: Any,
+    issued: CommandOctets | None = None,
 ) -> int:
-    """Add a valid telecommand; return its id. `issued` holds its octets if it has them already."""
+    """Add a valid telecommand; return its id."""
     _packed(name, arguments, 0)
     if isinstance(timeout_s, bool) or not 1 <= timeout_s <= TIMEOUT_LIMIT_S:
         raise InvalidInput("telecommand", "timeout_s", f"1 to {TIMEOUT_LIMIT_S}", str(timeout_s)[:40])
-    key = int(
-        repository.add(
-            connection,
-            repository.TELECOMMANDS,
-            vehicle_id=vehicle,
-            name=name,
-            arguments=dict(arguments),
-            state=state,
-            critical=int(_second_person(connection, vehicle, name, arguments) is not None),
-            timeout_s=timeout_s,
-            requested_by=actor,
-            created_utc_ns=utc_now_ns(),
-            window_id=window_id,
-            mission_id=in_force(connection, vehicle),
-            **issued,
-        )
+    key = store.add_command(
+        connection,
+        vehicle,
+        name,
+        arguments,
+        state=state,
+        critical=_second_person(connection, vehicle, name, arguments) is not None,
+        timeout_s=timeout_s,
+        actor=actor,
+        now_utc_ns=utc_now_ns(),
+        window_id=window_id,
+        mission_id=in_force(connection, vehicle),
+        issued=issued,
     )
     _note(connection, actor, "enter", key, state, {"name": name, "arguments": dict(arguments)})
     return key
 
 
-def _release(connection: Connection, row: repository.Row, actor: str) -> None:
+def _release(connection: Connection, record: CommandRecord, actor: str) -> None:
     """Assign sequence count and octets to a queued telecommand; they never change again."""
-    issued = _issued(connection, row["vehicle_id"], row["name"], row["arguments"], actor)
-    _decide(connection, row["id"], "released", **issued)
-    _note(
-        connection,
-        actor,
-        "release",
-        row["id"],
-        "released",
-        {"sequence_count": issued["sequence_count"]},
-    )
+    issued = _issued(connection, record.vehicle_id, record.name, record.arguments)
+    store.release(connection, record.id, issued, actor=actor, now_utc_ns=utc_now_ns())
+    _note(connection, actor, "release", record.id, "released", {"sequence_count": issued.sequence_count})
 
 
-def _decide(connection: Connection, command_id: int, state: str, decided_by: str, **values: Any) -> None:
-    values.setdefault("decided_utc_ns", utc_now_ns())
-    move(connection, TELECOMMAND, command_id, state, expected=("queued",), decided_by=decided_by, **values)
-
-
-def _issued(
-    connection: Connection, vehicle: int, name: str, arguments: Mapping[str, Any], actor: str
-) -> dict[str, Any]:
-    """Return the columns of a telecommand with the next sequence count of its spacecraft."""
+def _issued(connection: Connection, vehicle: int, name: str, arguments: Mapping[str, Any]) -> CommandOctets:
+    """Return the octets of a telecommand with the next sequence count of its spacecraft."""
     count = next_telecommand(connection, vehicle) % SEQUENCE_COUNT_LIMIT
-    octets = _packed(name, arguments, count)
-    return {
-        "sequence_count": count,
-        "request_id": int.from_bytes(octets[:4], "big"),
-        "octets": octets,
-        "decided_by": actor,
-        "decided_utc_ns": utc_now_ns(),
-    }
+    return CommandOctets(count, _packed(name, arguments, count))
 
 
 def _packed(name: str, arguments: Mapping[str, Any], count: int) -> bytes:
@@ -333,8 +298,7 @@ def _packed(name: str, arguments: Mapping[str, Any], count: int) -> bytes:
 
 def policy_of(connection: Connection, vehicle: int) -> ApprovalPolicy:
     """Return the approval policy of a spacecraft: that of the dictionary, modified by its mission description."""
-    row = repository.get(connection, repository.VEHICLES, vehicle, "spacecraft")
-    approval = approval_in_force(connection, int(row["ccsds_id"]))
+    approval = approval_in_force(connection, get_vehicle(connection, vehicle, "spacecraft").ccsds_id)
     return DEFAULT_POLICY.raised(*(approval.second_person_for or ())).relaxed(
         *(approval.one_person_for or ())
     )
@@ -365,17 +329,6 @@ def _require_approval(
         f"telecommand {name}: critical; expected a window that a second person has approved "
         f"({effect.effect}: {effect.reason})"
     )
-
-
-def _newest_ticks(connection: Connection, vehicle: int) -> int:
-    """The newest on-board time that the verification reports so far tell of."""
-    table = repository.SAMPLES["verifications"]
-    newest = connection.execute(
-        select(func.max(table.c.ticks)).where(
-            table.c.vehicle_id == vehicle, table.c.dictionary_version == readable_version(connection, vehicle)
-        )
-    ).scalar()
-    return int(newest) if newest is not None else -1
 
 
 def _note(

@@ -11,7 +11,7 @@ from typing import Any
 from sqlalchemy import Connection
 
 from ground_service.clock import utc_now_ns
-from ground_service.commanding.command_state import views_of_window
+from ground_service.commanding.store import views_of_window
 from ground_service.events import WindowChanged, publish
 from ground_service.ground import Ground
 from ground_service.ingest.core import account_sequence
@@ -82,7 +82,7 @@ def _facts(
         decision=window.decision,
         predecessor_failed=predecessor is not None
         and store.get_window(connection, predecessor).state == "failed",
-        command_states=tuple(view.state for view in views_of_window(connection, window.id)),
+        command_states=tuple(view.state for view in views_of_window(connection, window.id, utc_now_ns())),
         frames=frames,
         started=STARTED in events,
         stopped=STOPPED in events,

@@ -72,7 +72,7 @@ def test_a_command_goes_its_way_from_the_queue_to_its_completion(ground: Ground,
     assert ids == [command]
     view = get_command(ground, command)
     assert view.state == "sent"
-    request = {"request_id": view.row["request_id"]}
+    request = {"request_id": view.record.request_id}
     downlink(ground, tmp_path, ("verification_accepted", 1000, request))
     assert get_command(ground, command).state == "accepted"
     downlink(
@@ -85,7 +85,7 @@ def test_a_command_goes_its_way_from_the_queue_to_its_completion(ground: Ground,
     assert take_uplink(ground, spacecraft_id=SPACECRAFT, actor="ann") == (b"", [])
     # the receiver at the other end gets the very packet
     decoded = UplinkDecoder(SPACECRAFT).decode(stream)
-    assert list(decoded.packets) == [view.row["octets"]]
+    assert list(decoded.packets) == [view.record.octets]
 
 
 def test_bare_packets_can_be_taken_instead_of_frames(ground: Ground) -> None:
@@ -154,13 +154,13 @@ def test_a_critical_command_needs_a_second_person(ground: Ground, function: Any)
     with pytest.raises(Conflict, match="critical; expected a person other than ann"):
         release_command(ground, command, actor="ann")
     release_command(ground, command, actor="bob")
-    assert get_command(ground, command).row["decided_by"] == "bob"
+    assert get_command(ground, command).record.decided_by == "bob"
 
 
 def test_only_a_queued_command_can_be_decided_on(ground: Ground) -> None:
     command = entered(ground)
     reject_command(ground, command, actor="bob", reason="wrong cadence")
-    assert get_command(ground, command).row["reason"] == "wrong cadence"
+    assert get_command(ground, command).record.reason == "wrong cadence"
     for decide in (
         lambda: release_command(ground, command, actor="bob"),
         lambda: reject_command(ground, command, actor="bob", reason="again"),
@@ -189,7 +189,7 @@ def test_every_step_is_in_the_audit_log(ground: Ground) -> None:
 
 def test_a_failure_says_why(ground: Ground, tmp_path: Path) -> None:
     command = sent(ground)
-    request = get_command(ground, command).row["request_id"]
+    request = get_command(ground, command).record.request_id
     downlink(
         ground,
         tmp_path,
@@ -227,18 +227,18 @@ def test_a_time_out_is_put_on_record_once_and_stays_there(
     ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     silent, completed = sent(ground), sent(ground)
-    request = {"request_id": get_command(ground, completed).row["request_id"]}
+    request = {"request_id": get_command(ground, completed).record.request_id}
     downlink(ground, tmp_path, ("verification_completed", 3000, request))
-    due = get_command(ground, silent).row["sent_utc_ns"] + 600 * 10**9
+    due = get_command(ground, silent).record.sent_utc_ns + 600 * 10**9
 
     def noted(now: int) -> list[int]:
-        monkeypatch.setattr("ground_service.commanding.command_state.utc_now_ns", lambda: now)
+        monkeypatch.setattr("ground_service.commanding.service.utc_now_ns", lambda: now)
         return note_timeouts(ground, 0, now)
 
     assert noted(due - 1) == []
     assert noted(due + 10**9) == [silent]
     assert noted(due + 2 * 10**9) == []
-    late = {"request_id": get_command(ground, silent).row["request_id"]}
+    late = {"request_id": get_command(ground, silent).record.request_id}
     downlink(ground, tmp_path, ("verification_completed", 9000, late))
     assert (get_command(ground, silent).state, noted(due + 3 * 10**9)) == ("completed", [])
     with ground.database.reading() as connection:
@@ -312,7 +312,7 @@ def test_what_changes_the_state_of_the_payload_needs_a_second_person(
     ground: Ground, name: str, arguments: dict[str, Any], critical: bool
 ) -> None:
     command = enter_command(ground, name, arguments, spacecraft_id=SPACECRAFT, actor="ann")
-    assert bool(get_command(ground, command).row["critical"]) == critical
+    assert bool(get_command(ground, command).record.critical) == critical
     if critical:
         with pytest.raises(
             Conflict, match=r"critical; expected .* \((changes on-board state|destroys data): "
@@ -372,8 +372,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """A clock that stands at `NOW` until it is set."""
 
     def put(now: int) -> None:
-        for module in ("service", "command_state"):
-            monkeypatch.setattr(f"ground_service.commanding.{module}.utc_now_ns", lambda: now)
+        monkeypatch.setattr("ground_service.commanding.service.utc_now_ns", lambda: now)
 
     put(NOW)
     return put
@@ -403,7 +402,7 @@ def test_each_step_keeps_what_was_done_when_by_whom_and_tells_those_who_watch(
         "requested_by": "ann", "created_utc_ns": NOW, "window_id": None, "carrier_id": None, "decided_by": None,
         "sequence_count": None, "octets": None, "sent_utc_ns": None,
     }  # fmt: skip
-    assert {name: view.row[name] for name in expected} == expected
+    assert {name: getattr(view.record, name) for name in expected} == expected
     clock(NOW + 1)
     release_command(ground, command, actor="bob")
     octets = DICTIONARY.pack_command("perform_function", START, sequence_count=0)
@@ -415,12 +414,12 @@ def test_each_step_keeps_what_was_done_when_by_whom_and_tells_those_who_watch(
         "octets": octets,
         "request_id": int.from_bytes(octets[:4], "big"),
     }
-    row = get_command(ground, command).row
-    assert {name: row[name] for name in expected} == expected
+    row = get_command(ground, command).record
+    assert {name: getattr(row, name) for name in expected} == expected
     clock(NOW + 2)
     take_uplink(ground, spacecraft_id=SPACECRAFT, actor="cleo")
-    row = get_command(ground, command).row
-    assert (row["state"], row["sent_utc_ns"], row["sent_after_ticks"]) == ("sent", NOW + 2, -1)
+    row = get_command(ground, command).record
+    assert (row.state, row.sent_utc_ns, row.sent_after_ticks) == ("sent", NOW + 2, -1)
     assert notes(ground, command) == [
         ("ann", "enter telecommand", {"name": "perform_function", "arguments": START}),
         ("bob", "release telecommand", {"sequence_count": 0}),
@@ -433,8 +432,8 @@ def test_a_rejection_keeps_its_reason(ground: Ground, clock: Callable[[int], Non
     command = entered(ground)
     clock(NOW + 5)
     reject_command(ground, command, actor="bob", reason="wrong cadence")
-    row = get_command(ground, command).row
-    assert (row["state"], row["decided_by"], row["decided_utc_ns"], row["reason"]) == (
+    row = get_command(ground, command).record
+    assert (row.state, row.decided_by, row.decided_utc_ns, row.reason) == (
         "rejected",
         "bob",
         NOW + 5,
@@ -454,7 +453,7 @@ def test_a_time_out_lasts_a_second_to_68_years(ground: Ground, timeout_s: int, a
         )
 
     if accepted:
-        assert get_command(ground, enter()).row["timeout_s"] == timeout_s
+        assert get_command(ground, enter()).record.timeout_s == timeout_s
     else:
         with pytest.raises(
             InvalidInput, match=f"telecommand, timeout_s: expected 1 to 2147483647, found {timeout_s}"
@@ -463,7 +462,7 @@ def test_a_time_out_lasts_a_second_to_68_years(ground: Ground, timeout_s: int, a
 
 
 def test_a_command_is_followed_for_ten_minutes_unless_told_otherwise(ground: Ground) -> None:
-    assert get_command(ground, entered(ground)).row["timeout_s"] == 600
+    assert get_command(ground, entered(ground)).record.timeout_s == 600
 
 
 def test_an_unknown_name_is_answered_with_the_nearest_one(ground: Ground) -> None:
@@ -499,25 +498,25 @@ def test_an_uplink_holds_only_what_is_meant_for_its_spacecraft(ground: Ground) -
     assert take_uplink(ground, spacecraft_id=SPACECRAFT, instance="twin", actor="ann")[1] == [twin]
     assert [get_command(ground, one).state for one in (other, waiting)] == ["released", "queued"]
     # Each spacecraft counts by itself.
-    assert [get_command(ground, one).row["sequence_count"] for one in (mine, twin, other)] == [0, 0, 0]
+    assert [get_command(ground, one).record.sequence_count for one in (mine, twin, other)] == [0, 0, 0]
 
 
 def test_a_command_is_judged_by_reports_newer_than_those_known_when_it_was_sent(
     ground: Ground, tmp_path: Path
 ) -> None:
     first = sent(ground)
-    request = get_command(ground, first).row["request_id"]
+    request = get_command(ground, first).record.request_id
     downlink(
         ground,
         tmp_path,
         ("verification_accepted", 900, {"request_id": request}),
         ("verification_completed", 1200, {"request_id": request}),
     )
-    assert get_command(ground, sent(ground)).row["sent_after_ticks"] == 1200
+    assert get_command(ground, sent(ground)).record.sent_after_ticks == 1200
     other = enter_command(ground, "test_connection", {}, spacecraft_id=77, actor="ann")
     release_command(ground, other, actor="ann")
     take_uplink(ground, spacecraft_id=77, actor="ann")
-    assert get_command(ground, other).row["sent_after_ticks"] == -1
+    assert get_command(ground, other).record.sent_after_ticks == -1
 
 
 def test_commands_are_listed_newest_first_by_pages_and_by_state(ground: Ground) -> None:
@@ -526,7 +525,7 @@ def test_commands_are_listed_newest_first_by_pages_and_by_state(ground: Ground) 
 
     def listed(**which: Any) -> tuple[list[int], int]:
         views, total = list_commands(ground, **which)
-        return [int(view.row["id"]) for view in views], total
+        return [int(view.record.id) for view in views], total
 
     assert listed() == (ids[::-1], 4)
     assert listed(limit=2, offset=1) == ([ids[2], ids[1]], 4)
@@ -543,7 +542,7 @@ def test_time_outs_are_noted_from_the_first_instant_asked_for_to_before_the_last
     assert note_timeouts(ground, due + 1, due + 100) == []
     assert note_timeouts(ground, 0, due) == []
     assert note_timeouts(ground, due, due + 1) == [command]
-    assert get_command(ground, command).row["timeout_noted_utc_ns"] == due + 1
+    assert get_command(ground, command).record.timeout_noted_utc_ns == due + 1
     assert notes(ground, command)[-1] == (
         "service",
         "time out telecommand",
@@ -556,7 +555,7 @@ def test_several_commands_time_out_at_once_and_those_that_ended_do_not(
     ground: Ground, tmp_path: Path, clock: Callable[[int], None]
 ) -> None:
     commands = [sent(ground) for _ in range(3)]
-    ended = {"request_id": get_command(ground, commands[0]).row["request_id"]}
+    ended = {"request_id": get_command(ground, commands[0]).record.request_id}
     downlink(ground, tmp_path, ("verification_completed", 3000, ended))
     entered(ground)
     clock(NOW + 700 * 10**9)
@@ -565,7 +564,7 @@ def test_several_commands_time_out_at_once_and_those_that_ended_do_not(
 
 def vehicle_of(ground: Ground) -> int:
     command = entered(ground, "test_connection")
-    return int(get_command(ground, command).row["vehicle_id"])
+    return int(get_command(ground, command).record.vehicle_id)
 
 
 def test_an_activity_carries_the_octets_of_its_telecommand(
@@ -577,26 +576,26 @@ def test_an_activity_carries_the_octets_of_its_telecommand(
             connection, vehicle, "perform_function", START, release_ticks=65_536, actor="ann", timeout_s=77,
             window_id=5,
         )  # fmt: skip
-    carrier, inner = get_command(ground, outer).row, get_command(ground, outer - 1).row
+    carrier, inner = get_command(ground, outer).record, get_command(ground, outer - 1).record
     octets = DICTIONARY.pack_command("perform_function", START, sequence_count=0)
     expected = {
         "name": "perform_function", "arguments": START, "state": "carried", "requested_by": "ann", "timeout_s": 77,
         "window_id": 5, "carrier_id": outer, "sequence_count": 0, "octets": octets, "decided_by": "ann",
         "decided_utc_ns": NOW, "request_id": int.from_bytes(octets[:4], "big"),
     }  # fmt: skip
-    assert {name: inner[name] for name in expected} == expected
+    assert {name: getattr(inner, name) for name in expected} == expected
     arguments = {"release_ticks": 65_536, "items": [{"octet": octet} for octet in octets]}
     expected = {
         "name": "insert_activity", "arguments": arguments, "state": "released", "requested_by": "ann",
         "timeout_s": 77, "window_id": 5, "carrier_id": None, "sequence_count": 1, "decided_by": "ann",
         "octets": DICTIONARY.pack_command("insert_activity", arguments, sequence_count=1),
     }  # fmt: skip
-    assert {name: carrier[name] for name in expected} == expected
+    assert {name: getattr(carrier, name) for name in expected} == expected
     clock(NOW + 9)
     assert take_uplink(ground, spacecraft_id=SPACECRAFT, actor="bob")[1] == [outer]
     # What is inside is sent with its carrier.
-    inner = get_command(ground, outer - 1).row
-    assert (inner["state"], inner["sent_utc_ns"], inner["sent_after_ticks"]) == ("sent", NOW + 9, -1)
+    inner = get_command(ground, outer - 1).record
+    assert (inner.state, inner.sent_utc_ns, inner.sent_after_ticks) == ("sent", NOW + 9, -1)
 
 
 REBOOT = {"function_id": "reboot", "argument_1": 0.0, "argument_2": 0.0}
@@ -636,17 +635,17 @@ def test_a_telecommand_released_at_once_needs_an_approval_by_two_persons(
             )  # fmt: skip
 
     if released:
-        row = get_command(ground, add("perform_function", REBOOT)).row
-        assert (row["state"], row["critical"], row["timeout_s"], row["window_id"]) == ("released", 1, 50, 3)
-        assert get_command(ground, schedule()).row["critical"] == 1
+        row = get_command(ground, add("perform_function", REBOOT)).record
+        assert (row.state, row.critical, row.timeout_s, row.window_id) == ("released", 1, 50, 3)
+        assert get_command(ground, schedule()).record.critical == 1
     else:
         for work in (lambda: add("perform_function", REBOOT), schedule):
             with pytest.raises(Conflict, match=r"telecommand perform_function: .*critical"):
                 work()
         assert list_commands(ground)[1] == 1
     # A routine command needs nobody.
-    row = get_command(ground, add("test_connection", {})).row
-    assert (row["state"], row["critical"]) == ("released", 0)
+    row = get_command(ground, add("test_connection", {})).record
+    assert (row.state, row.critical) == ("released", 0)
 
 
 def test_the_count_of_telecommands_wraps(ground: Ground) -> None:
@@ -660,6 +659,6 @@ def test_the_count_of_telecommands_wraps(ground: Ground) -> None:
         )
     command = entered(ground, "test_connection")
     release_command(ground, command, actor="ann")
-    row = get_command(ground, command).row
-    assert row["sequence_count"] == 0
-    assert row["octets"] == DICTIONARY.pack_command("test_connection", {}, sequence_count=0)
+    row = get_command(ground, command).record
+    assert row.sequence_count == 0
+    assert row.octets == DICTIONARY.pack_command("test_connection", {}, sequence_count=0)

@@ -251,7 +251,7 @@ def test_a_database_before_version_1_is_carried_over(earlier: Path, tmp_path: Pa
         assert row["decoded_version"] is not None
         assert (window["edited_by"], window["decided_by"]) == ("bob", None)
         release_command(ground, 3, actor="eve")
-        assert get_command(ground, 3).row["sequence_count"] == 2  # two had counts: the next is the third
+        assert get_command(ground, 3).record.sequence_count == 2  # two had counts: the next is the third
         assert verify(ground, deep=True).damaged == []
         with open_ground(tmp_path / "fresh") as fresh:
             ingest_file(fresh, ground.files.path(next(iter(result_files(ground)))))
