@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from sqlalchemy import and_, func, select
-
+from ground_service.access import store
 from ground_service.access.model import AuditEntry, AuditHead
 from ground_service.errors import AuditBroken, InvalidInput
 from ground_service.ground import Ground
 from ground_service.store import audit as chain
-from ground_service.store import repository
 
 
 def list_entries(
@@ -29,25 +25,17 @@ def list_entries(
     `actor` and `target` must be equal; `action` may be a part of the name: "telecommand" finds "release telecommand".
     The interval does not include `until_utc_ns`.
     """
-    table = repository.AUDIT
-    conditions: list[Any] = []
-    if actor is not None:
-        conditions.append(table.c.actor == actor)
-    if action is not None:
-        conditions.append(table.c.action.contains(action, autoescape=True))
-    if target is not None:
-        conditions.append(table.c.target == target)
-    if since_utc_ns is not None:
-        conditions.append(table.c.utc_ns >= since_utc_ns)
-    if until_utc_ns is not None:
-        conditions.append(table.c.utc_ns < until_utc_ns)
-    chosen = and_(True, *conditions)
     with ground.database.reading() as connection:
-        total = connection.execute(select(func.count()).select_from(table).where(chosen)).scalar_one()
-        rows = connection.execute(
-            select(table).where(chosen).order_by(table.c.id.desc()).limit(limit).offset(offset)
-        ).mappings()
-        return [_entry(dict(row)) for row in rows], int(total)
+        return store.list_entries(
+            connection,
+            actor=actor,
+            action=action,
+            target=target,
+            since_utc_ns=since_utc_ns,
+            until_utc_ns=until_utc_ns,
+            limit=limit,
+            offset=offset,
+        )
 
 
 def audit_head(ground: Ground) -> AuditHead:
@@ -83,7 +71,3 @@ def parse_head(text: str) -> chain.Head:
             "audit head", "", "NUMBER:SHA256 as 'linna audit head' prints it", repr(text)[:100]
         )
     return chain.Head(int(number), sha256)
-
-
-def _entry(row: repository.Row) -> AuditEntry:
-    return AuditEntry.of(row, number=row["id"], time=row["utc_ns"])

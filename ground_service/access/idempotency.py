@@ -11,13 +11,10 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-from sqlalchemy import delete
-
+from ground_service.access import store
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, GroundError, StoreError
 from ground_service.ground import Ground
-from ground_service.store import repository
-from ground_service.store.states import change_if
 
 Work = Callable[[], dict[str, Any]]
 
@@ -46,36 +43,28 @@ def once(
     except StoreError:
         raise  # it may have been done all the same
     except GroundError:
-        _forget(ground, identity)
+        with ground.database.writing() as connection:
+            store.free_key(connection, identity)
         raise
-    table = repository.ANSWERS
     with ground.database.writing() as connection:
-        change_if(connection, table, identity, {"answer": None}, answer=answer)
+        store.set_answer(connection, identity, answer)
     return answer
 
 
 def _take(ground: Ground, identity: str, asked: str) -> dict[str, Any] | None:
     """The answer that is known already; None when the key is now this caller's to use."""
-    table = repository.ANSWERS
     with ground.database.writing() as connection:
-        if repository.add_new(connection, table, key=identity, request=asked, created_utc_ns=utc_now_ns()):
-            return None
-        known = repository.get(connection, table, identity, "answer")
-    if known["request"] != asked:
+        known = store.take_key(connection, identity, asked, utc_now_ns())
+    if known is None:
+        return None
+    if known.request != asked:
         raise Conflict("Idempotency-Key: expected the request that it was first sent with, found another")
-    if known["answer"] is None:
+    if known.answer is None:
         raise Conflict(
             "Idempotency-Key: the request was begun and its end is not known; look whether it was done, "
             "and use another key if it was not"
         )
-    answer: dict[str, Any] = known["answer"]
-    return answer
-
-
-def _forget(ground: Ground, identity: str) -> None:
-    table = repository.ANSWERS
-    with ground.database.writing() as connection:
-        connection.execute(delete(table).where(table.c.key == identity, table.c.answer.is_(None)))
+    return known.answer
 
 
 def _digest(value: object) -> str:

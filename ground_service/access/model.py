@@ -28,6 +28,12 @@ class User(Entity):
     created: UtcTime
 
 
+class UserRecord(User):
+    """A user with the key that tokens reference."""
+
+    id: int
+
+
 class Token(Entity):
     """Bearer token without its secret."""
 
@@ -39,6 +45,39 @@ class Token(Entity):
     expires: UtcTime | None = Field(description="null: never")
     revoked: UtcTime | None
     used: UtcTime | None = Field(description="Last use, to the hour; null: never used")
+
+
+class TokenRecord(Entity):
+    """Row of a token, with its user."""
+
+    id: int
+    user_id: int
+    hint: str
+    created_utc_ns: int
+    expires_utc_ns: int | None
+    revoked_utc_ns: int | None
+    used_utc_ns: int | None
+    name: str
+    role: Role
+    state: Literal["active", "disabled"] = Field(description="State of the user")
+
+    def expired(self, utc_ns: int) -> bool:
+        """Return whether the validity has ended at a time."""
+        return self.expires_utc_ns is not None and self.expires_utc_ns <= utc_ns
+
+    def token(self, utc_ns: int) -> Token:
+        """Return the token as it is at a time."""
+        state = "expired" if self.expired(utc_ns) else "active"
+        return Token.of(
+            dict(self), user=self.name, state="revoked" if self.revoked_utc_ns is not None else state
+        )
+
+
+class StoredAnswer(Entity):
+    """Row of an idempotency key: the hash of its request, and the response; None until the work is done."""
+
+    request: str
+    answer: dict[str, Any] | None
 
 
 class UserWithToken(Entity):

@@ -1,0 +1,196 @@
+"""SQL of users, tokens, stored responses and the audit log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sqlalchemy import Connection, delete, func, or_, select, update
+from sqlalchemy.sql import Select
+
+from ground_service.access.model import AuditEntry, StoredAnswer, TokenRecord, User, UserRecord
+from ground_service.errors import Conflict, NotFound
+from ground_service.store import repository
+from ground_service.store.states import change_if
+
+USERS, TOKENS = repository.USERS, repository.TOKENS
+ANSWERS, AUDIT = repository.ANSWERS, repository.AUDIT
+
+_ANYBODY = select(USERS.c.id).limit(1)
+
+
+def add_user(connection: Connection, name: str, role: str, now_utc_ns: int) -> bool:
+    """Add a user; return False if another transaction added it first."""
+    values = {"name": name, "role": role, "state": "active", "created_utc_ns": now_utc_ns}
+    return repository.add_new(connection, USERS, **values) is not None
+
+
+def has_users(connection: Connection) -> bool:
+    """Return whether there are users."""
+    return connection.execute(_ANYBODY).first() is not None
+
+
+def find_user(connection: Connection, name: str) -> UserRecord | None:
+    """Return a user; None if there is no such user."""
+    row = repository.find(connection, USERS, name=name)
+    return None if row is None else UserRecord.of(row)
+
+
+def get_user(connection: Connection, name: str) -> UserRecord:
+    """Return a user.
+
+    Raises
+    ------
+    NotFound
+        There is no such user.
+    """
+    user = find_user(connection, name)
+    if user is None:
+        raise NotFound("user", repr(name)[1:-1][:80])
+    return user
+
+
+def list_users(connection: Connection) -> list[User]:
+    """Return all users, by name."""
+    return [User.of(row) for row in connection.execute(select(USERS).order_by(USERS.c.name)).mappings()]
+
+
+def lock_admins(connection: Connection) -> list[int]:
+    """Lock the active administrators, so that not all can be disabled at once; return their ids."""
+    query = select(USERS.c.id).where(USERS.c.role == "admin", USERS.c.state == "active").order_by(USERS.c.id)
+    return [int(key) for key in connection.execute(query.with_for_update()).scalars()]
+
+
+def change_user(connection: Connection, user: UserRecord, column: str, expected: str, value: str) -> None:
+    """Change the state or role of a user.
+
+    Raises
+    ------
+    Conflict
+        The column does not have the expected value.
+    """
+    if change_if(connection, USERS, user.id, {column: expected}, **{column: value}):
+        return
+    found = connection.execute(select(USERS.c[column]).where(USERS.c.id == user.id)).scalar()
+    raise Conflict(f"user {user.name}: expected {column} {expected}, found {found}")
+
+
+def add_token(
+    connection: Connection,
+    user: UserRecord,
+    sha256: str,
+    *,
+    hint: str,
+    now_utc_ns: int,
+    expires_utc_ns: int | None,
+) -> int:
+    """Add a token; return its id."""
+    return int(
+        repository.add(
+            connection,
+            TOKENS,
+            user_id=user.id,
+            token_sha256=sha256,
+            hint=hint,
+            created_utc_ns=now_utc_ns,
+            expires_utc_ns=expires_utc_ns,
+        )
+    )
+
+
+def find_token(connection: Connection, sha256: str) -> TokenRecord | None:
+    """Return the token with this hash and its user; None without any."""
+    row = connection.execute(_tokens().where(TOKENS.c.token_sha256 == sha256)).mappings().first()
+    return None if row is None else TokenRecord.of(row)
+
+
+def get_token(connection: Connection, token_id: int) -> TokenRecord:
+    """Return a token and its user.
+
+    Raises
+    ------
+    NotFound
+        There is no such token.
+    """
+    row = connection.execute(_tokens().where(TOKENS.c.id == token_id)).mappings().first()
+    if row is None:
+        raise NotFound("token", token_id)
+    return TokenRecord.of(row)
+
+
+def list_tokens(connection: Connection, user: UserRecord | None) -> list[TokenRecord]:
+    """Return the tokens of one user or of all users, newest first."""
+    query = _tokens() if user is None else _tokens().where(TOKENS.c.user_id == user.id)
+    return [TokenRecord.of(row) for row in connection.execute(query.order_by(TOKENS.c.id.desc())).mappings()]
+
+
+def revoke_token(connection: Connection, token_id: int, now_utc_ns: int) -> bool:
+    """Revoke a token; return False if it was revoked before."""
+    return change_if(connection, TOKENS, token_id, {"revoked_utc_ns": None}, revoked_utc_ns=now_utc_ns)
+
+
+def revoke_tokens(
+    connection: Connection, user: UserRecord, now_utc_ns: int, *, kept: int | None = None
+) -> int:
+    """Revoke the tokens of a user, except one; return their number."""
+    others = [] if kept is None else [TOKENS.c.id != kept]
+    query = update(TOKENS).where(TOKENS.c.user_id == user.id, TOKENS.c.revoked_utc_ns.is_(None), *others)
+    return int(connection.execute(query.values(revoked_utc_ns=now_utc_ns)).rowcount)
+
+
+def note_use(connection: Connection, token_id: int, used_utc_ns: int) -> None:
+    """Store the last use of a token, unless a later one is stored."""
+    earlier = or_(TOKENS.c.used_utc_ns.is_(None), TOKENS.c.used_utc_ns < used_utc_ns)
+    connection.execute(update(TOKENS).where(TOKENS.c.id == token_id, earlier).values(used_utc_ns=used_utc_ns))
+
+
+def take_key(connection: Connection, key: str, request: str, now_utc_ns: int) -> StoredAnswer | None:
+    """Store an idempotency key with the hash of its request; return what is stored if the key is taken."""
+    if repository.add_new(connection, ANSWERS, key=key, request=request, created_utc_ns=now_utc_ns):
+        return None
+    return StoredAnswer.of(repository.get(connection, ANSWERS, key, "answer"))
+
+
+def set_answer(connection: Connection, key: str, answer: Mapping[str, Any]) -> None:
+    """Store the response of an idempotency key that has none."""
+    change_if(connection, ANSWERS, key, {"answer": None}, answer=answer)
+
+
+def free_key(connection: Connection, key: str) -> None:
+    """Delete an idempotency key that has no response."""
+    connection.execute(delete(ANSWERS).where(ANSWERS.c.key == key, ANSWERS.c.answer.is_(None)))
+
+
+def list_entries(
+    connection: Connection,
+    *,
+    actor: str | None,
+    action: str | None,
+    target: str | None,
+    since_utc_ns: int | None,
+    until_utc_ns: int | None,
+    limit: int,
+    offset: int,
+) -> tuple[list[AuditEntry], int]:
+    """Return a page of the audit entries that match, newest first, and the total number."""
+    table = AUDIT.c
+    conditions: list[Any] = []
+    if actor is not None:
+        conditions.append(table.actor == actor)
+    if action is not None:
+        conditions.append(table.action.contains(action, autoescape=True))
+    if target is not None:
+        conditions.append(table.target == target)
+    if since_utc_ns is not None:
+        conditions.append(table.utc_ns >= since_utc_ns)
+    if until_utc_ns is not None:
+        conditions.append(table.utc_ns < until_utc_ns)
+    total = connection.execute(select(func.count()).select_from(AUDIT).where(*conditions)).scalar_one()
+    query = select(AUDIT).where(*conditions).order_by(table.id.desc()).limit(limit).offset(offset)
+    rows = connection.execute(query).mappings()
+    return [AuditEntry.of(row, number=row["id"], time=row["utc_ns"]) for row in rows], int(total)
+
+
+def _tokens() -> Select[Any]:
+    joined = TOKENS.join(USERS, USERS.c.id == TOKENS.c.user_id)
+    return select(TOKENS, USERS.c.name, USERS.c.role, USERS.c.state).select_from(joined)
