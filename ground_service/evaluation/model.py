@@ -55,6 +55,22 @@ class Report(Entity):
     changes: list[ChangedFigure] | None
 
 
+class StoredReport(Entity):
+    """A stored report: see `store.models.Report`; times are UTC, ns."""
+
+    id: str
+    pass_id: int
+    html_sha256: str
+    json_sha256: str
+    pdf_sha256: str | None
+    summary: dict[str, Any]
+    mission_id: int | None
+    event_number: int | None
+    previous_id: str | None
+    changes: list[ChangedFigure] | None
+    created_utc_ns: int
+
+
 class ClassFigures(Entity):
     """Detector figures of one size class; null: not known."""
 

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ground_service.errors import NotFound
-from ground_service.evaluation.model import Report, ReportOverview
+from ground_service.evaluation import report_store
+from ground_service.evaluation.model import Report, ReportOverview, StoredReport
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
 from ground_service.passes.core import downsample
-from ground_service.store import repository
+from ground_service.passes.store import get_pass
 from ground_service.store.files import FileArchive
 
 _TEXTS = ("title", "verdict", "verdict_level", "evidence_level", "created_utc", "headline", "not_available")
@@ -29,18 +28,16 @@ def report_overview(ground: Ground, report_id: str, max_points: int) -> ReportOv
     Raises
     ------
     NotFound
-        If the report does not exist or has no JSON document.
+        If the report does not exist.
     """
-    row = report_row(ground, report_id)
-    if row["json_sha256"] is None:
-        raise NotFound(f"report {report_id} as", "json")
-    return ReportOverview(report_id=report_id, **_overview(ground.files, row["json_sha256"], max_points))
+    sha256 = get_report(ground, report_id).json_sha256
+    return ReportOverview(report_id=report_id, **_overview(ground.files, sha256, max_points))
 
 
-def report_row(ground: Ground, report_id: str) -> repository.Row:
-    """Return the row of a report."""
+def get_report(ground: Ground, report_id: str) -> StoredReport:
+    """Return a report."""
     with ground.database.reading() as connection:
-        return repository.get(connection, repository.REPORTS, report_id, "report")
+        return report_store.get_report(connection, report_id)
 
 
 def list_reports(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tuple[list[Report], int]:
@@ -52,21 +49,8 @@ def list_reports(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tu
         If the pass does not exist.
     """
     with ground.database.reading() as connection:
-        repository.get(connection, repository.PASSES, pass_id, "pass")
-        rows, total = repository.reports_of_pass(connection, pass_id, limit=limit, offset=offset)
-    reports = [
-        Report(
-            id=row["id"],
-            pass_id=row["pass_id"],
-            created=UtcTime(row["created_utc_ns"]),
-            mission_revision=row["mission_revision"],
-            event=row["event_number"],
-            previous=row["previous_id"],
-            changes=row["changes"],
-        )
-        for row in rows
-    ]
-    return reports, total
+        get_pass(connection, pass_id)
+        return report_store.list_reports(connection, pass_id, limit=limit, offset=offset)
 
 
 @lru_cache(maxsize=64)

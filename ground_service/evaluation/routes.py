@@ -8,10 +8,8 @@ from fastapi import Query, Request, Response
 
 from ground_service.access.security import Operator, Viewer, idempotent_id
 from ground_service.errors import NotFound
-from ground_service.evaluation import service
+from ground_service.evaluation import report_overview, service
 from ground_service.evaluation.model import PassFigures, Report, ReportOverview
-from ground_service.evaluation.report_overview import list_reports as reports_of_pass
-from ground_service.evaluation.report_overview import report_overview, report_row
 from ground_service.http.common import (
     API_PREFIX,
     GroundOf,
@@ -71,9 +69,9 @@ def get_report(
     ] = None,
 ) -> Response:
     """Return a report as HTML, PDF or JSON."""
-    row = report_row(ground, report_id)
+    report = report_overview.get_report(ground, report_id)
     kind = format or preferred_kind(request.headers.get("accept", ""))
-    sha256 = row[f"{kind}_sha256"]
+    sha256: str | None = getattr(report, f"{kind}_sha256")
     if sha256 is None:
         raise NotFound(f"report {report_id} as", kind)
     media = REPORT_MEDIA[kind] + ("; charset=utf-8" if kind == "html" else "")
@@ -99,14 +97,14 @@ def preferred_kind(accept: str) -> str:
 @evaluation.get("/passes/{pass_id}/reports")
 def list_reports(ground: GroundOf, _: Viewer, pass_id: PassId, paging: PagingOf) -> PageOf[Report]:
     """List the reports of a pass, newest first, with the changes that a re-evaluation made."""
-    items, total = reports_of_pass(ground, pass_id, limit=paging.limit, offset=paging.offset)
+    items, total = report_overview.list_reports(ground, pass_id, limit=paging.limit, offset=paging.offset)
     return paging.page(items, total)
 
 
 @evaluation.get("/reports/{report_id}/summary")
 def get_report_summary(ground: GroundOf, _: Viewer, report_id: Key) -> PassFigures:
     """Return the figures of a report."""
-    return PassFigures.model_validate(report_row(ground, report_id)["summary"])
+    return PassFigures.model_validate(report_overview.get_report(ground, report_id).summary)
 
 
 @evaluation.get("/reports/{report_id}/overview")
@@ -117,4 +115,4 @@ def get_report_overview(
     max_points: Annotated[int, Query(ge=1, le=10_000)] = 600,
 ) -> ReportOverview:
     """Return the verdict and headline figures of a report, and the 3-D error of every solution over time."""
-    return report_overview(ground, report_id, max_points)
+    return report_overview.report_overview(ground, report_id, max_points)

@@ -13,12 +13,14 @@ from typing import Any
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import storage_error
+from ground_service.evaluation import report_store as store
 from ground_service.evaluation.core import PassInputs, evaluate_pass, summary_of
+from ground_service.evaluation.model import ChangedFigure, StoredReport
 from ground_service.evaluation.store import load_pass_inputs
 from ground_service.evaluation.surface import surface_map
 from ground_service.events import PassEvaluated, publish
 from ground_service.ground import Ground
-from ground_service.store import repository
+from ground_service.passes.store import get_pass
 from ground_service.store.files import make_durable_folder, replace_durably
 from ground_service.store.stored_files import register_file
 from lunar.timescales import format_utc
@@ -43,10 +45,10 @@ class MadeReport:
 
 @dataclass(frozen=True, slots=True)
 class Reevaluation:
-    """Number of the event that causes a re-evaluation, and the row of the report before it."""
+    """Number of the event that causes a re-evaluation, and the report before it."""
 
     event: int
-    previous: Mapping[str, Any]
+    previous: StoredReport
 
 
 def evaluate(ground: Ground, pass_id: int, *, created_utc: str = "") -> PassReport:
@@ -97,29 +99,30 @@ def make_report(
     with ground.database.writing() as connection:
         for kind, file in stored.items():
             register_file(connection, file, "report", f"report of pass {pass_id} ({kind})", now)
-        record = repository.get(connection, repository.PASSES, pass_id, "pass")
-        added = repository.add_new(
+        record = get_pass(connection, pass_id)
+        added = store.add_report(
             connection,
-            repository.REPORTS,
-            id=identity,
-            pass_id=pass_id,
-            html_sha256=stored["html"].sha256,
-            json_sha256=stored["json"].sha256,
-            pdf_sha256=stored["pdf"].sha256 if pdf else None,
-            summary=summary,
-            mission_id=record["mission_id"],
-            event_number=None if again is None else again.event,
-            previous_id=None if again is None else again.previous["id"],
-            changes=None if again is None else changed_figures(again.previous["summary"], summary),
-            created_utc_ns=now,
+            StoredReport(
+                id=identity,
+                pass_id=pass_id,
+                html_sha256=stored["html"].sha256,
+                json_sha256=stored["json"].sha256,
+                pdf_sha256=stored["pdf"].sha256 if pdf else None,
+                summary=summary,
+                mission_id=record.mission_id,
+                event_number=None if again is None else again.event,
+                previous_id=None if again is None else again.previous.id,
+                changes=None if again is None else changed_figures(again.previous.summary, summary),
+                created_utc_ns=now,
+            ),
         )
-        if added is not None:
+        if added:
             publish(
                 connection,
                 PassEvaluated(
                     report_id=identity,
                     pass_id=pass_id,
-                    vehicle_id=record["vehicle_id"],
+                    vehicle_id=record.vehicle_id,
                     event=None if again is None else again.event,
                 ),
             )
@@ -139,26 +142,26 @@ def make_report(
 def reevaluate(ground: Ground, pass_id: int, *, report_id: str, event: int) -> MadeReport | None:
     """Evaluate a pass again because of an event; return the new report, or None if nothing in it would differ."""
     with ground.database.reading() as connection:
-        made = repository.find(connection, repository.REPORTS, id=report_id)
-        previous = repository.newest_report(connection, pass_id, other_than=report_id)
+        made = store.has_report(connection, report_id)
+        previous = store.newest_report(connection, pass_id, other_than=report_id)
     if previous is None:
         return None
-    if made is None:
+    if not made:
         from reports.render import to_json
 
-        report = evaluate(ground, pass_id, created_utc=format_utc(previous["created_utc_ns"]))
-        if hashlib.sha256(to_json(report).encode()).hexdigest() == previous["json_sha256"]:
+        report = evaluate(ground, pass_id, created_utc=format_utc(previous.created_utc_ns))
+        if hashlib.sha256(to_json(report).encode()).hexdigest() == previous.json_sha256:
             return None
     return make_report(
         ground,
         pass_id,
         report_id=report_id,
-        pdf=previous["pdf_sha256"] is not None,
+        pdf=previous.pdf_sha256 is not None,
         again=Reevaluation(event, previous),
     )
 
 
-def changed_figures(before: Any, after: Any, name: str = "") -> list[dict[str, Any]]:
+def changed_figures(before: Any, after: Any, name: str = "") -> list[ChangedFigure]:
     """Return the figures that differ between two summaries: name, value before and value after."""
     if isinstance(before, Mapping) and isinstance(after, Mapping):
         return [
@@ -166,7 +169,7 @@ def changed_figures(before: Any, after: Any, name: str = "") -> list[dict[str, A
             for key in sorted({*before, *after})
             for change in changed_figures(before.get(key), after.get(key), f"{name}.{key}" if name else key)
         ]
-    return [] if before == after else [{"figure": name, "before": before, "after": after}]
+    return [] if before == after else [ChangedFigure(figure=name, before=before, after=after)]
 
 
 def _documents(report: PassReport, *, pdf: bool) -> dict[str, bytes]:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection
 
 from ground_service.ephemerides.attitudes import AttitudeTable, load_attitudes, no_attitudes
+from ground_service.ephemerides.model import Ephemeris as EphemerisEntry
+from ground_service.ephemerides.store import covering_ephemerides, get_ephemeris
 from ground_service.errors import EvaluationError, InvalidInput
 from ground_service.evaluation.core import PassInputs
 from ground_service.evaluation.detection.fixes import IdentificationSamples
@@ -26,6 +28,8 @@ from ground_service.ground import Ground
 from ground_service.missions.frames import DeclaredFrames, camera_of, declared_frames
 from ground_service.missions.model import Camera, Mission
 from ground_service.missions.service import mission_of_pass
+from ground_service.passes import store as passes
+from ground_service.passes.model import PassRecord
 from ground_service.passes.packet_accounting import packet_accounting
 from ground_service.passes.samples import (
     NavigationSamples,
@@ -33,12 +37,11 @@ from ground_service.passes.samples import (
 )
 from ground_service.passes.span import PassSpan, pass_span
 from ground_service.passes.store import code_labels, detection_samples, event_list
-from ground_service.store import repository, telemetry
 from ground_service.store.codec import unpack_filter_states, unpack_identifications
 from ground_service.store.files import FileArchive
+from ground_service.store.vehicles import Vehicle, get_vehicle
 from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.datafolder import DataFolder
-from lunar.ephemeris import Ephemeris
 from lunar.ephemeris_files import load_ephemeris
 from lunar.frames import Orientation
 from lunar.timescales import format_utc, parse_utc
@@ -106,28 +109,23 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
         If there is no such pass.
     """
     with ground.database.reading() as connection:
-        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        record = passes.get_pass(connection, pass_id)
         span = pass_span(connection, record)
-        manifest: dict[str, Any] = record["manifest"]
-        mission = mission_of_pass(connection, record)
+        manifest: dict[str, Any] = record.manifest
+        mission = mission_of_pass(connection, record.mission_id, record.manifest)
         declared = declared_frames(mission.frames, ground.data)
         viewing = viewing_of(mission.camera, attitude_table(ground.files, record), span)
-        vehicle = repository.get(connection, repository.VEHICLES, record["vehicle_id"], "vehicle")
-        ephemeris = _ephemeris_row(connection, record)
-        frames = connection.execute(
-            select(repository.PASS_FRAMES.c.frame_number, repository.PASS_FRAMES.c.file_sha256)
-            .where(repository.PASS_FRAMES.c.pass_id == pass_id)
-            .order_by(repository.PASS_FRAMES.c.frame_number)
-        )
+        vehicle = get_vehicle(connection, record.vehicle_id)
+        ephemeris = _ephemeris(connection, record)
         return PassInputs(
             pass_id=str(pass_id),
-            title=record["name"],
-            start_utc_ns=record["start_utc_ns"],
-            stop_utc_ns=record["stop_utc_ns"],
+            title=record.name,
+            start_utc_ns=record.start_utc_ns,
+            stop_utc_ns=record.stop_utc_ns,
             packets=packet_accounting(ground.files, connection, record, span),
             viewing=viewing,
             orientation=declared.orientation,
-            reference=_reference(ground, ephemeris),
+            reference=None if ephemeris is None else load_ephemeris(ground.files.path(ephemeris.sha256)),
             catalogue=_catalogue(ground, record),
             detections=detection_samples(connection, span),
             navigation=navigation_samples(connection, span),
@@ -144,13 +142,13 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             refused=_refused(declared, mission.camera),
             reference_sigma_rtn_m=mission.reference.sigma_rtn_m,
             limits=Limits(**mission.requirements.model_dump()),
-            no_mission="" if record["mission_id"] is not None else _no_mission(vehicle["ccsds_id"]),
+            no_mission="" if record.mission_id is not None else _no_mission(vehicle.ccsds_id),
             cpu_percent=_cpu_percent(connection, span, manifest.get("cadence_s")),
             frames_expected=manifest.get("frames_expected"),
             cadence_s=manifest.get("cadence_s"),
             housekeeping=_housekeeping(connection, span),
             events=event_list(connection, span),
-            images=ImageShelf(ground.files, {int(number): sha256 for number, sha256 in frames}),
+            images=ImageShelf(ground.files, passes.frame_files(connection, pass_id)),
             provenance=_provenance(mission, declared, manifest, record, vehicle, ephemeris, span),
             data_sources=tuple(str(name) for name in manifest.get("data_sources", ())),
             evidence_level=mission.evidence.text,
@@ -167,7 +165,7 @@ def navigation_samples(connection: Connection, span: PassSpan) -> tuple[Navigati
         "ticks", "estimator", "frame_number", "outcome", "latitude_deg", "longitude_deg", "altitude_m",
         "sigma_r_m", "sigma_t_m", "sigma_n_m", "nis", "matched",
     )  # fmt: skip
-    columns = _columns(connection, "navigation_states", span, names)
+    columns = passes.sample_arrays(connection, span, "navigation_states", names)
     outcomes = DICTIONARY.labels("navigation_state", "outcome")
     return tuple(
         NavigationSamples(
@@ -188,15 +186,7 @@ def navigation_samples(connection: Connection, span: PassSpan) -> tuple[Navigati
 
 def filter_states(connection: Connection, span: PassSpan) -> FilterStates | None:
     """Return the estimates of the navigation filter with their covariances, in time order; None without any."""
-    rows = telemetry.samples(
-        connection,
-        "filter_states",
-        span.vehicle,
-        span.start_ticks,
-        span.stop_ticks,
-        span.dictionary_version,
-        ("ticks", "values", "innovation_degrees"),
-    )
+    rows = passes.samples(connection, span, "filter_states", ("ticks", "values", "innovation_degrees"))
     if not rows["ticks"]:
         return None
     ticks, first = np.unique(np.array(rows["ticks"], dtype=np.int64), return_index=True)
@@ -212,15 +202,7 @@ def filter_states(connection: Connection, span: PassSpan) -> FilterStates | None
 
 def identification_samples(connection: Connection, span: PassSpan) -> IdentificationSamples | None:
     """Which crater each used detection was taken for, in time order; None where nothing came down about it."""
-    rows = telemetry.samples(
-        connection,
-        "identifications",
-        span.vehicle,
-        span.start_ticks,
-        span.stop_ticks,
-        span.dictionary_version,
-        ("ticks", "items"),
-    )
+    rows = passes.samples(connection, span, "identifications", ("ticks", "items"))
     if not rows["ticks"]:
         return None
     by_image = dict(zip(reversed(rows["ticks"]), reversed(rows["items"]), strict=True))
@@ -235,18 +217,14 @@ def identification_samples(connection: Connection, span: PassSpan) -> Identifica
 
 def landmark_reports(connection: Connection, span: PassSpan) -> MappedCraters:
     """Every report of a crater that the payload mapped itself, in time order, out of the packets."""
-    octets = telemetry.packet_octets(
-        connection, span.vehicle, APID_DETECTIONS, span.start_ticks, span.stop_ticks
-    )
+    octets = passes.packet_octets(connection, span, APID_DETECTIONS)
     tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=("landmarks",))
     return mapped_craters(tables.get("landmarks"))
 
 
 def reported_instruments(connection: Connection, span: PassSpan) -> tuple[InstrumentReport, ...]:
     """Return the statistics of the optional instruments of the payload, out of the packets."""
-    octets = telemetry.packet_octets(
-        connection, span.vehicle, APID_INSTRUMENTS, span.start_ticks, span.stop_ticks
-    )
+    octets = passes.packet_octets(connection, span, APID_INSTRUMENTS)
     names = tuple(one.name for one in instrument_telemetry())
     return instrument_reports(DICTIONARY.unpack_many(octets, cut_packets(octets), only=names))
 
@@ -256,7 +234,7 @@ def outcome_samples(connection: Connection, span: PassSpan) -> tuple[OutcomeSamp
     names = (
         "ticks", "estimator", "frame_number", "outcome", "reset_trigger", "candidate_pairs", "anchor_reads",
     )  # fmt: skip
-    columns = _columns(connection, "frame_outcomes", span, names)
+    columns = passes.sample_arrays(connection, span, "frame_outcomes", names)
     outcomes = DICTIONARY.labels("frame_outcome", "outcome")
     triggers = DICTIONARY.labels("frame_outcome", "reset_trigger")
     return tuple(
@@ -286,9 +264,9 @@ def viewing_of(camera: Camera, attitudes: AttitudeTable, span: PassSpan) -> View
     )
 
 
-def attitude_table(files: FileArchive, record: Mapping[str, Any]) -> AttitudeTable:
+def attitude_table(files: FileArchive, record: PassRecord) -> AttitudeTable:
     """Return the attitude of each frame of a pass from its archive."""
-    sha256 = record["attitude_sha256"]
+    sha256 = record.attitude_sha256
     return no_attitudes() if sha256 is None else load_attitudes(files.path(sha256))
 
 
@@ -349,15 +327,6 @@ def burns_of(manifest: Mapping[str, Any]) -> tuple[CommandedBurn, ...]:
     )
 
 
-def _columns(
-    connection: Connection, kind: str, span: PassSpan, names: Sequence[str]
-) -> dict[str, NDArray[Any]]:
-    """Samples as arrays: whole numbers as int64, all else as float64 with NaN for NULL."""
-    return telemetry.sample_arrays(
-        connection, kind, span.vehicle, span.start_ticks, span.stop_ticks, span.dictionary_version, names
-    )
-
-
 def _by_estimator(columns: dict[str, NDArray[Any]], packet: str) -> list[tuple[str, dict[str, NDArray[Any]]]]:
     """The columns of each estimator by name, one row per frame and time, in an order of content."""
     names = DICTIONARY.labels(packet, "estimator")
@@ -377,7 +346,8 @@ def _by_estimator(columns: dict[str, NDArray[Any]], packet: str) -> list[tuple[s
 
 
 def _housekeeping(connection: Connection, span: PassSpan) -> tuple[HousekeepingParameter, ...]:
-    columns = _columns(connection, "housekeeping", span, ("ticks", *(name for name, _ in _TRENDS)))
+    names = ("ticks", *(name for name, _ in _TRENDS))
+    columns = passes.sample_arrays(connection, span, "housekeeping", names)
     if len(columns["ticks"]) == 0:
         return ()
     utc_ns = span.utc_ns(columns["ticks"].tolist())
@@ -388,9 +358,7 @@ def _housekeeping(connection: Connection, span: PassSpan) -> tuple[HousekeepingP
 
 def _cpu_percent(connection: Connection, span: PassSpan, cadence_s: float | None) -> float | None:
     """Return the largest processor time of a step over the cadence, in percent of one core; None if unknown."""
-    octets = telemetry.packet_octets(
-        connection, span.vehicle, APID_PERFORMANCE, span.start_ticks, span.stop_ticks
-    )
+    octets = passes.packet_octets(connection, span, APID_PERFORMANCE)
     table = DICTIONARY.unpack_many(octets, cut_packets(octets), only=("performance",)).get("performance")
     if table is None or not len(table) or not cadence_s:
         return None
@@ -400,24 +368,18 @@ def _cpu_percent(connection: Connection, span: PassSpan, cadence_s: float | None
     return float(known.max()) / (10.0 * cadence_s) if len(known) else None
 
 
-def _ephemeris_row(connection: Connection, record: Mapping[str, Any]) -> repository.Row | None:
-    if record["ephemeris_id"] is not None:
-        return repository.get(connection, repository.EPHEMERIDES, record["ephemeris_id"], "ephemeris")
-    covering = repository.covering_ephemerides(connection, record["start_utc_ns"], record["stop_utc_ns"])
+def _ephemeris(connection: Connection, record: PassRecord) -> EphemerisEntry | None:
+    if record.ephemeris_id is not None:
+        return get_ephemeris(connection, record.ephemeris_id)
+    covering = covering_ephemerides(connection, record.start_utc_ns, record.stop_utc_ns)
     return covering[0] if covering else None
 
 
-def _reference(ground: Ground, row: repository.Row | None) -> Ephemeris | None:
-    if row is None:
-        return None
-    return load_ephemeris(ground.files.path(row["file_sha256"]))
-
-
-def _catalogue(ground: Ground, record: Mapping[str, Any]) -> CraterCatalogue | None:
-    sha256 = record["catalogue_sha256"]
+def _catalogue(ground: Ground, record: PassRecord) -> CraterCatalogue | None:
+    sha256 = record.catalogue_sha256
     if sha256 is None:
         return None
-    sources = [name for name in record["manifest"].get("data_sources", ()) if "catalogue" in str(name)]
+    sources = [name for name in record.manifest.get("data_sources", ()) if "catalogue" in str(name)]
     return replace(
         load_catalogue(ground.files.path(sha256)), source="; ".join(sources) or "catalogue of the pass"
     )
@@ -427,15 +389,15 @@ def _provenance(
     mission: Mission,
     declared: DeclaredFrames,
     manifest: Mapping[str, Any],
-    record: Mapping[str, Any],
-    vehicle: Mapping[str, Any],
-    ephemeris: Mapping[str, Any] | None,
+    record: PassRecord,
+    vehicle: Vehicle,
+    ephemeris: EphemerisEntry | None,
     span: PassSpan,
 ) -> dict[str, str]:
     build = manifest.get("build") or {}
     gravity = manifest.get("gravity") or {}
     entries = {
-        "spacecraft": f"{vehicle['ccsds_id']} ({vehicle['instance']})",
+        "spacecraft": f"{vehicle.ccsds_id} ({vehicle.instance})",
         "payload build": " ".join(str(build[key]) for key in ("name", "version") if key in build),
         "detector model SHA-256": str(build.get("model_sha256", "")),
         "parameters SHA-256": str(build.get("parameters_sha256", "")),
@@ -447,19 +409,19 @@ def _provenance(
         else "",
         "mission description": (
             "none registered"
-            if record["mission_id"] is None
+            if record.mission_id is None
             else f"{mission.name}, revision {mission.revision[:16]}"
         ),
         "lunar orientation": declared.orientation.name if declared.orientation is not None else "",
         "dictionary": _dictionary_text(span.dictionary_version),
         "time correlation": ", ".join(str(c.id) for c in span.correlations) or "0 (ideal clock)",
         "reference ephemeris": (
-            f"{ephemeris['object_name']}, {ephemeris['frame']}, SHA-256 {ephemeris['file_sha256'][:16]}"
+            f"{ephemeris.object_name}, {ephemeris.frame}, SHA-256 {ephemeris.sha256[:16]}"
             if ephemeris
             else ""
         ),
-        "crater catalogue SHA-256": str(record["catalogue_sha256"] or "")[:16],
-        "archive": str(record["archive_digest"] or "")[:16],
+        "crater catalogue SHA-256": str(record.catalogue_sha256 or "")[:16],
+        "archive": str(record.archive_digest or "")[:16],
     }
     return {name: value for name, value in entries.items() if value}
 
@@ -470,13 +432,13 @@ def _dictionary_text(version: int) -> str:
     return f"version {version}, {DICTIONARY.hash[:16]}"
 
 
-def _configuration(manifest: Mapping[str, Any], record: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def _configuration(manifest: Mapping[str, Any], record: PassRecord) -> dict[str, dict[str, Any]]:
     groups: dict[str, dict[str, Any]] = {}
     if manifest.get("camera"):
         groups["camera"] = dict(manifest["camera"])
     groups["observation"] = {
-        "start_utc": format_utc(record["start_utc_ns"]),
-        "stop_utc": format_utc(record["stop_utc_ns"]),
+        "start_utc": format_utc(record.start_utc_ns),
+        "stop_utc": format_utc(record.stop_utc_ns),
         **{key: manifest[key] for key in ("cadence_s", "frames_expected", "light") if key in manifest},
     }
     return {name: group for name, group in groups.items() if group}

@@ -139,8 +139,8 @@ def get_mission(ground: Ground, revision: str) -> MissionDetail:
         return store.find_revision(connection, revision)
 
 
-def mission_of_pass(connection: Connection, record: Mapping[str, Any]) -> Mission:
+def mission_of_pass(connection: Connection, mission_id: int | None, manifest: Mapping[str, Any]) -> Mission:
     """Return the description that a pass refers to, otherwise that of its manifest."""
-    if record["mission_id"] is not None:
-        return store.get_mission(connection, record["mission_id"])
-    return mission_of_manifest(record["manifest"])
+    if mission_id is not None:
+        return store.get_mission(connection, mission_id)
+    return mission_of_manifest(manifest)

@@ -10,6 +10,7 @@ from typing import Any
 
 from ground_service.clock import utc_now_ns
 from ground_service.ephemerides.attitudes import load_attitudes
+from ground_service.ephemerides.store import add_ephemeris
 from ground_service.errors import InvalidInput, storage_error
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_stored
@@ -17,7 +18,7 @@ from ground_service.missions.declared import mission_of_manifest
 from ground_service.missions.model import Mission
 from ground_service.missions.service import enter, read_mission
 from ground_service.missions.store import ARCHIVE_ACTOR
-from ground_service.store import repository
+from ground_service.passes import store
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile
 from ground_service.store.stored_files import register_file
@@ -242,51 +243,36 @@ def _register(
     reference = load_ephemeris(folder / "reference.oem") if "reference.oem" in stored else None
     with ground.database.writing() as connection:
         hold(connection, f"archive {digest}")
-        existing = repository.find(connection, repository.PASSES, archive_digest=digest)
+        existing = store.archived_pass(connection, digest)
         if existing is not None:
-            return int(existing["id"])
+            return existing
         for name, file in stored.items():
             register_file(connection, file, Path(name).stem, name, now)
         for number, file in images.items():
             register_file(connection, file, "frame", f"frame {number}", now)
         ephemeris_id = None
         if reference is not None:
-            ephemeris_id = repository.add(
+            ephemeris_id = add_ephemeris(
                 connection,
-                repository.EPHEMERIDES,
-                file_sha256=stored["reference.oem"].sha256,
+                stored["reference.oem"],
+                reference,
                 name=f"reference of {manifest['pass_name']}",
-                object_name=reference.segments[0].object_name,
-                frame=reference.segments[0].frame,
-                start_utc_ns=reference.start_utc_ns,
-                stop_utc_ns=reference.stop_utc_ns,
-                states=sum(len(segment.utc_ns) for segment in reference.segments),
                 precedence=0,
-                created_utc_ns=now,
-            )
-        pass_id = int(
-            repository.add(
-                connection,
-                repository.PASSES,
-                vehicle_id=vehicle_id(connection, manifest["spacecraft_id"], instance_of(manifest, digest)),
-                name=manifest["pass_name"],
-                start_utc_ns=start_utc_ns,
-                stop_utc_ns=stop_utc_ns,
-                archive_digest=digest,
-                manifest={key: value for key, value in manifest.items() if key != "files"},
-                ephemeris_id=ephemeris_id,
-                catalogue_sha256=stored["catalogue.csv"].sha256 if "catalogue.csv" in stored else None,
-                attitude_sha256=stored[ATTITUDE_FILE].sha256 if ATTITUDE_FILE in stored else None,
-                mission_id=enter(connection, *mission, actor=ARCHIVE_ACTOR),
-                created_utc_ns=now,
-            )
+                now_utc_ns=now,
+            ).id
+        pass_id = store.add_pass(
+            connection,
+            vehicle_id=vehicle_id(connection, manifest["spacecraft_id"], instance_of(manifest, digest)),
+            name=manifest["pass_name"],
+            start_utc_ns=start_utc_ns,
+            stop_utc_ns=stop_utc_ns,
+            archive_digest=digest,
+            manifest={key: value for key, value in manifest.items() if key != "files"},
+            ephemeris_id=ephemeris_id,
+            catalogue_sha256=stored["catalogue.csv"].sha256 if "catalogue.csv" in stored else None,
+            attitude_sha256=stored[ATTITUDE_FILE].sha256 if ATTITUDE_FILE in stored else None,
+            mission_id=enter(connection, *mission, actor=ARCHIVE_ACTOR),
+            now_utc_ns=now,
         )
-        for number, file in images.items():
-            repository.add(
-                connection,
-                repository.PASS_FRAMES,
-                pass_id=pass_id,
-                frame_number=number,
-                file_sha256=file.sha256,
-            )
+        store.add_frames(connection, pass_id, {number: file.sha256 for number, file in images.items()})
         return pass_id

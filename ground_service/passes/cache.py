@@ -8,10 +8,10 @@ from collections.abc import Callable, Hashable
 from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
-from sqlalchemy import Connection, Engine, func, select
+from sqlalchemy import Connection, Engine
 
 from ground_service.ground import Ground
-from ground_service.store import repository
+from ground_service.passes.store import archive_state
 
 KEPT = 64
 """Answers kept of a database."""
@@ -30,7 +30,7 @@ def remembered(ground: Ground, connection: Connection, key: Hashable, make: Call
 
     What is stored while `make` reads is a newer state than the one noted, so that it is made again the next time.
     """
-    state = _state(connection)
+    state = archive_state(connection)
     engine = ground.database.engine
     with _lock:
         known = _answers.setdefault(engine, OrderedDict())
@@ -47,33 +47,3 @@ def remembered(ground: Ground, connection: Connection, key: Hashable, make: Call
         while len(known) > KEPT:
             known.popitem(last=False)
     return made
-
-
-_NEWEST = select(
-    *(
-        select(value).scalar_subquery()
-        for value in (
-            func.max(repository.PACKETS.c.id),
-            func.max(repository.INGESTS.c.finished_utc_ns),
-            func.max(repository.CORRELATIONS.c.id),
-            func.sum(repository.CORRELATIONS.c.superseded),
-        )
-    )
-)
-_DECODED = select(repository.VEHICLES.c.id, repository.VEHICLES.c.decoded_version).order_by(
-    repository.VEHICLES.c.id
-)
-
-_DECLARED = select(
-    repository.PACKET_DECODINGS.c.vehicle_id,
-    repository.PACKET_DECODINGS.c.definition_id,
-    repository.PACKET_DECODINGS.c.decoded_to,
-    repository.PACKET_DECODINGS.c.complete,
-).order_by(repository.PACKET_DECODINGS.c.vehicle_id, repository.PACKET_DECODINGS.c.definition_id)
-
-
-def _state(connection: Connection) -> Hashable:
-    """What answers depend on: everything else of the archive is never changed."""
-    newest = tuple(connection.execute(_NEWEST).one())
-    decoded = [tuple(row) for query in (_DECODED, _DECLARED) for row in connection.execute(query)]
-    return (*newest, *decoded)

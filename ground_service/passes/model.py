@@ -20,6 +20,23 @@ def _known(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
+class PassRecord(Entity):
+    """A stored pass: see `store.models.Pass`; times are UTC, ns."""
+
+    id: int
+    vehicle_id: int
+    name: str
+    start_utc_ns: int
+    stop_utc_ns: int
+    archive_digest: str | None
+    manifest: dict[str, Any]
+    ephemeris_id: int | None
+    catalogue_sha256: str | None
+    attitude_sha256: str | None
+    mission_id: int | None
+    created_utc_ns: int
+
+
 class PassSummary(Entity):
     """A pass in a list."""
 

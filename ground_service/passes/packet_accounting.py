@@ -7,19 +7,22 @@ with on-board times in the pass (`processing.downlink_accounting`); other passes
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection
 
 from ground_service.ingest.core import Gap, account_sequence
+from ground_service.passes import store
 from ground_service.passes.downlink_accounting import RawAccount, RawFile, account_raw, read_raw
+from ground_service.passes.model import PassRecord
 from ground_service.passes.span import PassSpan
-from ground_service.store import repository, telemetry
+from ground_service.store import telemetry
 from ground_service.store.files import FileArchive
+from ground_service.store.vehicles import get_vehicle
 from reports.values import ApidAccounting, CompletenessSeries, PacketAccounting, ReceptionQuality
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import APID_DETECTIONS, DICTIONARY
@@ -39,7 +42,7 @@ RAW_LIMIT_OCTETS = 128 << 20
 
 
 def packet_accounting(
-    files: FileArchive, connection: Connection, record: Mapping[str, Any], span: PassSpan
+    files: FileArchive, connection: Connection, record: PassRecord, span: PassSpan
 ) -> PacketAccounting:
     """Return the packet and octet accounting of a pass."""
     headers = telemetry.packet_headers(connection, span.vehicle, span.start_ticks, span.stop_ticks)
@@ -54,7 +57,7 @@ def packet_accounting(
         lost = np.concatenate([lost, *(_spread(gap) for gap in accounts[apid].gaps)])
     images = _images(connection, record, span)
     in_gaps = accounts[APID_DETECTIONS].lost if APID_DETECTIONS in accounts else 0
-    edges = _frames_at_edges(record["manifest"].get("frames_expected"), images, in_gaps)
+    edges = _frames_at_edges(record.manifest.get("frames_expected"), images, in_gaps)
     damaged = {} if raw is None else raw.crc_errors
     for apid in sorted({*accounts, *(apid for apid in damaged if apid in names)}):
         account = accounts.get(apid)
@@ -89,12 +92,12 @@ def packet_accounting(
 
 def _raw_account(files: FileArchive, connection: Connection, span: PassSpan) -> RawAccount | None:
     """Return sums over the raw files of the vehicle; None without files, or if one is too large."""
-    vehicle = repository.get(connection, repository.VEHICLES, span.vehicle, "vehicle")
+    spacecraft = get_vehicle(connection, span.vehicle).ccsds_id
     found = []
     for one in _raw_files(connection, span):
         if one.octets > RAW_LIMIT_OCTETS:
             return None
-        found.append(_raw_file(files, one.sha256, int(vehicle["ccsds_id"]), one.sections))
+        found.append(_raw_file(files, one.sha256, spacecraft, one.sections))
     return account_raw(found, span.start_ticks, span.stop_ticks) if found else None
 
 
@@ -125,19 +128,8 @@ def _receptions(connection: Connection, span: PassSpan) -> tuple[ReceptionQualit
 
 def _raw_files(connection: Connection, span: PassSpan) -> list[_Ingested]:
     """Return the ingested files that may contain data of the pass, each once, ordered by hash."""
-    ingests, stored = repository.INGESTS, repository.FILES
-    query = (
-        select(ingests.c.file_sha256, stored.c.octets, ingests.c.accounting)
-        .join(stored, stored.c.sha256 == ingests.c.file_sha256)
-        .where(
-            (ingests.c.vehicle_id == span.vehicle)
-            | ingests.c.accounting["vehicle_ids"][1].as_integer().is_not(None),
-            ingests.c.state == "done",
-        )
-        .order_by(ingests.c.file_sha256)
-    )
     chosen: dict[str, _Ingested] = {}
-    for sha256, octets, accounting in connection.execute(query):
+    for sha256, octets, accounting in store.ingested_files(connection, span.vehicle):
         if span.vehicle not in accounting.get("vehicle_ids", (span.vehicle,)):
             continue
         first, last = accounting.get("first_ticks"), accounting.get("last_ticks")
@@ -184,12 +176,10 @@ class _Images:
     after_last_made: int | None
 
 
-def _images(connection: Connection, record: Mapping[str, Any], span: PassSpan) -> _Images:
+def _images(connection: Connection, record: PassRecord, span: PassSpan) -> _Images:
     def columns(kind: str, *names: str, after_ticks: int = 0) -> dict[str, list[Any]]:
         stop = span.stop_ticks + after_ticks
-        return telemetry.samples(
-            connection, kind, span.vehicle, span.start_ticks, stop, span.dictionary_version, names
-        )
+        return store.samples(connection, replace(span, stop_ticks=stop), kind, names)
 
     images = columns("detections", "ticks", "frame_number")
     # An observation ends at the first frame time at or after its planned end: up to one cadence after the span.
@@ -207,8 +197,8 @@ def _images(connection: Connection, record: Mapping[str, Any], span: PassSpan) -
     )
 
 
-def _cadence_ticks(record: Mapping[str, Any]) -> int:
-    cadence_s = record["manifest"].get("cadence_s")
+def _cadence_ticks(record: PassRecord) -> int:
+    cadence_s = record.manifest.get("cadence_s")
     return 0 if cadence_s is None else round(cadence_s * TICKS_PER_SECOND)
 
 
@@ -256,11 +246,11 @@ def _apid_names() -> dict[int, str]:
 
 
 def _completeness(
-    record: Mapping[str, Any], span: PassSpan, ticks: IntArray, lost: NDArray[np.float64]
+    record: PassRecord, span: PassSpan, ticks: IntArray, lost: NDArray[np.float64]
 ) -> CompletenessSeries | None:
     if len(ticks) == 0:
         return None
-    edges = np.linspace(record["start_utc_ns"], record["stop_utc_ns"], COMPLETENESS_BINS + 1).astype(np.int64)
+    edges = np.linspace(record.start_utc_ns, record.stop_utc_ns, COMPLETENESS_BINS + 1).astype(np.int64)
     received = np.histogram(np.clip(span.utc_ns(list(ticks)), edges[0], edges[-1]), edges)[0]
     when = np.clip(span.utc_ns(lost[:, 0].astype(np.int64).tolist()), edges[0], edges[-1])
     missing = np.histogram(when, edges, weights=lost[:, 1])[0]

@@ -14,11 +14,12 @@ from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.missions import store as missions
 from ground_service.missions.definitions import DeclaredPackets, PacketDefinitions, packet_definitions
+from ground_service.passes import store
 from ground_service.passes.model import ExportFormat, PacketInfo, ParameterInfo, PassParameters
 from ground_service.passes.series import PARAMETERS, KindSamples, SampleSource
 from ground_service.passes.span import PassSpan, pass_span
-from ground_service.store import parameters as store
-from ground_service.store import repository, rollups, telemetry
+from ground_service.store import parameters as declared_values
+from ground_service.store import rollups
 from ground_service.timekeeping.core import utc_ns_of_ticks
 from lunar.arrays import FloatArray, IntArray
 from lunar.timescales import format_utc, ticks_from_utc_ns
@@ -78,7 +79,7 @@ class DeclaredReading:
     """Definition that the values of a vehicle are read with, and its parameters by name."""
 
     definitions: PacketDefinitions
-    decoding: store.Decoding
+    decoding: declared_values.Decoding
     parameters: dict[str, DeclaredParameter]
 
 
@@ -100,25 +101,16 @@ class DeclaredSamples:
         return self.places[name]
 
     def arrays(
-        self, connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int, names: tuple[str, ...]
+        self, connection: Connection, span: PassSpan, names: tuple[str, ...]
     ) -> dict[str, NDArray[Any]]:
-        """Return ``ticks`` and values (n,) between two on-board times."""
+        """Return ``ticks`` and values (n,) in a span."""
         places = [self.places[name] for name in names]
-        ticks, values = self._values(connection, vehicle, start_ticks, stop_ticks, places)
+        ticks, values = self._values(connection, span, places)
         return {"ticks": ticks, **{name: values[:, k] for k, name in enumerate(names)}}
 
-    def aggregates(
-        self,
-        connection: Connection,
-        vehicle: int,
-        start_ticks: int,
-        stop_ticks: int,
-        name: str,
-        width_ticks: int,
-    ) -> FloatArray:
+    def aggregates(self, connection: Connection, span: PassSpan, name: str, width_ticks: int) -> FloatArray:
         """Return stretches of a value."""
-        place = [self.places[name]]
-        ticks, found = self._values(connection, vehicle, start_ticks, stop_ticks, place)
+        ticks, found = self._values(connection, span, [self.places[name]])
         if not ticks.size:
             return np.zeros((0, 7))
         value = found[:, 0]
@@ -135,11 +127,10 @@ class DeclaredSamples:
         return np.column_stack([ticks[first], ticks[last], last - first + 1, count, *figures])
 
     def _values(
-        self, connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int, places: list[int]
+        self, connection: Connection, span: PassSpan, places: list[int]
     ) -> tuple[IntArray, FloatArray]:
-        return store.read_values(
-            connection, vehicle, self.version, self.part, start_ticks, stop_ticks, places
-        )
+        where = (span.vehicle, self.version, self.part, span.start_ticks, span.stop_ticks)
+        return declared_values.read_values(connection, *where, places)
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,10 +152,10 @@ class InstrumentSamples:
         raise LookupError(name)
 
     def arrays(
-        self, connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int, names: tuple[str, ...]
+        self, connection: Connection, span: PassSpan, names: tuple[str, ...]
     ) -> dict[str, NDArray[Any]]:
-        """Return ``ticks`` and values (n,) between two on-board times, in order of time."""
-        octets = telemetry.packet_octets(connection, vehicle, APID_INSTRUMENTS, start_ticks, stop_ticks)
+        """Return ``ticks`` and values (n,) in a span, in order of time."""
+        octets = store.packet_octets(connection, span, APID_INSTRUMENTS)
         tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=(self.packet,))
         if self.packet not in tables:
             return {"ticks": np.zeros(0, dtype=np.int64), **{name: np.zeros(0) for name in names}}
@@ -173,15 +164,7 @@ class InstrumentSamples:
         order = np.argsort(ticks, kind="stable")
         return {"ticks": ticks[order], **dict.fromkeys(names, items[self.field][order])}
 
-    def aggregates(
-        self,
-        connection: Connection,
-        vehicle: int,
-        start_ticks: int,
-        stop_ticks: int,
-        name: str,
-        width_ticks: int,
-    ) -> FloatArray:
+    def aggregates(self, connection: Connection, span: PassSpan, name: str, width_ticks: int) -> FloatArray:
         """Return stretches of a value; without roll-ups a series is never long."""
         raise LookupError(name)
 
@@ -195,16 +178,16 @@ def pass_parameters(ground: Ground, pass_id: int) -> PassParameters:
         There is no such pass.
     """
     with ground.database.reading() as connection:
-        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        record = store.get_pass(connection, pass_id)
         span = pass_span(connection, record)
-        found = declared_reading(connection, record["vehicle_id"])
+        found = declared_reading(connection, record.vehicle_id)
         if found is None:
             return PassParameters(parameters=own_parameters(), packets=(), outcomes={})
         packets = []
         for declared in found.definitions.declared:
             own_span = span_of(span, declared)
             for name, number in declared.numbers.items():
-                count = store.count_values(
+                count = declared_values.count_values(
                     connection,
                     span.vehicle,
                     found.decoding.definition_id,
@@ -243,11 +226,11 @@ def _own_info(name: str, packet: str, field: Field) -> ParameterInfo:
 
 def declared_reading(connection: Connection, vehicle: int) -> DeclaredReading | None:
     """Return the definition that the values of a vehicle are read with, None without one."""
-    decoding = store.readable_decoding(connection, vehicle)
+    decoding = declared_values.readable_decoding(connection, vehicle)
     if decoding is None:
         return None
     mission = missions.get_mission(
-        connection, store.mission_of_definition(connection, decoding.definition_id)
+        connection, declared_values.mission_of_definition(connection, decoding.definition_id)
     )
     definitions = packet_definitions(mission)
     return DeclaredReading(definitions, decoding, declared_parameters(definitions))
@@ -323,7 +306,7 @@ def export_packets(ground: Ground, pass_id: int, packet: str, kind: ExportFormat
         There are more packets than one file may have.
     """
     with ground.database.reading() as connection:
-        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        record = store.get_pass(connection, pass_id)
         span = pass_span(connection, record)
         if packet in {definition.name for definition in DICTIONARY.telemetry}:
             return format_records(_own_records(connection, span, packet), kind)
@@ -334,7 +317,7 @@ def export_packets(ground: Ground, pass_id: int, packet: str, kind: ExportFormat
         if found is None or declared is None or declared.decoder is None:
             raise NotFound("packet", packet[:80])
         span = span_of(span, declared)
-        ticks, packets = store.packets_of_container(
+        ticks, packets = declared_values.packets_of_container(
             connection,
             span.vehicle,
             found.decoding.definition_id,
@@ -355,7 +338,7 @@ def export_packets(ground: Ground, pass_id: int, packet: str, kind: ExportFormat
 
 def _own_records(connection: Connection, span: PassSpan, packet: str) -> list[Record]:
     apid = DICTIONARY.packet(packet).apid
-    octets = telemetry.packet_octets(connection, span.vehicle, apid, span.start_ticks, span.stop_ticks)
+    octets = store.packet_octets(connection, span, apid)
     tables = DICTIONARY.unpack_many(octets, cut_packets(octets), only=(packet,))
     records = packet_records(tables)
     if len(records) > RECORDS_LIMIT:

@@ -9,7 +9,6 @@ from fastapi.responses import JSONResponse
 
 from ground_service.access.idempotency import once
 from ground_service.access.security import Operator, UploadOf, Viewer, idempotent_id
-from ground_service.clock import utc_now_ns
 from ground_service.http.common import (
     API_PREFIX,
     GroundOf,
@@ -44,7 +43,6 @@ from ground_service.passes.model import (
     Trend,
 )
 from ground_service.passes.series import STATE_VALUES, series_document
-from ground_service.store.stored_files import register_file
 
 EXPORT_MEDIA: dict[ExportFormat, str] = {
     "json": "application/json",
@@ -74,8 +72,7 @@ async def upload_archive(
     job_id = idempotent_id("archive", caller, idempotency_key)
 
     def enter() -> Job:
-        with ground.database.writing() as connection:
-            register_file(connection, stored, "archive", name, utc_now_ns())
+        service.keep_archive(ground, stored, name)
         job = dispatcher.submit("archive", {"sha256": stored.sha256, "name": name}, job_id=job_id)
         return get_job(ground, job)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -59,19 +59,11 @@ class SampleSource(Protocol):
         """Return the place of a value in the roll-ups."""
 
     def arrays(
-        self, connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int, names: tuple[str, ...]
+        self, connection: Connection, span: PassSpan, names: tuple[str, ...]
     ) -> dict[str, NDArray[Any]]:
-        """Return ``ticks`` and values (n,) between two on-board times (both included), in order of time."""
+        """Return ``ticks`` and values (n,) in a span, in order of time."""
 
-    def aggregates(
-        self,
-        connection: Connection,
-        vehicle: int,
-        start_ticks: int,
-        stop_ticks: int,
-        name: str,
-        width_ticks: int,
-    ) -> FloatArray:
+    def aggregates(self, connection: Connection, span: PassSpan, name: str, width_ticks: int) -> FloatArray:
         """Return stretches of a value as `telemetry.sample_aggregates` does."""
 
 
@@ -93,25 +85,15 @@ class KindSamples:
         return rollups.KINDS[self.kind][2].index(name)
 
     def arrays(
-        self, connection: Connection, vehicle: int, start_ticks: int, stop_ticks: int, names: tuple[str, ...]
+        self, connection: Connection, span: PassSpan, names: tuple[str, ...]
     ) -> dict[str, NDArray[Any]]:
-        """Return ``ticks`` and values (n,) between two on-board times."""
-        columns = ("ticks", *names)
-        return telemetry.sample_arrays(
-            connection, self.kind, vehicle, start_ticks, stop_ticks, self.version, columns, **self._equal
-        )
+        """Return ``ticks`` and values (n,) in a span."""
+        where = (span.vehicle, span.start_ticks, span.stop_ticks, self.version)
+        return telemetry.sample_arrays(connection, self.kind, *where, ("ticks", *names), **self._equal)
 
-    def aggregates(
-        self,
-        connection: Connection,
-        vehicle: int,
-        start_ticks: int,
-        stop_ticks: int,
-        name: str,
-        width_ticks: int,
-    ) -> FloatArray:
+    def aggregates(self, connection: Connection, span: PassSpan, name: str, width_ticks: int) -> FloatArray:
         """Return stretches of a value, aggregated by the database."""
-        where = (vehicle, start_ticks, stop_ticks, self.version)
+        where = (span.vehicle, span.start_ticks, span.stop_ticks, self.version)
         return telemetry.sample_aggregates(connection, self.kind, *where, name, width_ticks, **self._equal)
 
     @property
@@ -133,7 +115,7 @@ class SeriesReading:
         """Values of the samples, named with their units, all read at once."""
         level, length = self._level()
         if length is None:
-            columns = self._samples(tuple(units), self.span.start_ticks, self.span.stop_ticks)
+            columns = self.source.arrays(self.connection, self.span, tuple(units))
             utc_ns, used = utc_ns_of_ticks(columns["ticks"], self.span.correlations)
             correlation = int(used[-1]) if len(used) else IDEAL_CLOCK
             return [
@@ -174,9 +156,7 @@ class SeriesReading:
     def _grouped(self, name: str, length: float) -> tuple[Aggregates, int]:
         """Stretches of half the length (ticks), put together by the database from the samples."""
         width = max(int(length / 2.0), 1)
-        found = self.source.aggregates(
-            self.connection, self.span.vehicle, self.span.start_ticks, self.span.stop_ticks, name, width
-        )
+        found = self.source.aggregates(self.connection, self.span, name, width)
         first, last, rows, count = found[:, :4].astype(np.int64).T
         begin, used = utc_ns_of_ticks(first, self.span.correlations)
         end, _ = utc_ns_of_ticks(last, self.span.correlations)
@@ -211,12 +191,10 @@ class SeriesReading:
         return join(pieces), int(used[-1]) if len(used) else IDEAL_CLOCK
 
     def _edge(self, name: str, start: int, stop: int) -> Aggregates:
-        columns = self._samples((name,), start, stop)
+        span = replace(self.span, start_ticks=start, stop_ticks=stop)
+        columns = self.source.arrays(self.connection, span, (name,))
         utc_ns = utc_ns_of_ticks(columns["ticks"], self.span.correlations)[0]
         return aggregate(utc_ns, columns[name].astype(np.float64))
-
-    def _samples(self, names: tuple[str, ...], start: int, stop: int) -> dict[str, NDArray[Any]]:
-        return self.source.arrays(self.connection, self.span.vehicle, start, stop, names)
 
 
 def series_document(series: Series) -> dict[str, Any]:

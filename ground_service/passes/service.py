@@ -17,11 +17,13 @@ from ground_service.http.times import UtcTime
 from ground_service.ingest.redecode import readable_version
 from ground_service.ingest.service import FLOWN
 from ground_service.missions import store as missions
+from ground_service.passes import store
 from ground_service.passes.cache import remembered
 from ground_service.passes.model import (
     Detection,
     Event,
     PassDetail,
+    PassRecord,
     PassSummary,
     Trend,
 )
@@ -38,8 +40,10 @@ from ground_service.passes.series import (
 from ground_service.passes.span import PassSpan, pass_span
 from ground_service.passes.store import detection_frames, detection_samples, event_list
 from ground_service.passes.trends import trend_of
-from ground_service.store import repository, rollups
-from ground_service.store.vehicles import vehicle_id
+from ground_service.store import rollups
+from ground_service.store.files import StoredFile
+from ground_service.store.stored_files import register_file
+from ground_service.store.vehicles import find_vehicle, vehicle_id
 from ground_service.text import require_line
 from ground_service.timekeeping.core import ticks_of_utc_ns
 from ground_service.timekeeping.store import load_correlations
@@ -54,8 +58,7 @@ TREND_POINTS = 60
 def list_passes(ground: Ground, *, limit: int = 100, offset: int = 0) -> tuple[list[PassSummary], int]:
     """Return a page of the passes, newest first, and the total number."""
     with ground.database.reading() as connection:
-        page = repository.page(connection, repository.PASSES, limit=limit, offset=offset)
-    return [PassSummary.of(row) for row in page.rows], page.total
+        return store.list_passes(connection, limit=limit, offset=offset)
 
 
 def get_pass(ground: Ground, pass_id: int) -> PassDetail:
@@ -67,19 +70,13 @@ def get_pass(ground: Ground, pass_id: int) -> PassDetail:
         There is no such pass.
     """
     with ground.database.reading() as connection:
-        record = repository.get(connection, repository.PASSES, pass_id, "pass")
-        vehicle = repository.get(connection, repository.VEHICLES, record["vehicle_id"], "vehicle")
-        reports = repository.page(connection, repository.REPORTS, limit=20, pass_id=pass_id)
-        mission = None if record["mission_id"] is None else missions.detail(connection, record["mission_id"])
-    return PassDetail.of(
-        record,
-        spacecraft_id=vehicle["ccsds_id"],
-        instance=vehicle["instance"],
-        archive_sha256=record["archive_digest"],
-        mission=None if mission is None else mission.mission,
-        mission_revision=None if mission is None else mission.revision,
-        reports=[row["id"] for row in reports.rows],
-    )
+        return store.pass_detail(connection, pass_id)
+
+
+def keep_archive(ground: Ground, stored: StoredFile, name: str) -> None:
+    """Add an uploaded pass archive to the files of the archive."""
+    with ground.database.writing() as connection:
+        register_file(connection, stored, "archive", name, utc_now_ns())
 
 
 def define_pass(
@@ -100,29 +97,22 @@ def define_pass(
     if stop_utc_ns <= start_utc_ns:
         raise InvalidInput("pass", "stop", "a time after the start", str(stop_utc_ns))
     with ground.database.writing() as connection:
-        return int(
-            repository.add(
-                connection,
-                repository.PASSES,
-                vehicle_id=vehicle_id(connection, spacecraft_id, instance),
-                name=name,
-                start_utc_ns=start_utc_ns,
-                stop_utc_ns=stop_utc_ns,
-                archive_digest=None,
-                manifest=dict(manifest or {}),
-                ephemeris_id=None,
-                catalogue_sha256=None,
-                attitude_sha256=None,
-                mission_id=missions.newest_of_spacecraft(connection, spacecraft_id),
-                created_utc_ns=utc_now_ns(),
-            )
+        return store.add_pass(
+            connection,
+            vehicle_id=vehicle_id(connection, spacecraft_id, instance),
+            name=name,
+            start_utc_ns=start_utc_ns,
+            stop_utc_ns=stop_utc_ns,
+            manifest=manifest,
+            mission_id=missions.newest_of_spacecraft(connection, spacecraft_id),
+            now_utc_ns=utc_now_ns(),
         )
 
 
 def completeness(ground: Ground, pass_id: int) -> PacketAccounting:
     """Return the accounting of the received and missing packets of a pass."""
     with ground.database.reading() as connection:
-        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        record = store.get_pass(connection, pass_id)
         return remembered(
             ground,
             connection,
@@ -134,7 +124,7 @@ def completeness(ground: Ground, pass_id: int) -> PacketAccounting:
 def events(ground: Ground, pass_id: int) -> tuple[PassEvent, ...]:
     """Return the event reports of a pass, in time order."""
     with ground.database.reading() as connection:
-        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        record = store.get_pass(connection, pass_id)
         return remembered(
             ground,
             connection,
@@ -152,7 +142,7 @@ def list_events(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tup
 def detections(ground: Ground, pass_id: int, *, limit: int, offset: int) -> tuple[list[Detection], int]:
     """Return a page of the detections of a pass, in time order, and the total number."""
     with ground.database.reading() as connection:
-        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        record = store.get_pass(connection, pass_id)
         span = pass_span(connection, record)
         ticks, offsets = remembered(
             ground, connection, ("frames", pass_id), lambda: detection_frames(connection, span)
@@ -193,7 +183,7 @@ def state_series(
         If there is no such pass or no such estimator.
     """
     with ground.database.reading() as connection:
-        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        record = store.get_pass(connection, pass_id)
         return _state_series(connection, record, estimator, values, max_points)
 
 
@@ -202,7 +192,7 @@ def states_document(
 ) -> bytes:
     """As `state_series`, as JSON, kept until something is new."""
     with ground.database.reading() as connection:
-        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        record = store.get_pass(connection, pass_id)
 
         def make() -> bytes:
             found = _state_series(connection, record, estimator, values, max_points)
@@ -213,7 +203,7 @@ def states_document(
 
 def _state_series(
     connection: Connection,
-    record: Mapping[str, Any],
+    record: PassRecord,
     estimator: str,
     values: tuple[str, ...],
     max_points: int,
@@ -241,14 +231,14 @@ def _state_series(
 def parameter_series(ground: Ground, pass_id: int, parameter: str, max_points: int) -> Series:
     """The series of one parameter of a pass."""
     with ground.database.reading() as connection:
-        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        record = store.get_pass(connection, pass_id)
         return _parameter_series(connection, pass_span(connection, record), parameter, max_points)
 
 
 def parameter_document(ground: Ground, pass_id: int, parameter: str, max_points: int) -> bytes:
     """As `parameter_series`, as JSON, kept until something is new."""
     with ground.database.reading() as connection:
-        record = repository.get(connection, repository.PASSES, pass_id, "pass")
+        record = store.get_pass(connection, pass_id)
 
         def make() -> bytes:
             span = pass_span(connection, record)
@@ -278,16 +268,14 @@ def trend_series(
 ) -> Series:
     """The series of one parameter of a spacecraft over any span, all there is by default."""
     with ground.database.reading() as connection:
-        vehicle = repository.find(connection, repository.VEHICLES, ccsds_id=spacecraft_id, instance=instance)
-        if vehicle is None:
-            raise NotFound("spacecraft", f"{spacecraft_id} ({instance})")
-        correlations = load_correlations(connection, vehicle["id"])
+        vehicle = find_vehicle(connection, spacecraft_id, instance).id
+        correlations = load_correlations(connection, vehicle)
         span = PassSpan(
-            vehicle["id"],
+            vehicle,
             0 if start_utc_ns is None else ticks_of_utc_ns(start_utc_ns, correlations),
             LAST_TICKS if stop_utc_ns is None else ticks_of_utc_ns(stop_utc_ns, correlations),
             correlations,
-            readable_version(connection, vehicle["id"]),
+            readable_version(connection, vehicle),
         )
         return _parameter_series(connection, span, parameter, max_points)
 
@@ -301,10 +289,8 @@ def spacecraft_trends(ground: Ground, spacecraft_id: int, instance: str) -> list
         There is no such spacecraft.
     """
     with ground.database.reading() as connection:
-        row = repository.find(connection, repository.VEHICLES, ccsds_id=spacecraft_id, instance=instance)
-    if row is None:
-        raise NotFound("spacecraft", f"{spacecraft_id} ({instance})")
-    return vehicle_trends(ground, row["id"])
+        vehicle = find_vehicle(connection, spacecraft_id, instance).id
+    return vehicle_trends(ground, vehicle)
 
 
 def vehicle_trends(ground: Ground, vehicle: int) -> list[Trend]:

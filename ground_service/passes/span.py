@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection
 
 from ground_service.ingest.redecode import readable_version
+from ground_service.passes.model import PassRecord
 from ground_service.timekeeping.core import TimeCorrelation, ticks_of_utc_ns, utc_ns_of_ticks
 from ground_service.timekeeping.store import load_correlations
 from lunar.arrays import IntArray
@@ -34,13 +34,13 @@ PASS_MARGIN_NS = 60_000_000_000
 """Samples this far outside a window still belong to it: housekeeping before the first and after the last image."""
 
 
-def pass_span(connection: Connection, record: Mapping[str, Any]) -> PassSpan:
+def pass_span(connection: Connection, record: PassRecord) -> PassSpan:
     """The stretch of on-board time of a pass, a margin included."""
-    correlations = load_correlations(connection, record["vehicle_id"])
+    correlations = load_correlations(connection, record.vehicle_id)
     return PassSpan(
-        vehicle=record["vehicle_id"],
-        start_ticks=ticks_of_utc_ns(record["start_utc_ns"] - PASS_MARGIN_NS, correlations),
-        stop_ticks=ticks_of_utc_ns(record["stop_utc_ns"] + PASS_MARGIN_NS, correlations),
+        vehicle=record.vehicle_id,
+        start_ticks=ticks_of_utc_ns(record.start_utc_ns - PASS_MARGIN_NS, correlations),
+        stop_ticks=ticks_of_utc_ns(record.stop_utc_ns + PASS_MARGIN_NS, correlations),
         correlations=correlations,
-        dictionary_version=readable_version(connection, record["vehicle_id"]),
+        dictionary_version=readable_version(connection, record.vehicle_id),
     )

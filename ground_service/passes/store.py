@@ -1,43 +1,226 @@
-"""SQL of the telemetry of a pass."""
+"""SQL of passes and of their telemetry."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection
+from sqlalchemy import Connection, func, insert, select
 
-from ground_service.passes.samples import (
-    DetectionSamples,
-    no_detections,
-)
+from ground_service.passes.model import PassDetail, PassRecord, PassSummary
+from ground_service.passes.samples import DetectionSamples, no_detections
 from ground_service.passes.span import PassSpan
-from ground_service.store import telemetry
+from ground_service.store import repository, telemetry
 from ground_service.store.codec import unpack_detections
 from ground_service.timekeeping.core import utc_ns_of_ticks
 from lunar.arrays import IntArray
-from reports.values import (
-    PassEvent,
-)
+from reports.values import PassEvent
 from tmtc.dictionary import DICTIONARY
 from tmtc.event_texts import event_text
 
+_PASSES = repository.PASSES
+_FRAMES = repository.PASS_FRAMES
 _SEVERITIES = {1: "info", 2: "low", 3: "medium", 4: "high"}
+_REPORTS_LISTED = 20
+
+
+def get_pass(connection: Connection, pass_id: int) -> PassRecord:
+    """Return a pass.
+
+    Raises
+    ------
+    NotFound
+        There is no such pass.
+    """
+    return PassRecord.of(repository.get(connection, _PASSES, pass_id, "pass"))
+
+
+def pass_detail(connection: Connection, pass_id: int) -> PassDetail:
+    """Return a pass with its spacecraft, mission and newest reports."""
+    vehicles, missions, reports = repository.VEHICLES, repository.MISSIONS, repository.REPORTS
+    query = (
+        select(
+            vehicles.c.ccsds_id.label("spacecraft_id"),
+            vehicles.c.instance,
+            missions.c.name.label("mission"),
+            missions.c.revision.label("mission_revision"),
+        )
+        .select_from(_PASSES)
+        .join(vehicles, vehicles.c.id == _PASSES.c.vehicle_id)
+        .outerjoin(missions, missions.c.id == _PASSES.c.mission_id)
+        .where(_PASSES.c.id == pass_id)
+    )
+    newest = (
+        select(reports.c.id)
+        .where(reports.c.pass_id == pass_id)
+        .order_by(reports.c.created_utc_ns.desc(), reports.c.id.desc())
+        .limit(_REPORTS_LISTED)
+    )
+    row = repository.get(connection, _PASSES, pass_id, "pass")
+    return PassDetail.of(
+        row,
+        archive_sha256=row["archive_digest"],
+        reports=list(connection.execute(newest).scalars()),
+        **connection.execute(query).mappings().one(),
+    )
+
+
+def list_passes(connection: Connection, *, limit: int, offset: int) -> tuple[list[PassSummary], int]:
+    """Return a page of the passes, newest first, and the total number."""
+    page = repository.page(connection, _PASSES, limit=limit, offset=offset)
+    return [PassSummary.of(row) for row in page.rows], page.total
+
+
+def passes_of_vehicle(connection: Connection, vehicle: int, *, reported: bool) -> list[PassRecord]:
+    """Return the passes of a vehicle, oldest first; only those with a report if `reported`."""
+    query = select(_PASSES).where(_PASSES.c.vehicle_id == vehicle).order_by(_PASSES.c.id)
+    if reported:
+        query = query.where(_PASSES.c.id.in_(select(repository.REPORTS.c.pass_id)))
+    return [PassRecord.of(row) for row in connection.execute(query).mappings()]
+
+
+def reported_without_ephemeris(connection: Connection, start_utc_ns: int, stop_utc_ns: int) -> list[int]:
+    """Return the passes with a report but no ephemeris of their own that overlap an interval."""
+    query = select(_PASSES.c.id).where(
+        _PASSES.c.ephemeris_id.is_(None),
+        _PASSES.c.start_utc_ns <= stop_utc_ns,
+        _PASSES.c.stop_utc_ns >= start_utc_ns,
+        _PASSES.c.id.in_(select(repository.REPORTS.c.pass_id)),
+    )
+    return [int(key) for key in connection.execute(query.order_by(_PASSES.c.id)).scalars()]
+
+
+def archived_pass(connection: Connection, digest: str) -> int | None:
+    """Return the id of the pass of an archive; None if it was not imported."""
+    return connection.execute(select(_PASSES.c.id).where(_PASSES.c.archive_digest == digest)).scalar()
+
+
+def add_pass(
+    connection: Connection,
+    *,
+    vehicle_id: int,
+    name: str,
+    start_utc_ns: int,
+    stop_utc_ns: int,
+    mission_id: int | None,
+    now_utc_ns: int,
+    manifest: Mapping[str, Any] | None = None,
+    archive_digest: str | None = None,
+    ephemeris_id: int | None = None,
+    catalogue_sha256: str | None = None,
+    attitude_sha256: str | None = None,
+) -> int:
+    """Add a pass; return its id."""
+    return int(
+        repository.add(
+            connection,
+            _PASSES,
+            vehicle_id=vehicle_id,
+            name=name,
+            start_utc_ns=start_utc_ns,
+            stop_utc_ns=stop_utc_ns,
+            archive_digest=archive_digest,
+            manifest=dict(manifest or {}),
+            ephemeris_id=ephemeris_id,
+            catalogue_sha256=catalogue_sha256,
+            attitude_sha256=attitude_sha256,
+            mission_id=mission_id,
+            created_utc_ns=now_utc_ns,
+        )
+    )
+
+
+def add_frames(connection: Connection, pass_id: int, sha256_by_frame: Mapping[int, str]) -> None:
+    """Add the archived images of a pass by frame number."""
+    rows = [
+        {"pass_id": pass_id, "frame_number": number, "file_sha256": sha256}
+        for number, sha256 in sha256_by_frame.items()
+    ]
+    if rows:
+        connection.execute(insert(_FRAMES), rows)
+
+
+def frame_files(connection: Connection, pass_id: int) -> dict[int, str]:
+    """Return the hashes of the archived images of a pass by frame number, ascending."""
+    query = select(_FRAMES.c.frame_number, _FRAMES.c.file_sha256).where(_FRAMES.c.pass_id == pass_id)
+    rows = connection.execute(query.order_by(_FRAMES.c.frame_number))
+    return {int(number): sha256 for number, sha256 in rows}
+
+
+def ingested_files(connection: Connection, vehicle: int) -> list[tuple[str, int, dict[str, Any]]]:
+    """Return hash, octets and accounting of the ingests that may have data of a vehicle, ordered by hash."""
+    ingests, stored = repository.INGESTS, repository.FILES
+    query = (
+        select(ingests.c.file_sha256, stored.c.octets, ingests.c.accounting)
+        .join(stored, stored.c.sha256 == ingests.c.file_sha256)
+        .where(
+            (ingests.c.vehicle_id == vehicle)
+            | ingests.c.accounting["vehicle_ids"][1].as_integer().is_not(None),
+            ingests.c.state == "done",
+        )
+        .order_by(ingests.c.file_sha256)
+    )
+    return [(sha256, int(octets), accounting) for sha256, octets, accounting in connection.execute(query)]
+
+
+def archive_state(connection: Connection) -> Hashable:
+    """Return a value that differs after new packets, ingests, decodings or correlations.
+
+    Everything else of the archive that answers depend on is never changed.
+    """
+    newest = tuple(connection.execute(_NEWEST).one())
+    decoded = [tuple(row) for query in (_DECODED, _DECLARED) for row in connection.execute(query)]
+    return (*newest, *decoded)
+
+
+_NEWEST = select(
+    *(
+        select(value).scalar_subquery()
+        for value in (
+            func.max(repository.PACKETS.c.id),
+            func.max(repository.INGESTS.c.finished_utc_ns),
+            func.max(repository.CORRELATIONS.c.id),
+            func.sum(repository.CORRELATIONS.c.superseded),
+        )
+    )
+)
+_DECODED = select(repository.VEHICLES.c.id, repository.VEHICLES.c.decoded_version).order_by(
+    repository.VEHICLES.c.id
+)
+_DECLARED = select(
+    repository.PACKET_DECODINGS.c.vehicle_id,
+    repository.PACKET_DECODINGS.c.definition_id,
+    repository.PACKET_DECODINGS.c.decoded_to,
+    repository.PACKET_DECODINGS.c.complete,
+).order_by(repository.PACKET_DECODINGS.c.vehicle_id, repository.PACKET_DECODINGS.c.definition_id)
+
+
+def samples(connection: Connection, span: PassSpan, kind: str, names: Sequence[str]) -> dict[str, list[Any]]:
+    """Return columns of the samples of one kind in a span, in order of time."""
+    return telemetry.samples(
+        connection, kind, span.vehicle, span.start_ticks, span.stop_ticks, span.dictionary_version, names
+    )
+
+
+def sample_arrays(
+    connection: Connection, span: PassSpan, kind: str, names: Sequence[str]
+) -> dict[str, NDArray[Any]]:
+    """As `samples`, as arrays: whole numbers as int64, all else as float64 with NaN for NULL."""
+    return telemetry.sample_arrays(
+        connection, kind, span.vehicle, span.start_ticks, span.stop_ticks, span.dictionary_version, names
+    )
+
+
+def packet_octets(connection: Connection, span: PassSpan, apid: int) -> bytes:
+    """Return the packets of one APID in a span, end to end in order of time."""
+    return telemetry.packet_octets(connection, span.vehicle, apid, span.start_ticks, span.stop_ticks)
 
 
 def detection_samples(connection: Connection, span: PassSpan) -> DetectionSamples:
     """Detections of every frame, in time order; of two reports on one image the first by content counts."""
-    rows = telemetry.samples(
-        connection,
-        "detections",
-        span.vehicle,
-        span.start_ticks,
-        span.stop_ticks,
-        span.dictionary_version,
-        ("ticks", "frame_number", "image_quality", "items"),
-    )
+    rows = samples(connection, span, "detections", ("ticks", "frame_number", "image_quality", "items"))
     if not rows["ticks"]:
         return no_detections()
     chosen = _first_reports(rows)
@@ -78,15 +261,7 @@ def _first_reports(rows: Mapping[str, list[Any]]) -> list[int]:
 
 def detection_frames(connection: Connection, span: PassSpan) -> tuple[IntArray, IntArray]:
     """On-board time of every frame (n,), ascending, and where its detections begin among all of the span (n + 1,)."""
-    rows = telemetry.samples(
-        connection,
-        "detections",
-        span.vehicle,
-        span.start_ticks,
-        span.stop_ticks,
-        span.dictionary_version,
-        ("ticks", "frame_number", "items"),
-    )
+    rows = samples(connection, span, "detections", ("ticks", "frame_number", "items"))
     if not rows["ticks"]:
         return np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)
     chosen = _first_reports(rows)
@@ -101,9 +276,7 @@ def code_labels(labels: Mapping[int, str], codes: NDArray[Any]) -> tuple[str, ..
 def event_list(connection: Connection, span: PassSpan) -> tuple[PassEvent, ...]:
     """Event reports of a pass, in time order."""
     names = ("ticks", "severity", "event_id", "frame_number", "value_1", "value_2")
-    rows = telemetry.samples(
-        connection, "events", span.vehicle, span.start_ticks, span.stop_ticks, span.dictionary_version, names
-    )
+    rows = samples(connection, span, "events", names)
     labels = DICTIONARY.labels("event_info", "event_id")
     utc_ns, correlation_ids = utc_ns_of_ticks(np.array(rows["ticks"], dtype=np.int64), span.correlations)
     events = [

@@ -87,30 +87,6 @@ def add_new(connection: Connection, table: Table, **values: Any) -> Any | None:
     return connection.execute(make(table).values(**values).on_conflict_do_nothing().returning(key)).scalar()
 
 
-def newest_report(connection: Connection, pass_id: int, *, other_than: str = "") -> Row | None:
-    """Return the newest report of a pass, except one; None without any."""
-    query = select(REPORTS).where(REPORTS.c.pass_id == pass_id, REPORTS.c.id != other_than)
-    found = connection.execute(query.order_by(REPORTS.c.created_utc_ns.desc()).limit(1)).mappings().first()
-    return None if found is None else dict(found)
-
-
-def reports_of_pass(
-    connection: Connection, pass_id: int, *, limit: int, offset: int
-) -> tuple[list[Row], int]:
-    """Return a page of the reports of a pass with their `mission_revision`, newest first, and their number."""
-    mine = REPORTS.c.pass_id == pass_id
-    query = (
-        select(REPORTS, MISSIONS.c.revision.label("mission_revision"))
-        .outerjoin(MISSIONS, MISSIONS.c.id == REPORTS.c.mission_id)
-        .where(mine)
-        .order_by(REPORTS.c.created_utc_ns.desc(), REPORTS.c.id)
-        .limit(limit)
-        .offset(offset)
-    )
-    total = connection.execute(select(func.count()).select_from(REPORTS).where(mine)).scalar_one()
-    return [dict(row) for row in connection.execute(query).mappings()], total
-
-
 def change(connection: Connection, table: Table, key: Any, **values: Any) -> None:
     """Change columns of the row with this primary key; states are changed by `states.move` alone."""
     column = next(iter(table.primary_key.columns))
@@ -161,16 +137,6 @@ def page(
     query = query.order_by(*(column.desc() if newest_first else column for column in order))
     rows = connection.execute(query.limit(limit).offset(offset)).mappings()
     return Page([dict(row) for row in rows], int(total))
-
-
-def covering_ephemerides(connection: Connection, start_utc_ns: int, stop_utc_ns: int) -> list[Row]:
-    """Reference ephemerides that overlap an interval, the one to prefer first: precedence, then the newest."""
-    query = (
-        select(EPHEMERIDES)
-        .where(EPHEMERIDES.c.start_utc_ns <= stop_utc_ns, EPHEMERIDES.c.stop_utc_ns >= start_utc_ns)
-        .order_by(EPHEMERIDES.c.precedence.desc(), EPHEMERIDES.c.id.desc())
-    )
-    return [dict(row) for row in connection.execute(query).mappings()]
 
 
 def _where(table: Table, equal: dict[str, Any]) -> Select[Any]:

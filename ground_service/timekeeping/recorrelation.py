@@ -18,13 +18,13 @@ from sqlalchemy import Connection
 
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
+from ground_service.ephemerides.store import covering_ephemerides
 from ground_service.errors import InvalidInput
 from ground_service.events import CorrelationChanged, ReceptionsEntered, publish
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime, time_of
 from ground_service.missions.stations import STATIONS
 from ground_service.missions.store import mission_of_vehicle
-from ground_service.store import repository
 from ground_service.store.vehicles import lock_vehicle, vehicle_id
 from ground_service.timekeeping import store
 from ground_service.timekeeping.core import CorrelationFit, clock_runs, fit_correlation, utc_ns_of_ticks
@@ -293,7 +293,7 @@ def _references(
 ) -> list[Ephemeris]:
     """Reference ephemerides to take light times from: those of the vehicle's passes first, then by precedence."""
     mine = store.ephemerides_of_passes(connection, vehicle)
-    rows = repository.covering_ephemerides(connection, int(earth_utc_ns.min()), int(earth_utc_ns.max()))
+    rows = covering_ephemerides(connection, int(earth_utc_ns.min()), int(earth_utc_ns.max()))
     if mine:
-        rows = [row for row in rows if row["id"] in mine]
-    return [load_ephemeris(ground.files.path(row["file_sha256"])) for row in rows]
+        rows = [row for row in rows if row.id in mine]
+    return [load_ephemeris(ground.files.path(row.sha256)) for row in rows]

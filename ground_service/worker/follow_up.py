@@ -38,6 +38,7 @@ from ground_service.ingest.service import undecoded_vehicles
 from ground_service.jobs.service import add_job
 from ground_service.missions.store import get_mission
 from ground_service.passes.span import pass_span
+from ground_service.passes.store import passes_of_vehicle, reported_without_ephemeris
 from ground_service.planning.progress import advance_windows
 from ground_service.store import events, repository
 from ground_service.store.events import LoggedEvent
@@ -87,18 +88,11 @@ def _after_ephemeris(ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
     event = EphemerisAdded.of(logged)
     with ground.database.reading() as connection:
         vehicles = vehicles_with_receptions(connection, event.start_utc_ns, event.stop_utc_ns)
+        passes = reported_without_ephemeris(connection, event.start_utc_ns, event.stop_utc_ns)
     for vehicle in vehicles:
         yield "recorrelate", vehicle
-    table = repository.PASSES
-    query = select(table.c.id).where(
-        table.c.ephemeris_id.is_(None),
-        table.c.start_utc_ns <= event.stop_utc_ns,
-        table.c.stop_utc_ns >= event.start_utc_ns,
-        table.c.id.in_(select(repository.REPORTS.c.pass_id)),
-    )
-    with ground.database.reading() as connection:
-        for pass_id in connection.execute(query.order_by(table.c.id)).scalars():
-            yield "re-evaluate", int(pass_id)
+    for pass_id in passes:
+        yield "re-evaluate", pass_id
 
 
 def _after_uplink(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
@@ -301,15 +295,11 @@ def open_following(
 
 def _reported_passes(connection: Connection, vehicle: int, first_ticks: int, last_ticks: int) -> list[int]:
     """Return the passes of a vehicle that have a report and that contain on-board times of an interval."""
-    table = repository.PASSES
-    query = select(table).where(
-        table.c.vehicle_id == vehicle, table.c.id.in_(select(repository.REPORTS.c.pass_id))
-    )
     found = []
-    for record in connection.execute(query.order_by(table.c.id)).mappings():
-        span = pass_span(connection, dict(record))
+    for record in passes_of_vehicle(connection, vehicle, reported=True):
+        span = pass_span(connection, record)
         if span.start_ticks <= last_ticks and first_ticks <= span.stop_ticks:
-            found.append(int(record["id"]))
+            found.append(record.id)
     return found
 
 

@@ -32,8 +32,8 @@ from ground_service.missions.store import approval_in_force, newest_of_spacecraf
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.model import PassDetail
 from ground_service.passes.service import define_pass, get_pass
+from ground_service.passes.store import get_pass as stored_pass
 from ground_service.settings import Settings
-from ground_service.store import repository
 from ground_service.store.database import prepare_database
 from linna import cli
 from tests.ground_service.conftest import write_manifest
@@ -174,9 +174,9 @@ def test_a_pass_refers_to_the_newest_description_of_its_spacecraft(ground) -> No
 def test_an_archive_without_a_description_states_what_its_manifest_declares(ground, synthetic_pass) -> None:
     key = import_archive(ground, synthetic_pass.folder)
     with ground.database.reading() as connection:
-        record = repository.get(connection, repository.PASSES, key, "pass")
-        mission = mission_of_pass(connection, record)
-    assert record["mission_id"] is not None
+        record = stored_pass(connection, key)
+        mission = mission_of_pass(connection, record.mission_id, record.manifest)
+    assert record.mission_id is not None
     assert (mission.name, mission.spacecraft.id) == ("synthetic", 76)
     assert (mission.camera.width_px, mission.camera.fov_deg, mission.camera.k1) == (512, 120.0, None)
     assert mission.frames.orientation == "IAU WGCCRE 2009"

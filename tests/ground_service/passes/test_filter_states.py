@@ -21,6 +21,7 @@ from ground_service.ingest.store import store_batch
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.service import define_pass
 from ground_service.passes.span import pass_span
+from ground_service.passes.store import get_pass
 from ground_service.store import repository
 from ground_service.store.vehicles import vehicle_id
 from tmtc.dictionary import DICTIONARY, dictionary_version
@@ -117,8 +118,7 @@ def archive_with(made: Any, packets: list[bytes]) -> Path:
 
 def states_of(ground: Ground, pass_id: int) -> Any:
     with ground.database.reading() as connection:
-        record = repository.get(connection, repository.PASSES, pass_id, "pass")
-        return filter_states(connection, pass_span(connection, record))
+        return filter_states(connection, pass_span(connection, get_pass(connection, pass_id)))
 
 
 def test_estimates_of_either_version_are_stored_with_covariance_and_degrees(

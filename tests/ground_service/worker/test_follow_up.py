@@ -12,6 +12,7 @@ from sqlalchemy import select, update
 
 from ground_service import events
 from ground_service.errors import StorageFull
+from ground_service.evaluation.model import ChangedFigure
 from ground_service.evaluation.report_overview import list_reports
 from ground_service.evaluation.service import changed_figures, make_report
 from ground_service.events import (
@@ -335,8 +336,8 @@ def test_changed_figures_of_nested_summaries() -> None:
     before = {"a": 1, "b": {"c": 2.0, "d": None}, "e": [1, 2]}
     after = {"a": 1, "b": {"c": 3.0, "d": None}, "e": [1, 3], "f": "new"}
     assert changed_figures(before, after) == [
-        {"figure": "b.c", "before": 2.0, "after": 3.0},
-        {"figure": "e", "before": [1, 2], "after": [1, 3]},
-        {"figure": "f", "before": None, "after": "new"},
+        ChangedFigure(figure="b.c", before=2.0, after=3.0),
+        ChangedFigure(figure="e", before=[1, 2], after=[1, 3]),
+        ChangedFigure(figure="f", before=None, after="new"),
     ]
     assert changed_figures(before, before) == []

@@ -1,0 +1,64 @@
+"""SQL of reports."""
+
+from __future__ import annotations
+
+from sqlalchemy import Connection, func, select
+
+from ground_service.evaluation.model import Report, StoredReport
+from ground_service.store import repository
+
+_REPORTS = repository.REPORTS
+_MISSIONS = repository.MISSIONS
+
+
+def get_report(connection: Connection, report_id: str) -> StoredReport:
+    """Return a report.
+
+    Raises
+    ------
+    NotFound
+        There is no such report.
+    """
+    return StoredReport.of(repository.get(connection, _REPORTS, report_id, "report"))
+
+
+def has_report(connection: Connection, report_id: str) -> bool:
+    """Return whether a report exists."""
+    return repository.find(connection, _REPORTS, id=report_id) is not None
+
+
+def newest_report(connection: Connection, pass_id: int, *, other_than: str = "") -> StoredReport | None:
+    """Return the newest report of a pass, except one; None without any."""
+    query = select(_REPORTS).where(_REPORTS.c.pass_id == pass_id, _REPORTS.c.id != other_than)
+    found = connection.execute(query.order_by(_REPORTS.c.created_utc_ns.desc()).limit(1)).mappings().first()
+    return None if found is None else StoredReport.of(found)
+
+
+def list_reports(
+    connection: Connection, pass_id: int, *, limit: int, offset: int
+) -> tuple[list[Report], int]:
+    """Return a page of the reports of a pass, newest first, and their number."""
+    mine = _REPORTS.c.pass_id == pass_id
+    query = (
+        select(
+            _REPORTS.c.id,
+            _REPORTS.c.pass_id,
+            _REPORTS.c.created_utc_ns,
+            _MISSIONS.c.revision.label("mission_revision"),
+            _REPORTS.c.event_number.label("event"),
+            _REPORTS.c.previous_id.label("previous"),
+            _REPORTS.c.changes,
+        )
+        .outerjoin(_MISSIONS, _MISSIONS.c.id == _REPORTS.c.mission_id)
+        .where(mine)
+        .order_by(_REPORTS.c.created_utc_ns.desc(), _REPORTS.c.id)
+        .limit(limit)
+        .offset(offset)
+    )
+    total = connection.execute(select(func.count()).select_from(_REPORTS).where(mine)).scalar_one()
+    return [Report.of(row) for row in connection.execute(query).mappings()], total
+
+
+def add_report(connection: Connection, report: StoredReport) -> bool:
+    """Add a report; return False if one with this id exists."""
+    return repository.add_new(connection, _REPORTS, **report.model_dump()) is not None
