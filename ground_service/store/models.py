@@ -743,6 +743,65 @@ class Telecommand(Base):
     window_id: Mapped[int | None] = mapped_column(Integer, index=True)
     carrier_id: Mapped[int | None] = mapped_column(BigInteger)
     mission_id: Mapped[int | None] = mapped_column(ForeignKey("missions.id"))
+    send_before_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
+
+
+class LinkRecord(Base):
+    """State of a connection to a ground station; one process at a time owns it.
+
+    `lease_utc_ns` is the end of the lease of the owner, wall time. `heard_utc_ns` is the mission time of the last
+    reception, `considered_utc_ns` the mission time up to which predicted contacts were compared with receptions.
+    """
+
+    __tablename__ = "links"
+    name: Mapped[str] = mapped_column(String(64), primary_key=True)
+    ccsds_id: Mapped[int] = mapped_column(Integer)
+    instance: Mapped[str] = mapped_column(String(96))
+    owner: Mapped[str | None] = mapped_column(String(96))
+    lease_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    state: Mapped[str] = mapped_column(String(16))
+    reason: Mapped[str | None] = mapped_column(Text)
+    octets: Mapped[int] = mapped_column(BigInteger)
+    heard_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
+    clock_offset_ns: Mapped[int | None] = mapped_column(BigInteger)
+    considered_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    send_requested: Mapped[int] = mapped_column(BigInteger)
+    send_done: Mapped[int] = mapped_column(BigInteger)
+    changed_utc_ns: Mapped[int] = mapped_column(BigInteger)
+
+
+class ContactRecord(Base):
+    """Contact over a link: open, ended or missed; times are mission time."""
+
+    __tablename__ = "contacts"
+    __table_args__ = (Index("ix_contacts_link_id", "link", "id"),)
+    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
+    link: Mapped[str] = mapped_column(String(64))
+    station: Mapped[str] = mapped_column(String(64))
+    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"))
+    state: Mapped[str] = mapped_column(String(16))
+    reason: Mapped[str | None] = mapped_column(Text)
+    start_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    stop_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
+    predicted_start_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
+    predicted_stop_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
+    octets: Mapped[int] = mapped_column(BigInteger)
+    telecommands: Mapped[int] = mapped_column(Integer)
+
+
+class Transmission(Base):
+    """Octets of telecommands for one link; `transmitted_utc_ns` (mission time) is NULL until they are on the wire."""
+
+    __tablename__ = "transmissions"
+    id: Mapped[int] = mapped_column(BigKey, primary_key=True)
+    link: Mapped[str] = mapped_column(String(64), index=True)
+    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"))
+    contact_id: Mapped[int | None] = mapped_column(BigInteger)
+    octets: Mapped[bytes] = mapped_column(LargeBinary)
+    telecommands: Mapped[list[int]] = mapped_column(JSON)
+    attempts: Mapped[int] = mapped_column(Integer)
+    taken_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    transmitted_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
 
 
 class CommandCounter(Base):

@@ -620,6 +620,7 @@ def upgrade() -> None:
         sa.Column("window_id", sa.Integer(), nullable=True),
         sa.Column("carrier_id", sa.BigInteger(), nullable=True),
         sa.Column("mission_id", sa.Integer(), nullable=True),
+        sa.Column("send_before_utc_ns", sa.BigInteger(), nullable=True),
         sa.ForeignKeyConstraint(
             ["mission_id"], ["missions.id"], name=op.f("fk_telecommands_mission_id_missions")
         ),
@@ -727,6 +728,59 @@ def upgrade() -> None:
         "ix_passes_vehicle_id_start_utc_ns", "passes", ["vehicle_id", "start_utc_ns"], unique=False
     )
     op.create_table(
+        "links",
+        sa.Column("name", sa.String(length=64), nullable=False),
+        sa.Column("ccsds_id", sa.Integer(), nullable=False),
+        sa.Column("instance", sa.String(length=96), nullable=False),
+        sa.Column("owner", sa.String(length=96), nullable=True),
+        sa.Column("lease_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("state", sa.String(length=16), nullable=False),
+        sa.Column("reason", sa.Text(), nullable=True),
+        sa.Column("octets", sa.BigInteger(), nullable=False),
+        sa.Column("heard_utc_ns", sa.BigInteger(), nullable=True),
+        sa.Column("clock_offset_ns", sa.BigInteger(), nullable=True),
+        sa.Column("considered_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("send_requested", sa.BigInteger(), nullable=False),
+        sa.Column("send_done", sa.BigInteger(), nullable=False),
+        sa.Column("changed_utc_ns", sa.BigInteger(), nullable=False),
+        sa.PrimaryKeyConstraint("name", name=op.f("pk_links")),
+    )
+    op.create_table(
+        "contacts",
+        sa.Column("id", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=False),
+        sa.Column("link", sa.String(length=64), nullable=False),
+        sa.Column("station", sa.String(length=64), nullable=False),
+        sa.Column("vehicle_id", sa.Integer(), nullable=False),
+        sa.Column("state", sa.String(length=16), nullable=False),
+        sa.Column("reason", sa.Text(), nullable=True),
+        sa.Column("start_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("stop_utc_ns", sa.BigInteger(), nullable=True),
+        sa.Column("predicted_start_utc_ns", sa.BigInteger(), nullable=True),
+        sa.Column("predicted_stop_utc_ns", sa.BigInteger(), nullable=True),
+        sa.Column("octets", sa.BigInteger(), nullable=False),
+        sa.Column("telecommands", sa.Integer(), nullable=False),
+        sa.ForeignKeyConstraint(["vehicle_id"], ["vehicles.id"], name=op.f("fk_contacts_vehicle_id_vehicles")),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_contacts")),
+    )
+    op.create_index("ix_contacts_link_id", "contacts", ["link", "id"], unique=False)
+    op.create_table(
+        "transmissions",
+        sa.Column("id", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=False),
+        sa.Column("link", sa.String(length=64), nullable=False),
+        sa.Column("vehicle_id", sa.Integer(), nullable=False),
+        sa.Column("contact_id", sa.BigInteger(), nullable=True),
+        sa.Column("octets", sa.LargeBinary(), nullable=False),
+        sa.Column("telecommands", sa.JSON(), nullable=False),
+        sa.Column("attempts", sa.Integer(), nullable=False),
+        sa.Column("taken_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("transmitted_utc_ns", sa.BigInteger(), nullable=True),
+        sa.ForeignKeyConstraint(
+            ["vehicle_id"], ["vehicles.id"], name=op.f("fk_transmissions_vehicle_id_vehicles")
+        ),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_transmissions")),
+    )
+    op.create_index(op.f("ix_transmissions_link"), "transmissions", ["link"], unique=False)
+    op.create_table(
         "pass_frames",
         sa.Column("pass_id", sa.Integer(), nullable=False),
         sa.Column("frame_number", sa.BigInteger(), nullable=False),
@@ -797,6 +851,9 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
+    op.drop_table("transmissions")
+    op.drop_table("contacts")
+    op.drop_table("links")
     op.drop_table("windows")
     op.drop_table("reports")
     op.drop_table("pass_frames")

@@ -1,0 +1,1 @@
+"""Links to ground stations: telemetry in, released telecommands out, contacts."""
