@@ -24,6 +24,7 @@ from ground_service.http.origins import LOOPBACK, SameOrigin
 from ground_service.http.proxies import ForwardedHeaders, TrustedProxies
 from ground_service.http.requests import PlainText
 from ground_service.http.uploads import UploadPool
+from ground_service.links.supervisor import LinkSupervisor
 from ground_service.routers import OPERATIONS
 from ground_service.settings import Settings
 from ground_service.web.live import live
@@ -79,6 +80,9 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         if inline_jobs or settings.resolved_broker_url() is None:
             app.state.dispatcher.resume()
         app.state.follow_up.drain()
+        supervisor = LinkSupervisor(ground) if settings.links else None
+        if supervisor is not None:
+            supervisor.start()
         app.state.sockets = Sockets(
             ground,
             open_without_users=app.state.open_without_users,
@@ -95,6 +99,8 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
             for chore in chores:
                 chore.cancel()
             await asyncio.gather(*chores, return_exceptions=True)
+            if supervisor is not None:
+                await asyncio.to_thread(supervisor.stop)
             await asyncio.to_thread(app.state.uploads.close)
             app.state.dispatcher.close()
             ground.close()

@@ -36,6 +36,7 @@ OPERATIONS = (
     Router("ground_service.missions.routes", "missions", "missions"),
     Router("ground_service.timekeeping.routes", "timekeeping", "spacecraft"),
     Router("ground_service.planning.routes", "planning", "windows"),
+    Router("ground_service.links.routes", "links", "links"),
     Router("ground_service.commanding.routes", "telecommands", "telecommands"),
     Router("ground_service.alarms.routes", "alarms", "alarms"),
     Router("ground_service.regression.routes", "regressions", "regressions"),

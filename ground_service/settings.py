@@ -71,6 +71,10 @@ class Settings(BaseSettings):
         pattern=r"^[A-Za-z0-9.:-]+:[0-9]{1,5}$",
         description="HOST:PORT of the console of a payload flown live, for the live page",
     )
+    links: bool = Field(
+        default=True,
+        description="Operate the links of mission descriptions in `linna serve`; false where `linna link run` does",
+    )
     log_format: Literal["text", "json"] = Field(default="text", description="Form of the log on stderr")
     rate_limit_per_s: float = Field(
         default=200.0, ge=0.0, description="Requests a second that one caller may make; 0: any number"

@@ -36,7 +36,7 @@ GROUPS: dict[str, tuple[str, str]] = {
     "dataset": ("dataset", "build, check and summarise detector data sets"),
     "detector": ("detector", "train, export, evaluate and run the crater detector"),
     "tm": ("tm", "decode and check telemetry; export the dictionary as ICD and XTCE"),
-    "link": ("link", "determine the link settings of a recorded downlink, with the evidence"),
+    "link": ("link", "link settings of a recorded downlink; links to ground stations and their contacts"),
     "mission": ("mission", "write, check, add, list and show mission descriptions"),
     "ingest": ("ingest", "ingest downlink files, pass archives or live telemetry"),
     "pass": ("pass_", "list and show passes"),

@@ -19,6 +19,7 @@ from ground_service.errors import InvalidInput
 from ground_service.evaluation.model import PassFigures, Report, ReportOverview
 from ground_service.ingest.model import Ingest, IngestAccepted
 from ground_service.jobs.model import Job
+from ground_service.links.model import Contacts, Link
 from ground_service.missions.model import MissionDetail, MissionRevision
 from ground_service.passes.model import (
     Completeness,
@@ -318,6 +319,26 @@ class Client(Connection):
     def get_uplink_state(self, spacecraft_id: int, *, instance: str = "flight") -> UplinkState:
         """Return the state of the telecommand receiver according to the newest telemetry."""
         return self._get(UplinkState, f"/spacecraft/{spacecraft_id}/uplink", instance=instance)
+
+    # Links and contacts
+
+    def list_links(self) -> Listing[Link]:
+        """List the links with their state."""
+        return self._list(Link, "/links", paged=False)
+
+    def get_link(self, name: str) -> Link:
+        """Return a link with its state."""
+        return self._get(Link, f"/links/{_part(name)}")
+
+    def send_link(self, name: str) -> Link:
+        """Have the released telecommands sent now, in a contact or not."""
+        return self._post(Link, f"/links/{_part(name)}/send")
+
+    def list_contacts(
+        self, *, since: str | None = None, until: str | None = None, link: str | None = None
+    ) -> Contacts:
+        """Return contacts that took place, were missed or are predicted."""
+        return self._get(Contacts, "/contacts", since=since, until=until, link=link)
 
     # Time correlation
 

@@ -10,6 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from tmtc.codes import FAILURES as _CODES
+
+_FAILURE_CODES = {name: code for code, name in _CODES}
+
 ACCEPTED, NOT_ACCEPTED, STARTED, NOT_STARTED = 1, 2, 3, 4
 PROGRESS, PROGRESS_FAILED, COMPLETED, NOT_COMPLETED, NOT_ROUTED = 5, 6, 7, 8, 10
 
@@ -24,6 +28,9 @@ STAGES = {
     NOT_COMPLETED: "not completed",
     NOT_ROUTED: "not routed",
 }
+DUPLICATE = _FAILURE_CODES["duplicate"]
+"""Failure code of a command that the payload had accepted before: it was transmitted again."""
+
 FAILURES = (NOT_ACCEPTED, NOT_STARTED, PROGRESS_FAILED, NOT_COMPLETED, NOT_ROUTED)
 
 
@@ -72,7 +79,11 @@ def fate_of(command: SentCommand, reports: Sequence[VerificationReport], now_utc
             key=lambda report: (report.ticks, report.subtype, report.step or 0),
         )
     )
-    seen = {report.subtype for report in mine}
+    # A transmission that may have been lost is repeated: the second copy is refused as a duplicate of the first.
+    seen = {
+        ACCEPTED if report.subtype == NOT_ACCEPTED and report.failure_code == DUPLICATE else report.subtype
+        for report in mine
+    }
     if seen & set(FAILURES):
         state = "failed"
     elif COMPLETED in seen:

@@ -94,6 +94,7 @@ class CommandRecord(Entity):
     window_id: int | None
     carrier_id: int | None
     mission_id: int | None
+    send_before_utc_ns: int | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,14 +9,14 @@ goes into the audit log in the transaction that makes it.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection
 
 from ground_service.access.service import audit
-from ground_service.clock import utc_now_ns
+from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.commanding import store
 from ground_service.commanding.approval import DEFAULT_POLICY, ApprovalPolicy
 from ground_service.commanding.model import CommandOctets, CommandRecord, CommandView, UplinkState
@@ -175,16 +175,36 @@ def take_uplink(
     """
     with ground.database.writing() as connection:
         vehicle = vehicle_id(connection, spacecraft_id, instance)
-        lock_spacecraft(connection, vehicle)
-        records = store.send_released(connection, vehicle, utc_now_ns())
-        ids = [record.id for record in records]
-        for command_id in ids:
-            _note(connection, actor, "send", command_id, "sent", {})
-        if ids:
-            publish(connection, CommandsSent(vehicle_id=vehicle, telecommands=tuple(ids)))
+        return take_released(connection, vehicle, spacecraft_id, framed=framed, actor=actor)
+
+
+def take_released(
+    connection: Connection, vehicle: int, spacecraft_id: int, *, framed: bool, actor: str
+) -> tuple[bytes, list[int]]:
+    """Do what `take_uplink` does, within the caller's transaction.
+
+    Commands whose time for transmission has passed stay released.
+    """
+    lock_spacecraft(connection, vehicle)
+    records = store.send_released(connection, vehicle, utc_now_ns(), mission_now_ns())
+    ids = [record.id for record in records]
+    for command_id in ids:
+        _note(connection, actor, "send", command_id, "sent", {})
+    if ids:
+        publish(connection, CommandsSent(vehicle_id=vehicle, telecommands=tuple(ids)))
     packets = [record.octets for record in records if record.octets is not None]
     stream = UplinkEncoder(spacecraft_id).encode(packets) if framed else b"".join(packets)
     return stream, ids
+
+
+def are_unreported(connection: Connection, ids: Sequence[int]) -> bool:
+    """Return whether telemetry shows nothing of sent telecommands, and all of them may still be carried out."""
+    for key in ids:
+        view = store.get_view(connection, key, utc_now_ns())
+        before = view.record.send_before_utc_ns
+        if view.state != "sent" or (before is not None and before <= mission_now_ns()):
+            return False
+    return True
 
 
 def note_timeouts(ground: Ground, since_utc_ns: int, until_utc_ns: int) -> list[int]:

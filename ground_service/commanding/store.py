@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import BigInteger, Connection, cast, func, select, update
+from sqlalchemy import BigInteger, Connection, cast, func, or_, select, update
 from sqlalchemy.sql import Select
 
 from ground_service.commanding.core import SentCommand, VerificationReport, fate_of
@@ -88,8 +88,12 @@ def set_carrier(connection: Connection, command_id: int, carrier_id: int) -> Non
     repository.change(connection, TELECOMMANDS, command_id, carrier_id=carrier_id)
 
 
-def send_released(connection: Connection, vehicle: int, now_utc_ns: int) -> list[CommandRecord]:
+def send_released(
+    connection: Connection, vehicle: int, now_utc_ns: int, mission_utc_ns: int
+) -> list[CommandRecord]:
     """Move the released telecommands of a vehicle, and those that they carry, to sent.
+
+    Those whose time for transmission has passed at `mission_utc_ns` stay released.
 
     Return the released ones in order of release. The caller holds the lock of the spacecraft. Verification
     reports after the newest one so far count.
@@ -98,12 +102,31 @@ def send_released(connection: Connection, vehicle: int, now_utc_ns: int) -> list
         select(func.max(VERIFICATIONS.c.ticks)).where(*_readable_reports(connection, vehicle))
     ).scalar()
     sent = {"sent_utc_ns": now_utc_ns, "sent_after_ticks": -1 if newest is None else int(newest)}
-    mine = [TELECOMMANDS.c.vehicle_id == vehicle, TELECOMMANDS.c.state == "released"]
+    mine = [TELECOMMANDS.c.vehicle_id == vehicle, *_sendable(mission_utc_ns)]
     rows = move_all(connection, TELECOMMAND, mine, "sent", **sent)
     rows.sort(key=lambda row: (row["decided_utc_ns"], row["id"]))
     carried = TELECOMMANDS.c.carrier_id.in_([row["id"] for row in rows])
     move_all(connection, TELECOMMAND, [carried], "sent", **sent)
     return [CommandRecord.of(row) for row in rows]
+
+
+def count_released(connection: Connection, ccsds_id: int, instance: str, mission_utc_ns: int) -> int:
+    """Return the number of released telecommands of a spacecraft that may still be sent."""
+    vehicles = repository.VEHICLES
+    query = (
+        select(func.count())
+        .select_from(TELECOMMANDS)
+        .join(vehicles, vehicles.c.id == TELECOMMANDS.c.vehicle_id)
+        .where(vehicles.c.ccsds_id == ccsds_id, vehicles.c.instance == instance, *_sendable(mission_utc_ns))
+    )
+    return int(connection.execute(query).scalar_one())
+
+
+def limit_sending(connection: Connection, ids: Sequence[int], before_utc_ns: int) -> None:
+    """Enter the mission time from which telecommands are no longer sent."""
+    connection.execute(
+        update(TELECOMMANDS).where(TELECOMMANDS.c.id.in_(ids)).values(send_before_utc_ns=before_utc_ns)
+    )
 
 
 def note_timeout(connection: Connection, command_id: int, now_utc_ns: int) -> bool:
@@ -232,6 +255,11 @@ def _issued(issued: CommandOctets, actor: str, now_utc_ns: int) -> dict[str, Any
         "decided_by": actor,
         "decided_utc_ns": now_utc_ns,
     }
+
+
+def _sendable(mission_utc_ns: int) -> tuple[Any, ...]:
+    before = TELECOMMANDS.c.send_before_utc_ns
+    return (TELECOMMANDS.c.state == "released", or_(before.is_(None), before > mission_utc_ns))
 
 
 def _readable_reports(connection: Connection, vehicle: int) -> tuple[Any, ...]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import os
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -56,42 +57,81 @@ class Spool:
 
     def recover(self) -> None:
         """Ingest what an earlier run left behind."""
+        self.open()
+        self.drain()
+
+    def open(self) -> int:
+        """Prepare the folder; return the octets that an earlier run left behind, for `drain`."""
         try:
             make_durable_folder(self.folder)
             current = self._current
             if current.exists() and current.stat().st_size:
                 replace_durably(current, self._sealed(self._first_free()))
             self._next = self._first_free()
+            return sum(path.stat().st_size for path in self.folder.glob("*.segment"))
         except OSError as error:
             raise storage_error(error, self.folder) from None
-        self._drain()
 
     def take(self, octets: bytes) -> None:
         """Keep octets; a full segment is ingested."""
-        try:
-            if self._stream is None:
-                self._stream = self._current.open("ab", buffering=0)
-            self._stream.write(octets)
-        except OSError as error:
-            raise storage_error(error, self.folder) from None
-        self._size += len(octets)
+        self.keep(octets)
         if self._size >= SEGMENT_OCTETS:
             self.seal()
 
+    def keep(self, octets: bytes, *, durably: bool = False) -> None:
+        """Write octets to the current segment, and to the disk if that is required."""
+        try:
+            if self._stream is None:
+                self._stream = self._current.open("ab", buffering=0)
+            rest = memoryview(octets)
+            while rest:
+                rest = rest[self._stream.write(rest) :]
+            if durably:
+                os.fdatasync(self._stream.fileno())
+        except OSError as error:
+            raise storage_error(error, self.folder) from None
+        self._size += len(octets)
+
     def pause(self) -> None:
         """The sender is silent: ingest what came, unless it is less than one frame or packet."""
-        if self._size and _holds_a_unit(self._current.read_bytes()):
+        if self.holds_a_unit():
             self.seal()
+
+    def holds_a_unit(self) -> bool:
+        """Return whether the current segment holds at least one frame or packet."""
+        return self._size > 0 and _holds_a_unit(self._current.read_bytes())
 
     def seal(self) -> None:
         """Ingest what came so far."""
+        if self.cut() is not None:
+            self.drain()
+
+    @property
+    def size(self) -> int:
+        """Octets of the current segment."""
+        return self._size
+
+    def cut(self) -> Path | None:
+        """End the current segment, for `drain`, which may run in another thread; return its file, None if empty."""
         if self._size == 0:
-            return
+            return None
         self._stream.close()
         self._stream, self._size = None, 0
-        replace_durably(self._current, self._sealed(self._next))
+        sealed = self._sealed(self._next)
+        replace_durably(self._current, sealed)
         self._next += 1
-        self._drain()
+        return sealed
+
+    def drain(self) -> None:
+        """Ingest the segments that have ended, in order."""
+        for path in sorted(self.folder.glob("*.segment")):
+            try:
+                self.report(path, self.ingest(path))
+            except (StoreError, OSError):
+                raise
+            except GroundError as error:
+                self.report(path, error)
+            path.unlink(missing_ok=True)
 
     @property
     def _current(self) -> Path:
@@ -103,16 +143,6 @@ class Spool:
     def _first_free(self) -> int:
         numbers = [int(path.stem) for path in self.folder.glob("*.segment") if path.stem.isdigit()]
         return max(numbers, default=-1) + 1
-
-    def _drain(self) -> None:
-        for path in sorted(self.folder.glob("*.segment")):
-            try:
-                self.report(path, self.ingest(path))
-            except (StoreError, OSError):
-                raise
-            except GroundError as error:
-                self.report(path, error)
-            path.unlink()
 
 
 def _holds_a_unit(octets: bytes) -> bool:

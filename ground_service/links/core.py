@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from lunar.arrays import BoolArray, IntArray
@@ -41,7 +41,7 @@ def predict_contacts(
     stations: Sequence[GroundStation],
     start_utc_ns: int,
     stop_utc_ns: int,
-    outages: dict[str, Sequence[Span]] | None = None,
+    outages: Mapping[str, Sequence[Span]] | None = None,
 ) -> tuple[PredictedContact, ...]:
     """Return the contacts of stations between two times as far as the ephemeris reaches, in order of time.
 
@@ -79,7 +79,9 @@ def without(span: Span, closed: Sequence[Span]) -> list[Span]:
     return parts
 
 
-def contact_at(contacts: Sequence[PredictedContact], utc_ns: int, margin_ns: int = 0) -> PredictedContact | None:
+def contact_at(
+    contacts: Sequence[PredictedContact], utc_ns: int, margin_ns: int = 0
+) -> PredictedContact | None:
     """Return the contact that contains a time, the margin before and after included; None without any."""
     for one in contacts:
         if one.start_utc_ns - margin_ns <= utc_ns <= one.stop_utc_ns + margin_ns:

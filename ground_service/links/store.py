@@ -7,6 +7,7 @@ from typing import Any
 
 from sqlalchemy import Connection, RowMapping, func, or_, select, update
 
+from ground_service.links.model import ContactState, LinkState
 from ground_service.store import repository
 
 _LINKS, _CONTACTS, _TRANSMISSIONS = repository.LINKS, repository.CONTACTS, repository.TRANSMISSIONS
@@ -21,7 +22,7 @@ class LinkRow:
     instance: str
     owner: str | None
     lease_utc_ns: int
-    state: str
+    state: LinkState
     reason: str | None
     octets: int
     heard_utc_ns: int | None
@@ -40,7 +41,7 @@ class ContactRow:
     link: str
     station: str
     vehicle_id: int
-    state: str
+    state: ContactState
     reason: str | None
     start_utc_ns: int
     stop_utc_ns: int | None
@@ -102,14 +103,18 @@ def acquire(
         changed_utc_ns=wall_utc_ns,
     )
     free = or_(_LINKS.c.owner.is_(None), _LINKS.c.lease_utc_ns < wall_utc_ns)
-    taken = update(_LINKS).where(_LINKS.c.name == name, free).values(
-        owner=owner,
-        lease_utc_ns=until_utc_ns,
-        ccsds_id=ccsds_id,
-        instance=instance,
-        state="waiting",
-        reason=None,
-        changed_utc_ns=wall_utc_ns,
+    taken = (
+        update(_LINKS)
+        .where(_LINKS.c.name == name, free)
+        .values(
+            owner=owner,
+            lease_utc_ns=until_utc_ns,
+            ccsds_id=ccsds_id,
+            instance=instance,
+            state="waiting",
+            reason=None,
+            changed_utc_ns=wall_utc_ns,
+        )
     )
     renewed = (
         update(_LINKS)
@@ -122,7 +127,13 @@ def acquire(
 def release(connection: Connection, name: str, owner: str, wall_utc_ns: int) -> None:
     """Give a link back, so that another process need not wait for the end of the lease."""
     mine = (_LINKS.c.name == name, _LINKS.c.owner == owner)
-    values = {"owner": None, "lease_utc_ns": 0, "state": "waiting", "reason": None, "changed_utc_ns": wall_utc_ns}
+    values = {
+        "owner": None,
+        "lease_utc_ns": 0,
+        "state": "waiting",
+        "reason": None,
+        "changed_utc_ns": wall_utc_ns,
+    }
     connection.execute(update(_LINKS).where(*mine).values(**values))
 
 
@@ -136,6 +147,14 @@ def add_octets(connection: Connection, name: str, octets: int) -> None:
     """Count received octets of a link."""
     statement = update(_LINKS).where(_LINKS.c.name == name).values(octets=_LINKS.c.octets + octets)
     connection.execute(statement)
+
+
+def note_heard(connection: Connection, name: str, heard_utc_ns: int | None, offset_ns: int | None) -> None:
+    """Record when something was received over a link, and the offset of the station's clock; None changes nothing."""
+    given = {"heard_utc_ns": heard_utc_ns, "clock_offset_ns": offset_ns}
+    values = {key: value for key, value in given.items() if value is not None}
+    if values:
+        connection.execute(update(_LINKS).where(_LINKS.c.name == name).values(**values))
 
 
 def request_send(connection: Connection, name: str) -> None:
@@ -161,7 +180,9 @@ def change_contact(connection: Connection, contact_id: int, **values: Any) -> No
     connection.execute(update(_CONTACTS).where(_CONTACTS.c.id == contact_id).values(**values))
 
 
-def count_in_contact(connection: Connection, contact_id: int, *, octets: int = 0, telecommands: int = 0) -> None:
+def count_in_contact(
+    connection: Connection, contact_id: int, *, octets: int = 0, telecommands: int = 0
+) -> None:
     """Count octets received and telecommands sent in a contact."""
     connection.execute(
         update(_CONTACTS)
@@ -231,16 +252,18 @@ def repeat_transmission(connection: Connection, transmission_id: int, link: str)
     )
 
 
-def note_transmitted(connection: Connection, transmission_id: int, contact_id: int | None, utc_ns: int) -> None:
+def note_transmitted(
+    connection: Connection, transmission_id: int, contact_id: int | None, utc_ns: int
+) -> None:
     """Record that the octets of a transmission are on the wire."""
     connection.execute(
         update(_TRANSMISSIONS)
         .where(_TRANSMISSIONS.c.id == transmission_id)
-        .values(
-            transmitted_utc_ns=utc_ns, contact_id=contact_id, attempts=_TRANSMISSIONS.c.attempts + 1
-        )
+        .values(transmitted_utc_ns=utc_ns, contact_id=contact_id, attempts=_TRANSMISSIONS.c.attempts + 1)
     )
 
 
 def _transmission(row: RowMapping) -> TransmissionRow:
-    return TransmissionRow(**{**row, "octets": bytes(row["octets"]), "telecommands": tuple(row["telecommands"])})
+    return TransmissionRow(
+        **{**row, "octets": bytes(row["octets"]), "telecommands": tuple(row["telecommands"])}
+    )

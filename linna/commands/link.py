@@ -1,4 +1,4 @@
-"""`linna link check`: link settings of a recorded downlink, with the evidence."""
+"""`linna link`: link settings of a recorded downlink; links to stations, their state, operation and contacts."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from linna.output import add_json_flag, emit
+from linna.commands._ground import add_operator_options, add_service_options, ground_client, open_service
+from linna.output import add_json_flag, emit, log
 
 if TYPE_CHECKING:
+    from ground_service.links.model import Link
     from tmtc.link_check import LinkProposal
 
 INCONCLUSIVE = 3
@@ -40,6 +42,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add_json_flag(checking)
     checking.set_defaults(handler=check)
+    _configure_operation(actions)
 
 
 def check(arguments: argparse.Namespace) -> int:
@@ -128,3 +131,91 @@ def _named(settings: Mapping[str, Any]) -> str:
 
 def _share(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.0f} %"
+
+
+def _configure_operation(actions: Any) -> None:
+    listing = actions.add_parser("list", help="list the links of the mission descriptions with their state")
+    listing.set_defaults(handler=list_all)
+    sending = actions.add_parser("send", help="send the released telecommands now, in a contact or not")
+    sending.add_argument("name", metavar="LINK")
+    sending.set_defaults(handler=send)
+    contacts = actions.add_parser("contacts", help="list past, missed and predicted contacts")
+    contacts.add_argument("--since", metavar="UTC", help="default: a day before mission time")
+    contacts.add_argument("--until", metavar="UTC", help="default: two days after --since")
+    contacts.add_argument("--link", metavar="LINK")
+    contacts.set_defaults(handler=list_contacts)
+    for one in (listing, sending, contacts):
+        add_operator_options(one)
+        add_json_flag(one)
+    running = actions.add_parser(
+        "run",
+        help="operate links in a process of their own",
+        description="Operate links until stopped, in place of `linna serve` (LINNA_LINKS=false).",
+    )
+    running.add_argument("names", nargs="*", metavar="LINK", help="default: all links")
+    add_service_options(running)
+    running.set_defaults(handler=operate)
+
+
+def list_all(arguments: argparse.Namespace) -> int:
+    with ground_client(arguments) as service:
+        found = list(service.list_links())
+    lines = [_line(one) for one in found]
+    figures = {"links": [one.model_dump(mode="json") for one in found]}
+    emit(arguments, figures, text="\n".join(lines) or "no mission description states a link")
+    return 0
+
+
+def send(arguments: argparse.Namespace) -> int:
+    with ground_client(arguments) as service:
+        found = service.send_link(arguments.name)
+    emit(arguments, found.model_dump(mode="json"), text=_line(found))
+    return 0
+
+
+def list_contacts(arguments: argparse.Namespace) -> int:
+    with ground_client(arguments) as service:
+        found = service.list_contacts(since=arguments.since, until=arguments.until, link=arguments.link)
+    lines = [
+        f"{one.start}  {one.stop or 'open':<27}  {one.state:<9} {one.link} ({one.station})"
+        f"  {one.octets} octets, {one.telecommands} telecommands{'  ' + one.reason if one.reason else ''}"
+        for one in found.contacts
+    ]
+    lines += [f"{name}: not predicted: {reason}" for name, reason in found.unpredicted.items()]
+    emit(arguments, found.model_dump(mode="json"), text="\n".join(lines) or "no contacts")
+    return 0
+
+
+def operate(arguments: argparse.Namespace) -> int:
+    import signal
+    import threading
+
+    from ground_service.links.service import declared_links
+    from ground_service.links.supervisor import LinkSupervisor
+    from linna.errors import UsageError
+
+    stopping = threading.Event()
+    with open_service(arguments) as ground:
+        names = frozenset(arguments.names)
+        unknown = sorted(names.difference(declared_links(ground)))
+        if unknown:
+            raise UsageError(
+                f"{unknown[0]}: expected a link of a mission description, found none of this name"
+            )
+        supervisor = LinkSupervisor(ground, names or None)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stopping.set())
+        supervisor.start()
+        log(f"links: {', '.join(sorted(names)) or 'all'}")
+        while not stopping.wait(0.5):
+            pass
+        supervisor.stop()
+    return 0
+
+
+def _line(link: Link) -> str:
+    reason = f": {link.reason}" if link.reason else ""
+    waiting = f", {link.unsent} telecommands wait" if link.unsent else ""
+    return (
+        f"{link.name} ({link.station or 'no station'}): {link.state}{reason}; {link.octets} octets{waiting}"
+    )

@@ -1,0 +1,531 @@
+"""Use cases of links: declared links with their state, contacts, and transmissions of released telecommands.
+
+A transmission is taken in one transaction with the state "sent" of its telecommands, and marked when its octets are on
+the wire. A process that ends between the two leaves a pending transmission, which the next owner of the link sends.
+Telecommands of which nothing was heard by the next contact are transmitted again: the payload refuses the second copy
+of a command that it has accepted.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from pathlib import Path
+
+from sqlalchemy import Connection
+
+from ground_service.access.service import audit
+from ground_service.clock import mission_now_ns, utc_now_ns
+from ground_service.commanding import service as commanding
+from ground_service.commanding.store import count_released
+from ground_service.ephemerides import store as ephemerides
+from ground_service.errors import Conflict, InvalidInput, NotFound
+from ground_service.events import ContactEnded, ContactMissed, ContactStarted, LinkChanged, publish
+from ground_service.ground import Ground
+from ground_service.http.times import UtcTime
+from ground_service.links import core, store
+from ground_service.links.core import NS, PredictedContact
+from ground_service.links.model import Contacts, Link, LinkContact, LinkState
+from ground_service.links.store import ContactRow, LinkRow, TransmissionRow
+from ground_service.missions import store as missions
+from ground_service.missions.model import Link as LinkSection
+from ground_service.missions.model import StationConnection
+from ground_service.missions.stations import outages_of, station_of
+from ground_service.store.vehicles import get_vehicle, vehicle_id
+from lunar.ephemeris import Ephemeris
+from lunar.ephemeris_files import load_ephemeris
+
+ACTOR = "link"
+REPEAT_ATTEMPTS = 3
+REPEAT_WITHIN_NS = 7 * 86_400 * NS
+"""Older transmissions are not repeated: their commands have timed out."""
+
+PREDICT_LIMIT_NS = 31 * 86_400 * NS
+MISSED_SHORTEST_NS = 120 * NS
+"""Shorter predicted contacts may be lost in the error of the ephemeris: they are not reported as missed."""
+
+MARGIN_NS = 120 * NS
+"""Receptions this long before or after a predicted contact belong to it."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeclaredLink:
+    """A link of a mission description in force; `stations` is its section `link`."""
+
+    spacecraft_id: int
+    link: StationConnection
+    stations: LinkSection
+
+    @property
+    def station(self) -> str:
+        """Name of the station; that of the link if it is not stated."""
+        return self.link.station or self.link.name
+
+
+def declared_links(ground: Ground) -> dict[str, DeclaredLink]:
+    """Return the links of the mission descriptions in force by name."""
+    with ground.database.reading() as connection:
+        return _declared(connection)
+
+
+def list_links(ground: Ground) -> list[Link]:
+    """Return all declared links with their state, by name."""
+    with ground.database.reading() as connection:
+        return [_link(connection, one) for _, one in sorted(_declared(connection).items())]
+
+
+def get_link(ground: Ground, name: str) -> Link:
+    """Return a declared link with its state.
+
+    Raises
+    ------
+    NotFound
+        No mission description in force declares it.
+    """
+    with ground.database.reading() as connection:
+        return _link(connection, _find(connection, name))
+
+
+def request_send(ground: Ground, name: str, *, actor: str) -> Link:
+    """Request that released telecommands are sent now, in a contact or not.
+
+    Raises
+    ------
+    NotFound
+        There is no such link.
+    Conflict
+        It has no uplink, or no process operates it.
+    """
+    with ground.database.writing() as connection:
+        declared = _find(connection, name)
+        if declared.link.uplink is None:
+            raise Conflict(f"link {name}: expected an uplink in the mission description, found none")
+        found = store.find_link(connection, name)
+        if found is None or found.owner is None or found.lease_utc_ns < utc_now_ns():
+            raise Conflict(
+                f"link {name}: expected a process that operates it ('linna serve' or 'linna link run'), found none"
+            )
+        store.request_send(connection, name)
+        audit(connection, actor, "send link", name, {})
+        return _link(connection, declared)
+
+
+def list_contacts(ground: Ground, start_utc_ns: int, stop_utc_ns: int, link: str | None = None) -> Contacts:
+    """Return stored and predicted contacts between two times.
+
+    Raises
+    ------
+    InvalidInput
+        The span is empty or too long.
+    NotFound
+        There is no such link.
+    """
+    if not 0 < stop_utc_ns - start_utc_ns <= PREDICT_LIMIT_NS:
+        days = PREDICT_LIMIT_NS // (86_400 * NS)
+        found = f"{(stop_utc_ns - start_utc_ns) / NS:.0f} s"
+        raise InvalidInput("contacts", "until", f"a time after since, by at most {days} days", found)
+    with ground.database.reading() as connection:
+        declared = _declared(connection)
+        if link is not None:
+            declared = {link: _find(connection, link)}
+        rows = store.contacts_between(connection, start_utc_ns, stop_utc_ns, link)
+        spacecraft = {
+            vehicle: get_vehicle(connection, vehicle).ccsds_id for vehicle in {row.vehicle_id for row in rows}
+        }
+    contacts = [_contact(row, spacecraft[row.vehicle_id]) for row in rows]
+    unpredicted = {}
+    for name, one in declared.items():
+        predicted, reason = predict(ground, one, start_utc_ns, stop_utc_ns)
+        if reason is not None:
+            unpredicted[name] = reason
+        mine = [row for row in rows if row.link == name]
+        contacts += [
+            _predicted(one, contact)
+            for contact in predicted
+            if not any(_belongs(row, contact) for row in mine)
+        ]
+    contacts.sort(key=lambda one: (one.start.utc_ns, one.link))
+    return Contacts(contacts=contacts, unpredicted=unpredicted)
+
+
+def predict(
+    ground: Ground, declared: DeclaredLink, start_utc_ns: int, stop_utc_ns: int
+) -> tuple[tuple[PredictedContact, ...], str | None]:
+    """Return the contacts of a link between two times, and the reason if they cannot be predicted."""
+    station = station_of(declared.stations, declared.link.station)
+    if station is None:
+        return (), "the mission description states no place of the station"
+    with ground.database.reading() as connection:
+        references = ephemerides.covering_ephemerides(connection, start_utc_ns, stop_utc_ns)
+    if not references:
+        return (), "no reference ephemeris covers the time"
+    ephemeris = _loaded(str(ground.files.path(references[0].sha256)))
+    outages = outages_of(declared.stations)
+    return core.predict_contacts(ephemeris, [station], start_utc_ns, stop_utc_ns, outages), None
+
+
+def acquire(ground: Ground, declared: DeclaredLink, owner: str, lease_ns: int) -> bool:
+    """Take or renew the lease of a link; return whether `owner` has it."""
+    now = utc_now_ns()
+    with ground.database.writing() as connection:
+        return store.acquire(
+            connection,
+            declared.link.name,
+            declared.spacecraft_id,
+            declared.link.instance,
+            owner=owner,
+            wall_utc_ns=now,
+            until_utc_ns=now + lease_ns,
+            mission_utc_ns=mission_now_ns(),
+        )
+
+
+def release(ground: Ground, name: str, owner: str) -> None:
+    """Give a link back."""
+    with ground.database.writing() as connection:
+        store.release(connection, name, owner, utc_now_ns())
+
+
+def change_state(ground: Ground, name: str, owner: str, state: str, reason: str | None) -> bool:
+    """Change the state of a link; return whether `owner` still has it."""
+    with ground.database.writing() as connection:
+        changed = store.change_link(
+            connection, name, owner, state=state, reason=reason, changed_utc_ns=utc_now_ns()
+        )
+        if changed:
+            publish(connection, LinkChanged(link=name, state=state, reason=reason))
+        return changed
+
+
+def find_open_contact(ground: Ground, name: str) -> ContactRow | None:
+    """Return the open contact of a link, which an earlier owner may have left."""
+    with ground.database.reading() as connection:
+        return store.open_contact(connection, name)
+
+
+def start_contact(ground: Ground, declared: DeclaredLink, utc_ns: int) -> ContactRow | None:
+    """Enter a contact that starts at a mission time and return it."""
+    predicted, _ = predict(ground, declared, utc_ns - MARGIN_NS, utc_ns + PREDICT_LIMIT_NS // 31)
+    now = core.contact_at(predicted, utc_ns, MARGIN_NS)
+    with ground.database.writing() as connection:
+        vehicle = vehicle_id(connection, declared.spacecraft_id, declared.link.instance)
+        key = store.add_contact(
+            connection,
+            link=declared.link.name,
+            station=declared.station,
+            vehicle_id=vehicle,
+            state="open",
+            start_utc_ns=utc_ns,
+            predicted_start_utc_ns=None if now is None else now.start_utc_ns,
+            predicted_stop_utc_ns=None if now is None else now.stop_utc_ns,
+            octets=0,
+            telecommands=0,
+        )
+        publish(
+            connection,
+            ContactStarted(
+                contact_id=key,
+                link=declared.link.name,
+                station=declared.station,
+                vehicle_id=vehicle,
+                start_utc_ns=utc_ns,
+            ),
+        )
+        return store.open_contact(connection, declared.link.name)
+
+
+def end_contact(ground: Ground, contact_id: int, name: str, stop_utc_ns: int) -> None:
+    """End the open contact of a link."""
+    with ground.database.writing() as connection:
+        found = store.open_contact(connection, name)
+        if found is None or found.id != contact_id:
+            return
+        stop = max(stop_utc_ns, found.start_utc_ns)
+        store.change_contact(connection, contact_id, state="ended", stop_utc_ns=stop)
+        publish(
+            connection,
+            ContactEnded(
+                contact_id=contact_id,
+                link=name,
+                station=found.station,
+                vehicle_id=found.vehicle_id,
+                start_utc_ns=found.start_utc_ns,
+                stop_utc_ns=stop,
+                octets=found.octets,
+                telecommands=found.telecommands,
+            ),
+        )
+
+
+def note_reception(
+    ground: Ground,
+    name: str,
+    contact_id: int | None,
+    octets: int,
+    heard_utc_ns: int | None,
+    offset_ns: int | None,
+) -> None:
+    """Count ingested octets of a link; `offset_ns` is that of the station's clock, None if unknown."""
+    with ground.database.writing() as connection:
+        store.add_octets(connection, name, octets)
+        if contact_id is not None:
+            store.count_in_contact(connection, contact_id, octets=octets)
+        store.note_heard(connection, name, heard_utc_ns, offset_ns)
+
+
+def note_missed(ground: Ground, declared: DeclaredLink, owner: str, now_utc_ns: int, why: str) -> int:
+    """Record the predicted contacts before a mission time in which nothing was received; return their number."""
+    name = declared.link.name
+    with ground.database.reading() as connection:
+        found = store.find_link(connection, name)
+    if found is None or declared.link.downlink is None or now_utc_ns <= found.considered_utc_ns:
+        return 0
+    since = max(found.considered_utc_ns, now_utc_ns - PREDICT_LIMIT_NS)
+    predicted, _ = predict(ground, declared, since - MARGIN_NS, now_utc_ns)
+    over = [
+        one
+        for one in predicted
+        if since < one.stop_utc_ns + MARGIN_NS <= now_utc_ns
+        and one.stop_utc_ns - one.start_utc_ns >= MISSED_SHORTEST_NS
+    ]
+    with ground.database.writing() as connection:
+        if not store.change_link(connection, name, owner, considered_utc_ns=now_utc_ns):
+            return 0
+        rows = store.contacts_between(connection, since - PREDICT_LIMIT_NS, now_utc_ns, name)
+        missed = [one for one in over if not any(_belongs(row, one) for row in rows)]
+        vehicle = vehicle_id(connection, declared.spacecraft_id, declared.link.instance) if missed else 0
+        for one in missed:
+            _add_missed(connection, declared, vehicle, one, why)
+    return len(missed)
+
+
+def send_due(ground: Ground, name: str) -> tuple[bool, int]:
+    """Return whether a transmission was requested, and the number of the request."""
+    with ground.database.reading() as connection:
+        found = store.find_link(connection, name)
+    if found is None:
+        return False, 0
+    return found.send_requested > found.send_done, found.send_requested
+
+
+def note_sent_request(ground: Ground, name: str, owner: str, number: int) -> None:
+    """Record that requests up to a number are done."""
+    with ground.database.writing() as connection:
+        store.change_link(connection, name, owner, send_done=number)
+
+
+def unsent(ground: Ground, declared: DeclaredLink) -> int:
+    """Return the number of telecommands that could be sent now: released ones, and pending transmissions."""
+    with ground.database.reading() as connection:
+        return _unsent(connection, declared) + sum(
+            len(one.telecommands) for one in store.pending_transmissions(connection, declared.link.name)
+        )
+
+
+def take_transmissions(ground: Ground, declared: DeclaredLink, owner: str) -> list[TransmissionRow]:
+    """Take the released telecommands for a link that `owner` has; return all its pending transmissions, in order."""
+    name = declared.link.name
+    with ground.database.reading() as connection:
+        if not _unsent(connection, declared):
+            return store.pending_transmissions(connection, name)
+    with ground.database.writing() as connection:
+        if not store.change_link(connection, name, owner, changed_utc_ns=utc_now_ns()):
+            return []
+        vehicle = vehicle_id(connection, declared.spacecraft_id, declared.link.instance)
+        octets, ids = commanding.take_released(
+            connection, vehicle, declared.spacecraft_id, framed=declared.link.format == "cltu", actor=ACTOR
+        )
+        if ids:
+            store.add_transmission(
+                connection,
+                link=name,
+                vehicle_id=vehicle,
+                octets=octets,
+                telecommands=ids,
+                attempts=0,
+                taken_utc_ns=mission_now_ns(),
+            )
+        return store.pending_transmissions(connection, name)
+
+
+def note_transmitted(ground: Ground, transmission: TransmissionRow, contact_id: int | None) -> None:
+    """Record that a transmission is on the wire."""
+    with ground.database.writing() as connection:
+        store.note_transmitted(connection, transmission.id, contact_id, mission_now_ns())
+        if contact_id is not None:
+            store.count_in_contact(connection, contact_id, telecommands=len(transmission.telecommands))
+
+
+def repeat_unconfirmed(ground: Ground, declared: DeclaredLink, contact: ContactRow) -> int:
+    """Have transmissions of earlier contacts sent again of which telemetry has shown nothing since; their number.
+
+    A transmission counts as lost when a contact with telemetry has ended after it and none of its telecommands was
+    reported. It is repeated in a later contact, at most `REPEAT_ATTEMPTS` times in total.
+    """
+    if declared.link.uplink is None:
+        return 0
+    with ground.database.reading() as connection:
+        heard = store.last_contact_stop(connection, contact.vehicle_id, contact.id)
+        if heard is None:
+            return 0
+        earlier = store.transmitted_before(
+            connection,
+            contact.vehicle_id,
+            min(heard, contact.start_utc_ns),
+            contact.start_utc_ns - REPEAT_WITHIN_NS,
+            REPEAT_ATTEMPTS,
+        )
+        lost = [
+            one
+            for one in earlier
+            if commanding.are_unreported(connection, one.telecommands, mission_now_ns())
+        ]
+    if lost:
+        with ground.database.writing() as connection:
+            for one in lost:
+                store.repeat_transmission(connection, one.id, declared.link.name)
+                audit(
+                    connection,
+                    ACTOR,
+                    "repeat transmission",
+                    str(one.id),
+                    {"telecommands": list(one.telecommands)},
+                )
+    return len(lost)
+
+
+def _add_missed(
+    connection: Connection, declared: DeclaredLink, vehicle: int, contact: PredictedContact, why: str
+) -> None:
+    key = store.add_contact(
+        connection,
+        link=declared.link.name,
+        station=declared.station,
+        vehicle_id=vehicle,
+        state="missed",
+        reason=why,
+        start_utc_ns=contact.start_utc_ns,
+        stop_utc_ns=contact.stop_utc_ns,
+        predicted_start_utc_ns=contact.start_utc_ns,
+        predicted_stop_utc_ns=contact.stop_utc_ns,
+        octets=0,
+        telecommands=0,
+    )
+    publish(
+        connection,
+        ContactMissed(
+            contact_id=key,
+            link=declared.link.name,
+            station=declared.station,
+            vehicle_id=vehicle,
+            start_utc_ns=contact.start_utc_ns,
+            stop_utc_ns=contact.stop_utc_ns,
+            reason=why,
+        ),
+    )
+
+
+def _declared(connection: Connection) -> dict[str, DeclaredLink]:
+    return {
+        link.name: DeclaredLink(spacecraft, link, mission.link)
+        for spacecraft, mission in missions.missions_in_force(connection).items()
+        for link in mission.links or ()
+    }
+
+
+def _find(connection: Connection, name: str) -> DeclaredLink:
+    declared = _declared(connection)
+    if name not in declared:
+        raise NotFound("link", name[:80])
+    return declared[name]
+
+
+def _link(connection: Connection, declared: DeclaredLink) -> Link:
+    link = declared.link
+    row = store.find_link(connection, link.name)
+    pending = store.pending_transmissions(connection, link.name)
+    owned = row is not None and row.owner is not None and row.lease_utc_ns >= utc_now_ns()
+    state, reason = _state(row, owned)
+    fault = core.clock_fault(None if row is None else row.clock_offset_ns)
+    heard = None if row is None else row.heard_utc_ns
+    offset = None if row is None else row.clock_offset_ns
+    return Link(
+        name=link.name,
+        kind=link.kind,
+        station=link.station,
+        spacecraft_id=declared.spacecraft_id,
+        instance=link.instance,
+        downlink=link.downlink,
+        uplink=link.uplink,
+        send=link.send,
+        state=state,
+        reason="; ".join(one for one in (reason, fault) if one) or None,
+        owner=row.owner if row is not None and owned else None,
+        octets=0 if row is None else row.octets,
+        heard=None if heard is None else UtcTime(heard),
+        clock_offset_s=None if offset is None else offset / NS,
+        unsent=_unsent(connection, declared),
+        unconfirmed=len(pending),
+        changed=UtcTime(0 if row is None else row.changed_utc_ns),
+    )
+
+
+def _state(row: LinkRow | None, owned: bool) -> tuple[LinkState, str | None]:
+    if row is None or not owned:
+        return "waiting", "no process operates it"
+    return row.state, row.reason
+
+
+def _unsent(connection: Connection, declared: DeclaredLink) -> int:
+    if declared.link.uplink is None:
+        return 0
+    return count_released(connection, declared.spacecraft_id, declared.link.instance, mission_now_ns())
+
+
+def _contact(row: ContactRow, spacecraft_id: int) -> LinkContact:
+    def time(utc_ns: int | None) -> UtcTime | None:
+        return None if utc_ns is None else UtcTime(utc_ns)
+
+    return LinkContact(
+        id=row.id,
+        link=row.link,
+        station=row.station,
+        spacecraft_id=spacecraft_id,
+        state=row.state,
+        reason=row.reason,
+        start=UtcTime(row.start_utc_ns),
+        stop=time(row.stop_utc_ns),
+        predicted_start=time(row.predicted_start_utc_ns),
+        predicted_stop=time(row.predicted_stop_utc_ns),
+        octets=row.octets,
+        telecommands=row.telecommands,
+    )
+
+
+def _predicted(declared: DeclaredLink, contact: PredictedContact) -> LinkContact:
+    start, stop = UtcTime(contact.start_utc_ns), UtcTime(contact.stop_utc_ns)
+    return LinkContact(
+        id=None,
+        link=declared.link.name,
+        station=declared.station,
+        spacecraft_id=declared.spacecraft_id,
+        state="predicted",
+        reason=None,
+        start=start,
+        stop=stop,
+        predicted_start=start,
+        predicted_stop=stop,
+        octets=0,
+        telecommands=0,
+    )
+
+
+def _belongs(row: ContactRow, contact: PredictedContact) -> bool:
+    """Return whether a stored contact is a predicted one."""
+    stop = row.stop_utc_ns if row.stop_utc_ns is not None else max(row.start_utc_ns, contact.start_utc_ns)
+    return row.start_utc_ns <= contact.stop_utc_ns + MARGIN_NS and contact.start_utc_ns - MARGIN_NS <= stop
+
+
+@functools.lru_cache(maxsize=2)
+def _loaded(path: str) -> Ephemeris:
+    return load_ephemeris(Path(path))
