@@ -281,15 +281,18 @@ def note_missed(ground: Ground, declared: DeclaredLink, owner: str, now_utc_ns: 
     if found is None or declared.link.downlink is None or now_utc_ns <= found.considered_utc_ns:
         return 0
     since = max(found.considered_utc_ns, now_utc_ns - PREDICT_LIMIT_NS)
-    predicted, _ = predict(ground, declared, since - MARGIN_NS, now_utc_ns)
+    predicted, _ = predict(ground, declared, since - 2 * MARGIN_NS, now_utc_ns)
     over = [
         one
         for one in predicted
-        if since < one.stop_utc_ns + MARGIN_NS <= now_utc_ns
+        if one.stop_utc_ns + MARGIN_NS <= now_utc_ns
         and one.stop_utc_ns - one.start_utc_ns >= MISSED_SHORTEST_NS
     ]
+    # A contact that may still go on is looked at again from its start.
+    going_on = [one.start_utc_ns for one in predicted if one.stop_utc_ns + MARGIN_NS > now_utc_ns]
+    considered = max(min([now_utc_ns, *(start - MARGIN_NS for start in going_on)]), since)
     with ground.database.writing() as connection:
-        if not store.change_link(connection, name, owner, considered_utc_ns=now_utc_ns):
+        if not store.change_link(connection, name, owner, considered_utc_ns=considered):
             return 0
         rows = store.contacts_between(connection, since - PREDICT_LIMIT_NS, now_utc_ns, name)
         missed = [one for one in over if not any(_belongs(row, one) for row in rows)]

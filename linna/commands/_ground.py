@@ -54,7 +54,9 @@ def ground_client(arguments: argparse.Namespace, *, background: bool = False) ->
 
         # The error of a failed job is that of the command, which prints it.
         logging.getLogger("ground_service.worker").setLevel(logging.ERROR)
-        return local_client(_opened(arguments), str(arguments.actor or local_actor()), background=background)
+        return local_client(
+            open_ground_only(arguments), str(arguments.actor or local_actor()), background=background
+        )
     from ground_service.client import Client
     from linna.errors import UsageError
 
@@ -98,12 +100,13 @@ def open_service(arguments: argparse.Namespace) -> Ground:
     """Return the opened service of this machine, which handles its events in this process."""
     from ground_service.worker.follow_up import follow_in_process
 
-    ground = _opened(arguments)
+    ground = open_ground_only(arguments)
     follow_in_process(ground)
     return ground
 
 
-def _opened(arguments: argparse.Namespace) -> Ground:
+def open_ground_only(arguments: argparse.Namespace) -> Ground:
+    """Return the opened service of this machine, which does not handle events."""
     from ground_service.ground import open_ground
     from linna.data import data_folder
 

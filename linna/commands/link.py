@@ -7,7 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from linna.commands._ground import add_operator_options, add_service_options, ground_client, open_service
+from linna.commands._ground import (
+    add_operator_options,
+    add_service_options,
+    ground_client,
+    open_ground_only,
+    settings_of,
+)
 from linna.output import add_json_flag, emit, log
 
 if TYPE_CHECKING:
@@ -192,10 +198,14 @@ def operate(arguments: argparse.Namespace) -> int:
 
     from ground_service.links.service import declared_links
     from ground_service.links.supervisor import LinkSupervisor
+    from ground_service.worker.dispatch import dispatcher_for
+    from ground_service.worker.follow_up import follow_in_process
     from linna.errors import UsageError
 
     stopping = threading.Event()
-    with open_service(arguments) as ground:
+    with open_ground_only(arguments) as ground:
+        dispatcher = dispatcher_for(ground, settings_of(arguments))
+        follow_in_process(ground, dispatcher.start)
         names = frozenset(arguments.names)
         unknown = sorted(names.difference(declared_links(ground)))
         if unknown:
@@ -210,6 +220,7 @@ def operate(arguments: argparse.Namespace) -> int:
         while not stopping.wait(0.5):
             pass
         supervisor.stop()
+        dispatcher.close()
     return 0
 
 

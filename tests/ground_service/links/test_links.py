@@ -1,0 +1,388 @@
+"""One link: reception without loss, contacts, and transmission of released telecommands, on both databases."""
+
+from __future__ import annotations
+
+import struct
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ground_service.clock import mission_now_ns, set_mission_clock, utc_now_ns
+from ground_service.commanding.service import enter_command, get_command, release_command
+from ground_service.errors import Conflict, NotFound
+from ground_service.events import read_events
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest.service import ingest_file
+from ground_service.links import service, store
+from ground_service.links.stream import ACKNOWLEDGEMENT
+from ground_service.store import repository
+from ground_service.store.canonical import archive_hash
+from ground_service.store.vehicles import all_vehicles
+from tests.ground_service.links.conftest import Station, declare, operated, until
+from tmtc.uplink import UplinkDecoder
+
+CADU = 1279
+SPACECRAFT = 76
+
+
+def hash_of(ground: Ground) -> str:
+    with ground.database.reading() as connection:
+        known = [one.id for one in all_vehicles(connection) if one.instance == "flight"]
+        return archive_hash(connection, known[0]) if known else ""
+
+
+@pytest.fixture(scope="module")
+def stream(synthetic_pass: Any) -> bytes:
+    return bytes((synthetic_pass.folder / "downlink.cadu").read_bytes())
+
+
+@pytest.fixture(scope="module")
+def expected(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> str:
+    with open_ground(tmp_path_factory.mktemp("whole")) as ground:
+        ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
+        return hash_of(ground)
+
+
+def released(ground: Ground, count: int = 1) -> list[int]:
+    keys = [
+        enter_command(ground, "test_connection", {}, spacecraft_id=SPACECRAFT, actor="ann")
+        for _ in range(count)
+    ]
+    for key in keys:
+        release_command(ground, key, actor="bob")
+    return keys
+
+
+def packets_of(octets: bytes) -> list[bytes]:
+    return list(UplinkDecoder(SPACECRAFT).decode(octets).packets)
+
+
+def octets_of(ground: Ground, keys: list[int]) -> list[bytes]:
+    return [bytes(get_command(ground, key).row["octets"]) for key in keys]
+
+
+def contact_events(ground: Ground) -> list[str]:
+    return [one.kind for one in read_events(ground.database, 0, 10_000) if one.kind.startswith("contact")]
+
+
+@pytest.mark.parametrize("cut", [1, 3, 4, CADU - 1, CADU, CADU + 1, 5 * CADU + 700, 9 * CADU + 2])
+def test_a_connection_that_is_cut_at_any_octet_and_continued_loses_nothing(
+    ground: Ground, station: Station, stream: bytes, expected: str, cut: int
+) -> None:
+    declare(ground, station.link())
+    with operated(ground) as runner:
+        first = station.accept()
+        first.sendall(stream[:cut])
+        first.close()
+        second = station.accept()
+        second.sendall(stream[cut:])
+        until(lambda: runner.octets_received >= len(stream) - CADU, "the archive")
+        second.close()
+        until(lambda: hash_of(ground) == expected, "the same archive")
+    assert service.get_link(ground, "lab").octets <= len(stream)
+
+
+def test_what_an_ended_process_has_left_in_its_spool_is_ingested_by_the_next(
+    either: Ground, station: Station, stream: bytes, expected: str
+) -> None:
+    declare(either, station.link())
+    folder = either.home / "incoming" / "link-lab"
+    folder.mkdir(parents=True)
+    (folder / "000000000003.segment").write_bytes(stream[: 4 * CADU + 9])
+    (folder / "current").write_bytes(stream[4 * CADU + 9 :])
+    with operated(either) as runner:
+        until(lambda: runner.octets_received == len(stream), "all octets")
+    assert hash_of(either) == expected
+
+
+def test_octets_are_acknowledged_when_they_are_on_disk(
+    ground: Ground, station: Station, stream: bytes
+) -> None:
+    declare(ground, station.link("acknowledge = true"))
+    with operated(ground):
+        connection = station.accept()
+        connection.settimeout(10.0)
+        connection.sendall(stream)
+        count = 0
+        while count < len(stream):
+            octets = connection.recv(ACKNOWLEDGEMENT.size)
+            assert len(octets) == ACKNOWLEDGEMENT.size
+            assert ACKNOWLEDGEMENT.unpack(octets)[0] > count
+            (count,) = ACKNOWLEDGEMENT.unpack(octets)
+        assert count == len(stream)
+
+
+def test_released_telecommands_are_sent_in_the_next_contact_and_not_before(
+    either: Ground, station: Station, stream: bytes
+) -> None:
+    declare(either, station.link())
+    keys = released(either, 3)
+    with operated(either) as runner:
+        connection = station.accept()
+        until(lambda: service.get_link(either, "lab").state == "connected", "the connection")
+        time.sleep(0.5)
+        assert not station.telecommands and runner.commands_unsent == 3
+        connection.sendall(stream)
+        until(lambda: packets_of(bytes(station.telecommands)) == octets_of(either, keys), "the telecommands")
+        assert runner.commands_unsent == 0
+        until(lambda: contact_events(either)[-1] == "contact ended", "the end of the contact")
+        more = released(either)
+        time.sleep(0.5)
+        assert len(packets_of(bytes(station.telecommands))) == 3
+        connection.sendall(stream[: 2 * CADU])
+        until(
+            lambda: packets_of(bytes(station.telecommands))[3:] == octets_of(either, more), "the next contact"
+        )
+    assert contact_events(either).count("contact started") == 2
+    ended = [one for one in read_events(either.database, 0, 10_000) if one.kind == "contact ended"]
+    assert (ended[0].payload["octets"], ended[0].payload["telecommands"]) == (len(stream), 3)
+
+
+def test_manual_links_send_on_request_only(ground: Ground, station: Station, stream: bytes) -> None:
+    declare(ground, station.link('send = "manual"'))
+    with pytest.raises(Conflict, match="expected a process that operates it"):
+        service.request_send(ground, "lab", actor="ann")
+    keys = released(ground)
+    with operated(ground):
+        station.accept().sendall(stream[: 3 * CADU])
+        until(lambda: service.get_link(ground, "lab").state == "contact", "the contact")
+        time.sleep(0.5)
+        assert not station.telecommands
+        assert service.request_send(ground, "lab", actor="ann").unsent == 1
+        until(lambda: packets_of(bytes(station.telecommands)) == octets_of(ground, keys), "the telecommand")
+        later = released(ground)
+        time.sleep(0.5)
+        assert len(packets_of(bytes(station.telecommands))) == 1
+        assert get_command(ground, later[0]).state == "released"
+    with pytest.raises(NotFound):
+        service.request_send(ground, "other", actor="ann")
+
+
+def test_telecommands_taken_by_a_process_that_ended_are_sent_once_by_the_next(
+    either: Ground, station: Station, stream: bytes
+) -> None:
+    declare(either, station.link())
+    keys = released(either, 2)
+    declared = service.declared_links(either)["lab"]
+    assert service.acquire(either, declared, "dead", 1)
+    assert len(service.take_transmissions(either, declared, "dead")) == 1
+    time.sleep(0.01)  # the lease of 1 ns has ended
+    assert service.take_transmissions(either, declared, "nobody") == service.take_transmissions(
+        either, declared, "dead"
+    )
+    assert service.get_link(either, "lab").unconfirmed == 1
+    with operated(either, "living"):
+        station.accept().sendall(stream[: 3 * CADU])
+        until(lambda: packets_of(bytes(station.telecommands)) == octets_of(either, keys), "the telecommands")
+        time.sleep(0.5)
+        assert len(packets_of(bytes(station.telecommands))) == 2
+    assert service.get_link(either, "lab").unconfirmed == 0
+
+
+def test_a_process_without_the_lease_takes_no_telecommands(either: Ground, station: Station) -> None:
+    declare(either, station.link())
+    keys = released(either)
+    declared = service.declared_links(either)["lab"]
+    assert service.acquire(either, declared, "first", 15_000_000_000)
+    assert not service.acquire(either, declared, "second", 15_000_000_000)
+    assert service.take_transmissions(either, declared, "second") == []
+    assert get_command(either, keys[0]).state == "released"
+    service.release(either, "lab", "second")
+    assert not service.acquire(either, declared, "second", 15_000_000_000)
+    service.release(either, "lab", "first")
+    assert service.acquire(either, declared, "second", 15_000_000_000)
+
+
+def test_transmissions_of_which_nothing_was_heard_are_repeated_in_the_next_contact(
+    ground: Ground, station: Station, stream: bytes
+) -> None:
+    declare(ground, station.link())
+    keys = released(ground)
+    with operated(ground):
+        connection = station.accept()
+        for contact in range(service.REPEAT_ATTEMPTS + 1):
+            rows = [stream[k * CADU : (k + 1) * CADU] for k in range(4 * contact, 4 * contact + 4)]
+            connection.sendall(rows[0] + rows[1])
+            wanted = min(contact + 1, service.REPEAT_ATTEMPTS)
+            until(lambda n=wanted: len(packets_of(bytes(station.telecommands))) == n, "the transmission")
+            time.sleep(0.2)
+            connection.sendall(rows[2] + rows[3])  # telemetry from after the transmission
+            until(
+                lambda n=contact: contact_events(ground).count("contact ended") > n, "the end of the contact"
+            )
+        sent = packets_of(bytes(station.telecommands))
+    assert sent == octets_of(ground, keys) * service.REPEAT_ATTEMPTS
+
+
+def test_expired_telecommands_are_not_sent(ground: Ground, station: Station, stream: bytes) -> None:
+    declare(ground, station.link())
+    late, timely = released(ground, 2)
+    with ground.database.writing() as connection:
+        for key, before in ((late, mission_now_ns() - 1), (timely, mission_now_ns() + 10**12)):
+            repository.change(connection, repository.TELECOMMANDS, key, send_before_utc_ns=before)
+    with operated(ground) as runner:
+        station.accept().sendall(stream[: 3 * CADU])
+        until(
+            lambda: packets_of(bytes(station.telecommands)) == octets_of(ground, [timely]), "the telecommand"
+        )
+        assert runner.commands_unsent == 0
+    assert get_command(ground, late).state == "released"
+
+
+def records(stream: bytes, utc_ns: int) -> bytes:
+    rows = [stream[at : at + CADU] for at in range(0, len(stream), CADU)]
+    return b"".join(struct.pack(">q", utc_ns) + row for row in rows)
+
+
+@pytest.mark.parametrize(("hours", "wrong"), [(0, False), (1, True), (-1, True)])
+def test_a_wrong_clock_of_the_station_is_reported_and_nothing_is_lost(
+    ground: Ground, station: Station, stream: bytes, expected: str, hours: int, wrong: bool
+) -> None:
+    declare(
+        ground,
+        '[link]\nframe_length = 1115\ncoding = "rs"\nrandomiser = "legacy"\nframe_checksum = true\n'
+        '[link.stations.madrid]\nheader_octets = 8\ntime_code = "unix_ns"\ntime_offset = 0\n'
+        + station.link('station = "madrid"'),
+    )
+    with operated(ground):
+        station.accept().sendall(records(stream, utc_now_ns() + hours * 3600 * 10**9))
+        until(lambda: hash_of(ground) == expected, "the same archive")
+        until(lambda: service.get_link(ground, "lab").clock_offset_s is not None, "the offset")
+        link = service.get_link(ground, "lab")
+    assert link.clock_offset_s == pytest.approx(hours * 3600, abs=PATIENCE_OF_CLOCK_S)
+    assert (link.reason is not None and "the clock of the station differs" in link.reason) == wrong
+
+
+PATIENCE_OF_CLOCK_S = 20.0
+
+
+def test_states_say_why_a_link_waits(ground: Ground, station: Station) -> None:
+    declare(ground, station.link())
+    assert service.get_link(ground, "lab").reason == "no process operates it"
+    station.down.close()
+    with operated(ground):
+        until(lambda: "refused" in (service.get_link(ground, "lab").reason or ""), "the reason")
+        assert service.get_link(ground, "lab").state == "waiting"
+
+
+def test_a_link_that_is_not_to_reconnect_fails_when_the_station_closes(
+    ground: Ground, station: Station, stream: bytes
+) -> None:
+    declare(ground, station.link("reconnect = false"))
+    with operated(ground):
+        connection = station.accept()
+        connection.sendall(stream[: 3 * CADU])
+        connection.close()
+        until(lambda: service.get_link(ground, "lab").state == "failed", "the state")
+        assert service.get_link(ground, "lab").reason == "closed by the station"
+
+
+def test_folders_are_watched_and_telecommands_written(
+    ground: Ground, tmp_path: Path, stream: bytes, expected: str
+) -> None:
+    incoming, outgoing = tmp_path / "in", tmp_path / "out"
+    declare(
+        ground, f'[[links]]\nname = "lab"\nkind = "file"\ndownlink = "{incoming}"\nuplink = "{outgoing}"\n'
+    )
+    with operated(ground) as runner:
+        until(lambda: "expected a folder" in (service.get_link(ground, "lab").reason or ""), "the reason")
+        incoming.mkdir()
+        outgoing.mkdir()
+        (incoming / "pass.cadu").write_bytes(stream)
+        keys = released(ground, 2)
+        until(lambda: list(outgoing.glob("*.cltu")), "the file")
+        until(lambda: runner.octets_received == len(stream), "the telemetry")
+        assert hash_of(ground) == expected
+    assert [path.name for path in outgoing.iterdir()] == ["lab-00000001.cltu"]
+    assert packets_of((outgoing / "lab-00000001.cltu").read_bytes()) == octets_of(ground, keys)
+    assert contact_events(ground) == ["contact started", "contact ended"]
+
+
+def test_the_file_is_not_read_again_by_the_next_process(
+    ground: Ground, tmp_path: Path, stream: bytes
+) -> None:
+    declare(ground, f'[[links]]\nname = "lab"\nkind = "file"\ndownlink = "{tmp_path}/in"\n')
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "pass.cadu").write_bytes(stream)
+    with operated(ground) as runner:
+        until(lambda: runner.octets_received == len(stream), "the telemetry")
+    with operated(ground, "another") as runner:
+        time.sleep(1.5)
+        assert runner.octets_received == 0
+
+
+def test_missed_contacts_are_recorded_once_with_the_reason(
+    either: Ground, station: Station, synthetic_pass: Any
+) -> None:
+    from ground_service.ephemerides.service import add_ephemeris
+    from tests.ground_service.conftest import START
+
+    declare(either, PLACES + station.link('station = "here"'))
+    stored = either.files.put_file(synthetic_pass.folder / "reference.oem")
+    add_ephemeris(either, stored, name="reference", precedence=0, actor="ann")
+    declared = service.declared_links(either)["lab"]
+    now = [START - 500 * 10**9]
+    set_mission_clock(lambda: now[0])
+    try:
+        found = service.list_contacts(either, START - 500 * 10**9, START + 1000 * 10**9)
+        assert found.unpredicted == {} and [one.state for one in found.contacts] == ["predicted"]
+        (contact,) = found.contacts
+        assert service.acquire(either, declared, "here", 15_000_000_000)
+        assert contact.stop is not None
+        assert (
+            service.note_missed(either, declared, "here", contact.start.utc_ns, "nothing was received") == 0
+        )
+        after = contact.stop.utc_ns + service.MARGIN_NS + 2 * 10**9
+        assert service.note_missed(either, declared, "other", after, "nothing was received") == 0
+        # looked at every half minute, as a link does, the whole contact counts
+        times = range(contact.start.utc_ns, after + 120 * 10**9, 30 * 10**9)
+        counts = [service.note_missed(either, declared, "here", t, "nothing was received") for t in times]
+        assert sum(counts) == 1 and counts[[t >= after for t in times].index(True)] == 1
+        (missed,) = service.list_contacts(either, START - 500 * 10**9, START + 1000 * 10**9).contacts
+        assert (missed.state, missed.reason) == ("missed", "nothing was received")
+        assert missed.predicted_start is not None and missed.predicted_stop is not None
+        assert abs(missed.predicted_start.utc_ns - contact.start.utc_ns) <= 10**9
+        assert abs(missed.predicted_stop.utc_ns - contact.stop.utc_ns) <= 10**9
+        assert contact_events(either) == ["contact missed"]
+    finally:
+        set_mission_clock(None)
+
+
+PLACES = """[link.stations.here]
+latitude_deg = -20.0
+longitude_deg = 120.0
+minimum_elevation_deg = 0.0
+"""
+
+
+def test_contacts_without_a_place_or_an_ephemeris_are_not_predicted(ground: Ground, station: Station) -> None:
+    declare(ground, station.link())
+    now = mission_now_ns()
+    assert service.list_contacts(ground, now, now + 10**12).unpredicted == {
+        "lab": "the mission description states no place of the station"
+    }
+    declare(ground, PLACES + station.link('station = "here"'))
+    assert service.list_contacts(ground, now, now + 10**12).unpredicted == {
+        "lab": "no reference ephemeris covers the time"
+    }
+
+
+def test_the_lease_is_kept_while_the_link_is_operated(ground: Ground, station: Station) -> None:
+    declare(ground, station.link())
+    with operated(ground):
+        with ground.database.reading() as connection:
+            first = store.find_link(connection, "lab")
+        until(
+            lambda: service.get_link(ground, "lab").owner == "here" and _lease(ground) > first.lease_utc_ns,
+            "a longer lease",
+        )
+    assert service.get_link(ground, "lab").owner is None
+
+
+def _lease(ground: Ground) -> int:
+    with ground.database.reading() as connection:
+        found = store.find_link(connection, "lab")
+    assert found is not None
+    return found.lease_utc_ns
