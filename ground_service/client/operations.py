@@ -19,7 +19,7 @@ from ground_service.errors import InvalidInput
 from ground_service.evaluation.model import PassFigures, Report, ReportOverview
 from ground_service.ingest.model import Ingest, IngestAccepted
 from ground_service.jobs.model import Job
-from ground_service.links.model import Contacts, Link
+from ground_service.links.model import Contacts, LinkStatus
 from ground_service.missions.model import MissionDetail, MissionRevision
 from ground_service.passes.model import (
     Completeness,
@@ -322,17 +322,17 @@ class Client(Connection):
 
     # Links and contacts
 
-    def list_links(self) -> Listing[Link]:
+    def list_links(self) -> Listing[LinkStatus]:
         """List the links with their state."""
-        return self._list(Link, "/links", paged=False)
+        return self._list(LinkStatus, "/links", paged=False)
 
-    def get_link(self, name: str) -> Link:
+    def get_link(self, name: str) -> LinkStatus:
         """Return a link with its state."""
-        return self._get(Link, f"/links/{_part(name)}")
+        return self._get(LinkStatus, f"/links/{_part(name)}")
 
-    def send_link(self, name: str) -> Link:
+    def send_link(self, name: str) -> LinkStatus:
         """Have the released telecommands sent now, in a contact or not."""
-        return self._post(Link, f"/links/{_part(name)}/send")
+        return self._post(LinkStatus, f"/links/{_part(name)}/send")
 
     def list_contacts(
         self, *, since: str | None = None, until: str | None = None, link: str | None = None

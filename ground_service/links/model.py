@@ -13,7 +13,7 @@ LinkState = Literal["waiting", "connected", "contact", "failed"]
 ContactState = Literal["predicted", "open", "ended", "missed"]
 
 
-class Link(Entity):
+class LinkStatus(Entity):
     """A link that a mission description in force declares, and its state."""
 
     name: str = Field(examples=["lab"])

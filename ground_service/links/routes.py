@@ -14,7 +14,7 @@ from ground_service.http.requests import operations, problems
 from ground_service.http.times import GivenTime
 from ground_service.links import service
 from ground_service.links.core import NS
-from ground_service.links.model import Contacts, Link
+from ground_service.links.model import Contacts, LinkStatus
 
 links = operations("links")
 
@@ -30,13 +30,13 @@ def list_links(ground: GroundOf, _: Viewer) -> PageOf[Link]:
 
 
 @links.get("/links/{name}")
-def get_link(ground: GroundOf, _: Viewer, name: LinkName) -> Link:
+def get_link(ground: GroundOf, _: Viewer, name: LinkName) -> LinkStatus:
     """Show a link with its state."""
     return service.get_link(ground, name)
 
 
 @links.post("/links/{name}/send", responses=problems(409))
-def send_link(ground: GroundOf, caller: Operator, name: LinkName) -> Link:
+def send_link(ground: GroundOf, caller: Operator, name: LinkName) -> LinkStatus:
     """Send the released telecommands now, in a contact or not."""
     return service.request_send(ground, name, actor=caller.name)
 

@@ -25,12 +25,12 @@ from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
 from ground_service.links import core, store
 from ground_service.links.core import NS, PredictedContact
-from ground_service.links.model import Contacts, Link, LinkContact, LinkState
+from ground_service.links.model import Contacts, LinkContact, LinkState, LinkStatus
 from ground_service.links.store import ContactRow, LinkRow, TransmissionRow
 from ground_service.missions import store as missions
 from ground_service.missions.model import Link as LinkSection
 from ground_service.missions.model import StationConnection
-from ground_service.missions.stations import outages_of, station_of
+from ground_service.missions.places import outages_of, station_of
 from ground_service.store.vehicles import get_vehicle, vehicle_id
 from lunar.ephemeris import Ephemeris
 from lunar.ephemeris_files import load_ephemeris
@@ -68,13 +68,13 @@ def declared_links(ground: Ground) -> dict[str, DeclaredLink]:
         return _declared(connection)
 
 
-def list_links(ground: Ground) -> list[Link]:
+def list_links(ground: Ground) -> list[LinkStatus]:
     """Return all declared links with their state, by name."""
     with ground.database.reading() as connection:
         return [_link(connection, one) for _, one in sorted(_declared(connection).items())]
 
 
-def get_link(ground: Ground, name: str) -> Link:
+def get_link(ground: Ground, name: str) -> LinkStatus:
     """Return a declared link with its state.
 
     Raises
@@ -86,7 +86,7 @@ def get_link(ground: Ground, name: str) -> Link:
         return _link(connection, _find(connection, name))
 
 
-def request_send(ground: Ground, name: str, *, actor: str) -> Link:
+def request_send(ground: Ground, name: str, *, actor: str) -> LinkStatus:
     """Request that released telecommands are sent now, in a contact or not.
 
     Raises
@@ -443,7 +443,7 @@ def _find(connection: Connection, name: str) -> DeclaredLink:
     return declared[name]
 
 
-def _link(connection: Connection, declared: DeclaredLink) -> Link:
+def _link(connection: Connection, declared: DeclaredLink) -> LinkStatus:
     link = declared.link
     row = store.find_link(connection, link.name)
     pending = store.pending_transmissions(connection, link.name)
@@ -452,7 +452,7 @@ def _link(connection: Connection, declared: DeclaredLink) -> Link:
     fault = core.clock_fault(None if row is None else row.clock_offset_ns)
     heard = None if row is None else row.heard_utc_ns
     offset = None if row is None else row.clock_offset_ns
-    return Link(
+    return LinkStatus(
         name=link.name,
         kind=link.kind,
         station=link.station,

@@ -17,7 +17,7 @@ from linna.commands._ground import (
 from linna.output import add_json_flag, emit, log
 
 if TYPE_CHECKING:
-    from ground_service.links.model import Link
+    from ground_service.links.model import LinkStatus
     from tmtc.link_check import LinkProposal
 
 INCONCLUSIVE = 3
@@ -224,7 +224,7 @@ def operate(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _line(link: Link) -> str:
+def _line(link: LinkStatus) -> str:
     reason = f": {link.reason}" if link.reason else ""
     waiting = f", {link.unsent} telecommands wait" if link.unsent else ""
     return (

@@ -759,7 +759,9 @@ def upgrade() -> None:
         sa.Column("predicted_stop_utc_ns", sa.BigInteger(), nullable=True),
         sa.Column("octets", sa.BigInteger(), nullable=False),
         sa.Column("telecommands", sa.Integer(), nullable=False),
-        sa.ForeignKeyConstraint(["vehicle_id"], ["vehicles.id"], name=op.f("fk_contacts_vehicle_id_vehicles")),
+        sa.ForeignKeyConstraint(
+            ["vehicle_id"], ["vehicles.id"], name=op.f("fk_contacts_vehicle_id_vehicles")
+        ),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_contacts")),
     )
     op.create_index("ix_contacts_link_id", "contacts", ["link", "id"], unique=False)

@@ -19,7 +19,7 @@ from ground_service.links.core import (
     without,
 )
 from ground_service.missions.model import parse_mission
-from ground_service.missions.stations import outages_of, station_of, stations_of
+from ground_service.missions.places import outages_of, station_of, stations_of
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.visibility import GroundStation, link
 from tests.ground_service.conftest import START, circular_states
