@@ -24,7 +24,7 @@ DAY_NS = 86_400 * NS
 
 
 @links.get("/links")
-def list_links(ground: GroundOf, _: Viewer) -> PageOf[Link]:
+def list_links(ground: GroundOf, _: Viewer) -> PageOf[LinkStatus]:
     """List the links of the mission descriptions in force with their state."""
     return PageOf.all_of(service.list_links(ground))
 

@@ -378,11 +378,7 @@ def repeat_unconfirmed(ground: Ground, declared: DeclaredLink, contact: ContactR
             contact.start_utc_ns - REPEAT_WITHIN_NS,
             REPEAT_ATTEMPTS,
         )
-        lost = [
-            one
-            for one in earlier
-            if commanding.are_unreported(connection, one.telecommands, mission_now_ns())
-        ]
+        lost = [one for one in earlier if commanding.are_unreported(connection, one.telecommands)]
     if lost:
         with ground.database.writing() as connection:
             for one in lost:

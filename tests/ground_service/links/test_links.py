@@ -60,7 +60,7 @@ def packets_of(octets: bytes) -> list[bytes]:
 
 
 def octets_of(ground: Ground, keys: list[int]) -> list[bytes]:
-    return [bytes(get_command(ground, key).row["octets"]) for key in keys]
+    return [bytes(get_command(ground, key).record.octets or b"") for key in keys]
 
 
 def contact_events(ground: Ground) -> list[str]:
