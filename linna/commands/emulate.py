@@ -66,6 +66,35 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="the ground commands: the scenario's own operator is silent",
     )
     live.add_argument("--stop-at-end", action="store_true", help="end with the scenario")
+    endless = parser.add_argument_group(
+        "continuous", "the spacecraft in operation: images in commanded windows alone, contacts of the stations"
+    )
+    endless.add_argument(
+        "--continuous", action="store_true", help="fly from the scenario's epoch on, whatever its windows"
+    )
+    endless.add_argument("--days", type=float, metavar="D", help="end after so many days (default: never)")
+    endless.add_argument(
+        "--station-port",
+        action="append",
+        default=[],
+        metavar="NAME:TM:TC",
+        help="telemetry and telecommand port of a station (default: any free ports)",
+    )
+    endless.add_argument(
+        "--hold-contacts",
+        action="store_true",
+        help="stop time at the beginning and the end of each contact until run on the console",
+    )
+    endless.add_argument(
+        "--keep-unacknowledged",
+        action="store_true",
+        help="stations keep telemetry until the client acknowledges it",
+    )
+    endless.add_argument("--state", type=Path, metavar="FILE", help="state to go on from, kept up to date")
+    endless.add_argument("--clock-file", type=Path, metavar="FILE", help="file for the mission time")
+    endless.add_argument(
+        "--operations", type=Path, metavar="FILE", help="TOML appended to the mission description"
+    )
     parser.add_argument(
         "--campaign", metavar="FILE", help="fly the fault campaign of a file, or a shipped one by name"
     )
@@ -84,10 +113,12 @@ def run(arguments: argparse.Namespace) -> int:
     )
     if arguments.campaign:
         return _campaign(arguments, scenario)
+    if arguments.continuous:
+        return _continuous(arguments, scenario)
     if arguments.live:
         return _live(arguments, scenario)
     if arguments.out is None:
-        raise UsageError("emulate: expected --out DIR, --live or --campaign FILE, found none of them")
+        raise UsageError("emulate: expected --out DIR, --live, --continuous or --campaign FILE, found none")
     kept = {"none": 0, "some": 8, "all": None}[arguments.frames]
     summary = emulate(
         scenario,
@@ -179,6 +210,72 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
         text=f"stopped; {live.sent} transmissions, mode {live.spacecraft.payload.mode.name}",
     )
     return 0
+
+
+def _continuous(arguments: argparse.Namespace, scenario: Scenario) -> int:
+    import signal
+    from dataclasses import asdict
+
+    from linna.data import data_folder
+    from linna.errors import UsageError
+    from payload_emulator.session.continuous import ContinuousSession
+    from payload_emulator.session.mission import operations_mission_text
+
+    if not scenario.link.stations:
+        raise UsageError(f"--continuous: expected link.stations in scenario {scenario.name}, found none")
+    if not arguments.rate >= 0.0 or (arguments.days is not None and not arguments.days > 0.0):
+        raise UsageError(
+            f"--rate, --days: expected numbers above 0, found {arguments.rate}, {arguments.days}"
+        )
+    data = data_folder()
+    further = arguments.operations.read_text(encoding="utf-8") if arguments.operations else ""
+    days = arguments.days
+    session = ContinuousSession(
+        scenario,
+        data,
+        rate=arguments.rate,
+        holds=arguments.hold_contacts,
+        stop_utc_ns=None if days is None else scenario.epoch_utc_ns + round(days * 86_400e9),
+        paused=arguments.paused,
+        host=arguments.host,
+        console_port=arguments.console_port,
+        mission_port=arguments.mission_port,
+        station_ports=_station_ports(arguments.station_port, scenario.link.stations),
+        checkpoint_file=arguments.state,
+        clock_file=arguments.clock_file,
+        keeps=arguments.keep_unacknowledged,
+        mission=lambda world, ports: operations_mission_text(world, data, arguments.host, ports, further),
+    )
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: session.stopping.set())
+    log(", ".join(f"{name} on {arguments.host}:{port}" for name, port in session.ports.items()))
+    session.run()
+    account = asdict(session.account)
+    figures = {"ports": session.ports, "utc": format_time(session.utc_ns), **account}
+    counted = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in account.items())
+    emit(arguments, figures, text=f"stopped at {figures['utc']}; {counted}")
+    return 0
+
+
+def format_time(utc_ns: int) -> str:
+    """Return a time for people, to the second."""
+    from lunar.timescales import format_utc
+
+    return format_utc(utc_ns, 0)
+
+
+def _station_ports(texts: list[str], stations: tuple[str, ...]) -> dict[str, tuple[int, int]]:
+    from linna.errors import UsageError
+
+    ports = {}
+    for text in texts:
+        name, *numbers = text.split(":")
+        if name not in stations or len(numbers) != 2 or not all(one.isdigit() for one in numbers):
+            raise UsageError(
+                f"--station-port: expected NAME:TM:TC with a station of {', '.join(stations)}, found {text!r}"
+            )
+        ports[name] = (int(numbers[0]), int(numbers[1]))
+    return ports
 
 
 def describe(summary: dict[str, Any], out: Path) -> str:

@@ -180,6 +180,39 @@ class Payload:
         """Packets that wait for downlink."""
         return self._machine.store.waiting
 
+    @property
+    def next_turn_ticks(self) -> int | None:
+        """On-board time of the next activity, frame or end of the observation; None without any.
+
+        For simulations that skip the time in which nothing is due.
+        """
+        machine = self._machine
+        due = [one.release_ticks for one in machine.schedule.activities[:1] if machine.schedule.enabled]
+        if machine.mode is PayloadMode.observing:
+            window = machine.observation
+            due += [ticks for ticks in (window.next_ticks, window.stop_ticks) if ticks]
+        return min(due, default=None)
+
+    def will_look(self, ticks: int, telecommand_octets: bytes) -> bool:
+        """Return whether a step at an on-board time with these telecommands may look at its image.
+
+        For simulations that make an image only where it is needed.
+        """
+        machine, window = self._machine, self._machine.observation
+        if machine.mode is PayloadMode.observing and not 0 < window.stop_ticks <= ticks:
+            return not window.cadence_ticks or ticks >= window.next_ticks - window.cadence_ticks // 2
+        schedule = machine.schedule
+        due = [one.packet for one in schedule.activities if schedule.enabled and one.release_ticks <= ticks]
+        orders = [*parse_commands(telecommand_octets), *parse_commands(b"".join(due))]
+        return any(
+            not isinstance(order, Refusal)
+            and (
+                name_of(order) == "start_observation"
+                or (name_of(order) == "set_mode" and order.values["argument_1"] == PayloadMode.observing)
+            )
+            for order in orders
+        )
+
     def summary(self) -> dict[str, Any]:
         """Return what the payload counted since boot, for the operators of the emulator."""
         return self._machine.observer.summary()

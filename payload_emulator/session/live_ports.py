@@ -56,6 +56,8 @@ class Server:
         Called with the number of a client that has disconnected.
     document
         Octets that are sent to each client, whose connection is then closed; None: connections stay open.
+    greeting
+        Returns the octets that a new connection begins with.
     """
 
     name: str
@@ -64,6 +66,7 @@ class Server:
     receive: Callable[[int, bytes], None]
     ended: Callable[[int], object] = lambda number: None
     document: bytes | None = None
+    greeting: Callable[[Client], bytes] = lambda client: b""
     listener: socket.socket = field(init=False)
     clients: dict[int, Client] = field(default_factory=dict)
     _selector: selectors.BaseSelector | None = None
@@ -143,8 +146,8 @@ class Server:
         client = Client(self._accepted, connection)
         self._selector.register(connection, selectors.EVENT_READ, (self, client))
         self.clients[client.number] = client
-        if self.document is not None:
-            client.unsent += self.document
+        client.unsent += self.greeting(client) if self.document is None else self.document
+        if client.unsent:
             self._flush(client)
 
     def _read(self, client: Client) -> None:

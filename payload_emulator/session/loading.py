@@ -118,6 +118,50 @@ def load_payload(
     ModelError
         The detector model is missing or no network of this project.
     """
+    build = _build(scenario, camera, data)
+    start, stop = reference.start_utc_ns, reference.stop_utc_ns
+    flight_orientation = IauOrientation()
+    position, velocity = reference.at(np.array([first_frame_utc_ns]))
+    start_state = _initial_state(scenario, first_frame_utc_ns, position[0], velocity[0])
+    tables = FlightTables(
+        anchor_ephemeris=_anchor_table(reference, orientation),
+        catalogue=_catalogue_octets(scenario, catalogue),
+        gravity=_gravity_octets(build.field),
+        orientation=_orientation_table(flight_orientation, start, stop),
+        initial_state=pack_initial_state(start_state),
+        burns=_burn_table([burn for burn in burns if burn.declared and start <= burn.utc_ns <= stop]),
+    )
+    described = {
+        "utc": format_utc(first_frame_utc_ns, 9),
+        "position_icrf_m": start_state.position_icrf_m.tolist(),
+        "velocity_icrf_m_s": start_state.velocity_icrf_m_s.tolist(),
+    }
+    return _loaded(build, tables, described, flight_orientation)
+
+
+def launch_payload(scenario: Scenario, camera: PinholeCamera, data: DataFolder) -> LoadedPayload:
+    """Flight software as launched: model, parameters and gravity field; all other tables are uploaded in flight.
+
+    Raises
+    ------
+    ModelError
+        The detector model is missing or no network of this project.
+    """
+    build = _build(scenario, camera, data)
+    return _loaded(build, FlightTables(gravity=_gravity_octets(build.field)), {}, IauOrientation())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Build:
+    """Model and parameters, and the gravity field of the filter."""
+
+    model: bytes
+    parameters: BuildParameters
+    detector: OnnxDetector
+    field: GravityField
+
+
+def _build(scenario: Scenario, camera: PinholeCamera, data: DataFolder) -> _Build:
     model_octets = network_octets(scenario.detector.network)
     navigation = scenario.navigation
     field = filter_field(navigation.filter_gravity, navigation.filter_degree, data)
@@ -133,28 +177,20 @@ def load_payload(
     )
     # Flight is given what the parameter file of the archive says, so that a replay is given the same.
     loaded = parse_parameters(format_parameters(chosen))
-    parameters = loaded.flight
-    detector = OnnxDetector(model_octets, loaded.detector)
-    start, stop = reference.start_utc_ns, reference.stop_utc_ns
-    flight_orientation = IauOrientation()
-    position, velocity = reference.at(np.array([first_frame_utc_ns]))
-    start_state = _initial_state(scenario, first_frame_utc_ns, position[0], velocity[0])
-    tables = FlightTables(
-        anchor_ephemeris=_anchor_table(reference, orientation),
-        catalogue=_catalogue_octets(scenario, catalogue),
-        gravity=pack_gravity_table(
-            GravityTable(field.name, field.gm_m3_s2, field.radius_m, field.c_bar, field.s_bar)
-        ),
-        orientation=_orientation_table(flight_orientation, start, stop),
-        initial_state=pack_initial_state(start_state),
-        burns=_burn_table([burn for burn in burns if burn.declared and start <= burn.utc_ns <= stop]),
-    )
+    return _Build(model_octets, loaded, OnnxDetector(model_octets, loaded.detector), field)
+
+
+def _loaded(
+    build: _Build, tables: FlightTables, start_state: dict[str, Any], orientation: Orientation
+) -> LoadedPayload:
+    """The payload of a build with tables, described for the archive."""
+    parameters, detector, field = build.parameters.flight, build.detector, build.field
     payload = Payload(
-        detector, parameters, tables, model_hash=detector.model_hash, model_octets=len(model_octets)
+        detector, parameters, tables, model_hash=detector.model_hash, model_octets=len(build.model)
     )
     return LoadedPayload(
         payload,
-        loaded,
+        build.parameters,
         tables,
         build={
             "name": "linna-flight",
@@ -162,21 +198,23 @@ def load_payload(
             "model_sha256": detector.sha256,
             "parameters_sha256": parameters.sha256,
         },
-        start_state={
-            "utc": format_utc(first_frame_utc_ns, 9),
-            "position_icrf_m": start_state.position_icrf_m.tolist(),
-            "velocity_icrf_m_s": start_state.velocity_icrf_m_s.tolist(),
-        },
+        start_state=start_state,
         table_hashes={
             item.name: hashlib.sha256(getattr(tables, item.name)).hexdigest() for item in fields(tables)
         },
         gravity={
             "filter": field.name,
             "filter_degree": field.degree,
-            "filter_orientation": flight_orientation.name,
+            "filter_orientation": orientation.name,
         },
-        model=model_octets,
+        model=build.model,
         detector=detector,
+    )
+
+
+def _gravity_octets(field: GravityField) -> bytes:
+    return pack_gravity_table(
+        GravityTable(field.name, field.gm_m3_s2, field.radius_m, field.c_bar, field.s_bar)
     )
 
 

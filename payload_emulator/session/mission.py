@@ -9,15 +9,17 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 
 from lunar.arrays import BoolArray, FloatArray
 from lunar.constants import MOON_RADIUS_M
+from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.datafolder import DataFolder
 from lunar.frames import IauOrientation, spherical_from_mcmf
+from lunar.timescales import format_utc
 from payload_emulator.flight.models import NETWORKS
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.session.flying import PLAYBACK_CHANNEL, SPACECRAFT_ID
@@ -25,7 +27,10 @@ from payload_emulator.session.loading import detector_parameters, filter_field, 
 from payload_emulator.session.recipe import Box, Source, load_recipe
 from payload_emulator.session.recording import StepInput
 from payload_emulator.session.scenario import SHIPPED, RequirementsSection, Scenario
+from payload_emulator.session.station_ports import RECORD_HEADER
 from payload_emulator.session.world import World, build_world
+from payload_emulator.sim.board.contact_plan import parse_outage
+from payload_emulator.sim.board.link import STATIONS
 from tmtc.cuc import TICKS_PER_SECOND
 from tmtc.dictionary import DICTIONARY
 from tmtc.link import LinkSettings
@@ -40,6 +45,8 @@ DETECTOR_RECIPE = SHIPPED / "detector-dataset.toml"
 
 SEEN_SPLITS = ("train", "val")
 """Splits whose terrain counts as seen; the validation split was used to choose thresholds."""
+
+_TRACK_STEP_S = 60.0
 
 SPACECRAFT_NAME = "SelenITA"
 CLOCK_EPOCH = "2000-01-01T00:00:00 TAI"
@@ -118,6 +125,55 @@ def mission_text(world: World, data: DataFolder) -> str:
         if stated:
             lines += ["", f"[{name}]", *stated]
     return "\n".join(lines) + "\n"
+
+
+def operations_mission_text(
+    world: World, data: DataFolder, host: str, ports: Mapping[str, tuple[int, int]], further: str = ""
+) -> str:
+    """Return the mission description of a spacecraft in continuous operation.
+
+    Parameters
+    ----------
+    ports
+        Telemetry and telecommand port of each station on `host`.
+    further
+        TOML appended to the text: automation, approval and resources.
+    """
+    scenario, link = world.scenario, world.scenario.link
+    step_ns = round(_TRACK_STEP_S * NS)
+    times = np.arange(world.truth.start_utc_ns, world.truth.stop_utc_ns, step_ns, dtype=np.int64)
+    latitude, _, _ = spherical_from_mcmf(world.truth.positions_mcmf(times))
+    low_deg, high_deg = scenario.window.latitude_band_deg
+    band = times[(np.degrees(latitude) >= low_deg) & (np.degrees(latitude) <= high_deg)]
+    lines = [mission_text(replace(world, frame_utc_ns=band), data).rstrip()]
+    for name in link.stations:
+        latitude_deg, longitude_deg, height_m = STATIONS[name]
+        own = [one for one in map(parse_outage, link.outages) if one.station == name]
+        values: dict[str, Value] = {
+            "latitude_deg": latitude_deg,
+            "longitude_deg": longitude_deg,
+            "height_m": height_m,
+            "minimum_elevation_deg": link.minimum_elevation_deg,
+            "downlink_bps": link.rate_bps,
+            "uplink_bps": link.uplink_bps,
+            "outages": [f"{format_utc(one.start_utc_ns)}/{format_utc(one.stop_utc_ns)}" for one in own],
+            "header_octets": RECORD_HEADER.size,
+            "time_code": "unix_ns",
+            "time_offset": 0,
+        }
+        lines += ["", f"[link.stations.{name}]", *(f"{key} = {_toml(value)}" for key, value in values.items())]
+    for name, (telemetry, telecommand) in ports.items():
+        values = {
+            "name": name,
+            "kind": "tcp",
+            "station": name,
+            "downlink": f"{host}:{telemetry}",
+            "uplink": f"{host}:{telecommand}",
+            "format": "cltu",
+            "send": "automatic",
+        }
+        lines += ["", "[[links]]", *(f"{key} = {_toml(value)}" for key, value in values.items())]
+    return "\n".join(lines) + "\n" + further
 
 
 def save_mission(folder: Path, world: World, data: DataFolder) -> None:

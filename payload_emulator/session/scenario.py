@@ -17,6 +17,7 @@ from lunar.errors import LunarError
 from lunar.timescales import parse_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.typed_toml import TableFault, read_table, toml_text
+from payload_emulator.sim.board.contact_plan import parse_outage
 from payload_emulator.sim.board.faults import parse_fault
 from payload_emulator.sim.board.link import LinkSection
 from payload_emulator.sim.instruments import simulated_instruments
@@ -644,6 +645,9 @@ def _check(scenario: Scenario, source: str) -> None:
         rate = getattr(link, key)
         require(0.0 <= rate <= 0.5, f"link.{key}", "from 0 to 0.5", rate)
     require(link.rate_bps > 0.0, "link.rate_bps", "positive", link.rate_bps)
+    require(link.uplink_bps > 0.0, "link.uplink_bps", "positive", link.uplink_bps)
+    for text in link.outages:
+        parse_outage(text)
     for text in scenario.faults.events:
         parse_fault(text)
     for name, settings in scenario.instruments.items():

@@ -60,6 +60,7 @@ Samples = Mapping[str, FloatArray]
 
 NO_SAMPLES: Samples = MappingProxyType({})
 _NS = 1_000_000_000
+_MS = 1_000_000
 _EPHEMERIS_STEP_NS = 10 * _NS
 _EPHEMERIS_MARGIN_NS = 120 * _NS
 _BEFORE_JUMP_NS = 10_000
@@ -161,12 +162,42 @@ def build_world(scenario: Scenario, data: DataFolder) -> World:
         )
     truth, burns = _disturbed(scenario, truth, burns, int(frame_utc_ns[0]), model)
     require_above_ground(truth, frame_utc_ns, terrain.height_m, _HIGHEST_GROUND_M)
-    names = (
+    return World(scenario, truth, terrain, model, burns, frame_utc_ns, _names(terrain, model))
+
+
+def open_world(scenario: Scenario, data: DataFolder, duration_s: float) -> World:
+    """Return the world of a scenario from its epoch on, whatever its windows: no frames but the clock's first instant.
+
+    Raises
+    ------
+    ScenarioError
+        The scenario flies an ephemeris file or has disturbances that belong to one arc.
+    """
+    section = scenario.disturbances
+    if scenario.orbit.oem or section.kidnap_distance_km > 0.0 or section.burn_delta_v_m_s != 0.0:
+        found = "orbit.oem" if scenario.orbit.oem else "a kidnap or a burn in [disturbances]"
+        raise ScenarioError(
+            f"scenario {scenario.name}: expected an orbit to propagate without end, found {found}"
+        )
+    terrain = open_terrain(
+        scenario.terrain.source,
+        data,
+        scenario.seed,
+        registration_north_east_m=scenario.terrain.registration_north_east_m,
+    )
+    model = force_model(scenario, data)
+    truth, burns = _propagate(scenario, model, duration_s / 86_400.0)
+    first = np.array([scenario.epoch_utc_ns], dtype=np.int64)
+    return World(scenario, truth, terrain, model, burns, first, _names(terrain, model))
+
+
+def _names(terrain: TiledTerrain, model: ForceModel) -> tuple[str, ...]:
+    """Data that a world is made of."""
+    return (
         *terrain.data_names,
         f"gravity {model.gravity.name} to degree {model.degree}",
         f"orientation {model.orientation.name}",
     )
-    return World(scenario, truth, terrain, model, burns, frame_utc_ns, names)
 
 
 def continued(world: World, duration_s: float) -> World | None:
@@ -182,23 +213,11 @@ def continued(world: World, duration_s: float) -> World | None:
     ScenarioError
         The trajectory dips below the ground at a new frame.
     """
-    scenario, truth, model = world.scenario, world.truth, world.model
+    scenario = world.scenario
     if scenario.orbit.oem:
         return None
-    joint_utc_ns = truth.stop_utc_ns
-    state = np.concatenate([part[0] for part in truth.states(joint_utc_ns)])
-    orbit = propagate_from(scenario, model, joint_utc_ns, state, duration_s)
-    burns = _executed(scenario, orbit.maneuvers)
-    stop_utc_ns = joint_utc_ns + round(duration_s * _NS)
-    breaks = (*truth.breaks_utc_ns, *(burn.utc_ns for burn in burns))
-    joint_tdb_s = float(tdb_s_from_utc_ns(joint_utc_ns))
-    longer = Truth(
-        spliced(truth.state_icrf, joint_tdb_s, orbit.trajectory.state),
-        truth.start_utc_ns,
-        stop_utc_ns,
-        truth.orientation,
-        breaks,
-    )
+    longer, burns = flown_on(world, duration_s)
+    stop_utc_ns = longer.stop_utc_ns
     interval_ns = round(scenario.camera.frame_interval_s * _NS)
     begin_utc_ns = int(world.frame_utc_ns[-1]) + 2 * interval_ns
     windows = [(begin_utc_ns, stop_utc_ns)]
@@ -214,6 +233,28 @@ def continued(world: World, duration_s: float) -> World | None:
         longer, frames[world.frame_utc_ns.size - 1 :], world.terrain.height_m, _HIGHEST_GROUND_M
     )
     return replace(world, truth=longer, burns=(*world.burns, *burns), frame_utc_ns=frames)
+
+
+def flown_on(world: World, duration_s: float) -> tuple[Truth, tuple[TrueBurn, ...]]:
+    """Return the flight with `duration_s` added to its end, and the burns in the added time.
+
+    Raises
+    ------
+    ImpactError
+        The orbit hits the Moon.
+    """
+    truth, joint_utc_ns = world.truth, world.truth.stop_utc_ns
+    state = np.concatenate([part[0] for part in truth.states(joint_utc_ns)])
+    orbit = propagate_from(world.scenario, world.model, joint_utc_ns, state, duration_s)
+    burns = _executed(world.scenario, orbit.maneuvers)
+    longer = Truth(
+        spliced(truth.state_icrf, float(tdb_s_from_utc_ns(joint_utc_ns)), orbit.trajectory.state),
+        truth.start_utc_ns,
+        joint_utc_ns + round(duration_s * _NS),
+        truth.orientation,
+        (*truth.breaks_utc_ns, *(burn.utc_ns for burn in burns)),
+    )
+    return longer, burns
 
 
 def _one_arc_of(interval: int, frame_utc_ns: IntArray, step_ns: int) -> IntArray:
@@ -269,7 +310,7 @@ def exposures(
 
             def begin(number: int) -> Future[Exposure]:
                 def prepared() -> tuple[_Scene, Samples]:
-                    scene = _scene(world, number)
+                    scene = _scene(world, int(world.frame_utc_ns[number]), number)
                     return scene, sample(scene.utc_ns, scene.camera_from_mcmf)
 
                 scene = renderer.submit(prepared)
@@ -324,12 +365,19 @@ class _Scene:
 
 def expose_frame(world: World, number: int) -> Exposure:
     """What the camera, the ADCS and the clock deliver for one frame. Every draw depends on (seed, frame) alone."""
-    return _exposed(world, _scene(world, number))
+    return _exposed(world, _scene(world, int(world.frame_utc_ns[number]), number))
 
 
-def _scene(world: World, number: int) -> _Scene:
+def expose_at(
+    world: World, utc_ns: int, sample: Callable[[int, FloatArray], Samples] = no_instruments
+) -> Exposure:
+    """Return what the camera, the ADCS and the clock deliver at any time; every draw depends on (seed, time) alone."""
+    scene = _scene(world, utc_ns, utc_ns // _MS)
+    return _exposed(world, scene, sample(utc_ns, scene.camera_from_mcmf))
+
+
+def _scene(world: World, utc_ns: int, number: int) -> _Scene:
     scenario = world.scenario
-    utc_ns = int(world.frame_utc_ns[number])
     rng = np.random.default_rng((scenario.seed, number))
     position = world.truth.positions_mcmf(utc_ns)[0]
     tdb_s = float(tdb_s_from_utc_ns(utc_ns))

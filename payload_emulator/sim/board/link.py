@@ -48,8 +48,9 @@ class LinkSection:
     Losses and bit errors have two states: a burst begins and ends with the given probabilities per frame. What is sent
     at once (a dump) comes again with probability `repeat_share`, and behind the next one with `reorder_share`.
     `stations` are those that listen (one of `STATIONS`), behind the limb of the Moon or not;
-    without any the link never ends. `rate_bps` counts the bits of packets. With `playback` the first half of each
-    contact's packets is asked for again in the next one.
+    without any the link never ends. `rate_bps` counts the bits of packets, `uplink_bps` those of telecommands. With
+    `playback` the first half of each contact's packets is asked for again in the next one. `outages` are spans in which
+    a station does not listen: `STATION START STOP`, UTC.
     """
 
     coding: Literal["rs", "none"] = "rs"
@@ -65,6 +66,8 @@ class LinkSection:
     minimum_elevation_deg: float = 10.0
     rate_bps: float = 64_000.0
     playback: bool = False
+    uplink_bps: float = 4_000.0
+    outages: tuple[str, ...] = ()
 
 
 @dataclass(slots=True, eq=False)
@@ -159,6 +162,10 @@ class Transmitter:
         )
         assert int(self.dumps[-1].last[-1]) < frames
         return octets
+
+    def idle(self, clcw: bytes) -> bytes:
+        """Return a CADU that carries nothing but the CLCW."""
+        return self._encoder.idle(1, clcw)
 
     def _zone(self, ocf: bool) -> int:
         """Octets of a frame for packets."""

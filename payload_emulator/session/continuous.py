@@ -1,0 +1,629 @@
+"""The spacecraft in continuous operation: from the scenario's epoch for any duration, at any speed, over TCP.
+
+Images are made only where the payload looks at them, in commanded windows; in between, time passes in steps of a
+minute with housekeeping, power, heat and the Sun of the orbit. Contacts follow from the geometry of the stations.
+Telecommands reach the spacecraft in contacts alone, at the rate of the uplink; telemetry leaves it at the rate of the
+downlink. The orbit is propagated a day at a time.
+
+Ports: a telemetry and a telecommand port for each station (`StationPorts`), the mission description, and a console with
+one JSON object a line out and one word a line in: `run`, `pause`, `until UTC`, `rate X`, `quit`. With `holds`, simulated
+time stands still at the beginning and at the end of each contact until `run`, so that a ground service can send its
+telecommands and finish its work however fast the simulation is.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import pickle
+import selectors
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lunar.datafolder import DataFolder
+from lunar.errors import LunarError
+from lunar.third_bodies import sun_position_icrf_m
+from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
+from lunar.visibility import sunlit_fraction
+from payload_emulator.errors import RecordError, ScenarioError
+from payload_emulator.flight.onboard.modes import PayloadMode
+from payload_emulator.session.flying import SPACECRAFT_ID, CatalogueDetector
+from payload_emulator.session.instruments import InstrumentBench
+from payload_emulator.session.live import TelecommandBuffer
+from payload_emulator.session.live_ports import Server
+from payload_emulator.session.loading import LoadedPayload, launch_payload
+from payload_emulator.session.scenario import Scenario
+from payload_emulator.session.spacecraft import Spacecraft, new_board
+from payload_emulator.session.station_ports import KEPT_LIMIT_OCTETS, StationPorts
+from payload_emulator.session.world import (
+    NO_SAMPLES,
+    Exposure,
+    World,
+    clock_ticks,
+    expose_at,
+    flown_on,
+    open_world,
+    sample_truth,
+)
+from payload_emulator.sim.board.contact_plan import StationContact, plan_contacts
+from payload_emulator.sim.board.faults import parse_fault
+from payload_emulator.sim.board.link import Receiver, Transmitter, transmit
+from payload_emulator.sim.board.platform import SimulatedBoard
+from payload_emulator.sim.orbit.truth import Spliced, Truth
+from tmtc.cuc import TICKS_PER_SECOND
+from tmtc.link import LinkSettings
+
+CHUNK_S = 86_400.0
+"""Time that the orbit is propagated ahead at once."""
+
+IDLE_STEP_S = 60.0
+"""Longest step outside contacts and windows."""
+
+CONTACT_STEP_S = 60.0
+"""Longest step in a contact."""
+
+_AHEAD_S = 4.0 * 3600.0
+_NS = 1_000_000_000
+_POLL_S = 0.05
+# Two steps at one reading of the on-board clock would look like a clock that stands still.
+_LEAST_STEP_NS = 20_000_000
+_FIRST_DOWNLINK_S = 2.0
+_NO_ATTITUDE = np.full(7, np.nan)
+_CLOCK = struct.Struct("<q")
+_CHECKPOINT_VERSION = 1
+_ARCS_KEPT = 2
+
+
+@dataclass(slots=True)
+class Account:
+    """What the session has done since its epoch."""
+
+    frames: int = 0
+    packets: int = 0
+    frames_sent: int = 0
+    frames_lost: int = 0
+    packets_lost_on_link: int = 0
+    contacts: int = 0
+    telecommands: int = 0
+    telecommand_octets_lost: int = 0
+    resets: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """State of a session outside of observations, from which it can go on after its process has ended.
+
+    The payload starts again from its board as after a loss of power.
+    """
+
+    scenario: str
+    utc_ns: int
+    board: SimulatedBoard
+    resets: tuple[int, ...]
+    clock_error_ticks: int
+    begun: frozenset[Any]
+    receiver: Receiver
+    transmitter: Transmitter
+    state_utc_ns: int
+    state_icrf: Any
+    account: Account
+
+
+def load_checkpoint(path: Path, scenario: Scenario) -> Checkpoint | None:
+    """Return the checkpoint in a file of this program; None without a file.
+
+    Raises
+    ------
+    RecordError
+        The file is damaged, or belongs to another scenario.
+    """
+    try:
+        version, checkpoint = pickle.loads(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, EOFError, AttributeError, ImportError, pickle.UnpicklingError) as error:
+        raise RecordError(f"{path}: expected the state of a session, found damage ({error})") from None
+    if version != _CHECKPOINT_VERSION or checkpoint.scenario != scenario.name:
+        raise RecordError(
+            f"{path}: expected the state of scenario {scenario.name}, found that of {checkpoint.scenario}"
+        )
+    assert isinstance(checkpoint, Checkpoint)
+    return checkpoint
+
+
+@dataclass(slots=True, eq=False)
+class ContinuousSession:
+    """A spacecraft that flies until it is told to stop.
+
+    Attributes
+    ----------
+    rate
+        Simulated seconds per second; 0: as fast as possible.
+    holds
+        Whether time stands still at the beginning and the end of contacts until the console says `run`.
+    stop_utc_ns
+        End of the session; None: none.
+    checkpoint_file
+        Where the state is kept between contacts and at the end.
+    clock_file
+        Where the mission time is written for the ground (`LINNA_CLOCK_FILE`).
+    keeps
+        Whether the stations keep records until they are acknowledged.
+    mission
+        From the ports in use (station: telemetry, telecommand) to the text of the mission description.
+    """
+
+    scenario: Scenario
+    data: DataFolder
+    rate: float = 0.0
+    holds: bool = False
+    stop_utc_ns: int | None = None
+    paused: bool = False
+    host: str = "127.0.0.1"
+    console_port: int = 0
+    mission_port: int = 0
+    station_ports: dict[str, tuple[int, int]] = field(default_factory=dict)
+    checkpoint_file: Path | None = None
+    clock_file: Path | None = None
+    keeps: bool = False
+    mission: Callable[[World, dict[str, tuple[int, int]]], str] = lambda world, ports: ""
+    stopping: threading.Event = field(default_factory=threading.Event)
+    account: Account = field(default_factory=Account)
+    world: World = field(init=False)
+    spacecraft: Spacecraft = field(init=False)
+    utc_ns: int = field(init=False)
+    contact: StationContact | None = None
+    stations: dict[str, StationPorts] = field(default_factory=dict)
+    console: Server = field(init=False)
+    mission_server: Server = field(init=False)
+    _loaded: LoadedPayload = field(init=False)
+    _contacts: deque[StationContact] = field(default_factory=deque)
+    _planned_until_ns: int = 0
+    _receiver: Receiver = field(default_factory=lambda: Receiver(SPACECRAFT_ID))
+    _transmitter: Transmitter = field(init=False)
+    _uplinks: dict[int, TelecommandBuffer] = field(default_factory=dict)
+    _uplinked: deque[tuple[int, bytes]] = field(default_factory=deque)
+    _bench: InstrumentBench = field(init=False)
+    _executor: ThreadPoolExecutor = field(init=False)
+    _next_image: tuple[int, Future[Exposure]] | None = None
+    _words: dict[int, bytes] = field(default_factory=dict)
+    _held: bool = False
+    _last_heard_ns: int = 0
+    _until_ns: int | None = None
+    _clock_map: Any = None
+
+    def __post_init__(self) -> None:
+        scenario = self.scenario
+        self._transmitter = Transmitter(SPACECRAFT_ID, LinkSettings(coding=scenario.link.coding))
+        self.world = open_world(scenario, self.data, CHUNK_S)
+        self._loaded = launch_payload(scenario, self.world.camera, self.data)
+        self.utc_ns = scenario.epoch_utc_ns
+        self._planned_until_ns = self.utc_ns
+        checkpoint = load_checkpoint(self.checkpoint_file, scenario) if self.checkpoint_file else None
+        board = new_board(scenario.seed) if checkpoint is None else checkpoint.board
+        self.spacecraft = Spacecraft(
+            self._loaded,
+            board,
+            scenario.epoch_utc_ns,
+            tuple(parse_fault(text) for text in scenario.faults.events),
+            CatalogueDetector(scenario.seed) if scenario.camera.images == "reduced" else None,
+        )
+        if checkpoint is not None:
+            self._restore(checkpoint)
+        self._bench = InstrumentBench(self.world)
+        self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="render")
+        self._open_ports()
+
+    @property
+    def ports(self) -> dict[str, int]:
+        """The ports in use, by name."""
+        found = {"console": self.console.port, "mission": self.mission_server.port}
+        for name, station in self.stations.items():
+            found[f"telemetry {name}"] = station.telemetry.port
+            found[f"telecommand {name}"] = station.telecommand.port
+        return found
+
+    def run(self) -> None:
+        """Fly until the end, or until told to stop; then keep the state and close everything."""
+        with selectors.DefaultSelector() as selector:
+            for server in self._servers():
+                server.attach(selector)
+            try:
+                self._fly(selector)
+            finally:
+                self._save()
+                self._say({"kind": "end", "utc": format_utc(self.utc_ns)})
+                self._executor.shutdown(cancel_futures=True)
+                for server in self._servers():
+                    server.close()
+
+    # Time
+
+    def _fly(self, selector: selectors.BaseSelector) -> None:
+        self._write_clock()
+        self._turn()
+        while not self.stopping.is_set():
+            if self.stop_utc_ns is not None and self.utc_ns >= self.stop_utc_ns:
+                return
+            self._plan_ahead()
+            due_ns = self._next_turn_ns()
+            if not self._wait(selector, due_ns):
+                return
+            self.utc_ns = due_ns
+            self._write_clock()
+            before = self.contact
+            self._turn()
+            if self.contact is not before:
+                self._hold(selector)
+            elif self._until_ns is not None and self.utc_ns >= self._until_ns:
+                self._until_ns, self.paused = None, True
+                self._say({"kind": "paused", "utc": format_utc(self.utc_ns)})
+
+    def _next_turn_ns(self) -> int:
+        """Return the time of the next step: of the payload, of the link, or the longest step there is."""
+        step_s = IDLE_STEP_S if self.contact is None else CONTACT_STEP_S
+        step_ns = round(step_s * _NS)
+        epoch_ns = self.scenario.epoch_utc_ns
+        due = [epoch_ns + ((self.utc_ns - epoch_ns) // step_ns + 1) * step_ns]
+        if self.contact is not None:
+            due.append(self.contact.stop_utc_ns)
+        elif self._contacts:
+            due.append(self._contacts[0].start_utc_ns)
+        payload = self.spacecraft.payload
+        ticks = payload.next_turn_ticks
+        if ticks is not None:
+            due.append(self._utc_of(ticks))
+        elif payload.mode is PayloadMode.observing:
+            due.append(self.utc_ns + round(self.scenario.camera.frame_interval_s * _NS))
+        due += [bound for bound in (self.stop_utc_ns, self._until_ns) if bound is not None]
+        return max(min(due), self.utc_ns + _LEAST_STEP_NS)
+
+    def _utc_of(self, ticks: int) -> int:
+        """Return the time at which the on-board clock reads `ticks`, or just after it."""
+        utc_ns = self.utc_ns
+        for _ in range(4):
+            left = ticks - self._ticks(utc_ns)
+            if left == 0:
+                return utc_ns
+            utc_ns += math.ceil(left * _NS / TICKS_PER_SECOND)
+        while self._ticks(utc_ns) < ticks:
+            utc_ns += _NS // TICKS_PER_SECOND
+        return utc_ns
+
+    def _ticks(self, utc_ns: int) -> int:
+        return clock_ticks(self.world, utc_ns) + self.spacecraft.clock_error_ticks
+
+    def _wait(self, selector: selectors.BaseSelector, due_ns: int) -> bool:
+        """Serve the ports until it is time for the next step; False where the session is to stop."""
+        due = time.monotonic() + (due_ns - self.utc_ns) / _NS / self.rate if self.rate > 0.0 else 0.0
+        self._serve(selector, 0.0)
+        while not self.stopping.is_set():
+            left = due - time.monotonic()
+            if self.paused or self._is_behind:
+                self._serve(selector, _POLL_S)
+            elif left <= 0.0:
+                return True
+            else:
+                self._serve(selector, min(left, _POLL_S))
+        return False
+
+    @property
+    def _is_behind(self) -> bool:
+        """Whether the ground has fallen so far behind that time must not go on."""
+        return any(one.waiting > KEPT_LIMIT_OCTETS // 16 for one in self.stations.values())
+
+    def _hold(self, selector: selectors.BaseSelector) -> None:
+        """Let time stand still after a contact has begun or ended, until the console says `run`."""
+        self._held = self.holds
+        self._say(self._contact_message())
+        while self._held and not self.stopping.is_set():
+            self._serve(selector, _POLL_S)
+        if self.contact is None and self.spacecraft.payload.mode is not PayloadMode.observing:
+            self._save()
+
+    def _contact_message(self) -> dict[str, Any]:
+        return {
+            "kind": "contact",
+            "state": "ended" if self.contact is None else "started",
+            "station": "" if self.contact is None else self.contact.station,
+            "utc": format_utc(self.utc_ns),
+            "mode": self.spacecraft.payload.mode.name,
+            "waiting": self.spacecraft.payload.waiting,
+            "sent": {name: one.sent for name, one in self.stations.items()},
+            "frames": self.account.frames,
+            "packets": self.account.packets,
+            "telecommands": self.account.telecommands,
+        }
+
+    def _plan_ahead(self) -> None:
+        """Propagate the orbit and find the contacts of the coming hours."""
+        world = self.world
+        while world.truth.stop_utc_ns < self.utc_ns + round(_AHEAD_S * _NS) + _NS * 600:
+            truth, burns = flown_on(world, CHUNK_S)
+            world = self.world = replace(world, truth=_pruned(truth), burns=(*world.burns, *burns))
+            self._bench.world = world
+        if self._planned_until_ns < self.utc_ns + round(_AHEAD_S * _NS / 2):
+            self._plan_contacts()
+
+    def _plan_contacts(self) -> None:
+        link = self.scenario.link
+        stop_ns = self.world.truth.stop_utc_ns - 300 * _NS
+        # A contact that was cut off by the end of the plan is found again as a whole.
+        while self._contacts and self._contacts[-1].stop_utc_ns >= self._planned_until_ns - _NS:
+            self._planned_until_ns = self._contacts.pop().start_utc_ns
+        start_ns = max(self._planned_until_ns, self.world.truth.start_utc_ns + 300 * _NS)
+        if self.contact is not None:
+            start_ns = max(start_ns, self.contact.stop_utc_ns)
+        ephemeris = sample_truth(self.world.truth, np.array([start_ns, stop_ns], dtype=np.int64))
+        self._contacts.extend(plan_contacts(ephemeris, link, start_ns, stop_ns))
+        self._planned_until_ns = stop_ns
+
+    # One step
+
+    def _turn(self) -> None:
+        """Let the spacecraft do what is due at this time, and send its telemetry."""
+        utc_ns, spacecraft = self.utc_ns, self.spacecraft
+        seconds = self._change_contact(utc_ns)
+        contact = self.contact
+        heard = contact is not None and seconds > 0.0
+        link = self.scenario.link
+        orders = self._take_orders(seconds) if heard else b""
+        ticks = self._ticks(utc_ns)
+        exposure = self._image(utc_ns) if spacecraft.payload.will_look(ticks, orders) else None
+        if exposure is not None and isinstance(spacecraft.detector, CatalogueDetector):
+            spacecraft.detector.show(self.world, exposure)
+        resets = len(spacecraft.resets)
+        packets = spacecraft.step(
+            utc_ns,
+            None if exposure is None else exposure.image,
+            _NO_ATTITUDE if exposure is None else exposure.attitude,
+            clock_ticks(self.world, utc_ns),
+            orders,
+            sunlit=self._sunlit(utc_ns),
+            downlink_octets=int(link.rate_bps / 8.0 * seconds) if heard else 0,
+            instruments=NO_SAMPLES if exposure is None else exposure.instruments,
+        )
+        self._receiver.carrier = self._receiver.bit_lock = heard
+        self.account.frames += exposure is not None
+        self.account.resets += len(spacecraft.resets) - resets
+        if contact is not None:
+            self._send(contact, packets)
+        if contact is not None and utc_ns >= contact.stop_utc_ns:
+            self._end_contact()
+
+    def _change_contact(self, utc_ns: int) -> float:
+        """Begin the contact that is due; the seconds of contact since the step before."""
+        if self.contact is None and self._contacts and self._contacts[0].start_utc_ns <= utc_ns:
+            self.contact = self._contacts.popleft()
+            self.account.contacts += 1
+            self._last_heard_ns = utc_ns
+            return _FIRST_DOWNLINK_S
+        if self.contact is None:
+            return 0.0
+        seconds = (utc_ns - self._last_heard_ns) / _NS
+        self._last_heard_ns = utc_ns
+        return seconds
+
+    def _end_contact(self) -> None:
+        """End a contact: telecommands that are still on their way are lost."""
+        self.account.telecommand_octets_lost += sum(len(octets) for _, octets in self._uplinked)
+        self._uplinked.clear()
+        self._uplinks.clear()
+        self.contact = None
+
+    def _take_orders(self, seconds: float) -> bytes:
+        """Return the telecommand packets that reach the spacecraft in some seconds at the rate of the uplink."""
+        allowed = int(self.scenario.link.uplink_bps / 8.0 * seconds)
+        packets: list[bytes] = []
+        while self._uplinked and allowed > 0:
+            connection, octets = self._uplinked.popleft()
+            if len(octets) > allowed:
+                self._uplinked.appendleft((connection, octets[allowed:]))
+                octets = octets[:allowed]
+            allowed -= len(octets)
+            packets += self._uplinks.setdefault(connection, TelecommandBuffer(self._receiver)).take(octets)
+        self.account.telecommands += len(packets)
+        return b"".join(packets)
+
+    def _image(self, utc_ns: int) -> Exposure:
+        """Return the frame of this moment, and begin to render the next one."""
+        prepared, self._next_image = self._next_image, None
+        if prepared is not None and prepared[0] == utc_ns:
+            exposure = prepared[1].result()
+        else:
+            if prepared is not None:
+                prepared[1].cancel()
+            exposure = self._executor.submit(self._expose, utc_ns).result()
+        window = self.spacecraft.payload.mode is PayloadMode.observing
+        if window:
+            following = utc_ns + round(self.scenario.camera.frame_interval_s * _NS)
+            ticks = self.spacecraft.payload.next_turn_ticks
+            if ticks is not None and ticks <= self._ticks(utc_ns):
+                # This frame is the one that is due; the next follows by the same interval.
+                ticks = None
+            at_ns = following if ticks is None else self._utc_of(ticks)
+            self._next_image = (at_ns, self._executor.submit(self._expose, at_ns))
+        return exposure
+
+    def _expose(self, utc_ns: int) -> Exposure:
+        return expose_at(self.world, utc_ns, self._bench.sample)
+
+    def _sunlit(self, utc_ns: int) -> float:
+        position, _ = self.world.truth.states(utc_ns)
+        return float(sunlit_fraction(position[0], sun_position_icrf_m(float(tdb_s_from_utc_ns(utc_ns)))))
+
+    def _send(self, contact: StationContact, packets: list[bytes]) -> None:
+        """Send packets, or an idle frame, to the station of the contact, over the link of the scenario."""
+        transmitter, station = self._transmitter, self.stations[contact.station]
+        clcw = self._receiver.clcw
+        length = transmitter.settings.cadu_length
+        light_s = contact.light_s(self.utc_ns)
+        received_ns = self.utc_ns + round(light_s * _NS)
+        if packets:
+            transmitter.send(packets, self.utc_ns, light_s=light_s, clcw=clcw)
+            dump = transmitter.dumps.pop()
+            seed = self.scenario.seed + self.account.frames_sent
+            reception = transmit([dump], transmitter.settings, self.scenario.link, seed)
+            octets = reception.octets
+            self.account.packets += len(packets)
+            self.account.packets_lost_on_link += reception.account["packets_lost"]
+            self.account.frames_lost += reception.account["frames_lost_on_link"]
+            self.account.frames_sent += reception.account["frames_sent"]
+        else:
+            octets = transmitter.idle(clcw)
+        station.send(received_ns, octets, length)
+
+    # Ports
+
+    def _open_ports(self) -> None:
+        for name in self.scenario.link.stations:
+            telemetry, telecommand = self.station_ports.get(name, (0, 0))
+            self.stations[name] = StationPorts(
+                name,
+                self.host,
+                lambda number, octets, name=name: self._take_telecommands(name, number, octets),
+                telemetry,
+                telecommand,
+                self.keeps,
+            )
+        self.console = Server(
+            "console",
+            self.console_port,
+            self.host,
+            self._take_words,
+            lambda number: self._words.pop(number, None),
+        )
+        used = {name: (one.telemetry.port, one.telecommand.port) for name, one in self.stations.items()}
+        text = self.mission(self.world, used)
+        self.mission_server = Server(
+            "mission", self.mission_port, self.host, lambda number, octets: None, document=text.encode()
+        )
+
+    def _servers(self) -> Iterator[Server]:
+        yield from (self.console, self.mission_server)
+        for station in self.stations.values():
+            yield from (station.telemetry, station.telecommand)
+
+    def _serve(self, selector: selectors.BaseSelector, timeout_s: float) -> None:
+        for key, events in selector.select(timeout_s):
+            server, client = key.data
+            server.serve(client, events)
+
+    def _take_telecommands(self, station: str, number: int, octets: bytes) -> None:
+        """Take octets that a station is to send up; without a contact of that station they are lost."""
+        connection = hash((station, number))
+        if self.contact is None or self.contact.station != station:
+            self.account.telecommand_octets_lost += len(octets)
+        elif octets:
+            self._uplinked.append((connection, octets))
+
+    def _take_words(self, connection: int, octets: bytes) -> None:
+        *lines, rest = (self._words.get(connection, b"") + octets)[-4096:].split(b"\n")
+        self._words[connection] = rest
+        for line in lines:
+            self._obey(line.decode("utf-8", "replace").split())
+
+    def _obey(self, words: list[str]) -> None:
+        if words == ["run"]:
+            self._held = self.paused = False
+        elif words == ["pause"]:
+            self.paused = True
+        elif words == ["quit"]:
+            self.stopping.set()
+        elif words == ["state"]:
+            self._say({"kind": "state", **self._contact_message(), "paused": self.paused or self._held})
+        elif len(words) == 2 and words[0] == "rate" and _number(words[1]) is not None:
+            self.rate = _number(words[1]) or 0.0
+        elif len(words) == 2 and words[0] == "until":
+            try:
+                self._until_ns = parse_utc(words[1])
+                self._held = self.paused = False
+            except LunarError as error:
+                self._say({"kind": "error", "text": str(error)})
+        elif words:
+            text = " ".join(words)[:80]
+            expected = "expected run, pause, state, until UTC, rate X or quit"
+            self._say({"kind": "error", "text": f"{expected}, found {text!r}"})
+
+    def _say(self, message: dict[str, Any]) -> None:
+        self.console.send(json.dumps(message).encode() + b"\n")
+
+    # State
+
+    def _write_clock(self) -> None:
+        if self.clock_file is None:
+            return
+        if self._clock_map is None:
+            self.clock_file.parent.mkdir(parents=True, exist_ok=True)
+            self.clock_file.write_bytes(_CLOCK.pack(self.utc_ns))
+            self._clock_map = np.memmap(self.clock_file, dtype="<i8", mode="r+", shape=(1,))
+        self._clock_map[0] = self.utc_ns
+
+    def _save(self) -> None:
+        """Keep the state of the session; of an observation in progress only what the board keeps."""
+        if self.checkpoint_file is None:
+            return
+        spacecraft = self.spacecraft
+        position, velocity = self.world.truth.states(self.utc_ns)
+        state = Checkpoint(
+            self.scenario.name,
+            self.utc_ns,
+            spacecraft.board,
+            tuple(spacecraft.resets),
+            spacecraft.clock_error_ticks,
+            frozenset(spacecraft.begun),
+            self._receiver,
+            self._transmitter,
+            self.utc_ns,
+            np.concatenate([position[0], velocity[0]]),
+            self.account,
+        )
+        beside = self.checkpoint_file.with_name(self.checkpoint_file.name + ".new")
+        beside.parent.mkdir(parents=True, exist_ok=True)
+        beside.write_bytes(pickle.dumps((_CHECKPOINT_VERSION, state)))
+        beside.replace(self.checkpoint_file)
+
+    def _restore(self, state: Checkpoint) -> None:
+        """Go on where a checkpoint was made."""
+        self.utc_ns = self._planned_until_ns = state.utc_ns
+        self.account, self._receiver, self._transmitter = state.account, state.receiver, state.transmitter
+        self.spacecraft.go_on(state.utc_ns, state.resets, state.clock_error_ticks, state.begun)
+        start = self.world
+        truth = Truth(
+            lambda tdb_s: np.broadcast_to(state.state_icrf, (tdb_s.size, 6)).copy(),
+            state.state_utc_ns,
+            state.state_utc_ns,
+            start.truth.orientation,
+        )
+        longer, burns = flown_on(replace(start, truth=truth), CHUNK_S)
+        self.world = replace(start, truth=longer, burns=burns)
+
+
+def _pruned(truth: Truth) -> Truth:
+    """Return a flight without its arcs of former days."""
+    arcs = truth.state_icrf
+    if not isinstance(arcs, Spliced) or len(arcs.arcs) <= _ARCS_KEPT:
+        return truth
+    joints = arcs.joints_tdb_s[-_ARCS_KEPT + 1 :]
+    start_ns = truth.stop_utc_ns - round(_ARCS_KEPT * CHUNK_S * _NS)
+    breaks = tuple(one for one in truth.breaks_utc_ns if one >= start_ns)
+    return Truth(
+        Spliced(joints, arcs.arcs[-_ARCS_KEPT:]), start_ns, truth.stop_utc_ns, truth.orientation, breaks
+    )
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if 0.0 <= value < 1e9 else None

@@ -1,0 +1,113 @@
+"""Ports of one emulated ground station: received telemetry out as records, telecommands in.
+
+A record is the time of reception (unsigned 64-bit nanoseconds since 1970-01-01 UTC, most significant octet first) and
+a CADU. The station keeps records that a client has not acknowledged, if it is told to: a client acknowledges with the
+number of octets of its connection that are durable there (unsigned 64 bits, most significant octet first), and a new
+connection begins with what is not acknowledged.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from payload_emulator.session.live_ports import Client, Server
+
+RECORD_HEADER = struct.Struct(">Q")
+_COUNT = struct.Struct(">Q")
+
+KEPT_LIMIT_OCTETS = 64 << 20
+"""Largest number of octets that a station keeps for a client that is not there; the simulation waits beyond half."""
+
+
+@dataclass(slots=True, eq=False)
+class StationPorts:
+    """Telemetry and telecommand port of one station.
+
+    Attributes
+    ----------
+    receive
+        Called with the number of the connection and telecommand octets; no octets: the connection has ended.
+    keeps
+        Whether records are kept until they are acknowledged.
+    sent
+        Octets of records handed to the telemetry port.
+    """
+
+    name: str
+    host: str
+    receive: Callable[[int, bytes], None]
+    telemetry_port: int = 0
+    telecommand_port: int = 0
+    keeps: bool = False
+    sent: int = 0
+    telemetry: Server = field(init=False)
+    telecommand: Server = field(init=False)
+    _kept: bytearray = field(default_factory=bytearray)
+    _begin: int = 0
+    _connections: dict[int, int] = field(default_factory=dict)
+    _counts: dict[int, bytes] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.telemetry = Server(
+            f"telemetry of {self.name}",
+            self.telemetry_port,
+            self.host,
+            self._acknowledge,
+            self._ended,
+            greeting=self._greet,
+        )
+        self.telecommand = Server(
+            f"telecommand of {self.name}",
+            self.telecommand_port,
+            self.host,
+            self.receive,
+            lambda number: self.receive(number, b""),
+        )
+
+    @property
+    def waiting(self) -> int:
+        """Octets that no client has taken, or acknowledged where records are kept."""
+        unsent = max((len(client.unsent) for client in self.telemetry.clients.values()), default=0)
+        return max(len(self._kept), unsent)
+
+    def send(self, received_utc_ns: int, cadus: bytes, cadu_length: int) -> None:
+        """Send CADUs that were received at a time."""
+        head = RECORD_HEADER.pack(received_utc_ns)
+        records = b"".join(
+            head + cadus[at : at + cadu_length] for at in range(0, len(cadus), cadu_length)
+        )
+        self.sent += len(records)
+        if self.keeps:
+            self._kept += records
+            if len(self._kept) > KEPT_LIMIT_OCTETS:
+                self._forget(len(self._kept) - KEPT_LIMIT_OCTETS)
+        self.telemetry.send(records)
+
+    def close(self) -> None:
+        """Close both ports."""
+        self.telemetry.close()
+        self.telecommand.close()
+
+    def _greet(self, client: Client) -> bytes:
+        """Return what a new telemetry connection begins with: everything that is not acknowledged."""
+        self._connections[client.number] = self._begin
+        return bytes(self._kept)
+
+    def _acknowledge(self, number: int, octets: bytes) -> None:
+        counts = self._counts.get(number, b"") + octets
+        whole = len(counts) // _COUNT.size * _COUNT.size
+        self._counts[number] = counts[whole:]
+        if whole and self.keeps:
+            count = _COUNT.unpack_from(counts, whole - _COUNT.size)[0]
+            self._forget(self._connections.get(number, self._begin) + count - self._begin)
+
+    def _ended(self, number: int) -> None:
+        self._connections.pop(number, None)
+        self._counts.pop(number, None)
+
+    def _forget(self, count: int) -> None:
+        count = min(max(count, 0), len(self._kept))
+        del self._kept[:count]
+        self._begin += count

@@ -1,0 +1,349 @@
+"""The spacecraft in continuous operation: commanded windows, contacts, storage, clock, state."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import selectors
+import socket
+import struct
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ground_service.missions.model import parse_mission
+from linna import cli
+from lunar.datafolder import DataFolder
+from lunar.timescales import parse_utc, tai_ns_from_utc_ns
+from payload_emulator.errors import RecordError, ScenarioError
+from payload_emulator.session.continuous import ContinuousSession, load_checkpoint
+from payload_emulator.session.mission import operations_mission_text
+from payload_emulator.session.scenario import Scenario, parse_scenario
+from payload_emulator.session.station_ports import RECORD_HEADER
+from tmtc.downlink import decode
+from tmtc.dictionary import DICTIONARY
+from tmtc.link import LinkSettings
+
+NS = 1_000_000_000
+HOUR_NS = 3600 * NS
+EPOCH = parse_utc("2029-08-07T00:00:00Z")
+CADU = LinkSettings().cadu_length
+
+SCENARIO = """
+name = "continuous"
+seed = 3
+[orbit]
+epoch = "2029-08-07T00:00:00Z"
+[dynamics]
+gravity = "builtin"
+degree = 8
+[window]
+search = "none"
+duration_s = 60.0
+[camera]
+images = "reduced"
+frame_interval_s = 15.0
+[terrain]
+source = "procedural"
+[navigation]
+estimators = ["spherical"]
+[clock]
+offset_s = 0.4
+drift_ppm = 5.0
+[link]
+stations = ["madrid"]
+rate_bps = 64000.0
+uplink_bps = 64000.0
+"""
+
+Act = Callable[["Ground", dict[str, Any]], None]
+
+
+def scenario(further: str = "") -> Scenario:
+    return parse_scenario(SCENARIO + further)
+
+
+class Ground:
+    """Station client and operator of a session in the test's process."""
+
+    def __init__(self, session: ContinuousSession, act: Act = lambda ground, contact: None) -> None:
+        self.session, self.act = session, act
+        self.contacts: list[dict[str, Any]] = []
+        self.records = b""
+        self.count = 0
+        self._lock = threading.Lock()
+        self._telemetry = self._connect("telemetry madrid")
+        self._telecommand = self._connect("telecommand madrid")
+        self._console = self._connect("console")
+        self._threads = [threading.Thread(target=self._receive), threading.Thread(target=self._operate)]
+        for thread in self._threads:
+            thread.start()
+
+    def _connect(self, name: str) -> socket.socket:
+        connection = socket.create_connection(("127.0.0.1", self.session.ports[name]), timeout=60)
+        return connection
+
+    def _receive(self) -> None:
+        while octets := self._telemetry.recv(65_536):
+            self.records += octets
+
+    def _operate(self) -> None:
+        for line in self._console.makefile("r"):
+            message = json.loads(line)
+            if message["kind"] == "contact":
+                self.contacts.append(message)
+                self.act(self, message)
+                self._console.sendall(b"run\n")
+
+    def send(self, *packets: bytes) -> None:
+        """Send telecommands, and wait until the station has them."""
+        self._telecommand.sendall(b"".join(packets))
+        time.sleep(0.1)
+
+    def command(self, name: str, **values: object) -> bytes:
+        self.count += 1
+        return DICTIONARY.pack_command(name, values, sequence_count=self.count, source=1)
+
+    def at(self, utc_ns: int, packet: bytes) -> bytes:
+        items = {"octet": np.frombuffer(packet, dtype=np.uint8)}
+        return self.command("insert_activity", release_ticks=self.session._ticks(utc_ns), items=items)
+
+    def function(self, name: str, first: float = 0.0, second: float = 0.0) -> bytes:
+        return self.command("perform_function", function_id=name, argument_1=first, argument_2=second)
+
+    def close(self) -> None:
+        for thread in self._threads:
+            thread.join(60)
+        for connection in (self._telemetry, self._telecommand, self._console):
+            connection.close()
+
+
+def flown(
+    scenario: Scenario, hours: float, act: Act = lambda ground, contact: None, **options: Any
+) -> tuple[ContinuousSession, Ground]:
+    """Fly a session for some hours from its epoch, with a client."""
+    stop = EPOCH + round(hours * HOUR_NS)
+    session = ContinuousSession(scenario, DataFolder(None), holds=True, stop_utc_ns=stop, **options)
+    thread = threading.Thread(target=session.run)
+    thread.start()
+    ground = Ground(session, act)
+    thread.join(120)
+    assert not thread.is_alive()
+    ground.close()
+    return session, ground
+
+
+def packets_of(records: bytes) -> list[tuple[int, str, dict[str, Any]]]:
+    """Reception time, name and values of every packet in records; what was sent at once has one reception time."""
+    length = RECORD_HEADER.size + CADU
+    assert len(records) % length == 0
+    dumps: dict[int, bytes] = {}
+    for start in range(0, len(records), length):
+        received = RECORD_HEADER.unpack_from(records, start)[0]
+        dumps[received] = dumps.get(received, b"") + records[start + RECORD_HEADER.size : start + length]
+    found = []
+    for received, cadus in dumps.items():
+        result = decode(cadus, settings=LinkSettings())
+        for start, size in zip(result.cut.offset.tolist(), result.cut.length.tolist(), strict=True):
+            name, values = DICTIONARY.unpack(result.buffer[start : start + size].tobytes())
+            found.append((received, name, values))
+    return found
+
+
+def test_a_commanded_window_long_after_the_arc_of_the_scenario_gives_its_frames() -> None:
+    start = EPOCH + 30 * HOUR_NS  # the scenario observes for one minute after its epoch
+
+    def act(ground: Ground, contact: dict[str, Any]) -> None:
+        if contact["state"] == "started" and ground.count == 0:
+            ground.send(
+                ground.at(start, ground.function("start_observation", 600.0, 15.0)),
+                ground.at(start + 605 * NS, ground.function("set_mode", 3.0)),
+            )
+
+    session, ground = flown(scenario(), 48.0, act)
+    names = Counter(name for _, name, _ in packets_of(ground.records))
+    assert session.account.telecommands == 2 and session.account.telecommand_octets_lost == 0
+    assert session.account.frames == 40  # 600 s / 15 s
+    assert names["detections"] == 40
+    # Housekeeping each minute, but what the store holds after the last contact.
+    sent_hours = (parse_utc(ground.contacts[-1]["utc"]) - EPOCH) / HOUR_NS
+    assert names["housekeeping"] == pytest.approx(60 * sent_hours, abs=70)
+    assert session.account.frames_lost == session.account.packets_lost_on_link == 0
+    assert sum(names.values()) == session.account.packets
+
+
+def test_without_commands_no_image_is_made_and_time_is_cheap() -> None:
+    before = time.process_time()
+    session, _ = flown(scenario(), 72.0)
+    assert session.account.frames == 0
+    assert time.process_time() - before < 40.0
+
+
+def test_the_store_fills_between_contacts_and_is_empty_after_one() -> None:
+    session, ground = flown(scenario(), 40.0)
+    started = [one for one in ground.contacts if one["state"] == "started"]
+    ended = [one for one in ground.contacts if one["state"] == "ended"]
+    assert len(ended) >= 2
+    gaps = [
+        (parse_utc(later["utc"]) - parse_utc(earlier["utc"])) / (60 * NS)
+        for earlier, later in zip(ended, started[1:], strict=False)
+    ]
+    waiting = [one["waiting"] for one in started[1:]]
+    # A housekeeping packet each minute and some of each five minutes wait after a gap; few after a contact.
+    assert all(count > 0.8 * gap for gap, count in zip(gaps, waiting, strict=False) if gap > 10)
+    assert max(gaps) > 60
+    assert all(one["waiting"] < 5 for one in ended)
+
+
+def test_telecommands_without_a_contact_of_their_station_are_lost() -> None:
+    def act(ground: Ground, contact: dict[str, Any]) -> None:
+        if contact["state"] == "ended":
+            ground.send(ground.command("test_connection"))
+
+    session, _ = flown(scenario(), 30.0, act)
+    assert session.account.telecommands == 0
+    assert session.account.telecommand_octets_lost > 0
+
+
+def test_the_uplink_carries_no_more_than_its_rate() -> None:
+    """100 telecommands at 80 bit/s: 10 octets a second, so that a contact of minutes takes part of them."""
+    sent: list[int] = []
+
+    def act(ground: Ground, contact: dict[str, Any]) -> None:
+        if contact["state"] == "started" and not sent:
+            packets = [ground.command("test_connection") for _ in range(2_000)]
+            sent.append(sum(map(len, packets)))
+            ground.send(*packets)
+
+    slow = parse_scenario(SCENARIO.replace("uplink_bps = 64000.0", "uplink_bps = 8.0"))
+    session, ground = flown(slow, 30.0, act)
+    first = [parse_utc(one["utc"]) for one in ground.contacts[:2]]
+    seconds = (first[1] - first[0]) / NS
+    packet = sent[0] // 2_000
+    assert session.account.telecommands == pytest.approx(seconds / packet, abs=2)
+    assert session.account.telecommand_octets_lost == pytest.approx(sent[0] - seconds, abs=2 * packet)
+
+
+def test_the_clock_drifts_as_the_scenario_says_by_its_time_reports() -> None:
+    def act(ground: Ground, contact: dict[str, Any]) -> None:
+        if contact["state"] == "started" and ground.count == 0:
+            ground.send(ground.command("set_time_report_rate", rate_exponent=0))
+
+    session, ground = flown(scenario(), 60.0, act)
+    reports = [(utc, values) for utc, name, values in packets_of(ground.records) if name == "time_report"]
+    ticks = np.array([values["reported_ticks"] for _, values in reports])
+    received = np.array([utc for utc, _ in reports])
+    assert ticks.size > 20
+    # The on-board clock counts TAI since 2000 in units of 2^-16 s.
+    zero = int(tai_ns_from_utc_ns(parse_utc("2000-01-01T00:00:00Z"))) - 32 * NS
+    elapsed_s = (np.asarray(tai_ns_from_utc_ns(received)) - zero) / NS
+    error_s = ticks / 65_536.0 - elapsed_s + 1.28
+    drift, offset = np.polyfit((received - EPOCH) / NS, error_s, 1)
+    # Light times of 1.18 to 1.36 s change by a few ms a day.
+    assert drift * 1e6 == pytest.approx(5.0, abs=0.5)
+    assert offset == pytest.approx(0.4, abs=0.15)
+
+
+def test_battery_and_temperature_follow_the_sun() -> None:
+    _, ground = flown(scenario(), 12.0)
+    rows = [values for _, name, values in packets_of(ground.records) if name == "housekeeping"]
+    volts = np.array([row["bus_voltage_v"] for row in rows])
+    camera_c = np.array([row["camera_temperature_c"] for row in rows])
+    assert volts.max() - volts.min() > 0.05
+    assert camera_c.max() - camera_c.min() > 5.0
+
+
+def test_a_session_goes_on_from_its_state(tmp_path: Path) -> None:
+    state = tmp_path / "session.state"
+    first, _ = flown(scenario(), 20.0, checkpoint_file=state)
+    kept = load_checkpoint(state, scenario())
+    assert kept is not None and kept.utc_ns == first.utc_ns
+    second, ground = flown(scenario(), 45.0, checkpoint_file=state)
+    assert second.account.contacts >= first.account.contacts
+    events = [
+        values for _, name, values in packets_of(ground.records) if name == "event_info" and values["event_id"] == 1
+    ]
+    assert second.spacecraft.resets
+    whole = ContinuousSession(scenario(), DataFolder(None), stop_utc_ns=EPOCH + 45 * HOUR_NS)
+    whole.run()
+    there, here = second.world.truth.states(second.utc_ns), whole.world.truth.states(whole.utc_ns)
+    assert np.linalg.norm(there[0] - here[0]) < 1.0
+    assert events is not None
+
+
+def test_a_damaged_or_foreign_state_is_refused_in_one_line(tmp_path: Path) -> None:
+    state = tmp_path / "session.state"
+    state.write_bytes(b"nothing")
+    with pytest.raises(RecordError, match="found damage"):
+        load_checkpoint(state, scenario())
+    flown(scenario(), 1.0, checkpoint_file=tmp_path / "other")
+    other = parse_scenario(SCENARIO.replace('"continuous"', '"another"'))
+    with pytest.raises(RecordError, match="expected the state of scenario another, found that of continuous"):
+        load_checkpoint(tmp_path / "other", other)
+
+
+def test_records_that_are_not_acknowledged_come_again_on_the_next_connection() -> None:
+    session = ContinuousSession(scenario(), DataFolder(None), keeps=True)
+    station = session.stations["madrid"]
+    station.send(5, bytes(CADU), CADU)
+    station.send(6, bytes(2 * CADU), CADU)
+    length = RECORD_HEADER.size + CADU
+    with selectors.DefaultSelector() as selector:
+        for server in session._servers():
+            server.attach(selector)
+
+        def served(connection: socket.socket, count: int) -> bytes:
+            got = b""
+            while len(got) < count:
+                session._serve(selector, 0.05)
+                connection.setblocking(False)
+                with contextlib.suppress(BlockingIOError):
+                    got += connection.recv(65_536)
+            return got
+
+        with socket.create_connection(("127.0.0.1", station.telemetry.port)) as first:
+            assert len(served(first, 3 * length)) == 3 * length
+            first.send(struct.pack(">Q", length))
+        for _ in range(20):
+            session._serve(selector, 0.02)
+        with socket.create_connection(("127.0.0.1", station.telemetry.port)) as second:
+            again = served(second, 2 * length)
+        assert RECORD_HEADER.unpack_from(again)[0] == 6 and len(again) == 2 * length
+        for server in session._servers():
+            server.close()
+
+
+def test_the_mission_description_names_stations_and_links() -> None:
+    text = operations_mission_text(
+        ContinuousSession(scenario(), DataFolder(None)).world, DataFolder(None), "127.0.0.1", {"madrid": (1, 2)}
+    )
+    mission = parse_mission(text)
+    assert mission.link.stations is not None
+    assert mission.link.stations["madrid"].latitude_deg == 40.43
+    assert mission.links is not None and mission.links[0].downlink == "127.0.0.1:1"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--continuous"], "expected link.stations in scenario"),
+        (["--continuous", "--days", "-1"], "expected"),
+    ],
+)
+def test_impossible_options_are_refused_in_one_line(
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["emulate", "low-over-mare", *words]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_scenario_with_an_ephemeris_or_a_kidnap_is_refused() -> None:
+    moved = "[disturbances]\nkidnap_distance_km = 10.0\n[maneuvers]\nenabled = false\n"
+    with pytest.raises(ScenarioError, match="expected an orbit to propagate without end, found a kidnap"):
+        ContinuousSession(scenario(moved), DataFolder(None))
