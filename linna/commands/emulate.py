@@ -67,7 +67,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     live.add_argument("--stop-at-end", action="store_true", help="end with the scenario")
     endless = parser.add_argument_group(
-        "continuous", "the spacecraft in operation: images in commanded windows alone, contacts of the stations"
+        "continuous",
+        "the spacecraft in operation: images in commanded windows alone, contacts of the stations",
     )
     endless.add_argument(
         "--continuous", action="store_true", help="fly from the scenario's epoch on, whatever its windows"

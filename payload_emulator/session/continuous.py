@@ -5,10 +5,10 @@ minute with housekeeping, power, heat and the Sun of the orbit. Contacts follow 
 Telecommands reach the spacecraft in contacts alone, at the rate of the uplink; telemetry leaves it at the rate of the
 downlink. The orbit is propagated a day at a time.
 
-Ports: a telemetry and a telecommand port for each station (`StationPorts`), the mission description, and a console with
-one JSON object a line out and one word a line in: `run`, `pause`, `until UTC`, `rate X`, `quit`. With `holds`, simulated
-time stands still at the beginning and at the end of each contact until `run`, so that a ground service can send its
-telecommands and finish its work however fast the simulation is.
+Ports: a telemetry and a telecommand port for each station (`StationPorts`), the mission description, and a console
+with one JSON object a line out and one word a line in: `run`, `pause`, `state`, `until UTC`, `rate X`, `quit`. With
+`holds`, simulated time stands still at the beginning and at the end of each contact until `run`, so that a ground
+service can send its telecommands and finish its work however fast the simulation is.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +33,9 @@ import numpy as np
 from lunar.datafolder import DataFolder
 from lunar.errors import LunarError
 from lunar.third_bodies import sun_position_icrf_m
-from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
+from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns
 from lunar.visibility import sunlit_fraction
-from payload_emulator.errors import RecordError, ScenarioError
+from payload_emulator.errors import RecordError
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.session.flying import SPACECRAFT_ID, CatalogueDetector
 from payload_emulator.session.instruments import InstrumentBench
@@ -198,6 +199,7 @@ class ContinuousSession:
     _words: dict[int, bytes] = field(default_factory=dict)
     _held: bool = False
     _last_heard_ns: int = 0
+    _waiting: int = 0
     _until_ns: int | None = None
     _clock_map: Any = None
 
@@ -337,7 +339,7 @@ class ContinuousSession:
             "station": "" if self.contact is None else self.contact.station,
             "utc": format_utc(self.utc_ns),
             "mode": self.spacecraft.payload.mode.name,
-            "waiting": self.spacecraft.payload.waiting,
+            "waiting": self._waiting if self.contact is not None else self.spacecraft.payload.waiting,
             "sent": {name: one.sent for name, one in self.stations.items()},
             "frames": self.account.frames,
             "packets": self.account.packets,
@@ -404,6 +406,7 @@ class ContinuousSession:
         """Begin the contact that is due; the seconds of contact since the step before."""
         if self.contact is None and self._contacts and self._contacts[0].start_utc_ns <= utc_ns:
             self.contact = self._contacts.popleft()
+            self._waiting = self.spacecraft.payload.waiting
             self.account.contacts += 1
             self._last_heard_ns = utc_ns
             return _FIRST_DOWNLINK_S
@@ -490,7 +493,7 @@ class ContinuousSession:
             self.stations[name] = StationPorts(
                 name,
                 self.host,
-                lambda number, octets, name=name: self._take_telecommands(name, number, octets),
+                partial(self._take_telecommands, name),
                 telemetry,
                 telecommand,
                 self.keeps,

@@ -161,7 +161,11 @@ def operations_mission_text(
             "time_code": "unix_ns",
             "time_offset": 0,
         }
-        lines += ["", f"[link.stations.{name}]", *(f"{key} = {_toml(value)}" for key, value in values.items())]
+        lines += [
+            "",
+            f"[link.stations.{name}]",
+            *(f"{key} = {_toml(value)}" for key, value in values.items()),
+        ]
     for name, (telemetry, telecommand) in ports.items():
         values = {
             "name": name,

@@ -75,9 +75,7 @@ class StationPorts:
     def send(self, received_utc_ns: int, cadus: bytes, cadu_length: int) -> None:
         """Send CADUs that were received at a time."""
         head = RECORD_HEADER.pack(received_utc_ns)
-        records = b"".join(
-            head + cadus[at : at + cadu_length] for at in range(0, len(cadus), cadu_length)
-        )
+        records = b"".join(head + cadus[at : at + cadu_length] for at in range(0, len(cadus), cadu_length))
         self.sent += len(records)
         if self.keeps:
             self._kept += records

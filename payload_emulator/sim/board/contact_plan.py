@@ -74,7 +74,9 @@ def parse_outage(text: str) -> Outage:
         The text has another form, or names no known station.
     """
     words = text.split()
-    fault = f"link.outages: expected STATION START STOP (UTC) with one of {', '.join(STATIONS)}, found {text!r}"
+    fault = (
+        f"link.outages: expected STATION START STOP (UTC) with one of {', '.join(STATIONS)}, found {text!r}"
+    )
     if len(words) != 3 or words[0] not in STATIONS:
         raise ScenarioError(fault)
     try:
@@ -96,9 +98,7 @@ def plan_contacts(
         place = station(name, section.minimum_elevation_deg)
         own = [one for one in outages if one.station == name]
 
-        def listens(
-            utc_ns: IntArray, place: GroundStation = place, own: Sequence[Outage] = own
-        ) -> BoolArray:
+        def listens(utc_ns: IntArray, place: GroundStation = place, own: Sequence[Outage] = own) -> BoolArray:
             # Reception comes later than emission by the light time, within a third of a second of this.
             held = link(ephemeris, utc_ns + _LIGHT_NS, place).visible.copy()
             for one in own:
