@@ -1,6 +1,7 @@
 """The import contracts of pyproject.toml hold, and they refuse what they are there to refuse."""
 
 import ast
+import re
 import shutil
 import subprocess
 import sys
@@ -160,6 +161,56 @@ def test_a_planted_cycle_is_found(copy_of_the_tree: Path, module: str, planted: 
     file = copy_of_the_tree / module
     file.write_text(file.read_text() + f"\n{planted}\n")
     assert any(cycle in one for one in import_cycles(copy_of_the_tree))
+
+
+SQL_LEFT: dict[str, tuple[str, ...]] = {
+    "evaluation": ("report_overview", "service"),
+    "ingest": ("listing", "parameters", "reception", "redecode", "service"),
+    "passes": ("archive_import", "cache", "packet_accounting", "parameters", "service"),
+    "timekeeping": ("recorrelation",),
+    "worker": ("backlog", "backup", "exchange", "follow_up", "integrity", "jobs", "routes", "upkeep"),
+}
+"""Modules that still contain SQL."""
+
+
+def modules_with_sql(root: Path) -> list[str]:
+    """Modules of the ground service besides its stores that import SQLAlchemy, tables or generic queries.
+
+    All may import `Connection`, to pass it on, and the exceptions of SQLAlchemy.
+    """
+    found = []
+    for name, file in modules_of(root).items():
+        parts = name.split(".")
+        if parts[0] != "ground_service" or parts[1:2] == ["store"] or re.fullmatch(r"(.*_)?store", parts[-1]):
+            continue
+        if any(
+            re.match(r"sqlalchemy\b(?!\.(Connection$|exc\b))", one)
+            or re.match(r"ground_service\.store\.(repository|models)\b", one)
+            for one in imported_names(name, file)
+        ):
+            found.append(name)
+    return found
+
+
+def test_only_stores_contain_sql() -> None:
+    left = {f"ground_service.{package}.{name}" for package, names in SQL_LEFT.items() for name in names}
+    assert set(modules_with_sql(ROOT)) == left
+
+
+@pytest.mark.parametrize(
+    "planted",
+    [
+        "from sqlalchemy import Connection, select",
+        "import sqlalchemy",
+        "from sqlalchemy.dialects import sqlite",
+        "def late():\n    from ground_service.store import repository",
+        "from ground_service.store.models import Window",
+    ],
+)
+def test_planted_sql_is_found(copy_of_the_tree: Path, planted: str) -> None:
+    file = copy_of_the_tree / "ground_service/planning/service.py"
+    file.write_text(file.read_text() + f"\n{planted}\n")
+    assert "ground_service.planning.service" in modules_with_sql(copy_of_the_tree)
 
 
 def compiled_functions() -> list[tuple[Path, ast.FunctionDef]]:

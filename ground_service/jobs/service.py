@@ -11,14 +11,14 @@ import uuid
 from collections.abc import Mapping
 from typing import Any
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, InvalidInput
 from ground_service.events import JobChanged, publish
 from ground_service.ground import Ground
+from ground_service.jobs import store
 from ground_service.jobs.model import Job
-from ground_service.store import repository
 from ground_service.store.counters import hold
 
 KINDS = (
@@ -33,8 +33,6 @@ KINDS = (
     "re-evaluation",
 )
 """Kinds of jobs; `worker.jobs` has a function for each."""
-
-FINISHED = ("done", "failed")
 
 IDENTITY = {
     "report": ("pass_id",),
@@ -69,23 +67,12 @@ def add_job(
     if kind not in KINDS:
         raise InvalidInput("job", "kind", " or ".join(KINDS), kind)
     identity = job_id or uuid.uuid4().hex
-    added = repository.add_new(
-        connection,
-        repository.JOBS,
-        id=identity,
-        kind=kind,
-        state="queued",
-        arguments=dict(arguments),
-        progress=0.0,
-        attempts=0,
-        created_utc_ns=utc_now_ns(),
-    )
-    if added:
+    if store.add_job(connection, identity, kind, arguments, utc_now_ns()):
         publish(connection, JobChanged(id=identity, kind=kind, state="queued"))
     else:
-        known = repository.get(connection, repository.JOBS, identity, "job")
-        if known["kind"] != kind or any(
-            known["arguments"].get(name) != arguments.get(name) for name in IDENTITY.get(kind, ())
+        known = store.get_job(connection, identity)
+        if known.kind != kind or any(
+            known.arguments.get(name) != arguments.get(name) for name in IDENTITY.get(kind, ())
         ):
             raise Conflict(OTHER_REQUEST)
     return identity
@@ -114,7 +101,7 @@ def enter_jobs(
     """
     with ground.database.writing() as connection:
         hold(connection, f"job {job_id}")
-        new = repository.find(connection, repository.JOBS, id=job_id) is None
+        new = store.find_job(connection, job_id) is None
         before = [
             add_job(
                 connection,
@@ -130,12 +117,8 @@ def enter_jobs(
 
 def unfinished_jobs(ground: Ground) -> list[str]:
     """Return the ids of unfinished jobs, oldest first."""
-    table = repository.JOBS
     with ground.database.reading() as connection:
-        rows = connection.execute(
-            select(table.c.id).where(table.c.state.not_in(FINISHED)).order_by(table.c.created_utc_ns)
-        )
-        return [str(row[0]) for row in rows]
+        return store.unfinished_jobs(connection)
 
 
 def get_job(ground: Ground, job_id: str) -> Job:
@@ -147,14 +130,12 @@ def get_job(ground: Ground, job_id: str) -> Job:
         There is no such job.
     """
     with ground.database.reading() as connection:
-        return Job.of(repository.get(connection, repository.JOBS, job_id, "job"))
+        return store.get_job(connection, job_id)
 
 
 def list_jobs(
     ground: Ground, *, kind: str | None = None, limit: int = 100, offset: int = 0
 ) -> tuple[list[Job], int]:
     """Return a page of the jobs, newest first, and the total number; `kind` selects jobs of one kind."""
-    equal: dict[str, Any] = {} if kind is None else {"kind": kind}
     with ground.database.reading() as connection:
-        page = repository.page(connection, repository.JOBS, limit=limit, offset=offset, **equal)
-    return [Job.of(row) for row in page.rows], page.total
+        return store.list_jobs(connection, kind=kind, limit=limit, offset=offset)

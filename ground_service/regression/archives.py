@@ -12,23 +12,22 @@ import struct
 import tempfile
 import tomllib
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import delete, select
-
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound, storage_error
 from ground_service.ground import Ground
+from ground_service.http.times import UtcTime
 from ground_service.passes.archive_import import checked_files, read_manifest
 from ground_service.passes.archive_zip import unpacked
-from ground_service.store import repository
+from ground_service.regression import store
+from ground_service.regression.model import ArchiveRecord, KeptArchive
 from ground_service.store.counters import hold
 from ground_service.store.files import FileArchive, replace_durably
-from ground_service.store.states import change_if
 
 MANIFEST = "manifest.json"
 _FILES_LOCK = "files of regression archives"
@@ -180,7 +179,6 @@ def coding_of(manifest: dict[str, Any]) -> str:
 
 def keep_archive(ground: Ground, path: Path, *, pinned: bool = False) -> PassArchive:
     """Check an archive and keep it by content; keeping it again changes nothing but the pin."""
-    table = repository.REGRESSION_ARCHIVES
     with opened_archive(path) as folder:
         archive = check_archive(folder)
         files = store_of(ground)
@@ -191,31 +189,35 @@ def keep_archive(ground: Ground, path: Path, *, pinned: bool = False) -> PassArc
             for name, file in stored.items():
                 if not file.path.exists():  # the file was removed with another archive meanwhile
                     files.put_file(folder / name)
-            added = repository.add_new(
-                connection,
-                table,
+            record = ArchiveRecord(
                 digest=archive.digest,
                 name=archive.name,
                 manifest_sha256=stored[MANIFEST].sha256,
                 frames=archive.frames,
                 octets=sum(file.octets for file in stored.values()),
-                pinned=int(pinned),
-                used_utc_ns=now,
-                created_utc_ns=now,
+                pinned=pinned,
+                kept_since=UtcTime(now),
             )
-            if not added:
-                repository.change(
-                    connection, table, archive.digest, used_utc_ns=now, **({"pinned": 1} if pinned else {})
-                )
+            store.keep_archive(connection, record)
     return archive
 
 
-def kept_archives(ground: Ground) -> list[dict[str, Any]]:
-    """Archives that are kept, the oldest first."""
-    table = repository.REGRESSION_ARCHIVES
+def kept_archives(ground: Ground) -> list[KeptArchive]:
+    """Return the kept archives, oldest first."""
     with ground.database.reading() as connection:
-        query = select(table).order_by(table.c.created_utc_ns, table.c.digest)
-        return [dict(row) for row in connection.execute(query).mappings()]
+        return [_shown(record) for record in store.list_archives(connection)]
+
+
+def kept_archive(ground: Ground, digest: str) -> KeptArchive:
+    """Return a kept archive.
+
+    Raises
+    ------
+    NotFound
+        There is no such archive.
+    """
+    with ground.database.reading() as connection:
+        return _shown(store.get_archive(connection, digest))
 
 
 def check_out(ground: Ground, digest: str, folder: Path) -> PassArchive:
@@ -227,15 +229,12 @@ def check_out(ground: Ground, digest: str, folder: Path) -> PassArchive:
         No archive of this identity is kept.
     """
     with ground.database.writing() as connection:
-        table = repository.REGRESSION_ARCHIVES
-        if not change_if(connection, table, digest, {}, used_utc_ns=utc_now_ns()):
-            raise NotFound("archive", digest)
-        row = repository.get(connection, table, digest, "archive")
+        manifest_sha256 = store.use_archive(connection, digest, utc_now_ns()).manifest_sha256
     files = store_of(ground)
-    manifest = json.loads(files.get(row["manifest_sha256"]))
+    manifest = json.loads(files.get(manifest_sha256))
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / MANIFEST).write_bytes(files.get(row["manifest_sha256"]))
+        (folder / MANIFEST).write_bytes(files.get(manifest_sha256))
         for name, entry in manifest["files"].items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(files.path(entry["sha256"]), folder / name)
@@ -249,8 +248,7 @@ def check_out(ground: Ground, digest: str, folder: Path) -> PassArchive:
 def pin_archive(ground: Ground, digest: str, pinned: bool) -> None:
     """Exclude an archive from retention, or include it again."""
     with ground.database.writing() as connection:
-        if not change_if(connection, repository.REGRESSION_ARCHIVES, digest, {}, pinned=int(pinned)):
-            raise NotFound("archive", digest)
+        store.pin_archive(connection, digest, pinned)
 
 
 def let_go(ground: Ground, *, unused_for_ns: int) -> list[str]:
@@ -258,22 +256,14 @@ def let_go(ground: Ground, *, unused_for_ns: int) -> list[str]:
 
     Files that another archive holds too stay.
     """
-    table = repository.REGRESSION_ARCHIVES
     files = store_of(ground)
     with ground.database.writing() as connection:
         hold(connection, _FILES_LOCK)
-        # One statement, so that an archive that is used or pinned concurrently is kept.
-        old = connection.execute(
-            delete(table)
-            .where(table.c.pinned == 0, table.c.used_utc_ns <= utc_now_ns() - unused_for_ns)
-            .returning(table.c.digest, table.c.manifest_sha256)
-        ).all()
-        kept = [row[0] for row in connection.execute(select(table.c.manifest_sha256))]
-        needed = set[str]().union(*(_held(files, sha256) for sha256 in kept))
-        unneeded = set[str]().union(*(_held(files, sha256) for _, sha256 in old)) - needed
-        for sha256 in unneeded:
+        old = store.remove_unused(connection, utc_now_ns() - unused_for_ns)
+        needed = _held(files, store.list_archives(connection))
+        for sha256 in _held(files, old) - needed:
             files.path(sha256).unlink(missing_ok=True)
-    return sorted(row[0] for row in old)
+    return sorted(record.digest for record in old)
 
 
 def store_of(ground: Ground) -> FileArchive:
@@ -281,10 +271,17 @@ def store_of(ground: Ground) -> FileArchive:
     return FileArchive(ground.home / "regression" / "files")
 
 
-def _held(files: FileArchive, manifest_sha256: str) -> set[str]:
-    """Hashes of the files of an archive, its manifest included."""
-    manifest = json.loads(files.get(manifest_sha256))
-    return {manifest_sha256, *(entry["sha256"] for entry in manifest["files"].values())}
+def _held(files: FileArchive, records: Sequence[ArchiveRecord]) -> set[str]:
+    """Return the hashes of the files of archives, their manifests included."""
+    held = {record.manifest_sha256 for record in records}
+    for record in records:
+        manifest = json.loads(files.get(record.manifest_sha256))
+        held |= {entry["sha256"] for entry in manifest["files"].values()}
+    return held
+
+
+def _shown(record: ArchiveRecord) -> KeptArchive:
+    return KeptArchive.of(dict(record))
 
 
 def frame_inputs(folder: Path) -> list[dict[str, Any]]:

@@ -12,6 +12,7 @@ from typing import Any
 from ground_service.errors import InvalidInput
 from ground_service.regression.archives import write_flight_view
 from ground_service.regression.builds import Build
+from ground_service.regression.model import OK
 from ground_service.regression.runner import (
     DOWNLINKS,
     PERFORMANCE,
@@ -25,7 +26,6 @@ PERFORMANCE_LIMIT_OCTETS = 64 << 20
 PRINTED_SHOWN = 2000
 PRINTED = "printed.txt"
 
-OK = "ok"
 OUTCOMES = {
     OK: "ended well",
     "crashed": "crashed",

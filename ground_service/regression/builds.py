@@ -21,9 +21,10 @@ from typing import Any
 from ground_service.clock import utc_now_ns
 from ground_service.errors import BuildNotChecked, InvalidInput, NotFound, storage_error
 from ground_service.ground import Ground
+from ground_service.http.times import UtcTime
+from ground_service.regression import model, store
 from ground_service.regression.runner import RunRequest, run_by_runner, run_in_sandbox
 from ground_service.sandbox.host import SandboxRefused, check_private, tail
-from ground_service.store import repository
 from ground_service.store.files import make_durable_folder, replace_durably
 from ground_service.text import require_line
 
@@ -230,9 +231,7 @@ def register_build(ground: Ground, build: Build, *, actor: str = "local") -> Bui
     except OSError as error:
         raise storage_error(error, folder) from None
     with ground.database.writing() as connection:
-        repository.add_new(
-            connection,
-            repository.BUILDS,
+        entry = model.Build(
             digest=build.digest,
             name=build.name,
             version=build.version,
@@ -242,8 +241,9 @@ def register_build(ground: Ground, build: Build, *, actor: str = "local") -> Bui
             flight_code=build.flight_code or None,
             provenance=dict(build.provenance),
             registered_by=actor,
-            created_utc_ns=utc_now_ns(),
+            registered=UtcTime(utc_now_ns()),
         )
+        store.add_build(connection, entry)
     return load_build(folder)
 
 
@@ -307,12 +307,9 @@ def registered_build(ground: Ground, digest: str) -> Build:
         If its files are no longer those that were registered.
     """
     with ground.database.reading() as connection:
-        page = repository.page(
-            connection, repository.BUILDS, limit=2, conditions=[repository.BUILDS.c.digest.startswith(digest)]
-        )
-    if page.total != 1 or len(digest) < 8:
+        whole = store.find_build(connection, digest)
+    if whole is None or len(digest) < 8:
         raise NotFound("build", digest)
-    whole = page.rows[0]["digest"]
     build = load_build(ground.home / "regression" / "builds" / whole)
     if build.digest != whole:
         raise InvalidInput(
@@ -331,10 +328,22 @@ def build_of(ground: Ground, given: str) -> Build:
     return registered_build(ground, given)
 
 
-def registered_builds(ground: Ground) -> list[dict[str, Any]]:
-    """Builds that are registered, the newest first."""
+def registered_builds(ground: Ground, *, limit: int = 1000, offset: int = 0) -> tuple[list[model.Build], int]:
+    """Return a page of the registered builds, newest first, and the total number."""
     with ground.database.reading() as connection:
-        return repository.page(connection, repository.BUILDS, limit=1000).rows
+        return store.list_builds(connection, limit=limit, offset=offset)
+
+
+def registered_entry(ground: Ground, digest: str) -> model.Build:
+    """Return the entry of a registered build.
+
+    Raises
+    ------
+    NotFound
+        There is no such build.
+    """
+    with ground.database.reading() as connection:
+        return store.get_build(connection, digest)
 
 
 def flight_code_hash() -> str:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,11 +17,12 @@ from ground_service.evaluation.service import plain
 from ground_service.evaluation.store import read_image
 from ground_service.ground import Ground
 from ground_service.missions.model import weakest_evidence
+from ground_service.regression import store
 from ground_service.regression.archives import store_of
 from ground_service.regression.gates.core import FAIL, INCONCLUSIVE, PASS, Gate
+from ground_service.regression.model import JudgedGate, Verdict
 from ground_service.regression.outcome import PassVerdict, RegressionOutcome, pass_figures
 from ground_service.regression.replay_samples import PassContext, ReadDownlink
-from ground_service.store import repository
 from lunar.timescales import format_utc
 from reports.values import (
     CampaignPass,
@@ -37,158 +38,69 @@ CHANGED_FRAMES = 4
 """Frames shown side by side: those that changed most."""
 
 
-def regression_json(outcome: RegressionOutcome) -> dict[str, Any]:
-    """The verdict for a script; NaN and infinities are null."""
-    result: dict[str, Any] = plain(
-        {
-            "verdict": outcome.verdict,
-            "baseline": _build(outcome.baseline),
-            "candidate": _build(outcome.candidate),
-            "policy": {
-                "version": outcome.policy.policy.version,
-                "sha256": outcome.policy.sha256,
-                "confidence": outcome.policy.policy.confidence,
-                "power": outcome.policy.policy.power,
-            },
-            "frames": outcome.frames_judged,
-            "frames_needed": outcome.frames_needed,
-            "gates": [_gate(gate) for gate in outcome.gates],
-            "passes": [_pass(one) for one in outcome.passes],
-            "remarks": list(outcome.remarks),
-        }
-    )
-    return result
-
-
-@dataclass(frozen=True, slots=True)
-class StoredBuild:
-    """Build in a stored verdict."""
-
-    name: str
-    version: str
-    digest: str
-
-    @property
-    def title(self) -> str:
-        """Name, version and the beginning of the identity."""
-        return " ".join(part for part in (self.name, self.version, f"({self.digest[:12]})") if part)
-
-
-@dataclass(frozen=True, slots=True)
-class StoredPolicy:
-    """Policy in a stored verdict."""
-
-    sha256: str
-
-
-@dataclass(frozen=True, slots=True)
-class StoredPass:
-    """Pass in a stored verdict."""
-
-    name: str
-    state: str
-    detail: str
-
-
-@dataclass(frozen=True, slots=True)
-class StoredVerdict:
-    """The part of a stored verdict that texts state."""
-
-    verdict: str
-    baseline: StoredBuild
-    candidate: StoredBuild
-    policy: StoredPolicy
-    gates: tuple[Gate, ...]
-    passes: tuple[StoredPass, ...]
-    remarks: tuple[str, ...]
-    frames_judged: int
-    frames_needed: int | None
-
-
-def stored_verdict(result: Mapping[str, Any]) -> StoredVerdict:
-    """Return the verdict of a JSON document of `regression_json`; null numbers become NaN."""
-
-    def number(value: float | None) -> float:
-        return math.nan if value is None else value
-
-    builds = [
-        StoredBuild(**{key: result[side][key] for key in ("name", "version", "digest")})
-        for side in ("baseline", "candidate")
-    ]
-    gates = tuple(
-        Gate(
-            name=gate["name"],
-            outcome=gate["outcome"],
-            baseline=number(gate["baseline"]),
-            candidate=number(gate["candidate"]),
-            margin=number(gate["margin"]),
-            limit=number(gate["limit"]),
-            unit=gate["unit"],
-            p_value=number(gate["p_value"]),
-            level=number(gate["level"]),
-            resolution=number(gate["resolution"]),
-            frames=gate["frames"],
-            frames_needed=gate["frames_needed"],
-            pass_name=gate["pass"] or "",
-            change_low=number(gate["change_bounds"][0]),
-            change_high=number(gate["change_bounds"][1]),
-            reason=gate["reason"] or "",
-            waived=gate["waived"] or "",
+def verdict_document(outcome: RegressionOutcome) -> Verdict:
+    """Return the verdict as it is stored and printed; NaN and infinities are null."""
+    return Verdict.model_validate(
+        plain(
+            {
+                "verdict": outcome.verdict,
+                "baseline": _build(outcome.baseline),
+                "candidate": _build(outcome.candidate),
+                "policy": {
+                    "version": outcome.policy.policy.version,
+                    "sha256": outcome.policy.sha256,
+                    "confidence": outcome.policy.policy.confidence,
+                    "power": outcome.policy.policy.power,
+                },
+                "frames": outcome.frames_judged,
+                "frames_needed": outcome.frames_needed,
+                "gates": [_gate(gate) for gate in outcome.gates],
+                "passes": [_pass(one) for one in outcome.passes],
+                "remarks": outcome.remarks,
+            }
         )
-        for gate in result["gates"]
-    )
-    passes = tuple(StoredPass(one["name"], one["state"], one["detail"]) for one in result["passes"])
-    return StoredVerdict(
-        result["verdict"],
-        builds[0],
-        builds[1],
-        StoredPolicy(result["policy"]["sha256"]),
-        gates,
-        passes,
-        tuple(result["remarks"]),
-        result["frames"],
-        result["frames_needed"],
     )
 
 
-def regression_text(outcome: RegressionOutcome | StoredVerdict) -> str:
+def regression_text(verdict: Verdict) -> str:
     """Return a summary for a terminal: verdict, failed and inconclusive gates, and the number of frames needed."""
-    lines = [f"{outcome.candidate.title} against {outcome.baseline.title}: {outcome.verdict}"]
-    for one in outcome.passes:
+    lines = [f"{verdict.candidate.title} against {verdict.baseline.title}: {verdict.verdict}"]
+    for one in verdict.passes:
         if one.state != "judged":
             lines.append(f"  {one.name}: {one.state}: {one.detail}")
-    for gate in sorted(outcome.gates, key=lambda gate: (FAIL, INCONCLUSIVE, PASS).index(gate.outcome)):
+    for gate in sorted(verdict.gates, key=lambda gate: (FAIL, INCONCLUSIVE, PASS).index(gate.outcome)):
         if gate.passed:
             continue
         where = f" on {gate.pass_name}" if gate.pass_name else ""
         state = f"waived ({gate.outcome}): {gate.waived}" if gate.waived else gate.outcome
         lines.append(f"  {state}: {gate.name}{where}: {gate_text(gate)}")
     counts = {
-        name: sum(gate.outcome == name for gate in outcome.gates) for name in (PASS, FAIL, INCONCLUSIVE)
+        name: sum(gate.outcome == name for gate in verdict.gates) for name in (PASS, FAIL, INCONCLUSIVE)
     }
     lines.append(
-        f"  {counts[PASS]} of {len(outcome.gates)} gates passed, {counts[FAIL]} failed, "
+        f"  {counts[PASS]} of {len(verdict.gates)} gates passed, {counts[FAIL]} failed, "
         f"{counts[INCONCLUSIVE]} inconclusive, over "
-        f"{sum(one.state == 'judged' for one in outcome.passes)} of {len(outcome.passes)} passes "
-        f"({outcome.frames_judged} frames)"
+        f"{sum(one.state == 'judged' for one in verdict.passes)} of {len(verdict.passes)} passes "
+        f"({verdict.frames} frames)"
     )
-    if not outcome.gates:
+    if not verdict.gates:
         lines.append("  No gate was judged: the passes above give no comparable metric")
-    if needed_text(outcome):
-        lines.append(f"  {needed_text(outcome)}")
-    lines += [f"  {remark}" for remark in outcome.remarks]
+    if needed_text(verdict):
+        lines.append(f"  {needed_text(verdict)}")
+    lines += [f"  {remark}" for remark in verdict.remarks]
     return "\n".join(lines)
 
 
-def gate_text(gate: Gate) -> str:
+def gate_text(gate: JudgedGate) -> str:
     """Return the values of a gate, why it is inconclusive, and the number of frames needed."""
     parts = [
         f"{_number(gate.baseline)} -> {_number(gate.candidate)} {gate.unit}".rstrip(),
         f"limit {_number(gate.limit)}",
     ]
     if gate.outcome == INCONCLUSIVE:
-        parts.append(gate.reason)
-        if not gate.reason.startswith("unknown"):
+        reason = gate.reason or ""
+        parts.append(reason)
+        if not reason.startswith("unknown"):
             parts.append(f"resolution {_number(gate.resolution)}, margin {gate.margin:.3g}")
             parts.append(f"{gate.frames} frames, {_needed(gate.frames_needed)}")
     elif gate.reason:
@@ -196,10 +108,10 @@ def gate_text(gate: Gate) -> str:
     return ", ".join(parts)
 
 
-def needed_text(outcome: RegressionOutcome | StoredVerdict) -> str:
+def needed_text(verdict: Verdict) -> str:
     """Return the number of frames and passes needed to decide every gate over the suite; empty if all are decided."""
-    needed, frames = outcome.frames_needed, outcome.frames_judged
-    judged = sum(one.state == "judged" for one in outcome.passes)
+    needed, frames = verdict.frames_needed, verdict.frames
+    judged = sum(one.state == "judged" for one in verdict.passes)
     if needed is None or needed <= frames or not judged:
         return ""
     passes = math.ceil(needed * judged / frames)
@@ -210,11 +122,11 @@ def _needed(frames: int | None) -> str:
     return "needs an unknown number" if frames is None else f"needs {frames:,}"
 
 
-def _number(value: float) -> str:
-    return f"{value:.4g}" if math.isfinite(value) else "unknown"
+def _number(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.4g}"
 
 
-def regression_junit(outcome: RegressionOutcome | StoredVerdict, finished_utc_ns: int) -> str:
+def regression_junit(verdict: Verdict, finished_utc_ns: int) -> str:
     """Return JUnit XML with a test case for every gate and every pass.
 
     Elements, their order and their attributes are valid in the schema of the Jenkins xUnit plugin (junit-10.xsd) and in
@@ -222,16 +134,16 @@ def regression_junit(outcome: RegressionOutcome | StoredVerdict, finished_utc_ns
     a waived case is skipped with its reason.
     """
     cases: list[tuple[str, str, str, str]] = []
-    for one in outcome.passes:
+    for one in verdict.passes:
         kind = "" if one.state == "judged" else "failure" if one.state == "candidate failed" else "error"
         cases.append((f"pass {one.name}", "passes", kind, one.detail and f"{one.state}: {one.detail}"))
-    for gate in outcome.gates:
+    for gate in verdict.gates:
         kind = {PASS: "", FAIL: "failure", INCONCLUSIVE: "error"}[gate.outcome]
         text = f"{gate.outcome}: {gate_text(gate)}"
         if gate.waived:
             kind, text = "skipped", f"waived: {gate.waived}; {text}"
         cases.append((f"{gate.name} ({gate.pass_name or 'suite'})", "gates", kind, text))
-    if not outcome.gates:
+    if not verdict.gates:
         cases.append(("gates", "gates", "error", "inconclusive: no gate was judged"))
     kinds = [kind for _, _, kind, _ in cases]
     suite = ET.Element(
@@ -248,12 +160,12 @@ def regression_junit(outcome: RegressionOutcome | StoredVerdict, finished_utc_ns
     )
     properties = ET.SubElement(suite, "properties")
     for name, value in (
-        ("verdict", outcome.verdict),
-        ("candidate", outcome.candidate.digest),
-        ("baseline", outcome.baseline.digest),
-        ("policy", outcome.policy.sha256),
-        ("frames", str(outcome.frames_judged)),
-        ("frames_needed", "unknown" if outcome.frames_needed is None else str(outcome.frames_needed)),
+        ("verdict", verdict.verdict),
+        ("candidate", verdict.candidate.digest),
+        ("baseline", verdict.baseline.digest),
+        ("policy", verdict.policy.sha256),
+        ("frames", str(verdict.frames)),
+        ("frames_needed", "unknown" if verdict.frames_needed is None else str(verdict.frames_needed)),
     ):
         ET.SubElement(properties, "property", name=name, value=value)
     for name, group, kind, text in cases:
@@ -262,7 +174,7 @@ def regression_junit(outcome: RegressionOutcome | StoredVerdict, finished_utc_ns
             ET.SubElement(case, kind, message=_xml(text))
         elif kind:
             ET.SubElement(case, kind, message=_xml(text), type="inconclusive" if kind == "error" else "fail")
-    ET.SubElement(suite, "system-out").text = _xml(regression_text(outcome))
+    ET.SubElement(suite, "system-out").text = _xml(regression_text(verdict))
     ET.SubElement(suite, "system-err")
     ET.indent(suite)
     return ET.tostring(suite, encoding="unicode", xml_declaration=True) + "\n"
@@ -342,11 +254,9 @@ def _changed_frame(ground: Ground, one: PassVerdict, frame: int) -> ChangedFrame
     assert one.context and one.baseline_read and one.candidate_read
     context = one.context
     with ground.database.reading() as connection:
-        row = repository.get(connection, repository.REGRESSION_ARCHIVES, one.digest, "archive")
-    import json
-
+        archive = store.get_archive(connection, one.digest)
     files = store_of(ground)
-    manifest = json.loads(files.get(row["manifest_sha256"]))
+    manifest = json.loads(files.get(archive.manifest_sha256))
     octets = files.get(manifest["files"][context.frame_names[frame]]["sha256"])
     image = read_image(octets, context.frame_names[frame])
     sides = [
@@ -551,8 +461,9 @@ def _verdict_text(outcome: RegressionOutcome, troubled: list[PassVerdict]) -> st
         parts.append(f"{sum(gate.passed for gate in outcome.gates)} of {len(outcome.gates)} gates passed.")
     if waived:
         parts.append(f"{_counted(waived, 'waived')}.")
-    if needed_text(outcome):
-        parts.append(needed_text(outcome) + ".")
+    needed = needed_text(verdict_document(outcome))
+    if needed:
+        parts.append(f"{needed}.")
     if troubled:
         parts.append(f"{len(troubled)} of {len(outcome.passes)} passes were not judged: see the remarks.")
     return " ".join(parts)

@@ -14,6 +14,7 @@ from typing import Any
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.service import plain
 from ground_service.ground import Ground
+from ground_service.jobs.store import set_progress
 from ground_service.regression.archives import kept_archives
 from ground_service.regression.baseline import baseline_figures
 from ground_service.regression.builds import CURRENT, Build, load_build, register_build, registered_build
@@ -28,8 +29,6 @@ from ground_service.regression.service import (
     keep_regression,
     run_regression,
 )
-from ground_service.store import repository
-from ground_service.store.states import change_if
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +50,7 @@ def prepared(
     NotFound, InvalidInput
         A build or an archive is not known, or none is kept.
     """
-    kept = {row["digest"] for row in kept_archives(ground)}
+    kept = {one.digest for one in kept_archives(ground)}
     for digest in archives:
         if digest not in kept:
             raise InvalidInput("archives", "", "identities of archives that are kept", digest[:64])
@@ -137,7 +136,7 @@ def _outcome(
             ground.check_stopping()
             share = 0.95 * number / total
             with ground.database.writing() as connection:
-                change_if(connection, repository.JOBS, job_id, {"state": "running"}, progress=share)
+                set_progress(connection, job_id, share)
 
     return run_regression(
         ground,

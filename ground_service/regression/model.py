@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from ground_service.http.model import Entity, Given
 from ground_service.http.times import UtcTime
+
+OK = "ok"
+"""Outcome of a successful replay."""
 
 
 class Build(Entity):
@@ -34,6 +37,26 @@ class KeptArchive(Entity):
     octets: int
     pinned: bool
     kept_since: UtcTime
+
+
+class ArchiveRecord(KeptArchive):
+    """A kept archive with the hash of its manifest."""
+
+    manifest_sha256: str
+
+
+class KeptReplay(Entity):
+    """A replay of a build over an archive: its outcome, and the hashes of its files."""
+
+    outcome: str
+    detail: str
+    downlink_sha256: str | None
+    performance_sha256: str | None
+    wall_s: float
+    cpu_s: float
+    peak_rss_mib: float
+    isolation: str
+    machine: str
 
 
 class ArchiveChange(Given):
@@ -95,13 +118,125 @@ class AnalysisRequest(Comparison):
     figure: str = Field(default="", max_length=100, description="Metric of a bisection")
 
 
+class JudgedBuild(Entity):
+    """A build in a verdict."""
+
+    name: str
+    version: str
+    digest: str
+    flight_code: str | None
+    provenance: dict[str, str]
+
+    @property
+    def title(self) -> str:
+        """Name, version and the beginning of the identity."""
+        return " ".join(part for part in (self.name, self.version, f"({self.digest[:12]})") if part)
+
+
+class JudgedPolicy(Entity):
+    """The policy of a verdict."""
+
+    version: str
+    sha256: str
+    confidence: float
+    power: float
+
+
+class JudgedGate(Entity):
+    """Decision of one gate; numbers are null if unknown or infinite."""
+
+    model_config = ConfigDict(validate_by_name=True, serialize_by_alias=True)
+
+    name: str = Field(examples=["detector.recall"])
+    pass_name: str | None = Field(alias="pass", description="null: the whole suite")
+    outcome: str = Field(description="pass, fail or inconclusive", examples=["pass"])
+    passed: bool
+    baseline: float | None
+    candidate: float | None
+    margin: float | None
+    limit: float | None
+    unit: str
+    change_bounds: tuple[float | None, float | None] = Field(
+        description="One-sided confidence bounds of the degradation"
+    )
+    p_value: float | None
+    level: float | None
+    resolution: float | None = Field(description="Smallest degradation that the frames detect")
+    frames: int
+    frames_needed: int | None
+    reason: str | None
+    waived: str | None
+
+
+class JudgedReplay(Entity):
+    """Replay of a pass by one build; its costs are null if its telemetry was not read."""
+
+    outcome: str
+    detail: str
+    cpu_s: float
+    wall_s: float
+    peak_rss_mib: float
+    outcome_shares: dict[str, dict[str, float]] | None = None
+    stages_ms: dict[str, float] | None = None
+    memory_mib: float | None = None
+    undecodable: int | None = None
+
+
+class JudgedPass(Entity):
+    """One pass of a verdict."""
+
+    name: str
+    archive: str
+    state: str = Field(description="judged, candidate failed, baseline failed or unusable")
+    detail: str
+    baseline: JudgedReplay | None = None
+    candidate: JudgedReplay | None = None
+    frames: int | None = None
+
+
+class Verdict(Entity):
+    """Verdict on a candidate build, as `linna regress run --json` prints it."""
+
+    verdict: str = Field(description="pass, fail or inconclusive", examples=["pass"])
+    baseline: JudgedBuild
+    candidate: JudgedBuild
+    policy: JudgedPolicy
+    frames: int = Field(description="Number of frames processed by both builds")
+    frames_needed: int | None = Field(
+        description="Number of frames needed to decide every gate over the suite; null if unknown"
+    )
+    gates: list[JudgedGate]
+    passes: list[JudgedPass]
+    remarks: list[str]
+
+    def document(self) -> dict[str, Any]:
+        """Return the JSON document."""
+        return self.model_dump(mode="json", exclude_unset=True)
+
+
 class Regression(Entity):
     """The verdict on a candidate build."""
 
     id: str
     verdict: str = Field(description="pass, fail or inconclusive", examples=["pass"])
     created: UtcTime
-    result: dict[str, Any] = Field(description="As printed by `linna regress run --json`")
+    result: Verdict
+
+    def summary(self) -> RegressionSummary:
+        """Return the regression as lists show it."""
+        counted = [gate.outcome for gate in self.result.gates if not gate.waived]
+        return RegressionSummary(
+            id=self.id,
+            verdict=self.verdict,
+            candidate=self.result.candidate.digest,
+            baseline=self.result.baseline.digest,
+            gates=len(self.result.gates),
+            gates_failed=counted.count("fail"),
+            gates_inconclusive=counted.count("inconclusive"),
+            frames=self.result.frames,
+            frames_needed=self.result.frames_needed,
+            created=self.created,
+        )
 
 
 class RegressionSummary(Entity):

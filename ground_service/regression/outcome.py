@@ -12,24 +12,10 @@ from ground_service.regression.gates.core import FAIL, INCONCLUSIVE, PASS, Gate,
 from ground_service.regression.gates.metrics import outcome_shares
 from ground_service.regression.gates.policy import PolicyFile
 from ground_service.regression.gates.samples import PassFrames
+from ground_service.regression.model import KeptReplay
 from ground_service.regression.replay_samples import PassContext, ReadDownlink
 
 EXIT_STATUS = {PASS: 0, FAIL: 1, INCONCLUSIVE: 3}
-
-
-@dataclass(frozen=True, slots=True)
-class KeptReplay:
-    """Completed replay: its outcome, and the location of its downlink."""
-
-    outcome: str
-    detail: str
-    downlink_sha256: str | None
-    performance_sha256: str | None
-    wall_s: float
-    cpu_s: float
-    peak_rss_mib: float
-    isolation: str
-    machine: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,12 +21,18 @@ from ground_service.http.common import (
 )
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations, problems
-from ground_service.http.times import UtcTime
 from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import enter_jobs, get_job
 from ground_service.regression import archives as archive_service
-from ground_service.regression.builds import CURRENT, load_build, register_build
+from ground_service.regression import service
+from ground_service.regression.builds import (
+    CURRENT,
+    load_build,
+    register_build,
+    registered_builds,
+    registered_entry,
+)
 from ground_service.regression.gates.policy import read_policy
 from ground_service.regression.jobs import compared, missing_replays
 from ground_service.regression.model import (
@@ -39,7 +45,6 @@ from ground_service.regression.model import (
     RegressionRequest,
     RegressionSummary,
 )
-from ground_service.store import repository
 from ground_service.store.files import StoredFile
 
 UPLOAD_PATHS = (f"{API_PREFIX}/builds", f"{API_PREFIX}/regression-archives")
@@ -52,9 +57,8 @@ regressions = operations("regression")
 @regressions.get("/builds")
 def list_builds(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[Build]:
     """List the registered builds, newest first."""
-    with ground.database.reading() as connection:
-        page = repository.page(connection, repository.BUILDS, limit=paging.limit, offset=paging.offset)
-    return paging.page([_build(row) for row in page.rows], page.total)
+    items, total = registered_builds(ground, limit=paging.limit, offset=paging.offset)
+    return paging.page(items, total)
 
 
 @regressions.post("/builds", status_code=201, openapi_extra=upload_body("Zip file of a build"))
@@ -70,13 +74,14 @@ async def add_build(upload: UploadOf, ground: GroundOf, caller: Operator) -> Bui
 @regressions.post("/builds/current", status_code=201)
 def add_current_build(ground: GroundOf, caller: Operator) -> Build:
     """Register the installed flight code with its own network and parameters."""
-    return _registered(ground, register_build(ground, load_build(CURRENT), actor=caller.name).digest)
+    digest = register_build(ground, load_build(CURRENT), actor=caller.name).digest
+    return registered_entry(ground, digest)
 
 
 @regressions.get("/regression-archives")
 def list_kept_archives(ground: GroundOf, _: Viewer) -> list[KeptArchive]:
     """List the archives that are kept for replays, oldest first."""
-    return [_archive(row) for row in archive_service.kept_archives(ground)]
+    return archive_service.kept_archives(ground)
 
 
 @regressions.post(
@@ -88,10 +93,7 @@ async def keep_archive(upload: UploadOf, ground: GroundOf, _: Operator, pinned: 
 
     def keep() -> KeptArchive:
         kept = archive_service.keep_archive(ground, stored.path, pinned=pinned)
-        with ground.database.reading() as connection:
-            return _archive(
-                repository.get(connection, repository.REGRESSION_ARCHIVES, kept.digest, "archive")
-            )
+        return archive_service.kept_archive(ground, kept.digest)
 
     return await upload.run(keep)
 
@@ -100,8 +102,7 @@ async def keep_archive(upload: UploadOf, ground: GroundOf, _: Operator, pinned: 
 def change_kept_archive(ground: GroundOf, _: Operator, digest: Digest, given: ArchiveChange) -> KeptArchive:
     """Change whether a kept archive is pinned."""
     archive_service.pin_archive(ground, digest, given.pinned)
-    with ground.database.reading() as connection:
-        return _archive(repository.get(connection, repository.REGRESSION_ARCHIVES, digest, "archive"))
+    return archive_service.kept_archive(ground, digest)
 
 
 @regressions.delete("/regression-archives")
@@ -163,32 +164,14 @@ def start_analysis(
 @regressions.get("/regressions")
 def list_regressions(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[RegressionSummary]:
     """List the verdicts, newest first."""
-    with ground.database.reading() as connection:
-        page = repository.page(connection, repository.REGRESSIONS, limit=paging.limit, offset=paging.offset)
-    items = [
-        RegressionSummary(
-            id=row["id"],
-            verdict=row["verdict"],
-            candidate=row["candidate_digest"],
-            baseline=row["baseline_digest"],
-            gates=len(row["result"]["gates"]),
-            gates_failed=_count(row, "fail"),
-            gates_inconclusive=_count(row, "inconclusive"),
-            frames=row["result"]["frames"],
-            frames_needed=row["result"]["frames_needed"],
-            created=UtcTime(row["created_utc_ns"]),
-        )
-        for row in page.rows
-    ]
-    return paging.page(items, page.total)
+    items, total = service.list_regressions(ground, limit=paging.limit, offset=paging.offset)
+    return paging.page(items, total)
 
 
 @regressions.get("/regressions/{regression_id}")
 def get_regression(ground: GroundOf, _: Viewer, regression_id: Key) -> Regression:
     """Show the verdict of a regression."""
-    with ground.database.reading() as connection:
-        row = repository.get(connection, repository.REGRESSIONS, regression_id, "regression")
-    return Regression.of(row)
+    return service.get_regression(ground, regression_id)
 
 
 @regressions.get(
@@ -198,9 +181,7 @@ def get_regression(ground: GroundOf, _: Viewer, regression_id: Key) -> Regressio
 )
 def get_regression_report(ground: GroundOf, _: Viewer, regression_id: Key) -> Response:
     """Return the report of a regression as HTML."""
-    with ground.database.reading() as connection:
-        row = repository.get(connection, repository.REGRESSIONS, regression_id, "regression")
-    return Response(ground.files.get(row["html_sha256"]), media_type="text/html; charset=utf-8")
+    return Response(service.report_of(ground, regression_id), media_type="text/html; charset=utf-8")
 
 
 def _register(ground: Ground, stored: StoredFile, caller: Caller) -> Build:
@@ -211,22 +192,4 @@ def _register(ground: Ground, stored: StoredFile, caller: Caller) -> Build:
                 f"{caller.name}: expected the role admin to register a program, found {caller.role}"
             )
         register_build(ground, build, actor=caller.name)
-    return _registered(ground, build.digest)
-
-
-def _registered(ground: Ground, digest: str) -> Build:
-    with ground.database.reading() as connection:
-        return _build(repository.get(connection, repository.BUILDS, digest, "build"))
-
-
-def _count(row: repository.Row, outcome: str) -> int:
-    """Return the number of gates with this outcome that are not waived."""
-    return sum(gate["outcome"] == outcome and not gate["waived"] for gate in row["result"]["gates"])
-
-
-def _build(row: repository.Row) -> Build:
-    return Build.of(row, registered=row["created_utc_ns"])
-
-
-def _archive(row: repository.Row) -> KeptArchive:
-    return KeptArchive.of(row, pinned=bool(row["pinned"]), kept_since=row["created_utc_ns"])
+    return registered_entry(ground, build.digest)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 import os
 import platform
 import tempfile
@@ -19,23 +18,23 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import true, update
-
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, InvalidInput
 from ground_service.events import RegressionJudged, publish
 from ground_service.ground import Ground
+from ground_service.http.times import UtcTime
+from ground_service.regression import store
 from ground_service.regression.archives import PassArchive, check_out, keep_archive, store_of
-from ground_service.regression.build_runs import OK, OUTCOMES, read_performance, run_build
+from ground_service.regression.build_runs import OUTCOMES, read_performance, run_build
 from ground_service.regression.builds import Build
-from ground_service.regression.documents import regression_html, regression_json
+from ground_service.regression.documents import regression_html, verdict_document
 from ground_service.regression.gates.core import judge
 from ground_service.regression.gates.metrics import same_telemetry
 from ground_service.regression.gates.policy import PolicyFile
-from ground_service.regression.outcome import KeptReplay, PassVerdict, RegressionOutcome
+from ground_service.regression.model import OK, KeptReplay, Regression, RegressionSummary
+from ground_service.regression.outcome import PassVerdict, RegressionOutcome
 from ground_service.regression.replay_samples import PassContext, ReadDownlink, pass_context, read_downlink
 from ground_service.regression.runner import PERFORMANCE
-from ground_service.store import repository
 from ground_service.store.stored_files import register_file
 from lunar.errors import LunarError
 from lunar.timescales import format_utc
@@ -108,9 +107,18 @@ def do_replay(ground: Ground, digest: str, build: Build) -> KeptReplay:
         archive = check_out(ground, digest, Path(folder) / "archive")
         refusal = _other_camera(build, archive)
         if refusal:
-            return _keep(
-                ground, digest, build, KeptReplay("refused", refusal, None, None, 0, 0, 0, "", _machine())
+            refused = KeptReplay(
+                outcome="refused",
+                detail=refusal,
+                downlink_sha256=None,
+                performance_sha256=None,
+                wall_s=0.0,
+                cpu_s=0.0,
+                peak_rss_mib=0.0,
+                isolation="",
+                machine=_machine(),
             )
+            return _keep(ground, digest, build, refused)
         run = run_build(
             build, archive.folder, Path(folder) / "out", runner=ground.runner, private=(ground.home,)
         )
@@ -135,15 +143,15 @@ def do_replay(ground: Ground, digest: str, build: Build) -> KeptReplay:
             digest,
             build,
             KeptReplay(
-                outcome,
-                detail,
-                stored["downlink"],
-                stored["performance"],
-                run.wall_s,
-                run.cpu_s,
-                run.peak_rss_mib,
-                run.isolation,
-                _machine(),
+                outcome=outcome,
+                detail=detail,
+                downlink_sha256=stored["downlink"],
+                performance_sha256=stored["performance"],
+                wall_s=run.wall_s,
+                cpu_s=run.cpu_s,
+                peak_rss_mib=run.peak_rss_mib,
+                isolation=run.isolation,
+                machine=_machine(),
             ),
         )
 
@@ -151,25 +159,17 @@ def do_replay(ground: Ground, digest: str, build: Build) -> KeptReplay:
 def find_replay(ground: Ground, digest: str, build: Build) -> KeptReplay | None:
     """What was kept of a replay; None where it was not done, or something of it is lost."""
     with ground.database.reading() as connection:
-        row = repository.find(connection, repository.REPLAYS, id=replay_id(digest, build))
-    if row is None:
+        replay = store.find_replay(connection, digest, build.digest)
+    if replay is None:
         return None
     files = store_of(ground)
-    if any(
-        row[key] and not files.path(row[key]).exists() for key in ("downlink_sha256", "performance_sha256")
-    ):
-        return None
-    return KeptReplay(**{item.name: row[item.name] for item in dataclasses.fields(KeptReplay)})
+    stored = [sha256 for sha256 in (replay.downlink_sha256, replay.performance_sha256) if sha256]
+    return replay if all(files.path(sha256).exists() for sha256 in stored) else None
 
 
 def is_done(replay: KeptReplay | None) -> bool:
     """Whether a replay need not be done again: what failed once may have failed for want of time or space."""
     return replay is not None and replay.outcome == OK
-
-
-def replay_id(digest: str, build: Build) -> str:
-    """Identity of a replay: hash of the identities of archive and build."""
-    return hashlib.sha256(f"{digest} {build.digest}".encode()).hexdigest()
 
 
 def judge_regression(
@@ -224,21 +224,50 @@ def keep_regression(ground: Ground, outcome: RegressionOutcome, *, regression_id
     now = utc_now_ns()
     with ground.database.writing() as connection:
         register_file(connection, html, "report", f"regression {identity}", now)
-        added = repository.add_new(  # a stored verdict is not replaced
-            connection,
-            repository.REGRESSIONS,
+        regression = Regression(
             id=identity,
-            baseline_digest=outcome.baseline.digest,
-            candidate_digest=outcome.candidate.digest,
             verdict=outcome.verdict,
-            result=regression_json(outcome),
-            missions=sorted({one.context.mission for one in outcome.passes if one.context is not None}),
-            html_sha256=html.sha256,
-            created_utc_ns=now,
+            created=UtcTime(now),
+            result=verdict_document(outcome),
         )
-        if added is not None:
+        flown = {one.context.mission for one in outcome.passes if one.context is not None}
+        added = store.add_regression(connection, regression, missions=sorted(flown), html_sha256=html.sha256)
+        if added:
             publish(connection, RegressionJudged(id=identity, verdict=outcome.verdict))
     return identity
+
+
+def list_regressions(
+    ground: Ground, *, limit: int = 100, offset: int = 0
+) -> tuple[list[RegressionSummary], int]:
+    """Return a page of the regressions, newest first, and the total number."""
+    with ground.database.reading() as connection:
+        return store.list_regressions(connection, limit=limit, offset=offset)
+
+
+def get_regression(ground: Ground, regression_id: str) -> Regression:
+    """Return a regression.
+
+    Raises
+    ------
+    NotFound
+        There is no such regression.
+    """
+    with ground.database.reading() as connection:
+        return store.get_regression(connection, regression_id)
+
+
+def report_of(ground: Ground, regression_id: str) -> bytes:
+    """Return the HTML report of a regression.
+
+    Raises
+    ------
+    NotFound
+        There is no such regression.
+    """
+    with ground.database.reading() as connection:
+        sha256 = store.get_report(connection, regression_id)
+    return ground.files.get(sha256)
 
 
 def _kept(ground: Ground, given: Path | str) -> PassArchive | PassVerdict:
@@ -248,12 +277,12 @@ def _kept(ground: Ground, given: Path | str) -> PassArchive | PassVerdict:
         if path.exists():
             return keep_archive(ground, path)
         with ground.database.reading() as connection:
-            row = repository.find(connection, repository.REGRESSION_ARCHIVES, digest=str(given))
-        if row is None:
+            record = store.find_archive(connection, str(given))
+        if record is None:
             raise InvalidInput(
                 str(given), "", "a pass archive, or the identity of one that is kept", "neither"
             )
-        return PassArchive(path, row["digest"], {"pass_name": row["name"]}, row["frames"])
+        return PassArchive(path, record.digest, {"pass_name": record.name}, record.frames)
     except (GroundError, LunarError) as error:
         return PassVerdict(path.name, "", "unusable", str(error))
 
@@ -289,22 +318,8 @@ def _read(ground: Ground, context: PassContext, replay: KeptReplay) -> ReadDownl
 
 def _keep(ground: Ground, digest: str, build: Build, replay: KeptReplay) -> KeptReplay:
     """Store a replay; a successful replay is never replaced by a concurrent one of another worker."""
-    values = {item.name: getattr(replay, item.name) for item in dataclasses.fields(replay)}
-    identity = replay_id(digest, build)
-    table = repository.REPLAYS
     with ground.database.writing() as connection:
-        added = repository.add_new(
-            connection,
-            table,
-            id=identity,
-            archive_digest=digest,
-            build_digest=build.digest,
-            created_utc_ns=utc_now_ns(),
-            **values,
-        )
-        if not added:
-            condition = table.c.outcome != OK if replay.outcome != OK else true()
-            connection.execute(update(table).where(table.c.id == identity, condition).values(**values))
+        store.keep_replay(connection, digest, build.digest, replay, utc_now_ns())
     return replay
 
 

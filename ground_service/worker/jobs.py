@@ -26,7 +26,8 @@ from ground_service.events import JobChanged, publish
 from ground_service.ground import Ground
 from ground_service.ingest.redecode import catch_up, redecode_job_id, vehicles_behind
 from ground_service.ingest.service import apply_definition, run_ingest
-from ground_service.jobs.service import FINISHED, enter_job
+from ground_service.jobs.service import enter_job
+from ground_service.jobs.store import FINISHED
 from ground_service.passes.archive_zip import import_zip
 from ground_service.store import repository
 from ground_service.store.states import JOB, change_if, move

@@ -120,7 +120,7 @@ def _finish(
 
 def _run(arguments: argparse.Namespace) -> int:
     from ground_service.clock import utc_now_ns
-    from ground_service.regression.documents import regression_junit, regression_text, stored_verdict
+    from ground_service.regression.documents import regression_junit, regression_text
     from ground_service.regression.gates.policy import load_policy
     from ground_service.regression.outcome import EXIT_STATUS
 
@@ -135,10 +135,9 @@ def _run(arguments: argparse.Namespace) -> int:
         found = service.get_regression(job.id)
         if arguments.report:
             service.get_regression_report(found.id, arguments.report)
-    verdict = stored_verdict(found.result)
     if arguments.junit:
-        arguments.junit.write_text(regression_junit(verdict, utc_now_ns()), encoding="utf-8")
-    emit(arguments, {"id": found.id, **found.result}, text=regression_text(verdict))
+        arguments.junit.write_text(regression_junit(found.result, utc_now_ns()), encoding="utf-8")
+    emit(arguments, {"id": found.id, **found.result.document()}, text=regression_text(found.result))
     return EXIT_STATUS[found.verdict]
 
 

@@ -28,9 +28,9 @@ from ground_service.regression.archives import (
 from ground_service.regression.builds import Build, build_of
 from ground_service.regression.documents import (
     regression_html,
-    regression_json,
     regression_junit,
     regression_text,
+    verdict_document,
 )
 from ground_service.regression.gates.core import GatePolicy
 from ground_service.regression.gates.policy import load_policy
@@ -304,17 +304,17 @@ def test_the_verdict_is_written_as_json_junit_and_text(judge, packets: Packets, 
     (copy / "catalogue.csv").write_text("")
     worse = with_detections(packets, lambda items: items | {"v_px": items["v_px"] - 1.0})
     outcome = judge(worse, archives=[copy, *(one.folder for one in passes)])
-    figures = json.loads(json.dumps(regression_json(outcome), allow_nan=False))
+    figures = json.loads(json.dumps(verdict_document(outcome).document(), allow_nan=False))
     assert figures["verdict"] == "fail"
     assert {"name", "baseline", "candidate", "limit", "passed"} <= set(figures["gates"][0])
     assert [one["state"] for one in figures["passes"]] == ["unusable", "judged", "judged"]
     assert figures["passes"][1]["candidate"]["outcome_shares"]["paper"] == {"multi": 1.0}
-    suite = ET.fromstring(regression_junit(outcome, 0))
+    suite = ET.fromstring(regression_junit(verdict_document(outcome), 0))
     assert int(suite.attrib["tests"]) == len(suite.findall("testcase")) == len(outcome.gates) + 3
     inconclusive = sum(gate.outcome == "inconclusive" for gate in outcome.gates)
     assert int(suite.attrib["errors"]) == len(suite.findall("testcase/error")) == 1 + inconclusive
     assert int(suite.attrib["failures"]) == sum(gate.outcome == "fail" for gate in outcome.gates) > 0
-    told = regression_text(outcome)
+    told = regression_text(verdict_document(outcome))
     assert "detector.bias" in told and "unusable" in told
 
 
@@ -377,7 +377,7 @@ def test_archives_that_are_pinned_stay_and_shared_files_stay_with_them(
     pin_archive(ground, second.digest, True)
     assert let_go(ground, unused_for_ns=10**18) == []
     assert let_go(ground, unused_for_ns=0) == [first.digest]
-    assert [row["digest"] for row in kept_archives(ground)] == [second.digest]
+    assert [one.digest for one in kept_archives(ground)] == [second.digest]
     # Both hold the same gray image: it is still there for the one that stays.
     assert check_out(ground, second.digest, tmp_path / "out").frames == 30
 
@@ -483,13 +483,15 @@ def test_a_build_that_differs_on_few_frames_is_inconclusive_with_the_frames_need
     assert recall.resolution > recall.margin == 0.02
     assert outcome.frames_judged == 60
     assert outcome.frames_needed is not None and outcome.frames_needed >= (recall.frames_needed or 0) > 60
-    told = regression_text(outcome)
+    told = regression_text(verdict_document(outcome))
     assert f"{outcome.frames_needed:,} frames are needed to decide every gate over the suite" in told
     assert "inconclusive: detector.recall" in told
-    figures = regression_json(outcome)
+    figures = verdict_document(outcome).document()
     assert (figures["verdict"], figures["frames"]) == ("inconclusive", 60)
     assert figures["frames_needed"] == outcome.frames_needed
-    case = ET.fromstring(regression_junit(outcome, 0)).find("testcase[@name='detector.recall (suite)']/error")
+    case = ET.fromstring(regression_junit(verdict_document(outcome), 0)).find(
+        "testcase[@name='detector.recall (suite)']/error"
+    )
     assert case is not None and "frames, needs" in case.attrib["message"]
 
 
@@ -518,8 +520,8 @@ def test_a_regression_without_a_gate_is_never_a_pass(judge, home, policy, passes
     outcome = judge()
     nothing = dataclasses.replace(outcome, gates=())
     assert (nothing.verdict, nothing.exit_status) == ("inconclusive", 3)
-    assert "No gate was judged" in regression_text(nothing)
-    suite = ET.fromstring(regression_junit(nothing, 0))
+    assert "No gate was judged" in regression_text(verdict_document(nothing))
+    suite = ET.fromstring(regression_junit(verdict_document(nothing), 0))
     assert int(suite.attrib["errors"]) == 1
 
 
@@ -545,10 +547,10 @@ def test_a_waived_gate_shows_its_reason_everywhere(
     outcome = waived_outcome(judge, tmp_path, home, make_build, passes, packets)
     reason = "new <network> & agreed (until 9999-12-31)"
     assert outcome.verdict == "pass"
-    assert f"waived (fail): {reason}: latency.network" in regression_text(outcome)
-    gates = {gate["name"]: gate for gate in regression_json(outcome)["gates"]}
+    assert f"waived (fail): {reason}: latency.network" in regression_text(verdict_document(outcome))
+    gates = {gate["name"]: gate for gate in verdict_document(outcome).document()["gates"]}
     assert (gates["latency.network"]["outcome"], gates["latency.network"]["waived"]) == ("fail", reason)
-    suite = ET.fromstring(regression_junit(outcome, 0))
+    suite = ET.fromstring(regression_junit(verdict_document(outcome), 0))
     skipped = suite.find("testcase[@name='latency.network (suite)']/skipped")
     assert skipped is not None and skipped.attrib["message"].startswith(f"waived: {reason}; fail: ")
     assert suite.attrib["skipped"] == "1" and suite.attrib["failures"] == "0"
@@ -580,7 +582,7 @@ def test_the_junit_document_holds_what_both_schemas_permit(
         archives=[copy, *(one.folder for one in passes)],
     )
     for outcome in (failing, waived_outcome(judge, tmp_path, home, make_build, passes, packets)):
-        suite = ET.fromstring(regression_junit(outcome, 1_880_000_000 * 10**9 + 5))
+        suite = ET.fromstring(regression_junit(verdict_document(outcome), 1_880_000_000 * 10**9 + 5))
         assert suite.attrib["timestamp"] == "2029-07-29T06:13:20"
         for element in suite.iter():
             assert set(element.attrib) == JUNIT[element.tag], element.tag

@@ -1,0 +1,75 @@
+"""SQL of the job queue."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sqlalchemy import Connection, select
+
+from ground_service.jobs.model import Job
+from ground_service.store import repository
+from ground_service.store.states import change_if
+
+JOBS = repository.JOBS
+
+FINISHED = ("done", "failed")
+
+
+def add_job(
+    connection: Connection, job_id: str, kind: str, arguments: Mapping[str, Any], now_utc_ns: int
+) -> bool:
+    """Add a queued job; return False if the id exists."""
+    added = repository.add_new(
+        connection,
+        JOBS,
+        id=job_id,
+        kind=kind,
+        state="queued",
+        arguments=dict(arguments),
+        progress=0.0,
+        attempts=0,
+        created_utc_ns=now_utc_ns,
+    )
+    return added is not None
+
+
+def find_job(connection: Connection, job_id: str) -> Job | None:
+    """Return a job; None if there is no such job."""
+    row = repository.find(connection, JOBS, id=job_id)
+    return None if row is None else Job.of(row)
+
+
+def get_job(connection: Connection, job_id: str) -> Job:
+    """Return a job.
+
+    Raises
+    ------
+    NotFound
+        There is no such job.
+    """
+    return Job.of(repository.get(connection, JOBS, job_id, "job"))
+
+
+def list_jobs(connection: Connection, *, kind: str | None, limit: int, offset: int) -> tuple[list[Job], int]:
+    """Return a page of the jobs, newest first, and the total number; `kind` selects jobs of one kind."""
+    equal: dict[str, Any] = {} if kind is None else {"kind": kind}
+    page = repository.page(connection, JOBS, limit=limit, offset=offset, **equal)
+    return [Job.of(row) for row in page.rows], page.total
+
+
+def unfinished_jobs(connection: Connection) -> list[str]:
+    """Return the ids of unfinished jobs, oldest first."""
+    query = select(JOBS.c.id).where(JOBS.c.state.not_in(FINISHED)).order_by(JOBS.c.created_utc_ns)
+    return [str(key) for key in connection.execute(query).scalars()]
+
+
+def queued_arguments(connection: Connection, kind: str) -> list[dict[str, Any]]:
+    """Return the arguments of the queued jobs of a kind."""
+    query = select(JOBS.c.arguments).where(JOBS.c.kind == kind, JOBS.c.state == "queued")
+    return [dict(arguments) for arguments in connection.execute(query).scalars()]
+
+
+def set_progress(connection: Connection, job_id: str, share: float) -> None:
+    """Store the progress of a running job; a job in another state does not change."""
+    change_if(connection, JOBS, job_id, {"state": "running"}, progress=share)

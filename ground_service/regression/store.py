@@ -1,0 +1,212 @@
+"""SQL of payload builds, kept pass archives, replays and regressions."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from typing import Any
+
+from sqlalchemy import Connection, delete, select, update
+
+from ground_service.errors import NotFound
+from ground_service.regression.model import (
+    OK,
+    ArchiveRecord,
+    Build,
+    KeptReplay,
+    Regression,
+    RegressionSummary,
+)
+from ground_service.store import repository
+from ground_service.store.states import change_if
+
+BUILDS, ARCHIVES = repository.BUILDS, repository.REGRESSION_ARCHIVES
+REPLAYS, REGRESSIONS = repository.REPLAYS, repository.REGRESSIONS
+
+
+def add_build(connection: Connection, build: Build) -> None:
+    """Add a build; adding it again changes nothing."""
+    values = build.model_dump(exclude={"registered"})
+    repository.add_new(connection, BUILDS, **values, created_utc_ns=build.registered.utc_ns)
+
+
+def get_build(connection: Connection, digest: str) -> Build:
+    """Return a registered build.
+
+    Raises
+    ------
+    NotFound
+        There is no such build.
+    """
+    return _build(repository.get(connection, BUILDS, digest, "build"))
+
+
+def find_build(connection: Connection, beginning: str) -> str | None:
+    """Return the identity of the only build whose identity begins so; None if there is none, or several."""
+    query = select(BUILDS.c.digest).where(BUILDS.c.digest.startswith(beginning)).limit(2)
+    found = connection.execute(query).scalars().all()
+    return str(found[0]) if len(found) == 1 else None
+
+
+def list_builds(connection: Connection, *, limit: int, offset: int) -> tuple[list[Build], int]:
+    """Return a page of the builds, newest first, and the total number."""
+    page = repository.page(connection, BUILDS, limit=limit, offset=offset)
+    return [_build(row) for row in page.rows], page.total
+
+
+def keep_archive(connection: Connection, archive: ArchiveRecord) -> None:
+    """Add a kept archive; adding it again notes its use and pins it if requested."""
+    values = archive.model_dump(exclude={"kept_since", "pinned"})
+    now, pinned = archive.kept_since.utc_ns, int(archive.pinned)
+    added = repository.add_new(
+        connection, ARCHIVES, **values, pinned=pinned, used_utc_ns=now, created_utc_ns=now
+    )
+    if not added:
+        pin = {"pinned": 1} if pinned else {}
+        repository.change(connection, ARCHIVES, archive.digest, used_utc_ns=now, **pin)
+
+
+def get_archive(connection: Connection, digest: str) -> ArchiveRecord:
+    """Return a kept archive.
+
+    Raises
+    ------
+    NotFound
+        There is no such archive.
+    """
+    return _archive(repository.get(connection, ARCHIVES, digest, "archive"))
+
+
+def find_archive(connection: Connection, digest: str) -> ArchiveRecord | None:
+    """Return a kept archive; None if there is no such archive."""
+    row = repository.find(connection, ARCHIVES, digest=digest)
+    return None if row is None else _archive(row)
+
+
+def list_archives(connection: Connection) -> list[ArchiveRecord]:
+    """Return all kept archives, oldest first."""
+    query = select(ARCHIVES).order_by(ARCHIVES.c.created_utc_ns, ARCHIVES.c.digest)
+    return [_archive(row) for row in connection.execute(query).mappings()]
+
+
+def use_archive(connection: Connection, digest: str, now_utc_ns: int) -> ArchiveRecord:
+    """Note the use of a kept archive, which postpones its removal, and return it.
+
+    Raises
+    ------
+    NotFound
+        There is no such archive.
+    """
+    if not change_if(connection, ARCHIVES, digest, {}, used_utc_ns=now_utc_ns):
+        raise NotFound("archive", digest)
+    return get_archive(connection, digest)
+
+
+def pin_archive(connection: Connection, digest: str, pinned: bool) -> None:
+    """Exclude an archive from removal, or include it again.
+
+    Raises
+    ------
+    NotFound
+        There is no such archive.
+    """
+    if not change_if(connection, ARCHIVES, digest, {}, pinned=int(pinned)):
+        raise NotFound("archive", digest)
+
+
+def remove_unused(connection: Connection, used_before_utc_ns: int) -> list[ArchiveRecord]:
+    """Delete the archives that are not pinned and were last used at this time or earlier; return them.
+
+    It is one statement, so that an archive that is used or pinned concurrently is kept.
+    """
+    query = delete(ARCHIVES).where(ARCHIVES.c.pinned == 0, ARCHIVES.c.used_utc_ns <= used_before_utc_ns)
+    return [_archive(row) for row in connection.execute(query.returning(*ARCHIVES.c)).mappings()]
+
+
+def keep_replay(
+    connection: Connection, archive: str, build: str, replay: KeptReplay, now_utc_ns: int
+) -> None:
+    """Store a replay of a build over an archive; an unsuccessful one does not replace a successful one."""
+    identity, values = replay_id(archive, build), replay.model_dump()
+    added = repository.add_new(
+        connection,
+        REPLAYS,
+        id=identity,
+        archive_digest=archive,
+        build_digest=build,
+        created_utc_ns=now_utc_ns,
+        **values,
+    )
+    if not added:
+        replaceable = [] if replay.outcome == OK else [REPLAYS.c.outcome != OK]
+        query = update(REPLAYS).where(REPLAYS.c.id == identity, *replaceable)
+        connection.execute(query.values(**values))
+
+
+def find_replay(connection: Connection, archive: str, build: str) -> KeptReplay | None:
+    """Return the stored replay of a build over an archive; None without any."""
+    row = repository.find(connection, REPLAYS, id=replay_id(archive, build))
+    return None if row is None else KeptReplay.of(row)
+
+
+def replay_id(archive: str, build: str) -> str:
+    """Return the identity of a replay: the hash of the identities of archive and build."""
+    return hashlib.sha256(f"{archive} {build}".encode()).hexdigest()
+
+
+def add_regression(
+    connection: Connection, regression: Regression, *, missions: list[str], html_sha256: str
+) -> bool:
+    """Add a regression; return False if its id exists, because a stored verdict is not replaced."""
+    verdict = regression.result
+    added = repository.add_new(
+        connection,
+        REGRESSIONS,
+        id=regression.id,
+        baseline_digest=verdict.baseline.digest,
+        candidate_digest=verdict.candidate.digest,
+        verdict=regression.verdict,
+        result=verdict.document(),
+        missions=missions,
+        html_sha256=html_sha256,
+        created_utc_ns=regression.created.utc_ns,
+    )
+    return added is not None
+
+
+def get_regression(connection: Connection, regression_id: str) -> Regression:
+    """Return a regression.
+
+    Raises
+    ------
+    NotFound
+        There is no such regression.
+    """
+    return Regression.of(repository.get(connection, REGRESSIONS, regression_id, "regression"))
+
+
+def get_report(connection: Connection, regression_id: str) -> str:
+    """Return the SHA-256 of the report of a regression.
+
+    Raises
+    ------
+    NotFound
+        There is no such regression.
+    """
+    return str(repository.get(connection, REGRESSIONS, regression_id, "regression")["html_sha256"])
+
+
+def list_regressions(
+    connection: Connection, *, limit: int, offset: int
+) -> tuple[list[RegressionSummary], int]:
+    """Return a page of the regressions, newest first, and the total number."""
+    page = repository.page(connection, REGRESSIONS, limit=limit, offset=offset)
+    return [Regression.of(row).summary() for row in page.rows], page.total
+
+
+def _build(row: Mapping[Any, Any]) -> Build:
+    return Build.of(row, registered=row["created_utc_ns"])
+
+
+def _archive(row: Mapping[Any, Any]) -> ArchiveRecord:
+    return ArchiveRecord.of(row, kept_since=row["created_utc_ns"])
