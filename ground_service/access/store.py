@@ -161,6 +161,12 @@ def free_key(connection: Connection, key: str) -> None:
     connection.execute(delete(ANSWERS).where(ANSWERS.c.key == key, ANSWERS.c.answer.is_(None)))
 
 
+def delete_answers(connection: Connection, before_utc_ns: int) -> int:
+    """Delete the idempotency keys that were stored before a time; return their number."""
+    query = delete(ANSWERS).where(ANSWERS.c.created_utc_ns < before_utc_ns)
+    return int(connection.execute(query).rowcount)
+
+
 def list_entries(
     connection: Connection,
     *,

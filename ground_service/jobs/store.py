@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, delete, select
 
 from ground_service.jobs.model import Job
 from ground_service.store import repository
-from ground_service.store.states import change_if
+from ground_service.store.states import JOB, change_if, move
 
 JOBS = repository.JOBS
 
@@ -73,3 +73,67 @@ def queued_arguments(connection: Connection, kind: str) -> list[dict[str, Any]]:
 def set_progress(connection: Connection, job_id: str, share: float) -> None:
     """Store the progress of a running job; a job in another state does not change."""
     change_if(connection, JOBS, job_id, {"state": "running"}, progress=share)
+
+
+def start_attempt(connection: Connection, job: Job, now_utc_ns: int) -> int:
+    """Start the next attempt of a job; return its number.
+
+    Raises
+    ------
+    StateConflict
+        Another process has started the job since it was read.
+    """
+    attempt = job.attempts + 1
+    move(
+        connection,
+        JOB,
+        job.id,
+        "running",
+        where={"attempts": job.attempts},
+        attempts=attempt,
+        started_utc_ns=now_utc_ns,
+    )
+    return attempt
+
+
+def requeue(connection: Connection, job_id: str, attempt: int) -> None:
+    """Queue an interrupted job again; the interrupted attempt does not count.
+
+    Raises
+    ------
+    StateConflict
+        Another process has started a new attempt.
+    """
+    where = {"attempts": attempt}
+    move(connection, JOB, job_id, "queued", where=where, attempts=attempt - 1, progress=0.0)
+
+
+def end_attempt(
+    connection: Connection,
+    job_id: str,
+    attempt: int,
+    now_utc_ns: int,
+    *,
+    result: Mapping[str, Any] | None = None,
+    error: str | None = None,
+) -> None:
+    """End an attempt of a job: it has failed if there is an error, otherwise it is done.
+
+    Raises
+    ------
+    StateConflict
+        Another process has started a new attempt.
+    """
+    outcome: dict[str, Any] = (
+        {"state": "failed", "error": error}
+        if error is not None
+        else {"state": "done", "error": None, "result": result, "progress": 1.0}
+    )
+    where = {"attempts": attempt}
+    move(connection, JOB, job_id, where=where, finished_utc_ns=now_utc_ns, **outcome)
+
+
+def delete_finished(connection: Connection, before_utc_ns: int) -> int:
+    """Delete the jobs that finished before a time; return their number."""
+    query = delete(JOBS).where(JOBS.c.finished_utc_ns < before_utc_ns, JOBS.c.state.in_(FINISHED))
+    return int(connection.execute(query).rowcount)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sqlalchemy import Connection
+from sqlalchemy import Connection, select
 from sqlalchemy.exc import IntegrityError
 
 from ground_service.store import repository
@@ -26,3 +26,8 @@ def register_file(connection: Connection, stored: StoredFile, kind: str, name: s
             )
     except IntegrityError:
         pass  # another process entered the same octets at the same time
+
+
+def file_names(connection: Connection) -> list[str]:
+    """Return the SHA-256 of all files, ascending."""
+    return sorted(connection.execute(select(repository.FILES.c.sha256)).scalars())

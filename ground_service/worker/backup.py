@@ -16,7 +16,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Table, select
+from sqlalchemy import Connection
 
 from ground_service.errors import Conflict, FileDamaged, InvalidInput, NotFound, storage_error
 from ground_service.ground import Ground
@@ -29,7 +29,7 @@ from ground_service.store.files import (
     read_blocks,
     replace_durably,
 )
-from ground_service.store.models import Base
+from ground_service.store.stored_files import file_names
 from lunar.timescales import format_utc
 
 SCHEMA_VERSION = 2
@@ -68,7 +68,7 @@ def backup(ground: Ground, out: Path, *, now_utc_ns: int) -> dict[str, Any]:
             with copy.reading() as connection:
                 tables = rows.table_digests(connection)
                 head = audit.read_head(connection)
-                names = _file_names(connection)
+                names = file_names(connection)
         finally:
             copy.engine.dispose()
         octets = 0
@@ -118,7 +118,7 @@ def restore(folder: Path, ground: Ground) -> dict[str, Any]:
     try:
         with source.snapshot() as connection:
             _check_rows(folder, connection, manifest)
-            names = _file_names(connection)
+            names = file_names(connection)
             for sha256 in names:
                 _check_file(FileArchive(folder / FILES), sha256)
             for sha256 in names:
@@ -156,7 +156,7 @@ def _check_rows(folder: Path, connection: Connection, manifest: dict[str, Any]) 
             )
         if manifest["tables"].get(name) != table.sha256:
             raise InvalidInput(str(folder / DATABASE), name, "the rows that were saved", "changed rows")
-    if _list_sha256(_file_names(connection)) != manifest["files_sha256"]:
+    if _list_sha256(file_names(connection)) != manifest["files_sha256"]:
         raise InvalidInput(str(folder / DATABASE), "files", "the files that were saved", "a changed list")
     head = audit.read_head(connection)
     if head is None or asdict(head) != manifest["audit_head"]:
@@ -171,11 +171,6 @@ def _check_rows(folder: Path, connection: Connection, manifest: dict[str, Any]) 
 def _strays(connection: Connection) -> Iterator[row_digests.StrayRow]:
     for table in row_digests.guarded_tables():
         yield from row_digests.stray_rows(connection, table)
-
-
-def _file_names(connection: Connection) -> list[str]:
-    table: Table = Base.metadata.tables["files"]
-    return sorted(connection.execute(select(table.c.sha256)).scalars())
 
 
 def _list_sha256(names: list[str]) -> str:

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from pydantic import ValidationError
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection
 
 from ground_service.alarms.service import examine_packets
 from ground_service.errors import PASSING, public_text
@@ -36,11 +36,13 @@ from ground_service.events import (
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import undecoded_vehicles
 from ground_service.jobs.service import add_job
+from ground_service.jobs.store import queued_arguments
 from ground_service.missions.store import get_mission
 from ground_service.passes.span import pass_span
 from ground_service.passes.store import passes_of_vehicle, reported_without_ephemeris
 from ground_service.planning.progress import advance_windows
-from ground_service.store import events, repository
+from ground_service.planning.store import get_record
+from ground_service.store import events
 from ground_service.store.events import LoggedEvent
 from ground_service.timekeeping.recorrelation import recorrelate
 from ground_service.timekeeping.store import vehicles_with_receptions
@@ -143,10 +145,9 @@ def _advance(ground: Ground, vehicle: int, _event: int) -> None:
 
 def _reevaluate(ground: Ground, pass_id: int, event: int) -> str | None:
     """Add the job of a re-evaluation, unless one waits already, which will find the same data."""
-    table = repository.JOBS
     with ground.database.writing() as connection:
-        waiting = select(table.c.arguments).where(table.c.kind == "re-evaluation", table.c.state == "queued")
-        if any(arguments["pass_id"] == pass_id for arguments in connection.execute(waiting).scalars()):
+        waiting = queued_arguments(connection, "re-evaluation")
+        if any(arguments["pass_id"] == pass_id for arguments in waiting):
             return None
         identity = _job_id("re-evaluation", pass_id, event)
         return add_job(connection, "re-evaluation", {"pass_id": pass_id, "event": event}, job_id=identity)
@@ -155,9 +156,9 @@ def _reevaluate(ground: Ground, pass_id: int, event: int) -> str | None:
 def _report(ground: Ground, window_id: int, event: int) -> str | None:
     """Add the job of the first report of a window if its mission description asks for automatic evaluation."""
     with ground.database.writing() as connection:
-        window = repository.get(connection, repository.WINDOWS, window_id, "window")
-        pass_id, mission_id = window["pass_id"], window["mission_id"]
-        if pass_id is None or mission_id is None or window["state"] != "downlinked":
+        window = get_record(connection, window_id)
+        pass_id, mission_id = window.pass_id, window.mission_id
+        if pass_id is None or mission_id is None or window.state != "downlinked":
             return None
         if not get_mission(connection, mission_id).automation.evaluate:
             return None

@@ -26,11 +26,11 @@ from ground_service.events import JobChanged, publish
 from ground_service.ground import Ground
 from ground_service.ingest.redecode import catch_up, redecode_job_id, vehicles_behind
 from ground_service.ingest.service import apply_definition, run_ingest
+from ground_service.jobs import store
+from ground_service.jobs.model import Job
 from ground_service.jobs.service import enter_job
 from ground_service.jobs.store import FINISHED
 from ground_service.passes.archive_zip import import_zip
-from ground_service.store import repository
-from ground_service.store.states import JOB, change_if, move
 from ground_service.worker.upkeep import nightly
 from lunar.errors import LunarError
 from reports.errors import ReportError
@@ -114,8 +114,8 @@ def enter_redecoding(ground: Ground) -> list[str]:
     ]
 
 
-def run_job(ground: Ground, job_id: str) -> dict[str, Any]:
-    """Run a job and return its row afterwards. A failed job records the reason and is not repeated.
+def run_job(ground: Ground, job_id: str) -> Job:
+    """Run a job and return it as it is afterwards. A failed job records the reason and is not repeated.
 
     A job that is already running, here or in another process, is not started.
 
@@ -127,65 +127,47 @@ def run_job(ground: Ground, job_id: str) -> dict[str, Any]:
     with _alone_here(job_id) as here, ground.database.alone(_lock_key(job_id)) as alone:
         if not (here and alone):
             with ground.database.reading() as connection:
-                return repository.get(connection, repository.JOBS, job_id, "job")
+                return store.get_job(connection, job_id)
         return _run_alone(ground, job_id)
 
 
-def _run_alone(ground: Ground, job_id: str) -> dict[str, Any]:
+def _run_alone(ground: Ground, job_id: str) -> Job:
     with ground.database.writing() as connection:
-        job = repository.get(connection, repository.JOBS, job_id, JOB.kind)
-        if job["state"] in FINISHED:
+        job = store.get_job(connection, job_id)
+        if job.state in FINISHED:
             return job
-        attempt = int(job["attempts"]) + 1
         try:
-            move(
-                connection,
-                JOB,
-                job_id,
-                "running",
-                where={"attempts": job["attempts"]},
-                attempts=attempt,
-                started_utc_ns=utc_now_ns(),
-            )
+            attempt = store.start_attempt(connection, job, utc_now_ns())
         except StateConflict:  # another process has started the job since it was read
-            return repository.get(connection, repository.JOBS, job_id, JOB.kind)
-        publish(connection, JobChanged(id=job_id, kind=job["kind"], state="running"))
+            return store.get_job(connection, job_id)
+        publish(connection, JobChanged(id=job_id, kind=job.kind, state="running"))
     if attempt > ATTEMPTS_LIMIT:
         error = f"given up after {ATTEMPTS_LIMIT} attempts that did not come to an end"
-        return _finish(ground, job_id, attempt, state="failed", error=error)
-    log.info("job %s (%s) begins", job_id, job["kind"], extra={"job": job_id, "kind": job["kind"]})
+        return _finish(ground, job_id, attempt, error=error)
+    log.info("job %s (%s) begins", job_id, job.kind, extra={"job": job_id, "kind": job.kind})
     try:
-        result = WORK[job["kind"]](ground, job["arguments"], job_id)
-        return _finish(ground, job_id, attempt, state="done", result=result, progress=1.0, error=None)
+        return _finish(ground, job_id, attempt, result=WORK[job.kind](ground, job.arguments, job_id))
     except PASSING as error:
-        log.info("job %s (%s) will run again: %s", job_id, job["kind"], error)
+        log.info("job %s (%s) will run again: %s", job_id, job.kind, error)
         _put_back(ground, job_id, attempt)
         raise
     except (GroundError, TmtcError, LunarError, ReportError) as error:
-        log.warning("job %s (%s) failed: %s", job_id, job["kind"], error)
-        return _finish(ground, job_id, attempt, state="failed", error=public_text(error))
+        log.warning("job %s (%s) failed: %s", job_id, job.kind, error)
+        return _finish(ground, job_id, attempt, error=public_text(error))
     except Exception as error:  # any error ends the job, which records it
         translated = storage_error(error, "archive") if isinstance(error, OSError) else None
         if isinstance(translated, PASSING):
-            log.info("job %s (%s) will run again: %s", job_id, job["kind"], error)
+            log.info("job %s (%s) will run again: %s", job_id, job.kind, error)
             _put_back(ground, job_id, attempt)
             raise translated from error
-        log.exception("job %s (%s): unexpected error", job_id, job["kind"], extra={"job": job_id})
-        return _finish(ground, job_id, attempt, state="failed", error=public_text(error))
+        log.exception("job %s (%s): unexpected error", job_id, job.kind, extra={"job": job_id})
+        return _finish(ground, job_id, attempt, error=public_text(error))
 
 
 def _put_back(ground: Ground, job_id: str, attempt: int) -> None:
     """Queue a job again that something else broke off; that is no attempt of its own. Not being able to is no harm."""
     with suppress(*PASSING, StateConflict), ground.database.writing() as connection:
-        move(
-            connection,
-            JOB,
-            job_id,
-            "queued",
-            where={"attempts": attempt},
-            attempts=attempt - 1,
-            progress=0.0,
-        )
+        store.requeue(connection, job_id, attempt)
 
 
 def _progress_of(ground: Ground, job_id: str) -> Callable[[float], None]:
@@ -197,7 +179,7 @@ def _progress_of(ground: Ground, job_id: str) -> Callable[[float], None]:
         if share - kept >= PROGRESS_STEP and share < 1.0:
             kept = share
             with ground.database.writing() as connection:
-                change_if(connection, repository.JOBS, job_id, {"state": "running"}, progress=share)
+                store.set_progress(connection, job_id, share)
 
     return keep
 
@@ -224,28 +206,27 @@ def _lock_key(job_id: str) -> int:
     return int.from_bytes(hashlib.blake2b(job_id.encode(), digest_size=8).digest(), "big", signed=True)
 
 
-def _finish(ground: Ground, job_id: str, attempt: int, *, state: str, **values: Any) -> dict[str, Any]:
+def _finish(
+    ground: Ground,
+    job_id: str,
+    attempt: int,
+    *,
+    result: Mapping[str, Any] | None = None,
+    error: str | None = None,
+) -> Job:
     """End the attempt of a job, unless another process has started a new attempt meanwhile."""
     with ground.database.writing() as connection:
+        finished = utc_now_ns()
         try:
-            move(
-                connection,
-                JOB,
-                job_id,
-                state,
-                where={"attempts": attempt},
-                finished_utc_ns=utc_now_ns(),
-                **values,
+            store.end_attempt(connection, job_id, attempt, finished, result=result, error=error)
+        except StateConflict as conflict:
+            log.warning(
+                "job %s: attempt %d ended after another one had started: %s", job_id, attempt, conflict
             )
-        except StateConflict as error:
-            log.warning("job %s: attempt %d ended after another one had started: %s", job_id, attempt, error)
-            return repository.get(connection, repository.JOBS, job_id, JOB.kind)
-        job = repository.get(connection, repository.JOBS, job_id, JOB.kind)
-        publish(
-            connection,
-            JobChanged(id=job_id, kind=job["kind"], state=job["state"], result=job["result"]),
-        )
-    took_s = (job["finished_utc_ns"] - job["started_utc_ns"]) / 1e9
-    told = {"job": job_id, "kind": job["kind"], "state": job["state"], "seconds": round(took_s, 3)}
-    log.info("job %s (%s) is %s after %.1f s", job_id, job["kind"], job["state"], took_s, extra=told)
+            return store.get_job(connection, job_id)
+        job = store.get_job(connection, job_id)
+        publish(connection, JobChanged(id=job_id, kind=job.kind, state=job.state, result=job.result))
+    took_s = 0.0 if job.started is None else (finished - job.started.utc_ns) / 1e9
+    told = {"job": job_id, "kind": job.kind, "state": job.state, "seconds": round(took_s, 3)}
+    log.info("job %s (%s) is %s after %.1f s", job_id, job.kind, job.state, took_s, extra=told)
     return job

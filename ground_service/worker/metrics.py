@@ -20,7 +20,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ground_service.ground import Ground
-from ground_service.worker.backlog import work_counts
+from ground_service.worker.store import count_work
 
 BUCKETS = (0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 30.0)
 
@@ -46,7 +46,8 @@ class Metrics:
 
     def answer(self, ground: Ground) -> Response:
         """All figures, those of the work read from the database now."""
-        counts = work_counts(ground)
+        with ground.database.reading() as connection:
+            counts = count_work(connection)
         # A state that nothing is in any more has no row, and must not keep its last count.
         self._jobs.clear()
         self._ingests.clear()

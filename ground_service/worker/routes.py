@@ -5,7 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter, Request, Response
 
 from ground_service.http.common import GroundOf
-from ground_service.store import repository
+from ground_service.jobs.service import list_jobs
 from ground_service.worker.model import Health
 
 operations = APIRouter(include_in_schema=False)
@@ -20,8 +20,7 @@ async def healthz() -> Health:
 @operations.get("/readyz")
 def readyz(ground: GroundOf) -> Health:
     """The service can be used: its database answers and takes what is written, and so does the archive of files."""
-    with ground.database.reading() as connection:
-        repository.page(connection, repository.JOBS, limit=1)
+    list_jobs(ground, limit=1)
     ground.database.require_writable()
     ground.files.require_writable()
     return Health(status="ok")

@@ -10,14 +10,15 @@ import hashlib
 from collections.abc import Mapping
 from typing import Any
 
-from sqlalchemy import delete, select
-
+from ground_service.access.store import delete_answers
 from ground_service.clock import utc_now_ns
 from ground_service.events import LimitsBroken, publish
 from ground_service.ground import Ground
+from ground_service.jobs.store import delete_finished
 from ground_service.passes.service import vehicle_trends
-from ground_service.store import events, repository
+from ground_service.store import events
 from ground_service.store.files import UNPACKING, remove_leftovers
+from ground_service.store.vehicles import all_vehicles
 from lunar.timescales import format_utc
 
 RETENTION_DAYS = 90
@@ -34,15 +35,15 @@ def nightly_job_id(utc_ns: int) -> str:
 def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> dict[str, Any]:
     """Trends of every spacecraft, and what was taken away."""
     with ground.database.reading() as connection:
-        vehicles = [dict(row) for row in connection.execute(select(repository.VEHICLES)).mappings()]
-    found = []
+        vehicles = all_vehicles(connection)
+    found: list[dict[str, Any]] = []
     for vehicle in vehicles:
-        trends = vehicle_trends(ground, vehicle["id"])
+        trends = vehicle_trends(ground, vehicle.id)
         if trends:
             found.append(
                 {
-                    "spacecraft_id": vehicle["ccsds_id"],
-                    "instance": vehicle["instance"],
+                    "spacecraft_id": vehicle.ccsds_id,
+                    "instance": vehicle.instance,
                     "trends": [trend.model_dump(mode="json") for trend in trends],
                 }
             )
@@ -66,14 +67,11 @@ def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> 
 def tidy(ground: Ground, retention_days: int) -> dict[str, int]:
     """Take away what is older than it is kept; how much of each kind that was."""
     before = utc_now_ns() - retention_days * DAY_NS
-    jobs, answers = repository.JOBS, repository.ANSWERS
     with ground.database.writing() as connection:
         removed = {
             "events": events.delete_before(connection, before),
-            "jobs": connection.execute(
-                delete(jobs).where(jobs.c.finished_utc_ns < before, jobs.c.state.in_(("done", "failed")))
-            ).rowcount,
-            "answers": connection.execute(delete(answers).where(answers.c.created_utc_ns < before)).rowcount,
+            "jobs": delete_finished(connection, before),
+            "answers": delete_answers(connection, before),
         }
     removed["files"] = ground.files.remove_leftovers() + remove_leftovers(ground.home, UNPACKING)
     return removed

@@ -185,13 +185,13 @@ def test_jobs_that_the_broker_lost_are_sent_again(
     key = _lock_key(lost)
     with ground.database.alone(key) as mine, ground.database.alone(key) as second:
         assert (mine, second) == (True, False)
-        assert run_job(ground, lost)["state"] == "queued"
+        assert run_job(ground, lost).state == "queued"
     dispatcher.resume()
     waiting = queue_length(settings)
     assert waiting >= 1
     dispatcher.resume()  # it waits already: nothing is added
     assert queue_length(settings) == waiting
-    assert run_job(ground, lost)["error"] == "pass 4712: not found"
+    assert run_job(ground, lost).error == "pass 4712: not found"
 
 
 def test_a_broker_that_is_away_refuses_nothing(ground: Ground, tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ def test_whatever_error_a_job_meets_it_ends_as_failed_and_is_not_repeated(
     job = job_that(monkeypatch, ground, work)
     for _ in range(3):
         row = run_job(ground, job)
-    assert (row["state"], row["error"], row["attempts"], len(tries)) == ("failed", shown, 1, 1)
+    assert (row.state, row.error, row.attempts, len(tries)) == ("failed", shown, 1, 1)
     assert unfinished_jobs(ground) == []
 
 
@@ -93,8 +93,8 @@ def test_a_result_that_the_database_cannot_hold_fails_the_job(
     ground: Ground, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     row = run_job(ground, job_that(monkeypatch, ground, lambda *_: {"median": float("nan")}))
-    assert row["state"] == "failed"
-    assert "JSON" in row["error"]
+    assert row.state == "failed"
+    assert "JSON" in row.error
 
 
 def test_an_attempt_that_another_has_overtaken_changes_nothing(
@@ -108,7 +108,7 @@ def test_an_attempt_that_another_has_overtaken_changes_nothing(
         return {"made by": "the first"}
 
     row = run_job(ground, job_that(monkeypatch, ground, work))
-    assert (row["state"], row["attempts"], row["result"]) == ("running", 2, None)
+    assert (row.state, row.attempts, row.result) == ("running", 2, None)
 
 
 def test_an_id_that_stands_for_another_request_is_refused(ground: Ground) -> None:

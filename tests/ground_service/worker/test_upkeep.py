@@ -47,9 +47,10 @@ def test_the_night_tells_trends_and_broken_limits(ground: Ground, synthetic_pass
     assert job == enter_job(ground, "nightly", {}, job_id=nightly_job_id(DAY_NS + 99))
     assert job != nightly_job_id(2 * DAY_NS)
     done = run_job(ground, job)
-    assert done["state"] == "done", done["error"]
-    assert done["result"]["spacecraft"][0]["spacecraft_id"] == 76
-    assert done["result"]["limits_broken"] == []
+    assert done.state == "done", done.error
+    assert done.result is not None
+    assert done.result["spacecraft"][0]["spacecraft_id"] == 76
+    assert done.result["limits_broken"] == []
 
 
 def test_what_is_old_goes_and_the_record_stays(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
