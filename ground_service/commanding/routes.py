@@ -21,7 +21,7 @@ from ground_service.http.common import (
 )
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations, problems
-from ground_service.ingest.service import FLOWN
+from ground_service.store.vehicles import FLOWN
 
 telecommands = operations("telecommands")
 

@@ -23,10 +23,9 @@ from ground_service.commanding.model import CommandOctets, CommandRecord, Comman
 from ground_service.errors import Conflict, InvalidInput
 from ground_service.events import CommandsSent, CommandStateChanged, publish
 from ground_service.ground import Ground
-from ground_service.ingest.service import FLOWN
 from ground_service.missions.store import approval_in_force, in_force
 from ground_service.store.counters import lock_spacecraft, next_telecommand
-from ground_service.store.vehicles import find_vehicle, get_vehicle, vehicle_id
+from ground_service.store.vehicles import FLOWN, find_vehicle, get_vehicle, vehicle_id
 from ground_service.text import REASON_LIMIT, require_line
 from tmtc.dictionary import DICTIONARY
 from tmtc.effects import CommandEffect, effect_of

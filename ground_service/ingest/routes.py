@@ -22,8 +22,9 @@ from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
 from ground_service.ingest import listing
 from ground_service.ingest.model import Ingest, IngestAccepted
-from ground_service.ingest.service import FLOWN, Place, enter_ingest
+from ground_service.ingest.service import Place, enter_ingest
 from ground_service.jobs.dispatcher import DispatcherOf
+from ground_service.store.vehicles import FLOWN
 
 UPLOAD_PATHS = (f"{API_PREFIX}/telemetry",)
 

@@ -43,15 +43,13 @@ from ground_service.store import parameters, repository
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile, mapped_octets, read_blocks
 from ground_service.store.stored_files import register_file
+from ground_service.store.vehicles import FLOWN
 from tmtc.arrays import as_octets
 from tmtc.cuc import NO_TICKS
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import TmtcError, UnknownCoding
 from tmtc.link import LinkSettings
 from tmtc.packets import PACKET_MAX_LENGTH
-
-FLOWN = "flight"
-"""Instance of a spacecraft that telemetry belongs to when nothing else is said."""
 
 Progress = Callable[[float], None]
 

@@ -24,7 +24,6 @@ from ground_service.http.common import (
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
 from ground_service.http.times import GivenTime
-from ground_service.ingest.service import FLOWN
 from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import get_job
@@ -43,6 +42,7 @@ from ground_service.passes.model import (
     Trend,
 )
 from ground_service.passes.series import STATE_VALUES, series_document
+from ground_service.store.vehicles import FLOWN
 
 EXPORT_MEDIA: dict[ExportFormat, str] = {
     "json": "application/json",

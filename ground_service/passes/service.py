@@ -15,7 +15,6 @@ from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
 from ground_service.ingest.redecode import readable_version
-from ground_service.ingest.service import FLOWN
 from ground_service.missions import store as missions
 from ground_service.passes import store
 from ground_service.passes.cache import remembered
@@ -43,7 +42,7 @@ from ground_service.passes.trends import trend_of
 from ground_service.store import rollups
 from ground_service.store.files import StoredFile
 from ground_service.store.stored_files import register_file
-from ground_service.store.vehicles import find_vehicle, vehicle_id
+from ground_service.store.vehicles import FLOWN, find_vehicle, vehicle_id
 from ground_service.text import require_line
 from ground_service.timekeeping.core import ticks_of_utc_ns
 from ground_service.timekeeping.store import load_correlations

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection, Table, and_, func, insert, select, update
-from sqlalchemy.dialects.postgresql import insert as postgresql_insert
-from sqlalchemy.dialects.sqlite import insert as sqlite_insert
 from sqlalchemy.sql import Select
 
 from ground_service.errors import NotFound
@@ -85,7 +83,7 @@ def add_new(connection: Connection, table: Table, **values: Any) -> Any | None:
 
     The function waits for a concurrent insert of the same row by another process.
     """
-    make = postgresql_insert if connection.dialect.name == "postgresql" else sqlite_insert
+    make = _insert_of(connection)
     key = next(iter(table.primary_key.columns))
     return connection.execute(make(table).values(**values).on_conflict_do_nothing().returning(key)).scalar()
 
@@ -140,6 +138,17 @@ def page(
     query = query.order_by(*(column.desc() if newest_first else column for column in order))
     rows = connection.execute(query.limit(limit).offset(offset)).mappings()
     return Page([dict(row) for row in rows], int(total))
+
+
+def _insert_of(connection: Connection) -> Any:
+    """Return the insert statement of the database, which has conflict clauses; each dialect takes long to import."""
+    if connection.dialect.name == "postgresql":
+        from sqlalchemy.dialects import postgresql
+
+        return postgresql.insert
+    from sqlalchemy.dialects import sqlite
+
+    return sqlite.insert
 
 
 def _where(table: Table, equal: dict[str, Any]) -> Select[Any]:

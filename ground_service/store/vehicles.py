@@ -11,6 +11,9 @@ from ground_service.errors import InvalidInput, NotFound
 from ground_service.store import repository
 from ground_service.text import require_line
 
+FLOWN = "flight"
+"""Instance of the spacecraft that flies; others are emulated or replayed runs."""
+
 SPACECRAFT_ID_MAX = 1023
 """Largest spacecraft id: a transfer frame has ten bits for it (CCSDS 132.0-B)."""
 

@@ -6,7 +6,7 @@ from ground_service.access.security import Operator, Viewer
 from ground_service.http.common import GroundOf, Instance, SpacecraftId
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
-from ground_service.ingest.service import FLOWN
+from ground_service.store.vehicles import FLOWN
 from ground_service.timekeeping.model import Correlation, Receptions, TimePoints, TimeReport
 from ground_service.timekeeping.recorrelation import enter_receptions, received_reports
 from ground_service.timekeeping.service import (

@@ -23,11 +23,11 @@ from ground_service.errors import GroundError, InvalidInput
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.packets import DIGEST_OCTETS, batch_of_cut
 from ground_service.ingest.parameters import decode_declared
-from ground_service.ingest.service import FLOWN, Place, ingest_stored
+from ground_service.ingest.service import Place, ingest_stored
 from ground_service.ingest.store import store_batch
 from ground_service.store import audit, repository, row_digests
 from ground_service.store.files import FileArchive, StoredFile, read_blocks
-from ground_service.store.vehicles import vehicle_id
+from ground_service.store.vehicles import FLOWN, vehicle_id
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import TmtcError
 from tmtc.packets import PRIMARY_HEADER_LENGTH
