@@ -93,6 +93,57 @@ def save_anchoring_study(path: Path, scores: Sequence[Mapping[str, Any]], captio
         _caption(figure, caption)
 
 
+def save_drift_study(
+    path: Path,
+    curves: Mapping[str, tuple[FloatArray, Sequence[FloatArray], Sequence[FloatArray]]],
+    caption: str,
+) -> None:
+    """Median position error over time by condition: with images, then coasting, and without images (dashed).
+
+    `curves` holds times (n,) in seconds, and the errors of every pass with and without images, by name.
+    """
+    factors: dict[str, list[str]] = {}
+    for name in curves:
+        if name != "nominal":
+            factors.setdefault(name.partition(":")[0], []).append(name)
+    columns = min(2, max(len(factors), 1))
+    rows = -(-max(len(factors), 1) // columns)
+    tints = ("vermillion", "green", "purple", "orange")
+    with _sheet(path, 9.0, 0.9 + 2.7 * rows) as figure:
+        grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+        for place, factor in enumerate(factors or {"nominal": []}):
+            axes = grid[place // columns][place % columns]
+            shown = ["nominal", *factors.get(factor, [])] if "nominal" in curves else factors.get(factor, [])
+            for name, tint in zip(shown, ("blue", *tints), strict=False):
+                seconds, vision, propagation = curves[name]
+                axes.plot(
+                    seconds / 60.0, np.median(np.stack(vision), axis=0), color=color(tint), linewidth=1.1,
+                    label=name.partition(": ")[2] or name,
+                )  # fmt: skip
+                axes.plot(
+                    seconds / 60.0, np.median(np.stack(propagation), axis=0), color=color(tint),
+                    linestyle=(0, (4, 2)), linewidth=0.8,
+                )  # fmt: skip
+            axes.set_yscale("log")
+            axes.set_title(factor)
+            axes.legend(fontsize="x-small", loc="upper right")
+        for axes in grid.flat[len(factors) or 1 :]:
+            axes.set_axis_off()
+        for axes in grid[-1]:
+            axes.set_xlabel("minutes from the start")
+        for row in grid:
+            row[0].set_ylabel("position error, m")
+        figure.subplots_adjust(
+            left=0.08,
+            right=0.985,
+            top=1 - 0.3 / figure.get_figheight(),
+            bottom=0.95 / figure.get_figheight(),
+            wspace=0.06,
+            hspace=0.22,
+        )
+        _caption(figure, caption)
+
+
 def save_class_histogram(path: Path, diameter_km: FloatArray, caption: str, bin_km: float = 0.5) -> None:
     """Histogram of crater diameters of 5 to 30 km in the three size classes, light to dark (the paper's Fig. 4)."""
     edges = np.arange(CLASS_EDGES_KM[0], CLASS_EDGES_KM[-1] + bin_km / 2, bin_km)
