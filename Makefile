@@ -18,7 +18,7 @@ DEMO_OUT    ?= linna-demo
 SAMPLE ?= 60
 SEED   ?= 1
 
-.PHONY: demo test check bench mutation up install install-dev clean
+.PHONY: demo test check docs sbom package bench mutation up install install-dev clean
 
 demo: $(DEMO_STAMPS)
 	$(BIN)/linna demo --out $(DEMO_OUT)
@@ -32,6 +32,19 @@ check: $(VENV)/.dev
 	$(BIN)/lint-imports
 	$(PYTHON) -m pip --python $(BIN)/python check
 	$(BIN)/python -m pytest -q tests/test_dependencies.py
+
+# The documentation site; `linna serve` shows it at /help.
+docs: $(VENV)/.dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
+# Software bill of materials of the runtime, CycloneDX.
+sbom: $(VENV)/.dev
+	mkdir -p dist
+	$(BIN)/python -m cyclonedx_py requirements requirements/runtime.txt --pyproject pyproject.toml --of JSON -o dist/linna.cdx.json
+
+# Wheel and source distribution.
+package: $(VENV)/.dev
+	$(BIN)/python -m build --outdir dist
 
 bench: $(VENV)/.bench
 	$(BIN)/python -m benchmarks
@@ -58,8 +71,8 @@ $(VENV)/.terrain: requirements/terrain.txt $(VENV)/.runtime
 	$(PIP) --no-compile -r requirements/terrain.txt
 	touch $@
 
-$(VENV)/.dev: requirements/dev.txt requirements/train.txt requirements/postgres.txt requirements/parquet.txt requirements/exports.txt $(VENV)/.runtime $(VENV)/.terrain
-	$(PIP) -r requirements/runtime.txt -r requirements/postgres.txt -r requirements/parquet.txt -r requirements/exports.txt -r requirements/train.txt -r requirements/dev.txt
+$(VENV)/.dev: requirements/dev.txt requirements/train.txt requirements/postgres.txt requirements/parquet.txt requirements/exports.txt requirements/docs.txt $(VENV)/.runtime $(VENV)/.terrain
+	$(PIP) -r requirements/runtime.txt -r requirements/postgres.txt -r requirements/parquet.txt -r requirements/exports.txt -r requirements/train.txt -r requirements/docs.txt -r requirements/dev.txt
 	touch $@
 
 $(VENV)/.bench: requirements/bench.txt $(VENV)/.dev

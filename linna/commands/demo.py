@@ -94,7 +94,7 @@ def next_steps(arguments: argparse.Namespace, figures: dict[str, Any]) -> list[s
             "report as HTML, PDF, JSON",
         ),
     )
-    return [f"  {linna} {command}\n      # {purpose}" for command, purpose in steps]
+    return [f"  # {purpose}\n  {linna} {command}" for command, purpose in steps]
 
 
 def describe(figures: dict[str, Any]) -> str:

@@ -1,0 +1,174 @@
+"""The documentation site: strict build, generated reference, self-contained pages, spelling, and commands that run."""
+
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+import docs_site
+from ground_service.web import documentation
+from linna.cli import GROUPS
+from linna.completion import command_parser
+from linna.parser import all_commands
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+TUTORIALS = sorted(path.name for path in (DOCS / "tutorials").glob("*.md"))
+MARK = re.compile(
+    r"^ *<!-- (?P<kind>file|run|tour)(?:: (?P<name>[\w.-]+))?(?:, status (?P<status>[\d,]+))?[^\n]*-->\n *```\w+\n"
+    r"(?P<text>.*?)^ *```$",
+    re.MULTILINE | re.DOTALL,
+)
+
+
+@pytest.fixture(scope="session")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    built = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)],
+        cwd=ROOT, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert built.returncode == 0, built.stdout + built.stderr
+    return folder
+
+
+def test_the_site_builds_without_a_warning_and_has_the_generated_reference(site: Path) -> None:
+    commands = (site / "reference" / "cli.html").read_text()
+    for group in GROUPS:
+        for name, _ in all_commands(command_parser(GROUPS, group)):
+            if name.split()[1] == group:
+                assert f">{name}<" in commands, name
+    assert "/api/v1/passes" in (site / "reference" / "http.html").read_text()
+    assert "LINNA_UPLOAD_LIMIT_MIB" in (site / "reference" / "configuration.html").read_text()
+
+
+def test_pages_load_nothing_from_elsewhere(site: Path) -> None:
+    for page in site.rglob("*.html"):
+        body = page.read_text()
+        for source in re.findall(r'<(?:script|img|link)[^>]+(?:src|href)="(https?:[^"]+)"', body):
+            assert 'rel="canonical"' in body and source.startswith("https://linna"), f"{page.name}: {source}"
+
+
+def test_the_service_shows_the_site_under_its_policy(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(documentation, "FOLDER", site)
+    answer = documentation.documentation_file("index.html")
+    policy = answer.headers["Content-Security-Policy"]
+    assert answer.media_type == "text/html; charset=utf-8" and "default-src 'none'" in policy
+    inline = re.findall(rb"<script>(.*?)</script>", bytes(answer.body), re.DOTALL)
+    assert (
+        inline and policy.count("'sha256-") == len(set(inline)) and "script-src 'self' 'unsafe" not in policy
+    )
+    for path in ("../pages.py", "no.html", "/etc/passwd"):
+        with pytest.raises(documentation.NotFound):
+            documentation.documentation_file(path)
+
+
+def test_spelling() -> None:
+    checked = subprocess.run(
+        [str(Path(sys.executable).with_name("typos")), "--config", str(ROOT / "typos.toml"), "docs", "README.md"],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert checked.returncode == 0, checked.stdout
+
+
+def test_the_readme_has_the_tour_of_the_first_tutorial() -> None:
+    (tour,) = [
+        m["text"]
+        for m in MARK.finditer((DOCS / "tutorials" / "first-pass.md").read_text())
+        if m["kind"] == "tour"
+    ]
+    assert tour in (ROOT / "README.md").read_text()
+    assert [shlex.split(line)[1] for line in tour.splitlines()] == ["demo", "serve", "plan", "plan", "report"]
+
+
+def environment(home: Path) -> dict[str, str]:
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("LINNA_DATA", "LINNA_HOME", "LINNA_SERVER")
+    }
+    return kept | {
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+        "PYTHONPATH": str(ROOT),
+        "XDG_DATA_HOME": str(home),
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("name", [name for name in TUTORIALS if name != "first-pass.md"])
+def test_the_commands_of_a_tutorial_run_as_written(name: str, tmp_path: Path) -> None:
+    ran = 0
+    for mark in MARK.finditer((DOCS / "tutorials" / name).read_text()):
+        text = "\n".join(
+            line.strip() if mark["kind"] == "run" else line for line in mark["text"].splitlines()
+        )
+        if mark["kind"] == "file":
+            (tmp_path / mark["name"]).write_text(text + "\n")
+            continue
+        for line in text.splitlines():
+            done = subprocess.run(
+                line,
+                shell=True,
+                cwd=tmp_path,
+                env=environment(tmp_path / "data"),
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+            allowed = {0} | {int(code) for code in (mark["status"] or "0").split(",")}
+            assert done.returncode in allowed, f"{line}\n{done.stdout[-2000:]}{done.stderr[-2000:]}"
+            ran += 1
+    assert ran > 0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_tour_runs_as_written(tmp_path: Path) -> None:
+    (tour,) = [
+        m["text"]
+        for m in MARK.finditer((DOCS / "tutorials" / "first-pass.md").read_text())
+        if m["kind"] == "tour"
+    ]
+    commands = tour.splitlines()
+    shell = {"cwd": tmp_path, "env": environment(tmp_path / "data"), "text": True}
+    demo = subprocess.run(commands[0], shell=True, capture_output=True, check=False, **shell)
+    assert demo.returncode == 0, demo.stderr[-2000:]
+    printed = [line.strip().removeprefix("linna ") for line in demo.stdout.splitlines()]
+    for command in commands[1:]:
+        assert command.removeprefix("linna ") in printed, command
+    server = subprocess.Popen(
+        shlex.split(commands[1]), cwd=tmp_path, env=shell["env"], start_new_session=True
+    )
+    try:
+        deadline = time.monotonic() + 120.0
+        while True:
+            try:
+                with urllib.request.urlopen("http://127.0.0.1:8042/passes", timeout=5) as answer:
+                    assert answer.status == 200
+                break
+            except OSError:
+                assert server.poll() is None and time.monotonic() < deadline
+                time.sleep(0.5)
+        for command in commands[2:]:
+            done = subprocess.run(command, shell=True, capture_output=True, check=False, **shell)
+            assert done.returncode == 0, f"{command}\n{done.stderr[-2000:]}"
+    finally:
+        os.killpg(server.pid, signal.SIGTERM)
+        server.wait(60)
+    assert (tmp_path / "linna-demo" / "window.cltu").stat().st_size > 0
+    assert (tmp_path / "linna-demo" / "report" / "report.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_reference_pages_name_every_setting() -> None:
+    from ground_service.settings import Settings
+
+    page = docs_site.configuration_page()
+    assert all(f"LINNA_{name.upper()}" in page for name in Settings.model_fields)
