@@ -16,7 +16,7 @@ k - 1 uses k states.  Newton's form with repeated nodes: Burden and Faires, Nume
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -244,6 +244,39 @@ def ephemeris_from_states(
         **{"object_id": object_name, **fields},
     )
     return Ephemeris((segment,))
+
+
+def clipped(ephemeris: Ephemeris, start_utc_ns: int, stop_utc_ns: int) -> Ephemeris:
+    """Return the part of an ephemeris that is useable in an interval, with the states that its interpolation needs.
+
+    Raises
+    ------
+    EphemerisCoverageError
+        Where no segment is useable in the interval.
+    """
+    parts = []
+    for one in ephemeris.segments:
+        start, stop = max(one.start_utc_ns, start_utc_ns), min(one.stop_utc_ns, stop_utc_ns)
+        if start > stop:
+            continue
+        margin = one.degree + 1
+        first = max(int(np.searchsorted(one.utc_ns, start, side="right")) - 1 - margin, 0)
+        last = min(int(np.searchsorted(one.utc_ns, stop, side="left")) + 1 + margin, len(one.utc_ns))
+        inner = (start, stop) != (int(one.utc_ns[first]), int(one.utc_ns[last - 1]))
+        parts.append(
+            replace(
+                one,
+                utc_ns=one.utc_ns[first:last],
+                position_m=one.position_m[first:last],
+                velocity_m_s=one.velocity_m_s[first:last],
+                useable_start_utc_ns=start if inner else None,
+                useable_stop_utc_ns=stop if inner else None,
+                covariances=tuple(c for c in one.covariances if start <= c.utc_ns <= stop),
+            )
+        )
+    if not parts:
+        ephemeris._refuse(start_utc_ns)
+    return Ephemeris(tuple(parts), ephemeris.originator, ephemeris.comments)
 
 
 def read_text(path: Path | str, expected: str) -> str:

@@ -83,6 +83,18 @@ def format_records(records: list[Record], kind: str) -> bytes:
         return f"[\n{lines}\n]\n".encode()
     if kind not in FORMATS:
         raise UnknownPacket(f"format: expected one of {', '.join(FORMATS)}, found {kind!r}")
+    columns = record_columns(records)
+    if kind == "parquet":
+        return parquet_octets(columns)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
+    return text.getvalue().encode()
+
+
+def record_columns(records: list[Record]) -> dict[str, list[object]]:
+    """Return the records as columns of one length, None where a record has no such value."""
     columns: dict[str, list[object]] = {}
     for row, record in enumerate(records):
         for key, value in _flat(record).items():
@@ -91,13 +103,21 @@ def format_records(records: list[Record], kind: str) -> bytes:
             column.append(value)
     for column in columns.values():
         column.extend([None] * (len(records) - len(column)))
-    if kind == "parquet":
-        return parquet_octets(columns)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(zip(*columns.values(), strict=True))
-    return text.getvalue().encode()
+    return columns
+
+
+def column_metadata(packet: str, dictionary: Dictionary = DICTIONARY) -> dict[str, dict[str, str]]:
+    """Return unit and description of the columns of a packet, as `record_columns` names them."""
+    definition = dictionary.packet(packet)
+    stated: dict[str, dict[str, str]] = {}
+    for one in definition.fields:
+        entry = {"description": one.description} | ({"unit": one.unit} if one.unit else {})
+        names = [one.name] if one.size == 1 else [f"{one.name}_{k}" for k in range(1, one.size + 1)]
+        stated |= dict.fromkeys(names, entry)
+    if definition.group:
+        units = {one.name: one.unit for one in definition.group.fields if one.unit}
+        stated[definition.group.name] = {"description": "JSON list of items", "units": json.dumps(units)}
+    return stated
 
 
 def _flat(record: Record) -> Record:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,8 +13,17 @@ from tmtc.errors import MissingLibrary
 _INT64_LIMIT = 1 << 63
 
 
-def parquet_octets(columns: Mapping[str, Sequence[object]]) -> bytes:
+def parquet_octets(
+    columns: Mapping[str, Sequence[object]],
+    *,
+    utc_columns: Collection[str] = (),
+    fields: Mapping[str, Mapping[str, str]] | None = None,
+    about: Mapping[str, str] | None = None,
+) -> bytes:
     """Return a Parquet file of columns of one length; values are integers, floats or texts, None if there is none.
+
+    `utc_columns` are nanoseconds since 1970 and become time stamps with the zone UTC. `fields` and `about` are metadata
+    of the columns (unit, description) and of the file.
 
     A column of integers is int64, uint64 if a value needs it, and text if it has values that no 64-bit type holds
     together.
@@ -30,7 +39,18 @@ def parquet_octets(columns: Mapping[str, Sequence[object]]) -> bytes:
     except ImportError:
         raise MissingLibrary("Parquet", "pyarrow", "linna[parquet]") from None
     buffer = io.BytesIO()
-    table = pyarrow.table({name: _array(pyarrow, values) for name, values in columns.items()})
+    arrays = {
+        name: pyarrow.array(values, type=pyarrow.timestamp("ns", tz="UTC"))
+        if name in utc_columns
+        else _array(pyarrow, values)
+        for name, values in columns.items()
+    }
+    stated = fields or {}
+    schema = pyarrow.schema(
+        [pyarrow.field(name, array.type, metadata=stated.get(name)) for name, array in arrays.items()],
+        metadata=dict(about) if about else None,
+    )
+    table = pyarrow.table(list(arrays.values()), schema=schema)
     parquet.write_table(table, buffer, compression="zstd")
     return buffer.getvalue()
 

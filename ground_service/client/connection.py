@@ -128,12 +128,12 @@ class Connection:
 
     # Streams
 
-    def _download(self, path: str, target: Path, **query: Value) -> None:
+    def _download(self, path: str, target: Path, *, body: Body | None = None, **query: Value) -> None:
         """Write a response to a file in blocks; the file is complete or absent."""
         partial = target.with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
-            self._send("GET", path, query=query, sink=partial)
+            self._send("GET" if body is None else "POST", path, query=query, body=body, sink=partial)
             partial.replace(target)
         finally:
             partial.unlink(missing_ok=True)

@@ -17,6 +17,8 @@ from ground_service.commanding.model import Telecommand, UplinkState
 from ground_service.ephemerides.model import Ephemeris
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.model import PassFigures, Report, ReportOverview
+from ground_service.exports.model import ExportFormat as FormatOfExports
+from ground_service.exports.model import ExportRequest, FormatName
 from ground_service.ingest.model import Ingest, IngestAccepted
 from ground_service.jobs.model import Job
 from ground_service.links.model import Contacts, LinkStatus
@@ -177,6 +179,15 @@ class Client(Connection):
     def get_packets(self, pass_id: int, packet: str, target: Path, *, kind: ExportFormat = "csv") -> None:
         """Download the decoded packets of one kind in a pass into a file."""
         self._download(f"/passes/{pass_id}/packets/{_part(packet)}", target, format=kind)
+
+    def export_pass(self, pass_id: int, kind: FormatName, target: Path, *, states: str = "reference") -> None:
+        """Write a pass in a format of other tools into a file; formats of several files give a zip archive."""
+        request = ExportRequest(pass_id=pass_id, format=kind, states=states)
+        self._download("/exports", target, body=request.model_dump(mode="json"))
+
+    def list_export_formats(self) -> list[FormatOfExports]:
+        """List the formats of exports."""
+        return self._all(FormatOfExports, "/exports/formats")
 
     def get_parameter(self, pass_id: int, parameter: str, *, max_points: int = 1000) -> ParameterSeries:
         """Return the series of a parameter of a pass."""

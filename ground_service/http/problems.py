@@ -29,6 +29,7 @@ from ground_service.errors import (
     public_text,
 )
 from lunar.errors import LunarError
+from lunar.errors import MissingLibrary as MissingLunarLibrary
 from reports.errors import ReportError
 from tmtc.errors import MissingLibrary, TmtcError
 
@@ -48,6 +49,7 @@ STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (StoreError, 503, "store unavailable"),
     (MissingLibrary, 501, "missing library"),
     (TmtcError, 422, "invalid telemetry"),
+    (MissingLunarLibrary, 501, "missing library"),
     (LunarError, 422, "invalid input"),
     (ReportError, 500, "report failed"),
     (GroundError, 400, "bad request"),

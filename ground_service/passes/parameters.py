@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -310,30 +310,45 @@ def export_packets(ground: Ground, pass_id: int, packet: str, kind: ExportFormat
         span = pass_span(connection, record)
         if packet in {definition.name for definition in DICTIONARY.telemetry}:
             return format_records(_own_records(connection, span, packet), kind)
-        found = declared_reading(connection, span.vehicle)
-        declared = None
-        if found is not None:
-            declared = next((one for one in found.definitions.declared if packet in one.layouts), None)
-        if found is None or declared is None or declared.decoder is None:
-            raise NotFound("packet", packet[:80])
-        span = span_of(span, declared)
-        ticks, packets = declared_values.packets_of_container(
-            connection,
-            span.vehicle,
-            found.decoding.definition_id,
-            declared.numbers[packet],
-            span.start_ticks,
-            span.stop_ticks,
-            RECORDS_LIMIT + 1,
-        )
+        return format_xtce_records(_declared_records(connection, span, packet), kind)
+
+
+def _declared_records(connection: Connection, span: PassSpan, packet: str) -> list[Record]:
+    """Return the packets of a container that the mission description defines, with their UTC."""
+    found = declared_reading(connection, span.vehicle)
+    declared = None
+    if found is not None:
+        declared = next((one for one in found.definitions.declared if packet in one.layouts), None)
+    if found is None or declared is None or declared.decoder is None:
+        raise NotFound("packet", packet[:80])
+    span = span_of(span, declared)
+    ticks, packets = declared_values.packets_of_container(
+        connection,
+        span.vehicle,
+        found.decoding.definition_id,
+        declared.numbers[packet],
+        span.start_ticks,
+        span.stop_ticks,
+        RECORDS_LIMIT + 1,
+    )
     if len(ticks) > RECORDS_LIMIT:
         raise InvalidInput("packets", packet, f"at most {RECORDS_LIMIT} in a pass", "more")
     cut = whole_packets(np.array([len(octets) for octets in packets.octets], dtype=np.int64))
     records = xtce_records(declared.decoder.decode(b"".join(packets.octets), cut))
     times = utc_ns_of_ticks(ticks, span.correlations)[0].tolist()
-    return format_xtce_records(
-        [{"utc": format_utc(time, 9), **one} for time, one in zip(times, records, strict=True)], kind
-    )
+    return [{"utc": format_utc(time, 9), **one} for time, one in zip(times, records, strict=True)]
+
+
+def packets_by_name(connection: Connection, span: PassSpan) -> Iterator[tuple[str, bool, list[Record]]]:
+    """Yield the packets of each kind in a pass: name, whether the dictionary has it, and the records with their UTC."""
+    for definition in DICTIONARY.telemetry:
+        if records := _own_records(connection, span, definition.name):
+            yield definition.name, True, records
+    found = declared_reading(connection, span.vehicle)
+    for declared in () if found is None else found.definitions.declared:
+        for name in declared.layouts if declared.decoder is not None else ():
+            if records := _declared_records(connection, span, name):
+                yield name, False, records
 
 
 def _own_records(connection: Connection, span: PassSpan, packet: str) -> list[Record]:

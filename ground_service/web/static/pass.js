@@ -7,11 +7,51 @@ const passId = Number(location.pathname.split("/").at(-1));
 const STATES = ["latitude_deg", "longitude_deg", "altitude_m"];
 const words = (name) => name.replaceAll("_", " ");
 
-async function openReport(id, format) {
-  const answer = await request(`reports/${id}?format=${format}`);
+// A link alone would lack the token of the caller.
+async function save(path, name, options) {
+  const answer = await request(path, options);
   const link = URL.createObjectURL(await answer.blob());
-  if (format === "html") window.open(link, "_blank", "noopener");
-  else element("a", { href: link, download: `pass-${passId}.${format}` }).click();
+  element("a", { href: link, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(link), 60_000);
+}
+
+async function openReport(id, format) {
+  if (format !== "html") return save(`reports/${id}?format=${format}`, `pass-${passId}.${format}`);
+  const answer = await request(`reports/${id}?format=html`);
+  window.open(URL.createObjectURL(await answer.blob()), "_blank", "noopener");
+}
+
+async function showExports() {
+  const formats = await get("exports/formats");
+  show("export-states", ["reference", ...dictionary.estimators].map((name) => element("option", { value: name }, name)));
+  const button = (one) =>
+    element(
+      "button",
+      {
+        type: "button",
+        disabled: !one.available,
+        onclick: acting(() =>
+          save("exports", `pass-${passId}${one.ending === "zip" ? `-${one.name}` : ""}.${one.ending}`, {
+            method: "POST",
+            json: { pass_id: passId, format: one.name, states: byId("export-states").value },
+          }),
+        ),
+      },
+      one.name,
+    );
+  show(
+    "exports",
+    table(
+      "Formats",
+      [
+        ["Format", button],
+        ["Contents", (one) => one.description + (one.available ? "" : ` (the server lacks linna[${one.extra}])`)],
+        ["States", (one) => (one.states ? "as chosen" : "")],
+      ],
+      formats,
+      "None.",
+    ),
+  );
 }
 
 function showReport(report, id) {
@@ -159,7 +199,12 @@ async function showParameters() {
   const { parameters, packets } = await get(`passes/${passId}/parameters`);
   show("parameter", parameterOptions(parameters));
   byId("parameter").value = "temperature_c";
-  const link = (packet, format) => element("a", { href: `/api/v1/passes/${passId}/packets/${encodeURIComponent(packet)}?format=${format}`, download: `pass-${passId}-${packet}.${format}` }, format === "csv" ? "CSV" : "Parquet");
+  const link = (packet, format) =>
+    element(
+      "button",
+      { type: "button", onclick: acting(() => save(`passes/${passId}/packets/${encodeURIComponent(packet)}?format=${format}`, `pass-${passId}-${packet}.${format}`)) },
+      format === "csv" ? "CSV" : "Parquet",
+    );
   const columns = [["Packet", (row) => row.packet], ["Source", (row) => row.source], ["Packets", (row) => figure(row.packets), "num"], ["Files", (row) => element("span", {}, link(row.packet, "csv"), " ", link(row.packet, "parquet"))]];
   if (packets.length) show("packets", table("Packets that the mission description defines", columns, packets, "None."));
   await showParameter();
@@ -239,6 +284,7 @@ async function load() {
       showEvents();
     }),
     showParameters(),
+    showExports(),
     showStates(dictionary.estimators),
   ]);
 }

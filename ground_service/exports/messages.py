@@ -1,0 +1,181 @@
+"""Orbit, attitude, sightings and SPICE kernels of a pass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ground_service.errors import EvaluationError
+from ground_service.evaluation.core import PassInputs
+from ground_service.evaluation.detection.landmarks import FIRST_LANDMARK_ID
+from ground_service.exports.formats import REFERENCE
+from ground_service.exports.poses import Poses, no_such_states, states_names
+from ground_service.exports.tables import identified_craters
+from ground_service.timekeeping.core import TimeCorrelation, ticks_of_utc_ns
+from lunar.aem import AttitudeSegment, format_aem
+from lunar.arrays import IntArray
+from lunar.ephemeris import Covariance, Ephemeris, clipped, ephemeris_from_states
+from lunar.oem import format_oem
+from lunar.oem_xml import format_oem_xml
+from lunar.opm import format_opm
+from lunar.spice import (
+    ClockLine,
+    ck_octets,
+    format_fk,
+    format_ik,
+    format_sclk,
+    spacecraft_id,
+    spk_octets,
+)
+from lunar.tdm import Sightings, format_tdm
+from lunar.timescales import TICKS_PER_SECOND, utc_ns_from_ticks
+
+FILTER = "anchored"
+"""Estimator whose states are downlinked with velocities and covariances."""
+
+DAY_TICKS = 86_400 * TICKS_PER_SECOND
+GAP_STEPS = 1.5
+"""Attitudes further apart than so many usual steps are not interpolated in a CK."""
+
+
+@dataclass(frozen=True, slots=True)
+class Craft:
+    """Name and CCSDS number of a spacecraft, and the correlations of its clock."""
+
+    name: str
+    number: int
+    correlations: tuple[TimeCorrelation, ...]
+
+
+def craft_name(inputs: PassInputs, number: int) -> str:
+    """Return the name of the spacecraft in the reference, otherwise one of its number."""
+    reference = inputs.reference
+    return reference.segments[0].object_name if reference is not None else f"SPACECRAFT_{number}"
+
+
+def ephemeris_of(inputs: PassInputs, states: str, craft: Craft) -> Ephemeris:
+    """Return the states of a pass as an ephemeris: the reference in its interval, or the states of the filter.
+
+    Raises
+    ------
+    EvaluationError
+        If there are no such states, or they have no velocities.
+    """
+    if states == REFERENCE:
+        if inputs.reference is None:
+            raise no_such_states(inputs, states)
+        return clipped(inputs.reference, inputs.start_utc_ns, inputs.stop_utc_ns)
+    if states not in states_names(inputs):
+        raise no_such_states(inputs, states)
+    found = inputs.filter_states
+    if states != FILTER or found is None or not len(found):
+        raise EvaluationError(
+            f"states: expected {REFERENCE} or {FILTER} (downlinked with velocities), found {states!r}"
+        )
+    covariances = tuple(
+        Covariance(int(utc), "ICRF", matrix[:6, :6])
+        for utc, matrix in zip(found.utc_ns, found.covariance, strict=True)
+    )
+    return ephemeris_from_states(
+        found.utc_ns,
+        found.state[:, :3],
+        found.state[:, 3:6],
+        craft.name,
+        interpolation="HERMITE",
+        degree=3,
+        comments=("states of the on-board navigation filter after each frame, downlinked",),
+        covariances=covariances,
+    )
+
+
+def orbit_octets(inputs: PassInputs, craft: Craft, kind: str, states: str) -> bytes:
+    """Return the orbit of a pass as `oem`, `oem-xml`, `opm` or `spk`."""
+    ephemeris = ephemeris_of(inputs, states, craft)
+    if kind == "spk":
+        return spk_octets(ephemeris, spacecraft_id(craft.number))
+    if kind == "opm":
+        return format_opm(ephemeris, ephemeris.start_utc_ns).encode()
+    return (format_oem_xml(ephemeris) if kind == "oem-xml" else format_oem(ephemeris)).encode()
+
+
+def attitude_octets(inputs: PassInputs, craft: Craft, kind: str) -> bytes:
+    """Return the attitude of the camera in the frames of a pass as `aem` or `ck`.
+
+    Raises
+    ------
+    EvaluationError
+        If the attitude of no frame is known.
+    """
+    utc_ns, q_wxyz = inputs.viewing.attitude_utc_ns, inputs.viewing.q_wxyz
+    if not len(utc_ns):
+        raise EvaluationError(f"pass {inputs.pass_id}: expected attitudes of its frames, found none")
+    if kind == "ck":
+        ticks = np.array([ticks_of_utc_ns(int(one), craft.correlations) for one in utc_ns], dtype=np.int64)
+        step = float(np.median(np.diff(ticks))) if len(ticks) > 1 else float(TICKS_PER_SECOND)
+        return ck_octets(ticks, q_wxyz, spacecraft_id(craft.number), gap_ticks=int(GAP_STEPS * step))
+    segment = AttitudeSegment(utc_ns, q_wxyz, object_name=craft.name, object_id=craft.name)
+    return format_aem((segment,)).encode()
+
+
+def sightings_text(inputs: PassInputs, poses: Poses, craft: Craft) -> str:
+    """Return the directions to identified craters as TDM.
+
+    Raises
+    ------
+    EvaluationError
+        If the payload reported no identification.
+    """
+    samples, craters = inputs.detections, identified_craters(inputs)
+    frame = np.searchsorted(samples.offsets, np.arange(len(craters)), side="right") - 1
+    place = np.full(len(samples), -1, dtype=np.int64)
+    place[poses.row] = np.arange(len(poses.row))
+    chosen = (
+        np.flatnonzero((craters >= 0) & (place[frame] >= 0)) if len(craters) else np.zeros(0, dtype=np.int64)
+    )
+    if not len(chosen):
+        raise EvaluationError(
+            f"pass {inputs.pass_id}: expected craters that the payload identified, found none in its telemetry"
+        )
+    rays = inputs.viewing.camera.rays(np.column_stack([samples.u_px[chosen], samples.v_px[chosen]]))
+    where = place[frame[chosen]]
+    directions = np.einsum("nji,nj->ni", poses.camera_from_icrf[where], rays)
+    utc_ns = poses.utc_ns[where]
+    sightings = []
+    for crater in np.unique(craters[chosen]).tolist():
+        rows = np.flatnonzero(craters[chosen] == crater)
+        name = f"LANDMARK_{crater}" if crater >= FIRST_LANDMARK_ID else f"CRATER_{crater}"
+        sightings.append(Sightings(name, utc_ns[rows], directions[rows]))
+    known = inputs.viewing.known(poses.utc_ns)
+    attitude = "telemetered" if known.all() else "declared" if not known.any() else "telemetered or declared"
+    comments = [
+        "lines of sight of detected craters that the payload identified; times of exposure on board",
+        f"attitude of the camera: {attitude}",
+    ]
+    return format_tdm(sightings, craft.name, comments=comments)
+
+
+def clock_lines(correlations: Sequence[TimeCorrelation], ticks: IntArray) -> list[ClockLine]:
+    """Return the time correlations as lines that follow each other; the first begins a day before the ticks (n,)."""
+    first = max(int(ticks.min()) - DAY_TICKS, 0)
+    if not correlations:
+        return [ClockLine(first, int(utc_ns_from_ticks(first)))]
+    ordered = sorted(correlations, key=lambda one: one.start_ticks)
+    lines = []
+    for number, one in enumerate(ordered):
+        start = min(first, one.start_ticks) if number == 0 else one.start_ticks
+        utc_ns = int(one.utc_ns(np.array([start], dtype=np.int64))[0])
+        lines.append(ClockLine(start, utc_ns, 1.0 + one.drift_ppb * 1e-9))
+    return lines
+
+
+def text_kernel(inputs: PassInputs, craft: Craft, kind: str) -> str:
+    """Return the text kernel `sclk`, `fk` or `ik` of a pass."""
+    number = spacecraft_id(craft.number)
+    if kind == "fk":
+        return format_fk(number, craft.name)
+    if kind == "ik":
+        return format_ik(inputs.viewing.camera, number, craft.name)
+    ticks = [ticks_of_utc_ns(one, craft.correlations) for one in (inputs.start_utc_ns, inputs.stop_utc_ns)]
+    return format_sclk(clock_lines(craft.correlations, np.array(ticks, dtype=np.int64)), number)

@@ -1,0 +1,57 @@
+"""Entities of exports."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from ground_service.http.model import Entity, Given
+
+FormatName = Literal[
+    "oem",
+    "oem-xml",
+    "opm",
+    "aem",
+    "tdm",
+    "spk",
+    "ck",
+    "sclk",
+    "fk",
+    "ik",
+    "geojson",
+    "gpkg",
+    "czml",
+    "parquet",
+    "netcdf",
+    "csv",
+    "tum",
+    "images",
+]
+
+
+class ExportRequest(Given):
+    """A pass, and the format of its export."""
+
+    pass_id: int = Field(ge=1, le=2**31 - 1, examples=[1])
+    format: FormatName = Field(examples=["geojson"])
+    states: str = Field(
+        default="reference",
+        min_length=1,
+        max_length=40,
+        examples=["reference"],
+        description="States of orbits and maps: `reference`, or the name of an estimator",
+    )
+
+
+class ExportFormat(Entity):
+    """A format of exports."""
+
+    name: str = Field(examples=["geojson"])
+    description: str
+    ending: str = Field(examples=["geojson"], description="Ending of the file; zip: several files")
+    states: bool = Field(description="The request chooses the states")
+    extra: str = Field(
+        description="Extra of the installation that the format needs; empty: none", examples=["geo"]
+    )
+    available: bool = Field(description="The library of the extra is installed")

@@ -1,0 +1,191 @@
+"""Exports of passes: everything is computed from the archive as it is now; nothing is stored."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from sqlalchemy import Connection
+
+from ground_service.errors import EvaluationError
+from ground_service.evaluation.core import PassInputs, evaluate_pass
+from ground_service.evaluation.navigation.trajectory import format_tum
+from ground_service.evaluation.store import load_pass_inputs
+from ground_service.exports import messages
+from ground_service.exports.czml import format_czml
+from ground_service.exports.formats import FORMATS, Format
+from ground_service.exports.layers import layers_of
+from ground_service.exports.maps import format_geojson, geopackage_octets
+from ground_service.exports.model import ExportFormat, ExportRequest
+from ground_service.exports.packet_files import parquet_files
+from ground_service.exports.poses import poses_of
+from ground_service.exports.table_files import csv_files, netcdf_octets
+from ground_service.exports.tables import pass_tables
+from ground_service.ground import Ground
+from ground_service.passes import store
+from ground_service.passes.parameters import packets_by_name
+from ground_service.passes.service import get_pass
+from ground_service.passes.span import PassSpan, pass_span
+from lunar.frames import mcmf_from_spherical
+from tmtc.errors import MissingLibrary
+
+ORBITS = ("oem", "oem-xml", "opm", "spk")
+ATTITUDES = ("aem", "ck")
+TEXT_KERNELS = ("sclk", "fk", "ik")
+MAPS = ("geojson", "gpkg", "czml")
+_EPOCH_OF_ZIP = (1980, 1, 1, 0, 0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """File of an export."""
+
+    name: str
+    octets: bytes
+
+
+def list_formats() -> list[ExportFormat]:
+    """Return the formats, and whether their libraries are installed here."""
+    return [
+        ExportFormat(
+            name=one.name,
+            description=one.description,
+            ending=one.ending,
+            states=one.states,
+            extra=one.extra,
+            available=not one.library or importlib.util.find_spec(one.library) is not None,
+        )
+        for one in FORMATS.values()
+    ]
+
+
+def export_pass(ground: Ground, request: ExportRequest) -> Exported:
+    """Return a pass in a format.
+
+    Raises
+    ------
+    NotFound
+        There is no such pass.
+    EvaluationError
+        The pass lacks what the format contains.
+    MissingLibrary
+        The format needs a library that is not installed.
+    """
+    chosen = FORMATS[request.format]
+    if chosen.library and importlib.util.find_spec(chosen.library) is None:
+        raise MissingLibrary(f"export as {chosen.name}", chosen.library, f"linna[{chosen.extra}]")
+    name = f"pass-{request.pass_id}.{chosen.ending}"
+    if chosen.several_files:
+        files = _files(ground, request, chosen)
+        return Exported(f"pass-{request.pass_id}-{chosen.name}.zip", _zipped(files))
+    return Exported(name, _octets(ground, request))
+
+
+def _octets(ground: Ground, request: ExportRequest) -> bytes:
+    inputs = load_pass_inputs(ground, request.pass_id)
+    kind = request.format
+    if kind == "netcdf":
+        return netcdf_octets(pass_tables(inputs, evaluate_pass(inputs).navigation), _about(inputs))
+    if kind in MAPS:
+        return _map_octets(inputs, kind, request.states)
+    detail = get_pass(ground, request.pass_id)
+    with ground.database.reading() as connection:
+        correlations = _span(connection, request.pass_id).correlations
+    number = detail.spacecraft_id
+    craft = messages.Craft(messages.craft_name(inputs, number), number, correlations)
+    if kind in ORBITS:
+        return messages.orbit_octets(inputs, craft, kind, request.states)
+    if kind in ATTITUDES:
+        return messages.attitude_octets(inputs, craft, kind)
+    if kind in TEXT_KERNELS:
+        return messages.text_kernel(inputs, craft, kind).encode()
+    return messages.sightings_text(inputs, poses_of(inputs, request.states), craft).encode()
+
+
+def _map_octets(inputs: PassInputs, kind: str, states: str) -> bytes:
+    poses = poses_of(inputs, states)
+    layers = layers_of(inputs, poses)
+    if kind == "czml":
+        return format_czml(inputs, poses, layers, inputs.title).encode()
+    if not any(one.features for one in layers):
+        raise EvaluationError(f"pass {inputs.pass_id}: expected frames with known positions, found none")
+    return format_geojson(layers, inputs.title).encode() if kind == "geojson" else geopackage_octets(layers)
+
+
+def _files(ground: Ground, request: ExportRequest, chosen: Format) -> dict[str, bytes]:
+    if chosen.name == "parquet":
+        with ground.database.reading() as connection:
+            span = _span(connection, request.pass_id)
+            files = parquet_files(packets_by_name(connection, span), {"pass": str(request.pass_id)})
+        return _some(files, request.pass_id, "packets")
+    if chosen.name == "images":
+        with ground.database.reading() as connection:
+            store.get_pass(connection, request.pass_id)
+            found = store.frame_files(connection, request.pass_id)
+        images = {f"{number:06d}.png": ground.files.get(sha256) for number, sha256 in found.items()}
+        return _some(images, request.pass_id, "archived images")
+    inputs = load_pass_inputs(ground, request.pass_id)
+    if chosen.name == "csv":
+        return csv_files(pass_tables(inputs, evaluate_pass(inputs).navigation), _about(inputs))
+    return _some(_trajectories(inputs), request.pass_id, "navigation solutions with a reference")
+
+
+def _span(connection: Connection, pass_id: int) -> PassSpan:
+    return pass_span(connection, store.get_pass(connection, pass_id))
+
+
+def _some(files: dict[str, bytes], pass_id: int, what: str) -> dict[str, bytes]:
+    if not files:
+        raise EvaluationError(f"pass {pass_id}: expected {what}, found none")
+    return files
+
+
+def _trajectories(inputs: PassInputs) -> dict[str, bytes]:
+    """Return each navigation solution, and the reference at its times, in TUM form."""
+    report = evaluate_pass(inputs)
+    files: dict[str, bytes] = {}
+    if report.reference is None:
+        return files
+    reference = report.reference
+    truth = mcmf_from_spherical(
+        np.radians(reference.latitude_deg), np.radians(reference.longitude_deg), reference.altitude_m
+    )
+    for series in report.navigation:
+        position = mcmf_from_spherical(
+            np.radians(series.latitude_deg), np.radians(series.longitude_deg), series.altitude_m
+        )
+        rows = np.minimum(np.searchsorted(reference.utc_ns, series.utc_ns), len(reference.utc_ns) - 1)
+        known = np.isfinite(position).all(axis=1) & (reference.utc_ns[rows] == series.utc_ns)
+        known &= np.isfinite(truth[rows]).all(axis=1)
+        if np.count_nonzero(known) < 2:
+            continue
+        utc_ns, there = series.utc_ns[known], truth[rows[known]]
+        stem = "".join(c if c.isalnum() else "-" for c in series.name.lower())
+        files[f"{stem}.tum"] = format_tum(utc_ns, position[known], there).encode()
+        files[f"{stem}-reference.tum"] = format_tum(utc_ns, there, there).encode()
+    return files
+
+
+def _about(inputs: PassInputs) -> dict[str, str]:
+    return {
+        "title": inputs.title,
+        "pass": inputs.pass_id,
+        "source": "LINNA ground service",
+        "evidence_level": inputs.evidence_level or "not stated",
+        "comment": "mean-Earth coordinates on the sphere of 1737.4 km (IAU_2015:30100)",
+    }
+
+
+def _zipped(files: Mapping[str, bytes]) -> bytes:
+    """Return a zip archive; the same files give the same octets."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, octets in files.items():
+            entry = zipfile.ZipInfo(name, _EPOCH_OF_ZIP)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            archive.writestr(entry, octets)
+    return buffer.getvalue()

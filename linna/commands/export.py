@@ -1,0 +1,74 @@
+"""`linna export PASS --format F --out F`: a pass in the formats of other tools."""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import zipfile
+from pathlib import Path
+
+from linna.commands._ground import add_operator_options, ground_client
+from linna.output import add_json_flag, emit, log
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    from ground_service.exports.formats import FORMATS, REFERENCE
+
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = "formats:\n" + "\n".join(f"  {one.name:<8} {one.description}" for one in FORMATS.values())
+    parser.add_argument("pass_id", type=int, metavar="PASS", help="number of the pass (see linna pass list)")
+    parser.add_argument(
+        "--format", required=True, choices=FORMATS, metavar="FORMAT", help="one of the list below"
+    )
+    parser.add_argument(
+        "--out",
+        required=True,
+        type=Path,
+        metavar="F",
+        help="file to write; for formats of several files a folder, or a name ending in .zip",
+    )
+    parser.add_argument(
+        "--states",
+        default=REFERENCE,
+        metavar="NAME",
+        help=f"states of orbits and maps: {REFERENCE} (default), or the name of an estimator",
+    )
+    add_operator_options(parser)
+    add_json_flag(parser)
+    parser.set_defaults(handler=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from ground_service.exports.formats import FORMATS
+    from linna.errors import UsageError
+
+    out: Path = arguments.out
+    unpacked = FORMATS[arguments.format].several_files and out.suffix.lower() != ".zip"
+    if out.exists() and out.is_dir() != unpacked:
+        expected, found = ("a folder", "a file") if unpacked else ("a file", "a folder")
+        raise UsageError(f"--out: expected {expected} for {arguments.format}, found {found} {str(out)!r}")
+    log(f"exporting pass {arguments.pass_id} as {arguments.format} ...")
+    with ground_client(arguments) as service, tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "export.zip" if unpacked else out
+        service.export_pass(arguments.pass_id, arguments.format, target, states=arguments.states)
+        files = _unpack(target, out) if unpacked else [out]
+    figures = {
+        "pass_id": arguments.pass_id,
+        "format": arguments.format,
+        "files": [str(file) for file in files],
+        "octets": sum(file.stat().st_size for file in files),
+    }
+    emit(arguments, figures, text="\n".join(figures["files"]))
+    return 0
+
+
+def _unpack(archive: Path, folder: Path) -> list[Path]:
+    """Write the files of an archive into a folder, under their plain names."""
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    with zipfile.ZipFile(archive) as opened:
+        for entry in opened.infolist():
+            path = folder / Path(entry.filename).name
+            path.write_bytes(opened.read(entry))
+            written.append(path)
+    return written

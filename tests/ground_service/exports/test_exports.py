@@ -1,0 +1,385 @@
+"""Exports of a pass, read back with the tools that they are made for."""
+
+import csv
+import importlib.util
+import io
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pandas
+import pyarrow.parquet
+import pyogrio
+import pytest
+import xarray
+from PIL import Image
+
+from ground_service.errors import EvaluationError, NotFound
+from ground_service.exports.formats import FORMATS
+from ground_service.exports.model import ExportRequest
+from ground_service.exports.service import export_pass, list_formats
+from ground_service.ground import Ground
+from lunar.aem import parse_aem
+from lunar.camera import PinholeCamera
+from lunar.catalogue import load_catalogue
+from lunar.ephemeris_files import load_ephemeris
+from lunar.frames import mcmf_from_spherical
+from lunar.oem import parse_oem
+from lunar.oem_xml import parse_oem_xml
+from lunar.spice import camera_id, et_from_utc_ns, spacecraft_id
+from tests.ground_service.conftest import SPACECRAFT, SPHERICAL_ERROR_RTN_M
+from tests.ground_service.exports.conftest import FILTER_OFFSET_M, FRAMES, RichPass
+from tests.lunar.spice_pool import kernels
+from tmtc.errors import MissingLibrary
+
+CRAFT = spacecraft_id(SPACECRAFT)
+
+
+def export(ground: Ground, kind: str, states: str = "reference") -> bytes:
+    return export_pass(
+        ground, ExportRequest.model_validate({"pass_id": 1, "format": kind, "states": states})
+    ).octets
+
+
+def unzipped(octets: bytes) -> dict[str, bytes]:
+    with zipfile.ZipFile(io.BytesIO(octets)) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+# Orbit, attitude, SPICE
+
+
+def test_oem_is_the_reference_in_the_interval_of_the_pass(rich_ground: Ground, rich_pass: RichPass) -> None:
+    found = parse_oem(export(rich_ground, "oem").decode())
+    reference = load_ephemeris(rich_pass.folder / "reference.oem")
+    assert (found.start_utc_ns, found.stop_utc_ns) == (rich_pass.utc_ns[0], rich_pass.utc_ns[-1])
+    between = rich_pass.utc_ns[:-1] + 7_123_456_789
+    np.testing.assert_array_equal(found.at(between)[0], reference.at(between)[0])
+    in_xml = parse_oem_xml(export(rich_ground, "oem-xml"))
+    np.testing.assert_array_equal(in_xml.at(between)[0], reference.at(between)[0])
+
+
+def test_oem_of_the_filter_has_its_states_and_covariances(rich_ground: Ground, rich_pass: RichPass) -> None:
+    segment = parse_oem(export(rich_ground, "oem", "anchored").decode()).segments[0]
+    reference = load_ephemeris(rich_pass.folder / "reference.oem")
+    np.testing.assert_array_equal(segment.utc_ns, rich_pass.utc_ns)
+    np.testing.assert_allclose(
+        segment.position_m - reference.at(segment.utc_ns)[0],
+        FILTER_OFFSET_M + np.zeros((FRAMES, 1)),
+        atol=1e-3,
+    )
+    np.testing.assert_allclose(segment.covariances[3].matrix, np.diag([100.0] * 3 + [1e-4] * 3), rtol=1e-6)
+
+
+def test_opm_has_the_state_at_the_start_of_the_pass(rich_ground: Ground, rich_pass: RichPass) -> None:
+    pairs = dict(line.split(" = ") for line in export(rich_ground, "opm").decode().splitlines() if line)
+    position, _ = load_ephemeris(rich_pass.folder / "reference.oem").at(rich_pass.utc_ns[0])
+    assert pairs["EPOCH"] == "2029-08-07T06:00:00.000"
+    assert float(pairs["X"].split()[0]) == pytest.approx(position[0] / 1e3, abs=1e-8)
+
+
+def test_aem_has_the_attitude_of_each_frame(rich_ground: Ground, rich_pass: RichPass) -> None:
+    (segment,) = parse_aem(export(rich_ground, "aem").decode())
+    from lunar.frames import matrix_from_quaternion
+
+    np.testing.assert_array_equal(segment.utc_ns, rich_pass.utc_ns)
+    np.testing.assert_allclose(matrix_from_quaternion(segment.q_wxyz), rich_pass.camera_from_icrf, atol=1e-11)
+
+
+def test_spice_kernels_together_see_the_detected_crater_in_its_pixel(
+    rich_ground: Ground, rich_pass: RichPass, tmp_path: Path
+) -> None:
+    names = ("spk", "ck", "sclk", "fk", "ik")
+    reference = load_ephemeris(rich_pass.folder / "reference.oem")
+    with kernels(tmp_path, **{name: export(rich_ground, name) for name in names}) as spice:
+        for k, utc_ns in enumerate(rich_pass.utc_ns):
+            et = float(et_from_utc_ns(int(utc_ns)))
+            state, _ = spice.spkgeo(CRAFT, et, "J2000", 301)
+            np.testing.assert_allclose(1e3 * state[:3], reference.at(utc_ns)[0], atol=1e-3)
+            if 0 < k < FRAMES - 1:  # the ends of a CK are sharp, and the clock has ticks of 15 us
+                turn = spice.pxform("J2000", "SELENITA_CAMERA", et)
+                np.testing.assert_allclose(turn, rich_pass.camera_from_icrf[k], atol=1e-6)
+        shape, frame, _, _, corners = spice.getfov(camera_id(CRAFT), 8)
+    assert (shape, frame) == ("POLYGON", "SELENITA_CAMERA")
+    np.testing.assert_allclose(PinholeCamera().project(corners), PinholeCamera().corners_px(), atol=1e-9)
+
+
+def test_tdm_points_at_the_craters_of_the_catalogue(rich_ground: Ground, rich_pass: RichPass) -> None:
+    text = export(rich_ground, "tdm").decode()
+    catalogue = load_catalogue(rich_pass.folder / "catalogue.csv")
+    by_crater = {int(number): k for k, number in enumerate(catalogue.ids)}
+    reference = load_ephemeris(rich_pass.folder / "reference.oem")
+    from lunar.frames import IauOrientation
+    from lunar.timescales import parse_utc, tdb_s_from_utc_ns
+
+    seen = 0
+    for part in text.split("META_START")[1:]:
+        crater = by_crater[int(part.partition("PARTICIPANT_2 = CRATER_")[2].partition("\n")[0])]
+        rows = [
+            line.split() for line in part.splitlines() if line.startswith("ANGLE_") and len(line.split()) == 4
+        ]
+        for first, second in zip(rows[::2], rows[1::2], strict=True):
+            utc_ns = parse_utc(first[2])
+            alpha, delta = np.radians([float(first[3]), float(second[3])])
+            sight = np.array([np.cos(delta) * np.cos(alpha), np.cos(delta) * np.sin(alpha), np.sin(delta)])
+            turn = IauOrientation().mcmf_from_icrf(tdb_s_from_utc_ns(utc_ns))
+            true = turn.T @ catalogue.position_mcmf_m[crater] - reference.at(utc_ns)[0]
+            # Detections are off by 1.35 pixels of at most 1 / 147.8 rad.
+            assert np.linalg.norm(sight - true / np.linalg.norm(true)) < 1.4 / 147.8
+            seen += 1
+    assert seen == sum(map(len, rich_pass.craters))
+
+
+# Maps
+
+
+def test_geojson_and_geopackage_have_the_same_features_on_the_moon(
+    rich_ground: Ground, rich_pass: RichPass, tmp_path: Path
+) -> None:
+    (tmp_path / "pass.geojson").write_bytes(export(rich_ground, "geojson"))
+    (tmp_path / "pass.gpkg").write_bytes(export(rich_ground, "gpkg"))
+    document = json.loads((tmp_path / "pass.geojson").read_text())
+    counts: dict[str, int] = {}
+    for feature in document["features"]:
+        counts[feature["properties"]["layer"]] = counts.get(feature["properties"]["layer"], 0) + 1
+    layers = {str(name): str(kind) for name, kind in pyogrio.list_layers(tmp_path / "pass.gpkg")}
+    assert layers == {
+        "tracks": "MultiLineString", "footprints": "MultiPolygon", "detections": "Point", "craters": "Point",
+    }  # fmt: skip
+    for layer in layers:
+        info = pyogrio.read_info(tmp_path / "pass.gpkg", layer=layer)
+        assert info["features"] == counts[layer], layer
+        assert 'AUTHORITY["IAU","30100"]' in info["crs"]
+        assert 'SPHEROID["Moon (2015) - Sphere",1737400,0' in info["crs"]
+    assert counts["footprints"] == FRAMES
+    assert counts["tracks"] == 4
+    read = pyogrio.read_info(tmp_path / "pass.geojson")
+    assert "1737400" in read["crs"]
+
+
+def test_located_detections_lie_on_their_craters(
+    rich_ground: Ground, rich_pass: RichPass, tmp_path: Path
+) -> None:
+    path = tmp_path / "pass.gpkg"
+    path.write_bytes(export(rich_ground, "gpkg"))
+    catalogue = load_catalogue(rich_pass.folder / "catalogue.csv")
+    _, _, geometry, values = pyogrio.raw.read(path, layer="detections")
+    meta = pyogrio.read_info(path, layer="detections")
+    columns = dict(zip(meta["fields"], values, strict=True))
+    places = np.array([np.frombuffer(one[-16:], "<f8") for one in geometry])
+    rows = {int(number): k for k, number in enumerate(catalogue.ids)}
+    known = np.flatnonzero(columns["crater_id"] >= 0)
+    assert len(known) == sum(map(len, rich_pass.craters))
+    mine = np.array([rows[int(columns["crater_id"][k])] for k in known])
+    found = mcmf_from_spherical(np.radians(places[known, 1]), np.radians(places[known, 0]), 0.0)
+    true = mcmf_from_spherical(catalogue.latitude_rad[mine], catalogue.longitude_rad[mine], 0.0)
+    # 1.35 pixels of 203 m at nadir and rims within 500 m of the sphere: both grow to the edges.
+    assert np.median(np.linalg.norm(found - true, axis=1)) < 1000.0
+
+
+def test_footprints_hold_the_sub_satellite_point_and_detections(
+    rich_ground: Ground, rich_pass: RichPass
+) -> None:
+    document = json.loads(export(rich_ground, "geojson"))
+    from lunar.frames import spherical_from_mcmf
+
+    latitude, longitude, _ = spherical_from_mcmf(rich_pass.position_mcmf_m)
+    rings = {
+        one["properties"]["frame"]: np.array(one["geometry"]["coordinates"][0][0])
+        for one in document["features"]
+        if one["properties"]["layer"] == "footprints"
+    }
+    for k in range(FRAMES):
+        east = np.degrees((longitude[k] + np.pi) % (2 * np.pi) - np.pi)
+        low, high = rings[k].min(axis=0), rings[k].max(axis=0)
+        assert (low < [east, np.degrees(latitude[k])]).all() and (
+            [east, np.degrees(latitude[k])] < high
+        ).all()
+        # The true arc to the middle of an edge is 53.4 km at 30 km altitude.
+        ring = mcmf_from_spherical(np.radians(rings[k][:, 1]), np.radians(rings[k][:, 0]), 0.0) / 1_737_400.0
+        below = rich_pass.position_mcmf_m[k] / np.linalg.norm(rich_pass.position_mcmf_m[k])
+        arc_km = 1737.4 * np.arccos(ring @ below)
+        assert arc_km.min() == pytest.approx(53.4, abs=0.1)
+        np.testing.assert_array_equal(rings[k][0], rings[k][-1])
+
+
+def test_maps_of_an_estimator_move_with_its_error(rich_ground: Ground) -> None:
+    def points(states: str) -> np.ndarray:
+        features = json.loads(export(rich_ground, "geojson", states))["features"]
+        places = [
+            one["geometry"]["coordinates"] for one in features if one["properties"]["layer"] == "detections"
+        ]
+        return np.array(places)
+
+    shift = np.radians(np.linalg.norm(points("spherical") - points("reference"), axis=1)) * 1_737_400.0
+    horizontal = float(np.linalg.norm(SPHERICAL_ERROR_RTN_M[1:]))
+    # The radial error shifts points away from nadir, and degrees of longitude are shorter.
+    assert np.median(shift) == pytest.approx(horizontal, rel=0.25)
+
+
+def test_czml_is_valid_and_follows_the_spacecraft(rich_ground: Ground, rich_pass: RichPass) -> None:
+    from czml3 import Document, Packet
+
+    packets = json.loads(export(rich_ground, "czml"))
+    assert packets[0]["id"] == "document" and packets[0]["version"] == "1.0"
+    Document(packets=[Packet(id=one["id"], name=one.get("name")) for one in packets[1:20]])
+    craft = next(one for one in packets if one["id"] == "spacecraft")
+    table = np.array(craft["position"]["cartesian"]).reshape(-1, 4)
+    np.testing.assert_allclose(table[:, 0], (rich_pass.utc_ns - rich_pass.utc_ns[0]) / 1e9)
+    np.testing.assert_allclose(table[:, 1:], rich_pass.position_mcmf_m, atol=1e-3)
+    q_xyzw = np.array(craft["orientation"]["unitQuaternion"]).reshape(-1, 5)[:, 1:]
+    from scipy.spatial.transform import Rotation
+
+    boresight = Rotation.from_quat(q_xyzw).apply([0.0, 0.0, 1.0])
+    down = -rich_pass.position_mcmf_m / np.linalg.norm(rich_pass.position_mcmf_m, axis=1, keepdims=True)
+    np.testing.assert_allclose(boresight, down, atol=1e-7)
+    assert len({one["id"] for one in packets}) == len(packets)
+
+
+# Tables and packets
+
+
+def test_csv_tables_have_every_sample_with_units(rich_ground: Ground, rich_pass: RichPass) -> None:
+    files = unzipped(export(rich_ground, "csv"))
+    metadata = json.loads(files["csv-metadata.json"])
+    assert {one["url"] for one in metadata["tables"]} | {"csv-metadata.json"} == set(files)
+    states = list(csv.DictReader(io.StringIO(files["states.csv"].decode())))
+    assert len(states) == 3 * FRAMES
+    assert states[0]["utc"] == "2029-08-07T06:00:00.000000000Z"
+    columns = next(one for one in metadata["tables"] if one["url"] == "states.csv")["tableSchema"]["columns"]
+    assert next(one for one in columns if one["name"] == "altitude_m")["linna:unit"] == "m"
+    assert [one["name"] for one in columns] == list(states[0])
+    spherical = [
+        one
+        for one in csv.DictReader(io.StringIO(files["residuals.csv"].decode()))
+        if one["solution"] == "spherical"
+    ]
+    found = np.array([[float(one[f"error_{axis}_m"]) for axis in "rtn"] for one in spherical])
+    np.testing.assert_allclose(found, SPHERICAL_ERROR_RTN_M + np.zeros((FRAMES, 1)), atol=0.5)
+    assert [one["sigma_r_m"] for one in spherical] == [""] * FRAMES
+    detections = list(csv.DictReader(io.StringIO(files["detections.csv"].decode())))
+    assert sum(one["crater_id"] != "-1" for one in detections) == sum(map(len, rich_pass.craters))
+
+
+def test_netcdf_has_the_tables_as_groups(rich_ground: Ground, rich_pass: RichPass, tmp_path: Path) -> None:
+    path = tmp_path / "pass.nc"
+    path.write_bytes(export(rich_ground, "netcdf"))
+    rows = unzipped(export(rich_ground, "csv"))
+    with xarray.open_datatree(path, engine="h5netcdf") as tree:
+        assert tree.attrs["title"] == "synthetic pass"
+        frames = tree["frames"].to_dataset()
+        np.testing.assert_array_equal(
+            frames["utc"].values.astype("datetime64[ns]").astype(np.int64), rich_pass.utc_ns
+        )
+        assert tree["detections"]["u_px"].attrs["units"] == "px"
+        for name in ("states", "residuals", "detections", "events", "housekeeping", "reference", "attitude"):
+            table = pandas.read_csv(io.BytesIO(rows[f"{name}.csv"]))
+            for column in table.columns.drop("utc"):
+                values = tree[name][column].values
+                if table[column].dtype.kind in "if":
+                    np.testing.assert_allclose(values.astype(float), table[column].to_numpy(float))
+                else:
+                    assert list(values) == list(table[column])
+
+
+def test_parquet_has_a_file_for_each_packet_type_with_units(rich_ground: Ground, rich_pass: RichPass) -> None:
+    files = unzipped(export(rich_ground, "parquet"))
+    assert {
+        "detections.parquet",
+        "housekeeping.parquet",
+        "filter_state.parquet",
+        "event_info.parquet",
+    } <= set(files)
+    table = pyarrow.parquet.read_table(io.BytesIO(files["housekeeping.parquet"]))
+    assert table.num_rows == FRAMES
+    assert str(table.schema.field("utc").type) == "timestamp[ns, tz=UTC]"
+    stated = table.schema.field("temperature_c").metadata
+    assert stated[b"unit"] == b"degC"
+    assert stated[b"description"]
+    assert table.schema.metadata[b"packet"] == b"housekeeping"
+    times = table.column("utc").cast("int64").to_numpy()
+    # Housekeeping was packed 400 ticks after each image.
+    np.testing.assert_allclose(times - rich_pass.utc_ns, 400 / 65_536 * 1e9, atol=20_000)
+
+
+def test_tum_trajectories_differ_by_the_error(rich_ground: Ground) -> None:
+    files = unzipped(export(rich_ground, "tum"))
+    solution, reference = (
+        np.loadtxt(io.BytesIO(files[name])) for name in ("spherical.tum", "spherical-reference.tum")
+    )
+    assert len(solution) == FRAMES
+    distance = np.linalg.norm(solution[:, 1:4] - reference[:, 1:4], axis=1)
+    np.testing.assert_allclose(distance, np.linalg.norm(SPHERICAL_ERROR_RTN_M), atol=1.0)
+
+
+def test_images_are_those_of_the_archive(rich_ground: Ground) -> None:
+    files = unzipped(export(rich_ground, "images"))
+    assert sorted(files) == ["000000.png", "000004.png", "000008.png"]
+    assert np.asarray(Image.open(io.BytesIO(files["000004.png"])))[0, 0] == 40
+
+
+# Requests
+
+
+def test_every_format_is_listed_and_gives_the_same_octets_twice(rich_ground: Ground) -> None:
+    assert [one.name for one in list_formats()] == list(FORMATS)
+    assert all(one.available for one in list_formats())
+    for name in ("oem", "aem", "geojson", "csv", "parquet", "sclk"):
+        assert export(rich_ground, name) == export(rich_ground, name), name
+
+
+@pytest.mark.parametrize(
+    ("kind", "states", "message"),
+    [
+        (
+            "oem",
+            "paper",
+            "states: expected reference or anchored .downlinked with velocities., found 'paper'",
+        ),
+        ("oem", "truth", "states: expected reference or paper or spherical or anchored, found 'truth'"),
+        ("geojson", "truth", "states: expected reference or paper or spherical or anchored, found 'truth'"),
+    ],
+)
+def test_states_that_do_not_exist_are_one_line(
+    rich_ground: Ground, kind: str, states: str, message: str
+) -> None:
+    with pytest.raises(EvaluationError, match=message):
+        export(rich_ground, kind, states)
+
+
+def test_a_pass_without_content_of_a_format_is_one_line(rich_ground: Ground) -> None:
+    from ground_service.passes.service import define_pass
+
+    empty = define_pass(
+        rich_ground,
+        name="empty",
+        start_utc_ns=10**18,
+        stop_utc_ns=10**18 + 60 * 10**9,
+        spacecraft_id=SPACECRAFT,
+    )
+    for kind, message in (
+        ("aem", "expected attitudes of its frames, found none"),
+        ("parquet", "expected packets, found none"),
+        ("images", "expected archived images, found none"),
+        ("oem", "states: expected none, found 'reference'"),
+        ("geojson", "lunar orientation"),
+    ):
+        with pytest.raises(EvaluationError, match=message):
+            export_pass(rich_ground, ExportRequest(pass_id=empty, format=kind))  # type: ignore[arg-type] # a name
+    with pytest.raises(NotFound, match="pass 999: not found"):
+        export_pass(rich_ground, ExportRequest(pass_id=999, format="images"))
+
+
+@pytest.mark.parametrize("kind", [name for name, one in FORMATS.items() if one.library])
+def test_a_missing_library_is_one_line_with_its_extra(
+    rich_ground: Ground, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    usual, chosen = importlib.util.find_spec, FORMATS[kind]
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == chosen.library else usual(name)
+    )
+    expected = rf"export as {kind}: expected the library {chosen.library}, found none; install linna\[{chosen.extra}\]"
+    with pytest.raises(MissingLibrary, match=expected):
+        export(rich_ground, kind)
+    assert not next(one for one in list_formats() if one.name == kind).available
