@@ -17,8 +17,7 @@ from ground_service.commanding.model import Telecommand, UplinkState
 from ground_service.ephemerides.model import Ephemeris
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.model import PassFigures, Report, ReportOverview
-from ground_service.exports.model import ExportFormat as FormatOfExports
-from ground_service.exports.model import ExportRequest, FormatName
+from ground_service.exports.model import ExportFormatInfo, FormatName
 from ground_service.ingest.model import Ingest, IngestAccepted
 from ground_service.jobs.model import Job
 from ground_service.links.model import Contacts, LinkStatus
@@ -182,12 +181,11 @@ class Client(Connection):
 
     def export_pass(self, pass_id: int, kind: FormatName, target: Path, *, states: str = "reference") -> None:
         """Write a pass in a format of other tools into a file; formats of several files give a zip archive."""
-        request = ExportRequest(pass_id=pass_id, format=kind, states=states)
-        self._download("/exports", target, body=request.model_dump(mode="json"))
+        self._download("/exports", target, body={"pass_id": pass_id, "format": kind, "states": states})
 
-    def list_export_formats(self) -> list[FormatOfExports]:
+    def list_export_formats(self) -> list[ExportFormatInfo]:
         """List the formats of exports."""
-        return self._all(FormatOfExports, "/exports/formats")
+        return self._all(ExportFormatInfo, "/exports/formats")
 
     def get_parameter(self, pass_id: int, parameter: str, *, max_points: int = 1000) -> ParameterSeries:
         """Return the series of a parameter of a pass."""

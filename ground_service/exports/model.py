@@ -44,7 +44,7 @@ class ExportRequest(Given):
     )
 
 
-class ExportFormat(Entity):
+class ExportFormatInfo(Entity):
     """A format of exports."""
 
     name: str = Field(examples=["geojson"])

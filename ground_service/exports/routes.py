@@ -6,7 +6,7 @@ from fastapi import Response
 
 from ground_service.access.security import Viewer
 from ground_service.exports import service
-from ground_service.exports.model import ExportFormat, ExportRequest
+from ground_service.exports.model import ExportFormatInfo, ExportRequest
 from ground_service.http.common import GroundOf
 from ground_service.http.requests import operations
 
@@ -33,6 +33,6 @@ def export_pass(ground: GroundOf, _: Viewer, request: ExportRequest) -> Response
 
 
 @exports.get("/exports/formats")
-def list_export_formats(_: Viewer) -> list[ExportFormat]:
+def list_export_formats(_: Viewer) -> list[ExportFormatInfo]:
     """List the formats of exports."""
     return service.list_formats()

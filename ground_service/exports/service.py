@@ -20,7 +20,7 @@ from ground_service.exports.czml import format_czml
 from ground_service.exports.formats import FORMATS, Format
 from ground_service.exports.layers import layers_of
 from ground_service.exports.maps import format_geojson, geopackage_octets
-from ground_service.exports.model import ExportFormat, ExportRequest
+from ground_service.exports.model import ExportFormatInfo, ExportRequest
 from ground_service.exports.packet_files import parquet_files
 from ground_service.exports.poses import poses_of
 from ground_service.exports.table_files import csv_files, netcdf_octets
@@ -48,10 +48,10 @@ class Exported:
     octets: bytes
 
 
-def list_formats() -> list[ExportFormat]:
+def list_formats() -> list[ExportFormatInfo]:
     """Return the formats, and whether their libraries are installed here."""
     return [
-        ExportFormat(
+        ExportFormatInfo(
             name=one.name,
             description=one.description,
             ending=one.ending,

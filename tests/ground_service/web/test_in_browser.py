@@ -53,6 +53,15 @@ def test_pages_have_no_serious_barrier(page, path, scheme):
     assert serious == []
 
 
+def test_a_pass_is_exported_with_a_button(page):
+    settled(page, "/passes/1")
+    with page.expect_download() as started:
+        page.get_by_role("button", name="oem", exact=True).click()
+    assert started.value.suggested_filename == "pass-1.oem"
+    with open(started.value.path()) as file:
+        assert file.readline() == "CCSDS_OEM_VERS = 2.0\n"
+
+
 def test_a_narrow_screen_scrolls_down_only(page):
     page.set_viewport_size({"width": 768, "height": 1024})
     for path in PATHS:
