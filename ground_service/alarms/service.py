@@ -21,7 +21,7 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, InvalidInput
 from ground_service.events import AlarmChanged, publish
 from ground_service.ground import Ground
-from ground_service.store import parameters
+from ground_service.store import parameters, telemetry
 from ground_service.timekeeping.core import utc_ns_of_ticks
 from ground_service.timekeeping.store import load_correlations
 from lunar.timescales import format_utc
@@ -161,7 +161,7 @@ def shelve_alarm(
 def _update(connection: Connection, vehicle: int, found: tuple[Condition, ...]) -> None:
     """Apply the conditions of new packets to the alarms of a vehicle, which the caller has locked."""
     now = utc_now_ns()
-    housekeeping = store.newest_packet(connection, vehicle, DICTIONARY.packet(core.HOUSEKEEPING).apid)
+    housekeeping = telemetry.newest_packet(connection, vehicle, DICTIONARY.packet(core.HOUSEKEEPING).apid)
     broken = frozenset[str]() if housekeeping is None else core.broken_limits(housekeeping)
     known = {(row.source, row.name): row for row in store.open_alarms(connection, vehicle)}
     worse: set[tuple[str, str]] = set()

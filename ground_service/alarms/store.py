@@ -14,7 +14,7 @@ from ground_service.alarms.model import AlarmChange
 from ground_service.errors import NotFound
 from ground_service.http.times import UtcTime
 from ground_service.store import models, states
-from ground_service.store.repository import PACKETS, VEHICLES, add_new
+from ground_service.store.repository import VEHICLES, add_new
 from ground_service.store.states import StateMachine
 
 _TABLES = models.Base.metadata.tables
@@ -70,18 +70,6 @@ def advance(connection: Connection, vehicle: int, packet_id: int) -> None:
     )
     if done.rowcount == 0:
         connection.execute(insert(_POSITIONS).values(vehicle_id=vehicle, packet_id=packet_id))
-
-
-def newest_packet(connection: Connection, vehicle: int, apid: int) -> bytes | None:
-    """Return the packet of an APID with the latest on-board time, None without any."""
-    query = (
-        select(PACKETS.c.octets)
-        .where(PACKETS.c.vehicle_id == vehicle, PACKETS.c.apid == apid)
-        .order_by(PACKETS.c.ticks.desc(), PACKETS.c.sequence_count.desc(), PACKETS.c.digest.desc())
-        .limit(1)
-    )
-    found = connection.execute(query).scalar()
-    return None if found is None else bytes(found)
 
 
 def open_alarms(connection: Connection, vehicle: int) -> list[AlarmRow]:

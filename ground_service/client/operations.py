@@ -27,10 +27,12 @@ from ground_service.passes.model import (
     Detection,
     Event,
     ExportFormat,
+    LiveParameter,
     ParameterSeries,
     PassDetail,
     PassParameters,
     PassSummary,
+    SpacecraftInstance,
     States,
     Trend,
 )
@@ -211,6 +213,14 @@ class Client(Connection):
             stop=stop,
             max_points=max_points,
         )
+
+    def list_spacecraft(self) -> list[SpacecraftInstance]:
+        """List the spacecraft in all instances, flown ones first."""
+        return self._all(SpacecraftInstance, "/spacecraft")
+
+    def list_live_parameters(self, spacecraft_id: int, *, instance: str = "flight") -> list[LiveParameter]:
+        """List the newest value of every parameter, with its age and limit state."""
+        return self._all(LiveParameter, "/parameters", spacecraft_id=spacecraft_id, instance=instance)
 
     def list_trends(self, spacecraft_id: int, *, instance: str = "flight") -> list[Trend]:
         """List the statistics of the housekeeping parameters over the last 30 days of on-board time."""

@@ -219,6 +219,30 @@ class ParameterInfo(Entity):
     )
 
 
+class SpacecraftInstance(Entity):
+    """A spacecraft in one instance: flown, emulated or replayed."""
+
+    spacecraft_id: int = Field(examples=[76])
+    instance: str = Field(examples=["flight"])
+
+
+class LiveParameter(Entity):
+    """Value of a parameter in the newest packet of its APID, by on-board time."""
+
+    name: str = Field(examples=["temperature_c"])
+    packet: str = Field(examples=["housekeeping"])
+    description: str
+    unit: str = Field(examples=["degC"])
+    value: Annotated[float | None, BeforeValidator(_known)] = Field(description="Null: not known")
+    text: str = Field(description="Value as people read it: the name of a code, or the number")
+    limit_state: Literal["none", "within", "warning", "alarm"] = Field(description="none: no limits")
+    limits: str = Field(description="Warning limits, else alarm limits; empty: none", examples=["-20 to 60"])
+    time: UtcTime = Field(description="Spacecraft time of the packet")
+    age_s: float | None = Field(
+        description="Time since then; null: the packet is later than the clock of the service", examples=[4.2]
+    )
+
+
 class PacketInfo(Entity):
     """Packets of one kind in a pass."""
 

@@ -9,6 +9,7 @@ from fastapi.responses import JSONResponse
 
 from ground_service.access.idempotency import once
 from ground_service.access.security import Operator, UploadOf, Viewer, idempotent_id
+from ground_service.errors import InvalidInput
 from ground_service.http.common import (
     API_PREFIX,
     GroundOf,
@@ -27,17 +28,20 @@ from ground_service.http.times import GivenTime
 from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import get_job
+from ground_service.passes import live as newest
 from ground_service.passes import parameters, service
 from ground_service.passes.model import (
     Completeness,
     Detection,
     Event,
     ExportFormat,
+    LiveParameter,
     ParameterSeries,
     PassDefinition,
     PassDetail,
     PassParameters,
     PassSummary,
+    SpacecraftInstance,
     States,
     Trend,
 )
@@ -211,6 +215,26 @@ def get_trend(
         stop_utc_ns=None if stop is None else stop.utc_ns,
     )
     return JSONResponse(series_document(found))
+
+
+@passes.get("/spacecraft")
+def list_spacecraft(ground: GroundOf, _: Viewer) -> PageOf[SpacecraftInstance]:
+    """List the spacecraft, flown ones first."""
+    return PageOf.all_of(newest.list_spacecraft(ground))
+
+
+@passes.get("/parameters")
+def list_live_parameters(
+    ground: GroundOf,
+    _: Viewer,
+    spacecraft_id: Annotated[int, Query(ge=0, le=1023, examples=[76])],
+    instance: Instance = FLOWN,
+    live: Annotated[bool, Query(description="Newest values; series are listed by pass")] = True,
+) -> PageOf[LiveParameter]:
+    """List the newest value of every parameter of a spacecraft, with its age and limit state."""
+    if not live:
+        raise InvalidInput("query", "live", "true; series are under /passes/{id}/telemetry", "false")
+    return PageOf.all_of(newest.live_parameters(ground, spacecraft_id, instance))
 
 
 @passes.get("/spacecraft/{spacecraft_id}/trends")

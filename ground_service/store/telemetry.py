@@ -47,6 +47,18 @@ def packet_octets(
     return b"".join(bytes(octets) for (octets,) in connection.execute(query))
 
 
+def newest_packet(connection: Connection, vehicle: int, apid: int) -> bytes | None:
+    """Return the packet of an APID with the latest on-board time, None without any."""
+    query = (
+        select(PACKETS.c.octets)
+        .where(PACKETS.c.vehicle_id == vehicle, PACKETS.c.apid == apid)
+        .order_by(PACKETS.c.ticks.desc(), PACKETS.c.sequence_count.desc(), PACKETS.c.digest.desc())
+        .limit(1)
+    )
+    found = connection.execute(query).scalar()
+    return None if found is None else bytes(found)
+
+
 def samples(
     connection: Connection,
     kind: str,

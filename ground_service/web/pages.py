@@ -57,6 +57,7 @@ PAGES = (
     Page("/passes", "passes", "Passes", "Passes"),
     Page("/passes/{pass_id}", "pass", "Pass", "", "passes"),
     Page("/telemetry", "telemetry", "Telemetry", "Telemetry"),
+    Page("/alarms", "alarms", "Alarms", "Alarms"),
     Page("/commands", "commands", "Commands", "Commands"),
     Page("/regression", "regression", "Regression", "Regression"),
     Page("/live", "live", "Live", "Live"),

@@ -83,6 +83,7 @@ class Sockets:
         self._readers: set[Session] = set()
         self._number = 0
         self._replays = asyncio.Semaphore(REPLAYS_AT_ONCE)
+        self._committed = asyncio.Event()
 
     @asynccontextmanager
     async def admitted(self, socket: WebSocket) -> AsyncIterator[Session | None]:
@@ -145,11 +146,21 @@ class Sockets:
 
     async def run(self) -> None:
         """Read the event log for all sockets and verify their callers until cancelled."""
+        loop = asyncio.get_running_loop()
+
+        def wake(_kinds: frozenset[str]) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                loop.call_soon_threadsafe(self._committed.set)
+
+        self._ground.database.listeners.add(wake)
         await asyncio.gather(self._read(), self._verify())
 
     async def _read(self) -> None:
         while True:
-            await asyncio.sleep(POLL_S)
+            # Events of this process are read at once, those of other processes after POLL_S.
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._committed.wait(), POLL_S)
+            self._committed.clear()
             if not self._readers:
                 continue
             try:

@@ -4,26 +4,19 @@ import { acting, byId, element, figure, notice, show, stateMark, table, timeText
 const number = (label, value, note) =>
   element("div", {}, element("dt", {}, label), element("dd", { class: "number" }, value), element("dd", { class: "note" }, note));
 
-async function latestAlarms(passes) {
-  if (!passes.items.length) return { items: [], pass: null };
-  const [pass] = passes.items;
-  const events = await get(`passes/${pass.id}/events`, { limit: 1000 });
-  return { pass, items: events.items.filter((event) => ["medium", "high"].includes(event.severity)) };
-}
-
 async function load() {
-  const [passes, windows, jobs] = await Promise.all([
+  const [passes, windows, jobs, alarms] = await Promise.all([
     get("passes", { limit: 8 }),
     get("windows", { limit: 8 }),
     get("jobs", { limit: 8 }),
+    get("alarms", { limit: 8, state: ["raised", "acknowledged"] }),
   ]);
-  const alarms = await latestAlarms(passes);
   const running = jobs.items.filter((job) => ["queued", "running"].includes(job.state)).length;
   const failed = jobs.items.filter((job) => job.state === "failed").length;
   show("glance", [
     number("Passes", figure(passes.total), passes.items.length ? `latest ${timeText(passes.items[0].start)}` : "none yet"),
     number("Windows", figure(windows.total), `${windows.items.filter((one) => one.state === "draft").length} of the latest are drafts`),
-    number("Alarms", figure(alarms.items.length), alarms.pass ? `in ${alarms.pass.name}` : "no pass yet"),
+    number("Open alarms", figure(alarms.total), alarms.total ? `latest: ${alarms.items[0].name.replaceAll("_", " ")}` : "none"),
     number("Jobs under way", figure(running), failed ? `${failed} of the latest failed` : "none of the latest failed"),
   ]);
   show(
@@ -55,13 +48,14 @@ async function load() {
   show(
     "alarms",
     table(
-      "Alarms of the latest pass",
+      "Open alarms",
       [
-        ["Time", (row) => timeText(row.time)],
-        ["Event", (row) => row.name.replaceAll("_", " ")],
+        ["Alarm", (row) => row.name.replaceAll("_", " ")],
+        ["Last", (row) => timeText(row.last)],
         ["Severity", (row) => stateMark(row.severity)],
+        ["State", (row) => stateMark(row.state)],
       ],
-      alarms.items.slice(-8),
+      alarms.items,
       "None.",
     ),
   );

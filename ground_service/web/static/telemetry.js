@@ -1,5 +1,6 @@
 import { get } from "./api.js";
 import { chart, columns } from "./charts.js";
+import { showLive } from "./values.js";
 import { acting, byId, dictionary, element, figure, limitText, parameterName, parameterOptions, seconds, show, timeText, trouble, unitText } from "./page.js";
 
 let definition = Object.fromEntries(dictionary.parameters.map((one) => [one.name, one]));
@@ -58,4 +59,5 @@ async function load() {
 byId("choice").addEventListener("submit", acting(add));
 byId("pass").addEventListener("change", acting(chooseParameters));
 byId("clear").addEventListener("click", () => show("charts"));
+showLive();
 load().catch((error) => error.status === 401 || trouble(error));

@@ -1,5 +1,7 @@
 """What operators do on the pages, done in Chromium."""
 
+import re
+import time
 import zipfile
 
 import pytest
@@ -10,6 +12,8 @@ from ground_service.regression.archives import pack_archive
 from lunar.ephemeris import ephemeris_from_states
 from lunar.oem import format_oem
 from lunar.timescales import parse_utc
+from tmtc.dictionary import DICTIONARY
+from tmtc.downlink import encode_cadus
 
 PATHS = [
     "/",
@@ -17,6 +21,7 @@ PATHS = [
     "/passes",
     "/passes/1",
     "/telemetry",
+    "/alarms",
     "/commands",
     "/regression",
     "/live",
@@ -30,6 +35,49 @@ NS = 1_000_000_000
 
 def newest_revision(page):
     return page.request.get("/api/v1/missions").json()["items"][0]["revision"]
+
+
+def packet(name, second, **values):
+    zeros = {field.name: 0 for field in DICTIONARY.packet(name).fields}
+    ticks = (900_000_000 + second) * 65_536
+    return DICTIONARY.pack(name, zeros | values, ticks=ticks, sequence_count=second)
+
+
+def camera_fault(second):
+    return packet("event_high", second, event_id=20, frame_number=second)
+
+
+def housekeeping(second, temperature_c):
+    return packet("housekeeping", second, structure_id=1, bus_voltage_v=12.0, temperature_c=temperature_c)
+
+
+def receive(page, packets):
+    """Upload packets as a downlink of spacecraft 77."""
+    answer = page.request.post(
+        f"/api/v1/telemetry?name={hash(tuple(packets)) & 0xFFFF}.cadu",
+        data=encode_cadus(packets, spacecraft_id=77),
+        headers={"Content-Type": "application/octet-stream"},
+    )
+    job = answer.json()["job_id"]
+    deadline = time.monotonic() + 20
+    while page.request.get(f"/api/v1/jobs/{job}").json()["state"] != "done":
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def colour_of(page, variable):
+    """The computed colour of a variable of the style sheet."""
+    return page.evaluate(
+        """variable => {
+            const probe = document.createElement("span");
+            document.body.append(probe);
+            probe.style.color = `var(${variable})`;
+            const found = getComputedStyle(probe).color;
+            probe.remove();
+            return found;
+        }""",
+        variable,
+    )
 
 
 def settled(page, path):
@@ -94,6 +142,34 @@ def test_the_pass_page_shows_what_came_and_makes_a_report(page):
     with page.expect_popup() as opened:
         page.get_by_role("button", name="Open HTML").click()
     expect(opened.value.get_by_role("heading", level=1)).to_be_visible()
+
+
+def test_an_alarm_is_acknowledged_on_its_page_and_keeps_its_history(page):
+    receive(page, [camera_fault(second) for second in range(3)])
+    settled(page, "/alarms?state=open")
+    row = page.locator("#alarms tbody tr", has_text="camera fault")
+    expect(row).to_contain_text("77, flight")
+    expect(row.locator(".state.raised")).to_have_css("border-top-color", colour_of(page, "--vermillion"))
+    row.get_by_role("button", name="Acknowledge").click()
+    expect(row).to_have_count(0)
+    page.get_by_label("State").select_option("cleared")
+    expect(page).to_have_url(re.compile("state=cleared"))
+    row.get_by_role("button", name="History").click()
+    expect(page.locator("#history")).to_contain_text("acknowledged")
+
+
+def test_newest_values_follow_the_telemetry(page):
+    receive(page, [housekeeping(0, 21.5)])
+    settled(page, "/telemetry")
+    page.get_by_label("Spacecraft").select_option("77 flight")
+    row = page.locator("#live tr", has_text="temperature")
+    expect(row).to_contain_text("21.5 °C")
+    expect(row).to_contain_text("within")
+    receive(page, [housekeeping(5, 70.25)])
+    expect(row).to_contain_text("70.25 °C")
+    expect(row.locator(".state.warning")).to_have_css("color", colour_of(page, "--caution"))
+    expect(row.locator("svg.spark polyline")).to_have_css("stroke-width", "1.4px")
+    expect(page.get_by_role("row", name="mode safe")).to_be_visible()
 
 
 MISSION = """name = "shown"

@@ -1,0 +1,90 @@
+import { get, send } from "./api.js";
+import { acting, byId, element, figure, pager, show, stateMark, table, timeText, trouble, unitText, watch } from "./page.js";
+
+const OPEN = ["raised", "acknowledged", "shelved"];
+const HOUR_MS = 3600e3;
+const words = (name) => name.replaceAll("_", " ");
+
+function readAddress() {
+  const given = new URLSearchParams(location.search);
+  byId("state").value = given.get("state") ?? "open";
+  byId("severity").value = given.get("severity") ?? "";
+}
+
+function writeAddress() {
+  const given = new URLSearchParams(location.search);
+  given.set("state", byId("state").value);
+  given.set("severity", byId("severity").value);
+  history.replaceState(null, "", `?${given}`);
+}
+
+async function showHistory(id) {
+  const alarm = await get(`alarms/${id}`);
+  byId("history-section").hidden = false;
+  byId("history-title").textContent = `History of alarm ${id}: ${words(alarm.name)}`;
+  show(
+    "history",
+    table(
+      "History",
+      [["Time", (row) => timeText(row.time)], ["By", (row) => row.actor], ["Change", (row) => row.change], ["Comment", (row) => row.comment]],
+      alarm.history,
+      "None.",
+    ),
+  );
+}
+
+const change = (path, id, body) => acting(async () => {
+  await send("POST", `alarms/${id}/${path}`, body);
+  await reload();
+  if (!byId("history-section").hidden) await showHistory(id);
+});
+
+function actions(alarm) {
+  const button = (label, listener) => element("button", { type: "button", onclick: listener, "aria-label": `${label} alarm ${alarm.id}` }, label);
+  const until = (hours) => new Date(Date.now() + hours * HOUR_MS).toISOString();
+  return element(
+    "span",
+    { class: "actions" },
+    alarm.state === "raised" ? button("Acknowledge", change("acknowledge", alarm.id, {})) : null,
+    alarm.state === "shelved" ? button("Unshelve", change("shelve", alarm.id, { until: until(-1) })) : null,
+    ["raised", "acknowledged"].includes(alarm.state) ? button("Shelve 8 h", change("shelve", alarm.id, { until: until(8) })) : null,
+    button("History", acting(() => showHistory(alarm.id))),
+  );
+}
+
+const reload = pager(async (limit, offset) => {
+  const chosen = byId("state").value;
+  const page = await get("alarms", { limit, offset, state: chosen === "open" ? OPEN : chosen || null, severity: byId("severity").value || null });
+  show(
+    "alarms",
+    table(
+      "Alarms",
+      [
+        ["Alarm", (row) => words(row.name)],
+        ["Severity", (row) => stateMark(row.severity)],
+        ["State", (row) => stateMark(row.state)],
+        ["Condition", (row) => (row.active ? "continues" : "has ended")],
+        ["Count", (row) => figure(row.count), "num"],
+        ["Last value", (row) => (row.value === null ? "" : `${figure(row.value)} ${unitText(row.unit)}, limits ${row.limits}`)],
+        ["First", (row) => timeText(row.first)],
+        ["Last", (row) => timeText(row.last)],
+        ["Spacecraft", (row) => `${row.spacecraft_id}, ${row.instance}`],
+        ["Acknowledged", (row) => (row.acknowledged_by ? `${row.acknowledged_by}, ${timeText(row.acknowledged)}` : "")],
+        ["", actions],
+      ],
+      page.items,
+      "No alarms.",
+    ),
+  );
+  return page;
+});
+
+for (const name of ["state", "severity"]) {
+  byId(name).addEventListener("change", acting(async () => {
+    writeAddress();
+    await reload.first();
+  }));
+}
+watch((message) => message.kind === "alarm" && reload().catch(trouble));
+readAddress();
+reload().catch((error) => error.status === 401 || trouble(error));

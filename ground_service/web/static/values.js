@@ -1,0 +1,96 @@
+// Newest values of the parameters of a spacecraft: value, limit state, age and recent course, updated by the feed.
+import { get } from "./api.js";
+import { acting, byId, element, lengthText, parameterName, show, stateMark, svg, table, timeText, trouble, unitText, watch } from "./page.js";
+
+const KEPT = 60; // values of the recent course
+const STALE_S = 120; // older values are marked
+const AGAIN_MS = 200; // shortest time between two requests
+
+const course = new Map();
+let values = [];
+let received = 0;
+let waiting = null;
+
+const key = (one) => `${byId("spacecraft").value} ${one.packet} ${one.name}`;
+
+function note(one) {
+  const kept = course.get(key(one)) ?? [];
+  if (one.value !== null && kept.at(-1)?.time !== one.time) kept.push({ time: one.time, value: one.value });
+  course.set(key(one), kept.slice(-KEPT));
+}
+
+function spark(one) {
+  const kept = (course.get(key(one)) ?? []).map((each) => each.value);
+  if (kept.length < 2) return null;
+  const [low, high] = [Math.min(...kept), Math.max(...kept)];
+  const points = kept.map((value, index) => `${(80 * index) / (kept.length - 1)},${high > low ? 16 - (14 * (value - low)) / (high - low) : 9}`);
+  return svg("svg", { viewBox: "0 0 80 18", class: "spark", role: "img", "aria-label": `last ${kept.length} values, ${low} to ${high}` }, svg("polyline", { points: points.join(" ") }));
+}
+
+function age(one) {
+  if (one.age_s === null) return "unknown";
+  const now = one.age_s + (Date.now() - received) / 1000;
+  return element("span", { class: now > STALE_S ? "stale" : null }, now > STALE_S ? `${lengthText(now)}, stale` : lengthText(now));
+}
+
+function draw() {
+  const chosen = values.filter((one) => one.packet === byId("packet").value);
+  show(
+    "live",
+    table(
+      "Newest values",
+      [
+        ["Parameter", (row) => element("span", { title: row.description }, parameterName(row.name, row.unit))],
+        ["Value", (row) => `${row.text} ${unitText(row.unit)}`.trim(), "num"],
+        ["Limits", (row) => (row.limit_state === "none" ? "" : [stateMark(row.limit_state), ` ${row.limits}`])],
+        ["Course", spark],
+        ["Age", age],
+        ["Spacecraft time", (row) => timeText(row.time)],
+      ],
+      chosen,
+      "No telemetry of this spacecraft has been received.",
+    ),
+  );
+}
+
+async function refresh() {
+  const [spacecraft, instance] = byId("spacecraft").value.split(" ");
+  if (!instance) return;
+  values = (await get("parameters", { spacecraft_id: spacecraft, instance })).items;
+  received = Date.now();
+  values.forEach(note);
+  const packet = byId("packet").value;
+  const packets = [...new Set(values.map((one) => one.packet))];
+  show("packet", packets.map((one) => element("option", { value: one }, one.replaceAll("_", " "))));
+  if (packets.includes(packet)) byId("packet").value = packet;
+  draw();
+}
+
+function soon() {
+  waiting ??= setTimeout(() => {
+    waiting = null;
+    refresh().catch(trouble);
+  }, AGAIN_MS);
+}
+
+export async function showLive() {
+  try {
+    const { items } = await get("spacecraft");
+    show("spacecraft", items.map((one) => element("option", { value: `${one.spacecraft_id} ${one.instance}` }, `${one.spacecraft_id}, ${one.instance}`)));
+    const wanted = new URLSearchParams(location.search).get("spacecraft");
+    if (items.some((one) => `${one.spacecraft_id} ${one.instance}` === wanted)) byId("spacecraft").value = wanted;
+    if (!items.length) draw();
+    await refresh();
+  } catch (error) {
+    if (error.status !== 401) trouble(error);
+  }
+  byId("spacecraft").addEventListener("change", acting(async () => {
+    const words = new URLSearchParams(location.search);
+    words.set("spacecraft", byId("spacecraft").value);
+    history.replaceState(null, "", `?${words}`);
+    await refresh();
+  }));
+  byId("packet").addEventListener("change", draw);
+  watch((message) => message.kind === "telemetry" && soon());
+  setInterval(draw, 5000);
+}
