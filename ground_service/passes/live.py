@@ -10,10 +10,9 @@ import numpy as np
 from ground_service.clock import mission_now_ns
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
-from ground_service.ingest.service import FLOWN
 from ground_service.passes.model import LiveParameter, SpacecraftInstance
 from ground_service.store import telemetry
-from ground_service.store.vehicles import all_vehicles, find_vehicle
+from ground_service.store.vehicles import FLOWN, all_vehicles, find_vehicle
 from ground_service.timekeeping.core import utc_ns_of_ticks
 from ground_service.timekeeping.store import load_correlations
 from tmtc.dictionary import DICTIONARY

@@ -22,16 +22,16 @@ with warnings.catch_warnings():
 
 VERBS = {
     "acknowledge", "add", "change", "define", "delete", "enter", "evaluate", "export", "get", "import", "keep", "list",
-    "reject", "release", "request", "revoke", "run", "search", "shelve", "start", "take", "uplink", "upload",
+    "reject", "release", "request", "revoke", "run", "search", "shelve", "send", "start", "take", "uplink", "upload",
 }  # fmt: skip
 SUMMARY_VERBS = {
     "Acknowledge", "Add", "Change", "Compare", "Count", "Create", "Define", "Delete", "Disable", "Evaluate", "Export",
     "Import", "Ingest", "Keep", "List", "Queue", "Register", "Reject", "Release", "Request", "Return", "Revoke", "Run",
-    "Search", "Show", "Suppress", "Take",
+    "Search", "Send", "Show", "Suppress", "Take",
 }  # fmt: skip
 TAGS = {
-    "access", "alarms", "ephemerides", "jobs", "missions", "passes", "planning", "regression", "reports",
-    "telecommands", "telemetry", "time",
+    "access", "alarms", "ephemerides", "exports", "jobs", "links", "missions", "passes", "planning", "regression",
+    "reports", "telecommands", "telemetry", "time",
 }  # fmt: skip
 
 
