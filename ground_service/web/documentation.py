@@ -46,7 +46,10 @@ def documentation_file(path: str) -> Response:
     NotFound
         There is no such file, or the documentation was not built (`make docs`).
     """
-    body = _files(FOLDER).get(path)
+    files = _files(FOLDER)
+    if not files:
+        raise NotFound("documentation", "it was not built, see make docs")
+    body = files.get(path)
     if body is None:
         raise NotFound("documentation page", path[:80])
     media = _MEDIA[Path(path).suffix]

@@ -24,7 +24,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, required=True, metavar="DIR", help="folder for drift.json, drift.png, drift.md"
     )
     drift.add_argument(
-        "--runs", type=int, default=12, metavar="N", help="passes of each condition (default: 12)"
+        "--runs", type=int, default=8, metavar="N", help="passes of each condition (default: 8)"
     )
     drift.add_argument("--seed", type=int, default=2001, help="seed of the first pass (default: 2001)")
     drift.add_argument(
