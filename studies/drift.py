@@ -2,8 +2,9 @@
 
 Each pass takes an image every 30 s for one revolution and then coasts. The same pass is flown without images for
 comparison. One condition differs from the nominal pass at a time: altitude, share of the revolution with light, crater
-density, size of the on-board catalogue, or build. Detections are simulated (evidence level 1): many passes are affordable, but
-the errors of a real network on a real picture are only those of its measured recall, precision and centre errors.
+density, size of the on-board catalogue, or build. Detections are simulated (evidence level 1): many passes are
+affordable, but the errors of a real network on a real picture are only those of its measured recall, precision and
+centre errors.
 """
 
 from __future__ import annotations

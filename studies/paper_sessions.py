@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,7 @@ def fly(shop: Workshop, flight: Flight) -> PaperSession:
 
     def make_report() -> dict[str, Any]:
         home = shop.out / "ground" / flight.key
+        shutil.rmtree(home, ignore_errors=True)  # of an interrupted run, or of another version
         with local_client(open_ground(home, shop.data), ACTOR) as service:
             pass_id = service.import_archive(archive)
             service.get_report(service.make_report(pass_id), report, kind="json")
