@@ -175,9 +175,8 @@ def field_of_view(shop: Workshop) -> dict[str, Any]:
         track = ground_track(
             ephemeris, default_orientation(shop.data), even_epochs(ephemeris, shop.effort.fov_step_s)
         )
-        within = np.abs(track.latitude_rad) <= math.radians(60.0)
         position = mcmf_from_spherical(track.latitude_rad, track.longitude_rad, track.altitude_m)
-        study = study_field_of_view(position[within], paper_density(shop))
+        study = study_field_of_view(position, paper_density(shop))
         return {
             "fov_deg": study.fov_deg.tolist(),
             "probability": {str(n): values.tolist() for n, values in study.probability_at_least.items()},
@@ -188,7 +187,9 @@ def field_of_view(shop: Workshop) -> dict[str, Any]:
 
     return dict(
         shop.step(
-            "fov", {"days": shop.effort.days, "step_s": shop.effort.fov_step_s, "density": "paper"}, make
+            "fov",
+            {"days": shop.effort.days, "step_s": shop.effort.fov_step_s, "density": "paper", "places": "all"},
+            make,
         )
     )
 
