@@ -61,7 +61,7 @@ def draw_fov_curves(canvas: Canvas, curves: FovCurves, threshold: float) -> None
     axes.set_yticks(np.arange(0.0, 1.01, 0.2), [f"{v:g} %" for v in range(0, 101, 20)])
     axes.set_xlabel("full field of view, degrees")
     axes.set_title("probability of craters in the footprint")
-    axes.legend(loc="upper left", frameon=False)
+    axes.legend(loc="lower right", frameon=False)
 
 
 def draw_image(canvas: Canvas, image: ByteArray) -> None:
