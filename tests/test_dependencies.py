@@ -35,7 +35,7 @@ def test_every_declared_dependency_has_its_pin() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert {name_of(text) for text in project["dependencies"]} <= set(pins("runtime"))
     extras = project["optional-dependencies"]
-    for extra, file in (("terrain", "terrain"), ("postgres", "postgres")):
+    for extra, file in (("terrain", "terrain"), ("postgres", "postgres"), ("docs", "docs")):
         known = {**pins("runtime"), **pins(file)}
         assert {name_of(text) for text in extras[extra]} <= set(known)
 
