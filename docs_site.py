@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import json
+from pathlib import Path
 from typing import Any
+
+NOTEBOOKS = Path(__file__).resolve().parent / "docs" / "notebooks"
 
 
 def on_files(files: Any, config: Any) -> Any:
@@ -17,7 +21,19 @@ def on_files(files: Any, config: Any) -> Any:
         ("reference/configuration.md", configuration_page()),
     ):
         files.append(File.generated(config, path, content=content))
+    for notebook in sorted(NOTEBOOKS.glob("*.ipynb")):
+        page = notebook_page(json.loads(notebook.read_text(encoding="utf-8")))
+        files.append(File.generated(config, f"notebooks/{notebook.stem}.md", content=page))
     return files
+
+
+def notebook_page(notebook: dict[str, Any]) -> str:
+    """Return a notebook as a page: its text and its code, without outputs."""
+    parts = []
+    for cell in notebook["cells"]:
+        text = "".join(cell["source"])
+        parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
+    return "\n\n".join(parts) + "\n"
 
 
 def cli_page() -> str:

@@ -5,6 +5,8 @@ import shutil
 
 import numpy as np
 import pytest
+from pycocotools.coco import COCO
+from pycocotools.cocoeval import COCOeval
 
 from lunar.catalogue import size_class
 from payload_emulator.errors import DatasetError
@@ -283,3 +285,32 @@ def test_deeper_craters_weigh_more():
     _, shallow = store.choose_tiers(craters(depth_ratio=0.03), 512, 512, False)
     _, deep = store.choose_tiers(craters(depth_ratio=0.1), 512, 512, False)
     assert shallow[0] < deep[0] == 1.0
+
+
+@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # of pycocotools itself
+def test_pycocotools_reads_the_annotations_and_scores_them_as_perfect(blob_dataset, capsys):
+    path = blob_dataset.folder / "coco_train.json"
+    truth = COCO(str(path))
+    annotations = truth.loadAnns(truth.getAnnIds())
+    assert len(annotations) == len(json.loads(path.read_text())["annotations"]) > 0
+    for one in annotations:
+        # The mask lies in the image and in the box, to the pixel, and fills the area.
+        mask = truth.annToMask(one)
+        rows, columns = np.nonzero(mask)
+        x, y, width, height = one["bbox"]
+        assert mask.shape == (512, 512)
+        if len(rows):
+            assert x - 1.0 <= columns.min() and columns.max() <= x + width + 1.0
+            assert y - 1.0 <= rows.min() and rows.max() <= y + height + 1.0
+        # Pixels at the rim are in or out.
+        assert abs(mask.sum() - one["area"]) <= 1.0 + 2.0 * (width + height)
+    found = [
+        {"image_id": one["image_id"], "category_id": one["category_id"], "bbox": one["bbox"], "score": 1.0}
+        for one in annotations
+    ]
+    scores = COCOeval(truth, truth.loadRes(found), "bbox")
+    scores.params.maxDets = [1, 10, 1000]
+    scores.evaluate()
+    scores.accumulate()
+    precision = scores.eval["precision"][..., -1]  # with every detection of an image
+    assert precision[precision > -1.0].min() > 0.999

@@ -1,0 +1,157 @@
+"""`linna.open` on a home folder, a server and pass archives; and the notebooks of the documentation, executed."""
+
+import builtins
+import json
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import nbformat
+import numpy as np
+import pytest
+import uvicorn
+from nbclient import NotebookClient
+
+import linna
+from ground_service.access.service import add_user
+from ground_service.app import create_app
+from ground_service.ground import Ground
+from ground_service.passes.archive_zip import zip_folder
+from ground_service.settings import Settings
+from linna.errors import UsageError
+from linna.passes import Archive
+from tests.ground_service.conftest import (
+    SPHERICAL_ERROR_RTN_M,
+    free_port,
+)
+from tests.ground_service.exports.conftest import FRAMES, RichPass
+from tmtc.errors import MissingLibrary
+
+ROOT = Path(__file__).resolve().parents[3]
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+
+
+def check(archive: Archive) -> None:
+    """The tables and figures of the synthetic pass."""
+    one = archive.passes[0]
+    residuals = one.residuals
+    spherical = residuals[residuals["solution"] == "spherical"]
+    assert len(spherical) == FRAMES
+    assert spherical["error_3d_m"].median() == pytest.approx(np.linalg.norm(SPHERICAL_ERROR_RTN_M), abs=1.0)
+    assert residuals.attrs["units"]["error_3d_m"] == "m"
+    assert str(one.states["utc"].dtype) == "datetime64[ns, UTC]"
+    assert one.states["utc"].iloc[0].isoformat() == "2029-08-07T06:00:00+00:00"
+    assert sorted(one.images) == [0, 4, 8]
+    assert one.images[4][0, 0] == 40
+    summary = archive.summary()
+    assert summary.loc[one.id, "spherical median_3d_m"] == pytest.approx(
+        spherical["error_3d_m"].median(), rel=1e-3
+    )
+
+
+def test_a_home_folder_is_opened(rich_ground: Ground) -> None:
+    with linna.open(rich_ground.home) as archive:
+        check(archive)
+        assert "passes" in repr(archive)
+
+
+def test_an_archive_is_opened_as_folder_and_as_zip(rich_pass: RichPass) -> None:
+    with linna.open(rich_pass.folder) as archive:
+        check(archive)
+    packed = zip_folder(rich_pass.folder)
+    try:
+        named = packed.with_suffix(".zip")
+        packed.rename(named)
+        with linna.open(named) as archive:
+            assert [one.name for one in archive.passes] == ["synthetic pass"]
+    finally:
+        named.unlink()
+
+
+@pytest.fixture
+def server(rich_ground: Ground) -> Iterator[tuple[str, str]]:
+    """Address of a server on the home folder, and a token."""
+    port = free_port()
+    app = create_app(Settings(home=rich_ground.home, allowed_hosts="127.0.0.1"), inline_jobs=True)
+    running = uvicorn.Server(uvicorn.Config(app, port=port, log_level="error", ws="none"))
+    thread = threading.Thread(target=running.run)
+    thread.start()
+    while not running.started:
+        time.sleep(0.05)
+    yield f"http://127.0.0.1:{port}", add_user(rich_ground, "notebook-reader", "viewer")
+    running.should_exit = True
+    thread.join()
+
+
+def test_a_server_is_opened_with_a_token(server: tuple[str, str]) -> None:
+    url, token = server
+    with linna.open(url, token=token) as archive:
+        check(archive)
+
+
+def test_tables_have_the_types_of_their_columns(rich_ground: Ground) -> None:
+    with linna.open(rich_ground.home) as archive:
+        one = archive[1]
+        assert set(one.tables) >= {"states", "residuals", "frames", "detections", "events", "reference"}
+        detections = one.detections
+        assert (str(detections["crater_id"].dtype), str(detections["u_px"].dtype)) == ("int64", "float64")
+        assert one.states.loc[one.states["estimator"] == "paper", "sigma_r_m"].isna().all()
+        tree = one.dataset()
+        np.testing.assert_array_equal(tree["detections"]["u_px"].values, detections["u_px"].to_numpy())
+        with pytest.raises(UsageError, match=r"table: expected states, residuals.*, found 'statse'"):
+            one.table("statse")
+
+
+@pytest.mark.parametrize("name", ["missing", "empty"])
+def test_a_source_of_no_kind_is_one_line(tmp_path: Path, name: str) -> None:
+    (tmp_path / "empty").mkdir()
+    found = "another folder" if name == "empty" else "none"
+    with pytest.raises(UsageError, match=rf"{name}: expected a home folder with linna.db, .*, found {found}"):
+        linna.open(tmp_path / name)
+    assert list((tmp_path / "empty").iterdir()) == []
+
+
+def test_without_pandas_one_line_names_the_extra(
+    rich_ground: Ground,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    usual = builtins.__import__
+
+    def without(name: str, *rest: object) -> object:
+        if name == "pandas":
+            raise ImportError(name)
+        return usual(name, *rest)  # type: ignore[arg-type] # as called
+
+    with linna.open(rich_ground.home) as archive:
+        monkeypatch.setattr(builtins, "__import__", without)
+        with pytest.raises(MissingLibrary, match=r"pandas, found none; install linna\[notebook\]"):
+            _ = archive.passes[0].states
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_is_stored_without_outputs_and_small(path: Path) -> None:
+    assert path.stat().st_size < 20_000
+    for cell in json.loads(path.read_text())["cells"]:
+        assert cell.get("outputs", []) == [] and cell.get("execution_count") is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_runs(
+    path: Path,
+    rich_ground: Ground,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("LINNA_HOME", str(rich_ground.home))
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.delenv("MPLBACKEND", raising=False)  # pictures are outputs of cells
+    notebook = nbformat.read(path, as_version=4)
+    NotebookClient(notebook, timeout=120, kernel_name="python3").execute()
+    shown = [one for cell in notebook.cells for one in cell.get("outputs", [])]
+    assert any("image/png" in one.get("data", {}) for one in shown)
+    assert not any(one["output_type"] == "error" or one.get("name") == "stderr" for one in shown)
+
+
+def test_there_are_three_notebooks() -> None:
+    assert [path.stem for path in NOTEBOOKS] == ["campaign", "detector", "pass"]
