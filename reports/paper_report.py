@@ -370,8 +370,8 @@ def _statistics(session: PaperSession) -> Table:
             )
         )
     return Table(
-        f"Position error of each estimator against the reference, and reads of the anchor ephemeris (resets to the "
-        f"ground truth in the paper); {_NO_NUMBER}. {_evidence(session.level)}",
+        "Position error of each estimator against the reference, and reads of the anchor ephemeris (the ground truth "
+        f"in the paper): at resets, and for the altitude that scales each image; {_NO_NUMBER}. {_evidence(session.level)}",
         columns,
         tuple(rows),
     )
