@@ -371,7 +371,8 @@ def _statistics(session: PaperSession) -> Table:
         )
     return Table(
         "Position error of each estimator against the reference, and reads of the anchor ephemeris (the ground truth "
-        f"in the paper): at resets, and for the altitude that scales each image; {_NO_NUMBER}. {_evidence(session.level)}",
+        f"in the paper): at resets, and for the altitude that scales each image; {_NO_NUMBER}. "
+        f"{_evidence(session.level)}",
         columns,
         tuple(rows),
     )
