@@ -1,7 +1,7 @@
 """Accounting of the packets, frames and octets of one pass: received, missing, damaged and duplicate.
 
 Missing packets follow from sequence counts and from the planned frames. Frames and octets are those of the raw files
-with on-board times in the pass (`processing.downlink_accounting`); other passes of the spacecraft have no influence.
+with on-board times in the pass (`passes.downlink_accounting`); other passes of the spacecraft have no influence.
 """
 
 from __future__ import annotations

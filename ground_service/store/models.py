@@ -816,7 +816,7 @@ class Window(Base):
     """Planned observation window.
 
     `decision` is the decision of a person (draft, approved, failed). `state` is the progress of the window including
-    telemetry, updated by `services.window_progress`. `version` counts changes by persons. `edited_by` added the window
+    telemetry, updated by `planning.progress`. `version` counts changes by persons. `edited_by` added the window
     or changed it last, `decided_by` made the decision.
     """
 
