@@ -181,6 +181,24 @@ class JobChanged(Event):
     result: dict[str, Any] | None = None
 
 
+class ArchiveImported(Event):
+    """A pass archive was imported with its telemetry."""
+
+    event_kind = "archive imported"
+    pass_id: int
+    vehicle_id: int
+
+
+class AutomationChanged(Event):
+    """An action of an automation rule was recorded, decided, or has ended; `event` is the event that caused it."""
+
+    event_kind = "automation"
+    id: int
+    event: int
+    action: str
+    state: str
+
+
 class LimitsBroken(Event):
     """Trends of housekeeping parameters are outside their limits."""
 

@@ -49,6 +49,7 @@ GROUPS: dict[str, tuple[str, str]] = {
         "navigation solutions of a pass as TUM files, with absolute and relative errors",
     ),
     "alarm": ("alarm", "list, acknowledge and shelve alarms"),
+    "automation": ("automation", "list the rules and actions of the automation, approve or refuse actions"),
     "command": ("command", "queue, release, uplink and verify telecommands"),
     "serve": ("serve", "run the HTTP server of the ground service"),
     "worker": ("worker", "run a job worker of the ground service"),

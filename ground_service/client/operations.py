@@ -11,6 +11,7 @@ from urllib.parse import quote
 
 from ground_service.access.model import AuditEntry, AuditHead, Token, User, UserWithToken
 from ground_service.alarms.model import Alarm, AlarmDetail
+from ground_service.automation.model import AutomationAction, RuleInForce
 from ground_service.client.connection import Body, Connection, Listing, new_key
 from ground_service.client.problems import JobFailed
 from ground_service.commanding.model import Telecommand, UplinkState
@@ -21,7 +22,7 @@ from ground_service.exports.model import ExportFormatInfo, FormatName
 from ground_service.ingest.model import Ingest, IngestAccepted
 from ground_service.jobs.model import Job
 from ground_service.links.model import Contacts, LinkStatus
-from ground_service.missions.model import MissionDetail, MissionRevision
+from ground_service.missions.model import HeldCatalogue, MissionDetail, MissionRevision
 from ground_service.passes.model import (
     Completeness,
     Detection,
@@ -278,6 +279,34 @@ class Client(Connection):
     def get_mission(self, revision: str) -> MissionDetail:
         """Return a revision with its document."""
         return self._get(MissionDetail, f"/missions/{_part(revision)}")
+
+    def list_catalogues(self) -> Listing[HeldCatalogue]:
+        """List the crater catalogues that the ground holds, newest first."""
+        return self._list(HeldCatalogue, "/catalogues")
+
+    def add_catalogue(self, file: Path, *, name: str | None = None) -> HeldCatalogue:
+        """Upload a crater catalogue, which mission descriptions name by its SHA-256."""
+        return self._post(HeldCatalogue, "/catalogues", file, name=name or file.name)
+
+    # Automation
+
+    def list_automation_rules(self) -> Listing[RuleInForce]:
+        """List the automation rules in force."""
+        return self._list(RuleInForce, "/automation/rules", paged=False)
+
+    def list_automation_actions(
+        self, *, state: str | None = None, pass_id: int | None = None
+    ) -> Listing[AutomationAction]:
+        """List the actions of rules with their causes and results, newest first."""
+        return self._list(AutomationAction, "/automation/actions", state=state, pass_id=pass_id)
+
+    def approve_automation_action(self, action_id: int) -> AutomationAction:
+        """Approve an action that waits for approval, and those after it in its rule."""
+        return self._post(AutomationAction, f"/automation/actions/{action_id}/approve")
+
+    def refuse_automation_action(self, action_id: int) -> AutomationAction:
+        """Refuse an action that waits for approval, and those after it in its rule."""
+        return self._post(AutomationAction, f"/automation/actions/{action_id}/refuse")
 
     # Telecommands
 

@@ -116,7 +116,7 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
         declared = declared_frames(mission.frames, ground.data)
         viewing = viewing_of(mission.camera, attitude_table(ground.files, record), span)
         vehicle = get_vehicle(connection, record.vehicle_id)
-        ephemeris = _ephemeris(connection, record)
+        ephemeris = reference_of(connection, record)
         return PassInputs(
             pass_id=str(pass_id),
             title=record.name,
@@ -368,7 +368,7 @@ def _cpu_percent(connection: Connection, span: PassSpan, cadence_s: float | None
     return float(known.max()) / (10.0 * cadence_s) if len(known) else None
 
 
-def _ephemeris(connection: Connection, record: PassRecord) -> EphemerisEntry | None:
+def reference_of(connection: Connection, record: PassRecord) -> EphemerisEntry | None:
     if record.ephemeris_id is not None:
         return get_ephemeris(connection, record.ephemeris_id)
     covering = covering_ephemerides(connection, record.start_utc_ns, record.stop_utc_ns)

@@ -31,6 +31,7 @@ KINDS = (
     "nightly",
     "redecode",
     "re-evaluation",
+    "automation",
 )
 """Kinds of jobs; `worker.jobs` has a function for each."""
 
@@ -42,6 +43,7 @@ IDENTITY = {
     "analysis": ("candidate", "baseline", "analysis"),
     "redecode": ("vehicle_id",),
     "re-evaluation": ("pass_id",),
+    "automation": ("event",),
 }
 """Arguments that must be equal for two requests with the same job id to be the same request."""
 

@@ -16,10 +16,10 @@ from ground_service.missions.model import (
     Evidence,
     Frames,
     Mission,
-    Section,
     Spacecraft,
     World,
 )
+from ground_service.missions.section import Section
 
 AnySection = TypeVar("AnySection", bound=Section)
 

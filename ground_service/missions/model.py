@@ -13,11 +13,13 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Final, Literal, get_args
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 
 from ground_service.errors import InvalidInput
 from ground_service.http.model import Entity, InstanceName
 from ground_service.http.times import UtcTime
+from ground_service.missions.rules import Automation, Channel, Conditions, Rule
+from ground_service.missions.section import Array, Section
 from lunar.errors import TimeFormatError
 from lunar.timescales import parse_utc
 from tmtc.dictionary import DICTIONARY
@@ -34,7 +36,6 @@ Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 Percent = Annotated[float, Field(ge=0.0, le=100.0)]
-Array = Field(strict=False)
 Estimator = Literal["paper", "spherical", "anchored"]
 
 
@@ -46,15 +47,6 @@ def _known_subject(subject: str) -> str:
 
 
 CommandSubject = Annotated[str, AfterValidator(_known_subject)]
-
-
-class Section(BaseModel):
-    """Base class of the sections: frozen, without undeclared keys or non-finite numbers.
-
-    Values are not converted between types, such as true to 1; TOML arrays are read as tuples.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
 
 class Spacecraft(Section):
@@ -206,9 +198,13 @@ class Camera(Section):
 
 
 class Catalogue(Section):
-    """Crater catalogue and its registration to the terrain."""
+    """Crater catalogue and its registration to the terrain.
+
+    `sha256` names a catalogue that the ground holds; without it, `source` is the name of a public product.
+    """
 
     source: str | None = None
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = None
     registration_north_m: float | None = None
     registration_east_m: float | None = None
 
@@ -319,14 +315,6 @@ class Requirements(Section):
     storage_percent: Percent | None = None
     temperature_max_c: float | None = None
     temperature_min_c: float | None = None
-
-
-class Automation(Section):
-    """Rules of automatic operation."""
-
-    accept: Literal["all", "declared", "none"] | None = None
-    keep_days: Positive | None = None
-    evaluate: bool | None = None
 
 
 class Approval(Section):
@@ -564,6 +552,15 @@ class MissionRevision(Entity):
     entered_by: str
 
 
+class HeldCatalogue(Entity):
+    """Crater catalogue that the ground holds, for mission descriptions that name its hash."""
+
+    sha256: str
+    name: str = Field(examples=["craters.csv"])
+    octets: int
+    received: UtcTime
+
+
 class MissionDetail(MissionRevision):
     """Stored revision with its document."""
 
@@ -609,8 +606,17 @@ _INNER: dict[tuple[str, str], type[Section]] = {
     ("Mission", "packets"): PacketSource,
     ("Mission", "links"): StationConnection,
     ("PacketSource", "time"): PacketTime,
+    ("Automation", "rules"): Rule,
+    ("Rule", "when"): Conditions,
 }
 """Sections in lists and optional sections, by the section that has them."""
+
+
+_NAMED: dict[tuple[type[BaseModel], str], type[Section]] = {
+    (Link, "stations"): StationLink,
+    (Automation, "channels"): Channel,
+}
+"""Sections in tables with names as keys, by the section that has them."""
 
 
 def _unknown_keys(kind: type[BaseModel], table: Any, source: str, path: str) -> Iterator[InvalidInput]:
@@ -633,16 +639,17 @@ def _unknown_keys(kind: type[BaseModel], table: Any, source: str, path: str) -> 
                 )
         elif isinstance(field.annotation, type) and issubclass(field.annotation, Section):
             yield from _unknown_keys(field.annotation, value, source, place)
-        elif kind is Link and key == "stations" and isinstance(value, dict):
-            for name, station in value.items():
-                yield from _unknown_keys(StationLink, station, source, f"{place}.{name}")
+        elif (kind, key) in _NAMED and isinstance(value, dict):
+            for name, one in value.items():
+                yield from _unknown_keys(_NAMED[kind, key], one, source, f"{place}.{name}")
 
 
 def _fault(source: str, error: Any) -> InvalidInput:
     place = ".".join(str(part) for part in error["loc"])
     message = str(error["msg"])
     expected = (message[:1].lower() + message[1:]).removeprefix("value error, ")
-    return InvalidInput(source, place, expected.removeprefix("input should be "), repr(error["input"])[:80])
+    expected, _, found = expected.removeprefix("input should be ").partition(", found ")
+    return InvalidInput(source, place, expected, found or repr(error["input"])[:80])
 
 
 def _not_stated(section: BaseModel, path: str = "") -> Iterator[str]:

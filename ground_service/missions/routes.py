@@ -6,12 +6,14 @@ from typing import Annotated
 
 from fastapi import Body, Path, Query
 
-from ground_service.access.security import Operator, Viewer
-from ground_service.http.common import GroundOf, Name, PagingOf
+from ground_service.access.security import Operator, UploadOf, Viewer
+from ground_service.http.common import API_PREFIX, GroundOf, Name, PagingOf, upload_body
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
-from ground_service.missions import service
-from ground_service.missions.model import MissionDetail, MissionRevision
+from ground_service.missions import catalogues, service
+from ground_service.missions.model import HeldCatalogue, MissionDetail, MissionRevision
+
+UPLOAD_PATHS = (f"{API_PREFIX}/catalogues",)
 
 missions = operations("missions")
 
@@ -46,3 +48,21 @@ def add_mission(
 def get_mission(ground: GroundOf, _: Viewer, revision: Revision) -> MissionDetail:
     """Show a revision with its document."""
     return service.get_mission(ground, revision)
+
+
+@missions.get("/catalogues")
+def list_catalogues(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[HeldCatalogue]:
+    """List the crater catalogues that the ground holds, newest first."""
+    items, total = catalogues.list_catalogues(ground, limit=paging.limit, offset=paging.offset)
+    return paging.page(items, total)
+
+
+@missions.post(
+    "/catalogues", status_code=201, openapi_extra=upload_body("Crater catalogue: CSV, plain or gzip")
+)
+async def add_catalogue(
+    upload: UploadOf, ground: GroundOf, caller: Operator, name: Name = "catalogue.csv"
+) -> HeldCatalogue:
+    """Add a crater catalogue, which a mission description names by its SHA-256 (catalogue.sha256)."""
+    stored = await upload.stored()
+    return await upload.run(lambda: catalogues.add_catalogue(ground, stored, name, actor=caller.name))

@@ -5,12 +5,13 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
-from sqlalchemy import Connection, select, update
+from sqlalchemy import Connection, func, select, update
 from sqlalchemy.exc import IntegrityError
 
 from ground_service.errors import NotFound
 from ground_service.missions.model import (
     Approval,
+    HeldCatalogue,
     Link,
     Mission,
     MissionDetail,
@@ -20,6 +21,7 @@ from ground_service.missions.model import (
 from ground_service.store import repository
 
 MISSIONS = repository.MISSIONS
+CATALOGUE_KIND = "catalogue"
 ARCHIVE_ACTOR = "archive"
 """Actor of mission descriptions that are imported with pass archives."""
 
@@ -186,6 +188,21 @@ def approval_in_force(connection: Connection, ccsds_id: int) -> Approval:
         .limit(1)
     ).scalar()
     return Approval() if found is None else get_mission(connection, int(found)).approval
+
+
+def get_catalogue(connection: Connection, sha256: str) -> HeldCatalogue:
+    """Return a held crater catalogue."""
+    return HeldCatalogue.of(repository.get(connection, repository.FILES, sha256, "catalogue"))
+
+
+def list_catalogues(connection: Connection, *, limit: int, offset: int) -> tuple[list[HeldCatalogue], int]:
+    """Return a page of the held crater catalogues, newest first, and the total number."""
+    files = repository.FILES
+    mine = files.c.kind == CATALOGUE_KIND
+    query = select(files).where(mine).order_by(files.c.received_utc_ns.desc(), files.c.sha256)
+    total = connection.execute(select(func.count()).select_from(files).where(mine)).scalar_one()
+    rows = connection.execute(query.limit(limit).offset(offset)).mappings()
+    return [HeldCatalogue.of(dict(row)) for row in rows], int(total)
 
 
 def _document(row: repository.Row) -> Mission:

@@ -132,6 +132,13 @@ def add_pass(
     )
 
 
+def set_catalogue(connection: Connection, record: PassRecord, sha256: str, source: str) -> None:
+    """Store the crater catalogue of a pass and its source."""
+    sources = [*record.manifest.get("data_sources", ()), f"crater catalogue {source}"]
+    manifest = {**record.manifest, "data_sources": sources}
+    repository.change(connection, repository.PASSES, record.id, catalogue_sha256=sha256, manifest=manifest)
+
+
 def add_frames(connection: Connection, pass_id: int, sha256_by_frame: Mapping[int, str]) -> None:
     """Add the archived images of a pass by frame number."""
     rows = [

@@ -345,11 +345,36 @@ class Window(Entity):
     changed: UtcTime
 
 
+class UploadedState(Entity):
+    """State that the estimators of a window start from, Moon-centred ICRF."""
+
+    utc: UtcTime
+    position_icrf_m: tuple[float, float, float]
+    velocity_icrf_m_s: tuple[float, float, float]
+
+
+class UploadedBurn(Entity):
+    """Manoeuvre that was announced to the estimators of a window."""
+
+    utc: UtcTime
+    delta_v_icrf_m_s: tuple[float, float, float]
+    sigma_m_s: float
+
+
+class WindowUploads(Entity):
+    """What the telecommands of a window load on board, as the manifest of a pass states it."""
+
+    start_state: UploadedState | None = None
+    burns: list[UploadedBurn] | None = None
+
+
 class WindowRecord(Window):
     """A window with the fields that only the service uses."""
 
     vehicle_id: int
     mission_id: int | None
+    closed: bool
+    uploads: WindowUploads | None
     decision: Decision
     edited_by: str
     decided_by: str | None

@@ -52,6 +52,19 @@ def advance_windows(ground: Ground, vehicle: int) -> int:
     return len(changed)
 
 
+def close_window(ground: Ground, window_id: int) -> str:
+    """Do not wait for packets of a window that are missing; return its state then.
+
+    A window that was reported and that telemetry from after its end has followed is processed.
+    """
+    with ground.database.writing() as connection:
+        store.close_window(connection, window_id)
+        vehicle = store.get_record(connection, window_id).vehicle_id
+    advance_windows(ground, vehicle)
+    with ground.database.reading() as connection:
+        return store.get_window(connection, window_id).state
+
+
 def _advance(
     connection: Connection, window: WindowRecord, correlations: tuple[TimeCorrelation, ...]
 ) -> str | None:
@@ -89,6 +102,7 @@ def _facts(
         heard_after=store.has_reports_between(connection, vehicle, stop, stop + HEARD_TICKS),
         lost=_lost(connection, vehicle, start, stop) if frames else None,
         reported=window.pass_id is not None and store.has_report(connection, window.pass_id),
+        closed=window.closed,
     )
 
 

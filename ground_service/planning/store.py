@@ -11,7 +11,7 @@ from ground_service.commanding.store import ids_of_windows
 from ground_service.errors import NotFound
 from ground_service.ingest.redecode import readable_version
 from ground_service.planning.core import Commitment
-from ground_service.planning.model import AssessedWindow, Window, WindowEntry, WindowRecord
+from ground_service.planning.model import AssessedWindow, Window, WindowEntry, WindowRecord, WindowUploads
 from ground_service.planning.window_states import COMMITTED, PlannedSpan
 from ground_service.store import repository, telemetry
 from ground_service.store.counters import lock_spacecraft
@@ -72,6 +72,21 @@ def change_window(connection: Connection, found: WindowRecord, **columns: Any) -
     """Change columns of a window unless its version, state or pass has changed since; return whether it was changed."""
     unchanged = {"version": found.version, "state": found.state, "pass_id": found.pass_id}
     return change_if(connection, WINDOWS, found.id, unchanged, **columns)
+
+
+def close_window(connection: Connection, window_id: int) -> None:
+    """Record that missing packets of a window are not waited for."""
+    change_if(connection, WINDOWS, window_id, {"closed": 0}, closed=1)
+
+
+def note_uploads(connection: Connection, window_id: int, uploads: WindowUploads) -> None:
+    """Record what the telecommands of a window load on board; a pass that exists already gets it too."""
+    stated = uploads.model_dump(mode="json", exclude_unset=True)
+    repository.change(connection, WINDOWS, window_id, uploads=stated)
+    row = repository.get(connection, WINDOWS, window_id, "window")
+    if row["pass_id"] is not None:
+        known = repository.get(connection, repository.PASSES, row["pass_id"], "pass")["manifest"]
+        repository.change(connection, repository.PASSES, row["pass_id"], manifest={**known, **stated})
 
 
 def lock_plan(connection: Connection, vehicle: int) -> None:
@@ -192,6 +207,11 @@ def add_pass(connection: Connection, window: WindowRecord, mission_id: int | Non
                 "window_id": window.id,
                 "cadence_s": window.cadence_s,
                 "frames_expected": window.predicted.frames,
+                **(
+                    {}
+                    if window.uploads is None
+                    else window.uploads.model_dump(mode="json", exclude_unset=True)
+                ),
             },
             ephemeris_id=window.ephemeris_id,
             catalogue_sha256=None,

@@ -41,6 +41,8 @@ class WindowFacts:
         Packets missing from its span; None where none came at all.
     reported
         Whether a report of its pass was made.
+    closed
+        Whether it was decided not to wait for the packets that are missing.
     """
 
     decision: str
@@ -52,6 +54,7 @@ class WindowFacts:
     heard_after: bool = False
     lost: int | None = None
     reported: bool = False
+    closed: bool = False
 
 
 def state_of(facts: WindowFacts) -> tuple[str, str | None]:
@@ -60,7 +63,7 @@ def state_of(facts: WindowFacts) -> tuple[str, str | None]:
         return facts.decision, None
     begun = facts.started or facts.frames > 0
     over = begun and (facts.stopped or facts.heard_after)
-    if over and facts.lost == 0 and facts.heard_after:
+    if over and facts.heard_after and (facts.lost == 0 or facts.closed):
         return ("processed" if facts.reported else "downlinked"), None
     if over:
         return "executed", None

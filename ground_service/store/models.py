@@ -817,7 +817,8 @@ class Window(Base):
 
     `decision` is the decision of a person (draft, approved, failed). `state` is the progress of the window including
     telemetry, updated by `planning.progress`. `version` counts changes by persons. `edited_by` added the window
-    or changed it last, `decided_by` made the decision.
+    or changed it last, `decided_by` made the decision. `closed`: it is processed although telemetry is missing.
+    `uploads` is what its telecommands load on board.
     """
 
     __tablename__ = "windows"
@@ -837,9 +838,39 @@ class Window(Base):
     mission_id: Mapped[int | None] = mapped_column(ForeignKey("missions.id"))
     data_octets: Mapped[int] = mapped_column(BigInteger)
     predicted: Mapped[dict[str, Any]] = mapped_column(JSON)
+    closed: Mapped[int] = mapped_column(Flag, server_default="0")
+    uploads: Mapped[dict[str, Any] | None] = mapped_column(JSON)
     version: Mapped[int] = mapped_column(Integer)
     created_by: Mapped[str] = mapped_column(String(64))
     edited_by: Mapped[str] = mapped_column(String(64))
+    decided_by: Mapped[str | None] = mapped_column(String(64))
+    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    changed_utc_ns: Mapped[int] = mapped_column(BigInteger)
+
+
+class AutomationActionRow(Base):
+    """Action of an automation rule that an event caused; one for the same event, rule, place in it and subject.
+
+    `subject` is the pass, vehicle or mission. `mission_id` is the revision in force; NULL without any.
+    """
+
+    __tablename__ = "automation_actions"
+    __table_args__ = (UniqueConstraint("event_number", "rule", "position", "subject"),)
+    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    event_number: Mapped[int] = mapped_column(BigInteger)
+    trigger: Mapped[str] = mapped_column(String(32))
+    rule: Mapped[str] = mapped_column(String(100))
+    position: Mapped[int] = mapped_column(SmallInteger)
+    action: Mapped[str] = mapped_column(String(32))
+    subject: Mapped[str] = mapped_column(String(32))
+    vehicle_id: Mapped[int | None] = mapped_column(Integer)
+    pass_id: Mapped[int | None] = mapped_column(Integer, index=True)
+    window_id: Mapped[int | None] = mapped_column(Integer)
+    mission_id: Mapped[int | None] = mapped_column(ForeignKey("missions.id"))
+    text: Mapped[str] = mapped_column(Text)
+    state: Mapped[str] = mapped_column(String(16), index=True)
+    result: Mapped[dict[str, Any] | None] = mapped_column(JSON)
+    error: Mapped[str | None] = mapped_column(Text)
     decided_by: Mapped[str | None] = mapped_column(String(64))
     created_utc_ns: Mapped[int] = mapped_column(BigInteger)
     changed_utc_ns: Mapped[int] = mapped_column(BigInteger)

@@ -55,6 +55,14 @@ JOB = StateMachine(
     # A job whose process ended prematurely is still "running" and is started again.
     {"queued": ("running",), "running": ("running", "queued", "done", "failed")},
 )
+AUTOMATION_ACTION = StateMachine(
+    "automation action",
+    repository.AUTOMATION_ACTIONS,
+    {
+        "waiting": ("queued", "refused", "skipped"),
+        "queued": ("done", "failed", "skipped"),
+    },
+)
 
 
 def move(

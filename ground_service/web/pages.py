@@ -63,6 +63,7 @@ PAGES = (
     Page("/live", "live", "Live", "Live"),
     Page("/missions", "missions", "Missions", "Missions"),
     Page("/missions/{revision}", "mission", "Mission", "", "missions"),
+    Page("/automation", "automation", "Automation", "Automation"),
     Page("/audit", "audit", "Audit log", "Audit"),
     Page("/docs", "docs", "HTTP API", ""),
     Page("/licences", "licences", "Licences", ""),

@@ -20,8 +20,10 @@ from pydantic import ValidationError
 from sqlalchemy import Connection
 
 from ground_service.alarms.service import examine_packets
+from ground_service.automation.service import OCCURRENCES, has_actions, record_actions
 from ground_service.errors import PASSING, public_text
 from ground_service.events import (
+    AutomationChanged,
     CommandsSent,
     CorrelationChanged,
     EphemerisAdded,
@@ -30,7 +32,6 @@ from ground_service.events import (
     PassEvaluated,
     ReceptionsEntered,
     TelemetryReceived,
-    WindowChanged,
     publish,
 )
 from ground_service.ground import Ground, open_ground
@@ -112,10 +113,10 @@ def _after_mission(ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
             yield "decode", vehicle
 
 
-def _after_window(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
-    event = WindowChanged.of(logged)
-    if event.state == "downlinked":
-        yield "report", event.id
+def _after_decision(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
+    event = AutomationChanged.of(logged)
+    if event.state in ("queued", "refused"):
+        yield "act", event.event
 
 
 FOLLOWING: Mapping[str, Callable[[Ground, LoggedEvent], Iterator[Work]]] = {
@@ -125,10 +126,21 @@ FOLLOWING: Mapping[str, Callable[[Ground, LoggedEvent], Iterator[Work]]] = {
     EphemerisAdded.event_kind: _after_ephemeris,
     CommandsSent.event_kind: _after_uplink,
     PassEvaluated.event_kind: _after_report,
-    WindowChanged.event_kind: _after_window,
     MissionAdded.event_kind: _after_mission,
+    AutomationChanged.event_kind: _after_decision,
 }
-"""The work that follows an event, by its kind."""
+"""The work that keeps derived data up to date after an event, by its kind."""
+
+KINDS = frozenset({*FOLLOWING, *OCCURRENCES})
+"""Kinds of events that are read: those with such work, and those that rules react to."""
+
+
+def _work_of(ground: Ground, event: LoggedEvent) -> Iterator[Work]:
+    """Yield the work that follows an event; rules act after derived data are up to date."""
+    if event.kind in FOLLOWING:
+        yield from FOLLOWING[event.kind](ground, event)
+    if event.kind in OCCURRENCES and has_actions(ground, event):
+        yield "match rules", event.number
 
 
 def _recorrelate(ground: Ground, vehicle: int, _event: int) -> None:
@@ -173,13 +185,28 @@ def _decode(ground: Ground, vehicle: int, event: int) -> str:
         )
 
 
+def _match_rules(ground: Ground, number: int, _event: int) -> None:
+    """Record the actions that rules of mission descriptions take on an event."""
+    with ground.database.reading() as connection:
+        [event] = events.read_events(connection, number - 1, 1)
+    record_actions(ground, event)
+
+
+def _act(ground: Ground, number: int, event: int) -> str:
+    """Add the job of the actions of event `number`; `event` recorded or decided one of them."""
+    with ground.database.writing() as connection:
+        identity = _job_id("automation", number, event)
+        return add_job(connection, "automation", {"event": number}, job_id=identity)
+
+
 DOING: Mapping[str, Callable[[Ground, int, int], str | None]] = {
     "recorrelate": _recorrelate,
     "alarms": _alarms,
     "advance windows": _advance,
     "re-evaluate": _reevaluate,
-    "report": _report,
     "decode": _decode,
+    "match rules": _match_rules,
+    "act": _act,
 }
 """Functions of the work in the order in which they run; each returns the id of a job to start, or None."""
 
@@ -197,7 +224,7 @@ class FollowUp:
 
     def __call__(self, kinds: frozenset[str]) -> None:
         """Handle the events of a commit; the commit has succeeded, so errors are logged."""
-        if not kinds.isdisjoint(FOLLOWING):
+        if not kinds.isdisjoint(KINDS):
             self.drain()
 
     def drain(self) -> None:
@@ -236,12 +263,12 @@ class FollowUp:
         ground = self._ground
         with ground.database.reading() as connection:
             position = events.position_of(connection, CONSUMER)
-            batch = events.read_events(connection, position, BATCH, FOLLOWING)
+            batch = events.read_events(connection, position, BATCH, KINDS)
         work: dict[Work, list[int]] = {}
         failed = []
         for event in batch:
             try:
-                for one in FOLLOWING[event.kind](ground, event):
+                for one in _work_of(ground, event):
                     work.setdefault(one, []).append(event.number)
             except ValidationError as error:
                 log.error("event %d (%s) is not valid: %s", event.number, event.kind, error)

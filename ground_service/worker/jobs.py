@@ -31,6 +31,7 @@ from ground_service.jobs.model import Job
 from ground_service.jobs.service import enter_job
 from ground_service.jobs.store import FINISHED
 from ground_service.passes.archive_zip import import_zip
+from ground_service.worker.actions import run_actions
 from ground_service.worker.upkeep import nightly
 from lunar.errors import LunarError
 from reports.errors import ReportError
@@ -74,6 +75,10 @@ def _redecode(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dic
     return {"rows": rows + apply_definition(ground, vehicle)}
 
 
+def _automation(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
+    return run_actions(ground, int(arguments["event"]), job_id)
+
+
 def _replay(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
     from ground_service.regression.jobs import replay_job
 
@@ -102,6 +107,7 @@ WORK: dict[str, Work] = {
     "nightly": nightly,
     "redecode": _redecode,
     "re-evaluation": _reevaluate,
+    "automation": _automation,
 }
 """Functions of the jobs by kind (`jobs.KINDS`). Each may be run twice with the same arguments and job without harm."""
 

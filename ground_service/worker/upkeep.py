@@ -18,7 +18,7 @@ from ground_service.jobs.store import delete_finished
 from ground_service.passes.service import vehicle_trends
 from ground_service.store import events
 from ground_service.store.files import UNPACKING, remove_leftovers
-from ground_service.store.vehicles import all_vehicles
+from ground_service.store.vehicles import all_vehicles, get_vehicle
 from lunar.timescales import format_utc
 
 RETENTION_DAYS = 90
@@ -47,21 +47,28 @@ def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> 
                     "trends": [trend.model_dump(mode="json") for trend in trends],
                 }
             )
-    broken = [
-        {
-            **{key: one[key] for key in ("spacecraft_id", "instance")},
-            "parameter": trend["parameter"],
-            "limit_state": trend["limit_state"],
-        }
-        for one in found
-        for trend in one["trends"]
-        if trend["limit_state"] != "within"
-    ]
+    broken = [one for vehicle in vehicles for one in broken_limits(ground, vehicle.id)]
     if broken:
         with ground.database.writing() as connection:
             publish(connection, LimitsBroken(broken=broken))
     removed = tidy(ground, int(arguments.get("retention_days", RETENTION_DAYS)))
     return {"spacecraft": found, "limits_broken": broken, "removed": removed}
+
+
+def broken_limits(ground: Ground, vehicle: int) -> list[dict[str, Any]]:
+    """Return the housekeeping parameters of a vehicle whose trends are outside their limits."""
+    with ground.database.reading() as connection:
+        found = get_vehicle(connection, vehicle)
+    return [
+        {
+            "spacecraft_id": found.ccsds_id,
+            "instance": found.instance,
+            "parameter": trend.parameter,
+            "limit_state": trend.limit_state,
+        }
+        for trend in vehicle_trends(ground, vehicle)
+        if trend.limit_state != "within"
+    ]
 
 
 def tidy(ground: Ground, retention_days: int) -> dict[str, int]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from linna.commands._catalogue_choice import CATALOGUE_HELP, open_catalogue
+from linna.commands._ground import add_operator_options, ground_client
 from linna.output import add_json_flag, emit
 
 if TYPE_CHECKING:
@@ -32,6 +33,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
             "curate", help="make the on-board anchoring catalogue from a crater list and terrain"
         )
     )
+    adding = commands.add_parser(
+        "add", help="have the ground service hold a catalogue, which a mission description names by its hash"
+    )
+    adding.add_argument("file", type=Path, metavar="FILE", help="CSV, plain or gzip")
+    add_operator_options(adding)
+    add_json_flag(adding)
+    adding.set_defaults(handler=run_add)
     from linna.commands._catalogue_landmarks import configure as configure_landmarks
     from linna.commands._catalogue_minimum import configure as configure_minimum
 
@@ -42,6 +50,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     configure_minimum(
         commands.add_parser("minimum", help="how few landmarks keep the error of navigation bounded")
     )
+
+
+def run_add(arguments: argparse.Namespace) -> int:
+    with ground_client(arguments) as service:
+        held = service.add_catalogue(arguments.file)
+    emit(arguments, held.model_dump(mode="json"), text=f"{held.name}: {held.sha256}")
+    return 0
 
 
 def _configure_curate(curate: argparse.ArgumentParser) -> None:

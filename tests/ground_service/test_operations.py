@@ -21,17 +21,18 @@ with warnings.catch_warnings():
     from fastapi.testclient import TestClient
 
 VERBS = {
-    "acknowledge", "add", "change", "define", "delete", "enter", "evaluate", "export", "get", "import", "keep", "list",
-    "reject", "release", "request", "revoke", "run", "search", "shelve", "send", "start", "take", "uplink", "upload",
+    "acknowledge", "add", "approve", "change", "define", "delete", "enter", "evaluate", "export", "get", "import",
+    "keep", "list", "refuse", "reject", "release", "request", "revoke", "run", "search", "send", "shelve", "start",
+    "take", "uplink", "upload",
 }  # fmt: skip
 SUMMARY_VERBS = {
-    "Acknowledge", "Add", "Change", "Compare", "Count", "Create", "Define", "Delete", "Disable", "Evaluate", "Export",
-    "Import", "Ingest", "Keep", "List", "Queue", "Register", "Reject", "Release", "Request", "Return", "Revoke", "Run",
-    "Search", "Send", "Show", "Suppress", "Take",
+    "Acknowledge", "Add", "Approve", "Change", "Compare", "Count", "Create", "Define", "Delete", "Disable",
+    "Evaluate", "Export", "Import", "Ingest", "Keep", "List", "Queue", "Refuse", "Register", "Reject", "Release",
+    "Request", "Return", "Revoke", "Run", "Search", "Send", "Show", "Suppress", "Take",
 }  # fmt: skip
 TAGS = {
-    "access", "alarms", "ephemerides", "exports", "jobs", "links", "missions", "passes", "planning", "regression",
-    "reports", "telecommands", "telemetry", "time",
+    "access", "alarms", "automation", "ephemerides", "exports", "jobs", "links", "missions", "passes", "planning",
+    "regression", "reports", "telecommands", "telemetry", "time",
 }  # fmt: skip
 
 

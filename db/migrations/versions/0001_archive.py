@@ -830,6 +830,8 @@ def upgrade() -> None:
         sa.Column("mission_id", sa.Integer(), nullable=True),
         sa.Column("data_octets", sa.BigInteger(), nullable=False),
         sa.Column("predicted", sa.JSON(), nullable=False),
+        sa.Column("closed", sa.SmallInteger(), server_default="0", nullable=False),
+        sa.Column("uploads", sa.JSON(), nullable=True),
         sa.Column("version", sa.Integer(), nullable=False),
         sa.Column("created_by", sa.String(length=64), nullable=False),
         sa.Column("edited_by", sa.String(length=64), nullable=False),
@@ -851,11 +853,47 @@ def upgrade() -> None:
         "ix_windows_vehicle_id_start_utc_ns", "windows", ["vehicle_id", "start_utc_ns"], unique=False
     )
 
+    op.create_table(
+        "automation_actions",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("event_number", sa.BigInteger(), nullable=False),
+        sa.Column("trigger", sa.String(length=32), nullable=False),
+        sa.Column("rule", sa.String(length=100), nullable=False),
+        sa.Column("position", sa.SmallInteger(), nullable=False),
+        sa.Column("action", sa.String(length=32), nullable=False),
+        sa.Column("subject", sa.String(length=32), nullable=False),
+        sa.Column("vehicle_id", sa.Integer(), nullable=True),
+        sa.Column("pass_id", sa.Integer(), nullable=True),
+        sa.Column("window_id", sa.Integer(), nullable=True),
+        sa.Column("mission_id", sa.Integer(), nullable=True),
+        sa.Column("text", sa.Text(), nullable=False),
+        sa.Column("state", sa.String(length=16), nullable=False),
+        sa.Column("result", sa.JSON(), nullable=True),
+        sa.Column("error", sa.Text(), nullable=True),
+        sa.Column("decided_by", sa.String(length=64), nullable=True),
+        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("changed_utc_ns", sa.BigInteger(), nullable=False),
+        sa.ForeignKeyConstraint(
+            ["mission_id"], ["missions.id"], name=op.f("fk_automation_actions_mission_id_missions")
+        ),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_automation_actions")),
+        sa.UniqueConstraint(
+            "event_number",
+            "rule",
+            "position",
+            "subject",
+            name=op.f("uq_automation_actions_event_number_rule_position_subject"),
+        ),
+    )
+    op.create_index(op.f("ix_automation_actions_pass_id"), "automation_actions", ["pass_id"], unique=False)
+    op.create_index(op.f("ix_automation_actions_state"), "automation_actions", ["state"], unique=False)
+
 
 def downgrade() -> None:
     op.drop_table("transmissions")
     op.drop_table("contacts")
     op.drop_table("links")
+    op.drop_table("automation_actions")
     op.drop_table("windows")
     op.drop_table("reports")
     op.drop_table("pass_frames")

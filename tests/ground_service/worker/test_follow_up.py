@@ -20,15 +20,12 @@ from ground_service.events import (
     FollowUpFailed,
     PassEvaluated,
     TelemetryReceived,
-    WindowChanged,
     publish,
 )
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import unfinished_jobs
-from ground_service.missions.service import add_mission
 from ground_service.passes.service import define_pass
-from ground_service.planning.service import WindowEntry, add_window
 from ground_service.store import events as log
 from ground_service.store import repository
 from ground_service.store.database import prepare_database
@@ -304,32 +301,6 @@ def test_a_re_evaluation_that_waits_already_is_not_added_again(
             follow.drain()
         assert len(jobs_of(ground, "re-evaluation")) == 1 == len(unfinished_jobs(ground))
         assert len(reports_of(ground, pass_id)) == 1
-
-
-@pytest.mark.parametrize(("rule", "reports"), [("evaluate = true", 1), ("evaluate = false", 0), ("", 0)])
-def test_a_downlinked_window_gets_one_report_if_its_mission_description_asks_for_it(
-    tmp_path: Path, rule: str, reports: int
-) -> None:
-    with open_ground(tmp_path) as ground:
-        follow = FollowUp(ground, start=lambda _job: None)
-        text = f'name = "m"\n[spacecraft]\nid = {SPACECRAFT}\n[automation]\n{rule}\n'
-        mission = add_mission(ground, text.encode())
-        start = parse_utc("2029-08-07T06:00:00Z")
-        entry = WindowEntry("w", start, start + 300_000_000_000, 15.0, SPACECRAFT)
-        window = add_window(ground, entry, actor="ann")
-        pass_id = define_pass(
-            ground, name="w", start_utc_ns=start, stop_utc_ns=start + 1, spacecraft_id=SPACECRAFT
-        )
-        for state in ("executed", "downlinked", "downlinked"):
-            with ground.database.writing() as connection:
-                changed = {"state": state, "pass_id": pass_id, "mission_id": mission.id}
-                connection.execute(update(repository.WINDOWS).values(**changed))
-                publish(connection, WindowChanged(id=window.id, state=state))
-            follow.drain()
-            expected = reports if state == "downlinked" else 0
-            assert [job["arguments"] for job in jobs_of(ground, "report")] == [
-                {"pass_id": pass_id}
-            ] * expected
 
 
 def test_changed_figures_of_nested_summaries() -> None:

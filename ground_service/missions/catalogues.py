@@ -1,0 +1,89 @@
+"""Crater catalogues that the ground holds, and the one that a mission description names."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+
+from ground_service.access.service import audit
+from ground_service.clock import utc_now_ns
+from ground_service.errors import InvalidInput
+from ground_service.ground import Ground
+from ground_service.missions import store
+from ground_service.missions.model import HeldCatalogue, Mission
+from ground_service.store.files import StoredFile
+from ground_service.store.stored_files import register_file
+from lunar.catalogue import CraterCatalogue, load_catalogue
+from lunar.datafolder import DataFolder
+from lunar.errors import LunarError
+
+
+def add_catalogue(ground: Ground, stored: StoredFile, name: str, *, actor: str = "local") -> HeldCatalogue:
+    """Hold an archived crater catalogue (CSV, plain or gzip), for mission descriptions that name its SHA-256.
+
+    Raises
+    ------
+    InvalidInput
+        It is not a crater catalogue.
+    """
+    try:
+        craters = len(load_catalogue(stored.path))
+    except LunarError as error:
+        reason = str(error).replace(str(stored.path), name)
+        raise InvalidInput("catalogue", "", "a crater catalogue", reason) from None
+    with ground.database.writing() as connection:
+        register_file(connection, stored, store.CATALOGUE_KIND, name, utc_now_ns())
+        audit(connection, actor, "add catalogue", name, {"sha256": stored.sha256, "craters": craters})
+        return store.get_catalogue(connection, stored.sha256)
+
+
+def catalogue_of(ground: Ground, mission: Mission) -> CraterCatalogue:
+    """Return the catalogue that a mission description names: a held file, or an available public product.
+
+    Raises
+    ------
+    InvalidInput
+        It names none, or none that is available.
+    """
+    stated = mission.catalogue
+    if stated.sha256 is not None:
+        path = ground.files.path(stated.sha256)
+        if not path.exists():
+            raise InvalidInput(
+                mission.name, "catalogue.sha256", "a catalogue that the ground holds", stated.sha256[:16]
+            )
+        return replace(_load(path), source=stated.source or f"catalogue {stated.sha256[:16]}")
+    if stated.source is None:
+        raise InvalidInput(
+            mission.name, "catalogue", "the source or SHA-256 of a crater catalogue", "neither"
+        )
+    found = _public(ground.data, stated.source)
+    if found is None:
+        raise InvalidInput(
+            mission.name,
+            "catalogue.source",
+            "a crater catalogue that is available (linna data fetch, or linna catalogue add FILE and catalogue.sha256)",
+            stated.source,
+        )
+    return found
+
+
+def list_catalogues(ground: Ground, *, limit: int = 100, offset: int = 0) -> tuple[list[HeldCatalogue], int]:
+    """Return a page of the held catalogues, newest first, and the total number."""
+    with ground.database.reading() as connection:
+        return store.list_catalogues(connection, limit=limit, offset=offset)
+
+
+def _public(data: DataFolder, source: str) -> CraterCatalogue | None:
+    for path in (data.catalogue_composite, data.catalogue_lu, data.catalogue_robbins):
+        if path is not None:
+            found = _load(path)
+            if found.source == source:
+                return found
+    return None
+
+
+@functools.lru_cache(maxsize=3)
+def _load(path: Path) -> CraterCatalogue:
+    return load_catalogue(path)

@@ -1,0 +1,181 @@
+"""Execution of the actions of automation rules.
+
+A job runs all actions that one event has caused. An action that is done is not repeated; one that a killed process left
+is done again under the same identity, so that it has one result.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Callable, Mapping
+from itertools import groupby
+from typing import Any
+
+from ground_service.automation import store
+from ground_service.automation.model import OPEN_STATES, AutomationAction
+from ground_service.clock import utc_now_ns
+from ground_service.errors import (
+    PASSING,
+    EvaluationError,
+    GroundError,
+    InvalidInput,
+    StateConflict,
+    public_text,
+)
+from ground_service.evaluation.preparation import align_pass
+from ground_service.evaluation.report_store import newest_report
+from ground_service.evaluation.service import make_report, pass_summary, reevaluate
+from ground_service.events import LimitsBroken, publish
+from ground_service.ground import Ground
+from ground_service.missions.rules import DEFAULT_RULES, Rule
+from ground_service.planning.progress import close_window
+from ground_service.timekeeping.recorrelation import recorrelate
+from ground_service.worker.upkeep import broken_limits
+
+log = logging.getLogger(__name__)
+
+
+def run_actions(ground: Ground, event: int, job_id: str) -> dict[str, Any]:
+    """Run the actions of an event that are queued; return their numbers by state."""
+    with ground.database.reading() as connection:
+        actions = store.actions_of_event(connection, event)
+    for _, chain in groupby(actions, key=lambda one: (one.rule, one.subject)):
+        _run_chain(ground, list(chain))
+    with ground.database.reading() as connection:
+        after = store.actions_of_event(connection, event)
+    counts: dict[str, int] = {}
+    for one in after:
+        counts[one.state] = counts.get(one.state, 0) + 1
+    return {"event": event, **counts}
+
+
+def _run_chain(ground: Ground, chain: list[AutomationAction]) -> None:
+    """Run the actions of one rule on one subject in order, up to one that waits; skip those after a failed one."""
+    stopped = ""
+    for action in chain:
+        ground.check_stopping()
+        if action.state == "waiting" and not stopped:
+            return
+        if action.state in ("failed", "refused", "skipped"):
+            stopped = action.action
+        if action.state not in OPEN_STATES:
+            continue
+        if stopped:
+            _end(ground, action, "skipped", error=f"{stopped} before it was not done")
+        elif not _run_one(ground, action):
+            stopped = action.action
+
+
+def _run_one(ground: Ground, action: AutomationAction) -> bool:
+    """Run one action and record its end; return whether it succeeded."""
+    try:
+        _end(ground, action, "done", result=DOING[action.action](ground, action))
+        return True
+    except PASSING:
+        raise
+    except GroundError as error:
+        log.warning("automation action %d (%s) failed: %s", action.id, action.action, error)
+        _end(ground, action, "failed", error=public_text(error))
+    except Exception as error:  # one faulty action must not stop those of other rules
+        log.exception("automation action %d (%s): unexpected error", action.id, action.action)
+        _end(ground, action, "failed", error=public_text(error))
+    return False
+
+
+def _end(ground: Ground, action: AutomationAction, state: str, **values: Any) -> None:
+    """Record the end of an action, unless another process has recorded it."""
+    try:
+        with ground.database.writing() as connection:
+            store.change_state(connection, action, state, now_utc_ns=utc_now_ns(), **values)
+    except StateConflict as error:
+        log.warning("%s", error)
+
+
+def _rule(ground: Ground, action: AutomationAction) -> Rule:
+    """Return the rule of an action in the revision that caused it."""
+    with ground.database.reading() as connection:
+        rules = store.rules_of_revision(connection, action.mission_id)
+    for rule in (*rules, *DEFAULT_RULES):
+        if rule.name == action.rule:
+            return rule
+    raise InvalidInput("rule", "", "a rule of the mission description", action.rule)
+
+
+def _pass_of(action: AutomationAction) -> int:
+    if action.pass_id is None:
+        raise EvaluationError(f"{action.action}: the event concerns no pass")
+    return action.pass_id
+
+
+def _identity(action: AutomationAction) -> str:
+    """Return the id of what an action makes: the same action again makes the same."""
+    return hashlib.blake2b(f"automation {action.id}".encode(), digest_size=16).hexdigest()
+
+
+def _correlate(ground: Ground, action: AutomationAction) -> dict[str, Any]:
+    if action.vehicle_id is None:
+        raise EvaluationError("correlate: the event concerns no spacecraft")
+    return {"changed": recorrelate(ground, action.vehicle_id)}
+
+
+def _align(ground: Ground, action: AutomationAction) -> dict[str, Any]:
+    return align_pass(ground, _pass_of(action))
+
+
+def _evaluate(ground: Ground, action: AutomationAction) -> dict[str, Any]:
+    found = pass_summary(ground, _pass_of(action))
+    kept = ("frames", "packets", "packets_lost", "navigation", "verdict", "verdict_level", "evidence_level")
+    return {name: found[name] for name in kept} | {"recall": found["detector"]["recall"]}
+
+
+def _report(ground: Ground, action: AutomationAction) -> dict[str, Any]:
+    """Make the first report of a pass, or a new one if anything in it differs from the last."""
+    pass_id, identity = _pass_of(action), _identity(action)
+    with ground.database.reading() as connection:
+        previous = newest_report(connection, pass_id, other_than=identity)
+    if previous is None:
+        made = make_report(ground, pass_id, report_id=identity, pdf=True)
+        return {"report_id": made.report_id, "verdict": made.summary["verdict"]}
+    again = reevaluate(ground, pass_id, report_id=identity, event=action.event)
+    if again is None:
+        return {"report_id": previous.id, "unchanged": True}
+    return {"report_id": again.report_id, "verdict": again.summary["verdict"], "previous": previous.id}
+
+
+def _mark_processed(ground: Ground, action: AutomationAction) -> dict[str, Any]:
+    if action.window_id is None:
+        raise EvaluationError("mark_processed: the pass belongs to no window")
+    return {"window_id": action.window_id, "state": close_window(ground, action.window_id)}
+
+
+def _run_regression(ground: Ground, action: AutomationAction) -> dict[str, Any]:
+    from ground_service.regression.jobs import prepared, regression_job
+
+    rule = _rule(ground, action)
+    arguments = prepared(ground, rule.candidate or "current", rule.baseline or "current", ())
+    return regression_job(ground, arguments, _identity(action))
+
+
+def _compute_trends(ground: Ground, action: AutomationAction) -> dict[str, Any]:
+    """Compute the trends of a spacecraft; broken limits alarm unless the last such action found the same."""
+    if action.vehicle_id is None:
+        raise EvaluationError("compute_trends: the event concerns no spacecraft")
+    broken = broken_limits(ground, action.vehicle_id)
+    with ground.database.writing() as connection:
+        last = store.last_result(connection, action)
+        if broken and (last is None or last.get("limits_broken") != broken):
+            publish(connection, LimitsBroken(broken=broken))
+    return {"limits_broken": broken}
+
+
+DOING: Mapping[str, Callable[[Ground, AutomationAction], dict[str, Any]]] = {
+    "correlate": _correlate,
+    "align": _align,
+    "evaluate": _evaluate,
+    "report": _report,
+    "mark_processed": _mark_processed,
+    "run_regression": _run_regression,
+    "compute_trends": _compute_trends,
+}
+"""Functions of the actions; each may be repeated without harm."""

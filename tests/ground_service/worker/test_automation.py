@@ -1,0 +1,361 @@
+"""A live pass that nobody asks for: reported, complete and processed; and what rules do with events."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ground_service import events
+from ground_service.automation.service import decide, list_actions, list_rules, record_actions
+from ground_service.ephemerides.service import add_ephemeris
+from ground_service.errors import InvalidInput, StateConflict, StorageFull
+from ground_service.evaluation import service as evaluation
+from ground_service.events import ContactEnded, PassEvaluated, RegressionJudged, WindowChanged, publish
+from ground_service.ground import Ground, open_ground
+from ground_service.ingest.service import ingest_file
+from ground_service.jobs.service import unfinished_jobs
+from ground_service.missions.catalogues import add_catalogue, catalogue_of, list_catalogues
+from ground_service.missions.model import parse_mission
+from ground_service.missions.service import add_mission
+from ground_service.planning import store as windows
+from ground_service.planning.model import UploadedState, WindowUploads
+from ground_service.planning.service import WindowEntry, add_window, change_window, get_window
+from ground_service.worker import actions
+from ground_service.worker.dispatch import InlineDispatcher
+from ground_service.worker.follow_up import FollowUp, follow_in_process
+from lunar.timescales import format_utc
+from tests.ground_service.conftest import (
+    CADENCE_S,
+    NS,
+    SPACECRAFT,
+    START,
+    SyntheticPass,
+    circular_states,
+    encode_downlink,
+)
+
+FRAMES = 24
+STOP = START + 10 * CADENCE_S * NS
+
+MISSION = f"""
+name = "live"
+[spacecraft]
+id = {SPACECRAFT}
+[time]
+correlation = "ideal"
+[frames]
+orientation = "IAU WGCCRE 2009"
+gravity_field = "GRGM1200L (12x12, built in)"
+gravity_degree = 12
+[camera]
+width_px = 512
+height_px = 512
+fov_deg = 120.0
+pointing = "nadir"
+[catalogue]
+source = "synthetic craters"
+sha256 = "{{sha256}}"
+[evidence]
+world = "procedural"
+seed = 1
+[requirements]
+estimator = "spherical"
+median_error_m = 200.0
+recall = 0.5
+"""
+
+
+@pytest.fixture(scope="module")
+def flown(make_pass: Callable[..., SyntheticPass]) -> SyntheticPass:
+    return make_pass(frames=FRAMES, seed=9)
+
+
+def prepared(ground: Ground, flown: SyntheticPass, rules: str = "") -> int:
+    """Enter what a ground knows before a pass; return an approved window."""
+    held = add_catalogue(ground, ground.files.put_file(flown.folder / "catalogue.csv"), "craters.csv")
+    add_mission(ground, (MISSION.format(sha256=held.sha256) + rules).encode())
+    reference = ground.files.put_file(flown.folder / "reference.oem")
+    add_ephemeris(ground, reference, name="reference")
+    entry = WindowEntry("live", START, STOP, float(CADENCE_S), SPACECRAFT)
+    window = add_window(ground, entry, actor="ann")
+    change_window(ground, window.id, actor="bob", changes={}, decision="approved")
+    position, velocity = circular_states(np.array([START]))
+    state = UploadedState.model_validate(
+        {
+            "utc": format_utc(START),
+            "position_icrf_m": tuple(position[0].tolist()),
+            "velocity_icrf_m_s": tuple(velocity[0].tolist()),
+        }
+    )
+    with ground.database.writing() as connection:
+        windows.note_uploads(connection, window.id, WindowUploads(start_state=state))
+    return window.id
+
+
+def receive(ground: Ground, packets: list[bytes], folder: Path) -> None:
+    file = folder / f"{len(packets)}.cadu"
+    file.write_bytes(encode_downlink(packets))
+    ingest_file(ground, file, spacecraft_id=SPACECRAFT)
+
+
+def recorded(ground: Ground, **equal: Any) -> list[tuple[str, str, str]]:
+    found, _ = list_actions(ground, **equal)
+    return [(one.rule, one.action, one.state) for one in reversed(found)]
+
+
+def end_contact(ground: Ground, vehicle: int, utc_ns: int) -> None:
+    ended = ContactEnded(
+        contact_id=1,
+        link="x",
+        station="madrid",
+        vehicle_id=vehicle,
+        start_utc_ns=utc_ns - 60 * NS,
+        stop_utc_ns=utc_ns,
+        octets=1,
+        telecommands=0,
+    )
+    with ground.database.writing() as connection:
+        publish(connection, ended)
+
+
+def report_of(ground: Ground, pass_id: int) -> dict[str, Any]:
+    path = ground.home / "reports" / f"pass-{pass_id}" / "report.json"
+    document: dict[str, Any] = json.loads(path.read_text())
+    return document
+
+
+def test_a_live_pass_is_complete_and_processed_without_a_request(
+    either: Ground, flown: SyntheticPass, tmp_path: Path
+) -> None:
+    window_id = prepared(either, flown)
+    receive(either, flown.packets, tmp_path)
+    window = get_window(either, window_id)
+    assert window.state == "processed" and window.pass_id is not None
+    assert recorded(either) == [
+        ("report of a complete window", "align", "done"),
+        ("report of a complete window", "report", "done"),
+        ("trends", "compute_trends", "done"),
+    ]
+    found, _ = list_actions(either, pass_id=window.pass_id)
+    log = {one.number: one for one in events.read_events(either.database, 0, 1000)}
+    aligned = found[-1]
+    assert log[aligned.event].payload == {"id": window_id, "state": "downlinked"}
+    assert aligned.result is not None and set(aligned.result["missing"]) == {"correlation"}
+    report = report_of(either, window.pass_id)
+    assert report["evidence_level"].startswith("2 ")
+    assert {one["name"] for one in report["navigation"] if one["kind"] == "baseline"} >= {
+        "propagate-only",
+        "Kepler",
+    }
+    assert 0.6 < report["detector"]["micro"]["recall"] < 0.8  # a quarter of the craters is not detected
+    assert {one["key"]: one["status"] for one in report["requirements"]}["detector.recall"] == "met"
+    assert not {"detector", "reference", "error"} & set(report["not_available"])
+
+
+def test_an_incomplete_window_is_processed_after_the_contact_and_late_data_change_its_report(
+    either: Ground, flown: SyntheticPass, tmp_path: Path
+) -> None:
+    window_id = prepared(either, flown)
+    lost = slice(20, 26)
+    receive(either, flown.packets[: lost.start] + flown.packets[lost.stop :], tmp_path)
+    assert get_window(either, window_id).state == "executed" and recorded(either) == []
+    with either.database.reading() as connection:
+        vehicle = windows.get_record(connection, window_id).vehicle_id
+    end_contact(either, vehicle, START)  # before the end of the window
+    assert recorded(either) == []
+    end_contact(either, vehicle, STOP + NS)
+    window = get_window(either, window_id)
+    assert window.state == "processed" and window.pass_id is not None
+    assert [one[1:] for one in recorded(either)] == [
+        ("align", "done"),
+        ("report", "done"),
+        ("mark_processed", "done"),
+        ("compute_trends", "done"),
+    ]
+    first = report_of(either, window.pass_id)
+    receive(either, flown.packets[lost], tmp_path)
+    again = report_of(either, window.pass_id)
+    assert again["packets"]["lost"] < first["packets"]["lost"]
+    assert get_window(either, window_id).state == "processed"
+    end_contact(either, vehicle, STOP + 2 * NS)
+    assert len(recorded(either)) == 4
+
+
+def test_an_event_that_is_handled_again_acts_once(
+    ground: Ground, flown: SyntheticPass, tmp_path: Path
+) -> None:
+    window_id = prepared(ground, flown)
+    receive(ground, flown.packets, tmp_path)
+    before = recorded(ground)
+    for event in events.read_events(ground.database, 0, 1000):
+        if event.kind == WindowChanged.event_kind:
+            record_actions(ground, event)
+    assert recorded(ground) == before and get_window(ground, window_id).state == "processed"
+    made = [
+        one for one in events.read_events(ground.database, 0, 1000) if one.kind == PassEvaluated.event_kind
+    ]
+    assert len(made) == 1
+
+
+def test_actions_that_a_process_left_are_done_by_the_next(
+    tmp_path: Path, flown: SyntheticPass, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any, **__: Any) -> Any:
+        raise StorageFull("disk")
+
+    with open_ground(tmp_path / "home") as ground:
+        follow_in_process(ground)
+        window_id = prepared(ground, flown)
+        with monkeypatch.context() as patched:
+            patched.setattr(actions, "make_report", full)
+            receive(ground, flown.packets, tmp_path)
+        assert [one[1:] for one in recorded(ground)] == [("align", "done"), ("report", "queued")]
+        assert get_window(ground, window_id).state == "downlinked"
+    with open_ground(tmp_path / "home") as ground:
+        follow_in_process(ground)
+        InlineDispatcher(ground).resume()
+        assert get_window(ground, window_id).state == "processed"
+        assert {one[2] for one in recorded(ground)} == {"done"} and unfinished_jobs(ground) == []
+
+
+def test_a_failed_action_skips_those_after_it_and_states_why(
+    ground: Ground, flown: SyntheticPass, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: Any) -> Any:
+        raise InvalidInput("pass", "", "a pass", "none")
+
+    monkeypatch.setitem(actions.DOING, "align", broken)  # type: ignore[arg-type]  # a dictionary behind a Mapping
+    window_id = prepared(ground, flown)
+    receive(ground, flown.packets, tmp_path)
+    found, _ = list_actions(ground)
+    assert [(one.action, one.state, one.error) for one in reversed(found)] == [
+        ("align", "failed", "pass: expected a pass, found none"),
+        ("report", "skipped", "align before it was not done"),
+    ]
+    assert get_window(ground, window_id).state == "downlinked"
+
+
+APPROVED = """
+[[automation.rules]]
+name = "report with approval"
+on = "window ended"
+when = { window_state = ["downlinked"] }
+do = ["align", "report"]
+approval = true
+"""
+
+
+def test_actions_with_approval_wait_for_it(ground: Ground, flown: SyntheticPass, tmp_path: Path) -> None:
+    window_id = prepared(ground, flown, APPROVED)
+    receive(ground, flown.packets, tmp_path)
+    assert [one[1:] for one in recorded(ground)] == [("align", "waiting"), ("report", "waiting")]
+    waiting, _ = list_actions(ground, state="waiting")
+    decided = decide(ground, waiting[-1].id, approve=True, actor="ann")
+    assert decided.decided_by == "ann"
+    assert [one[1:] for one in recorded(ground)] == [("align", "done"), ("report", "done")]
+    assert get_window(ground, window_id).state == "processed"
+    with pytest.raises(StateConflict, match="expected state waiting, found done"):
+        decide(ground, waiting[-1].id, approve=False, actor="ann")
+
+
+def test_refused_actions_are_not_done(ground: Ground, flown: SyntheticPass, tmp_path: Path) -> None:
+    window_id = prepared(ground, flown, APPROVED)
+    receive(ground, flown.packets, tmp_path)
+    waiting, _ = list_actions(ground, state="waiting")
+    decide(ground, waiting[-1].id, approve=False, actor="ann")
+    assert [one[1:] for one in recorded(ground)] == [("align", "refused"), ("report", "refused")]
+    assert get_window(ground, window_id).state == "downlinked"
+
+
+@pytest.mark.parametrize("rules", ["[automation]\nevaluate = false\n", "[automation]\nrules = []\n"])
+def test_automation_that_is_switched_off_does_nothing(
+    ground: Ground, flown: SyntheticPass, tmp_path: Path, rules: str
+) -> None:
+    window_id = prepared(ground, flown, rules)
+    receive(ground, flown.packets, tmp_path)
+    assert recorded(ground) == [] and get_window(ground, window_id).state == "downlinked"
+
+
+def test_rules_in_force_show_which_are_default(ground: Ground, flown: SyntheticPass) -> None:
+    prepared(ground, flown, APPROVED)
+    rules = list_rules(ground)
+    assert [(one.spacecraft_id, one.name, one.default) for one in rules] == [
+        (SPACECRAFT, "report with approval", False),
+        (None, "report of a complete window", True),
+        (None, "report of an incomplete window", True),
+        (None, "trends", True),
+    ]
+
+
+def test_a_gate_acts_for_every_mission_that_reacts_to_it(ground: Ground, flown: SyntheticPass) -> None:
+    rule = '[[automation.rules]]\nname = "gate"\non = "gate done"\nwhen = { verdict = ["fail"] }\n'
+    prepared(ground, flown, rule + 'do = ["compute_trends"]\n')
+    with ground.database.writing() as connection:
+        publish(connection, RegressionJudged(id="0" * 32, verdict="pass"))
+    assert recorded(ground) == []
+    with ground.database.writing() as connection:
+        publish(connection, RegressionJudged(id="1" * 32, verdict="fail"))
+    assert recorded(ground) == [("gate", "compute_trends", "failed")]
+
+
+def test_a_report_that_is_requested_again_without_changes_is_kept(
+    ground: Ground, flown: SyntheticPass, tmp_path: Path
+) -> None:
+    window_id = prepared(ground, flown)
+    receive(ground, flown.packets, tmp_path)
+    with ground.database.writing() as connection:
+        publish(connection, WindowChanged(id=window_id, state="downlinked"))
+    found, _ = list_actions(ground)
+    assert found[0].action == "report" and found[0].result is not None and found[0].result["unchanged"]
+
+
+def test_the_catalogue_of_a_live_pass_is_cut_to_its_track(
+    ground: Ground, flown: SyntheticPass, tmp_path: Path
+) -> None:
+    window_id = prepared(ground, flown)
+    receive(ground, flown.packets, tmp_path)
+    pass_id = get_window(ground, window_id).pass_id
+    assert pass_id is not None
+    whole = evaluation.evaluate(ground, pass_id)
+    assert whole.detector is not None
+    assert any("synthetic craters" in one for one in whole.data_sources)
+
+
+def test_a_mission_without_an_available_catalogue_is_refused_with_the_reason(ground: Ground) -> None:
+    missing = parse_mission(f'name = "m"\n[catalogue]\nsha256 = "{"0" * 64}"\n')
+    with pytest.raises(
+        InvalidInput, match=r"m, catalogue.sha256: expected a catalogue that the ground holds"
+    ):
+        catalogue_of(ground, missing)
+    with pytest.raises(InvalidInput, match="linna catalogue add FILE"):
+        catalogue_of(ground, parse_mission('name = "m"\n[catalogue]\nsource = "x"\n'))
+    with pytest.raises(InvalidInput, match="found neither"):
+        catalogue_of(ground, parse_mission('name = "m"\n'))
+
+
+def test_only_a_crater_catalogue_is_held(ground: Ground, flown: SyntheticPass) -> None:
+    with pytest.raises(InvalidInput, match="crater catalogue"):
+        add_catalogue(ground, ground.files.put_octets(b"a,b\n1,2\n"), "x.csv")
+    for _ in range(2):
+        add_catalogue(ground, ground.files.put_file(flown.folder / "catalogue.csv"), "craters.csv")
+    held, total = list_catalogues(ground)
+    assert total == 1 and held[0].name == "craters.csv"
+
+
+def test_a_worker_that_only_reads_events_records_no_action_twice(
+    tmp_path: Path, flown: SyntheticPass
+) -> None:
+    with open_ground(tmp_path / "home") as ground:
+        jobs: list[str] = []
+        follow = FollowUp(ground, start=jobs.append)
+        prepared(ground, flown)
+        receive(ground, flown.packets, tmp_path)
+        for _ in range(3):
+            follow.drain()
+        assert [one[1:] for one in recorded(ground)] == [("align", "queued"), ("report", "queued")]
+        assert len(set(jobs)) == len(unfinished_jobs(ground)) == 1
