@@ -8,6 +8,7 @@ then Earth and Sun positions.  ``force`` holds the scalars, at the places named 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,52 @@ REACHED, STEP_LIMIT, EVENT, GROUND, TOO_SMALL = range(5)
 """Why an integration ended."""
 
 NO_EVENT, PERISELENE, APOSELENE = range(3)
+
+EVENT_TOLERANCE_S = 1e-6
+EVENT_TRIES = 5
+SHORTEST_STEP_S = 1e-6
+
+
+class Forces(NamedTuple):
+    """What acts: packed gravity field, scalars (see the module), table over the span, length of the field's scratch."""
+
+    gravity: FloatArray
+    scalars: FloatArray
+    table: FloatArray
+    scratch_size: int
+
+
+class Method(NamedTuple):
+    """Butcher's tableau of an embedded method (stages in rows), and the order of its error estimate.
+
+    ``b`` and ``error`` have a row for positions and one for velocities; ``nystrom``: for second-order equations.
+    """
+
+    nystrom: bool
+    a: FloatArray
+    b: FloatArray
+    c: FloatArray
+    error: FloatArray
+    second_error: FloatArray
+    error_order: int
+
+
+class Control(NamedTuple):
+    """Tolerance of a step, longest step, radius of the ground; which event ends the integration, at which radius."""
+
+    rtol: float
+    max_step_s: float
+    ground_m: float
+    event: int
+    event_radius_m: float
+
+
+class Knots(NamedTuple):
+    """Accepted steps: seconds (n,), states (n, 6) and accelerations (n, 3)."""
+
+    times: FloatArray
+    states: FloatArray
+    rates: FloatArray
 
 
 @njit(error_model="numpy", boundscheck=False, fastmath={"contract", "nsz"})
@@ -341,59 +388,67 @@ def _next_size(step: float, estimate: float, h: float, max_step: float, order: i
 
 
 @njit(error_model="numpy", boundscheck=False, nogil=True)
+def _next_end(t: float, stop_s: float, sign: float, h: float) -> tuple[float, float]:
+    """Return the end and the length of the next step; the last two share what is left, so that none is tiny."""
+    left = sign * (stop_s - t)
+    step = h if left > 2.0 * h else (left if left <= h else 0.5 * left)
+    return (stop_s if step == left else t + sign * step), step
+
+
+@njit(error_model="numpy", boundscheck=False, nogil=True)
+def _search_step(
+    knots: Knots,
+    count: int,
+    status: int,
+    sign: float,
+    control: Control,
+    y: FloatArray,
+    k: FloatArray,
+    work: FloatArray,
+) -> tuple[int, float]:
+    """Return what happened in the step to the newest knot, and the time from there to the event that ends it."""
+    times, states, rates = knots
+    if status == EVENT:  # the dense output gave the time to some ms: Newton's rule on radial speed
+        return EVENT, _seconds_to_periapsis(y, k)
+    if count == 0:
+        return status, 0.0
+    found, fraction = _events(
+        times, states, rates, count - 1, sign, control.ground_m, control.event, control.event_radius_m, work
+    )
+    return found, (fraction - 1.0) * (times[count] - times[count - 1]) if found == EVENT else 0.0
+
+
+@njit(error_model="numpy", boundscheck=False, nogil=True)
 def integrate(
     start_s: float,
     y0: FloatArray,
     stop_s: float,
-    gravity: FloatArray,
-    force: FloatArray,
-    table: FloatArray,
-    scratch_size: int,
-    nystrom: bool,
-    a: FloatArray,
-    b: FloatArray,
-    c: FloatArray,
-    error: FloatArray,
-    second_error: FloatArray,
-    error_order: int,
-    rtol: float,
-    max_step_s: float,
+    forces: Forces,
+    method: Method,
+    control: Control,
     first_step_s: float,
-    ground_m: float,
-    event: int,
-    event_radius_m: float,
-    times: FloatArray,
-    states: FloatArray,
-    rates: FloatArray,
+    knots: Knots,
 ) -> tuple[int, int, int, float]:
     """Integrate adaptively from ``start_s`` to ``stop_s`` (either may be the later), keeping every accepted step.
 
-    Returns (number of knots, why it ended, evaluations, next step).  Knots go to ``times``, ``states`` (n, 6) and
-    ``rates`` (n, 3), the accelerations, until these are full (STEP_LIMIT).  EVENT: the last knot is a periselene
-    below ``event_radius_m``, or an aposelene above it, whichever ``event`` asks for.  GROUND: the last step met
-    radius ``ground_m``, at its end or at a periselene in it.
+    Returns (number of knots, why it ended, evaluations, next step).  Knots are filled until they are full
+    (STEP_LIMIT).  EVENT: the last knot is a periselene below ``event_radius_m``, or an aposelene above it, whichever
+    ``event`` asks for.  GROUND: the last step met radius ``ground_m``, at its end or at a periselene in it.
 
     One loop over stages, with the forces evaluated in one place (each further one would be compiled again).  Stage 0
     is at a new knot; only there is the step that led to it searched for events, as its quintic needs the
     acceleration at both ends.
     """
-    stages = len(c)
-    scratch, frame, work, y, new = (
-        np.empty(scratch_size),
-        np.empty(COLUMNS),
-        np.empty(6),
-        np.empty(6),
-        np.empty(6),
-    )
-    k, first, second = np.empty((stages, 6)), np.empty(6), np.empty(6)
-    for d in range(6):
-        y[d] = y0[d]
-    two_estimates = False
-    for i in range(stages):
-        two_estimates = two_estimates or second_error[i] != 0.0
+    gravity, scalars, table, scratch_size = forces
+    nystrom, a, b, c, error, second_error, order = method
+    times, states, rates = knots
+    last = len(c) - 1
+    scratch, frame, work = np.empty(scratch_size), np.empty(COLUMNS), np.empty(6)
+    k, y, new, first, second = np.empty((last + 1, 6)), y0.copy(), np.empty(6), np.empty(6), np.empty(6)
+    two = bool(np.any(second_error != 0.0))
     sign = 1.0 if stop_s >= start_s else -1.0
     t = t_new = start_s
-    h = min(abs(first_step_s), max_step_s)
+    h = min(abs(first_step_s), control.max_step_s)
     step = signed = 0.0
     count = evaluations = stage = tries = 0
     status = REACHED
@@ -402,64 +457,47 @@ def integrate(
         _stage_place(work, k, y, a, c, stage, signed, nystrom)
         if not known:
             k[stage, 3], k[stage, 4], k[stage, 5] = force_acceleration(
-                t + c[stage] * signed, work[0], work[1], work[2], gravity, force, table, scratch, frame
+                t + c[stage] * signed, work[0], work[1], work[2], gravity, scalars, table, scratch, frame
             )
             evaluations += 1
         known = False
         if stage == 0:
             _keep_knot(times, states, rates, count, t, y, k)
-            wait = 0.0
-            if status == EVENT:  # the dense output gave the time to some ms: Newton's rule on radial speed
-                wait = _seconds_to_periapsis(y, k)
-            elif count > 0:
-                status, fraction = _events(
-                    times, states, rates, count - 1, sign, ground_m, event, event_radius_m, work
-                )
-                if status == EVENT:
-                    wait = (fraction - 1.0) * (t - times[count - 1])
-            if abs(wait) > 1e-6 and tries < 5:  # take the step again, as far as the event
+            status, wait = _search_step(knots, count, status, sign, control, y, k, work)
+            if abs(wait) > EVENT_TOLERANCE_S and tries < EVENT_TRIES:  # the step again, as far as the event
                 tries += 1
-                t_new = t + wait
-                t = times[count - 1]
-                signed = t_new - t
+                t, t_new = times[count - 1], t + wait
+                signed, stage = t_new - t, 1
                 step = abs(signed)
                 _back_to_knot(y, k, states, rates, count - 1)
-                stage = 1
                 continue
             count += 1
             if status != REACHED or sign * (stop_s - t) <= 0.0:
                 return count, status, evaluations, h
             if count == len(times):
                 return count, STEP_LIMIT, evaluations, h
-        elif stage < stages - 1:
+        elif stage < last:
             stage += 1
             continue
         else:
             estimate = _step_end(
-                new, first, second, k, y, b, error, second_error, signed, rtol, nystrom, two_estimates
+                new, first, second, k, y, b, error, second_error, signed, control.rtol, nystrom, two
             )
-            h = _next_size(step, estimate, h, max_step_s, error_order, rejected)
+            h = _next_size(step, estimate, h, control.max_step_s, order, rejected)
             if estimate <= 1.0:
                 rejected = False
                 t = t_new
-                for d in range(6):
-                    y[d] = new[d]
-                if nystrom:  # the last stage is the first of the next step
-                    known = True
-                    for d in range(3, 6):
-                        k[0, d] = k[stages - 1, d]
-                stage = 0
-                signed = 0.0
+                y[:] = new
+                known = nystrom  # the last stage is the first of the next step
+                if known:
+                    k[0, 3:] = k[last, 3:]
+                signed, stage = 0.0, 0
                 continue
-            if h < 1e-6:
+            if h < SHORTEST_STEP_S:
                 return count, TOO_SMALL, evaluations, h
             rejected = True
-        left = sign * (stop_s - t)
-        # The last two steps share what is left, so that no tiny step is made.
-        step = h if left > 2.0 * h else (left if left <= h else 0.5 * left)
-        t_new = stop_s if step == left else t + sign * step
-        signed = sign * step
-        stage = 1
+        t_new, step = _next_end(t, stop_s, sign, h)
+        signed, stage = sign * step, 1
 
 
 @njit(error_model="numpy", boundscheck=False)

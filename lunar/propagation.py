@@ -336,6 +336,41 @@ def integrate_arc(
     method = TABLEAUX[integrator]
     rtol = method.rtol if rtol is None else rtol
     max_step_s = method.max_step_s if max_step_s is None else max_step_s
+    _check_arc(state, stop_s, rtol, max_step_s, ground_radius_m)
+    forces = kernel.Forces(*force_arrays(model, epoch_tdb_s, start_s, stop_s))
+    tableau = kernel.Method(
+        method.nystrom, method.a, method.b, method.c, method.error, method.second_error, method.error_order
+    )
+    control = kernel.Control(rtol, max_step_s, ground_radius_m, event, event_radius_m)
+    parts: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+    time, y, step, evaluations = start_s, np.ascontiguousarray(state), first_step_s, 0
+    status = kernel.STEP_LIMIT
+    while status == kernel.STEP_LIMIT:
+        knots = kernel.Knots(np.empty(_KNOTS), np.empty((_KNOTS, 6)), np.empty((_KNOTS, 3)))
+        count, status, cost, step = kernel.integrate(
+            time, y, float(stop_s), forces, tableau, control, step, knots
+        )
+        first = 1 if parts else 0  # a part begins with the last knot of the one before
+        parts.append((knots.times[first:count], knots.states[first:count], knots.rates[first:count]))
+        time, y = knots.times[count - 1], knots.states[count - 1].copy()
+        evaluations += cost
+    if status == kernel.TOO_SMALL:
+        raise OrbitError(
+            f"propagation: expected steps over 1 us to meet a tolerance of {rtol:g}, found none at {time:.3f} s"
+        )
+    elapsed, states, rates = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    ground_s = np.nan
+    if status == kernel.GROUND:
+        ground_s = _ground_time(elapsed[-2:], states[-2:], rates[-2:], ground_radius_m)
+        if not stop_at_ground:
+            raise _impact(epoch_tdb_s, ground_s, elapsed[-2:], states[-2:], rates[-2:], model)
+    return Arc(elapsed, states, rates, status, evaluations, step, ground_s)
+
+
+def _check_arc(
+    state: FloatArray, stop_s: float, rtol: float, max_step_s: float, ground_radius_m: float
+) -> None:
+    """Refuse limits that no integration can keep, and a start in the ground."""
     if not (1e-15 <= rtol <= 1e-3 and max_step_s > 0.0 and np.isfinite(stop_s)):
         raise OrbitError(
             f"propagation: expected a finite span, a step over 0 s and a tolerance from 1e-15 to 1e-3, "
@@ -347,57 +382,6 @@ def integrate_arc(
             f"start of the orbit: expected a distance above {ground_radius_m / 1e3:.3f} km from the Moon's centre, "
             f"found {radius / 1e3:.3f} km"
         )
-    gravity, force, table, scratch = force_arrays(model, epoch_tdb_s, start_s, stop_s)
-    parts: list[tuple[FloatArray, FloatArray, FloatArray]] = []
-    time, y, step, evaluations = start_s, np.ascontiguousarray(state), first_step_s, 0
-    status = kernel.STEP_LIMIT
-    while status == kernel.STEP_LIMIT:
-        times, states, rates = np.empty(_KNOTS), np.empty((_KNOTS, 6)), np.empty((_KNOTS, 3))
-        count, status, cost, step = kernel.integrate(
-            time,
-            y,
-            float(stop_s),
-            gravity,
-            force,
-            table,
-            scratch,
-            method.nystrom,
-            method.a,
-            method.b,
-            method.c,
-            method.error,
-            method.second_error,
-            method.error_order,
-            rtol,
-            max_step_s,
-            step,
-            ground_radius_m,
-            event,
-            event_radius_m,
-            times,
-            states,
-            rates,
-        )
-        parts.append(
-            (times[:count], states[:count], rates[:count])
-            if not parts
-            else (times[1:count], states[1:count], rates[1:count])
-        )
-        time, y = times[count - 1], states[count - 1].copy()
-        evaluations += cost
-    elapsed = np.concatenate([part[0] for part in parts])
-    kept_states = np.concatenate([part[1] for part in parts])
-    kept_rates = np.concatenate([part[2] for part in parts])
-    if status == kernel.TOO_SMALL:
-        raise OrbitError(
-            f"propagation: expected steps over 1 us to meet a tolerance of {rtol:g}, found none at {time:.3f} s"
-        )
-    ground_s = np.nan
-    if status == kernel.GROUND:
-        ground_s = _ground_time(elapsed[-2:], kept_states[-2:], kept_rates[-2:], ground_radius_m)
-        if not stop_at_ground:
-            raise _impact(epoch_tdb_s, ground_s, elapsed[-2:], kept_states[-2:], kept_rates[-2:], model)
-    return Arc(elapsed, kept_states, kept_rates, status, evaluations, step, ground_s)
 
 
 def join(epoch_tdb_s: float, arcs: list[Arc]) -> Trajectory:

@@ -451,7 +451,11 @@ LARGEST_REGISTRATION_M = 5_000.0
 _MOON_RADIUS_KM = 1737.4
 
 
-def _check_cartesian(orbit: OrbitSection, require: Callable[[bool, str, str, object], None]) -> None:
+Require = Callable[[bool, str, str, object], None]
+"""Refuses a value unless the first argument holds; the others are the key, what is expected and what was found."""
+
+
+def _check_cartesian(orbit: OrbitSection, require: Require) -> None:
     """Refuse a Cartesian state that is incomplete, contradicts other keys or lies in the Moon."""
     for key in ("position_km", "velocity_km_s"):
         values = getattr(orbit, key)
@@ -491,7 +495,26 @@ def _check(scenario: Scenario, source: str) -> None:
         if not good:
             raise ScenarioError(f"{source}: {key} must be {expected}, found {found!r}")
 
-    orbit, camera, window = scenario.orbit, scenario.camera, scenario.window
+    for check in (
+        _check_orbit,
+        _check_dynamics,
+        _check_camera,
+        _check_window,
+        _check_terrain,
+        _check_detector,
+        _check_disturbances,
+        _check_light,
+        _check_navigation,
+        _check_link,
+        _check_instruments,
+    ):
+        check(scenario, require)
+    for text in scenario.faults.events:
+        parse_fault(text)
+
+
+def _check_orbit(scenario: Scenario, require: Require) -> None:
+    orbit, window = scenario.orbit, scenario.window
     for key, text in (("orbit.epoch", orbit.epoch), ("window.start", window.start)):
         try:
             if text or key == "orbit.epoch":
@@ -506,7 +529,7 @@ def _check(scenario: Scenario, source: str) -> None:
         )
         perilune_km = orbit.semi_major_axis_km * (1.0 - orbit.eccentricity)
         require(
-            perilune_km > 1737.4,
+            perilune_km > _MOON_RADIUS_KM,
             "orbit.semi_major_axis_km and eccentricity",
             "an orbit above the ground (perilune radius over 1737.4 km)",
             round(perilune_km, 3),
@@ -517,10 +540,11 @@ def _check(scenario: Scenario, source: str) -> None:
             "from 0 to 180",
             orbit.inclination_deg,
         )
-    require(
-        2 <= scenario.dynamics.degree <= 1200, "dynamics.degree", "from 2 to 1200", scenario.dynamics.degree
-    )
+
+
+def _check_dynamics(scenario: Scenario, require: Require) -> None:
     dynamics = scenario.dynamics
+    require(2 <= dynamics.degree <= 1200, "dynamics.degree", "from 2 to 1200", dynamics.degree)
     require(
         0.0 <= dynamics.solar_area_to_mass_m2_kg <= 1e3,
         "dynamics.solar_area_to_mass_m2_kg",
@@ -533,11 +557,19 @@ def _check(scenario: Scenario, source: str) -> None:
         "from 0 to 2",
         dynamics.solar_reflection,
     )
+
+
+def _check_camera(scenario: Scenario, require: Require) -> None:
+    camera = scenario.camera
     require(16 <= camera.width_px <= 8192, "camera.width_px", "from 16 to 8192", camera.width_px)
     require(16 <= camera.height_px <= 8192, "camera.height_px", "from 16 to 8192", camera.height_px)
     require(1.0 <= camera.fov_deg <= 170.0, "camera.fov_deg", "from 1 to 170", camera.fov_deg)
     require(-60.0 <= camera.tilt_deg <= 60.0, "camera.tilt_deg", "from -60 to 60", camera.tilt_deg)
     require(camera.frame_interval_s > 0.0, "camera.frame_interval_s", "positive", camera.frame_interval_s)
+
+
+def _check_window(scenario: Scenario, require: Require) -> None:
+    window = scenario.window
     require(
         0.0 < window.latitude_limit_deg <= 90.0,
         "window.latitude_limit_deg",
@@ -551,6 +583,23 @@ def _check(scenario: Scenario, source: str) -> None:
         "a band of latitudes within window.latitude_limit_deg, lower limit first",
         (window.latitude_min_deg, window.latitude_max_deg),
     )
+    require(
+        0.0 < window.longitude_max_deg - window.longitude_min_deg <= 360.0,
+        "window.longitude_max_deg",
+        "over window.longitude_min_deg by up to 360",
+        window.longitude_max_deg,
+    )
+    require(window.passes >= 1, "window.passes", "at least 1", window.passes)
+    require(window.arc_interval >= 1, "window.arc_interval", "at least 1", window.arc_interval)
+    require(
+        window.search != "none" or window.duration_s > 0.0,
+        "window.duration_s",
+        "positive when window.search is 'none'",
+        window.duration_s,
+    )
+
+
+def _check_terrain(scenario: Scenario, require: Require) -> None:
     shift = scenario.terrain.registration_north_east_m
     require(
         not shift or (len(shift) == 2 and max(map(abs, shift)) <= LARGEST_REGISTRATION_M),
@@ -564,6 +613,9 @@ def _check(scenario: Scenario, source: str) -> None:
         f"empty where terrain.source is {scenario.terrain.source!r}",
         shift,
     )
+
+
+def _check_detector(scenario: Scenario, require: Require) -> None:
     detector = scenario.detector
     require(
         detector.score_threshold < 0.0 or 0.0 < detector.score_threshold < 1.0,
@@ -578,14 +630,10 @@ def _check(scenario: Scenario, source: str) -> None:
         detector.max_detections,
     )
     require(detector.network != "", "detector.network", "a shipped network or an ONNX file", detector.network)
-    require(
-        0.0 < window.longitude_max_deg - window.longitude_min_deg <= 360.0,
-        "window.longitude_max_deg",
-        "over window.longitude_min_deg by up to 360",
-        window.longitude_max_deg,
-    )
-    require(window.passes >= 1, "window.passes", "at least 1", window.passes)
-    require(window.arc_interval >= 1, "window.arc_interval", "at least 1", window.arc_interval)
+
+
+def _check_disturbances(scenario: Scenario, require: Require) -> None:
+    orbit = scenario.orbit
     moved = scenario.disturbances.kidnap_distance_km > 0.0 or scenario.disturbances.burn_delta_v_m_s != 0.0
     require(
         not (moved and (scenario.maneuvers.enabled or orbit.oem)),
@@ -599,12 +647,9 @@ def _check(scenario: Scenario, source: str) -> None:
         "zero or more",
         scenario.disturbances.kidnap_distance_km,
     )
-    require(
-        window.search != "none" or window.duration_s > 0.0,
-        "window.duration_s",
-        "positive when window.search is 'none'",
-        window.duration_s,
-    )
+
+
+def _check_light(scenario: Scenario, require: Require) -> None:
     light = scenario.light
     require(
         light.elevation_min_deg <= light.elevation_max_deg,
@@ -618,6 +663,9 @@ def _check(scenario: Scenario, source: str) -> None:
         "no more than light.azimuth_max_deg",
         light.azimuth_min_deg,
     )
+
+
+def _check_navigation(scenario: Scenario, require: Require) -> None:
     for name in scenario.navigation.estimators:
         require(name in ESTIMATORS, "navigation.estimators", f"of {', '.join(ESTIMATORS)}", name)
     require(len(scenario.navigation.estimators) > 0, "navigation.estimators", "at least one estimator", ())
@@ -630,6 +678,9 @@ def _check(scenario: Scenario, source: str) -> None:
         "at least twice reference.radial_m",
         reference.transverse_m,
     )
+
+
+def _check_link(scenario: Scenario, require: Require) -> None:
     link = scenario.link
     for key in (
         "frame_loss",
@@ -648,8 +699,9 @@ def _check(scenario: Scenario, source: str) -> None:
     require(link.uplink_bps > 0.0, "link.uplink_bps", "positive", link.uplink_bps)
     for text in link.outages:
         parse_outage(text)
-    for text in scenario.faults.events:
-        parse_fault(text)
+
+
+def _check_instruments(scenario: Scenario, require: Require) -> None:
     for name, settings in scenario.instruments.items():
         instrument = simulated_instruments()[name]
         for limit in instrument.limits(settings):

@@ -63,6 +63,17 @@ class Thresholds:
     navigation: float
 
 
+def _average_precisions(
+    truths: Sequence[FrameTruth], found: Sequence[FrameDetections], strict: Tally, fair: Tally
+) -> dict[str, Any]:
+    per_class = [average_precision(tally(truths, found, classes=(k,), rule=RADIUS_RULE)) for k in range(3)]
+    return {
+        "strict": average_precision(strict),
+        "ignore_aware": average_precision(fair),
+        "per_class": per_class,
+    }
+
+
 def score(
     truths: Sequence[FrameTruth],
     found: Sequence[FrameDetections],
@@ -89,13 +100,7 @@ def score(
         "ignore_aware_half_radius": fair_radius.figures(threshold).to_dict(),
         "strict_3_to_30_km": wide.figures(threshold).to_dict(),
         "ignore_aware_3_to_30_km": wide_fair.figures(threshold).to_dict(),
-        "average_precision_half_radius": {
-            "strict": average_precision(strict_radius),
-            "ignore_aware": average_precision(fair_radius),
-            "per_class": [
-                average_precision(tally(truths, found, classes=(k,), rule=RADIUS_RULE)) for k in range(3)
-            ],
-        },
+        "average_precision_half_radius": _average_precisions(truths, found, strict_radius, fair_radius),
         "balanced": _at(pair, thresholds.balanced),
         "navigation": _at(pair, thresholds.navigation),
         "recall_by_degradation": _recall_by(

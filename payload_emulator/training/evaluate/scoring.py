@@ -206,28 +206,16 @@ def tally(
     parts: list[tuple[NDArray[np.generic], ...]] = []
     craters: list[tuple[NDArray[np.generic], ...]] = []
     for number, (truth, found) in enumerate(zip(truths, detections, strict=True)):
-        in_frame = (
-            (truth.u_px >= -0.5)
-            & (truth.u_px <= truth.width_px - 0.5)
-            & (truth.v_px >= -0.5)
-            & (truth.v_px <= truth.height_px - 0.5)
-        )
+        wanted = _in_frame(truth)
         if classes:
-            wanted = in_frame & np.isin(size_class(truth.diameter_m), classes)
+            wanted &= np.isin(size_class(truth.diameter_m), classes)
             own = size_class(found.diameter_m) if found.size_class is None else found.size_class
             chosen = np.isin(own, classes)
         else:
-            wanted = in_frame & (truth.diameter_m >= low_m) & (truth.diameter_m <= high_m)
+            wanted &= (truth.diameter_m >= low_m) & (truth.diameter_m <= high_m)
             chosen = (found.diameter_m >= low_m) & (found.diameter_m <= high_m)
         if ignore_aware:
-            inset = 0.25 * truth.diameter_px
-            deep_inside = (
-                (truth.u_px >= inset)
-                & (truth.u_px <= truth.width_px - 1 - inset)
-                & (truth.v_px >= inset)
-                & (truth.v_px <= truth.height_px - 1 - inset)
-            )
-            wanted &= deep_inside & (truth.depth_ratio >= FAIR_DEPTH_RATIO)
+            wanted &= _could_be_seen(truth)
         w = np.flatnonzero(wanted)
         d = np.flatnonzero(chosen)
         hit = match(found.u_px[d], found.v_px[d], truth.u_px[w], truth.v_px[w], truth.diameter_px[w], rule)
@@ -243,45 +231,88 @@ def tally(
                 rule,
             )
             outcome[(outcome == 0) & near] = -1
-        error_u = np.where(hit >= 0, found.u_px[d] - truth.u_px[w][hit] if w.size else np.nan, np.nan)
-        error_v = np.where(hit >= 0, found.v_px[d] - truth.v_px[w][hit] if w.size else np.nan, np.nan)
-        sizes = truth.diameter_px[w][hit] if w.size else np.ones(d.size)
-        log_ratio = np.where(hit >= 0, np.log(found.diameter_px[d] / sizes), np.nan)
-        octant = int(np.floor(np.mod(truth.sun_azimuth_image_rad, 2.0 * np.pi) / (np.pi / 4.0))) % 8
-        parts.append(
-            (
-                found.score[d],
-                outcome,
-                error_u,
-                error_v,
-                found.sigma_px[d],
-                np.full(d.size, truth.block),
-                np.full(d.size, octant),
-                log_ratio,
-                found.u_px[d],
-                found.v_px[d],
-                np.full(d.size, number),
-                np.full(d.size, np.nan) if found.depth_ratio is None else found.depth_ratio[d],
-                np.where(hit >= 0, truth.depth_ratio[w][hit] if w.size else np.nan, np.nan),
-                np.where(hit >= 0, truth.ids[w][hit] if w.size else -1, -1),
-            )
-        )
-        score = np.full(w.size, np.nan)
-        score[hit[hit >= 0]] = found.score[d][hit >= 0]
-        craters.append(
-            (
-                score,
-                truth.depth_ratio[w],
-                truth.diameter_px[w],
-                truth.diameter_m[w],
-                truth.ids[w],
-                np.full(w.size, truth.block),
-                truth.u_px[w],
-                truth.v_px[w],
-                np.full(w.size, number),
-            )
-        )
+        parts.append(_detection_columns(number, truth, found, w, d, hit, outcome))
+        craters.append(_crater_columns(number, truth, found.score[d], w, hit))
     return Tally(*_columns(parts, 14), *_columns(craters, 9))
+
+
+def _in_frame(truth: FrameTruth) -> BoolArray:
+    """Return which craters have their centre in the image."""
+    return np.asarray(
+        (truth.u_px >= -0.5)
+        & (truth.u_px <= truth.width_px - 0.5)
+        & (truth.v_px >= -0.5)
+        & (truth.v_px <= truth.height_px - 0.5)
+    )
+
+
+def _could_be_seen(truth: FrameTruth) -> BoolArray:
+    """Return which craters are deep enough and have their centre half a radius inside the image."""
+    inset = 0.25 * truth.diameter_px
+    return np.asarray(
+        (truth.u_px >= inset)
+        & (truth.u_px <= truth.width_px - 1 - inset)
+        & (truth.v_px >= inset)
+        & (truth.v_px <= truth.height_px - 1 - inset)
+        & (truth.depth_ratio >= FAIR_DEPTH_RATIO)
+    )
+
+
+def _detection_columns(
+    number: int,
+    truth: FrameTruth,
+    found: FrameDetections,
+    wanted: IntArray,
+    chosen: IntArray,
+    hit: IntArray,
+    outcome: NDArray[np.int8],
+) -> tuple[NDArray[np.generic], ...]:
+    """Return the columns of a tally that describe the ``chosen`` detections of a frame.
+
+    ``hit`` is the place among the ``wanted`` craters of the crater that each detection takes, -1 for none.
+    """
+    matched = hit >= 0
+
+    def of_crater(values: FloatArray) -> FloatArray:
+        """Return values of the matched craters; NaN where none."""
+        return np.where(matched, values[wanted][hit], np.nan) if wanted.size else np.full(hit.size, np.nan)
+
+    octant = int(np.floor(np.mod(truth.sun_azimuth_image_rad, 2.0 * np.pi) / (np.pi / 4.0))) % 8
+    return (
+        found.score[chosen],
+        outcome,
+        found.u_px[chosen] - of_crater(truth.u_px),
+        found.v_px[chosen] - of_crater(truth.v_px),
+        found.sigma_px[chosen],
+        np.full(chosen.size, truth.block),
+        np.full(chosen.size, octant),
+        np.log(found.diameter_px[chosen] / of_crater(truth.diameter_px)),
+        found.u_px[chosen],
+        found.v_px[chosen],
+        np.full(chosen.size, number),
+        np.full(chosen.size, np.nan) if found.depth_ratio is None else found.depth_ratio[chosen],
+        of_crater(truth.depth_ratio),
+        np.where(matched, truth.ids[wanted][hit] if wanted.size else -1, -1),
+    )
+
+
+def _crater_columns(
+    number: int, truth: FrameTruth, scores: FloatArray, wanted: IntArray, hit: IntArray
+) -> tuple[NDArray[np.generic], ...]:
+    """Return the columns of a tally that describe the ``wanted`` craters of a frame."""
+    score = np.full(wanted.size, np.nan)
+    score[hit[hit >= 0]] = scores[hit >= 0]
+    return (
+        score,
+        truth.depth_ratio[wanted],
+        truth.diameter_px[wanted],
+        truth.diameter_m[wanted],
+        truth.ids[wanted],
+        np.full(wanted.size, truth.block),
+        truth.u_px[wanted],
+        truth.v_px[wanted],
+        np.full(wanted.size, number),
+    )
 
 
 def match_any(

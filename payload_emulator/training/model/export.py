@@ -85,9 +85,8 @@ def export(
     from payload_emulator.training.model.model import ExportedCraterNet
     from payload_emulator.training.model.restore import enlarging, network_from_onnx
 
-    network, stored = (
-        network_from_onnx(checkpoint) if checkpoint.suffix == ".onnx" else load_network(checkpoint)
-    )
+    is_exported = checkpoint.suffix == ".onnx"
+    network, stored = network_from_onnx(checkpoint) if is_exported else load_network(checkpoint)
     if enlarge:
         network = enlarging(network, enlarge)
         stored = stored | {"config": network.config.to_dict()}
@@ -97,12 +96,8 @@ def export(
             f"{checkpoint}: expected a network with the paper's class heatmaps, found one without"
         )
     calibration = calibrate(network, datasets)
-    exported = ExportedCraterNet(
-        network,
-        calibration.geometry_shift,
-        network.heat_channels if paper_classes else 1,
-        classes_only=classes_only,
-    ).eval()
+    heats = network.heat_channels if paper_classes else 1
+    exported = ExportedCraterNet(network, calibration.geometry_shift, heats, classes_only=classes_only).eval()
     model = keep_blocked(onnx_model(exported))
     metadata = _metadata(stored, calibration, checkpoint, datasets) | {
         "git_revision": revision,
@@ -125,10 +120,7 @@ def export(
     if test:
         tested = _test_figures(octets, datasets, paper_classes)
         octets = _with_metadata(model, metadata | {"test_figures": json.dumps(tested)})
-    unfinished = out.with_name(f".{out.name}.unfinished")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    unfinished.write_bytes(octets)
-    unfinished.replace(out)
+    _write_whole(out, octets)
     return {
         "model": str(out),
         "model_bytes": len(octets),
@@ -142,6 +134,14 @@ def export(
         "validation": calibration.figures,
         "test": tested,
     }
+
+
+def _write_whole(out: Path, octets: bytes) -> None:
+    """Write a file so that it is either complete or absent."""
+    unfinished = out.with_name(f".{out.name}.unfinished")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    unfinished.write_bytes(octets)
+    unfinished.replace(out)
 
 
 def class_medians_m(datasets: Sequence[Dataset]) -> list[float]:

@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,6 +31,9 @@ from payload_emulator.training.data.dataset import Dataset, Frame
 from payload_emulator.training.data.feeder import Feeder, TrainParameters
 from payload_emulator.training.evaluate.landmarks import Landmarks, with_landmarks
 from payload_emulator.training.model.curves import append_curve, draw_curves
+
+if TYPE_CHECKING:
+    from payload_emulator.training.model.model import ModelConfig
 
 ENVIRONMENT = {
     "OMP_WAIT_POLICY": "PASSIVE",
@@ -70,18 +73,12 @@ def train(
     import cv2
     import torch
 
-    from payload_emulator.training.model.model import CraterNet, ModelConfig
+    from payload_emulator.training.model.model import CraterNet
     from payload_emulator.training.model.restore import count_statistics
 
-    if train_frames is None:
-        train_frames = [(d, f) for d in datasets for f in d.frames("train")]
+    frames = _training_frames(datasets, train_frames, landmarks)
     validation = [(d, f) for d in datasets for f in d.frames("val")]
-    if landmarks is not None:
-        train_frames = [(d, with_landmarks(d, f, landmarks)) for d, f in train_frames]
-    if not train_frames:
-        raise DatasetError("training: expected frames of the split 'train', found none")
-    if len({(d.width_px, d.height_px, round(d.focal_px, 3)) for d in datasets}) > 1:
-        raise DatasetError("training: expected data sets of one camera, found several")
+    _check_datasets(datasets, frames, parameters)
     run.mkdir(parents=True, exist_ok=True)
     cv2.setNumThreads(1)
     torch.manual_seed(parameters.seed)
@@ -89,7 +86,71 @@ def train(
     replicas = parameters.replicas or (1 if device == "cuda" else max(1, min(os.cpu_count() or 1, 8)))
     if device == "cpu":
         torch.set_num_threads(1)
-    config = ModelConfig(
+    config = _model_config(parameters)
+    network = CraterNet(config).to(device, memory_format=torch.channels_last)
+    average = copy.deepcopy(network).eval()
+    optimiser = torch.optim.AdamW(
+        _parameter_groups(network, parameters.weight_decay), lr=parameters.learning_rate, fused=True
+    )
+    files = _RunFiles(run, network, average, optimiser, config.to_dict())
+    state = _Progress()
+    origin: dict[str, Any] | None = None
+    if files.checkpoint.is_file():
+        state = files.resume(device)
+        report(f"resumed at step {state.step}, {state.seconds / 60:.1f} min, best F1 {state.best_f1:.3f}")
+    elif start_from is not None:
+        origin = _start_from(start_from, network, average)
+        report(f"started from {start_from.name}")
+    images = _load_images(frames, report, parameters.preparation is Preparation.normalise_first)
+    _write_run(run, parameters, datasets, config.to_dict(), replicas, device, origin)
+    feeder = Feeder(frames, images, parameters)
+    if origin is not None and start_from is not None and start_from.suffix == ".onnx":
+        count_statistics(network, feeder, average)
+    team = _Team(network, replicas, device, parameters)
+    _optimise(
+        team, feeder, files, state, lambda: _validate(average, validation, parameters.validation_frames, device),
+        learns_blindly=not validation, report=report,
+    )  # fmt: skip
+    files.save(state, {})
+    draw_curves(run)
+    return {
+        "best": {"f1": state.best_f1, "step": state.best_step},
+        "steps": state.step,
+        "minutes": state.seconds / 60.0,
+        "images_per_s": state.step * parameters.batch / max(state.seconds, 1e-9),
+        "train_frames": len(frames),
+        "validation_frames": len(validation),
+    }
+
+
+def _training_frames(
+    datasets: Sequence[Dataset],
+    chosen: Sequence[tuple[Dataset, Frame]] | None,
+    landmarks: Landmarks | None,
+) -> list[tuple[Dataset, Frame]]:
+    """Return the frames to learn from: the chosen ones or the split "train", with landmarks as further labels."""
+    frames = [(d, f) for d in datasets for f in d.frames("train")] if chosen is None else list(chosen)
+    return frames if landmarks is None else [(d, with_landmarks(d, f, landmarks)) for d, f in frames]
+
+
+def _check_datasets(
+    datasets: Sequence[Dataset], frames: Sequence[tuple[Dataset, Frame]], parameters: TrainParameters
+) -> None:
+    if not frames:
+        raise DatasetError("training: expected frames of the split 'train', found none")
+    if len({(d.width_px, d.height_px, round(d.focal_px, 3)) for d in datasets}) > 1:
+        raise DatasetError("training: expected data sets of one camera, found several")
+    in_colour = parameters.preparation is Preparation.normalise_first
+    if in_colour and not all(d.index["recipe"].get("colour") == "rgb" for d in datasets):
+        raise DatasetError(
+            'training: expected data sets in colour (colour = "rgb") to normalise before averaging'
+        )
+
+
+def _model_config(parameters: TrainParameters) -> ModelConfig:
+    from payload_emulator.training.model.model import ModelConfig
+
+    return ModelConfig(
         parameters.pyramid_channels,
         parameters.detail_blocks,
         parameters.detail_channels,
@@ -100,85 +161,106 @@ def train(
         parameters.enlarge,
         str(parameters.preparation),
     )
-    network = CraterNet(config).to(device, memory_format=torch.channels_last)
-    average = copy.deepcopy(network).eval()
-    optimiser = torch.optim.AdamW(
-        _parameter_groups(network, parameters.weight_decay), lr=parameters.learning_rate, fused=True
-    )
-    state = _Progress()
-    origin: dict[str, Any] | None = None
-    checkpoint = run / "checkpoint.pt"
-    if checkpoint.is_file():
-        stored = torch.load(checkpoint, map_location=device, weights_only=False)
-        network.load_state_dict(stored["network"])
-        average.load_state_dict(stored["average"])
-        optimiser.load_state_dict(stored["optimiser"])
-        state = _Progress(**stored["progress"])
-        report(f"resumed at step {state.step}, {state.seconds / 60:.1f} min, best F1 {state.best_f1:.3f}")
-    elif start_from is not None:
-        origin = _start_from(start_from, network, average)
-        report(f"started from {start_from.name}")
-    in_colour = parameters.preparation is Preparation.normalise_first
-    if in_colour and not all(d.index["recipe"].get("colour") == "rgb" for d in datasets):
-        raise DatasetError(
-            'training: expected data sets in colour (colour = "rgb") to normalise before averaging'
-        )
-    images = _load_images(train_frames, report, in_colour)
-    _write_run(run, parameters, datasets, config.to_dict(), replicas, device, origin)
-    feeder = Feeder(train_frames, images, parameters)
-    if origin is not None and start_from is not None and start_from.suffix == ".onnx":
-        count_statistics(network, feeder, average)
-    team = _Team(network, replicas, device, parameters)
+
+
+def _optimise(
+    team: _Team,
+    feeder: Feeder,
+    files: _RunFiles,
+    state: _Progress,
+    validate: Callable[[], dict[str, float]],
+    *,
+    learns_blindly: bool,
+    report: Callable[[str], None],
+) -> None:
+    """Take steps until the budget is spent or validations bring no gain; validate and save at intervals.
+
+    Without validation frames (``learns_blindly``) the newest weights count as the best.
+    """
+    parameters = team.parameters
     shown = _Shown()
     began = time.monotonic() - state.seconds
     last_saved = last_validated = time.monotonic()
-
     while not _finished(state, parameters):
         rate = _learning_rate(state, parameters)
-        for group in optimiser.param_groups:
+        for group in files.optimiser.param_groups:
             group["lr"] = rate
-        terms = team.step(feeder, state.step, optimiser)
+        terms = team.step(feeder, state.step, files.optimiser)
         state.step += 1
         state.seconds = time.monotonic() - began
-        _update_average(
-            average, network, min(parameters.average_decay, (1.0 + state.step) / (10.0 + state.step))
-        )
+        decay = min(parameters.average_decay, (1.0 + state.step) / (10.0 + state.step))
+        _update_average(files.average, files.network, decay)
         shown.add(terms)
         if state.step % 50 == 0:
-            line = shown.line(state, rate, parameters.batch)
-            report(line)
+            report(shown.line(state, rate, parameters.batch))
         now = time.monotonic()
         if now - last_validated > 60.0 * parameters.validate_every_minutes or _finished(state, parameters):
-            last_validated = now
-            figures = _validate(average, validation, parameters.validation_frames, device)
-            append_curve(run, state.step, state.seconds / 60.0, shown.last, figures)
+            last_validated = last_saved = now
+            figures = validate()
+            append_curve(files.run, state.step, state.seconds / 60.0, shown.last, figures)
             report(
                 f"validation at {state.seconds / 60:.1f} min: F1 {figures['f1']:.3f} (P {figures['precision']:.3f} "
                 f"R {figures['recall']:.3f} loc {figures['loc_px']:.2f} px, threshold {figures['threshold']:.2f})"
             )
-            if not validation or figures["f1"] >= state.best_f1:
+            if learns_blindly or figures["f1"] >= state.best_f1:
                 state.best_f1, state.best_step, state.stale = figures["f1"], state.step, 0
-                _save(run / "best.pt", network, average, None, state, config.to_dict(), figures)
+                files.save_best(state, figures)
             else:
                 state.stale += 1
-            _save(checkpoint, network, average, optimiser, state, config.to_dict(), figures)
-            last_saved = now
+            files.save(state, figures)
             if parameters.patience and state.stale >= parameters.patience:
                 report(f"stopped early: {state.stale} validations without gain")
                 break
         elif now - last_saved > 60.0:
-            _save(checkpoint, network, average, optimiser, state, config.to_dict(), {})
+            files.save(state, {})
             last_saved = now
-    _save(checkpoint, network, average, optimiser, state, config.to_dict(), {})
-    draw_curves(run)
-    return {
-        "best": {"f1": state.best_f1, "step": state.best_step},
-        "steps": state.step,
-        "minutes": state.seconds / 60.0,
-        "images_per_s": state.step * parameters.batch / max(state.seconds, 1e-9),
-        "train_frames": len(train_frames),
-        "validation_frames": len(validation),
-    }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _RunFiles:
+    """What a run saves: network, running average of its weights and optimiser, in the files of its folder."""
+
+    run: Path
+    network: Any
+    average: Any
+    optimiser: Any
+    config: dict[str, Any]
+
+    @property
+    def checkpoint(self) -> Path:
+        return self.run / "checkpoint.pt"
+
+    def resume(self, device: str) -> _Progress:
+        """Give networks and optimiser the state of the checkpoint; return its progress."""
+        import torch
+
+        stored = torch.load(self.checkpoint, map_location=device, weights_only=False)
+        self.network.load_state_dict(stored["network"])
+        self.average.load_state_dict(stored["average"])
+        self.optimiser.load_state_dict(stored["optimiser"])
+        return _Progress(**stored["progress"])
+
+    def save(self, state: _Progress, figures: dict[str, float]) -> None:
+        """Write the checkpoint, from which a run can be resumed."""
+        self._write(self.checkpoint, state, figures, {"optimiser": self.optimiser.state_dict()})
+
+    def save_best(self, state: _Progress, figures: dict[str, float]) -> None:
+        """Write the weights of the best validation."""
+        self._write(self.run / "best.pt", state, figures, {})
+
+    def _write(self, path: Path, state: _Progress, figures: dict[str, float], more: dict[str, Any]) -> None:
+        import torch
+
+        document = {
+            "network": self.network.state_dict(),
+            "average": self.average.state_dict(),
+            "progress": asdict(state),
+            "config": self.config,
+            "figures": figures,
+        }
+        unfinished = path.with_suffix(".unfinished")
+        torch.save(document | more, unfinished)
+        unfinished.replace(path)
 
 
 @dataclass(slots=True)
@@ -394,31 +476,6 @@ def _load_images(
     images = [dataset.image(frame) if in_colour else dataset.gray(frame) for dataset, frame in frames]
     report(f"{len(images)} training images loaded in {time.monotonic() - began:.1f} s")
     return images
-
-
-def _save(
-    path: Path,
-    network: Any,
-    average: Any,
-    optimiser: Any,
-    state: _Progress,
-    config: dict[str, Any],
-    figures: dict[str, float],
-) -> None:
-    import torch
-
-    document = {
-        "network": network.state_dict(),
-        "average": average.state_dict(),
-        "progress": asdict(state),
-        "config": config,
-        "figures": figures,
-    }
-    if optimiser is not None:
-        document["optimiser"] = optimiser.state_dict()
-    unfinished = path.with_suffix(".unfinished")
-    torch.save(document, unfinished)
-    unfinished.replace(path)
 
 
 def _write_run(
