@@ -126,6 +126,12 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
     app.state.operations = [route for one in routers for route in one.routes if isinstance(route, Route)]
     app.state.metrics = Metrics()
     problems.install(app)
+    _add_middleware(app, settings, budgets)
+    return app
+
+
+def _add_middleware(app: FastAPI, settings: Settings, budgets: SharedBudgets | None) -> None:
+    """Add what runs around each request; the last one added runs first."""
     app.add_middleware(
         BodyLimit,
         upload_paths=tuple(
@@ -139,7 +145,6 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
     app.add_middleware(HeadersAndTags)
     app.add_middleware(Watch, metrics=app.state.metrics)
     app.add_middleware(ForwardedHeaders, proxies=TrustedProxies(settings.trusted_proxies))
-    return app
 
 
 def shared_budgets(settings: Settings) -> SharedBudgets | None:

@@ -174,8 +174,24 @@ def differences(
     shop: Workshop,
 ) -> tuple[Difference, ...]:
     """Return every difference between the paper and this run, each with one sentence."""
-    first = sessions[0]
-    rows = [
+    rows = [*_orbit_differences(orbit, classes, fov, sessions[0], shop), *_image_differences(samples, shop)]
+    if any(d.name == CLASS_ONLY for d in detectors):
+        rows.append(
+            Difference(
+                "Class-only head",
+                "15 h of training on an RTX 4060",
+                f"{shop.effort.training_steps} steps on a CPU",
+                "Both networks give class heatmaps and offsets; this one starts from the shipped weights and sees "
+                f"{shop.effort.method_frames} images, so precision and recall are those of a short training.",
+            )
+        )
+    return (*rows, *_METHOD_DIFFERENCES)
+
+
+def _orbit_differences(
+    orbit: PaperOrbit, classes: CatalogueClasses, fov: FovCurves, first: PaperSession, shop: Workshop
+) -> list[Difference]:
+    return [
         Difference(
             "Images of the session",
             f"{count_text(published.SESSION_FRAMES)} in about 24 h",
@@ -203,6 +219,11 @@ def differences(
             "The smallest field with three craters in over 90 % of positions depends on the catalogue's density and "
             "on which positions it covers.",
         ),
+    ]
+
+
+def _image_differences(samples: int, shop: Workshop) -> list[Difference]:
+    return [
         Difference(
             "Pictures",
             "Blender Cycles on SLDEM2015 at 256 px/deg",
@@ -224,40 +245,31 @@ def differences(
             "The photograph is not a public data product of this project, so only the rendered view is shown.",
         ),
     ]
-    if any(d.name == CLASS_ONLY for d in detectors):
-        rows.append(
-            Difference(
-                "Class-only head",
-                "15 h of training on an RTX 4060",
-                f"{shop.effort.training_steps} steps on a CPU",
-                "Both networks give class heatmaps and offsets; this one starts from the shipped weights and sees "
-                f"{shop.effort.method_frames} images, so precision and recall are those of a short training.",
-            )
-        )
-    rows += [
-        Difference(
-            "Planar and spherical",
-            "projection onto a plane",
-            "both are flown",
-            "At 120° the edge of an image is 3 % farther on the sphere than on a plane (30 km), which the planar "
-            "odometry reads as motion; the spherical one removes this error.",
-        ),
-        Difference(
-            "Reference",
-            "the simulator's truth",
-            "an uploaded ephemeris with orbit-determination errors",
-            "In flight nobody has the truth, so the ground compares with an ephemeris of 10, 30 and 15 m (1 sigma, "
-            "radial, along-track, cross-track).",
-        ),
-        Difference(
-            "Resets",
-            "at time gaps and on time-out, to the truth",
-            "the same triggers, reads counted",
-            "The reset rules are those of Section VI-C, with the optional time-out at 300 s; each read of the anchor "
-            "ephemeris is counted and downlinked.",
-        ),
-    ]
-    return tuple(rows)
+
+
+_METHOD_DIFFERENCES = (
+    Difference(
+        "Planar and spherical",
+        "projection onto a plane",
+        "both are flown",
+        "At 120° the edge of an image is 3 % farther on the sphere than on a plane (30 km), which the planar "
+        "odometry reads as motion; the spherical one removes this error.",
+    ),
+    Difference(
+        "Reference",
+        "the simulator's truth",
+        "an uploaded ephemeris with orbit-determination errors",
+        "In flight nobody has the truth, so the ground compares with an ephemeris of 10, 30 and 15 m (1 sigma, "
+        "radial, along-track, cross-track).",
+    ),
+    Difference(
+        "Resets",
+        "at time gaps and on time-out, to the truth",
+        "the same triggers, reads counted",
+        "The reset rules are those of Section VI-C, with the optional time-out at 300 s; each read of the anchor "
+        "ephemeris is counted and downlinked.",
+    ),
+)
 
 
 def _verdict(sessions: Sequence[PaperSession]) -> str:

@@ -237,3 +237,31 @@ def test_compiled_functions_use_no_linear_algebra_of_numba_which_asks_for_scipy(
         or (isinstance(part, ast.Attribute) and ast.unparse(part) in ("np.linalg", "np.dot", "np.vdot"))
     ]
     assert asking == []
+
+
+LONGEST_FUNCTION = 80
+
+
+def long_functions(root: Path) -> list[str]:
+    """Functions of the product with more lines than `LONGEST_FUNCTION`, docstring and arguments included."""
+    return [
+        f"{name}.{node.name}: {node.end_lineno - node.lineno + 1} lines"
+        for name, file in modules_of(root).items()
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        and node.end_lineno is not None
+        and node.end_lineno - node.lineno >= LONGEST_FUNCTION
+    ]
+
+
+def test_no_function_of_the_product_is_longer_than_eighty_lines() -> None:
+    assert long_functions(ROOT) == []
+
+
+def test_a_planted_function_of_one_line_more_is_found(tmp_path: Path) -> None:
+    (tmp_path / "lunar").mkdir()
+    file = tmp_path / "lunar" / "planted.py"
+    file.write_text("async def longest():\n" + "    pass\n" * (LONGEST_FUNCTION - 1))
+    assert long_functions(tmp_path) == []
+    file.write_text("async def longer():\n" + "    pass\n" * LONGEST_FUNCTION)
+    assert long_functions(tmp_path) == ["lunar.planted.longer: 81 lines"]

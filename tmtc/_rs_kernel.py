@@ -118,60 +118,98 @@ def correct(
         degree = _locate(syndromes, parity, errors, locator, before, kept, exponent, logarithm)
         if degree > errors:
             continue
-        # the locator at every place at once
-        sums[:] = 0
-        for k in range(degree + 1):
-            row = place_table[k, locator[k]]
-            for lane in range(32):
-                sums[lane] ^= row[lane]
-        number = 0
-        for place in range(CODEWORD):
-            if sum_octets[place] == 0:
-                if number == degree or place < fill:
-                    number = -1
-                    break
-                found[number] = place
-                number += 1
-        if number != degree:
+        if not _find_places(locator, degree, fill, place_table, sums, sum_octets, found):
             continue
-        # the evaluator: the product of syndromes and locator, powers below the degree
-        for k in range(degree):
-            total = np.uint8(0)
-            for j in range(k + 1):
-                if locator[j] and syndromes[k - j]:
-                    total ^= exponent[logarithm[locator[j]] + logarithm[syndromes[k - j]]]
-            evaluator[k] = total
-        good = True
-        for i in range(degree):
-            place = found[i]
-            inverse = (255 - places[place]) % 255
-            numerator = np.uint8(0)
-            power = 0
-            for k in range(degree):
-                if evaluator[k]:
-                    numerator ^= exponent[logarithm[evaluator[k]] + power]
-                power += inverse
-                if power >= 255:
-                    power -= 255
-            # the odd terms of the locator are its derivative divided by the place
-            odd = np.uint8(0)
-            power = inverse
-            step = 2 * inverse % 255
-            for k in range(1, degree + 1, 2):
-                if locator[k]:
-                    odd ^= exponent[logarithm[locator[k]] + power]
-                power += step
-                if power >= 255:
-                    power -= 255
-            if numerator == 0 or odd == 0:
-                good = False
-                break
-            values[i] = exponent[(logarithm[numerator] + 255 - logarithm[odd] + offsets[place]) % 255]
-        if not good:
+        _evaluate(syndromes, locator, degree, evaluator, exponent, logarithm)
+        if not _error_values(found, locator, evaluator, degree, exponent, logarithm, places, offsets, values):
             continue
         for i in range(degree):
             word[found[i]] ^= values[i]
         counts[n] = degree
+
+
+@njit
+def _find_places(
+    locator: RecordArray,
+    degree: int,
+    fill: int,
+    place_table: RecordArray,
+    sums: RecordArray,
+    sum_octets: RecordArray,
+    found: RecordArray,
+) -> bool:
+    """Write the roots of the locator, evaluated at every place at once; False unless there are as many as its degree."""
+    sums[:] = 0
+    for k in range(degree + 1):
+        row = place_table[k, locator[k]]
+        for lane in range(32):
+            sums[lane] ^= row[lane]
+    number = 0
+    for place in range(CODEWORD):
+        if sum_octets[place] == 0:
+            if number == degree or place < fill:
+                return False
+            found[number] = place
+            number += 1
+    return number == degree
+
+
+@njit
+def _evaluate(
+    syndromes: RecordArray,
+    locator: RecordArray,
+    degree: int,
+    evaluator: RecordArray,
+    exponent: RecordArray,
+    logarithm: RecordArray,
+) -> None:
+    """Write the evaluator: the product of syndromes and locator, powers below the degree."""
+    for k in range(degree):
+        total = np.uint8(0)
+        for j in range(k + 1):
+            if locator[j] and syndromes[k - j]:
+                total ^= exponent[logarithm[locator[j]] + logarithm[syndromes[k - j]]]
+        evaluator[k] = total
+
+
+@njit
+def _error_values(
+    found: RecordArray,
+    locator: RecordArray,
+    evaluator: RecordArray,
+    degree: int,
+    exponent: RecordArray,
+    logarithm: RecordArray,
+    places: RecordArray,
+    offsets: RecordArray,
+    values: RecordArray,
+) -> bool:
+    """Write the errors at the found places by Forney's formula; False if one of them is zero or undefined."""
+    for i in range(degree):
+        place = found[i]
+        inverse = (255 - places[place]) % 255
+        numerator = np.uint8(0)
+        power = 0
+        for k in range(degree):
+            if evaluator[k]:
+                numerator ^= exponent[logarithm[evaluator[k]] + power]
+            power += inverse
+            if power >= 255:
+                power -= 255
+        # the odd terms of the locator are its derivative divided by the place
+        odd = np.uint8(0)
+        power = inverse
+        step = 2 * inverse % 255
+        for k in range(1, degree + 1, 2):
+            if locator[k]:
+                odd ^= exponent[logarithm[locator[k]] + power]
+            power += step
+            if power >= 255:
+                power -= 255
+        if numerator == 0 or odd == 0:
+            return False
+        values[i] = exponent[(logarithm[numerator] + 255 - logarithm[odd] + offsets[place]) % 255]
+    return True
 
 
 @njit

@@ -57,101 +57,110 @@ _FRAME = (
 _OCTETS = (Field("octet", "u8", "One octet of the part"),)
 
 
+_HOUSEKEEPING = PacketDefinition(
+    "housekeeping", APID_HOUSEKEEPING, 3, 25, "Periodic state of the payload",
+    (
+        Field("structure_id", "u16", "Housekeeping structure, always 1", minimum=1, maximum=1),
+        Field("boot_count", "u16", "Boots since manufacture"),
+        Field("mode", "u8", "Mode of the payload", labels=MODES),
+        Field("frames_processed", "u32", "Frames handed to the detector since boot"),
+        Field("frames_bad", "u32", "Frames refused for their image quality since boot"),
+        Field("detections_total", "u32", "Craters detected since boot"),
+        Field("packets_sent", "u32", "Telemetry packets made since boot"),
+        Field("anchor_reads", "u32", "Reads of the anchor ephemeris since boot, all estimators"),
+        Field("events_sent", "u32", "Event packets made since boot"),
+        Field("telecommands_accepted", "u16", "Telecommands accepted since boot"),
+        Field("telecommands_rejected", "u16", "Telecommands rejected since boot"),
+        Field("last_image_quality", "u8", "Verdict on the last image", labels=IMAGE_QUALITIES),
+        Field(
+            "temperature_c", "i16", "Temperature of the processor board", "degC", scale=0.01,
+            saturate=True, warning=(-20.0, 60.0), alarm=(-40.0, 85.0),
+        ),
+        Field(
+            "bus_voltage_v", "u16", "Voltage of the supply bus", "V", scale=0.001, saturate=True,
+            warning=(11.0, 13.0), alarm=(10.0, 14.0),
+        ),
+        Field(
+            "power_w", "u16", "Power drawn by the payload", "W", scale=0.01, saturate=True,
+            warning=(0.0, 15.0), alarm=(0.0, 20.0),
+        ),
+        Field("memory_used_kib", "u32", "Memory in use", "KiB"),
+        Field("queue_depth", "u16", "Telemetry packets waiting for downlink"),
+        Field(
+            "storage_used_permille", "u16", "Packet store in use", "1/1000", maximum=1000,
+            warning=(0.0, 800.0), alarm=(0.0, 950.0),
+        ),
+        Field("model_hash", "u32", "First 32 bits of the SHA-256 of the detector model"),
+        Field("parameters_hash", "u32", "First 32 bits of the SHA-256 of the parameter table"),
+        Field("catalogue_hash", "u32", "First 32 bits of the SHA-256 of the catalogue table"),
+        Field("anchor_table_hash", "u32", "First 32 bits of the SHA-256 of the anchor ephemeris"),
+        Field("clock_status", "u8", "State of the on-board clock", labels=CLOCK_STATES),
+        Field("watchdog_resets", "u16", "Resets by the watchdog since manufacture"),
+    ),
+)  # fmt: skip
+
+_FRAME_PACKETS = (
+    PacketDefinition(
+        "detections", APID_DETECTIONS, 129, 1, "Craters detected in one frame",
+        (
+            *_FRAME,
+            Field("image_quality", "u8", "Verdict on the image", labels=IMAGE_QUALITIES),
+            Field("count", "u8", "Number of detections that follow"),
+        ),
+        Group(
+            "count",
+            (
+                Field("u_px", "u16", "Centre, rightwards, pixel centres at integers", "px", scale=1 / 64),
+                Field("v_px", "u16", "Centre, downwards, pixel centres at integers", "px", scale=1 / 64),
+                Field("diameter_px", "u16", "Apparent diameter", "px", scale=1 / 64, saturate=True),
+                Field("score", "u8", "Confidence", scale=1 / 255, minimum=0.0, maximum=1.0),
+                Field("size_class", "i8", "Size class by the on-board range", labels=SIZE_CLASSES),
+                Field(
+                    "sigma_px", "u8", "Standard deviation of the centre, each axis", "px", scale=1 / 64,
+                    missing=255, saturate=True,
+                ),
+            ),
+        ),
+    ),
+    PacketDefinition(
+        "navigation_state", APID_NAVIGATION_STATE, 129, 2, "Position of one estimator after one frame",
+        (
+            *_FRAME,
+            Field("estimator", "u8", "Which estimator speaks", labels=ESTIMATORS),
+            Field("outcome", "u8", "How the state came about", labels=OUTCOMES),
+            Field("latitude_deg", "f64", "Latitude, mean-Earth frame", "deg"),
+            Field("longitude_deg", "f64", "Longitude, mean-Earth frame", "deg"),
+            Field("altitude_m", "f64", "Height above the 1737.4 km sphere", "m"),
+            Field("velocity_icrf_m_s", "f32", "Velocity, ICRF axes; NaN if not estimated", "m/s", size=3),
+            Field("sigma_rtn_m", "f32", "Standard deviations: radial, transverse, normal", "m", size=3),
+            Field("nis", "f32", "Normalised innovation squared of the last update, NaN without one"),
+            Field("matched", "u8", "Detections used", saturate=True),
+        ),
+    ),
+    PacketDefinition(
+        "frame_outcome", APID_FRAME_OUTCOME, 129, 3, "What one estimator did with one frame",
+        (
+            *_FRAME,
+            Field("estimator", "u8", "Which estimator speaks", labels=ESTIMATORS),
+            Field("outcome", "u8", "Outcome of the frame", labels=OUTCOMES),
+            Field("reset_trigger", "u8", "Why the estimator was re-anchored", labels=RESET_TRIGGERS),
+            Field("detections", "u8", "Detections offered", saturate=True),
+            Field("candidate_pairs", "u16", "Pairs that passed the motion bounds", saturate=True),
+            Field("pairs", "u8", "Pairs used in the solution", saturate=True),
+            Field("shift_east_m", "f32", "Ground shift since the frame before, NaN without one", "m"),
+            Field("shift_north_m", "f32", "Ground shift since the frame before, NaN without one", "m"),
+            Field("anchor_reads", "u32", "Reads of the anchor ephemeris by this estimator so far"),
+        ),
+    ),
+)  # fmt: skip
+
+
 def _telemetry(events: Labels, failures: Labels, tables: Labels) -> tuple[PacketDefinition, ...]:
+    return (_HOUSEKEEPING, *_FRAME_PACKETS, *_reports(events, failures, tables))
+
+
+def _reports(events: Labels, failures: Labels, tables: Labels) -> tuple[PacketDefinition, ...]:
     return (
-        PacketDefinition(
-            "housekeeping", APID_HOUSEKEEPING, 3, 25, "Periodic state of the payload",
-            (
-                Field("structure_id", "u16", "Housekeeping structure, always 1", minimum=1, maximum=1),
-                Field("boot_count", "u16", "Boots since manufacture"),
-                Field("mode", "u8", "Mode of the payload", labels=MODES),
-                Field("frames_processed", "u32", "Frames handed to the detector since boot"),
-                Field("frames_bad", "u32", "Frames refused for their image quality since boot"),
-                Field("detections_total", "u32", "Craters detected since boot"),
-                Field("packets_sent", "u32", "Telemetry packets made since boot"),
-                Field("anchor_reads", "u32", "Reads of the anchor ephemeris since boot, all estimators"),
-                Field("events_sent", "u32", "Event packets made since boot"),
-                Field("telecommands_accepted", "u16", "Telecommands accepted since boot"),
-                Field("telecommands_rejected", "u16", "Telecommands rejected since boot"),
-                Field("last_image_quality", "u8", "Verdict on the last image", labels=IMAGE_QUALITIES),
-                Field(
-                    "temperature_c", "i16", "Temperature of the processor board", "degC", scale=0.01,
-                    saturate=True, warning=(-20.0, 60.0), alarm=(-40.0, 85.0),
-                ),
-                Field(
-                    "bus_voltage_v", "u16", "Voltage of the supply bus", "V", scale=0.001, saturate=True,
-                    warning=(11.0, 13.0), alarm=(10.0, 14.0),
-                ),
-                Field(
-                    "power_w", "u16", "Power drawn by the payload", "W", scale=0.01, saturate=True,
-                    warning=(0.0, 15.0), alarm=(0.0, 20.0),
-                ),
-                Field("memory_used_kib", "u32", "Memory in use", "KiB"),
-                Field("queue_depth", "u16", "Telemetry packets waiting for downlink"),
-                Field(
-                    "storage_used_permille", "u16", "Packet store in use", "1/1000", maximum=1000,
-                    warning=(0.0, 800.0), alarm=(0.0, 950.0),
-                ),
-                Field("model_hash", "u32", "First 32 bits of the SHA-256 of the detector model"),
-                Field("parameters_hash", "u32", "First 32 bits of the SHA-256 of the parameter table"),
-                Field("catalogue_hash", "u32", "First 32 bits of the SHA-256 of the catalogue table"),
-                Field("anchor_table_hash", "u32", "First 32 bits of the SHA-256 of the anchor ephemeris"),
-                Field("clock_status", "u8", "State of the on-board clock", labels=CLOCK_STATES),
-                Field("watchdog_resets", "u16", "Resets by the watchdog since manufacture"),
-            ),
-        ),
-        PacketDefinition(
-            "detections", APID_DETECTIONS, 129, 1, "Craters detected in one frame",
-            (
-                *_FRAME,
-                Field("image_quality", "u8", "Verdict on the image", labels=IMAGE_QUALITIES),
-                Field("count", "u8", "Number of detections that follow"),
-            ),
-            Group(
-                "count",
-                (
-                    Field("u_px", "u16", "Centre, rightwards, pixel centres at integers", "px", scale=1 / 64),
-                    Field("v_px", "u16", "Centre, downwards, pixel centres at integers", "px", scale=1 / 64),
-                    Field("diameter_px", "u16", "Apparent diameter", "px", scale=1 / 64, saturate=True),
-                    Field("score", "u8", "Confidence", scale=1 / 255, minimum=0.0, maximum=1.0),
-                    Field("size_class", "i8", "Size class by the on-board range", labels=SIZE_CLASSES),
-                    Field(
-                        "sigma_px", "u8", "Standard deviation of the centre, each axis", "px", scale=1 / 64,
-                        missing=255, saturate=True,
-                    ),
-                ),
-            ),
-        ),
-        PacketDefinition(
-            "navigation_state", APID_NAVIGATION_STATE, 129, 2, "Position of one estimator after one frame",
-            (
-                *_FRAME,
-                Field("estimator", "u8", "Which estimator speaks", labels=ESTIMATORS),
-                Field("outcome", "u8", "How the state came about", labels=OUTCOMES),
-                Field("latitude_deg", "f64", "Latitude, mean-Earth frame", "deg"),
-                Field("longitude_deg", "f64", "Longitude, mean-Earth frame", "deg"),
-                Field("altitude_m", "f64", "Height above the 1737.4 km sphere", "m"),
-                Field("velocity_icrf_m_s", "f32", "Velocity, ICRF axes; NaN if not estimated", "m/s", size=3),
-                Field("sigma_rtn_m", "f32", "Standard deviations: radial, transverse, normal", "m", size=3),
-                Field("nis", "f32", "Normalised innovation squared of the last update, NaN without one"),
-                Field("matched", "u8", "Detections used", saturate=True),
-            ),
-        ),
-        PacketDefinition(
-            "frame_outcome", APID_FRAME_OUTCOME, 129, 3, "What one estimator did with one frame",
-            (
-                *_FRAME,
-                Field("estimator", "u8", "Which estimator speaks", labels=ESTIMATORS),
-                Field("outcome", "u8", "Outcome of the frame", labels=OUTCOMES),
-                Field("reset_trigger", "u8", "Why the estimator was re-anchored", labels=RESET_TRIGGERS),
-                Field("detections", "u8", "Detections offered", saturate=True),
-                Field("candidate_pairs", "u16", "Pairs that passed the motion bounds", saturate=True),
-                Field("pairs", "u8", "Pairs used in the solution", saturate=True),
-                Field("shift_east_m", "f32", "Ground shift since the frame before, NaN without one", "m"),
-                Field("shift_north_m", "f32", "Ground shift since the frame before, NaN without one", "m"),
-                Field("anchor_reads", "u32", "Reads of the anchor ephemeris by this estimator so far"),
-            ),
-        ),
         *(
             PacketDefinition(
                 f"event_{severity}", APID_EVENTS, 5, subtype, f"Event report, {meaning}",
@@ -367,6 +376,12 @@ def _second_telemetry() -> tuple[PacketDefinition, ...]:
                 ),
             ),
         ),
+        *_machine_telemetry(),
+    )  # fmt: skip
+
+
+def _machine_telemetry() -> tuple[PacketDefinition, ...]:
+    return (
         PacketDefinition(
             "performance", APID_PERFORMANCE, 3, 25, "Periodic state of the machine",
             (

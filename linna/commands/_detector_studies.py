@@ -73,6 +73,12 @@ def configure(verbs: Any) -> None:
     add_json_flag(choose)
     choose.set_defaults(handler=_choose)
 
+    _add_ablate(verbs)
+
+
+def _add_ablate(verbs: Any) -> None:
+    from linna.output import add_json_flag
+
     ablate = verbs.add_parser(
         "ablate", help="train the recipe with one thing changed at a time, at equal small budgets"
     )

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from linna.output import emit, log, progress
 
 if TYPE_CHECKING:
-    from studies.lost_in_space import Share
+    from studies.lost_in_space import LostRow, Share
 
 LEAST_CATALOGUED = 6
 
 
 def run(arguments: argparse.Namespace) -> int:
     import math
-
-    import numpy as np
 
     from linna.data import data_folder
     from linna.errors import UsageError
@@ -29,12 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
     from payload_emulator.session.world import build_world
     from studies import lost_in_space as study
 
-    if arguments.frames < FRAMES_COMBINED:
-        raise UsageError(f"--frames: expected at least {FRAMES_COMBINED}, found {arguments.frames}")
-    if not 1.0 <= arguments.min_diameter_km <= 20.0:
-        raise UsageError(f"--min-diameter-km: expected 1 to 20, found {arguments.min_diameter_km:g}")
-    if not 0.0 < arguments.attitude_deg <= 2.0:
-        raise UsageError(f"--attitude-deg: expected above 0 and up to 2, found {arguments.attitude_deg:g}")
+    _check(arguments, FRAMES_COMBINED)
     scenario = study.pointed(load_scenario(arguments.scenario), arguments.attitude_deg)
     world = build_world(scenario, data_folder())
     numbers = study.frames_in_sets(world, math.ceil(arguments.frames / FRAMES_COMBINED))
@@ -67,9 +61,6 @@ def run(arguments: argparse.Namespace) -> int:
         "all sets of four": study.share(sets),
         f"sets, {LEAST_CATALOGUED} known in each": study.share(sets, LEAST_CATALOGUED),
     }
-    errors = np.array([row.error_m for row in single])
-    right = errors[errors <= study.WRONG_PLACE_M]
-    spent = np.array([row.cpu_s for row in single])
     unseen = unseen_share(world)
     found = level_of("real-terrain" if world.terrain.is_real else "procedural", unseen)
     level = f"level {level_text(found, unseen)}: frames rendered along {scenario.name}, the shipped detector"
@@ -83,12 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
             {"from_km": low, "to_km": None if math.isinf(high) else high, **_as_json(row)}
             for low, high, row in study.by_altitude(single, LEAST_CATALOGUED)
         ],
-        "median_error_m": float(np.median(right)) if right.size else None,
-        "p95_error_m": float(np.percentile(right, 95.0)) if right.size else None,
-        "median_cpu_s": float(np.median(spent)),
-        "largest_cpu_s": float(np.max(spent)),
-        "catalogued_per_frame": float(np.mean([row.catalogued for row in single])),
-        "detections_per_frame": float(np.mean([row.detections for row in single])),
+        **_statistics(single, study.WRONG_PLACE_M),
         "craters": len(board),
         "min_diameter_km": arguments.min_diameter_km,
         "attitude_sigma_deg": arguments.attitude_deg,
@@ -100,23 +86,51 @@ def run(arguments: argparse.Namespace) -> int:
         "level": level,
         "data": list(world.data_names),
     }
-    lines = [f"{'':<24}{'searches':>9}{'correct':>9}{'share':>8}{'wrong':>7}"]
-    lines += [
-        f"{name:<24}{row.searches:>9}{row.correct:>9}{100 * row.correct_share:>7.1f}%{row.wrong:>7}"
-        for name, row in rows.items()
-    ]
-    lines += [
-        f"  {low:.0f} to {high:.0f} km".ljust(24)
-        + f"{row.searches:>9}{row.correct:>9}{100 * row.correct_share:>7.1f}%{row.wrong:>7}"
-        for low, high, row in study.by_altitude(single, LEAST_CATALOGUED)
-    ]
-    lines.append(
+    table = _table(rows, study.by_altitude(single, LEAST_CATALOGUED))
+    last = (
         f"{figures['catalogued_per_frame']:.1f} of {figures['detections_per_frame']:.1f} detections a frame are of "
         f"the {len(board)} craters of the map; {figures['median_cpu_s']:.2f} s "
         f"(largest {figures['largest_cpu_s']:.2f}) a search"
     )
-    emit(arguments, figures, text="\n".join([*lines, level]))
+    emit(arguments, figures, text="\n".join([*table, last, level]))
     return 0
+
+
+def _statistics(single: Sequence[LostRow], wrong_m: float) -> dict[str, float | None]:
+    """Return errors of the frames placed within ``wrong_m``, processor times, and counts per frame."""
+    import numpy as np
+
+    errors = np.array([row.error_m for row in single])
+    right = errors[errors <= wrong_m]
+    spent = np.array([row.cpu_s for row in single])
+    return {
+        "median_error_m": float(np.median(right)) if right.size else None,
+        "p95_error_m": float(np.percentile(right, 95.0)) if right.size else None,
+        "median_cpu_s": float(np.median(spent)),
+        "largest_cpu_s": float(np.max(spent)),
+        "catalogued_per_frame": float(np.mean([row.catalogued for row in single])),
+        "detections_per_frame": float(np.mean([row.detections for row in single])),
+    }
+
+
+def _check(arguments: argparse.Namespace, least_frames: int) -> None:
+    from linna.errors import UsageError
+
+    if arguments.frames < least_frames:
+        raise UsageError(f"--frames: expected at least {least_frames}, found {arguments.frames}")
+    if not 1.0 <= arguments.min_diameter_km <= 20.0:
+        raise UsageError(f"--min-diameter-km: expected 1 to 20, found {arguments.min_diameter_km:g}")
+    if not 0.0 < arguments.attitude_deg <= 2.0:
+        raise UsageError(f"--attitude-deg: expected above 0 and up to 2, found {arguments.attitude_deg:g}")
+
+
+def _table(rows: dict[str, Share], by_altitude: Iterable[tuple[float, float, Share]]) -> list[str]:
+    """Return the lines of a table of correct and wrong searches."""
+    named = [*rows.items(), *((f"  {low:.0f} to {high:.0f} km", row) for low, high, row in by_altitude)]
+    return [f"{'':<24}{'searches':>9}{'correct':>9}{'share':>8}{'wrong':>7}"] + [
+        f"{name:<24}{row.searches:>9}{row.correct:>9}{100 * row.correct_share:>7.1f}%{row.wrong:>7}"
+        for name, row in named
+    ]
 
 
 def _as_json(row: Share) -> dict[str, Any]:

@@ -17,9 +17,21 @@ from linna.commands._detector_common import (
 
 def configure(parser: argparse.ArgumentParser) -> None:
     from linna.commands import _detector_domain, _detector_make, _detector_studies
-    from linna.output import add_json_flag
 
     verbs = parser.add_subparsers(title="verbs", required=True)
+
+    _add_train(verbs)
+    _add_export(verbs)
+    _add_evaluate(verbs)
+    _detector_studies.configure(verbs)
+    _detector_make.configure(verbs)
+    _detector_domain.configure(verbs)
+    _add_detect(verbs)
+    _add_bench_and_info(verbs)
+
+
+def _add_train(verbs: Any) -> None:
+    from linna.output import add_json_flag
 
     train = verbs.add_parser("train", help="train a network; resumes the run of the same folder")
     train.add_argument("datasets", type=Path, nargs="+", metavar="DATASET")
@@ -67,6 +79,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_json_flag(train)
     train.set_defaults(handler=_train)
 
+
+def _add_export(verbs: Any) -> None:
+    from linna.output import add_json_flag
+
     export = verbs.add_parser("export", help="write the ONNX network of a run, checked against torch")
     export.add_argument(
         "run", type=Path, metavar="RUN", help="folder of a run, a checkpoint file, or an exported network"
@@ -103,6 +119,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_json_flag(export)
     export.set_defaults(handler=_export)
 
+
+def _add_evaluate(verbs: Any) -> None:
+    from linna.output import add_json_flag
+
     evaluate = verbs.add_parser("evaluate", help="precision, recall and localisation on a data set")
     add_model(evaluate)
     evaluate.add_argument("--dataset", type=Path, nargs="+", required=True, metavar="DIR")
@@ -134,9 +154,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_json_flag(evaluate)
     evaluate.set_defaults(handler=_evaluate)
 
-    _detector_studies.configure(verbs)
-    _detector_make.configure(verbs)
-    _detector_domain.configure(verbs)
+
+def _add_detect(verbs: Any) -> None:
+    from linna.output import add_json_flag
 
     detect = verbs.add_parser("detect", help="craters in any PNG, TIFF or JPEG")
     detect.add_argument("images", type=Path, nargs="+", metavar="IMAGE")
@@ -151,6 +171,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     detect.add_argument("--threshold", type=float, default=None)
     add_json_flag(detect)
     detect.set_defaults(handler=_detect)
+
+
+def _add_bench_and_info(verbs: Any) -> None:
+    from linna.output import add_json_flag
 
     bench = verbs.add_parser("bench", help="latency and memory on this machine")
     add_model(bench)

@@ -34,6 +34,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default="some",
         help="images kept in the archive (default: eight of them)",
     )
+    _add_live(parser)
+    _add_continuous(parser)
+    parser.add_argument(
+        "--campaign", metavar="FILE", help="fly the fault campaign of a file, or a shipped one by name"
+    )
+    add_json_flag(parser)
+    parser.set_defaults(handler=run)
+
+
+def _add_live(parser: argparse.ArgumentParser) -> None:
     live = parser.add_argument_group("live", "the payload as a process to watch and to command over TCP")
     live.add_argument("--live", action="store_true", help="fly live instead of writing an archive")
     live.add_argument("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
@@ -66,6 +76,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="the ground commands: the scenario's own operator is silent",
     )
     live.add_argument("--stop-at-end", action="store_true", help="end with the scenario")
+
+
+def _add_continuous(parser: argparse.ArgumentParser) -> None:
     endless = parser.add_argument_group(
         "continuous",
         "the spacecraft in operation: images in commanded windows alone, contacts of the stations",
@@ -96,11 +109,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     endless.add_argument(
         "--operations", type=Path, metavar="FILE", help="TOML appended to the mission description"
     )
-    parser.add_argument(
-        "--campaign", metavar="FILE", help="fly the fault campaign of a file, or a shipped one by name"
-    )
-    add_json_flag(parser)
-    parser.set_defaults(handler=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
 from reports.document import Block, Column, Facts, Heading, Paragraph, Picture, Table
 from reports.figures import accounting
 from reports.sections.common import PassView, arc_words
 from reports.text import NOT_A_VALUE, computed_text, count_text, duration_text, percent_text, utc_text
-from reports.values import FrameAccounting, ReceptionQuality
+from reports.values import (
+    ApidAccounting,
+    CompletenessSeries,
+    FrameAccounting,
+    PacketAccounting,
+    ReceptionQuality,
+    TimeSpan,
+)
 
 _MOST_GAPS = 40
 
@@ -64,84 +73,106 @@ def _link_quality(receptions: tuple[ReceptionQuality, ...]) -> Table:
 
 def frames_and_packets(view: PassView) -> list[Block]:
     report = view.report
-    blocks: list[Block] = [Heading("Frames and packets")]
-    count = report.accounting
-    steps = _frame_steps(count) if count is not None else []
-    if count is None or not steps:
-        blocks.append(view.absent("accounting", "Frame accounting"))
-    else:
-        last = steps[-1]
-        bad = "" if not count.bad_image else f" {count.bad_image} could not be used as images."
-        blocks.append(
-            Picture(
-                "frames",
-                f"Frames left after each step. Of {count_text(steps[0][1])} {steps[0][0]}, {count_text(last[1])} "
-                f"({percent_text(last[1], steps[0][1])}) are {last[0]}.{bad}",
-                "Bars: " + ", ".join(f"{name} {n}" for name, n in steps),
-                0.28 + 0.27 * len(steps),
-                lambda c: accounting.draw_frame_steps(c, steps),
-            )
-        )
-        if count.quality:
-            words = ", ".join(f"{name} {count_text(n)}" for name, n in count.quality.items())
-            blocks.append(Paragraph(f"Image quality as judged on board: {words}.", small=True))
+    blocks: list[Block] = [Heading("Frames and packets"), *_frame_blocks(view)]
     packets = report.packets
     if packets is None:
-        blocks.append(view.absent("packets", "Packet accounting"))
-        return blocks
-    blocks.append(Heading("Downlink", 3))
-    blocks.append(
-        Facts(
+        return [*blocks, view.absent("packets", "Packet accounting")]
+    blocks += [Heading("Downlink", 3), _downlink_facts(packets)]
+    if packets.completeness is not None and len(packets.completeness.expected):
+        blocks.append(_completeness(view, packets.completeness))
+    if packets.by_apid:
+        blocks.append(_packets_by_apid(packets.by_apid))
+    if packets.receptions:
+        blocks.append(_link_quality(packets.receptions))
+    if report.gaps:
+        blocks.append(_gaps(report.gaps))
+    return blocks
+
+
+def _frame_blocks(view: PassView) -> list[Block]:
+    """Return the frames left after each step, and their image quality."""
+    count = view.report.accounting
+    steps = _frame_steps(count) if count is not None else []
+    if count is None or not steps:
+        return [view.absent("accounting", "Frame accounting")]
+    last = steps[-1]
+    bad = "" if not count.bad_image else f" {count.bad_image} could not be used as images."
+    blocks: list[Block] = [
+        Picture(
+            "frames",
+            f"Frames left after each step. Of {count_text(steps[0][1])} {steps[0][0]}, {count_text(last[1])} "
+            f"({percent_text(last[1], steps[0][1])}) are {last[0]}.{bad}",
+            "Bars: " + ", ".join(f"{name} {n}" for name, n in steps),
+            0.28 + 0.27 * len(steps),
+            lambda c: accounting.draw_frame_steps(c, steps),
+        )
+    ]
+    if count.quality:
+        words = ", ".join(f"{name} {count_text(n)}" for name, n in count.quality.items())
+        blocks.append(Paragraph(f"Image quality as judged on board: {words}.", small=True))
+    return blocks
+
+
+def _downlink_facts(packets: PacketAccounting) -> Facts:
+    return Facts(
+        (
             (
-                (
-                    "Packets received",
-                    f"{count_text(packets.packets)} ({percent_text(packets.packets, packets.expected, 2)} of "
-                    f"{count_text(packets.expected)} expected)",
-                ),
-                ("Packets lost in gaps", count_text(packets.lost)),
-                (
-                    "Packets lost at the edges",
-                    computed_text(packets.lost_at_edges, "not known without a plan"),
-                ),
-                (
-                    "Duplicates, conflicts",
-                    f"{computed_text(packets.duplicates)}, {count_text(packets.conflicts)}",
-                ),
-                ("Packets with CRC errors", computed_text(packets.crc_errors)),
-                (
-                    "Transfer frames, of these bad",
-                    f"{computed_text(packets.frames)}, {computed_text(packets.frames_bad)}",
-                ),
-                ("Symbols corrected", computed_text(packets.symbols_corrected)),
-                (
-                    "Octets, of these skipped",
-                    f"{computed_text(packets.octets)}, {computed_text(packets.octets_skipped)}",
-                ),
-            )
+                "Packets received",
+                f"{count_text(packets.packets)} ({percent_text(packets.packets, packets.expected, 2)} of "
+                f"{count_text(packets.expected)} expected)",
+            ),
+            ("Packets lost in gaps", count_text(packets.lost)),
+            ("Packets lost at the edges", computed_text(packets.lost_at_edges, "not known without a plan")),
+            (
+                "Duplicates, conflicts",
+                f"{computed_text(packets.duplicates)}, {count_text(packets.conflicts)}",
+            ),
+            ("Packets with CRC errors", computed_text(packets.crc_errors)),
+            (
+                "Transfer frames, of these bad",
+                f"{computed_text(packets.frames)}, {computed_text(packets.frames_bad)}",
+            ),
+            ("Symbols corrected", computed_text(packets.symbols_corrected)),
+            (
+                "Octets, of these skipped",
+                f"{computed_text(packets.octets)}, {computed_text(packets.octets_skipped)}",
+            ),
         )
     )
-    completeness = packets.completeness
-    if completeness is not None and len(completeness.expected):
-        faulty = int(np.sum(completeness.received < completeness.expected))
-        said = (
-            "Every interval is complete."
-            if not faulty
-            else f"{faulty} of {len(completeness.expected)} intervals are not complete."
-        )
-        blocks.append(
-            Picture(
-                "completeness",
-                f"Packets received of those expected, by on-board time. {said} Complete intervals are blue, others "
-                f"vermillion.{arc_words(view.time, report.imaging_arcs)}",
-                f"Completeness over time. {said}",
-                1.85,
-                lambda c: accounting.draw_completeness(
-                    c, completeness, view.time, report.imaging_arcs, report.gaps
-                ),
-            )
-        )
-    if packets.by_apid:
-        rows = tuple(
+
+
+def _completeness(view: PassView, completeness: CompletenessSeries) -> Picture:
+    report = view.report
+    faulty = int(np.sum(completeness.received < completeness.expected))
+    said = (
+        "Every interval is complete."
+        if not faulty
+        else f"{faulty} of {len(completeness.expected)} intervals are not complete."
+    )
+    return Picture(
+        "completeness",
+        f"Packets received of those expected, by on-board time. {said} Complete intervals are blue, others "
+        f"vermillion.{arc_words(view.time, report.imaging_arcs)}",
+        f"Completeness over time. {said}",
+        1.85,
+        lambda c: accounting.draw_completeness(c, completeness, view.time, report.imaging_arcs, report.gaps),
+    )
+
+
+def _packets_by_apid(by_apid: Mapping[int, ApidAccounting]) -> Table:
+    return Table(
+        "Packets by application process.",
+        (
+            Column("APID", numeric=False),
+            Column("packet", numeric=False),
+            Column("received"),
+            Column("in gaps", group="lost"),
+            Column("at edges", group="lost"),
+            Column("duplicates"),
+            Column("conflicts"),
+            Column("CRC errors"),
+        ),
+        tuple(
             (
                 f"0x{apid:03X}",
                 a.name,
@@ -152,48 +183,30 @@ def frames_and_packets(view: PassView) -> list[Block]:
                 count_text(a.conflicts),
                 computed_text(a.crc_errors),
             )
-            for apid, a in sorted(packets.by_apid.items())
-        )
-        blocks.append(
-            Table(
-                "Packets by application process.",
-                (
-                    Column("APID", numeric=False),
-                    Column("packet", numeric=False),
-                    Column("received"),
-                    Column("in gaps", group="lost"),
-                    Column("at edges", group="lost"),
-                    Column("duplicates"),
-                    Column("conflicts"),
-                    Column("CRC errors"),
-                ),
-                rows,
-                note="Lost in gaps: missing sequence counts between received packets. Lost at edges: packets of "
-                "planned frames before the first and after the last received packet. Duplicates and CRC errors "
-                "are counted in the raw files over the on-board time of the pass.",
+            for apid, a in sorted(by_apid.items())
+        ),
+        note="Lost in gaps: missing sequence counts between received packets. Lost at edges: packets of "
+        "planned frames before the first and after the last received packet. Duplicates and CRC errors "
+        "are counted in the raw files over the on-board time of the pass.",
+    )
+
+
+def _gaps(gaps: Sequence[TimeSpan]) -> Table:
+    return Table(
+        "Gaps in what was received.",
+        (
+            Column("from", numeric=False),
+            Column("to", numeric=False),
+            Column("length"),
+            Column("of", numeric=False),
+        ),
+        tuple(
+            (
+                utc_text(g.start_utc_ns),
+                utc_text(g.stop_utc_ns),
+                duration_text((g.stop_utc_ns - g.start_utc_ns) / 1e9),
+                g.label or "packets",
             )
-        )
-    if packets.receptions:
-        blocks.append(_link_quality(packets.receptions))
-    if report.gaps:
-        blocks.append(
-            Table(
-                "Gaps in what was received.",
-                (
-                    Column("from", numeric=False),
-                    Column("to", numeric=False),
-                    Column("length"),
-                    Column("of", numeric=False),
-                ),
-                tuple(
-                    (
-                        utc_text(g.start_utc_ns),
-                        utc_text(g.stop_utc_ns),
-                        duration_text((g.stop_utc_ns - g.start_utc_ns) / 1e9),
-                        g.label or "packets",
-                    )
-                    for g in report.gaps[:_MOST_GAPS]
-                ),
-            )
-        )
-    return blocks
+            for g in gaps[:_MOST_GAPS]
+        ),
+    )

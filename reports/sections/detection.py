@@ -12,7 +12,7 @@ from reports.figures.canvas import WIDTH_IN
 from reports.published import SOURCE, TABLE_II
 from reports.sections.common import PassView
 from reports.text import NOT_A_VALUE, count_text, number_text, percent_text, significant_text
-from reports.values import ClassScore, DetectorScore, GalleryFrame
+from reports.values import ClassScore, DetectorScore, GalleryFrame, ResidualSeries
 
 
 def detector_table(score: DetectorScore) -> Table:
@@ -81,6 +81,34 @@ def detector_blocks(score: DetectorScore) -> list[Block]:
                 lambda c: detector.draw_class_scores(c, scores),
             )
         )
+    blocks += _bins(score)
+    if score.curves or score.calibration:
+        blocks.append(
+            Picture(
+                "curves",
+                _curves_caption(bool(score.curves), bool(score.calibration)),
+                "Precision-recall curves and calibration.",
+                2.95,
+                lambda c: detector.draw_curves(c, score.curves, score.calibration),
+            )
+        )
+    if score.residuals is not None and np.isfinite(score.residuals.du_px).any():
+        blocks.append(_residuals(score.residuals))
+    if score.repeatability is not None and math.isfinite(score.repeatability):
+        blocks.append(
+            Paragraph(
+                f"Repeatability: a crater detected in one frame and visible in the next is detected again in "
+                f"{percent_text(score.repeatability, 1.0)} of cases. Frame-to-frame matching needs this twice, "
+                "a catalogue once.",
+                small=True,
+            )
+        )
+    return blocks
+
+
+def _bins(score: DetectorScore) -> list[Block]:
+    """Return precision and recall by altitude and by light; a sentence where all craters are in one bin."""
+    blocks: list[Block] = []
     parts = [
         (label, bins)
         for label, bins in (
@@ -114,47 +142,28 @@ def detector_blocks(score: DetectorScore) -> list[Block]:
                 lambda c: detector.draw_bins(c, parts),
             )
         )
-    if score.curves or score.calibration:
-        blocks.append(
-            Picture(
-                "curves",
-                _curves_caption(bool(score.curves), bool(score.calibration)),
-                "Precision-recall curves and calibration.",
-                2.95,
-                lambda c: detector.draw_curves(c, score.curves, score.calibration),
-            )
-        )
-    residuals = score.residuals
-    if residuals is not None and np.isfinite(residuals.du_px).any():
-        mean, _ = detector.octant_bias(residuals)
-        whole = float(np.hypot(np.nanmean(residuals.du_px), np.nanmean(residuals.dv_px)))
-        worst = float(np.nanmax(np.hypot(mean[:, 0], mean[:, 1]))) if np.isfinite(mean).any() else math.nan
-        text = (
-            f", and {significant_text(worst, 2)} px in the worst octant of Sun azimuth"
-            if math.isfinite(worst)
-            else ""
-        )
-        blocks.append(
-            Picture(
-                "residuals",
-                "Mean signed distance between detected and expected centres. Over all it is "
-                f"{significant_text(whole, 2)} px{text}. A bias "
-                "common to a frame moves the whole fix and does not show in the innovations.",
-                f"Mean residual over all {significant_text(whole, 2)} px.",
-                3.5,
-                lambda c: detector.draw_residuals(c, residuals),
-            )
-        )
-    if score.repeatability is not None and math.isfinite(score.repeatability):
-        blocks.append(
-            Paragraph(
-                f"Repeatability: a crater detected in one frame and visible in the next is detected again in "
-                f"{percent_text(score.repeatability, 1.0)} of cases. Frame-to-frame matching needs this twice, "
-                "a catalogue once.",
-                small=True,
-            )
-        )
     return blocks
+
+
+def _residuals(residuals: ResidualSeries) -> Picture:
+    """Return the picture of the mean distances between detected and expected centres."""
+    mean, _ = detector.octant_bias(residuals)
+    whole = float(np.hypot(np.nanmean(residuals.du_px), np.nanmean(residuals.dv_px)))
+    worst = float(np.nanmax(np.hypot(mean[:, 0], mean[:, 1]))) if np.isfinite(mean).any() else math.nan
+    text = (
+        f", and {significant_text(worst, 2)} px in the worst octant of Sun azimuth"
+        if math.isfinite(worst)
+        else ""
+    )
+    return Picture(
+        "residuals",
+        "Mean signed distance between detected and expected centres. Over all it is "
+        f"{significant_text(whole, 2)} px{text}. A bias "
+        "common to a frame moves the whole fix and does not show in the innovations.",
+        f"Mean residual over all {significant_text(whole, 2)} px.",
+        3.5,
+        lambda c: detector.draw_residuals(c, residuals),
+    )
 
 
 def _curves_caption(curves: bool, calibration: bool) -> str:
