@@ -138,7 +138,7 @@ def _find_places(
     sum_octets: RecordArray,
     found: RecordArray,
 ) -> bool:
-    """Write the roots of the locator, evaluated at every place at once; False unless there are as many as its degree."""
+    """Write the roots of the locator, evaluated at every place at once; False unless their number is its degree."""
     sums[:] = 0
     for k in range(degree + 1):
         row = place_table[k, locator[k]]

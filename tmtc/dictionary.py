@@ -380,44 +380,48 @@ def _second_telemetry() -> tuple[PacketDefinition, ...]:
     )  # fmt: skip
 
 
+def _performance() -> PacketDefinition:
+    return PacketDefinition(
+        "performance", APID_PERFORMANCE, 3, 25, "Periodic state of the machine",
+        (
+            Field("structure_id", "u16", "Housekeeping structure, always 2", minimum=2, maximum=2),
+            *(
+                Field(f"cpu_{stage}_ms", "f32", f"{_MILLISECONDS}: {meaning}", "ms")
+                for stage, meaning in (
+                    ("commands", "telecommands and schedule"),
+                    ("detector", "image preparation and detector"),
+                    ("navigation", "estimators"),
+                    ("telemetry", "packets and store"),
+                    ("monitoring", "monitoring and memory scrubbing"),
+                )
+            ),
+            Field("detector_latency_max_ms", "f32", "Longest run of the detector since the last report", "ms"),
+            Field("detector_timeouts", "u16", "Runs of the detector that took too long, since boot"),
+            Field(
+                "camera_temperature_c", "i16", "Temperature of the camera", "degC", scale=0.01, saturate=True,
+                warning=(-20.0, 50.0), alarm=(-30.0, 60.0),
+            ),
+            Field("bus_current_a", "u16", "Current drawn from the bus", "A", scale=0.001, saturate=True),
+            *(
+                Field(f"queue_{name}", "u16", f"Packets of class {name} waiting for downlink", saturate=True)
+                for _, name in STORE_CLASSES
+            ),
+            *(
+                Field(f"store_{name}_permille", "u16", f"Store of class {name} in use", "1/1000", maximum=1000)
+                for _, name in STORE_CLASSES
+            ),
+            Field("store_overwritten", "u32", "Packets lost from the store before they were sent, since boot"),
+            Field("storage_errors", "u16", "Damaged packets found in the store since boot", saturate=True),
+            Field("memory_repairs", "u16", "Regions of memory restored since boot", saturate=True),
+            Field("activities", "u8", "Activities in the schedule"),
+            Field("last_command_count", "u16", "Sequence count of the newest telecommand, 65535 if none"),
+        ),
+    )  # fmt: skip
+
+
 def _machine_telemetry() -> tuple[PacketDefinition, ...]:
     return (
-        PacketDefinition(
-            "performance", APID_PERFORMANCE, 3, 25, "Periodic state of the machine",
-            (
-                Field("structure_id", "u16", "Housekeeping structure, always 2", minimum=2, maximum=2),
-                *(
-                    Field(f"cpu_{stage}_ms", "f32", f"{_MILLISECONDS}: {meaning}", "ms")
-                    for stage, meaning in (
-                        ("commands", "telecommands and schedule"),
-                        ("detector", "image preparation and detector"),
-                        ("navigation", "estimators"),
-                        ("telemetry", "packets and store"),
-                        ("monitoring", "monitoring and memory scrubbing"),
-                    )
-                ),
-                Field("detector_latency_max_ms", "f32", "Longest run of the detector since the last report", "ms"),
-                Field("detector_timeouts", "u16", "Runs of the detector that took too long, since boot"),
-                Field(
-                    "camera_temperature_c", "i16", "Temperature of the camera", "degC", scale=0.01, saturate=True,
-                    warning=(-20.0, 50.0), alarm=(-30.0, 60.0),
-                ),
-                Field("bus_current_a", "u16", "Current drawn from the bus", "A", scale=0.001, saturate=True),
-                *(
-                    Field(f"queue_{name}", "u16", f"Packets of class {name} waiting for downlink", saturate=True)
-                    for _, name in STORE_CLASSES
-                ),
-                *(
-                    Field(f"store_{name}_permille", "u16", f"Store of class {name} in use", "1/1000", maximum=1000)
-                    for _, name in STORE_CLASSES
-                ),
-                Field("store_overwritten", "u32", "Packets lost from the store before they were sent, since boot"),
-                Field("storage_errors", "u16", "Damaged packets found in the store since boot", saturate=True),
-                Field("memory_repairs", "u16", "Regions of memory restored since boot", saturate=True),
-                Field("activities", "u8", "Activities in the schedule"),
-                Field("last_command_count", "u16", "Sequence count of the newest telecommand, 65535 if none"),
-            ),
-        ),
+        _performance(),
         PacketDefinition(
             "housekeeping_report", APID_REPORTS, 3, 25, "Values of a structure that was defined by telecommand",
             (_STRUCTURE, Field("count", "u8", "Number of quantities that follow")),

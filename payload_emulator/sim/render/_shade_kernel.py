@@ -4,6 +4,9 @@ The Sun stands at -x of the tangent frame: its vector is (-sun_flat, 0, sun_up).
 pixels: the tangent grid would blur them once more.
 """
 
+# NumPy's single-precision numbers count as floats for numba.
+# mypy: disable-error-code="no-any-return"
+
 from __future__ import annotations
 
 import math
