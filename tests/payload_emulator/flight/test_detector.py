@@ -13,6 +13,7 @@ from payload_emulator.flight.vision.detector import (
     DetectorParameters,
     OnnxDetector,
     decode,
+    decode_classes,
     drop_duplicates,
     remove_parallax,
 )
@@ -224,3 +225,25 @@ def test_what_a_dropped_repetition_would_have_dropped_stays():
     # The second repeats the first and goes; the third repeats only the second, so it is a crater of its own.
     found = detections([100, 108, 116], [100, 100, 100], diameter=30.0)
     assert drop_duplicates(found, DetectorParameters()).u_px.tolist() == [100, 116]
+
+
+def test_the_first_map_of_offsets_points_right_and_the_second_down():
+    heat = np.zeros((128, 128), np.float32)
+    heat[50, 20] = 0.9
+    geometry = np.zeros((4, 128, 128), np.float32)
+    geometry[0], geometry[1] = 0.25, -0.5
+    found = decode(heat, geometry, 0.5)
+    # Cells of 4 px whose first has its centre at 1.5 px.
+    assert found.u_px.tolist() == [4 * 20.25 + 1.5]
+    assert found.v_px.tolist() == [4 * 49.5 + 1.5]
+
+
+def test_classes_give_median_diameters_and_the_best_class_of_a_place_counts():
+    heat = np.zeros((3, 128, 128), np.float32)
+    heat[0, 50, 20], heat[1, 50, 21], heat[2, 80, 80], heat[0, 80, 90] = 0.9, 0.8, 0.7, 0.6
+    medians_m = np.array([6e3, 12e3, 20e3])
+    found = decode_classes(heat, np.zeros((2, 128, 128), np.float32), medians_m, 0.5)
+    assert found.size_class.tolist() == [0, 2, 0]
+    assert found.diameter_m.tolist() == [6e3, 20e3, 6e3]
+    assert found.u_px.tolist() == [4 * column + 1.5 for column in (20, 80, 90)]
+    assert found.v_px.tolist() == [4 * row + 1.5 for row in (50, 80, 80)]

@@ -9,6 +9,7 @@ import pytest
 
 from payload_emulator.flight.navigation.identification import (
     IdentificationParameters,
+    _consistent,
     identify,
     minimum_members,
 )
@@ -113,3 +114,17 @@ def test_a_lone_pair_is_refused_where_it_would_move_the_place_farther_than_it_th
     assert run(lone, sighting(places), sigma_px=1.0) == [(0, 0)]
     assert run(lone, sighting(places), sigma_px=3.5) == []
     assert run(found(places[:3] + 0.5), sighting(places), sigma_px=3.5) == [(0, 0), (1, 1), (2, 2)]
+
+
+def test_a_pair_that_contradicts_the_shift_of_all_others_is_removed() -> None:
+    # Prediction off by 15 px (1 sigma) for all craters alike, 1 px of noise a pair: offsets agree or do not.
+    offset = np.array([[20.0, -10.0], [20.5, -10.0], [20.0, -9.0], [50.0, -10.0]])
+    every = np.arange(4)
+    prior_px2 = common_shift(4, 15.0)
+    noise_px2 = np.zeros((4, 2, 2)) + 0.5 * np.eye(2)
+    variance_px2 = np.full(4, 0.5)
+    kept = _consistent(every, every, offset, prior_px2, noise_px2, variance_px2)
+    assert kept.tolist() == [0, 1, 2]
+    agreeing = offset[:3]
+    kept = _consistent(every[:3], every, agreeing, prior_px2, noise_px2, variance_px2)
+    assert kept.tolist() == [0, 1, 2]

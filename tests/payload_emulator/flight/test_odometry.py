@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import pytest
 
 from lunar.camera import PinholeCamera
+from lunar.constants import MOON_RADIUS_M
 from payload_emulator.flight.navigation import odometry
 from payload_emulator.flight.navigation.matcher import GroundFeatures, Match
-from payload_emulator.flight.navigation.odometry import OdometryParameters, OdometryState
+from payload_emulator.flight.navigation.odometry import OdometryParameters, OdometryState, frame_features
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
+from payload_emulator.flight.vision.detections import Detections
 from tmtc.tables import AnchorTable, pack_anchor_table, unpack_anchor_table
 
 CAMERA = PinholeCamera()
@@ -288,3 +291,21 @@ def test_detections_with_nan_or_beyond_the_horizon_match_nothing() -> None:
         Mode.spherical,
     )
     assert high.ground.size_class.tolist() == [-1]
+
+
+def test_on_the_sphere_a_detection_lies_at_its_arc_from_the_place_below() -> None:
+    # A ground point two degrees east at the height of the sphere, seen from 30 km: x / f = R sin a / (r - R cos a).
+    camera, altitude_m, arc_rad = PinholeCamera(), 30_000.0, math.radians(2.0)
+    down_m = MOON_RADIUS_M + altitude_m - MOON_RADIUS_M * math.cos(arc_rad)
+    tangent = MOON_RADIUS_M * math.sin(arc_rad) / down_m
+    u, v = camera.centre_px
+    seen = Detections(
+        np.array([u + camera.focal_px * tangent, u]),
+        np.array([v, v]),
+        np.full(2, 20.0),
+        np.ones(2),
+        np.ones(2),
+    )
+    ground = frame_features(seen, altitude_m, camera, Mode.spherical).ground
+    assert ground.east_m == pytest.approx([MOON_RADIUS_M * arc_rad, 0.0], abs=1e-6)
+    assert ground.north_m == pytest.approx([0.0, 0.0], abs=1e-6)

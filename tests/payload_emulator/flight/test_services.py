@@ -290,6 +290,14 @@ def test_an_event_that_is_disabled_is_not_reported_until_it_is_enabled(rig: Any)
     assert "frame_skipped" in rig.events(rig.step(rig.command("enable_event", event_id="frame_skipped")))
 
 
+def test_a_change_of_the_reported_events_is_itself_an_event_also_for_that_event(rig: Any) -> None:
+    changed = 70  # event_reporting_changed
+    for command, value in (("disable_event", 0.0), ("enable_event", 1.0)):
+        packets = rig.step(rig.command(command, event_id="event_reporting_changed"))
+        said = [one for one in rig.named(packets, "event_info") if one["event_id"] == changed]
+        assert [(one["value_1"], one["value_2"]) for one in said] == [(float(changed), value)]
+
+
 # Time (9), large data (13), the store (15)
 
 

@@ -60,3 +60,13 @@ def test_two_damaged_copies_are_lost_and_what_does_not_fit_is_refused() -> None:
     settings.read()
     assert not settings.write({"much": "x" * 500})
     assert Settings(memory).read() == (Recovery.whole, VALUES)
+
+
+def test_a_set_of_settings_knows_the_generation_that_it_wrote() -> None:
+    memory = np.zeros(1000, dtype=np.uint8)
+    settings = Settings(memory)
+    for _ in range(3):
+        assert settings.write(VALUES)
+        found = Settings(memory)
+        found.read()
+        assert found.generation == settings.generation
