@@ -1,7 +1,8 @@
-"""Attitude table of a pass archive (`attitude.csv`), one row per frame."""
+"""Attitudes of a pass archive: `attitude.csv` with a row for each frame, or a CCSDS AEM (`attitude.aem`)."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_service.errors import InvalidInput
+from lunar.aem import parse_aem
+from lunar.errors import LunarError
+from lunar.frames import ICRF_NAMES
+
+ATTITUDE_FILES = ("attitude.csv", "attitude.aem")
+CAMERA_NAMES = ("INSTRUMENT", "CAMERA")
+"""Beginnings of the names of the camera axes in an AEM."""
 
 HEADER = "image_ticks,q_w,q_x,q_y,q_z"
 UNIT_TOLERANCE = 1e-3
@@ -17,10 +25,19 @@ UNIT_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeTable:
-    """On-board time of images (n,) and the quaternions (n, 4) from ICRF axes to the camera."""
+    """Times of attitudes and the quaternions (n, 4) from ICRF axes to the camera.
+
+    Attributes
+    ----------
+    image_ticks
+        On-board time of images (n,); empty for an AEM.
+    utc_ns
+        Times (n,), ascending, of an AEM, whose attitudes are interpolated; None for a table of images.
+    """
 
     image_ticks: NDArray[np.int64]
     q_wxyz: NDArray[np.float64]
+    utc_ns: NDArray[np.int64] | None = None
 
 
 def no_attitudes() -> AttitudeTable:
@@ -28,18 +45,34 @@ def no_attitudes() -> AttitudeTable:
     return AttitudeTable(np.zeros(0, dtype=np.int64), np.zeros((0, 4)))
 
 
-def load_attitudes(path: Path, source: str = "attitude.csv") -> AttitudeTable:
-    """Return the table in a file.
+def attitude_file(names: Collection[str], source: str) -> str | None:
+    """Return the name of the attitude file among the files of an archive, None without one.
 
     Raises
     ------
     InvalidInput
-        The file is not an attitude table; the message states the first invalid line.
+        There are two of them.
+    """
+    found = [name for name in ATTITUDE_FILES if name in names]
+    if len(found) > 1:
+        raise InvalidInput(source, "", f"one of {' and '.join(ATTITUDE_FILES)}", "both")
+    return found[0] if found else None
+
+
+def load_attitudes(path: Path, source: str = "attitude.csv") -> AttitudeTable:
+    """Return the attitudes in a file, a table or an AEM.
+
+    Raises
+    ------
+    InvalidInput
+        The file is neither; the message states the first invalid line.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError:
         raise InvalidInput(source, "", "UTF-8 text", "other octets") from None
+    if lines and lines[0].startswith("CCSDS_AEM_VERS"):
+        return _of_message("\n".join(lines), source)
     if not lines or lines[0] != HEADER:
         raise InvalidInput(source, "line 1", HEADER, repr(lines[0][:80]) if lines else "nothing")
     ticks, quaternions = [], []
@@ -57,3 +90,20 @@ def load_attitudes(path: Path, source: str = "attitude.csv") -> AttitudeTable:
         ticks.append(time)
         quaternions.append(quaternion)
     return AttitudeTable(np.array(ticks, dtype=np.int64), np.array(quaternions).reshape(-1, 4))
+
+
+def _of_message(text: str, source: str) -> AttitudeTable:
+    try:
+        segments = parse_aem(text, source)
+    except LunarError as error:
+        raise InvalidInput(source, "", "a CCSDS AEM", str(error).removeprefix(f"{source}: ")) from None
+    times, quaternions = [], []
+    for one in segments:
+        frames = (one.frame_a.upper(), one.frame_b.upper())
+        if frames[0] not in ICRF_NAMES or not frames[1].startswith(CAMERA_NAMES):
+            expected = "REF_FRAME_A = ICRF and REF_FRAME_B = INSTRUMENT_1 (the camera)"
+            raise InvalidInput(source, "", expected, f"{one.frame_a} and {one.frame_b}")
+        times.append(one.utc_ns)
+        quaternions.append(one.q_wxyz)
+    utc_ns, first = np.unique(np.concatenate(times), return_index=True)
+    return AttitudeTable(np.zeros(0, dtype=np.int64), np.concatenate(quaternions)[first], utc_ns)

@@ -253,7 +253,8 @@ def outcome_samples(connection: Connection, span: PassSpan) -> tuple[OutcomeSamp
 
 def viewing_of(camera: Camera, attitudes: AttitudeTable, span: PassSpan) -> Viewing:
     """Return the pointing of the camera during a pass."""
-    utc_ns = span.utc_ns(attitudes.image_ticks.tolist())
+    message = attitudes.utc_ns
+    utc_ns = span.utc_ns(attitudes.image_ticks.tolist()) if message is None else message
     order = np.argsort(utc_ns, kind="stable")
     return Viewing(
         camera_of(camera),
@@ -261,6 +262,7 @@ def viewing_of(camera: Camera, attitudes: AttitudeTable, span: PassSpan) -> View
         math.radians(camera.yaw_deg or 0.0),
         utc_ns[order],
         attitudes.q_wxyz[order],
+        interpolated=message is not None,
     )
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ground_service.clock import utc_now_ns
-from ground_service.ephemerides.attitudes import load_attitudes
+from ground_service.ephemerides.attitudes import attitude_file, load_attitudes
 from ground_service.ephemerides.store import add_ephemeris
 from ground_service.errors import InvalidInput, storage_error
 from ground_service.ground import Ground
@@ -33,7 +33,6 @@ from lunar.timescales import parse_utc
 SCHEMA_VERSION = 1
 RECEPTIONS_FILE = "receptions.csv"
 MISSION_FILE = "mission.toml"
-ATTITUDE_FILE = "attitude.csv"
 MANIFEST_LIMIT_OCTETS = 16 << 20
 
 FRAMES_KEPT = 200
@@ -70,8 +69,9 @@ def import_archive(ground: Ground, folder: Path, progress: Callable[[str], None]
     for name, load in (("reference.oem", load_ephemeris), ("catalogue.csv", load_catalogue)):
         if name in names:
             _refuse_unreadable(folder / name, load)
-    if ATTITUDE_FILE in names:
-        load_attitudes(folder / ATTITUDE_FILE, str(folder / ATTITUDE_FILE))
+    attitudes = attitude_file(names, str(folder))
+    if attitudes is not None:
+        load_attitudes(folder / attitudes, str(folder / attitudes))
     stored = {name: ground.files.put_file(folder / name) for name in names if not name.startswith("frames/")}
     images = {number: ground.files.put_file(folder / name) for number, name in _chosen_frames(names)}
     pass_id = _register(
@@ -241,6 +241,7 @@ def _register(
 ) -> int:
     now = utc_now_ns()
     reference = load_ephemeris(folder / "reference.oem") if "reference.oem" in stored else None
+    attitudes = attitude_file(stored, str(folder))
     with ground.database.writing() as connection:
         hold(connection, f"archive {digest}")
         existing = store.archived_pass(connection, digest)
@@ -270,7 +271,7 @@ def _register(
             manifest={key: value for key, value in manifest.items() if key != "files"},
             ephemeris_id=ephemeris_id,
             catalogue_sha256=stored["catalogue.csv"].sha256 if "catalogue.csv" in stored else None,
-            attitude_sha256=stored[ATTITUDE_FILE].sha256 if ATTITUDE_FILE in stored else None,
+            attitude_sha256=None if attitudes is None else stored[attitudes].sha256,
             mission_id=enter(connection, *mission, actor=ARCHIVE_ACTOR),
             now_utc_ns=now,
         )

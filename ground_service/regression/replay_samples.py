@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ground_service.ephemerides.attitudes import load_attitudes, no_attitudes
+from ground_service.ephemerides.attitudes import ATTITUDE_FILES, attitude_file, load_attitudes, no_attitudes
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.detection.viewing import Viewing
 from ground_service.evaluation.store import orientation_of
 from ground_service.missions.frames import camera_of
 from ground_service.missions.model import Camera, Evidence
-from ground_service.passes.archive_import import ATTITUDE_FILE, archived_mission
+from ground_service.passes.archive_import import archived_mission
 from ground_service.passes.samples import DetectionSamples, NavigationSamples
 from ground_service.regression.archives import PassArchive, frame_inputs
 from ground_service.regression.gates.samples import PassFrames, pass_frames
@@ -104,21 +104,19 @@ def _viewing(
     folder: Path, declared: Camera, camera: PinholeCamera, ticks: IntArray, utc_ns: IntArray
 ) -> Viewing:
     """Return the pointing of the camera for the frames of an archive."""
-    path = folder / ATTITUDE_FILE
-    table = load_attitudes(path, str(path)) if path.is_file() else no_attitudes()
+    present = [name for name in ATTITUDE_FILES if (folder / name).is_file()]
+    name = attitude_file(present, str(folder))
+    table = no_attitudes() if name is None else load_attitudes(folder / name, str(folder / name))
+    mounting = (math.radians(declared.tilt_deg or 0.0), math.radians(declared.yaw_deg or 0.0))
+    if table.utc_ns is not None:
+        return Viewing(camera, *mounting, table.utc_ns, table.q_wxyz, interpolated=True)
     order = np.argsort(ticks, kind="stable")
     rows = np.searchsorted(ticks[order], table.image_ticks)
     known = rows < len(ticks)
     known[known] = ticks[order][rows[known]] == table.image_ticks[known]
     frames = order[rows[known]]
     in_time = np.argsort(utc_ns[frames], kind="stable")
-    return Viewing(
-        camera,
-        math.radians(declared.tilt_deg or 0.0),
-        math.radians(declared.yaw_deg or 0.0),
-        utc_ns[frames][in_time],
-        table.q_wxyz[known][in_time],
-    )
+    return Viewing(camera, *mounting, utc_ns[frames][in_time], table.q_wxyz[known][in_time])
 
 
 def read_downlink(

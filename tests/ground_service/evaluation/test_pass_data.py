@@ -14,6 +14,7 @@ import pytest
 from ground_service.ephemerides.attitudes import HEADER, load_attitudes
 from ground_service.errors import EvaluationError, InvalidInput
 from ground_service.evaluation.core import evaluate_pass
+from ground_service.evaluation.detection.viewing import Viewing
 from ground_service.evaluation.service import evaluate
 from ground_service.evaluation.store import load_pass_inputs, orientation_of
 from ground_service.evaluation.verdict import Limits
@@ -25,6 +26,7 @@ from ground_service.missions.model import Camera, Frames, Mission
 from ground_service.missions.service import add_mission
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.service import define_pass
+from lunar.aem import AttitudeSegment, format_aem
 from lunar.camera import PinholeCamera
 from lunar.datafolder import DataFolder
 from lunar.frames import IauOrientation
@@ -207,9 +209,75 @@ def test_the_attitude_of_an_archive_is_found_by_the_time_of_the_image(
     assert viewing.q_wxyz.tolist() == [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]]
 
 
+def with_attitude_message(synthetic_pass: Any, folder: Path, **fields: Any) -> AttitudeSegment:
+    """Copy the archive with an AEM of a steady turn about the boresight, a sample every 10 s; return what it has."""
+    shutil.copytree(synthetic_pass.folder, folder)
+    utc_ns = synthetic_pass.utc_ns[0] + np.arange(0, 121, 10) * 10**9
+    angle = np.radians(2.0) * np.arange(len(utc_ns))
+    zero = np.zeros(len(utc_ns))
+    q_wxyz = np.column_stack([np.cos(angle / 2.0), zero, zero, np.sin(angle / 2.0)])
+    q_wxyz[3] *= -1.0  # the same attitude
+    segment = AttitudeSegment(utc_ns, q_wxyz, **fields)
+    (folder / "attitude.aem").write_text(format_aem((segment,)))
+    manifest = json.loads((folder / "manifest.json").read_text())
+    write_manifest(folder, {key: value for key, value in manifest.items() if key != "files"})
+    return segment
+
+
+def test_an_attitude_message_is_interpolated_to_the_times_of_the_images(
+    synthetic_pass: Any, ground: Ground, tmp_path: Path
+) -> None:
+    with_attitude_message(synthetic_pass, tmp_path / "a")
+    viewing = load_pass_inputs(ground, import_archive(ground, tmp_path / "a")).viewing
+    utc_ns = synthetic_pass.utc_ns
+    # Images are 15 s apart; the message ends after 120 s.
+    assert np.flatnonzero(viewing.known(utc_ns)).tolist() == list(range(9))
+    turn = np.broadcast_to(np.eye(3), (len(utc_ns), 3, 3))
+    rotations = viewing.camera_from_mcmf(utc_ns, np.full((len(utc_ns), 3), 1.0e6), turn)
+    # A quaternion turns vectors: by 2 degrees in 10 s.
+    angles = np.degrees(np.arctan2(rotations[:9, 1, 0], rotations[:9, 0, 0]))
+    np.testing.assert_allclose(angles, 3.0 * np.arange(9), atol=1e-9)
+
+
+def test_attitudes_are_not_interpolated_over_a_gap() -> None:
+    times = np.array([0, 1, 2, 3, 20, 21], dtype=np.int64) * 10**9
+    viewing = Viewing(attitude_utc_ns=times, q_wxyz=np.tile([1.0, 0, 0, 0], (6, 1)), interpolated=True)
+    asked = np.array([-1, 0, 2_500_000_000, 10 * 10**9, 20 * 10**9, 22 * 10**9])
+    assert viewing.known(asked).tolist() == [False, True, True, False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"frame_b": "SC_BODY_1"}, "expected REF_FRAME_A = ICRF and REF_FRAME_B = .*, found ICRF and SC_BODY_1"),
+        ({"frame_a": "LVLH"}, "found LVLH and INSTRUMENT_1"),
+    ],
+)  # fmt: skip
+def test_an_attitude_message_in_other_axes_is_refused(
+    synthetic_pass: Any, ground: Ground, tmp_path: Path, fields: dict[str, str], message: str
+) -> None:
+    with_attitude_message(synthetic_pass, tmp_path / "a", **fields)
+    with pytest.raises(InvalidInput, match=message):
+        import_archive(ground, tmp_path / "a")
+
+
+def test_two_attitude_files_are_refused(synthetic_pass: Any, ground: Ground, tmp_path: Path) -> None:
+    folder = tmp_path / "a"
+    with_attitude_message(synthetic_pass, folder)
+    (folder / "attitude.csv").write_text(f"{HEADER}\n")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    write_manifest(folder, {key: value for key, value in manifest.items() if key != "files"})
+    with pytest.raises(InvalidInput, match=r"expected one of attitude\.csv and attitude\.aem, found both"):
+        import_archive(ground, folder)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        (
+            "CCSDS_AEM_VERS = 9\n",
+            "a.csv: expected a CCSDS AEM, found line 1: expected an AEM version out of 1.0, 2.0",
+        ),
         ("", "a.csv, line 1: expected image_ticks,q_w"),
         ("ticks,q\n", "a.csv, line 1: expected image_ticks,q_w"),
         (f"{HEADER}\n5,1,0,0,0\n6,1,0,0\n", "a.csv, line 3: expected on-board ticks and a unit quaternion"),
