@@ -38,6 +38,7 @@ Styles = Mapping[str, tuple[str, tuple[float, ...] | None]]
 _LEFT, _RIGHT, _BOTTOM, _TOP = 0.72, 2.0, 0.50, 0.28
 _MOST_NAMED_RESETS = 9
 _DENSE = 900
+_GAP_STEPS = 8.0
 _AXES_OF_RTN = ("radial", "along-track", "cross-track")
 
 
@@ -91,6 +92,15 @@ def draw_lines(
     alone = finite & ~beside[:-2] & ~beside[2:]
     if alone.any():
         axes.plot(x[alone], y[alone], ".", color=tint, markersize=canvas.pt(4.0))
+
+
+def broken(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return a line with NaN in gaps of more than `_GAP_STEPS` usual steps, where nothing was estimated."""
+    if len(x) < 3:
+        return x, y
+    step = np.diff(x)
+    after = np.flatnonzero(step > _GAP_STEPS * np.median(step)) + 1
+    return np.insert(x, after, x[after - 1]), np.insert(y, after, np.nan)
 
 
 def _positive(length: FloatArray) -> FloatArray:
@@ -242,7 +252,7 @@ def draw_ground_error(
         axes.set_title(f"{name} error, {'north' if i == 0 else 'east'} positive")
         entries = []
         for (one, _, keep), error in zip(errors, shown, strict=True):
-            draw_lines(canvas, axes, time.x(one.utc_ns[keep]), error / factor, styles[one.name])
+            draw_lines(canvas, axes, *broken(time.x(one.utc_ns[keep]), error / factor), styles[one.name])
             entries.append((one.name, _last_finite(error / factor)))
         mark_resets(canvas, axes, time, resets, named=i == 0)
         _name_lines(canvas, axes, height, entries, styles)

@@ -103,3 +103,12 @@ def test_no_column_is_without_a_name() -> None:
         heads = [part.split("</thead>")[0] for part in text.split("<thead>")[1:]]
         assert heads
         assert not [head for head in heads if re.search(r"<th[^>]*></th>", head)], kind
+
+
+def test_a_line_is_broken_where_nothing_was_estimated() -> None:
+    x = np.array([0.0, 15.0, 30.0, 45.0, 1000.0, 1015.0])
+    at, error = navigation.broken(x, np.arange(6.0))
+    assert at.tolist() == [0.0, 15.0, 30.0, 45.0, 45.0, 1000.0, 1015.0]
+    assert np.isnan(error[4]) and np.nansum(error) == 15.0
+    even = np.arange(0.0, 100.0, 15.0)
+    assert navigation.broken(even, even)[1].tolist() == even.tolist()
