@@ -32,6 +32,10 @@ class LinnaFormatter(argparse.HelpFormatter):
         return super()._format_action(action)
 
 
+class RawFormatter(LinnaFormatter, argparse.RawDescriptionHelpFormatter):
+    """The same for descriptions and epilogues whose lines stay as they are."""
+
+
 class LinnaParser(argparse.ArgumentParser):
     """Argument parser of all commands; errors are raised as `BadUsage`."""
 

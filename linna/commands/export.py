@@ -9,12 +9,13 @@ from pathlib import Path
 
 from linna.commands._ground import add_operator_options, ground_client
 from linna.output import add_json_flag, emit, log
+from linna.parser import RawFormatter
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     from ground_service.exports.formats import FORMATS, REFERENCE
 
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.formatter_class = RawFormatter
     parser.epilog = "formats:\n" + "\n".join(f"  {one.name:<8} {one.description}" for one in FORMATS.values())
     parser.add_argument("pass_id", type=int, metavar="PASS", help="number of the pass (see linna pass list)")
     parser.add_argument(
