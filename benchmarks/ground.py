@@ -2,8 +2,8 @@
 
 `sqlite`, `postgresql`: a mixed downlink as CADUs (housekeeping, detections of 20 craters, navigation states, events in
 equal numbers) stored packet by packet and decoded; rates are by processor time (of this process: not of a database
-server) and by the clock. `states`: down-sampled reads over one parameter, beside reading rows. `api`: ordinary reads at
-a steady rate. `stream`: memory of the service while a long downlink comes in.
+server) and by the clock. `states`: down-sampled reads over one parameter, compared with reading rows. `api`: ordinary
+reads at a steady rate. `stream`: memory of the service while a long downlink comes in.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def definition(packets: int) -> dict[str, Any]:
 
 
 def states(rows: int, queries: int = 40) -> dict[str, Any]:
-    """Times of down-sampled reads over a parameter of so many rows, whole and in part, beside reading all of a part."""
+    """Time down-sampled reads over a parameter, whole and in part, and reading all rows of a part."""
     ticks_a_row = 6_554  # ten a second
     with tempfile.TemporaryDirectory() as folder, open_ground(Path(folder)) as ground:
         with ground.database.writing() as connection:
@@ -181,7 +181,7 @@ def states(rows: int, queries: int = 40) -> dict[str, Any]:
 
 
 def postgres(packets: int, url: str | None) -> dict[str, Any]:
-    """As `ingest`, into PostgreSQL: at `url`, or a server of its own where PostgreSQL is installed."""
+    """As `ingest`, into PostgreSQL: at `url`, or a private server where PostgreSQL is installed."""
     if url:
         return ingest(packets, url)
     with tempfile.TemporaryDirectory() as folder, PostgresServer(Path(folder)) as server:

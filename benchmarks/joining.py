@@ -159,7 +159,7 @@ def work(url: str, home: str, pieces: list[bytes], ready: Any, gate: Any) -> Non
 
 
 def measure_workers(pieces: int) -> dict[str, Any]:
-    """Pieces a second that one and two worker processes ingest, each the pieces of a downlink of its own."""
+    """Pieces a second that one and two worker processes ingest, each the pieces of a separate downlink."""
     stream = mixed_downlink(40 * pieces)
     size = len(stream) // (2 * pieces)
     context = multiprocessing.get_context("spawn")

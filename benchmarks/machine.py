@@ -31,7 +31,7 @@ class _Board(BareBoard):
 
 
 def bench(days: float = 365.0, minutes: int = 10) -> dict[str, Any]:
-    """Resident memory idle and after every month of `days`, with a packet of housekeeping every so many minutes."""
+    """Resident memory idle and after every month of `days`, with a packet of housekeeping at an interval in minutes."""
     from payload_emulator.flight.models import load_shipped_model
     from payload_emulator.flight.payload import Payload, PayloadMode
     from payload_emulator.flight.vision.detector import OnnxDetector

@@ -1,6 +1,6 @@
 """Time to interactive of every page over a full database: python -m benchmarks.pages [--passes N] [--rows N].
 
-A service with so many passes of one spacecraft and so many rows of housekeeping is seeded and served, and every page is
+A service with passes of one spacecraft and rows of housekeeping is seeded and served, and every page is
 opened in Chromium with an empty cache, three times. A page is interactive when it has handled the last answer it asked
 for and its main thread is idle; the middle of the three is printed, with the processor time that the page's main thread
 took, which a busy machine does not stretch. `--home` opens the pages of an existing service's home instead.
@@ -84,7 +84,7 @@ def seed(home: Path, passes: int, rows: int) -> None:
 
 
 def _housekeeping(connection: Any, vehicle: int, first: int, begin: int, count: int) -> None:
-    """Rows and roll-ups of so many seconds; the temperature goes up and down with the orbit, all else stands."""
+    """Add rows and roll-ups of a number of seconds; the temperature follows the orbit, all else is constant."""
     version = DICTIONARY.version
     names = ", ".join(HOUSEKEEPING_VALUES)
     values = ", ".join(

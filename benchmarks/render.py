@@ -3,8 +3,8 @@
 One JSON object, on the procedural Moon and, where LINNA_DATA names it, on GLD100 terrain no detector was trained on.
 
 speed: milliseconds of processor time of a 512 x 512 frame with shadows, by stage, at three altitudes, the smallest of
-nine; beside it the ray march over the same frame, and Blender's Cycles at 16 samples where LINNA_BLENDER_PYTHON names
-an interpreter that has it.
+nine; for comparison the ray march over the same frame, and Blender's Cycles at 16 samples where
+LINNA_BLENDER_PYTHON names an interpreter that has it.
 fast_vs_raymarch: random poses of 14 to 50 km, Sun of 3 to 60 degrees, any azimuth and yaw, tilt to 5 degrees.
 labels_vs_cast_rims: labels against rims found by casting rays onto the same terrain, pixels.
 """

@@ -3,7 +3,7 @@
 Importing this module imports numba (about half a second), so only kernel modules do it, and the modules that
 call kernels import those inside the function that needs them.  Superword-level vectorisation is off in numba
 by default and can only be switched on before numba is first imported; it makes the unrolled gravity kernel
-several times quicker. Compiled code is kept between runs beside the source, or in the user's cache folder
+several times quicker. Compiled code is kept between runs in the folder of the source, or in the user's cache folder
 where that is read-only.
 """
 

@@ -1,6 +1,6 @@
 """CCSDS Tracking Data Message 2.0 of optical sightings: directions from a spacecraft to landmarks.
 
-Each landmark is a participant of a segment of its own.  The path is from the landmark (2) to the spacecraft
+Each landmark is a participant of its own segment.  The path is from the landmark (2) to the spacecraft
 (1); the angles are right ascension and declination of the line of sight in ICRF axes.
 
 References

@@ -41,7 +41,7 @@ class Variant:
     """The recipe with one thing changed: settings, or which frames it learns from.
 
     frames : "mixed" (the recipe's), "strip" (its real frames all from `STRIP_DEG`), "real" (no procedural worlds),
-        "plain" (real terrain as the rasters have it, a data set of its own) or "refitted" (labels on measured rims).
+        "plain" (real terrain as the rasters have it, a separate data set) or "refitted" (labels on measured rims).
     """
 
     name: str
@@ -99,7 +99,7 @@ def ablate(
     parameters: AblationParameters = AblationParameters(),
     report: Callable[[str], None] = lambda line: None,
 ) -> list[dict[str, Any]]:
-    """Train each variant in a folder of its own under `folder` and score it on the validation split; return the rows.
+    """Train each variant in its own folder under `folder` and score it on the validation split; return the rows.
 
     The baseline runs with every seed, the others with the first unless `every_seed`. Variants without
     material are left out and logged. Finished variants are not trained again.

@@ -299,7 +299,7 @@ def search_frames(
 
 
 def share(rows: Sequence[LostRow], least_catalogued: int = 0) -> Share:
-    """Return how searches came out, of frames with so many detections of craters of the map or more."""
+    """Return the outcomes of searches, of frames with at least a number of detections of craters of the map."""
     errors = np.array([row.error_m for row in rows if row.catalogued >= least_catalogued])
     right = errors <= WRONG_PLACE_M
     return Share(

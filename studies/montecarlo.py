@@ -287,7 +287,7 @@ def consistency(runs: Iterable[NavigationRun], settle_frames: int = 20) -> Consi
 
 
 def anees_bounds(runs: int, degrees: int = 6, sigmas: float = 1.96) -> tuple[float, float]:
-    """Return the 95 % bounds of the average over independent runs of a chi-square of so many degrees (normal limit)."""
+    """Return the 95 % bounds of the average over independent runs of a chi-square (normal limit)."""
     width = sigmas * np.sqrt(2.0 * degrees / runs)
     return degrees - float(width), degrees + float(width)
 

@@ -176,7 +176,7 @@ def _evaluate(
     report: Report,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Figures of both models on one test source; the report of the first beside them."""
+    """Figures of both models on one test source; with the report of the first."""
     from payload_emulator.training.evaluate.evaluate import evaluate, open_for_evaluation, run, summary
     from payload_emulator.training.evaluate.report import detector_report
     from reports.render import render_html

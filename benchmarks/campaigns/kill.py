@@ -13,7 +13,7 @@ state, none shares a sequence count or was handed out twice, every change has on
 and `linna verify` finds no damage. Exit status 1 where that does not hold. `--laptop`: one API alone, with its jobs, on
 SQLite.
 
-The campaign goes in runs of `--kills-per-run`, each with servers and an archive of its own. With `--state` each run is
+The campaign goes in runs of `--kills-per-run`, each with its own servers and archive. With `--state` each run is
 added to a file when it is over, and a campaign goes on where that file ends; `--seconds` begins no run after that time
 and ends the kills of the one under way.
 """

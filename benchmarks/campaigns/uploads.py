@@ -2,8 +2,8 @@
 
     python -m benchmarks.campaigns.uploads [--uploads N] [--half-sent N] [--sockets N] [--postgres] [--json]
 
-Starts the ground service on a private port (SQLite; `--postgres`: a PostgreSQL server of its own) and measures, from
-processes of their own:
+Starts the ground service on a private port (SQLite; `--postgres`: a private PostgreSQL server) and measures, from
+separate processes:
 
 - *uploads*: N clients connect, then all send a downlink at the same moment. One that is answered with 503 comes again
   after Retry-After until it is accepted.

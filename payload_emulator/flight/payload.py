@@ -469,7 +469,7 @@ class Payload:
     # Downlink
 
     def _downlink(self) -> list[bytes]:
-        """What TM/TC takes of the store; a report of time every so many frames of it."""
+        """What TM/TC takes of the store; a time report at the commanded interval of frames."""
         machine = self._machine
         takes = machine.board.downlink_octets()
         kinds = StoreClass if self._sends_all else _SMALL_CLASSES

@@ -329,7 +329,7 @@ def fly_moment(
     exposure: Exposure | None,
     by_hand: bytes = b"",
 ) -> Flown:
-    """Fly one moment; `by_hand` are telecommand packets that were received beside those of the operator."""
+    """Fly one moment; `by_hand` are telecommand packets that were received in addition to those of the operator."""
     if exposure is not None and isinstance(spacecraft.detector, CatalogueDetector):
         spacecraft.detector.show(world, exposure)
     orders = receiver.take(operator.orders(moment, spacecraft.payload.mode)) + by_hand

@@ -197,7 +197,7 @@ def take_frame(
         The paper's labels were asked for of a camera that does not look straight down, image up to the north.
     """
     rendering, filmic_png = render_view(world, view, renderer_name, blender_python)
-    # The noise is drawn from a stream of its own: light and noise of a view do not depend on each other.
+    # The noise is drawn from a separate stream: light and noise of a view do not depend on each other.
     rng = np.random.default_rng((world.scenario.seed, view.utc_ns, 1))
     metadata = metadata_of(world, view) | {"renderer": renderer_name, "label_rule": label_rule}
     return Frame(

@@ -438,7 +438,7 @@ def snapshot(
     rate: float,
     craters: CraterCatalogue | None = None,
 ) -> dict[str, Any]:
-    """A moment for a viewer: image, detections, catalogue, outcome and estimate of each estimator beside the truth."""
+    """A moment for a viewer: image, detections, catalogue, outcome estimate of each estimator, and truth."""
     message: dict[str, Any] = {
         "kind": "turn" if flown.exposure is None else "frame",
         "utc": format_utc(flown.moment.utc_ns),

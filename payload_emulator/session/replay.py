@@ -2,7 +2,7 @@
 
 A replay sees its archive and its build, nothing else: no data folder, no clock, no network. The same build on the same
 archive gives the same octets. What it costs is measured around the payload, in the CPU time of this thread, and never
-enters the downlink; beside each frame a fixed computation is timed as a yardstick, so that a busy machine or a slow one
+enters the downlink; with each frame a fixed computation is timed for comparison, so that a busy machine or a slow one
 can be told from a slow build.
 """
 
@@ -80,7 +80,7 @@ class Replay:
 
 
 def load_flight_build(path: Path) -> FlightBuild:
-    """A build from its TOML file: `name`, `version`, `model` and `parameters` (files beside it).
+    """A build from its TOML file: `name`, `version`, `model` and `parameters` (files in the same folder).
 
     Raises
     ------

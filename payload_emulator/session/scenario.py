@@ -88,7 +88,7 @@ class WindowSection:
     no earlier than `start` (the orbit's epoch when empty), between the two longitudes (east-positive; the second may
     exceed 360); "none" observes from `start` for `duration_s`.
     Frames are taken where the sub-satellite latitude is within `latitude_limit_deg` of the equator and between
-    `latitude_min_deg` and `latitude_max_deg`, on one of so many arcs as `arc_interval` says (1: on every one).
+    `latitude_min_deg` and `latitude_max_deg`, on every `arc_interval`-th arc (1: on all).
     """
 
     search: Literal["terrain", "none"] = "terrain"
@@ -430,7 +430,7 @@ def _read(kind: type[T], table: object, source: str, path: str = "") -> T:
     try:
         return read_table(kind, table, path)
     except TableFault as fault:
-        # Instruments have sections of their own names.
+        # The section of an instrument has its name.
         known = [name for name in fault.known if name != "instruments"]
         if "." not in fault.place:
             known += simulated_instruments() if known else []

@@ -31,7 +31,7 @@ class SuitePass:
 def suite_scenarios(
     given: Sequence[str] = (), *, frames: int | None = None, seeds: int = 1
 ) -> list[Scenario]:
-    """The scenarios of a suite: those shipped, or those given, each with so many seeds.
+    """The scenarios of a suite: those shipped, or those given, each with a number of seeds.
 
     Parameters
     ----------

@@ -204,7 +204,7 @@ def continued(world: World, duration_s: float) -> World | None:
     """Return the world flown on beyond its trajectory, with the frames of the added time; None for an OEM file.
 
     The window's band of latitudes and its search still decide where frames are taken; its number of passes and its
-    duration do not. Frames begin two intervals after the last, so that they are an arc of their own.
+    duration do not. Frames begin two intervals after the last, so that they form a separate arc.
 
     Raises
     ------
@@ -258,7 +258,7 @@ def flown_on(world: World, duration_s: float) -> tuple[Truth, tuple[TrueBurn, ..
 
 
 def _one_arc_of(interval: int, frame_utc_ns: IntArray, step_ns: int) -> IntArray:
-    """The frames of one arc out of so many; an arc ends where the latitude limit interrupts the frames."""
+    """Return the frames of every n-th arc; an arc ends where the latitude limit interrupts the frames."""
     arc = np.cumsum(np.diff(frame_utc_ns, prepend=frame_utc_ns[:1]) > step_ns)
     return np.asarray(frame_utc_ns[arc % interval == 0])
 

@@ -268,7 +268,7 @@ def _begun(
 
 
 def _best_tracks(tracks: tuple[Track, ...], limit: int) -> tuple[Track, ...]:
-    """Return at most so many tracks, without those of the fewest and then the oldest sightings."""
+    """Return the tracks up to a limit, without those of the fewest and then the oldest sightings."""
     if len(tracks) <= limit:
         return tracks
     order = sorted(range(len(tracks)), key=lambda t: (len(tracks[t].views), tracks[t].views[-1].ticks))
@@ -323,7 +323,7 @@ def _joined(
 def _longer(
     track: Track, view: View, uv: FloatArray, variance_px2: float, diameter_m: float, kept: int
 ) -> Track:
-    """Return the track with one more sighting, of which the last so many are kept."""
+    """Return the track with one more sighting; only the newest sightings up to a limit are kept."""
     count = len(track.views)
     return replace(
         track,

@@ -74,7 +74,7 @@ class LostParameters:
     log_diameter_gate
         Largest difference of the logarithms of measured and catalogued diameter.
     detections
-        The strongest so many detections are used: all that a detector gives. Those smaller than any crater of the map
+        Number of detections used, strongest first: all that a detector gives. Those smaller than any crater of the map
         cost no evidence, since no crater is like them, and the strongest alone are not those that the map holds.
     places
         Best places of the vote that are fitted.
@@ -127,7 +127,7 @@ class PlaceIndex:
 
     @property
     def octets(self) -> int:
-        """Size of what is kept beside the map."""
+        """Return the size of what is kept in addition to the map."""
         bins = self.bin_start.nbytes + self.bin_height_m.nbytes
         arrays = (self.log_diameter, self.latitude_rad, self.tangent, self.longitude_rad)
         return int(bins + sum(array.nbytes for array in arrays))
@@ -446,7 +446,7 @@ def _fitted(
 
 
 def log_poisson_tail(count: int, mean: float) -> float:
-    """Return the logarithm of the probability of at least so many events of a Poisson distribution."""
+    """Return the logarithm of the probability of at least a number of events of a Poisson distribution."""
     if count <= 0 or mean <= 0.0:
         return 0.0 if count <= 0 else -math.inf
     if count <= mean:

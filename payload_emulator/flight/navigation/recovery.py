@@ -45,12 +45,12 @@ def disagreements(
 
 
 def is_widened_search_due(count: int, parameters: AnchoredParameters) -> bool:
-    """Return whether so many disagreements ask for a widened search."""
+    """Return whether the number of disagreements requires a widened search."""
     return count >= parameters.suspicion_frames
 
 
 def is_lost_search_due(count: int, parameters: AnchoredParameters) -> bool:
-    """Return whether so many disagreements ask for a search without a prior."""
+    """Return whether the number of disagreements requires a search without a prior."""
     beyond = count - parameters.lost_frames
     return beyond >= 0 and beyond % parameters.limits.lost_search_every == 0
 

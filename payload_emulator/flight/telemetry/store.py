@@ -178,7 +178,7 @@ class PacketStore:
         return True
 
     def take(self, octets: int, kinds: Iterable[StoreClass] = StoreClass) -> list[bytes]:
-        """Packets of some classes for downlink, up to so many octets, in the order in which they were made.
+        """Packets of some classes for downlink, up to a number of octets, in the order in which they were made.
 
         Chosen by class, then by age; what is asked for again comes after all that was never sent. A packet that does
         not fit ends the choice, so that none overtakes another of its class.

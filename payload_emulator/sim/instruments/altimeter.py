@@ -126,7 +126,7 @@ def beam(radius_rad: float) -> tuple[FloatArray, FloatArray]:
 
 
 def ground_ranges_m(terrain: Terrain, position_mcmf_m: FloatArray, directions: FloatArray) -> FloatArray:
-    """Return the distance (n,) from a place to the terrain along unit directions (n, 3) in MCMF; NaN beside the Moon.
+    """Return the distance (n,) from a place to the terrain along unit directions (n, 3) in MCMF; NaN on a miss.
 
     Each iteration intersects the rays with the sphere through the ground below the points reached before.
     """

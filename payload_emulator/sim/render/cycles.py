@@ -1,4 +1,4 @@
-"""The paper's own renderer: Blender's Cycles, in a process of its own, with the inputs and outputs of `renderer`.
+"""The paper's own renderer: Blender's Cycles, in a separate process, with the inputs and outputs of `renderer`.
 
 Blender is optional and stays outside: a scene goes to another interpreter as a file of arrays, pictures come back as
 files.  That interpreter needs ``bpy`` (the wheel of Blender, GPL); this package never imports it.

@@ -2,8 +2,8 @@
 
     python cycles_worker.py SCENE.npz OUT.exr PICTURE.png COST.json
 
-A program of its own: it imports numpy and Blender's ``bpy`` and nothing of this project, so that Blender (GPL, with
-pins of its own on numpy) never shares a process with the rest.  `cycles_scene.CyclesScene` says what the scene holds.
+A separate program: it imports numpy and Blender's ``bpy`` and nothing of this project, so that Blender (GPL, with
+its own version of numpy) never shares a process with the rest.  `cycles_scene.CyclesScene` says what the scene holds.
 OUT.exr takes scene-linear radiance and the passes, PICTURE.png the Filmic picture in 16 bits, COST.json seconds.
 Exit status 3: there is no ``bpy``.
 """

@@ -30,8 +30,8 @@ Mask = BoolArray
 REASONS = ("size", "no_terrain", "shallow", "no_rim", "moved", "confusable")
 """Why a crater is dropped, in the order in which it is tested."""
 
-# Rims measured on coarse rasters lie low: 44 m (5 to 30 km) and 30 m (3 to 30 km) at 16 px/deg beside 64 px/deg, 106 m
-# at 4 px/deg (measured on GLD100); taken as linear in the logarithm of the resolution, zero from 64 px/deg on.
+# Rims measured on coarse rasters lie low: 44 m (5 to 30 km) and 30 m (3 to 30 km) at 16 px/deg compared with 64 px/deg,
+# 106 m at 4 px/deg (measured on GLD100); taken as linear in the logarithm of the resolution, zero from 64 px/deg on.
 _FULL_RESOLUTION_PPD = 64.0
 _LOW_RIM_M_PER_HALVING = 20.0
 _BLOCK_DEG = 5.0
@@ -119,7 +119,7 @@ class Curation:
     dropped
         Number by reason.
     offset_m
-        Common shift east, north of the raster's rims beside the list, removed from every centre.
+        Common shift east, north of the raster's rims from the list, removed from every centre.
     offset_sigma_m
         Standard error of that shift.
     shift_m

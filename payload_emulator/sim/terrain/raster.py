@@ -213,7 +213,7 @@ class RasterTerrain(TiledTerrain):
         return out, weight
 
     def _slope_gain(self, latitude: FloatArray, longitude: FloatArray) -> Heights:
-        """How rough the ground about each pixel is beside average ground, (rows, columns)."""
+        """Return the roughness of the ground about each pixel, relative to average ground, (rows, columns)."""
         step = float(latitude[0] - latitude[1])
         # About 1 km between nodes whatever the level, on pixels all tiles share.
         stride = max(1, round(SLOPE_SPACING_M / (step * MOON_RADIUS_M)))

@@ -137,7 +137,7 @@ class TiledTerrain(ABC):
     """Cache of tiles and everything that follows from it; a source only has to make one tile.
 
     A terrain belongs to one thread, the first that asks it for ground: the tiles of a patch are overwritten by later
-    ones.  Other threads are refused; each opens a terrain of its own, which gives the same bits.
+    ones.  Other threads are refused; each opens its own terrain, which gives the same bits.
     """
 
     is_real: bool = False

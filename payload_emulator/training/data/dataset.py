@@ -271,7 +271,7 @@ def diameter_on_ground_m(
 
 
 def ground_points(dataset: Dataset, frame: Frame, u_px: FloatArray, v_px: FloatArray) -> FloatArray:
-    """Points (n, 3) of the mean ground that pixels of a frame look at, MCMF m; NaN beside the Moon."""
+    """Points (n, 3) of the mean ground that pixels of a frame look at, MCMF m; NaN where a ray misses the Moon."""
     heading = dataset.camera.rays(np.stack([u_px, v_px], axis=-1)) @ frame.camera_from_mcmf
     reach = intersect_sphere(frame.position_mcmf_m, heading, MOON_RADIUS_M + frame.values["ground_m"])
     return np.asarray(frame.position_mcmf_m + reach[:, None] * heading)

@@ -32,7 +32,7 @@ _FIRST_ID = 10_000_000_000  # above every catalogue's numbers
 class RecurrenceRule:
     """When detections at one place are a landmark.
 
-    sightings : in at least so many frames; suns_apart_deg : two of them with Suns at least that far apart in azimuth;
+    sightings : least number of frames; suns_apart_deg : two of them with Suns at least that far apart in azimuth;
     share : of all frames that look at the place; reach : of the diameter, within which detections are one place.
     """
 

@@ -1,4 +1,4 @@
-"""Where detections lie beside the craters: signed errors by Sun and by place in the image, and beside measured rims.
+"""Position errors of detections: signed errors by Sun and by place in the image, from listed and from measured rims.
 
 Errors are detection minus crater in pixels, u right and v down. Beside the image's axes they are given toward the Sun
 in the image and across it (to the right of who looks toward the Sun): shadows would draw a detector along the first.

@@ -23,7 +23,7 @@ class LossWeights:
     diameter: float = 0.7
     sigma: float = 0.1
     depth: float = 0.2
-    class_heat: float = 0.25  # of the paper's class heatmaps, a variant beside the common one
+    class_heat: float = 0.25  # of the paper's class heatmaps, a variant in addition to the common one
     high_score: float = 0.85  # background above this on incompletely catalogued terrain is left alone
 
 

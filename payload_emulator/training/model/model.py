@@ -68,7 +68,7 @@ class ModelConfig:
     backbone : "small" or "large" of MobileNetV3.
     stride_px : stride of the output maps in pixels of the network's first layer, 4 or 2.
     preparation : how a colour frame becomes the network's input, a `flight.vision.preprocess.Preparation`.
-    enlarge : the network enlarges the image so many times first, for craters of few pixels (high altitudes).
+    enlarge : factor by which the network first enlarges the image, for craters of few pixels (high altitudes).
     """
 
     pyramid_channels: int = 64
