@@ -31,14 +31,6 @@ class Elements:
     argument_of_perilune_rad: float
     true_anomaly_rad: float
 
-    @property
-    def periselene_radius_m(self) -> float:
-        return self.semi_major_axis_m * (1.0 - self.eccentricity)
-
-    @property
-    def aposelene_radius_m(self) -> float:
-        return self.semi_major_axis_m * (1.0 + self.eccentricity)
-
 
 def state_from_elements(elements: Elements, gm_m3_s2: float) -> tuple[FloatArray, FloatArray]:
     """Return position (3,) in m and velocity (3,) in m/s in the frame of the elements.

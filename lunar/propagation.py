@@ -144,20 +144,6 @@ class Trajectory:
             if b - a > 1
         )
 
-    def apsides(self) -> tuple[FloatArray, FloatArray]:
-        """Return the elapsed times (k,) at which radial speed vanishes, in order, and the radii (k,) there in m."""
-        radial = np.einsum("ij,ij->i", self.states[:, :3], self.states[:, 3:])
-        spans = np.nonzero((radial[:-1] * radial[1:] < 0.0) & (np.diff(self.elapsed_s) > 0.0))[0]
-        low, high = self.elapsed_s[spans].copy(), self.elapsed_s[spans + 1].copy()
-        rising = radial[spans] < 0.0
-        for _ in range(50):
-            middle = 0.5 * (low + high)
-            state = self.state_after(middle)
-            before = (np.einsum("ij,ij->i", state[:, :3], state[:, 3:]) < 0.0) == rising
-            low, high = np.where(before, middle, low), np.where(before, high, middle)
-        times = 0.5 * (low + high)
-        return times, np.linalg.norm(self.state_after(times)[:, :3], axis=-1)
-
 
 def propagate(
     epoch_tdb_s: float,

@@ -116,12 +116,8 @@ class Terrain(Protocol):
         """Tiles of a level within ``spacing_m`` of places that lie within half a turn of each other."""
         ...
 
-    def craters_near(self, latitude_rad: float, longitude_rad: float, radius_m: float) -> CraterCatalogue:
-        """Catalogue craters about a place, rim heights and depths measured on this terrain."""
-        ...
-
     def measured(self, indices: IntArray) -> CraterCatalogue:
-        """Catalogue craters of these indices, likewise measured."""
+        """Return catalogue craters of these indices, rim heights and depths measured on this terrain."""
         ...
 
     def rim_tilts_m(self, indices: IntArray) -> FloatArray:
@@ -302,11 +298,6 @@ class TiledTerrain(ABC):
             kernels.sample_pool(patch.heights, patch.table, TILE_SHIFT, rows, columns, values)
             out[chosen] = values
         return out.reshape(latitude.shape)
-
-    def craters_near(self, latitude_rad: float, longitude_rad: float, radius_m: float) -> CraterCatalogue:
-        """Catalogue craters with centres within ``radius_m``, with rims and depths as this terrain shows them."""
-        indices = np.asarray(self.catalogue.near(latitude_rad, longitude_rad, radius_m), dtype=np.int64)
-        return self.measured(indices)
 
     def measured(self, indices: IntArray) -> CraterCatalogue:
         """The craters of these indices, measured: rim height is the mean on the rim circle, depth from it to the floor.
