@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from sqlalchemy import Connection, select
@@ -10,7 +11,7 @@ from ground_service.automation.core import Occurrence, PlannedAction
 from ground_service.automation.model import AutomationAction
 from ground_service.events import AutomationChanged, publish
 from ground_service.missions.model import Mission
-from ground_service.missions.rules import Rule
+from ground_service.missions.rules import Channel, Rule
 from ground_service.missions.store import ARCHIVE_ACTOR, get_mission, newest_of_spacecraft
 from ground_service.planning import store as planning
 from ground_service.planning.progress import HEARD_TICKS, MARGIN_NS
@@ -172,6 +173,11 @@ def list_actions(
 def rules_of_revision(connection: Connection, mission_id: int | None) -> tuple[Rule, ...]:
     """Return the stated rules of a revision; none for None."""
     return () if mission_id is None else get_mission(connection, mission_id).automation.rules or ()
+
+
+def channels_of_revision(connection: Connection, mission_id: int | None) -> Mapping[str, Channel]:
+    """Return the channels of notifications of a revision; none for None."""
+    return {} if mission_id is None else get_mission(connection, mission_id).automation.channels or {}
 
 
 def last_result(connection: Connection, action: AutomationAction) -> dict[str, Any] | None:

@@ -36,6 +36,7 @@ ACTIONS: Final = (
     "mark_processed",
     "run_regression",
     "compute_trends",
+    "notify",
 )
 
 CONDITIONS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -138,13 +139,17 @@ class Channel(Section):
     webhook
         Address (http or https) that receives a JSON document by POST.
     email
-        Addresses that receive a message through the mail server of the deployment.
+        Addresses that receive a message.
+    smtp, sender
+        Mail server as HOST:PORT, and the sender of messages.
     signing_secret
-        Name of the file under the deployment's secrets with the key of the webhook's HMAC-SHA256 signature.
+        Name of the file in the folder `secrets` of the service with the key of the webhook's HMAC-SHA256 signature.
     """
 
     webhook: Annotated[str, Field(pattern=r"^https?://[^\s]+$", max_length=1000)] | None = None
     email: Annotated[tuple[Annotated[str, Field(pattern=r"^[^@\s]+@[^@\s]+$")], ...], Array] | None = None
+    smtp: Annotated[str, Field(pattern=r"^[^\s:/]+:[0-9]{1,5}$")] = "localhost:25"
+    sender: Annotated[str, Field(pattern=r"^[^@\s]+@[^@\s]+$")] = "linna@localhost"
     signing_secret: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]+$", max_length=64)] | None = None
 
     @model_validator(mode="after")

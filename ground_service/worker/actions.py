@@ -31,6 +31,7 @@ from ground_service.ground import Ground
 from ground_service.missions.rules import DEFAULT_RULES, Rule
 from ground_service.planning.progress import close_window
 from ground_service.timekeeping.recorrelation import recorrelate
+from ground_service.worker.notifications import NotDelivered, send
 from ground_service.worker.upkeep import broken_limits
 
 log = logging.getLogger(__name__)
@@ -169,6 +170,28 @@ def _compute_trends(ground: Ground, action: AutomationAction) -> dict[str, Any]:
     return {"limits_broken": broken}
 
 
+def _notify(ground: Ground, action: AutomationAction) -> dict[str, Any]:
+    """Send the event over the channels of the rule; each gets it, also if another one fails."""
+    rule = _rule(ground, action)
+    with ground.database.reading() as connection:
+        channels = store.channels_of_revision(connection, action.mission_id)
+    content = {
+        name: value
+        for name, value in action.model_dump(mode="json").items()
+        if name in ("event", "trigger", "rule", "text", "subject", "pass_id", "window_id", "created")
+    }
+    faults = {}
+    for name in rule.notify or ():
+        ground.check_stopping()
+        try:
+            send(ground.home, channels[name], f"{_identity(action)}.{name}", f"LINNA: {action.text}", content)
+        except GroundError as error:
+            faults[name] = public_text(error)
+    if faults:
+        raise NotDelivered("; ".join(f"{name}: {fault}" for name, fault in faults.items()))
+    return dict.fromkeys(rule.notify or (), "delivered")
+
+
 DOING: Mapping[str, Callable[[Ground, AutomationAction], dict[str, Any]]] = {
     "correlate": _correlate,
     "align": _align,
@@ -177,5 +200,6 @@ DOING: Mapping[str, Callable[[Ground, AutomationAction], dict[str, Any]]] = {
     "mark_processed": _mark_processed,
     "run_regression": _run_regression,
     "compute_trends": _compute_trends,
+    "notify": _notify,
 }
 """Functions of the actions; each may be repeated without harm."""

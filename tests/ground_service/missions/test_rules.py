@@ -69,6 +69,18 @@ def rule(name: str = "a", on: str = "window ended", do: str = '["report"]', more
             "'correlation changed' → 'alarm'",
         ),
         (
+            rule(do='["notify"]', more='notify = ["op"]\n[automation.channels.ops]\nemail = ["a@b"]'),
+            "automation: expected rule 'a': a known channel ('ops'), found 'op'",
+        ),
+        (
+            rule(do='["notify"]'),
+            "automation.rules.0: expected rule 'a': the action notify and the channels to notify, found one of them",
+        ),
+        (
+            "[automation.channels.ops]\nwebhook = 'http://x/'\nemail = ['a@b']\n",
+            "automation.channels.ops: expected either webhook or email, found",
+        ),
+        (
             "[automation]\nevaluate = false\n" + rule(),
             "automation: expected no rule with a report where evaluate is false, found 'a'",
         ),
