@@ -15,6 +15,8 @@ from ground_service.store import events as log
 from ground_service.store.database import Database
 from ground_service.store.events import LoggedEvent
 
+KNOWN_LIMIT = 1_000_000
+
 
 class Event(BaseModel):
     """Event of the kind `event_kind`; its fields are the payload in the log."""
@@ -229,6 +231,14 @@ class FollowUpFailed(Event):
 def publish(connection: Connection, event: Event) -> None:
     """Publish an event in the write transaction of this connection."""
     log.publish(connection, event.event_kind, event.model_dump(mode="json", exclude_none=True))
+
+
+def publish_once(connection: Connection, event: Event) -> None:
+    """Publish an event as `publish` does, unless an equal one is in the log; for kinds of rare events."""
+    payload = event.model_dump(mode="json", exclude_none=True)
+    known = log.read_events(connection, 0, KNOWN_LIMIT, {event.event_kind})
+    if all(one.payload != payload for one in known):
+        publish(connection, event)
 
 
 def read_events(database: Database, after: int, limit: int = 200) -> list[LoggedEvent]:

@@ -12,6 +12,7 @@ from ground_service.clock import utc_now_ns
 from ground_service.ephemerides.attitudes import attitude_file, load_attitudes
 from ground_service.ephemerides.store import add_ephemeris
 from ground_service.errors import InvalidInput, storage_error
+from ground_service.events import ArchiveImported, publish_once
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_stored
 from ground_service.missions.declared import mission_of_manifest
@@ -94,6 +95,10 @@ def import_archive(ground: Ground, folder: Path, progress: Callable[[str], None]
             instance=instance_of(manifest, digest),
             name="downlink.cadu",
         )
+    with ground.database.writing() as connection:
+        hold(connection, f"archive {digest}")
+        vehicle = store.get_pass(connection, pass_id).vehicle_id
+        publish_once(connection, ArchiveImported(pass_id=pass_id, vehicle_id=vehicle))
     return pass_id
 
 

@@ -22,6 +22,7 @@ from ground_service.jobs.service import unfinished_jobs
 from ground_service.missions.catalogues import add_catalogue, catalogue_of, list_catalogues
 from ground_service.missions.model import parse_mission
 from ground_service.missions.service import add_mission
+from ground_service.passes.archive_import import import_archive
 from ground_service.planning import store as windows
 from ground_service.planning.model import UploadedState, WindowUploads
 from ground_service.planning.service import WindowEntry, add_window, change_window, get_window
@@ -359,3 +360,25 @@ def test_a_worker_that_only_reads_events_records_no_action_twice(
             follow.drain()
         assert [one[1:] for one in recorded(ground)] == [("align", "queued"), ("report", "queued")]
         assert len(set(jobs)) == len(unfinished_jobs(ground)) == 1
+
+
+IMPORTED = """
+name = "m"
+[spacecraft]
+id = 76
+[[automation.rules]]
+name = "report of an archive"
+on = "archive imported"
+do = ["align", "report"]
+"""
+
+
+def test_an_imported_archive_acts_once(ground: Ground, flown: SyntheticPass) -> None:
+    add_mission(ground, IMPORTED.encode())
+    pass_id = import_archive(ground, flown.folder)
+    assert import_archive(ground, flown.folder) == pass_id
+    assert recorded(ground) == [
+        ("report of an archive", "align", "done"),
+        ("report of an archive", "report", "done"),
+    ]
+    assert report_of(ground, pass_id)["detector"] is not None
