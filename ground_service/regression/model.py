@@ -37,6 +37,7 @@ class KeptArchive(Entity):
     octets: int
     pinned: bool
     kept_since: UtcTime
+    pass_id: int | None = Field(default=None, description="The pass that was imported from it")
 
 
 class ArchiveRecord(KeptArchive):

@@ -56,7 +56,7 @@ def list_builds(connection: Connection, *, limit: int, offset: int) -> tuple[lis
 
 def keep_archive(connection: Connection, archive: ArchiveRecord) -> None:
     """Add a kept archive; adding it again notes its use and pins it if requested."""
-    values = archive.model_dump(exclude={"kept_since", "pinned"})
+    values = archive.model_dump(exclude={"kept_since", "pinned", "pass_id"})
     now, pinned = archive.kept_since.utc_ns, int(archive.pinned)
     added = repository.add_new(
         connection, ARCHIVES, **values, pinned=pinned, used_utc_ns=now, created_utc_ns=now
@@ -85,7 +85,12 @@ def find_archive(connection: Connection, digest: str) -> ArchiveRecord | None:
 
 def list_archives(connection: Connection) -> list[ArchiveRecord]:
     """Return all kept archives, oldest first."""
-    query = select(ARCHIVES).order_by(ARCHIVES.c.created_utc_ns, ARCHIVES.c.digest)
+    passes = repository.PASSES
+    query = (
+        select(ARCHIVES, passes.c.id.label("pass_id"))
+        .outerjoin(passes, passes.c.archive_digest == ARCHIVES.c.digest)
+        .order_by(ARCHIVES.c.created_utc_ns, ARCHIVES.c.digest)
+    )
     return [_archive(row) for row in connection.execute(query).mappings()]
 
 

@@ -263,7 +263,9 @@ def _kept(service: Client, given: list[str]) -> tuple[list[str], list[dict[str, 
     from ground_service.errors import InvalidInput
     from lunar.errors import LunarError
 
-    known = {one.digest for one in service.list_kept_archives()}
+    kept = list(service.list_kept_archives())
+    known = {one.digest for one in kept}
+    of_pass = {str(one.pass_id): one.digest for one in kept if one.pass_id is not None}
     digests: list[str] = []
     unusable: list[dict[str, str]] = []
     for item in given:
@@ -273,8 +275,12 @@ def _kept(service: Client, given: list[str]) -> tuple[list[str], list[dict[str, 
                 digests.append(_upload(service, path, known))
             elif item in known:
                 digests.append(item)
+            elif item in of_pass:
+                digests.append(of_pass[item])
             else:
-                raise InvalidInput(item, "", "a pass archive, or the identity of one that is kept", "neither")
+                raise InvalidInput(
+                    item, "", "a pass archive, or the identity or the pass of one that is kept", "neither"
+                )
         except (InvalidInput, InvalidRequest, LunarError) as error:
             unusable.append({"name": path.name, "detail": str(error)[:1000]})
     return digests, unusable
@@ -336,10 +342,10 @@ def _archive(arguments: argparse.Namespace) -> int:
         elif arguments.action == "prune":
             removed = service.delete_kept_archives(unused_days=arguments.unused_days).removed
         kept = service.list_kept_archives()
-    shown = {"digest", "name", "frames", "octets", "pinned"}
+    shown = {"digest", "name", "frames", "octets", "pinned", "pass_id"}
     lines = [
         f"{one.digest[:16]}  {one.frames:5} frames  {one.octets / 1e6:8.1f} MB  {one.name}"
-        f"{'  pinned' if one.pinned else ''}"
+        f"{'' if one.pass_id is None else f'  pass {one.pass_id}'}{'  pinned' if one.pinned else ''}"
         for one in kept
     ]
     rows = [one.model_dump(mode="json", include=shown) for one in kept]
