@@ -283,8 +283,7 @@ def draw_altitude(
     name_axis(axes, canvas, "km")
     keep = time.inside(track.utc_ns)
     axes.plot(
-        time.x(track.utc_ns[keep]),
-        track.altitude_m[keep] / 1e3,
+        *broken(time.x(track.utc_ns[keep]), track.altitude_m[keep] / 1e3),
         color=color(REFERENCE),
         linewidth=canvas.pt(5.0),
         alpha=0.3,
@@ -293,7 +292,7 @@ def draw_altitude(
     for one in series:
         kept = time.inside(one.utc_ns)
         x = time.x(one.utc_ns[kept])
-        draw_lines(canvas, axes, x, one.altitude_m[kept] / 1e3, styles[one.name])
+        draw_lines(canvas, axes, *broken(x, one.altitude_m[kept] / 1e3), styles[one.name])
         error = np.abs(one.altitude_m[kept] - reference_at(track, one.utc_ns[kept])[2])
         errors.append((one, x, _positive(error)))
         entries.append((one.name, _last_finite(one.altitude_m[kept] / 1e3)))
@@ -306,7 +305,7 @@ def draw_altitude(
     log_length_axis(below, "y", [error for _, _, error in errors])
     below.set_title("altitude error, magnitude")
     for one, x, error in errors:
-        draw_lines(canvas, below, x, error, styles[one.name])
+        draw_lines(canvas, below, *broken(x, error), styles[one.name])
 
 
 def draw_distribution(
