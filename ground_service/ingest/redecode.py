@@ -36,13 +36,6 @@ def redecode(ground: Ground, vehicle: int, dictionary: Dictionary) -> int:
     return _go_on(ground, vehicle, dictionary)
 
 
-def redecode_all(ground: Ground) -> int:
-    """Decode everything with the dictionary of this version; how many rows that gave."""
-    with ground.database.reading() as connection:
-        vehicles = list(connection.execute(select(repository.VEHICLES.c.id)).scalars())
-    return sum(redecode(ground, int(vehicle), DICTIONARY) for vehicle in vehicles)
-
-
 def catch_up(ground: Ground, vehicle: int) -> int:
     """Decode a vehicle that an older dictionary decoded with that of this version; how many rows that gave."""
     with ground.database.reading() as connection:

@@ -22,9 +22,9 @@ from ground_service.ingest import edge_store as edges
 from ground_service.ingest.frames import ChannelEdge, is_checked
 from ground_service.ingest.joining import Joiner
 from ground_service.ingest.packets import PacketBatch
-from ground_service.ingest.parameters import decode_declared, definitions_of_spacecraft
+from ground_service.ingest.parameters import decode_declared, definitions_in_force, definitions_of_spacecraft
 from ground_service.ingest.reception import ExpectedLink, expected_link, remember_link
-from ground_service.ingest.redecode import catch_up
+from ground_service.ingest.redecode import catch_up, redecode
 from ground_service.ingest.store import store_batch
 from ground_service.ingest.stream import (
     BARE,
@@ -43,7 +43,7 @@ from ground_service.store import parameters, repository
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile, mapped_octets, read_blocks
 from ground_service.store.stored_files import register_file
-from ground_service.store.vehicles import FLOWN
+from ground_service.store.vehicles import FLOWN, all_vehicles
 from tmtc.arrays import as_octets
 from tmtc.cuc import NO_TICKS
 from tmtc.dictionary import DICTIONARY
@@ -363,7 +363,7 @@ def _read_piece(
 
 
 def apply_definition(ground: Ground, vehicle: int) -> int:
-    """Decode a vehicle's packets with the newest mission description; return the number of samples.
+    """Decode a vehicle's packets with the definitions in force for it; return the number of samples.
 
     Packets without a checksum that no earlier description declared are not stored yet: the raw files are read again.
     """
@@ -379,11 +379,24 @@ def apply_definition(ground: Ground, vehicle: int) -> int:
     return stored + decode_declared(ground, vehicle)
 
 
-def undecoded_vehicles(ground: Ground, spacecraft_id: int) -> list[int]:
-    """Return the vehicles of a spacecraft whose packets are not decoded with its newest mission description."""
+def decode_all_again(ground: Ground) -> int:
+    """Decode all packets with this version's dictionary and the mission descriptions; return the number of rows."""
     with ground.database.reading() as connection:
-        definitions, _ = definitions_of_spacecraft(connection, spacecraft_id)
-        return parameters.undecoded(connection, spacecraft_id, definitions.digest)
+        vehicles = [one.id for one in all_vehicles(connection)]
+    return sum(redecode(ground, one, DICTIONARY) + apply_definition(ground, one) for one in vehicles)
+
+
+def undecoded_vehicles(ground: Ground, spacecraft_id: int) -> list[int]:
+    """Return the vehicles of a spacecraft whose packets are not decoded with the definitions in force for them."""
+    with ground.database.reading() as connection:
+        mine = [one for one in all_vehicles(connection) if one.ccsds_id == spacecraft_id]
+        return [
+            one.id
+            for one in mine
+            if not parameters.is_decoded(
+                connection, one.id, definitions_in_force(connection, one.id)[0].digest
+            )
+        ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -423,7 +436,9 @@ class _Reading:
         """Return the packets that the mission description of a spacecraft declares."""
         if spacecraft not in self.definitions:
             with self.ground.database.reading() as connection:
-                self.definitions[spacecraft] = definitions_of_spacecraft(connection, spacecraft)[0]
+                self.definitions[spacecraft] = definitions_of_spacecraft(
+                    connection, spacecraft, self.piece.scope
+                )[0]
         return self.definitions[spacecraft]
 
     def _unchecked_apids(self, spacecraft: int) -> frozenset[int]:

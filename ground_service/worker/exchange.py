@@ -30,7 +30,7 @@ from ground_service.errors import (
     storage_error,
 )
 from ground_service.ground import Ground
-from ground_service.ingest.redecode import redecode_all
+from ground_service.ingest.service import decode_all_again
 from ground_service.store import audit, repository, rows
 from ground_service.store.database import Database, schema_revisions
 from ground_service.store.files import FileArchive, read_blocks, replace_durably
@@ -268,7 +268,7 @@ def import_database(ground: Ground, path: Path, *, say: Say | None = None) -> Im
     decoded = 0
     if earlier:
         tell("packets decoded again")
-        decoded = redecode_all(ground)
+        decoded = decode_all_again(ground)
     return ImportResult(
         revision=manifest.revision, rows=stored, files=len(names), left_out=left_out, decoded=decoded
     )

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -217,6 +217,26 @@ def _copy_missions(connection: Connection, scratch: Ground) -> None:
     if missions:
         with scratch.database.writing() as writing:
             writing.execute(insert(repository.MISSIONS), [dict(row) for row in missions])
+            _copy_archived_passes(connection, writing)
+
+
+def _copy_archived_passes(connection: Connection, writing: Connection) -> None:
+    """Copy the passes of archives: the link settings and packets of their descriptions hold for their instances."""
+    passes, vehicles = repository.PASSES, repository.VEHICLES
+    query = (
+        select(passes, vehicles.c.ccsds_id, vehicles.c.instance)
+        .join(vehicles, vehicles.c.id == passes.c.vehicle_id)
+        .where(
+            passes.c.archive_digest.is_not(None),
+            passes.c.mission_id.in_(select(repository.MISSIONS.c.id)),
+        )
+    )
+    for row in connection.execute(query.order_by(passes.c.id)).mappings().all():
+        kept = {column.name: row[column] for column in passes.c if not column.name.endswith("_sha256")}
+        with suppress(InvalidInput):  # a vehicle that is not valid is reported when its packets are decoded
+            vehicle = vehicle_id(writing, row["ccsds_id"], row["instance"])
+            kept |= {"vehicle_id": vehicle, "ephemeris_id": None}
+            writing.execute(insert(passes).values(kept))
 
 
 def _decode_declared_again(scratch: Ground, found: _Findings) -> None:
