@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from sqlalchemy import Connection, Table
+from sqlalchemy import Connection
 
 from ground_service.errors import GroundError, InvalidInput
 from ground_service.ground import Ground, open_ground
@@ -375,7 +375,7 @@ def _compare_parameters(
         )
 
 
-def _check_packets_of(connection: Connection, table: Table, vehicle: int, found: _Findings) -> None:
+def _check_packets_of(connection: Connection, table: store.Table, vehicle: int, found: _Findings) -> None:
     """Report packets referenced by values that are missing or have another number."""
     for packet, count in store.missing_packets(connection, table, vehicle):
         found.damage("packets", packet, f"expected the packet of {count} rows of {table.name}, found none")

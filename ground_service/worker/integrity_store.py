@@ -7,7 +7,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, Table, and_, func, insert, select, text
+from sqlalchemy import Connection, and_, func, insert, select, text
+from sqlalchemy import Table as Table
 
 from ground_service.errors import InvalidInput
 from ground_service.store import repository
