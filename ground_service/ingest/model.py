@@ -116,4 +116,4 @@ class Ingest(Entity):
     finished: UtcTime | None
     error: str | None
     dictionary_version: int = Field(examples=[1])
-    accounting: IngestResult | None = Field(description="null: nothing was ingested yet")
+    accounting: IngestResult | None = Field(description="null: not ingested yet, or by an earlier version")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from pydantic import ValidationError
 from sqlalchemy import Connection, bindparam, delete, func, select
 
 from ground_service.events import TelemetryReceived, publish
@@ -277,8 +278,8 @@ def change_result(connection: Connection, result: IngestResult) -> None:
     repository.change(connection, _INGESTS, result.ingest_id, accounting=result.model_dump(mode="json"))
 
 
-def results_of_vehicle(connection: Connection, vehicle: int) -> list[tuple[str, int, IngestResult]]:
-    """Return hash, octets and result of the ingests with packets of a vehicle, or of none, ordered by hash."""
+def results_of_vehicle(connection: Connection, vehicle: int) -> list[tuple[str, int, IngestResult | None]]:
+    """Return hash, octets and result of the ingests that may have packets of a vehicle, ordered by hash."""
     query = (
         select(_INGESTS.c.file_sha256, _FILES.c.octets, _INGESTS.c.accounting)
         .join(_FILES, _FILES.c.sha256 == _INGESTS.c.file_sha256)
@@ -290,10 +291,9 @@ def results_of_vehicle(connection: Connection, vehicle: int) -> list[tuple[str, 
         .order_by(_INGESTS.c.file_sha256)
     )
     found = (
-        (sha256, int(octets), IngestResult.model_validate(accounting))
-        for sha256, octets, accounting in connection.execute(query)
+        (sha256, int(octets), _result(accounting)) for sha256, octets, accounting in connection.execute(query)
     )
-    return [one for one in found if not one[2].vehicle_ids or vehicle in one[2].vehicle_ids]
+    return [one for one in found if one[2] is None or vehicle in one[2].vehicle_ids]
 
 
 def forget_samples(connection: Connection, vehicle: int, dictionary_version: int) -> None:
@@ -321,4 +321,12 @@ def packets_between(
 
 
 def _ingest(row: Mapping[str, Any]) -> Ingest:
-    return Ingest.of(row, sha256=row["file_sha256"], accounting=row["accounting"] or None)
+    return Ingest.of(row, sha256=row["file_sha256"], accounting=_result(row["accounting"]))
+
+
+def _result(accounting: dict[str, Any]) -> IngestResult | None:
+    """Return a stored result; None without one, and for one of an earlier version."""
+    try:
+        return IngestResult.model_validate(accounting)
+    except ValidationError:
+        return None

@@ -129,9 +129,11 @@ def _raw_files(connection: Connection, span: PassSpan) -> list[_Ingested]:
     """Return the ingested files that may contain data of the pass, each once, ordered by hash."""
     chosen: dict[str, _Ingested] = {}
     for sha256, octets, result in results_of_vehicle(connection, span.vehicle):
-        first, last = result.first_ticks, result.last_ticks
+        first = last = reception = None
+        if result is not None:
+            first, last, reception = result.first_ticks, result.last_ticks, result.reception
         if first is None or last is None or (first <= span.stop_ticks and last >= span.start_ticks):
-            chosen[sha256] = _Ingested(sha256, octets, _sections(result.reception), result.reception)
+            chosen[sha256] = _Ingested(sha256, octets, _sections(reception), reception)
     return list(chosen.values())
 
 
