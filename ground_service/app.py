@@ -12,7 +12,7 @@ from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.routing import Route
 
-from ground_service.clock import utc_now_ns
+from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.commanding.service import note_timeouts
 from ground_service.errors import GroundError
 from ground_service.ground import ground_from_settings
@@ -25,6 +25,7 @@ from ground_service.http.proxies import ForwardedHeaders, TrustedProxies
 from ground_service.http.requests import PlainText
 from ground_service.http.uploads import UploadPool
 from ground_service.links.supervisor import LinkSupervisor
+from ground_service.planning.standing import needs_plan
 from ground_service.routers import OPERATIONS
 from ground_service.settings import Settings
 from ground_service.web.documentation import documentation
@@ -37,7 +38,7 @@ from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.jobs import enter_redecoding
 from ground_service.worker.metrics import Metrics, Watch
 from ground_service.worker.routes import operations
-from ground_service.worker.upkeep import nightly_job_id
+from ground_service.worker.upkeep import nightly_job_id, plan_job_id
 
 log = logging.getLogger(__name__)
 
@@ -177,6 +178,12 @@ async def _nights(app: FastAPI, settings: Settings) -> None:
             log.exception("the nightly job could not be entered")
 
 
+def _plan(app: FastAPI) -> None:
+    """Enter the job of the plan once an hour of mission time, however many servers do."""
+    if needs_plan(app.state.ground):
+        app.state.dispatcher.submit("plan", {}, job_id=plan_job_id(mission_now_ns()))
+
+
 async def _sweeps(app: FastAPI) -> None:
     """Take up, every now and then, jobs that something left unfinished, and note telecommands whose end is overdue."""
     since = utc_now_ns() - DAY_NS
@@ -185,6 +192,7 @@ async def _sweeps(app: FastAPI) -> None:
         try:
             await run_in_threadpool(app.state.dispatcher.resume)
             await run_in_threadpool(app.state.follow_up.drain)
+            await run_in_threadpool(_plan, app)
             until = utc_now_ns()
             for command in await run_in_threadpool(note_timeouts, app.state.ground, since, until):
                 log.warning("telecommand %d: its end is overdue", command, extra={"telecommand": command})

@@ -164,6 +164,14 @@ class ContactMissed(Event):
     reason: str
 
 
+class RequestChanged(Event):
+    """A standing request was added, changed or deleted."""
+
+    event_kind = "request"
+    id: int
+    state: str
+
+
 class PlanChanged(Event):
     """The planner added windows for a standing request, or replaced failed ones."""
 

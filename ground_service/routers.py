@@ -38,6 +38,7 @@ OPERATIONS = (
     Router("ground_service.timekeeping.routes", "timekeeping", "spacecraft"),
     Router("ground_service.planning.routes", "planning", "windows"),
     Router("ground_service.links.routes", "links", "links"),
+    Router("ground_service.planning.request_routes", "requests", "requests"),
     Router("ground_service.commanding.routes", "telecommands", "telecommands"),
     Router("ground_service.alarms.routes", "alarms", "alarms"),
     Router("ground_service.automation.routes", "automation", "automation"),

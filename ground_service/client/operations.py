@@ -38,6 +38,7 @@ from ground_service.passes.model import (
     Trend,
 )
 from ground_service.planning.model import Imported, Plan, SearchResult, Window
+from ground_service.planning.request_model import RequestPlan, StandingRequest
 from ground_service.regression.model import Build, KeptArchive, Pruned, Regression, RegressionSummary
 from ground_service.timekeeping.model import Correlation, TimeReport
 
@@ -367,6 +368,32 @@ class Client(Connection):
     def get_uplink_state(self, spacecraft_id: int, *, instance: str = "flight") -> UplinkState:
         """Return the state of the telecommand receiver according to the newest telemetry."""
         return self._get(UplinkState, f"/spacecraft/{spacecraft_id}/uplink", instance=instance)
+
+    # Standing requests
+
+    def list_requests(self) -> Listing[StandingRequest]:
+        """List the standing requests, newest first."""
+        return self._list(StandingRequest, "/requests")
+
+    def add_request(self, request: Fields, *, key: str | None = None) -> StandingRequest:
+        """Add a standing request."""
+        return self._post(StandingRequest, "/requests", dict(request), key=key or new_key())
+
+    def get_request(self, request_id: int) -> StandingRequest:
+        """Return a standing request."""
+        return self._get(StandingRequest, f"/requests/{request_id}")
+
+    def change_request(self, request_id: int, change: Fields) -> StandingRequest:
+        """Pause or resume a standing request, or replace its terms."""
+        return self._call(StandingRequest, "PATCH", f"/requests/{request_id}", body=dict(change))
+
+    def delete_request(self, request_id: int) -> None:
+        """Delete a standing request; its windows stay."""
+        self._octets("DELETE", f"/requests/{request_id}")
+
+    def get_request_plan(self, request_id: int) -> RequestPlan:
+        """Return the last plan of a standing request."""
+        return self._get(RequestPlan, f"/requests/{request_id}/plan")
 
     # Links and contacts
 

@@ -29,6 +29,7 @@ KINDS = (
     "regression",
     "analysis",
     "nightly",
+    "plan",
     "redecode",
     "re-evaluation",
     "automation",

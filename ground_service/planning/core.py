@@ -8,13 +8,14 @@ they came whenever a station sees the spacecraft.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 
 from ground_service.evaluation.detection.recall import expected_craters
+from ground_service.links.core import predict_contacts
 from ground_service.missions.stations import STATIONS
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
@@ -49,6 +50,9 @@ class Constraints:
     altitude_m: Range | None = None
     sun_elevation_rad: Range | None = None
     latitude_rad: Range | None = None
+    regions_rad: tuple[tuple[Range, Range], ...] = ()
+    """Latitudes, and longitudes from west to east; one of them has to hold."""
+
     craters_per_frame: float | None = None
     crater_diameter_m: Range = (5e3, 30e3)
     mare: bool | None = None
@@ -185,6 +189,39 @@ class Planner:
                     candidates.append(candidate)
         return SearchResult(tuple(candidates), contacts, refused)
 
+    def spans(
+        self, constraints: Constraints, start_utc_ns: int, stop_utc_ns: int, *, step_s: float = 30.0
+    ) -> list[tuple[int, int]]:
+        """Return the spans in which the constraints hold, cut at the maximum duration, without short ones."""
+        found = find_windows(
+            lambda epochs: self._holds(epochs, constraints),
+            start_utc_ns,
+            stop_utc_ns,
+            step_s,
+            EDGE_TOLERANCE_S,
+        )
+        parts = [part for span in found for part in _cut(*span, constraints.maximum_duration_s)]
+        return [(a, b) for a, b in parts if b - a >= constraints.minimum_duration_s * NS]
+
+    def sunlit(self, utc_ns: IntArray) -> FloatArray:
+        """Return the share (n,) of the Sun that the spacecraft sees."""
+        return self._geometry(utc_ns).sunlit
+
+    def downlink_octets(
+        self, start_utc_ns: int, steps: int, step_s: float, outages: Mapping[str, Sequence[tuple[int, int]]]
+    ) -> FloatArray:
+        """Return the octets that contacts can take in each step (n,), outside the outages of the stations."""
+        edges = start_utc_ns + np.arange(steps + 1, dtype=np.int64) * round(step_s * NS)
+        stop = min(int(edges[-1]), self.ephemeris.stop_utc_ns)
+        seconds = np.zeros(steps)
+        if stop > start_utc_ns:
+            contacts = predict_contacts(self.ephemeris, self.resources.stations, start_utc_ns, stop, outages)
+            spans = [Contact(one.station, one.start_utc_ns, one.stop_utc_ns) for one in contacts]
+            for begin, end in _union(spans):
+                inside = np.minimum(edges[1:], end) - np.maximum(edges[:-1], begin)
+                seconds += np.maximum(inside, 0) / NS
+        return np.asarray(seconds * self.resources.downlink_bit_s / 8.0)
+
     def predict(
         self,
         start_utc_ns: int,
@@ -240,6 +277,8 @@ class Planner:
         ):
             if limits is not None:
                 held &= (value >= limits[0]) & (value <= limits[1])
+        if constraints.regions_rad:
+            held &= in_regions(at.latitude_rad, at.longitude_rad, constraints.regions_rad)
         if constraints.sunlit:
             held &= at.sunlit >= 1.0
         if constraints.mare is not None and self.mare is not None:
@@ -322,6 +361,18 @@ class Planner:
         if constraints.needs_contact and candidate.downlinked_by_utc_ns is None:
             return "no contact to downlink its data"
         return None
+
+
+def in_regions(
+    latitude_rad: FloatArray, longitude_rad: FloatArray, regions_rad: Sequence[tuple[Range, Range]]
+) -> BoolArray:
+    """Return whether places (n,) are in one of the regions; a region may contain the date line."""
+    inside = np.zeros(len(latitude_rad), dtype=np.bool_)
+    for (south, north), (west, east) in regions_rad:
+        width = east - west if east - west >= 2.0 * math.pi else (east - west) % (2.0 * math.pi)
+        along = (longitude_rad - west) % (2.0 * math.pi)
+        inside |= (latitude_rad >= south) & (latitude_rad <= north) & (along <= width)
+    return inside
 
 
 def frames_between(start_utc_ns: int, stop_utc_ns: int, cadence_s: float) -> int:

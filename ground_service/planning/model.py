@@ -339,6 +339,7 @@ class Window(Entity):
     data_octets: int
     predicted: WindowPrediction
     telecommands: list[int]
+    request_id: int | None = Field(description="The standing request that it was planned for")
     version: int
     created_by: str
     created: UtcTime

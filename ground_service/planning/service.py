@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -44,7 +45,6 @@ from ground_service.planning.model import (
     WindowRecord,
     WindowSearch,
 )
-from ground_service.planning.preparation import MARGIN_NS, Activity, TicksOf, prepare_window
 from ground_service.planning.window_states import PlannedSpan, span_conflicts
 from ground_service.store.counters import lock_spacecraft
 from ground_service.store.vehicles import vehicle_id
@@ -69,6 +69,9 @@ BATTERY_HISTORY_S = 7200
 """The battery is taken to be full one orbit before a window that is checked by itself."""
 
 VERIFICATION_MARGIN_S = 3600
+
+DAYLIGHT_RAD = (0.0, math.pi / 2.0)
+"""A camera needs the Sun above the horizon of the sub-satellite point."""
 
 _DECIDABLE = {
     "draft": ("approved", "uplinked", "failed"),
@@ -97,6 +100,12 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
     with ground.database.reading() as connection:
         reference = _ephemeris_for(connection, given.ephemeris_id, start, stop)
         mission = missions.mission_in_force(connection, given.spacecraft_id)
+        if (
+            mission is not None
+            and mission.camera.fov_deg is not None
+            and constraints.sun_elevation_rad is None
+        ):
+            constraints = replace(constraints, sun_elevation_rad=DAYLIGHT_RAD)
         commitments = store.commitments(connection, given.spacecraft_id, given.instance)
         catalogue_sha256 = None
         if given.catalogue_pass_id is not None:
@@ -114,7 +123,7 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
     mare = _mare(ground.data) if constraints.mare is not None else None
     if constraints.mare is not None and mare is None:
         raise InvalidInput("search", "terrain", "an albedo map among the public data", "none")
-    planner = _planner(ground, reference, mission, given.resources.value(), catalogue, mare)
+    planner = planner_of(ground, reference, mission, given.resources.value(), catalogue, mare)
     found = planner.search(
         constraints, start, stop, given.cadence_s, step_s=given.step_s, commitments=commitments
     )
@@ -293,9 +302,6 @@ def uplink_window(ground: Ground, window_id: int, *, actor: str) -> list[int]:
             (stop, ("stop_observation", 0.0, 0.0)),
         )
         approval = commanding.Approval(window.edited_by, window.decided_by)
-        further = _preparation(
-            ground, connection, window, lambda utc_ns: ticks_of_utc_ns(utc_ns, correlations)
-        )
         ids = [
             commanding.add_released(
                 connection,
@@ -307,17 +313,13 @@ def uplink_window(ground: Ground, window_id: int, *, actor: str) -> list[int]:
                 approval=approval,
             )
         ]
-        named: list[Activity] = [
-            (utc_ns, "perform_function", {"function_id": function, "argument_1": first, "argument_2": second})
-            for utc_ns, (function, first, second) in activities
-        ]
-        for utc_ns, command, arguments in sorted([*further, *named], key=lambda one: one[0]):
+        for utc_ns, (function, first, second) in activities:
             ids.append(
                 commanding.add_scheduled(
                     connection,
                     window.vehicle_id,
-                    command,
-                    arguments,
+                    "perform_function",
+                    {"function_id": function, "argument_1": first, "argument_2": second},
                     release_ticks=ticks_of_utc_ns(utc_ns, correlations),
                     actor=actor,
                     timeout_s=timeout_s,
@@ -325,40 +327,9 @@ def uplink_window(ground: Ground, window_id: int, *, actor: str) -> list[int]:
                     approval=approval,
                 )
             )
+        commands.limit_sending(connection, ids, start)
         _note(connection, actor, "uplink", window_id, window.state, {"telecommands": ids})
         return ids
-
-
-def _preparation(
-    ground: Ground, connection: Connection, window: WindowRecord, ticks_of: TicksOf
-) -> list[Activity]:
-    """Return the activities that prepare a window, where its mission description asks for uploads."""
-    mission = None if window.mission_id is None else missions.get_mission(connection, window.mission_id)
-    if mission is None or mission.uploads is None:
-        return []
-    start, stop = window.start.utc_ns, window.stop.utc_ns
-    found = ephemerides.covering_ephemerides(connection, start - MARGIN_NS, stop + MARGIN_NS)
-    whole = [
-        one for one in found if one.start.utc_ns <= start - MARGIN_NS and stop + MARGIN_NS <= one.stop.utc_ns
-    ]
-    orientation = declared_frames(mission.frames, ground.data).orientation or ground.orientation
-    activities, state = prepare_window(
-        mission.uploads,
-        _load(ground, whole[0]) if whole else None,
-        orientation,
-        start,
-        stop,
-        ticks_of,
-        8 * window.id,
-    )
-    if state is not None:
-        x, y, z = state.position_icrf_m.tolist()
-        u, v, w = state.velocity_icrf_m_s.tolist()
-        uploaded = model.UploadedState(
-            utc=UtcTime(state.utc_ns), position_icrf_m=(x, y, z), velocity_icrf_m_s=(u, v, w)
-        )
-        store.note_uploads(connection, window.id, model.WindowUploads(start_state=uploaded))
-    return activities
 
 
 def get_window(ground: Ground, window_id: int) -> Window:
@@ -408,6 +379,8 @@ def _assessed(
                 )
             )
     else:
+        if (conflict := _coverage_conflict(connection, entry)) is not None:
+            conflicts.append(conflict)
         mine = Commitment(entry.start_utc_ns, entry.stop_utc_ns, octets)
         peak, _ = storage_peak([*commitments, mine], (), entry.resources.downlink_bit_s, mine)
     if peak > entry.resources.storage_octets:
@@ -427,7 +400,7 @@ def _assessed(
     return AssessedWindow(entry, octets, predicted)
 
 
-def _planner(
+def planner_of(
     ground: Ground,
     reference: Ephemeris,
     mission: Mission | None,
@@ -456,7 +429,7 @@ def _prediction(
     for one in candidates:
         start, stop = one.start.utc_ns, one.stop.utc_ns
         if start <= entry.start_utc_ns and entry.stop_utc_ns <= stop:
-            planner = _planner(ground, one, mission, entry.resources)
+            planner = planner_of(ground, one, mission, entry.resources)
             try:
                 return planner.predict(
                     entry.start_utc_ns,
@@ -469,6 +442,22 @@ def _prediction(
             except EphemerisCoverageError:
                 continue
     return None
+
+
+def _coverage_conflict(connection: Connection, entry: WindowEntry) -> PlanConflict | None:
+    """Return the conflict of a window that no ephemeris covers; None as long as the service has no ephemeris."""
+    known, total = ephemerides.list_ephemerides(connection, limit=1, offset=0)
+    if not total:
+        return None
+    newest = (
+        known[0] if entry.ephemeris_id is None else ephemerides.get_ephemeris(connection, entry.ephemeris_id)
+    )
+    return PlanConflict(
+        "ephemeris",
+        None,
+        f"expected a time that a reference ephemeris covers (ephemeris {newest.id} from {newest.start} to "
+        f"{newest.stop}), found {UtcTime(entry.start_utc_ns)} to {UtcTime(entry.stop_utc_ns)}",
+    )
 
 
 def _span_conflicts(

@@ -142,6 +142,12 @@ def open_windows(connection: Connection, vehicle: int) -> list[WindowRecord]:
     return _windows(connection, query.order_by(WINDOWS.c.start_utc_ns), WindowRecord)
 
 
+def records_where(connection: Connection, *conditions: Any) -> list[WindowRecord]:
+    """Return the windows that fulfil conditions on their columns, in order of time."""
+    query = _joined().where(*conditions).order_by(WINDOWS.c.start_utc_ns, WINDOWS.c.id)
+    return _windows(connection, query, WindowRecord)
+
+
 def find_same(connection: Connection, vehicle: int, entry: WindowEntry) -> int | None:
     """Return the id of a window of a vehicle with this name and span; None without any."""
     row = repository.find(

@@ -846,6 +846,27 @@ class Window(Base):
     decided_by: Mapped[str | None] = mapped_column(String(64))
     created_utc_ns: Mapped[int] = mapped_column(BigInteger)
     changed_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    request_id: Mapped[int | None] = mapped_column(ForeignKey("standing_requests.id"))
+
+
+class StandingRequestRow(Base):
+    """Standing request with its last plan; `plans` counts plans, so that one of several processes stores each."""
+
+    __tablename__ = "standing_requests"
+    id: Mapped[int] = mapped_column(Integer, primary_key=True)
+    vehicle_id: Mapped[int] = mapped_column(ForeignKey("vehicles.id"))
+    name: Mapped[str] = mapped_column(Text)
+    state: Mapped[str] = mapped_column(String(16))
+    priority: Mapped[int] = mapped_column(Integer)
+    terms: Mapped[dict[str, Any]] = mapped_column(JSON)
+    plan: Mapped[dict[str, Any] | None] = mapped_column(JSON)
+    plans: Mapped[int] = mapped_column(Integer)
+    planned_utc_ns: Mapped[int | None] = mapped_column(BigInteger)
+    anchor_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    version: Mapped[int] = mapped_column(Integer)
+    created_by: Mapped[str] = mapped_column(String(64))
+    created_utc_ns: Mapped[int] = mapped_column(BigInteger)
+    changed_utc_ns: Mapped[int] = mapped_column(BigInteger)
 
 
 class AutomationActionRow(Base):

@@ -1,7 +1,6 @@
-"""Tables and generic queries, for store modules only.
+"""Reading and writing of everything but packets: one function per question, plain rows out.
 
-Every function takes the connection of the caller's transaction. Rows are dictionaries of column values, which a store
-turns into the entities of its capability.
+Every function takes the connection of the caller's transaction. Rows come back as dictionaries of column values.
 """
 
 from __future__ import annotations
@@ -43,6 +42,7 @@ PACKET_DEFINITIONS = _table(models.PacketDefinition)
 PACKET_DECODINGS = _table(models.PacketDecoding)
 PARAMETER_SAMPLES = _table(models.ParameterSample)
 PIECES = _table(models.Piece)
+STANDING_REQUESTS = _table(models.StandingRequestRow)
 GOOD_LINKS = _table(models.GoodLink)
 KNOWN_LINKS = _table(models.KnownLink)
 STREAM_EDGES = _table(models.StreamEdge)

@@ -13,8 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import JSON, Connection, Float, LargeBinary, String, collate, insert, select, text
-from sqlalchemy import Table as Table
+from sqlalchemy import JSON, Connection, Float, LargeBinary, String, Table, collate, insert, select, text
 
 from ground_service.store import models
 

@@ -25,13 +25,17 @@ from ground_service.errors import PASSING, public_text
 from ground_service.events import (
     AutomationChanged,
     CommandsSent,
+    ContactEnded,
+    ContactMissed,
     CorrelationChanged,
     EphemerisAdded,
     FollowUpFailed,
     MissionAdded,
     PassEvaluated,
     ReceptionsEntered,
+    RequestChanged,
     TelemetryReceived,
+    WindowChanged,
     publish,
 )
 from ground_service.ground import Ground, open_ground
@@ -42,6 +46,7 @@ from ground_service.missions.store import get_mission
 from ground_service.passes.span import pass_span
 from ground_service.passes.store import passes_of_vehicle, reported_without_ephemeris
 from ground_service.planning.progress import advance_windows
+from ground_service.planning.standing import needs_plan
 from ground_service.planning.store import get_record
 from ground_service.store import events
 from ground_service.store.events import LoggedEvent
@@ -96,6 +101,7 @@ def _after_ephemeris(ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
         yield "recorrelate", vehicle
     for pass_id in passes:
         yield "re-evaluate", pass_id
+    yield "plan", 0
 
 
 def _after_uplink(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
@@ -111,12 +117,22 @@ def _after_mission(ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
     if event.spacecraft_id is not None:
         for vehicle in undecoded_vehicles(ground, event.spacecraft_id):
             yield "decode", vehicle
+        yield "plan", 0
 
 
 def _after_decision(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
     event = AutomationChanged.of(logged)
     if event.state in ("queued", "refused"):
         yield "act", event.event
+
+
+def _after_window(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
+    if WindowChanged.of(logged).state == "failed":
+        yield "plan", 0
+
+
+def _after_change_of_plan(_ground: Ground, _logged: LoggedEvent) -> Iterator[Work]:
+    yield "plan", 0
 
 
 FOLLOWING: Mapping[str, Callable[[Ground, LoggedEvent], Iterator[Work]]] = {
@@ -128,6 +144,10 @@ FOLLOWING: Mapping[str, Callable[[Ground, LoggedEvent], Iterator[Work]]] = {
     PassEvaluated.event_kind: _after_report,
     MissionAdded.event_kind: _after_mission,
     AutomationChanged.event_kind: _after_decision,
+    WindowChanged.event_kind: _after_window,
+    ContactEnded.event_kind: _after_change_of_plan,
+    ContactMissed.event_kind: _after_change_of_plan,
+    RequestChanged.event_kind: _after_change_of_plan,
 }
 """The work that keeps derived data up to date after an event, by its kind."""
 
@@ -199,6 +219,14 @@ def _act(ground: Ground, number: int, event: int) -> str:
         return add_job(connection, "automation", {"event": number}, job_id=identity)
 
 
+def _plan(ground: Ground, _key: int, event: int) -> str | None:
+    """Add the job that brings the plan of standing requests up to date, if there is anything to plan."""
+    if not needs_plan(ground):
+        return None
+    with ground.database.writing() as connection:
+        return add_job(connection, "plan", {}, job_id=_job_id("plan", 0, event))
+
+
 DOING: Mapping[str, Callable[[Ground, int, int], str | None]] = {
     "recorrelate": _recorrelate,
     "alarms": _alarms,
@@ -207,6 +235,7 @@ DOING: Mapping[str, Callable[[Ground, int, int], str | None]] = {
     "decode": _decode,
     "match rules": _match_rules,
     "act": _act,
+    "plan": _plan,
 }
 """Functions of the work in the order in which they run; each returns the id of a job to start, or None."""
 

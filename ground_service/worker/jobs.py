@@ -31,6 +31,7 @@ from ground_service.jobs.model import Job
 from ground_service.jobs.service import enter_job
 from ground_service.jobs.store import FINISHED
 from ground_service.passes.archive_zip import import_zip
+from ground_service.planning.standing import plan_tick
 from ground_service.worker.actions import run_actions
 from ground_service.worker.upkeep import nightly
 from lunar.errors import LunarError
@@ -57,6 +58,11 @@ def _reevaluate(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> di
     pass_id, event = int(arguments["pass_id"]), int(arguments["event"])
     made = reevaluate(ground, pass_id, report_id=job_id, event=event)
     return {"report_id": None if made is None else made.report_id, "pass_id": pass_id, "event": event}
+
+
+def _plan(ground: Ground, _arguments: Mapping[str, Any], _job_id: str) -> dict[str, Any]:
+    """Bring the plan of standing requests up to date."""
+    return dict(plan_tick(ground))
 
 
 def _ingest(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
@@ -105,6 +111,7 @@ WORK: dict[str, Work] = {
     "regression": _regression,
     "analysis": _analysis,
     "nightly": nightly,
+    "plan": _plan,
     "redecode": _redecode,
     "re-evaluation": _reevaluate,
     "automation": _automation,

@@ -32,6 +32,11 @@ def nightly_job_id(utc_ns: int) -> str:
     return hashlib.sha256(f"nightly {format_utc(utc_ns)[:10]}".encode()).hexdigest()[:32]
 
 
+def plan_job_id(utc_ns: int) -> str:
+    """Return the id of the job that plans in an hour of mission time."""
+    return hashlib.sha256(f"plan {format_utc(utc_ns)[:13]}".encode()).hexdigest()[:32]
+
+
 def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> dict[str, Any]:
     """Trends of every spacecraft, and what was taken away."""
     with ground.database.reading() as connection:

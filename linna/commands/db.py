@@ -229,10 +229,10 @@ def run_tidy(arguments: argparse.Namespace) -> int:
 
 
 def run_redecode(arguments: argparse.Namespace) -> int:
-    from ground_service.ingest.service import decode_all_again
+    from ground_service.ingest.redecode import redecode_all
 
     with open_service(arguments) as ground:
-        rows = decode_all_again(ground)
+        rows = redecode_all(ground)
     emit(arguments, {"rows": rows}, text=f"{rows} rows")
     return 0
 

@@ -61,6 +61,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
             one.add_argument("--reason", required=True)
         one.set_defaults(handler=handler, action=name)
         parsers.append(one)
+    _configure_requests(actions)
     exporting = actions.add_parser("export", help="write the plan as JSON")
     exporting.add_argument("--out", type=Path, required=True, metavar="FILE")
     exporting.set_defaults(handler=export)
@@ -236,3 +237,110 @@ def _line(window: Window) -> str:
         f"{window.id:>4}  {str(window.start)[:19]}Z  {str(window.stop)[:19]}Z  {window.state}{reason}  "
         f"{window.name}"
     )
+
+
+def _configure_requests(actions: Any) -> None:
+    requests = actions.add_parser("request", help="standing requests, which the planner keeps in the plan")
+    kinds = requests.add_subparsers(metavar="ACTION", required=True)
+    adding = kinds.add_parser("add", help="add a standing request")
+    adding.add_argument("--name", required=True)
+    adding.add_argument("--spacecraft-id", type=int, required=True, metavar="N")
+    adding.add_argument("--instance", default="flight")
+    adding.add_argument("--windows", type=int, required=True, metavar="N", help="windows in each period")
+    adding.add_argument("--period-days", type=float, default=7.0, metavar="D")
+    adding.add_argument(
+        "--horizon-days", type=float, default=3.0, metavar="D", help="days ahead (default: 3)"
+    )
+    adding.add_argument("--sun", type=float, nargs=2, metavar=RANGE, help="Sun elevation, degrees")
+    adding.add_argument("--altitude", type=float, nargs=2, metavar=RANGE, help="altitude, km")
+    adding.add_argument("--latitude", type=float, nargs=2, metavar=RANGE, help="latitude, degrees")
+    adding.add_argument(
+        "--longitude", type=float, nargs=2, metavar=("WEST", "EAST"), help="degrees, to the east"
+    )
+    adding.add_argument("--duration", type=float, nargs=2, metavar=RANGE, help="duration, seconds")
+    adding.add_argument(
+        "--minimum-battery", type=float, metavar="SHARE", help="share of its capacity (default: 0.3)"
+    )
+    adding.set_defaults(handler=add_request)
+    listing = kinds.add_parser("list", help="list the standing requests, newest first")
+    listing.set_defaults(handler=list_requests)
+    parsers = [adding, listing]
+    for name, text in (
+        ("plan", "show the candidates of the last plan with the reasons"),
+        ("pause", "plan no further windows"),
+        ("resume", "plan windows again"),
+        ("delete", "delete a standing request; its windows stay"),
+    ):
+        one = kinds.add_parser(name, help=text)
+        one.add_argument("request_id", type=int, metavar="ID")
+        one.set_defaults(handler=show_request_plan if name == "plan" else change_request, action=name)
+        parsers.append(one)
+    for one in parsers:
+        add_operator_options(one)
+        add_json_flag(one)
+
+
+def add_request(arguments: argparse.Namespace) -> int:
+    def limits(pair: list[float] | None) -> dict[str, float] | None:
+        return None if pair is None else {"min": pair[0], "max": pair[1]}
+
+    request: dict[str, Any] = {
+        "name": arguments.name,
+        "spacecraft_id": arguments.spacecraft_id,
+        "instance": arguments.instance,
+        "windows": arguments.windows,
+        "period_days": arguments.period_days,
+        "horizon_days": arguments.horizon_days,
+        "sun_elevation_deg": limits(arguments.sun),
+        "altitude_km": limits(arguments.altitude),
+        "minimum_battery": arguments.minimum_battery,
+    }
+    if arguments.duration is not None:
+        request["minimum_duration_s"], request["maximum_duration_s"] = arguments.duration
+    region: dict[str, Any] = {"latitude_deg": limits(arguments.latitude)}
+    if arguments.longitude is not None:
+        region["west_deg"], region["east_deg"] = arguments.longitude
+    region = {key: value for key, value in region.items() if value is not None}
+    if region:
+        request["regions"] = [region]
+    with ground_client(arguments) as service:
+        added = service.add_request({key: value for key, value in request.items() if value is not None})
+    emit(arguments, added.model_dump(mode="json"), text=f"standing request {added.id}: {added.state}")
+    return 0
+
+
+def list_requests(arguments: argparse.Namespace) -> int:
+    with ground_client(arguments) as service:
+        found = list(service.list_requests())
+    lines = [
+        f"{one.id:>4}  {one.state:<7} {one.name}: {one.terms.windows} in {one.terms.period_days:g} days; "
+        + (", ".join(f"{number} {state}" for state, number in one.windows.items()) or "no windows yet")
+        for one in found
+    ]
+    figures = {"requests": [one.model_dump(mode="json") for one in found]}
+    emit(arguments, figures, text="\n".join(lines) or "no standing requests")
+    return 0
+
+
+def show_request_plan(arguments: argparse.Namespace) -> int:
+    with ground_client(arguments) as service:
+        plan = service.get_request_plan(arguments.request_id)
+    lines = [plan.reason] if plan.reason else []
+    for one in plan.candidates:
+        outcome = f"window {one.window_id}" if one.window_id is not None else f"rejected: {one.reason}"
+        lines.append(f"{one.start}  {one.stop}  {outcome}")
+    lines += [f"window {one['window_id']} failed: {one['reason']}" for one in plan.replaced]
+    emit(arguments, plan.model_dump(mode="json"), text="\n".join(lines) or "no candidates")
+    return 0
+
+
+def change_request(arguments: argparse.Namespace) -> int:
+    with ground_client(arguments) as service:
+        if arguments.action == "delete":
+            service.delete_request(arguments.request_id)
+            emit(arguments, {"deleted": arguments.request_id}, text=f"request {arguments.request_id} deleted")
+            return 0
+        state = "paused" if arguments.action == "pause" else "active"
+        found = service.change_request(arguments.request_id, {"state": state})
+    emit(arguments, found.model_dump(mode="json"), text=f"standing request {found.id}: {found.state}")
+    return 0

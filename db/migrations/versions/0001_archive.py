@@ -814,6 +814,27 @@ def upgrade() -> None:
     )
     op.create_index(op.f("ix_reports_pass_id"), "reports", ["pass_id"], unique=False)
     op.create_table(
+        "standing_requests",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("vehicle_id", sa.Integer(), nullable=False),
+        sa.Column("name", sa.Text(), nullable=False),
+        sa.Column("state", sa.String(length=16), nullable=False),
+        sa.Column("priority", sa.Integer(), nullable=False),
+        sa.Column("terms", sa.JSON(), nullable=False),
+        sa.Column("plan", sa.JSON(), nullable=True),
+        sa.Column("plans", sa.Integer(), nullable=False),
+        sa.Column("planned_utc_ns", sa.BigInteger(), nullable=True),
+        sa.Column("anchor_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("version", sa.Integer(), nullable=False),
+        sa.Column("created_by", sa.String(length=64), nullable=False),
+        sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("changed_utc_ns", sa.BigInteger(), nullable=False),
+        sa.ForeignKeyConstraint(
+            ["vehicle_id"], ["vehicles.id"], name=op.f("fk_standing_requests_vehicle_id_vehicles")
+        ),
+        sa.PrimaryKeyConstraint("id", name=op.f("pk_standing_requests")),
+    )
+    op.create_table(
         "windows",
         sa.Column("id", sa.Integer(), nullable=False),
         sa.Column("vehicle_id", sa.Integer(), nullable=False),
@@ -838,6 +859,7 @@ def upgrade() -> None:
         sa.Column("decided_by", sa.String(length=64), nullable=True),
         sa.Column("created_utc_ns", sa.BigInteger(), nullable=False),
         sa.Column("changed_utc_ns", sa.BigInteger(), nullable=False),
+        sa.Column("request_id", sa.Integer(), nullable=True),
         sa.ForeignKeyConstraint(
             ["ephemeris_id"], ["ephemerides.id"], name=op.f("fk_windows_ephemeris_id_ephemerides")
         ),
@@ -847,6 +869,9 @@ def upgrade() -> None:
             ["predecessor_id"], ["windows.id"], name=op.f("fk_windows_predecessor_id_windows")
         ),
         sa.ForeignKeyConstraint(["vehicle_id"], ["vehicles.id"], name=op.f("fk_windows_vehicle_id_vehicles")),
+        sa.ForeignKeyConstraint(
+            ["request_id"], ["standing_requests.id"], name=op.f("fk_windows_request_id_standing_requests")
+        ),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_windows")),
     )
     op.create_index(
@@ -895,6 +920,7 @@ def downgrade() -> None:
     op.drop_table("links")
     op.drop_table("automation_actions")
     op.drop_table("windows")
+    op.drop_table("standing_requests")
     op.drop_table("reports")
     op.drop_table("pass_frames")
     op.drop_table("passes")

@@ -41,9 +41,9 @@ class Station:
     def __post_init__(self) -> None:
         threading.Thread(target=self._take_uplinks, daemon=True).start()
 
-    def accept(self) -> socket.socket:
+    def accept(self, seconds: float = PATIENCE_S) -> socket.socket:
         """Return the next telemetry connection of the service."""
-        self.down.settimeout(PATIENCE_S)
+        self.down.settimeout(seconds)
         connection, _ = self.down.accept()
         self.connections.append(connection)
         return connection

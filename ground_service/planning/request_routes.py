@@ -1,0 +1,82 @@
+"""HTTP operations on standing requests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import Response
+
+from ground_service.access.idempotency import once
+from ground_service.access.security import Operator, Viewer
+from ground_service.http.common import API_PREFIX, GroundOf, OnceKey, PagingOf, PassId
+from ground_service.http.model import PageOf
+from ground_service.http.requests import operations, problems
+from ground_service.planning import standing
+from ground_service.planning.request_model import (
+    RequestPlan,
+    StandingRequest,
+    StandingRequestChange,
+    StandingRequestIn,
+)
+
+requests = operations("requests")
+
+
+@requests.get("/requests")
+def list_requests(ground: GroundOf, _: Viewer, paging: PagingOf) -> PageOf[StandingRequest]:
+    """List the standing requests, newest first."""
+    items, total = standing.list_requests(ground, limit=paging.limit, offset=paging.offset)
+    return paging.page(items, total)
+
+
+@requests.post("/requests", status_code=201)
+def add_request(
+    response: Response,
+    ground: GroundOf,
+    caller: Operator,
+    given: StandingRequestIn,
+    idempotency_key: OnceKey = None,
+) -> StandingRequest:
+    """Add a standing request; the planner fills the coming days from then on."""
+
+    def add() -> dict[str, Any]:
+        return standing.add_request(ground, given, actor=caller.name).model_dump(mode="json")
+
+    answer = once(
+        ground,
+        actor=caller.name,
+        operation="request",
+        key=idempotency_key,
+        request=given.model_dump(mode="json"),
+        work=add,
+    )
+    added = StandingRequest.model_validate(answer, strict=False)
+    response.headers["Location"] = f"{API_PREFIX}/requests/{added.id}"
+    return added
+
+
+@requests.get("/requests/{request_id}")
+def get_request(ground: GroundOf, _: Viewer, request_id: PassId) -> StandingRequest:
+    """Show a standing request with the numbers of its windows."""
+    return standing.get_request(ground, request_id)
+
+
+@requests.patch("/requests/{request_id}", responses=problems(409))
+def change_request(
+    ground: GroundOf, caller: Operator, request_id: PassId, given: StandingRequestChange
+) -> StandingRequest:
+    """Pause or resume a standing request, or replace its terms; planned windows stay."""
+    return standing.change_request(ground, request_id, given, actor=caller.name)
+
+
+@requests.delete("/requests/{request_id}", status_code=204)
+def delete_request(ground: GroundOf, caller: Operator, request_id: PassId) -> Response:
+    """Delete a standing request; its windows stay in the plan."""
+    standing.delete_request(ground, request_id, actor=caller.name)
+    return Response(status_code=204)
+
+
+@requests.get("/requests/{request_id}/plan")
+def get_request_plan(ground: GroundOf, _: Viewer, request_id: PassId) -> RequestPlan:
+    """Show the last plan: every candidate window, planned or rejected with the reason."""
+    return standing.get_plan(ground, request_id)

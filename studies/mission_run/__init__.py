@@ -1,1 +1,0 @@
-"""A mission over simulated days: payload, stations, ground service and automation together."""

@@ -1,0 +1,280 @@
+"""Standing requests: filling, explaining, replacing, approval, and one plan of several processes, on both databases."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ground_service.clock import set_mission_clock
+from ground_service.commanding.service import list_commands
+from ground_service.ephemerides.service import add_ephemeris
+from ground_service.errors import InvalidInput, NotFound
+from ground_service.events import read_events
+from ground_service.ground import Ground, open_ground
+from ground_service.missions.service import add_mission
+from ground_service.planning import request_store, standing
+from ground_service.planning import service as planning
+from ground_service.planning.request_model import RequestTerms, StandingRequestChange, StandingRequestIn
+from ground_service.store.database import prepare_database
+from ground_service.worker.follow_up import follow_in_process
+from lunar.ephemeris import ephemeris_from_states
+from lunar.oem import save_oem
+from tests.ground_service.conftest import START, circular_states
+
+NS = 10**9
+HOUR = 3600 * NS
+DAYS = 3
+
+MISSION = """name = "selenita"
+[spacecraft]
+id = 76
+[camera]
+fov_deg = 120.0
+width_px = 512
+height_px = 512
+[link.stations.here]
+latitude_deg = 10.0
+longitude_deg = 60.0
+minimum_elevation_deg = 0.0
+[link.stations.there]
+latitude_deg = -10.0
+longitude_deg = -120.0
+minimum_elevation_deg = 0.0
+{extra}
+"""
+LINKS = """[[links]]
+name = "a"
+kind = "tcp"
+station = "here"
+uplink = "127.0.0.1:9"
+[[links]]
+name = "b"
+kind = "tcp"
+station = "there"
+uplink = "127.0.0.1:9"
+"""
+AUTOMATIC = '[approval]\nwindows = "automatic"\n'
+
+
+@dataclass
+class Now:
+    utc_ns: int = field(default=START)
+
+
+@pytest.fixture
+def now() -> Iterator[Now]:
+    moment = Now()
+    set_mission_clock(lambda: moment.utc_ns)
+    yield moment
+    set_mission_clock(None)
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Ground]:
+    """An empty service on each database, which does not follow its events: only the tests plan."""
+    url = None
+    if request.param == "postgresql":
+        url = request.getfixturevalue("new_postgres_database")()
+        prepare_database(url, upgrade=True).engine.dispose()
+    with open_ground(tmp_path / "home", database_url=url) as opened:
+        yield opened
+
+
+@pytest.fixture
+def ground(tmp_path: Path) -> Iterator[Ground]:
+    """As `either`, on SQLite."""
+    with open_ground(tmp_path / "home") as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def oem(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    every = START - 3 * HOUR + np.arange(0, DAYS * 86_400, 60, dtype=np.int64) * NS
+    path = tmp_path_factory.mktemp("oem") / "reference.oem"
+    save_oem(ephemeris_from_states(every, *circular_states(every)), path)
+    return path
+
+
+def prepare(ground: Ground, oem: Path, extra: str = AUTOMATIC + LINKS) -> None:
+    add_mission(ground, MISSION.format(extra=extra).encode(), actor="ann")
+    add_ephemeris(ground, ground.files.put_file(oem), name="reference", precedence=0, actor="ann")
+
+
+def request(ground: Ground, **changes: object) -> int:
+    values = {
+        "name": "low Sun",
+        "spacecraft_id": 76,
+        "windows": 4,
+        "period_days": 7.0,
+        "horizon_days": 1.0,
+    } | changes
+    return standing.add_request(ground, StandingRequestIn.model_validate(values), actor="ann").id
+
+
+def test_the_coming_days_are_filled_approved_and_released(either: Ground, oem: Path, now: Now) -> None:
+    prepare(either, oem)
+    key = request(either)
+    done = standing.plan_tick(either, now.utc_ns)
+    assert done == {"failed": 0, "added": 4, "approved": 4, "released": 4}
+    windows, _ = planning.list_windows(either)
+    assert {one.request_id for one in windows} == {key}
+    for one in windows:
+        assert one.state == "approved" and one.start.utc_ns >= now.utc_ns + standing.LEAD_NS
+        assert one.predicted.sun_elevation_deg is not None and one.predicted.sun_elevation_deg.min >= -0.1
+    plan = standing.get_plan(either, key)
+    assert [one.window_id for one in plan.candidates if one.outcome == "planned"] == sorted(
+        one.id for one in windows
+    )
+    left = [one.reason for one in plan.candidates if one.outcome == "rejected"]
+    assert left and all(left) and "the number of windows of its period is planned" in left
+    assert standing.get_request(either, key).windows == {"approved": 4}
+    commands, _ = list_commands(either, state="released")
+    assert len(commands) == 12 and all(one.record.send_before_utc_ns for one in commands)
+    assert [e.payload["request_id"] for e in read_events(either.database, 0, 9999) if e.kind == "plan"] == [
+        key
+    ]
+
+
+def test_doing_it_again_changes_nothing(either: Ground, oem: Path, now: Now) -> None:
+    prepare(either, oem)
+    request(either)
+    standing.plan_tick(either, now.utc_ns)
+    first = planning.list_windows(either)
+    for later in (0, 600, 1200):
+        assert sum(standing.plan_tick(either, now.utc_ns + later * NS).values()) == 0
+    assert planning.list_windows(either) == first
+
+
+def test_a_request_is_planned_without_further_action(tmp_path: Path, oem: Path, now: Now) -> None:
+    with open_ground(tmp_path / "home") as ground:
+        follow_in_process(ground)
+        prepare(ground, oem)
+        key = request(ground, windows=2)
+        assert standing.get_request(ground, key).windows == {"approved": 2}
+        assert sum(standing.plan_tick(ground, now.utc_ns).values()) == 0
+
+
+def test_windows_that_found_no_contact_fail_and_are_replaced(either: Ground, oem: Path, now: Now) -> None:
+    prepare(either, oem)
+    key = request(either)
+    standing.plan_tick(either, now.utc_ns)
+    windows, _ = planning.list_windows(either)
+    first = min(windows, key=lambda one: one.start.utc_ns)
+    now.utc_ns = first.start.utc_ns
+    done = standing.plan_tick(either, now.utc_ns)
+    assert (done["failed"], done["added"]) == (1, 1)
+    failed = planning.get_window(either, first.id)
+    assert (failed.state, failed.reason) == ("failed", standing.NO_CONTACT)
+    assert {get.state for get in list_commands(either)[0] if get.record.window_id == first.id} == {"rejected"}
+    assert standing.get_plan(either, key).replaced == [{"window_id": first.id, "reason": standing.NO_CONTACT}]
+    assert standing.get_request(either, key).windows == {"approved": 4, "failed": 1}
+
+
+def test_without_automatic_approval_windows_wait_for_a_person_and_then_are_released(
+    ground: Ground, oem: Path, now: Now
+) -> None:
+    prepare(ground, oem, LINKS)
+    request(ground, windows=2)
+    assert standing.plan_tick(ground, now.utc_ns) == {"failed": 0, "added": 2, "approved": 0, "released": 0}
+    windows, _ = planning.list_windows(ground)
+    assert {one.state for one in windows} == {"draft"}
+    last = max(windows, key=lambda one: one.start.utc_ns)
+    planning.change_window(ground, last.id, actor="bob", changes={}, decision="approved")
+    assert standing.plan_tick(ground, now.utc_ns)["released"] == 1
+    first = min(windows, key=lambda one: one.start.utc_ns)
+    assert standing.plan_tick(ground, first.start.utc_ns)["failed"] == 1
+    assert planning.get_window(ground, first.id).reason == standing.NOT_APPROVED
+
+
+def test_windows_need_a_contact_before_them(ground: Ground, oem: Path, now: Now) -> None:
+    closed = 'outages = ["2029-08-07T00:00:00Z/2029-08-07T18:00:00Z"]\nminimum_elevation_deg = 0.0\n'
+    text = MISSION.format(extra=AUTOMATIC + LINKS).replace("minimum_elevation_deg = 0.0\n", closed)
+    add_mission(ground, text.encode(), actor="ann")
+    add_ephemeris(ground, ground.files.put_file(oem), name="reference", precedence=0, actor="ann")
+    key = request(ground)
+    standing.plan_tick(ground, now.utc_ns)
+    plan = standing.get_plan(ground, key)
+    reasons = {one.reason for one in plan.candidates if one.start.utc_ns < START + 12 * HOUR}
+    assert reasons == {"no contact before it to send its telecommands"}
+    planned = [one for one in plan.candidates if one.outcome == "planned"]
+    assert planned and all(one.start.utc_ns > START + 12 * HOUR for one in planned)
+
+
+def test_the_duty_limit_of_the_mission_description_is_kept(ground: Ground, oem: Path, now: Now) -> None:
+    prepare(ground, oem, AUTOMATIC + LINKS + "[resources]\nobserve_hours_per_day = 0.5\n")
+    key = request(ground, windows=20, maximum_duration_s=900.0, minimum_duration_s=800.0)
+    assert standing.plan_tick(ground, now.utc_ns)["added"] == 2
+    reasons = {one.reason for one in standing.get_plan(ground, key).candidates}
+    assert "more than 0.5 h of observation within 24 h" in reasons
+
+
+def test_regions_and_the_end_of_the_ephemeris_bound_the_plan(ground: Ground, oem: Path, now: Now) -> None:
+    prepare(ground, oem)
+    region = {"latitude_deg": {"min": -20.0, "max": 20.0}}
+    key = request(ground, windows=50, horizon_days=10.0, regions=[region], minimum_duration_s=60.0)
+    standing.plan_tick(ground, now.utc_ns)
+    plan = standing.get_plan(ground, key)
+    assert plan.reason is not None and plan.reason.startswith("the reference ephemeris ends at 2029-08-10")
+    windows, _ = planning.list_windows(ground)
+    assert windows
+    for one in windows:
+        assert one.predicted.latitude_deg is not None
+        assert -20.1 <= one.predicted.latitude_deg.min <= one.predicted.latitude_deg.max <= 20.1
+
+
+def test_without_an_ephemeris_the_plan_says_so(ground: Ground, now: Now) -> None:
+    add_mission(ground, MISSION.format(extra=AUTOMATIC).encode(), actor="ann")
+    key = request(ground)
+    assert standing.plan_tick(ground, now.utc_ns)["added"] == 0
+    assert standing.get_plan(ground, key).reason == "no reference ephemeris covers the coming days"
+
+
+def test_paused_and_deleted_requests_are_not_planned(ground: Ground, oem: Path, now: Now) -> None:
+    prepare(ground, oem)
+    key = request(ground)
+    standing.change_request(ground, key, StandingRequestChange(state="paused"), actor="ann")
+    assert standing.plan_tick(ground, now.utc_ns)["added"] == 0
+    terms = RequestTerms(windows=1, horizon_days=1.0)
+    standing.change_request(ground, key, StandingRequestChange(state="active", terms=terms), actor="ann")
+    assert standing.plan_tick(ground, now.utc_ns)["added"] == 1
+    standing.delete_request(ground, key, actor="ann")
+    assert [one.request_id for one in planning.list_windows(ground)[0]] == [None]
+    with pytest.raises(NotFound):
+        standing.get_request(ground, key)
+
+
+def test_contradictory_terms_are_refused(ground: Ground) -> None:
+    with pytest.raises(InvalidInput, match="minimum_duration_s: expected at most maximum_duration_s"):
+        request(ground, minimum_duration_s=900.0, maximum_duration_s=600.0)
+    with pytest.raises(InvalidInput, match="stop: expected a time after the start"):
+        request(ground, start="2029-08-07T00:00:00Z", stop="2029-08-06T00:00:00Z")
+
+
+def test_processes_that_plan_at_the_same_time_make_one_plan(
+    new_postgres_database, oem: Path, tmp_path: Path, now: Now
+) -> None:
+    url = new_postgres_database()
+    prepare_database(url, upgrade=True).engine.dispose()
+    grounds = [open_ground(tmp_path / "home", database_url=url) for _ in range(4)]
+    prepare(grounds[0], oem)
+    key = request(grounds[0])
+    added: list[int] = []
+    threads = [
+        threading.Thread(target=lambda one=one: added.append(standing.plan_tick(one, now.utc_ns)["added"]))
+        for one in grounds
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(120)
+    assert sorted(added) == [0, 0, 0, 4]
+    assert planning.list_windows(grounds[0])[1] == 4
+    with grounds[0].database.reading() as connection:
+        assert request_store.get_request_record(connection, key).plans == 1
+    for one in grounds:
+        one.close()
